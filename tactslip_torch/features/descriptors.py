@@ -1,0 +1,410 @@
+"""The paper's 17 descriptors of a bin, a wavelet branch or a spectrum (REFERENCE.md section 4).
+
+Each descriptor is a function of a ``Sample``: ``n`` values along the last axis, with the parts
+that several descriptors share (sorted values, scaled deviations, moments) computed once, when
+first asked for. ``describe`` is the front door.
+
+Extremes (our rules): a sample whose span is below ``16 * eps * scale`` counts as constant and is
+replaced by its mean beforehand (``settle``); it then has std, cv, skewness, correlation and
+entropy 0 and kurtosis 3. A zero sample has peak factor 0; a zero spectrum has centroid, spread and
+band energy ratios 0. Moments are two-pass, on values shifted by a sample and scaled by the span, so
+large offsets, denormals and 1e30 neither cancel nor overflow. Energies saturate at the largest
+finite number of the dtype. Gradients of replaced or tied values are 0 or one-sided, never NaN.
+A NaN or Inf among the values makes every descriptor NaN: never a silent number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+EPS64 = torch.finfo(torch.float64).eps
+ENTROPY_LEVELS = 255
+RUN_TOLERANCE = {torch.float64: 1e-12, torch.float32: 2.0**-20}
+CV_FLOOR = 1e-6
+
+
+def is_constant(x: Tensor, scale: Tensor) -> Tensor:
+    """Whether the span of ``x`` is rounding noise beside ``scale``, the size of the raw bin.
+
+    Shape:
+        - x: ``[*, n]``; scale: ``[*]``; output: ``[*]``, bool
+    """
+    span = x.detach().amax(-1) - x.detach().amin(-1)
+    return span < 16 * torch.finfo(x.dtype).eps * scale
+
+
+def settle(x: Tensor, scale: Tensor) -> Tensor:
+    """Replace what ``is_constant`` by its mean, value by value; gradients there are 0.
+
+    Shape:
+        - x, output: ``[*, n]``; scale: ``[*]``
+    """
+    first = x[..., :1].detach()
+    mean = first + (x.detach() - first).mean(-1, keepdim=True)
+    return torch.where(is_constant(x, scale)[..., None], mean, x)
+
+
+class Sample:
+    """Values to be described, and what several descriptors share.
+
+    Args:
+        x: the values, ``[*, n]`` with ``n >= 2``.
+        scale: ``[*]``, largest magnitude of the raw bin they come from, by which ``mode``
+            decides which values are equal. Default: their own.
+        reference: what ``correlation`` correlates with, broadcastable to ``x``.
+        frequency_hz: ``[n]``, the axis of a spectrum, for its centroid and spread.
+    """
+
+    def __init__(
+        self,
+        x: Tensor,
+        scale: Tensor | None = None,
+        reference: Sample | None = None,
+        frequency_hz: Tensor | None = None,
+    ) -> None:
+        self.x = x
+        self.num = x.shape[-1]
+        self._scale = scale
+        self.reference = reference
+        self.frequency_hz = frequency_hz
+
+    @cached_property
+    def ordered(self) -> Tensor:
+        """Sorted values, ``[*, n]``; NumPy's vectorised sort where no gradient is asked for."""
+        x = self.x
+        if x.device.type != "cpu" or x.requires_grad or torch.compiler.is_compiling():
+            return torch.sort(x, dim=-1).values
+        return torch.from_numpy(np.sort(x.numpy(), axis=-1))
+
+    @cached_property
+    def span(self) -> Tensor:
+        """Largest minus smallest value, ``[*]``; NaN or Inf where a value is."""
+        return self.x.amax(-1) - self.x.amin(-1)
+
+    @cached_property
+    def is_flat(self) -> Tensor:
+        """All values equal, ``[*]``."""
+        return self.span.detach() == 0
+
+    @cached_property
+    def magnitude(self) -> Tensor:
+        """Largest absolute value, ``[*]``, without gradient."""
+        return self.x.detach().abs().amax(-1)
+
+    @cached_property
+    def scale(self) -> Tensor:
+        """The size values are compared by, ``[*]``."""
+        return self.magnitude if self._scale is None else self._scale
+
+    @cached_property
+    def safe_span(self) -> Tensor:
+        """The span without gradient, 1 where it is 0, ``[*]``."""
+        return torch.where(self.is_flat, 1.0, self.span.detach())
+
+    @cached_property
+    def shifted(self) -> Tensor:
+        """Values minus the first, over the span: of order one whatever the unit, ``[*, n]``."""
+        return (self.x - self.x[..., :1].detach()) / self.safe_span[..., None]
+
+    @cached_property
+    def shifted_mean(self) -> Tensor:
+        """Mean of ``shifted``, ``[*, 1]``."""
+        return self.shifted.mean(-1, keepdim=True)
+
+    @cached_property
+    def deviation(self) -> Tensor:
+        """Values minus their mean, over the span, ``[*, n]``."""
+        return self.shifted - self.shifted_mean
+
+    @cached_property
+    def squares(self) -> Tensor:
+        """Squared ``deviation``, ``[*, n]``."""
+        return self.deviation * self.deviation
+
+    @cached_property
+    def variance(self) -> Tensor:
+        """Mean of ``squares``, 1 where the sample is flat, ``[*]``."""
+        return torch.where(self.is_flat, 1.0, self.squares.mean(-1))
+
+    @cached_property
+    def is_zero(self) -> Tensor:
+        """All values zero, ``[*]``."""
+        return self.magnitude == 0
+
+    @cached_property
+    def by_magnitude(self) -> Tensor:
+        """Values over the largest magnitude (zeros stay zeros), ``[*, n]``."""
+        return self.x / torch.where(self.is_zero, 1.0, self.magnitude)[..., None]
+
+    @cached_property
+    def rms(self) -> Tensor:
+        """Root mean square over the largest magnitude, 1 for a zero sample, ``[*]``."""
+        mean_square = (self.by_magnitude * self.by_magnitude).mean(-1)
+        return torch.where(self.is_zero, 1.0, mean_square).sqrt()
+
+    @cached_property
+    def weights(self) -> Tensor:
+        """A spectrum's lines as shares of their sum, 0 for a zero spectrum, ``[*, n]``."""
+        total = self.by_magnitude.sum(-1, keepdim=True)
+        return self.by_magnitude / torch.where(self.is_zero[..., None], 1.0, total)
+
+
+def mean(sample: Sample) -> Tensor:
+    """Arithmetic mean, ``[*]``."""
+    first = sample.x[..., 0].detach()
+    return first + sample.safe_span * sample.shifted_mean.squeeze(-1)
+
+
+def median(sample: Sample) -> Tensor:
+    """Middle value, or the mean of the two middle values for even ``n``, ``[*]``."""
+    middle = sample.ordered[..., (sample.num - 1) // 2 : sample.num // 2 + 1]
+    return middle.mean(-1)
+
+
+def mode(sample: Sample) -> Tensor:
+    """Most frequent value, the smallest of ties; the minimum if all are distinct, ``[*]``.
+
+    Sorted values no further than a tolerance from their neighbour form one run (ours): 1e-12 of
+    ``scale`` in float64, 2^-20 in float32, because exact equality in branches is decided by
+    rounding. The result is the first value of the longest run. Not differentiable where the
+    longest run changes; elsewhere the gradient is that of the value returned.
+    """
+    tolerance = RUN_TOLERANCE.get(sample.x.dtype, 2.0**-8) * sample.scale[..., None]
+    ordered = sample.ordered.detach()
+    apart = ordered[..., 1:] - ordered[..., :-1] > tolerance
+    rank = _rank_in_run(apart)
+    last = rank.argmax(-1, keepdim=True)  # the first maximum: the end of the first longest run
+    return sample.ordered.gather(-1, last - rank.gather(-1, last).long()).squeeze(-1)
+
+
+def range_(sample: Sample) -> Tensor:
+    """Largest minus smallest value, ``[*]``."""
+    return sample.span
+
+
+def mean_deviation(sample: Sample) -> Tensor:
+    """Mean absolute deviation from the mean, ``[*]``."""
+    return sample.safe_span * sample.deviation.abs().mean(-1)
+
+
+def std(sample: Sample) -> Tensor:
+    """Standard deviation with ``n - 1`` in the denominator, ``[*]``."""
+    unbiased = (sample.variance * (sample.num / (sample.num - 1))).sqrt()
+    return torch.where(sample.is_flat, 0.0, sample.safe_span * unbiased)
+
+
+def cv(sample: Sample) -> Tensor:
+    """Coefficient of variation, ``std / mean``, signed, ``[*]``.
+
+    The mean's magnitude counts as at least 1e-6 of the rms (ours); 0 for a zero sample.
+    """
+    size = torch.where(sample.is_zero, 1.0, sample.magnitude)
+    relative_mean = mean(sample) / size
+    floor = torch.maximum(relative_mean.abs(), CV_FLOOR * sample.rms)
+    signed = torch.where(relative_mean < 0, -floor, floor)
+    return std(sample) / size / signed
+
+
+def iqr(sample: Sample) -> Tensor:
+    """Interquartile range, quantiles at Hazen positions ``q n + 1/2``, ``[*]``."""
+    return _hazen_quantile(sample, 0.75) - _hazen_quantile(sample, 0.25)
+
+
+def skewness(sample: Sample) -> Tensor:
+    """Third central moment over the 3/2 power of the second, ``[*]``; 0 for a constant."""
+    return (sample.squares * sample.deviation).mean(-1) / sample.variance**1.5
+
+
+def kurtosis(sample: Sample) -> Tensor:
+    """Fourth central moment over the squared second, not excess, ``[*]``; 3 for a constant."""
+    plain = (sample.squares * sample.squares).mean(-1) / sample.variance**2
+    return torch.where(sample.is_flat, 3.0, plain)
+
+
+def energy(sample: Sample) -> Tensor:
+    """Sum of squares, ``[*]``; saturates at the largest finite number of the dtype."""
+    return (sample.x * sample.x).sum(-1).clamp(max=torch.finfo(sample.x.dtype).max)
+
+
+def entropy(sample: Sample) -> Tensor:
+    """Shannon entropy of the amplitude histogram in bits, ``[*]``; 0 for a constant.
+
+    Values are quantised to 256 levels between their extremes, with exact halves rounded up; the
+    distinct levels serve as histogram *edges*, so the two highest occupied ones share one cell.
+    Piecewise constant: its gradient is 0 wherever it exists, and none flows.
+    """
+    ordered = sample.ordered.detach()
+    relative = (ordered - ordered[..., :1]) / sample.safe_span[..., None]
+    level = (relative * ENTROPY_LEVELS + (0.5 + 1e-9)).floor()
+    # the maximum always has the top level, so the second highest level joins it
+    new_cell = (level[..., 1:] != level[..., :-1]) & (level[..., 1:] != ENTROPY_LEVELS)
+    growth = _entropy_growth(sample.num).to(sample.x)
+    return torch.where(sample.is_flat, 0.0, growth[_rank_in_run(new_cell).int()].sum(-1))
+
+
+def peak_factor(sample: Sample) -> Tensor:
+    """Signed maximum over the root mean square, ``[*]``; 0 for a zero sample."""
+    size = torch.where(sample.is_zero, 1.0, sample.magnitude)
+    return sample.x.amax(-1) / size / sample.rms
+
+
+def correlation(sample: Sample) -> Tensor:
+    """Pearson correlation with the filtered raw bin, ``[*]``; 0 if either is constant.
+
+    Raises:
+        ValueError: if the sample has no reference.
+    """
+    if sample.reference is None:
+        raise ValueError("correlation needs reference=, the filtered raw bin of the branch")
+    other = sample.reference
+    covariance = (sample.deviation * other.deviation).mean(-1)
+    plain = covariance / (sample.variance.sqrt() * other.variance.sqrt())
+    return torch.where(sample.is_flat | other.is_flat, 0.0, plain)
+
+
+def spectral_centroid(sample: Sample) -> Tensor:
+    """Mean frequency with amplitudes as weights, hertz, ``[*]``; 0 for a zero spectrum.
+
+    Raises:
+        ValueError: if the sample has no frequency axis.
+    """
+    return (sample.weights * _frequency_axis(sample)).sum(-1)
+
+
+def spectral_spread(sample: Sample) -> Tensor:
+    """Root of the weighted mean squared distance from the centroid, hertz, ``[*]``.
+
+    0 for a zero spectrum and for a single line.
+
+    Raises:
+        ValueError: if the sample has no frequency axis.
+    """
+    distance = _frequency_axis(sample) - spectral_centroid(sample)[..., None]
+    square = (sample.weights * distance * distance).sum(-1)
+    is_positive = square.detach() > 0
+    return torch.where(is_positive, torch.where(is_positive, square, 1.0).sqrt(), square)
+
+
+def band_energy_ratio(spectra: Tensor) -> Tensor:
+    """Each branch's share of the energy of all branches' spectra; 0 if all are zero.
+
+    Shape:
+        - spectra: ``[*, branches, lines]``
+        - output: ``[*, branches]``
+    """
+    largest = spectra.detach().flatten(-2).abs().amax(-1)[..., None, None]
+    scaled = spectra / torch.where(largest == 0, 1.0, largest)
+    energies = (scaled * scaled).sum(-1)
+    total = energies.sum(-1, keepdim=True)
+    return energies / torch.where(total.detach() == 0, 1.0, total)
+
+
+_DESCRIPTORS: dict[str, Callable[[Sample], Tensor]] = {
+    "mean": mean,
+    "median": median,
+    "mode": mode,
+    "range": range_,
+    "mean_deviation": mean_deviation,
+    "std": std,
+    "cv": cv,
+    "iqr": iqr,
+    "skewness": skewness,
+    "kurtosis": kurtosis,
+    "energy": energy,
+    "entropy": entropy,
+    "peak_factor": peak_factor,
+    "correlation": correlation,
+    "spectral_centroid": spectral_centroid,
+    "spectral_spread": spectral_spread,
+}
+COMMON_DESCRIPTORS = tuple(_DESCRIPTORS)[:13]
+TIME_DESCRIPTORS = (*COMMON_DESCRIPTORS, "correlation")
+SPECTRUM_DESCRIPTORS = (*COMMON_DESCRIPTORS, "spectral_centroid", "spectral_spread")
+
+
+def describe(
+    x: Tensor,
+    names: Sequence[str],
+    *,
+    scale: Tensor | None = None,
+    reference: Tensor | None = None,
+    frequency_hz: Tensor | None = None,
+) -> Tensor:
+    """The named descriptors of samples that are already settled (``settle``) where they must be.
+
+    Args:
+        x: values in any unit.
+        names: any of ``TIME_DESCRIPTORS`` or ``SPECTRUM_DESCRIPTORS``, in any order.
+        scale: largest magnitude of the raw bin; default: that of ``x``.
+        reference: the filtered raw bin, needed by ``correlation``.
+        frequency_hz: the axis of a spectrum, needed by its centroid and spread.
+
+    Shape:
+        - x: ``[*, n]``; scale: ``[*]``; reference: broadcastable to ``x``; frequency_hz: ``[n]``
+        - output: ``[*, len(names)]``
+
+    Raises:
+        ValueError: for an unknown name, fewer than two values, or a missing argument.
+
+    Example:
+        >>> describe(torch.tensor([1.0, 2.0, 2.0, 5.0]), ["mean", "mode", "range"])
+        tensor([2.5000, 2.0000, 4.0000])
+    """
+    unknown = [name for name in names if name not in _DESCRIPTORS]
+    if unknown:
+        raise ValueError(f"unknown descriptors {unknown}; known are {', '.join(_DESCRIPTORS)}")
+    if x.shape[-1] < 2:
+        raise ValueError(f"a sample needs at least two values, got {x.shape[-1]}")
+    sample = Sample(x, scale, None if reference is None else Sample(reference), frequency_hz)
+    values = torch.stack([_DESCRIPTORS[name](sample) for name in names], dim=-1)
+    return torch.where(sample.span.detach().isfinite()[..., None], values, torch.nan)
+
+
+def _frequency_axis(sample: Sample) -> Tensor:
+    if sample.frequency_hz is None:
+        raise ValueError("spectral_centroid and spectral_spread need frequency_hz=")
+    return sample.frequency_hz.to(sample.x)
+
+
+def _hazen_quantile(sample: Sample, q: float) -> Tensor:
+    """Linear interpolation at the one-based position ``q n + 1/2``, ``[*]``."""
+    position = min(max(q * sample.num - 0.5, 0.0), sample.num - 1.0)
+    below = int(position)
+    above = min(below + 1, sample.num - 1)
+    share = position - below
+    return sample.ordered[..., below] * (1 - share) + sample.ordered[..., above] * share
+
+
+def _rank_in_run(is_boundary: Tensor) -> Tensor:
+    """Position of each sorted value within its run, from 0.
+
+    Shape:
+        - is_boundary: ``[*, n - 1]``, bool: a new run starts behind this value
+        - output: ``[*, n]``, small integers
+    """
+    num = is_boundary.shape[-1] + 1
+    dtype = torch.int16 if num <= torch.iinfo(torch.int16).max else torch.int32
+    position = torch.arange(num, dtype=dtype, device=is_boundary.device)
+    start = torch.where(is_boundary, position[1:], 0)
+    start = torch.cat([torch.zeros_like(start[..., :1]), start], dim=-1)
+    return position - _running_max(start)
+
+
+def _running_max(x: Tensor) -> Tensor:
+    """``cummax`` of non-negative values by doubling: log2(n) plain maxima, which export to ONNX."""
+    reach = 1
+    while reach < x.shape[-1]:
+        x = torch.cat([x[..., :reach], torch.maximum(x[..., reach:], x[..., :-reach])], dim=-1)
+        reach *= 2
+    return x
+
+
+def _entropy_growth(num: int) -> Tensor:
+    """What the value of rank ``r`` in its cell adds to the entropy of ``num`` values, ``[num]``."""
+    share = torch.arange(num + 1, dtype=torch.float64) / num
+    return (-share * (share + EPS64).log2()).diff()

@@ -1,0 +1,248 @@
+"""The pool: every descriptor of every channel, branch and spectrum (REFERENCE.md section 4).
+
+For the paper's hand 14 gauges x 13 descriptors + 10 films x (8 branches x (14 time + 15 frequency)
++ 8 band energy ratios) = 2582 features of one 50 ms bin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from tactslip_torch.features.descriptors import (
+    COMMON_DESCRIPTORS,
+    SPECTRUM_DESCRIPTORS,
+    TIME_DESCRIPTORS,
+    band_energy_ratio,
+    describe,
+    is_constant,
+    settle,
+)
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
+from tactslip_torch.signals.wavelet import branch_matrix, branch_names
+
+
+@dataclass(frozen=True)
+class FeatureName:
+    """What a feature is, and of what.
+
+    Args:
+        channel: channel name, such as ``"PVDF3"``.
+        component: ``"raw"`` (SG) or a branch, ``"A1"`` to ``"D4"``.
+        domain: ``"time"`` or ``"freq"``.
+        descriptor: name in ``descriptors.py``, or ``"band_energy_ratio"``.
+
+    Example:
+        >>> str(FeatureName("PVDF3", "A2", "freq", "kurtosis"))
+        'PVDF3 A2 freq kurtosis'
+    """
+
+    channel: str
+    component: str
+    domain: str
+    descriptor: str
+
+    def __str__(self) -> str:
+        return f"{self.channel} {self.component} {self.domain} {self.descriptor}"
+
+
+class FeaturePool(nn.Module):
+    """All features of filtered bins, in the paper's order.
+
+    Holds two constant matrices, the wavelet branches and the spectrum, evaluated on an identity
+    in float64 through ptwt and torch.fft. Follows the dtype and the device of its input. Gradients
+    flow wherever the descriptor is differentiable.
+
+    Args:
+        hand: the channels, in the order in which bins hold them.
+        sample_rate_hz: of the bins.
+        bin_samples: length of a bin; 100 (50 ms at 2 kHz) in the paper.
+        wavelet: name of the wavelet.
+        level: number of wavelet levels.
+        spectrum: ``"reference"`` (the authors') or ``"clean"`` (ours).
+
+    Raises:
+        ValueError: if the rate is not positive, or the bin is too short for the levels.
+
+    Example:
+        >>> pool = FeaturePool(HandLayout.paper24())
+        >>> pool(torch.randn(5, 24, 100)).shape, str(pool.names[0])
+        (torch.Size([5, 2582]), 'SG1 raw time mean')
+    """
+
+    def __init__(
+        self,
+        hand: HandLayout,
+        sample_rate_hz: float = 2000.0,
+        *,
+        bin_samples: int = 100,
+        wavelet: str = "rbio2.2",
+        level: int = 4,
+        spectrum: SpectrumMethod = "reference",
+    ) -> None:
+        super().__init__()
+        if not sample_rate_hz > 0:
+            raise ValueError(f"sample_rate_hz must be positive, got {sample_rate_hz}")
+        self.hand = hand
+        self.sample_rate_hz = float(sample_rate_hz)
+        self.bin_samples = bin_samples
+        self.wavelet = wavelet
+        self.level = level
+        self.spectrum: SpectrumMethod = spectrum
+        self._gauges = list(hand.indices("SG"))
+        self._films = list(hand.indices("PVDF"))
+        self.names = _pool_names(hand, level)
+        lines = spectrum_matrix(bin_samples, spectrum)
+        self._constants = {  # float64; cast to the bins' dtype on use, so they never lose digits
+            "branches": branch_matrix(bin_samples, wavelet, level),
+            "cosine": lines.real.contiguous(),
+            "sine": lines.imag.contiguous(),
+            "frequency_hz": frequency_axis_hz(bin_samples, sample_rate_hz, spectrum),
+            "is_approximation": torch.tensor([n[0] == "A" for n in branch_names(level)]),
+        }
+
+    def forward(self, bins: Tensor) -> Tensor:
+        """Features of filtered bins.
+
+        Shape:
+            - bins: ``[*, C, n]``
+            - output: ``[*, F]``, every value finite where the bins are; NaN for every feature
+              of a channel that holds a NaN or Inf
+
+        Raises:
+            ValueError: if the number of channels or samples is another, or bins are not floating.
+        """
+        self._check(bins)
+        films = bins[..., self._films, :]
+        scale = films.detach().abs().amax(-1)  # [*, films]
+        branches = self.branches(films)  # [*, films, branches, n]
+        spectra = self.amplitudes(branches)  # [*, films, branches, lines]
+        branch_scale = scale[..., None].expand(branches.shape[:-1])
+        in_time = describe(
+            branches,
+            TIME_DESCRIPTORS,
+            scale=branch_scale,
+            reference=settle(films, scale)[..., None, :],
+        )
+        in_frequency = describe(
+            spectra,
+            SPECTRUM_DESCRIPTORS,
+            scale=branch_scale,
+            frequency_hz=self._constant("frequency_hz", bins),
+        )
+        ratios = band_energy_ratio(spectra).unflatten(-1, (self.level, 2))  # [*, films, level, 2]
+        by_level = torch.cat(
+            [part.unflatten(-2, (self.level, 2)).flatten(-2) for part in (in_time, in_frequency)],
+            dim=-1,
+        )  # [*, films, level, 2 * (14 + 15)]
+        of_films = torch.cat([by_level.flatten(-2), ratios.transpose(-1, -2).flatten(-2)], dim=-1)
+        return torch.cat([self._of_gauges(bins), of_films.flatten(-2)], dim=-1)
+
+    def branches(self, films: Tensor) -> Tensor:
+        """Wavelet branches, those that are constant replaced (D by 0, A by their mean).
+
+        Shape:
+            - films: ``[*, n]``
+            - output: ``[*, 2 * level, n]`` in the order of ``branch_names``
+        """
+        matrix = self._constant("branches", films)  # [branches, n, n]
+        is_approximation = self._constant("is_approximation", films)[:, None]
+        first = films[..., None, :1].detach()  # keeps a small vibration on a large offset exact
+        shifted = (films[..., None, :] - first).squeeze(-2) @ matrix.flatten(0, 1).T
+        shifted = shifted.unflatten(-1, matrix.shape[:2])
+        branches = shifted + torch.where(is_approximation, first, 0.0)
+        scale = films.detach().abs().amax(-1)[..., None].expand(branches.shape[:-1])
+        constant = is_constant(branches, scale)[..., None]
+        return torch.where(constant & ~is_approximation, 0.0, settle(branches, scale))
+
+    def amplitudes(self, branches: Tensor) -> Tensor:
+        """Amplitude spectrum of each branch; the gradient of a line that is zero is 0.
+
+        Shape:
+            - branches: ``[*, n]``
+            - output: ``[*, lines]``
+        """
+        size = branches.detach().abs().amax(-1, keepdim=True)
+        size = torch.where(size == 0, 1.0, size)  # squares of 1e30 or 1e-30 stay in range
+        scaled = branches / size
+        real = scaled @ self._constant("cosine", branches).T
+        imaginary = scaled @ self._constant("sine", branches).T
+        square = real * real + imaginary * imaginary
+        is_zero = square.detach() == 0
+        return size * torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
+
+    def extract(self, bins: Tensor, chunk_bins: int = 64) -> Tensor:
+        """``forward`` in chunks that fit the processor's cache: same values, bounded memory.
+
+        Shape:
+            - bins: ``[N, C, n]``
+            - output: ``[N, F]``
+        """
+        self._check(bins)
+        if not len(bins):
+            return bins.new_empty(0, len(self.names))
+        return torch.cat([self(chunk) for chunk in bins.split(chunk_bins)])
+
+    def validity(self, bins: Tensor) -> Tensor:
+        """Which channels can be trusted.
+
+        False where a channel holds a NaN or Inf or its span is within 64 eps of its magnitude
+        (a dead sensor, or a vibration the dtype cannot resolve).
+
+        Shape:
+            - bins: ``[*, C, n]``
+            - output: ``[*, C]``, bool
+
+        Raises:
+            ValueError: as ``forward``.
+        """
+        self._check(bins)
+        span = bins.amax(-1) - bins.amin(-1)
+        magnitude = bins.abs().amax(-1)
+        return span.isfinite() & (span > 64 * torch.finfo(bins.dtype).eps * magnitude)
+
+    def _of_gauges(self, bins: Tensor) -> Tensor:
+        gauges = bins[..., self._gauges, :]
+        scale = gauges.detach().abs().amax(-1)
+        return describe(settle(gauges, scale), COMMON_DESCRIPTORS, scale=scale).flatten(-2)
+
+    def _constant(self, name: str, like: Tensor) -> Tensor:
+        constant = self._constants[name]
+        if constant.dtype == torch.bool:
+            return constant.to(like.device)
+        return constant.to(like)
+
+    def _check(self, bins: Tensor) -> None:
+        if bins.ndim < 2 or bins.shape[-2:] != (len(self.hand), self.bin_samples):
+            raise ValueError(
+                f"expected bins [*, {len(self.hand)}, {self.bin_samples}] (channels, samples), "
+                f"got {tuple(bins.shape)}"
+            )
+        if not bins.is_floating_point():
+            raise ValueError(f"expected floating-point bins in volts, got {bins.dtype}")
+
+
+def _pool_names(hand: HandLayout, level: int) -> tuple[FeatureName, ...]:
+    names = [
+        FeatureName(hand.names[i], "raw", "time", descriptor)
+        for i in hand.indices("SG")
+        for descriptor in COMMON_DESCRIPTORS
+    ]
+    domains = (("time", TIME_DESCRIPTORS), ("freq", SPECTRUM_DESCRIPTORS))
+    for channel in (hand.names[i] for i in hand.indices("PVDF")):
+        names += [
+            FeatureName(channel, f"{kind}{m}", domain, descriptor)
+            for m in range(1, level + 1)
+            for domain, descriptors in domains
+            for kind in "AD"
+            for descriptor in descriptors
+        ]
+        names += [
+            FeatureName(channel, f"{kind}{m}", "freq", "band_energy_ratio")
+            for kind in "AD"
+            for m in range(1, level + 1)
+        ]
+    return tuple(names)

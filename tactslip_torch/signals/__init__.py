@@ -1,0 +1,1 @@
+"""From raw channels to what features are taken from: filter, bins, wavelet branches, spectra."""

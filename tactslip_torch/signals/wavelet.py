@@ -1,0 +1,108 @@
+"""Wavelet branches of a bin (paper section IV-C, REFERENCE.md section 3), through ptwt.
+
+A branch is a component *reconstructed to the bin's length*: all other coefficients are set to
+zero and the transform is inverted. Every step is linear in the bin, so ``branch_matrix`` says it
+all; features use the matrix, and ``wavelet_branches`` is what the matrix is made of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Literal
+
+import pywt
+import torch
+from ptwt.conv_transform import wavedec, waverec
+from torch import Tensor
+
+ExtensionMode = Literal["symmetric", "reflect", "zero", "constant", "periodic"]
+
+
+def branch_names(level: int) -> tuple[str, ...]:
+    """``("A1", "D1", "A2", "D2", ...)``, the order of branches everywhere.
+
+    Example:
+        >>> branch_names(2)
+        ('A1', 'D1', 'A2', 'D2')
+    """
+    return tuple(f"{kind}{m}" for m in range(1, level + 1) for kind in "AD")
+
+
+def wavelet_branches(
+    x: Tensor, wavelet: str = "rbio2.2", level: int = 4, mode: ExtensionMode = "symmetric"
+) -> Tensor:
+    """Approximations and details of a signal, each at the signal's own length.
+
+    ``A1 + D1 = x`` and ``A(m) = A(m+1) + D(m+1)``. Gradients flow (the map is linear).
+
+    Args:
+        x: filtered bin.
+        wavelet: any discrete wavelet PyWavelets knows; ``rbio2.2`` in the paper.
+        level: number of levels; 4 in the paper.
+        mode: extension at the ends; half-point ``symmetric`` in the paper's MATLAB
+            (ptwt's own default, ``reflect``, is another).
+
+    Shape:
+        - x: ``[*, n]``
+        - output: ``[*, 2 * level, n]`` in the order of ``branch_names``
+
+    Raises:
+        ValueError: if the wavelet is unknown or the signal too short for the level.
+
+    Reference:
+        ``pywt.wavedec`` and ``pywt.waverec`` with all but one coefficient array zeroed.
+    """
+    num_samples = x.shape[-1]
+    if wavelet not in pywt.wavelist(kind="discrete"):
+        raise ValueError(
+            f"unknown wavelet {wavelet!r}; pywt.wavelist(kind='discrete') lists the known ones"
+        )
+    highest = pywt.dwt_max_level(num_samples, pywt.Wavelet(wavelet).dec_len)
+    if not 1 <= level <= highest:
+        raise ValueError(
+            f"level must lie in 1..{highest} for bins of {num_samples} samples and {wavelet}, "
+            f"got {level}; use fewer levels or longer bins"
+        )
+    flat = x.reshape(-1, num_samples)
+    coefficients = wavedec(flat, wavelet, mode=mode, level=level)  # cA, cD(level), .., cD1
+    details = list(_details(coefficients[1:], wavelet, num_samples))  # D(level), .., D1
+    approximation = _rebuild([coefficients[0]], coefficients[1:], wavelet, num_samples)
+    branches: list[Tensor] = []
+    for detail in details:  # from the coarsest: A(m-1) = A(m) + D(m)
+        branches = [approximation, detail, *branches]
+        approximation = approximation + detail
+    return torch.stack(branches, dim=-2).reshape(*x.shape[:-1], 2 * level, num_samples)
+
+
+def _details(details: list[Tensor], wavelet: str, num_samples: int) -> Iterator[Tensor]:
+    """Each detail alone, coarsest first."""
+    for kept in range(len(details)):
+        leading = [torch.zeros_like(details[0])]
+        leading += [torch.zeros_like(d) for d in details[:kept]]
+        yield _rebuild([*leading, details[kept]], details[kept + 1 :], wavelet, num_samples)
+
+
+def _rebuild(kept: list[Tensor], zeroed: list[Tensor], wavelet: str, num_samples: int) -> Tensor:
+    """Inverse transform of ``kept``, followed by zeros in the shapes of ``zeroed``."""
+    coefficients = [*kept, *(torch.zeros_like(d) for d in zeroed)]
+    return waverec(coefficients, wavelet)[..., :num_samples]
+
+
+@lru_cache(maxsize=16)
+def branch_matrix(
+    num_samples: int,
+    wavelet: str = "rbio2.2",
+    level: int = 4,
+    mode: ExtensionMode = "symmetric",
+) -> Tensor:
+    """``wavelet_branches`` as one matrix: ``branches = matrix @ x``. Do not write into it.
+
+    Shape:
+        - output: ``[2 * level, n, n]``, float64
+
+    Raises:
+        ValueError: as ``wavelet_branches``.
+    """
+    identity = torch.eye(num_samples, dtype=torch.float64)
+    return wavelet_branches(identity, wavelet, level, mode).movedim(0, -1).contiguous()
