@@ -1,0 +1,129 @@
+"""The polynomial kernel extreme learning machine, solved in closed form (paper section IV-E).
+
+On targets of +-1 this is kernel ridge regression with ``alpha = 1 / C``; with class weights it is
+the weighted ELM of Zong, Huang and Chen (2013). Two routes to the same machine: dual, one
+unknown per training bin, and primal, one unknown per monomial of the features.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def polynomial_kernel(a: Tensor, b: Tensor, degree: int = 2, offset: float = 0.5) -> Tensor:
+    """Kernel matrix ``(a b' + offset) ** degree``.
+
+    Shape:
+        - a: ``[*, N, K]``; b: ``[*, M, K]``; output: ``[*, N, M]``
+    """
+    gram: Tensor = (a @ b.mT + offset) ** degree
+    return gram
+
+
+def solve_kernel_elm(
+    gram: Tensor, targets: Tensor, penalty: float, weights: Tensor | None = None
+) -> Tensor:
+    """Output weights of the kernel machine: ``(gram + diag(1 / (penalty * weights)))^-1 targets``.
+
+    One Cholesky factorisation, no inverse. Differentiable in ``gram`` and ``targets``. With
+    ``penalty=inf`` the minimum-norm solution through the Moore-Penrose pseudo-inverse, the
+    paper's wording.
+
+    Args:
+        gram: kernel matrix of the training bins, symmetric, positive semi-definite; only its
+            lower triangle is read.
+        targets: +1 for slip and -1 for non-slip.
+        penalty: the paper's ``C``, positive; larger fits the training bins more closely.
+        weights: positive weight of each bin; default 1.
+
+    Shape:
+        - gram: ``[*, N, N]``; targets, weights, output: ``[*, N]``
+
+    Raises:
+        ValueError: if shapes disagree, ``penalty`` is not positive, or the system is not positive
+            definite in its dtype.
+
+    Reference:
+        Huang, Zhou, Ding and Zhang (2012), IEEE Trans. SMC-B 42(2), 513-529. Equals ``dual_coef_``
+        of ``sklearn.kernel_ridge.KernelRidge(alpha=1 / penalty)``.
+
+    Example:
+        >>> solve_kernel_elm(torch.eye(2), torch.tensor([1.0, -1.0]), penalty=1.0)
+        tensor([ 0.5000, -0.5000])
+    """
+    num_bins = gram.shape[-1]
+    if gram.shape[-2] != num_bins or targets.shape[-1] != num_bins:
+        raise ValueError(
+            f"expected gram [*, N, N] and targets [*, N] with one N, got {tuple(gram.shape)} "
+            f"and {tuple(targets.shape)}"
+        )
+    _check_penalty(penalty)
+    if math.isinf(penalty):
+        inverse: Tensor = torch.linalg.pinv(gram, hermitian=True)
+        return (inverse @ targets[..., None]).squeeze(-1)
+    ridge = torch.full_like(targets, 1 / penalty) if weights is None else 1 / (penalty * weights)
+    return _cholesky_solve(gram + torch.diag_embed(ridge), targets, "gram + I/C", penalty)
+
+
+def solve_primal(
+    features: Tensor, targets: Tensor, penalty: float, weights: Tensor | None = None
+) -> Tensor:
+    """Weights of explicit features: ``(X' W X + I / penalty)^-1 X' W targets``.
+
+    The same machine as ``solve_kernel_elm`` on ``gram = X X'``, cheaper when there are more bins
+    than features (``beta = penalty W (t - X w)``, ``w = X' beta``).
+
+    Args:
+        features: explicit feature map of the training bins, such as ``quadratic_features``.
+        targets: +1 for slip and -1 for non-slip.
+        penalty: the paper's ``C``, positive and finite.
+        weights: positive weight of each bin; default 1.
+
+    Shape:
+        - features: ``[N, P]``; targets, weights: ``[N]``; output: ``[P]``
+
+    Raises:
+        ValueError: as ``solve_kernel_elm``; an infinite penalty is refused (use the dual).
+    """
+    if features.shape[:1] != targets.shape:
+        raise ValueError(
+            f"expected features [N, P] and targets [N], got {tuple(features.shape)} "
+            f"and {tuple(targets.shape)}"
+        )
+    weighted = features if weights is None else features * weights[:, None]
+    return solve_normal_equations(features.mT @ weighted, weighted.mT @ targets, penalty)
+
+
+def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Tensor:
+    """``(normal + I / penalty)^-1 moment``; what ``solve_primal`` does once the sums are known.
+
+    Shape:
+        - normal: ``[P, P]``, ``X' W X``; moment: ``[P]``, ``X' W t``; output: ``[P]``
+
+    Raises:
+        ValueError: as ``solve_primal``.
+    """
+    _check_penalty(penalty)
+    if math.isinf(penalty):
+        raise ValueError("the primal needs a finite penalty; solve the dual for penalty=inf")
+    ridged = normal.clone()
+    ridged.diagonal().add_(1 / penalty)
+    return _cholesky_solve(ridged, moment, "X'WX + I/C", penalty)
+
+
+def _cholesky_solve(system: Tensor, targets: Tensor, name: str, penalty: float) -> Tensor:
+    factor, info = torch.linalg.cholesky_ex(system)
+    if bool(info.any()):
+        raise ValueError(
+            f"{name} is not positive definite at penalty={penalty:g} in {system.dtype}; "
+            "lower the penalty, scale the features, or solve in float64"
+        )
+    return torch.cholesky_solve(targets[..., None], factor).squeeze(-1)
+
+
+def _check_penalty(penalty: float) -> None:
+    if not penalty > 0:
+        raise ValueError(f"penalty (the paper's C) must be positive, got {penalty}")

@@ -1,0 +1,110 @@
+"""The degree-2 kernel machine as what it is: a quadratic form (REFERENCE.md section 5).
+
+``sum_i beta_i (z_i . z + c)^2 = z' Q z + l' z + a`` with ``Q = Z' diag(beta) Z``,
+``l = 2 c Z' beta`` and ``a = c^2 sum(beta)``: exact, and of one size whatever the number of
+training bins.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+
+class QuadraticForm(nn.Module):
+    """``z' Q z + l' z + a``.
+
+    Args:
+        quadratic: ``[K, K]``, symmetric.
+        linear: ``[K]``.
+        constant: a scalar tensor.
+
+    Raises:
+        ValueError: if shapes disagree.
+    """
+
+    quadratic: Tensor
+    linear: Tensor
+    constant: Tensor
+
+    def __init__(self, quadratic: Tensor, linear: Tensor, constant: Tensor) -> None:
+        super().__init__()
+        num = linear.shape[-1]
+        if quadratic.shape != (num, num) or linear.shape != (num,) or constant.shape != ():
+            raise ValueError(
+                "expected quadratic [K, K], linear [K] and a scalar constant, got "
+                f"{tuple(quadratic.shape)}, {tuple(linear.shape)} and {tuple(constant.shape)}"
+            )
+        self.register_buffer("quadratic", quadratic.clone())
+        self.register_buffer("linear", linear.clone())
+        self.register_buffer("constant", constant.clone())
+
+    def forward(self, z: Tensor) -> Tensor:
+        """The score.
+
+        Shape:
+            - z: ``[*, K]``
+            - output: ``[*]``
+        """
+        return ((z @ self.quadratic + self.linear) * z).sum(-1) + self.constant
+
+
+def collapse(support: Tensor, beta: Tensor, offset: float = 0.5) -> QuadraticForm:
+    """Fold a degree-2 kernel sum into its quadratic form.
+
+    Shape:
+        - support: ``[N, K]``, scaled training bins
+        - beta: ``[N]``, their output weights
+    """
+    pull = support.mT @ beta
+    return QuadraticForm(
+        support.mT @ (support * beta[:, None]), 2 * offset * pull, offset**2 * beta.sum()
+    )
+
+
+def num_quadratic_features(num_features: int) -> int:
+    """Number of monomials up to degree 2: 7381 for 120 features."""
+    return (num_features + 1) * (num_features + 2) // 2
+
+
+def quadratic_features(z: Tensor, offset: float = 0.5) -> Tensor:
+    """The explicit feature map of the degree-2 kernel: ``phi(a) . phi(b) = (a . b + offset)^2``.
+
+    Order: ``z_i z_j`` for i <= j row by row (those with i < j times sqrt 2), then
+    ``sqrt(2 offset) z``, then ``offset``.
+
+    Shape:
+        - z: ``[N, K]``
+        - output: ``[N, (K + 1)(K + 2) / 2]``
+    """
+    num = z.shape[-1]
+    squares = [
+        torch.cat([z[:, i : i + 1], math.sqrt(2) * z[:, i + 1 :]], dim=-1) * z[:, i : i + 1]
+        for i in range(num)
+    ]
+    last = torch.full_like(z[:, :1], offset)
+    return torch.cat([*squares, math.sqrt(2 * offset) * z, last], dim=-1)
+
+
+def from_primal(weights: Tensor, num_features: int, offset: float = 0.5) -> QuadraticForm:
+    """The quadratic form that weights of ``quadratic_features`` stand for.
+
+    Shape:
+        - weights: ``[(K + 1)(K + 2) / 2]``
+
+    Raises:
+        ValueError: if the number of weights is another.
+    """
+    if weights.shape != (num_quadratic_features(num_features),):
+        raise ValueError(
+            f"expected {num_quadratic_features(num_features)} weights for {num_features} "
+            f"features, got {tuple(weights.shape)}"
+        )
+    rows, columns = torch.triu_indices(num_features, num_features)
+    upper = weights.new_zeros(num_features, num_features)
+    upper[rows, columns] = weights[: len(rows)] * math.sqrt(0.5)
+    upper.diagonal().mul_(math.sqrt(0.5))
+    linear = weights[len(rows) : -1] * math.sqrt(2 * offset)
+    return QuadraticForm(upper + upper.T, linear, weights[-1] * offset)
