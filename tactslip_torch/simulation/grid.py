@@ -1,0 +1,114 @@
+"""Blocks of time: the unit in which samples are computed and noise is keyed.
+
+A block has a fixed place on the recording's time axis, and everything in it is computed whole,
+from itself and the block before it. So a stretch of time needs the blocks that cover it and one
+block of history, and its samples equal those of the whole recording. Filters are finite
+(at most one block plus one tap) and run by overlap-save at one fixed FFT length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactslip_torch.simulation.randomness import Array, Key, normal_blocks
+
+Blocks = NDArray[np.int64]
+
+
+def block_samples_for(sample_rate_hz: float) -> int:
+    """Samples per block: the power of two next above a quarter second, 512 at 2 kHz."""
+    return max(64, 1 << int(np.ceil(np.log2(0.25 * sample_rate_hz))))
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Some blocks of a recording, ascending.
+
+    Args:
+        blocks: absolute indices ``[K]``; -1 is the block before the recording.
+        block_samples: samples per block, B.
+        sample_rate_hz: samples per second.
+    """
+
+    blocks: Blocks
+    block_samples: int
+    sample_rate_hz: float
+
+    @cached_property
+    def time_s(self) -> Array:
+        """Time of every sample, ``[K, B]``."""
+        index = self.blocks[:, None] * self.block_samples + np.arange(self.block_samples)
+        return np.asarray(index / self.sample_rate_hz, dtype=np.float64)
+
+    def overlapping(self, start_s: float, end_s: float) -> slice:
+        """The rows whose blocks touch ``[start_s, end_s]``."""
+        first = np.floor(start_s * self.sample_rate_hz / self.block_samples)
+        last = np.floor(end_s * self.sample_rate_hz / self.block_samples)
+        low, high = np.searchsorted(self.blocks, [first, last + 1])
+        return slice(int(low), int(high))
+
+    def with_history(self) -> tuple[Grid, NDArray[np.int64], NDArray[np.int64]]:
+        """A grid that also has every block's predecessor, and the rows of both in it.
+
+        Returns:
+            The larger grid, the rows ``[K]`` of the predecessors, the rows ``[K]`` of the blocks.
+        """
+        wider = np.union1d(self.blocks, self.blocks - 1)
+        grid = Grid(wider, self.block_samples, self.sample_rate_hz)
+        return grid, np.searchsorted(wider, self.blocks - 1), np.searchsorted(wider, self.blocks)
+
+    def filtered(self, before: Array, now: Array, response: NDArray[np.complex128]) -> Array:
+        """Overlap-save: the filter's output on the blocks, from them and their predecessors.
+
+        Shape:
+            - before, now: ``[*, K, B]``
+            - response: ``[*, B + 1]``, the rfft over 2 B points of at most B + 1 taps
+            - output: ``[*, K, B]``
+        """
+        spectrum = np.fft.rfft(np.concatenate([before, now], axis=-1), axis=-1)
+        spectrum *= response
+        signal = np.fft.irfft(spectrum, 2 * self.block_samples, axis=-1)
+        return np.asarray(signal[..., self.block_samples :], dtype=np.float64)
+
+    def coloured_noise(self, key: Key, response: NDArray[np.complex128]) -> Array:
+        """White noise of unit variance behind a filter, ``[K, B]``."""
+        grid, before, now = self.with_history()
+        white = normal_blocks(key, grid.blocks, self.block_samples)
+        return self.filtered(white[before], white[now], response)
+
+    def frequency_hz(self) -> Array:
+        """The ``B + 1`` frequencies of a filter's response."""
+        step_hz = 0.5 * self.sample_rate_hz / self.block_samples
+        return np.arange(self.block_samples + 1, dtype=np.float64) * step_hz
+
+
+def causal_response(magnitude: Array, *, unit_power: bool = False) -> NDArray[np.complex128]:
+    """The minimum-phase filter of at most B + 1 taps with about this magnitude.
+
+    Args:
+        magnitude: on ``Grid.frequency_hz``, floored at 1e-4 of its maximum.
+        unit_power: scale the taps so that white noise of unit variance comes out with unit
+            variance.
+
+    Shape:
+        - magnitude: ``[*, B + 1]``
+        - output: ``[*, B + 1]``, the rfft over 2 B points of the taps
+
+    Reference:
+        Oppenheim and Schafer, Discrete-Time Signal Processing: minimum phase from the folded
+        real cepstrum.
+    """
+    num_taps = magnitude.shape[-1]
+    n = 2 * (num_taps - 1)
+    floor = 1e-4 * magnitude.max(axis=-1, keepdims=True)
+    cepstrum = np.fft.irfft(np.log(np.maximum(magnitude, floor)), n, axis=-1)
+    cepstrum[..., 1 : n // 2] *= 2.0
+    cepstrum[..., n // 2 + 1 :] = 0.0
+    taps = np.fft.irfft(np.exp(np.fft.rfft(cepstrum, axis=-1)), n, axis=-1)[..., :num_taps]
+    if unit_power:
+        taps = taps / np.sqrt(np.sum(taps**2, axis=-1, keepdims=True))
+    return np.asarray(np.fft.rfft(taps, n, axis=-1), dtype=np.complex128)

@@ -1,0 +1,94 @@
+"""The arm: rest, accelerate, run, decelerate, stroke after stroke without return.
+
+First link of the chain in PHYSICS.md. Times in seconds from the start of the recording,
+positions in millimetres from where the arm was then.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactslip_torch.simulation.knobs import Stroke
+from tactslip_torch.simulation.randomness import Array
+
+
+@dataclass(frozen=True)
+class ArmStroke:
+    """One stroke as the arm runs it: a trapezoid of speed, or a triangle if it is short.
+
+    Args:
+        start_s: when the arm begins to move.
+        origin_mm: where it begins.
+        acceleration_mm_s2: of both ramps.
+        peak_mm_s: highest speed, the steady one unless the stroke is short.
+        ramp_s: duration of each ramp.
+        stop_s: when the arm is at rest again.
+        distance_mm: travel.
+    """
+
+    start_s: float
+    origin_mm: float
+    acceleration_mm_s2: float
+    peak_mm_s: float
+    ramp_s: float
+    stop_s: float
+    distance_mm: float
+
+    def travel_mm(self, time_s: Array) -> Array:
+        """Distance from the stroke's origin, clamped before and after the stroke."""
+        t = np.clip(time_s - self.start_s, 0.0, self.stop_s - self.start_s)
+        up = np.minimum(t, self.ramp_s)
+        down = np.maximum(t - (self.stop_s - self.start_s - self.ramp_s), 0.0)
+        half = 0.5 * self.acceleration_mm_s2
+        return half * up * up + self.peak_mm_s * (t - up) - half * down * down
+
+    def speed_mm_s(self, time_s: Array) -> Array:
+        """Speed; zero outside the stroke."""
+        ramp = np.minimum(time_s - self.start_s, self.stop_s - time_s)
+        return np.clip(self.acceleration_mm_s2 * ramp, 0.0, self.peak_mm_s)
+
+    def time_of_travel_s(self, travel_mm: Array) -> Array:
+        """When the arm has come so far; the inverse of ``travel_mm`` within the stroke."""
+        ramp_mm = 0.5 * self.acceleration_mm_s2 * self.ramp_s**2
+        early = np.sqrt(2 * np.minimum(travel_mm, ramp_mm) / self.acceleration_mm_s2)
+        left_mm = np.clip(self.distance_mm - travel_mm, 0.0, ramp_mm)
+        late = self.stop_s - np.sqrt(2 * left_mm / self.acceleration_mm_s2)
+        middle = self.start_s + self.ramp_s + (travel_mm - ramp_mm) / self.peak_mm_s
+        time = np.where(travel_mm <= ramp_mm, self.start_s + early, middle)
+        return np.where(self.distance_mm - travel_mm < ramp_mm, late, time)
+
+
+def arm_strokes(strokes: tuple[Stroke, ...], acceleration_m_s2: float) -> tuple[ArmStroke, ...]:
+    """The strokes as the arm runs them, one after the other.
+
+    A stroke at speed v over the distance d lasts ``d/v + v/a``, so the paper's nominal onsets of
+    2, 9 and 13.5 s become arm starts at 2, 9.04 and 13.62 s.
+    """
+    plan, now_s, here_mm = [], 0.0, 0.0
+    a = 1000.0 * acceleration_m_s2
+    for stroke in strokes:
+        peak = min(stroke.speed_mm_s, math.sqrt(a * stroke.distance_mm))
+        start_s = now_s + stroke.pause_s
+        now_s = start_s + stroke.distance_mm / peak + peak / a
+        plan.append(ArmStroke(start_s, here_mm, a, peak, peak / a, now_s, stroke.distance_mm))
+        here_mm += stroke.distance_mm
+    return tuple(plan)
+
+
+def arm_position_mm(plan: tuple[ArmStroke, ...], time_s: Array) -> Array:
+    """Where the arm is, over all strokes."""
+    position = np.zeros_like(time_s)
+    for stroke in plan:
+        position += stroke.travel_mm(time_s)
+    return position
+
+
+def arm_speed_mm_s(plan: tuple[ArmStroke, ...], time_s: Array) -> Array:
+    """How fast the arm is, over all strokes."""
+    speed = np.zeros_like(time_s)
+    for stroke in plan:
+        speed += stroke.speed_mm_s(time_s)
+    return speed

@@ -1,0 +1,209 @@
+"""A scene: everything that determines one simulated recording, and the paper's set of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
+
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.simulation.knobs import Contact, Disturbances, Sensors, Stroke
+from tactslip_torch.simulation.materials import MATERIALS, SEEN_MATERIALS, UNSEEN_MATERIALS
+
+FIDELITIES = ("kinematic",)
+"""The rungs that exist, cheapest first."""
+
+SIMULATION_VERSION = 1
+"""Raised whenever the samples of some scene change; part of ``Scene.to_dict``, so of cache keys."""
+
+PAPER_STROKES = (Stroke(20.0), Stroke(40.0), Stroke(60.0))
+"""100 mm at 20, 40 and 60 mm/s after 2 s of rest each; the strokes run on without return."""
+
+_GROUPS: dict[str, type[Any]] = {
+    "contact": Contact,
+    "sensors": Sensors,
+    "disturbances": Disturbances,
+}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is simulated. Equal scenes give equal bytes.
+
+    Args:
+        material: id in ``MATERIALS``.
+        hand: the channels; elements are its distinct (finger, segment) pairs.
+        strokes: at least one; each longer than 1.5 times the longest presliding travel.
+        contact: how the hand touches and slides.
+        sensors: the sensing elements and their front end.
+        disturbances: what is not slip.
+        acceleration_m_s2: of the arm, at each start and stop.
+        sample_rate_hz: samples per second and channel.
+        fidelity: the rung to simulate on, one of ``FIDELITIES``.
+        seed: of the whole set.
+        session: the mounting: noise floor, mains, offsets, gains and load shares belong to it.
+            ``None`` stands for the material's id: one session per material, as in the paper.
+        cycle: index of the recording within its session.
+
+    Raises:
+        ValueError: if the material or rung is unknown, there is no stroke, a rate or
+            acceleration is not positive, no element can touch, kinetic friction exceeds static,
+            or a stroke is too short to slip.
+
+    Example:
+        >>> scene = Scene("M1", cycle=3)
+        >>> scene.session, Scene.from_dict(scene.to_dict()) == scene
+        ('M1', True)
+    """
+
+    material: str
+    hand: HandLayout = field(default_factory=HandLayout.paper24)
+    strokes: tuple[Stroke, ...] = PAPER_STROKES
+    contact: Contact = field(default_factory=Contact)
+    sensors: Sensors = field(default_factory=Sensors)
+    disturbances: Disturbances = field(default_factory=Disturbances)
+    acceleration_m_s2: float = 0.5
+    sample_rate_hz: float = 2000.0
+    fidelity: str = "kinematic"
+    seed: int = 0
+    session: str | int | None = None
+    cycle: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "strokes", tuple(self.strokes))
+        if self.material not in MATERIALS:
+            raise ValueError(
+                f"unknown material {self.material!r}; known are {', '.join(MATERIALS)}"
+            )
+        if self.session is None:
+            object.__setattr__(self, "session", self.material)
+        if self.fidelity not in FIDELITIES:
+            raise ValueError(
+                f"unknown fidelity {self.fidelity!r}; there is {', '.join(FIDELITIES)}"
+            )
+        for name in ("sample_rate_hz", "acceleration_m_s2"):
+            value = getattr(self, name)
+            if not 0 < value < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {value}")
+        self._require_strokes()
+        self._require_contact()
+
+    def _require_strokes(self) -> None:
+        """Refuse scenes without slip: this rung's recordings have an onset per stroke."""
+        if not self.strokes:
+            raise ValueError("strokes must hold at least one stroke, got none")
+        longest_mm = 1.5 * self.contact.presliding_mm[1]
+        for number, stroke in enumerate(self.strokes, 1):
+            if stroke.distance_mm <= 1.5 * longest_mm:
+                raise ValueError(
+                    f"stroke {number} of {stroke.distance_mm:g} mm is too short to slip surely: "
+                    f"presliding may take {longest_mm:g} mm; it needs {1.5 * longest_mm:g} mm"
+                )
+
+    def _require_contact(self) -> None:
+        """Refuse contacts that this hand or this material contradicts."""
+        contact, known = self.contact, set(self.hand.names)
+        strangers = sorted(set(contact.touching or ()) - known)
+        if strangers:
+            raise ValueError(f"contact.touching names {strangers}, which this hand does not have")
+        loads = dict(contact.finger_loads)
+        touching = known if contact.touching is None else set(contact.touching)
+        if not any(c.name in touching and loads.get(c.finger, 1.0) > 0 for c in self.hand.channels):
+            raise ValueError("no element in contact: every element that may touch has zero load")
+        material = MATERIALS[self.material]
+        if contact.mu_s is None and contact.mu_k is not None and contact.mu_k > material.mu_s:
+            raise ValueError(
+                f"contact.mu_k must not exceed mu_s, got {contact.mu_k} above {self.material}'s "
+                f"{material.mu_s}; set contact.mu_s too"
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The scene as plain JSON types, without loss: with its version, a cache key."""
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "hand"}
+        plain["hand"] = self.hand.to_rows()
+        plain["strokes"] = [asdict(stroke) for stroke in self.strokes]
+        for name in _GROUPS:
+            plain[name] = {k: _listed(v) for k, v in asdict(plain[name]).items()}
+        plain["simulation_version"] = SIMULATION_VERSION
+        return plain
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> Scene:
+        """The scene that ``to_dict`` wrote.
+
+        Raises:
+            ValueError: if the scene is a bad one.
+            TypeError: if a key is unknown.
+        """
+        values = {k: v for k, v in plain.items() if k != "simulation_version"}
+        if "hand" in values:
+            values["hand"] = HandLayout.from_rows(values["hand"])
+        if "strokes" in values:
+            values["strokes"] = tuple(Stroke(**stroke) for stroke in values["strokes"])
+        for name, group in _GROUPS.items():
+            if name in values:
+                values[name] = group(**values[name])
+        return cls(**values)
+
+
+def paper_scenes(
+    *,
+    seed: int = 0,
+    cycles: int = 28,
+    materials: Iterable[str] = SEEN_MATERIALS + UNSEEN_MATERIALS,
+    hand: HandLayout | None = None,
+    **overrides: Any,
+) -> list[Scene]:
+    """The paper's protocol: every cycle of every material, ordered by material, then cycle.
+
+    Args:
+        seed: of the whole set.
+        cycles: recordings per material.
+        materials: ids in ``MATERIALS``.
+        hand: defaults to the paper's.
+        overrides: any field of ``Scene``, or directly any field of ``Contact``, ``Sensors`` or
+            ``Disturbances``, such as the calibrated ``friction_noise_mv``, ``presliding_mm`` and
+            ``burst_rate_hz``. A group may be a mapping of its fields.
+
+    Raises:
+        ValueError: if a scene is bad, an override is no such field, or there is no cycle.
+
+    Example:
+        >>> scenes = paper_scenes(cycles=2, materials=("M1", "iron"), burst_rate_hz=0.1)
+        >>> [(s.material, s.cycle) for s in scenes]
+        [('M1', 0), ('M1', 1), ('iron', 0), ('iron', 1)]
+        >>> scenes[0].disturbances.burst_rate_hz
+        0.1
+    """
+    if cycles < 1:
+        raise ValueError(f"cycles must be at least 1, got {cycles}")
+    values = _grouped(overrides)
+    return [
+        Scene(material, hand or HandLayout.paper24(), seed=seed, cycle=cycle, **values)
+        for material in materials
+        for cycle in range(cycles)
+    ]
+
+
+def _listed(value: Any) -> Any:
+    """Tuples as lists, all the way down."""
+    return [_listed(v) for v in value] if isinstance(value, tuple) else value
+
+
+def _grouped(overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Overrides as fields of ``Scene``, the groups' own fields sorted into their groups."""
+    values = dict(overrides)
+    for name, group in _GROUPS.items():
+        given = values.pop(name, None)
+        base = given if isinstance(given, group) else group(**(given or {}))
+        inner = {f.name: values.pop(f.name) for f in fields(group) if f.name in values}
+        values[name] = replace(base, **inner)
+    known = {f.name for f in fields(Scene)} - {"material", "hand", "seed", "cycle"}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise ValueError(
+            f"unknown override {', '.join(unknown)}; a scene has {', '.join(sorted(known))} "
+            "and the fields of Contact, Sensors and Disturbances"
+        )
+    return values

@@ -1,0 +1,150 @@
+"""From the skin to volts: the strain gauge's chain, the film's chain, and the front end.
+
+An SG follows force slowly and stays: preload, shear, creep, offset, drift. A PVDF film gives the
+rate of strain: nothing of what stays passes its high-pass. Both end in white noise and a
+converter with rails. Last link of the chain in PHYSICS.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactslip_torch.simulation.friction import Slips, shear_share
+from tactslip_torch.simulation.grasp import Grasp, recording_key, session_key
+from tactslip_torch.simulation.grid import Grid, causal_response
+from tactslip_torch.simulation.motion import ArmStroke, arm_position_mm
+from tactslip_torch.simulation.randomness import Array, generator, lognormal, normal_blocks
+from tactslip_torch.simulation.scene import Scene
+from tactslip_torch.simulation.vibration import Vibration
+
+SG_VIBRATION_SHARE = 0.08
+"""Of the film's vibration, what the gauge on the stiff backing sees (prior, ours)."""
+
+FORCE_FLUCTUATION = 0.03
+"""Slow fluctuation of friction over its mean while sliding, rms (prior, ours)."""
+
+RUNOUT_PERIOD_MM = 180.0
+"""Travel over which the normal load rises and falls (prior, ours)."""
+
+DRIFT_TONES = 4
+"""Slow sines that make up a channel's drift, .05 to 2 Hz."""
+
+_DRIFT_NODES = 8  # per block, joined by straight lines
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """Parameters of every channel in one recording, ``[C]`` each.
+
+    Args:
+        gain: factor on what the element feels.
+        white_v: rms of white noise.
+        offset_v: constant.
+    """
+
+    gain: Array
+    white_v: Array
+    offset_v: Array
+
+
+def draw_front(scene: Scene) -> Front:
+    """Gains, noise floors and offsets: per session, and a little again per recording."""
+    knobs, num = scene.sensors, len(scene.hand)
+    session, rng = generator(*session_key(scene, "front")), generator(*recording_key(scene, "f"))
+    gain = lognormal(session, knobs.gain_spread, num) * lognormal(rng, knobs.gain_spread / 3, num)
+    floor_mv = knobs.white_noise_mv * lognormal(session, knobs.white_noise_session_spread)
+    sg_offset = knobs.sg_session_offset_v * session.standard_normal(num)
+    sg_offset = sg_offset + knobs.sg_offset_v * rng.standard_normal(num)
+    pvdf_offset = 1e-3 * knobs.pvdf_offset_mv * rng.uniform(-1.0, 1.0, num)
+    is_sg = np.array([channel.kind == "SG" for channel in scene.hand.channels])
+    return Front(
+        gain=gain,
+        white_v=1e-3 * floor_mv * lognormal(session, 0.2, num),
+        offset_v=np.where(is_sg, sg_offset, pvdf_offset),
+    )
+
+
+def element_friction(
+    scene: Scene, grasp: Grasp, slips: Slips, plan: tuple[ArmStroke, ...], element: int, grid: Grid
+) -> tuple[Array, Array]:
+    """Normal force and friction force in newtons, ``[K, B]`` each; never above ``mu_s N``.
+
+    The normal force has the surface's run-out and creeps after the grasp like the shear.
+    """
+    angle = 2 * np.pi / RUNOUT_PERIOD_MM * arm_position_mm(plan, grid.time_s)
+    runout = scene.contact.runout * np.sin(angle + grasp.runout_phase[element])
+    since_grasp_s = np.maximum(grid.time_s, 0.0) + 1.0
+    creep = np.exp(-since_grasp_s / (5.0 * grasp.relaxation_time_s[element]))
+    normal_n = (
+        grasp.load_n[element] * (1.0 + runout) * (1.0 + 0.3 * grasp.relaxation[element] * creep)
+    )
+    share = shear_share(grasp, slips, plan, element, grid, scene.contact.recoil_s)
+    return normal_n, grasp.surface.mu_s * normal_n * share
+
+
+def highpass_response(scene: Scene, grid: Grid) -> NDArray[np.complex128]:
+    """The film and its amplifier: first-order high-pass that passes no constant."""
+    f = grid.frequency_hz()
+    response = causal_response(f / np.hypot(f, scene.sensors.pvdf_highpass_hz))
+    taps = np.fft.irfft(response, 2 * grid.block_samples)[: grid.block_samples + 1]
+    taps -= taps.sum() / len(taps)
+    return np.asarray(np.fft.rfft(taps, 2 * grid.block_samples), dtype=np.complex128)
+
+
+def gauge_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: Vibration) -> Array:
+    """What an SG of unit gain says of its element."""
+    sensors = scene.sensors
+    slow = sensors.sg_shear_v_per_n * friction_n * (1.0 + FORCE_FLUCTUATION * vibration.fluctuation)
+    return (
+        sensors.sg_preload_v_per_n * normal_n
+        + slow
+        + SG_VIBRATION_SHARE * (vibration.high + vibration.low)
+    )
+
+
+def film_volts(scene: Scene, grid: Grid, friction_n: Array, vibration: Vibration) -> Array:
+    """What a PVDF film of unit gain says of its element.
+
+    Args:
+        scene: whose sensors.
+        grid: where the volts are wanted.
+        friction_n: friction on ``grid.with_history()``.
+        vibration: on ``grid``; behind the high-pass already.
+    """
+    _, before, now = grid.with_history()
+    strain_v = scene.sensors.pvdf_shear_v_per_n * friction_n
+    slow = grid.filtered(strain_v[before], strain_v[now], highpass_response(scene, grid))
+    return slow + vibration.high + vibration.low
+
+
+def drift(scene: Scene, index: int, grid: Grid) -> Array:
+    """Slow drift of one channel in volts, ``[K, B]``: a few slow sines."""
+    kind = scene.hand.channels[index].kind
+    size_mv = scene.sensors.sg_drift_mv if kind == "SG" else scene.sensors.pvdf_drift_mv
+    rng = generator(*recording_key(scene, "drift"), index)
+    hertz = 0.05 * 40.0 ** rng.random(DRIFT_TONES)
+    phase = 2 * np.pi * rng.random(DRIFT_TONES)
+    amplitude = 1e-3 * size_mv * np.sqrt(2.0 / DRIFT_TONES) * lognormal(rng, 0.3, DRIFT_TONES)
+    nodes = np.arange(_DRIFT_NODES + 1) / _DRIFT_NODES
+    t = (grid.blocks[:, None] + nodes) * (grid.block_samples / grid.sample_rate_hz)
+    value = np.zeros_like(t)
+    for a, f, p in zip(amplitude, hertz, phase, strict=True):
+        value += a * np.sin(2 * np.pi * f * t + p)
+    step = grid.block_samples // _DRIFT_NODES
+    ramp = np.arange(step) / step
+    lines: Array = value[:, :-1, None] + np.diff(value)[:, :, None] * ramp
+    return np.asarray(lines.reshape(grid.time_s.shape), dtype=np.float64)
+
+
+def front_end(scene: Scene, front: Front, index: int, grid: Grid, volts: Array) -> Array:
+    """What the converter says: with offset, drift and white noise, between the rails, in steps."""
+    key = (*recording_key(scene, "white"), scene.hand.names[index])
+    noise = front.white_v[index] * normal_blocks(key, grid.blocks, grid.block_samples)
+    total = volts + front.offset_v[index] + drift(scene, index, grid) + noise
+    rail_v = scene.sensors.rail_v
+    step: float = 2.0 * rail_v / 2.0**scene.sensors.num_bits
+    quantised: Array = np.clip(np.round(total / step) * step, -rail_v, rail_v - step)
+    return quantised

@@ -1,0 +1,198 @@
+"""A scene in, a recording out.
+
+The kinematic rung: arm motion, quasi-static contact, vibration, sensors. Only the channels and
+the stretches of time that are asked for are computed; elements out of contact cost no friction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tactslip_torch.data.recording import Recording
+from tactslip_torch.simulation.disturbances import Common
+from tactslip_torch.simulation.friction import Slips, slips
+from tactslip_torch.simulation.grasp import Grasp, draw_grasp
+from tactslip_torch.simulation.grid import Grid, block_samples_for
+from tactslip_torch.simulation.motion import ArmStroke, arm_strokes
+from tactslip_torch.simulation.randomness import Array
+from tactslip_torch.simulation.scene import SIMULATION_VERSION, Scene
+from tactslip_torch.simulation.sensors import (
+    draw_front,
+    element_friction,
+    film_volts,
+    front_end,
+    gauge_volts,
+)
+from tactslip_torch.simulation.timeline import Timeline, timeline_of
+from tactslip_torch.simulation.vibration import Vibration, element_vibration, shared_field
+
+
+def simulate(
+    scene: Scene,
+    *,
+    windows: Sequence[tuple[float, float]] | None = None,
+    channels: Iterable[str] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> Recording:
+    """The scene's recording, with exact onsets.
+
+    Args:
+        scene: what to simulate.
+        windows: ``(start_s, end_s)`` stretches to compute, ``None`` for all. Samples from
+            ``round(start_s * rate)`` up to ``round(end_s * rate)``; they equal those of the whole
+            recording. The cost is that of the blocks of a quarter second that they touch.
+        channels: names of the channels to compute, ``None`` for all.
+        dtype: of the samples, floating.
+
+    Shape:
+        - samples: ``[C, T]`` for the whole hand and duration, volts; NaN where not asked for
+
+    Raises:
+        ValueError: if a window lies outside the recording or is empty, a channel is unknown, or
+            ``dtype`` is not floating.
+
+    Example:
+        >>> recording = simulate(Scene("M1"), windows=[(2.0, 2.1)], channels=["PVDF7"])
+        >>> int(recording.samples.isfinite().sum())
+        200
+    """
+    if not dtype.is_floating_point:
+        raise ValueError(f"dtype must be floating, got {dtype}")
+    plan = arm_strokes(scene.strokes, scene.acceleration_m_s2)
+    grasp = draw_grasp(scene)
+    slipping = slips(grasp, plan)
+    truth = timeline_of(scene, plan, grasp, slipping)
+    wanted = _wanted_samples(scene, truth, windows)
+    indices = _channel_indices(scene, channels)
+    volts = np.full((len(scene.hand), truth.num_samples), np.nan)
+    if wanted and indices:
+        grid = _covering_grid(scene, wanted)
+        rows = _kinematic(scene, plan, grasp, slipping, grid, indices)
+        for index in indices:
+            _place(volts[index], rows[index], grid, wanted)
+    return Recording(
+        samples=torch.from_numpy(volts).to(dtype),
+        sample_rate_hz=scene.sample_rate_hz,
+        material=scene.material,
+        speeds_mm_s=truth.speeds_mm_s,
+        onsets_s=truth.onsets_s,
+        sliding_s=truth.sliding_s,
+        annotated_onsets_s=truth.annotated_onsets_s,
+        provenance=_provenance(scene),
+    )
+
+
+def _kinematic(
+    scene: Scene,
+    plan: tuple[ArmStroke, ...],
+    grasp: Grasp,
+    slipping: Slips,
+    grid: Grid,
+    indices: list[int],
+) -> dict[int, Array]:
+    """Volts of the channels asked for on the grid, ``[K, B]`` each."""
+    front, common = draw_front(scene), Common(scene, plan, grid)
+    felt = {index: np.zeros(grid.time_s.shape) for index in indices}
+    elements: dict[int, list[int]] = {}
+    for index in indices:
+        elements.setdefault(int(grasp.element_of_channel[index]), []).append(index)
+    touching = [element for element in elements if grasp.load_n[element] > 0]
+    if touching:
+        field = shared_field(scene, grasp, plan, grid)
+    for element in touching:
+        vibration = element_vibration(scene, grasp, slipping, field, element)
+        signals = _element_volts(scene, plan, grasp, slipping, grid, element, vibration)
+        for index in elements[element]:
+            felt[index] = front.gain[index] * signals[scene.hand.channels[index].kind]
+    return {
+        index: front_end(scene, front, index, grid, felt[index] + common.channel(index))
+        for index in indices
+    }
+
+
+def _element_volts(
+    scene: Scene,
+    plan: tuple[ArmStroke, ...],
+    grasp: Grasp,
+    slipping: Slips,
+    grid: Grid,
+    element: int,
+    vibration: Vibration,
+) -> dict[str, Array]:
+    """What an SG and a PVDF film of unit gain feel of one touching element."""
+    history, _, now = grid.with_history()
+    normal_n, friction_n = element_friction(scene, grasp, slipping, plan, element, history)
+    return {
+        "SG": gauge_volts(scene, normal_n[now], friction_n[now], vibration),
+        "PVDF": film_volts(scene, grid, friction_n, vibration),
+    }
+
+
+def _wanted_samples(
+    scene: Scene, truth: Timeline, windows: Sequence[tuple[float, float]] | None
+) -> list[tuple[int, int]]:
+    """The windows in samples."""
+    if windows is None:
+        return [(0, truth.num_samples)]
+    wanted = []
+    for start_s, end_s in windows:
+        if not (math.isfinite(start_s) and math.isfinite(end_s)):
+            raise ValueError(f"a window must be finite, got ({start_s}, {end_s})")
+        first, last = (round(t * scene.sample_rate_hz) for t in (start_s, end_s))
+        if not 0 <= first < last <= truth.num_samples:
+            raise ValueError(
+                f"a window must lie within the recording, 0 <= start < end <= "
+                f"{truth.duration_s:g} s, got ({start_s:g}, {end_s:g})"
+            )
+        wanted.append((first, last))
+    return wanted
+
+
+def _channel_indices(scene: Scene, channels: Iterable[str] | None) -> list[int]:
+    """Positions of the channels asked for, in file order."""
+    names = scene.hand.names
+    if channels is None:
+        return list(range(len(names)))
+    asked = {channels} if isinstance(channels, str) else set(channels)
+    unknown = sorted(asked - set(names))
+    if unknown:
+        raise ValueError(f"unknown channels {', '.join(unknown)}; this hand has {', '.join(names)}")
+    return [index for index, name in enumerate(names) if name in asked]
+
+
+def _covering_grid(scene: Scene, wanted: list[tuple[int, int]]) -> Grid:
+    """The blocks that the wanted samples touch."""
+    size = block_samples_for(scene.sample_rate_hz)
+    blocks: set[int] = set()
+    for first, last in wanted:
+        blocks.update(range(first // size, (last - 1) // size + 1))
+    return Grid(np.array(sorted(blocks), dtype=np.int64), size, scene.sample_rate_hz)
+
+
+def _place(out: Array, rows: Array, grid: Grid, wanted: list[tuple[int, int]]) -> None:
+    """Copy the wanted samples of a channel's blocks to their places, and no others."""
+    size = grid.block_samples
+    for first, last in wanted:
+        low: NDArray[np.int64] = np.searchsorted(grid.blocks, [first // size])
+        run = rows[int(low[0]) :].reshape(-1)  # a window's blocks follow each other
+        offset = first - first // size * size
+        out[first:last] = run[offset : offset + last - first]
+
+
+def _provenance(scene: Scene) -> dict[str, object]:
+    """Where the recording comes from."""
+    return {
+        "simulated": True,
+        "fidelity": scene.fidelity,
+        "seed": scene.seed,
+        "material": scene.material,
+        "session": scene.session,
+        "cycle": scene.cycle,
+        "simulation_version": SIMULATION_VERSION,
+        "numpy_version": np.__version__,
+    }

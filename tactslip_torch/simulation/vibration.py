@@ -1,0 +1,192 @@
+"""What a sliding element sounds like: friction noise, texture, and the bursts of letting go.
+
+Volts at a PVDF film of unit gain. Three parts while an element slides: a *high* part, broadband
+behind the skin's resonance (friction noise of every contact, and the texture's ``k^-a`` part,
+whose spectrum keeps its shape at any speed); a *low* part below 25 Hz; and *lines* at
+speed over wavelength, which run with the arm's position. Then a burst where it lets go.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactslip_torch.simulation.friction import Slips, sliding_gate
+from tactslip_torch.simulation.grasp import Grasp, Surface, recording_key, session_key
+from tactslip_torch.simulation.grid import Grid, causal_response
+from tactslip_torch.simulation.motion import ArmStroke, arm_position_mm, arm_speed_mm_s
+from tactslip_torch.simulation.randomness import Array, generator, lognormal
+from tactslip_torch.simulation.scene import Scene
+
+REFERENCE_MM_S = 40.0
+"""The speed at which levels are given."""
+
+LOW_BAND_HZ = 25.0
+"""Where the low part of friction noise ends."""
+
+STOP_PULSE_SHARE = 0.2
+"""Burst of sticking again over that of letting go (ours)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Vibration:
+    """One element's vibration on a grid, ``[K, B]`` each.
+
+    Args:
+        high: volts above about 25 Hz, bursts included.
+        low: volts below 25 Hz.
+        fluctuation: the friction force's relative slow fluctuation, unit rms while sliding.
+    """
+
+    high: Array
+    low: Array
+    fluctuation: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """What all elements of a recording share on a grid.
+
+    Args:
+        grid: where.
+        friction_level: volts rms of friction noise at mu = 1 and 1 N, ``[K, B]``.
+        texture_level: volts rms of texture at 1 N, ``[K, B]``.
+        lines: sine and cosine of every line, ``[2, L, K, B]``; L may be 0.
+    """
+
+    grid: Grid
+    friction_level: Array
+    texture_level: Array
+    lines: Array
+
+
+def shared_field(scene: Scene, grasp: Grasp, plan: tuple[ArmStroke, ...], grid: Grid) -> Field:
+    """Levels and lines as the arm's speed and position make them."""
+    surface, contact = grasp.surface, scene.contact
+    speed = arm_speed_mm_s(plan, grid.time_s)
+    relative = speed / REFERENCE_MM_S
+    return Field(
+        grid=grid,
+        friction_level=1e-3 * contact.friction_noise_mv * relative**contact.friction_noise_exponent,
+        texture_level=1e-3 * surface.texture_mv * relative**surface.texture_exponent,
+        lines=_lines(scene, grasp, arm_position_mm(plan, grid.time_s), speed),
+    )
+
+
+def _lines(scene: Scene, grasp: Grasp, position_mm: Array, speed_mm_s: Array) -> Array:
+    """Sine and cosine of the texture's lines, weighted by what the skin and the converter pass.
+
+    A tacky material's sawtooth has harmonics that fall with their order. Lines near or beyond
+    the Nyquist frequency are faded out, not folded.
+    """
+    wavelengths_mm, weights = _line_table(scene, grasp.surface)
+    out = np.zeros((2, len(weights), *position_mm.shape))
+    middle_hz, damping = float(np.median(grasp.resonance_hz)), float(grasp.damping[0])
+    for number, (wavelength, weight) in enumerate(zip(wavelengths_mm, weights, strict=True)):
+        frequency = speed_mm_s / wavelength
+        passed = weight * _resonance(frequency, middle_hz, damping)
+        passed *= np.clip(4.5 - 10.0 * frequency / scene.sample_rate_hz, 0.0, 1.0)
+        phase = (2 * np.pi / wavelength) * position_mm
+        np.multiply(passed, np.sin(phase), out=out[0, number])
+        np.multiply(passed, np.cos(phase), out=out[1, number])
+    return out
+
+
+def _line_table(scene: Scene, surface: Surface) -> tuple[list[float], list[float]]:
+    """Wavelengths in mm and weights whose squares sum to 1; empty without a wavelength."""
+    if surface.wavelength_mm is None:
+        return [], []
+    rng = generator(*session_key(scene, "lines"), scene.material)
+    orders = np.repeat([1, 2, 3, 4], 2) if surface.material.character == "tacky" else np.ones(6)
+    spread = lognormal(rng, surface.material.line_bandwidth, len(orders))
+    weights = (1.0 / orders) / np.sqrt(np.sum(1.0 / orders**2))
+    return (surface.wavelength_mm * spread / orders).tolist(), weights.tolist()
+
+
+def _resonance(frequency_hz: Array, resonance_hz: float, damping: float) -> Array:
+    """Magnitude of the skin's resonance, 1 at its peak."""
+    ratio = (frequency_hz / resonance_hz) ** 2
+    return 2 * damping / np.sqrt((1 - ratio) ** 2 + 4 * damping**2 * ratio)
+
+
+def band_responses(grasp: Grasp, element: int, grid: Grid) -> NDArray[np.complex128]:
+    """Filters of the high and of the low part, of unit power, ``[2, B + 1]``.
+
+    The high part: rate of a height spectrum ``k^-a``, so ``f^(1 - a/2)``, behind the skin.
+    """
+    f = np.maximum(grid.frequency_hz(), 1.0)
+    tilt = (f / LOW_BAND_HZ) ** (1.0 - 0.5 * grasp.surface.spectral_exponent)
+    skin = _resonance(f, float(grasp.resonance_hz[element]), float(grasp.damping[element]))
+    step = (f / LOW_BAND_HZ) ** 4
+    high = tilt * skin * np.sqrt(step / (1 + step))
+    low = np.sqrt(f**2 / (f**2 + 4.0) / (1 + step))
+    return causal_response(np.stack([high, low]), unit_power=True)
+
+
+def element_vibration(
+    scene: Scene, grasp: Grasp, slips: Slips, field: Field, element: int
+) -> Vibration:
+    """One touching element's vibration over the whole grid; work only where it slides."""
+    grid, shape = field.grid, field.grid.time_s.shape
+    vibration = Vibration(np.zeros(shape), np.zeros(shape), np.zeros(shape))
+    responses = None
+    for stroke in range(len(slips.start_s)):
+        rows = grid.overlapping(slips.start_s[stroke, element], slips.end_s[stroke, element])
+        if rows.start == rows.stop:
+            continue
+        responses = band_responses(grasp, element, grid) if responses is None else responses
+        gate = sliding_gate(slips, element, stroke, grid.time_s[rows])
+        part = Grid(grid.blocks[rows], grid.block_samples, grid.sample_rate_hz)
+        noise = [
+            part.coloured_noise((*recording_key(scene, band), element), response)
+            for band, response in zip(("high", "low"), responses, strict=True)
+        ]
+        root_load = np.sqrt(grasp.load_n[element])
+        friction = grasp.surface.mu_ratio * grasp.surface.mu_s * root_load
+        friction = friction * field.friction_level[rows]
+        texture = root_load * field.texture_level[rows]
+        low_share, line_share = (
+            scene.contact.friction_noise_low_share,
+            grasp.surface.material.line_share,
+        )
+        broad = np.sqrt((1 - low_share) * friction**2 + (1 - line_share) * texture**2)
+        lines = _element_lines(scene, field, element, rows)
+        high = broad * noise[0] + np.sqrt(line_share) * texture * lines
+        vibration.high[rows] += gate * high
+        vibration.low[rows] += gate * (np.sqrt(low_share) * friction * noise[1])
+        vibration.fluctuation[rows] += gate * noise[1]
+    _add_bursts(scene, grasp, slips, element, grid, vibration.high)
+    return vibration
+
+
+def _element_lines(scene: Scene, field: Field, element: int, rows: slice) -> Array:
+    """The element's own mixture of the shared lines, about unit rms."""
+    total = np.zeros(field.friction_level[rows].shape)
+    num_lines = field.lines.shape[1]
+    if num_lines:
+        rng = generator(*recording_key(scene, "line mixture"), element)
+        mixture = rng.standard_normal((2, num_lines))
+        for part in range(2):
+            for line in range(num_lines):
+                total += mixture[part, line] * field.lines[part, line, rows]
+    return total
+
+
+def _add_bursts(
+    scene: Scene, grasp: Grasp, slips: Slips, element: int, grid: Grid, volts: Array
+) -> None:
+    """Add the ringing of the skin at each letting go and, weaker, at each sticking again."""
+    omega = 2 * np.pi * grasp.resonance_hz[element]
+    decay = grasp.damping[element] * omega
+    rng = generator(*recording_key(scene, "onset pulse"), element)
+    strengths = lognormal(rng, 0.3, (len(slips.start_s), 2))
+    full_v = scene.contact.onset_pulse_v * grasp.friction_n[element]
+    for stroke, pair in enumerate(strengths):
+        starts = (slips.start_s[stroke, element], slips.end_s[stroke, element])
+        for start_s, strength, share in zip(starts, pair, (1.0, -STOP_PULSE_SHARE), strict=True):
+            rows = grid.overlapping(start_s, start_s + 12.0 / decay)
+            since = np.maximum(grid.time_s[rows] - start_s, 0.0)
+            ringing = np.exp(-decay * since) * np.sin(omega * since)
+            volts[rows] += share * full_v * strength * ringing
