@@ -10,7 +10,7 @@ import numpy as np
 
 from tactslip_torch.simulation.grasp import recording_key, session_key
 from tactslip_torch.simulation.grid import Grid, causal_response
-from tactslip_torch.simulation.motion import ArmStroke, arm_position_mm, arm_speed_mm_s
+from tactslip_torch.simulation.motion import ArmStroke, Motion
 from tactslip_torch.simulation.randomness import Array, generator, lognormal
 from tactslip_torch.simulation.scene import Scene
 
@@ -32,11 +32,11 @@ class Common:
 
     Args:
         scene: whose disturbances.
-        plan: the arm's strokes.
-        grid: where.
+        motion: the arm's motion, and where.
     """
 
-    def __init__(self, scene: Scene, plan: tuple[ArmStroke, ...], grid: Grid) -> None:
+    def __init__(self, scene: Scene, motion: Motion) -> None:
+        plan, grid = motion.plan, motion.grid
         self.grid = grid
         num = len(scene.hand)
         knobs = scene.disturbances
@@ -52,7 +52,7 @@ class Common:
             * lognormal(session, 0.4, (num, len(ARM_MODES_HZ)))
         )
         self._mains = _mains(scene, grid) if knobs.mains_mv > 0 else None
-        self._motor = _motor(scene, plan, grid) if knobs.motor_vibration_mv > 0 else None
+        self._motor = _motor(scene, motion) if knobs.motor_vibration_mv > 0 else None
         self._arm = _arm_ringing(scene, plan, grid) if knobs.arm_transient_mv > 0 else None
         self._bursts = _draw_bursts(scene, plan[-1].stop_s)
 
@@ -96,8 +96,9 @@ def _mains(scene: Scene, grid: Grid) -> Array:
     return wave
 
 
-def _motor(scene: Scene, plan: tuple[ArmStroke, ...], grid: Grid) -> tuple[slice, Array]:
+def _motor(scene: Scene, motion: Motion) -> tuple[slice, Array]:
     """Vibration of unit rms at 40 mm/s while the arm moves: two gear lines and broad noise."""
+    grid, plan = motion.grid, motion.plan
     rows = grid.overlapping(plan[0].start_s, plan[-1].stop_s)
     part = Grid(grid.blocks[rows], grid.block_samples, grid.sample_rate_hz)
     if not len(part.blocks):
@@ -105,10 +106,9 @@ def _motor(scene: Scene, plan: tuple[ArmStroke, ...], grid: Grid) -> tuple[slice
     f = np.maximum(part.frequency_hz(), 1.0)
     response = causal_response(f**2 / (f**2 + 20.0**2) / (1 + (f / 200.0) ** 2), unit_power=True)
     noise = part.coloured_noise(recording_key(scene, "motor"), response)
-    position = arm_position_mm(plan, part.time_s)
     for pitch in MOTOR_PITCH_MM:
-        noise += np.sin(2 * np.pi / pitch * position)
-    level = np.sqrt(arm_speed_mm_s(plan, part.time_s) / 40.0)
+        noise += np.sin(2 * np.pi / pitch * motion.position_mm[rows])
+    level = np.sqrt(motion.speed_mm_s[rows] / 40.0)
     return rows, level * noise / np.sqrt(2.0)
 
 

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactslip_torch.simulation.grasp import Grasp
-from tactslip_torch.simulation.grid import Grid
-from tactslip_torch.simulation.motion import ArmStroke
+from tactslip_torch.simulation.motion import ArmStroke, Motion
 from tactslip_torch.simulation.randomness import Array
 
 RESTICK_SHARE = 0.5
@@ -79,39 +78,27 @@ def sliding_gate(slips: Slips, element: int, stroke: int, time_s: Array) -> Arra
     return -np.expm1(-since / SLIDE_RISE_S)
 
 
-def shear_share(
-    grasp: Grasp,
-    slips: Slips,
-    plan: tuple[ArmStroke, ...],
-    element: int,
-    grid: Grid,
-    recoil_s: float,
-) -> Array:
-    """Friction force over ``mu_s N`` of one element, in ``[0, 1]``.
+def shear_share(grasp: Grasp, slips: Slips, motion: Motion, element: int, recoil_s: float) -> Array:
+    """Friction force over ``mu_s N`` of one element, in ``[0, 1]``; zero before the first stroke.
 
     Shape:
-        - output: ``[K, B]`` on the grid
+        - output: ``[K, B]`` on the motion's grid
     """
-    share = np.zeros_like(grid.time_s)
-    if not len(grid.blocks):
-        return share
-    last_s = float(grid.time_s[-1, -1])
-    for number, stroke in enumerate(plan):
-        next_s = plan[number + 1].start_s if number + 1 < len(plan) else max(last_s, stroke.stop_s)
-        rows = grid.overlapping(stroke.start_s, next_s)
-        t = grid.time_s[rows]
-        stuck = slips.shear_before[number, element] + (
-            stroke.travel_mm(t) / grasp.presliding_mm[element]
-        )
-        since = np.clip(t - slips.start_s[number, element], 0.0, None)
-        ratio = grasp.surface.mu_ratio
-        sliding = ratio + (1.0 - ratio) * np.exp(-since / recoil_s)
-        left_mm = stroke.distance_mm - stroke.travel_mm(t)
+    time_s = motion.grid.time_s
+    share = np.zeros_like(time_s)
+    presliding_mm, ratio = grasp.presliding_mm[element], grasp.surface.mu_ratio
+    next_starts_s = [stroke.start_s for stroke in motion.plan[1:]] + [np.inf]
+    for number, (stroke, next_s) in enumerate(zip(motion.plan, next_starts_s, strict=True)):
+        rows = motion.grid.overlapping(stroke.start_s, next_s)
+        t, travel_mm = time_s[rows], motion.travel_mm[number][rows]
+        let_go_s, stick_s = slips.start_s[number, element], slips.end_s[number, element]
+        stretching = slips.shear_before[number, element] + travel_mm / presliding_mm
+        sliding = ratio + (1.0 - ratio) * np.exp(-np.maximum(t - let_go_s, 0.0) / recoil_s)
         after = slips.shear_after[number, element]
-        sticking = after - left_mm / grasp.presliding_mm[element]
-        rest = after * _relaxed(grasp, np.clip(t - stroke.stop_s, 0.0, None), element)
-        value = np.where(since > 0, sliding, np.minimum(stuck, 1.0))
-        value = np.where(t >= slips.end_s[number, element], sticking, value)
+        sticking = after - (stroke.distance_mm - travel_mm) / presliding_mm
+        rest = after * _relaxed(grasp, np.maximum(t - stroke.stop_s, 0.0), element)
+        value = np.where(t > let_go_s, sliding, np.minimum(stretching, 1.0))
+        value = np.where(t >= stick_s, sticking, value)
         value = np.where(t >= stroke.stop_s, rest, value)
-        share[rows] = np.where((t >= stroke.start_s) & (t <= next_s), value, share[rows])
+        np.copyto(share[rows], value, where=(t >= stroke.start_s) & (t <= next_s))
     return share

@@ -51,11 +51,11 @@ class Grid:
         low, high = np.searchsorted(self.blocks, [first, last + 1])
         return slice(int(low), int(high))
 
-    def with_history(self) -> tuple[Grid, NDArray[np.int64], NDArray[np.int64]]:
+    @cached_property
+    def history(self) -> tuple[Grid, Blocks, Blocks]:
         """A grid that also has every block's predecessor, and the rows of both in it.
 
-        Returns:
-            The larger grid, the rows ``[K]`` of the predecessors, the rows ``[K]`` of the blocks.
+        The larger grid, the rows ``[K]`` of the predecessors, the rows ``[K]`` of the blocks.
         """
         wider = np.union1d(self.blocks, self.blocks - 1)
         grid = Grid(wider, self.block_samples, self.sample_rate_hz)
@@ -76,7 +76,7 @@ class Grid:
 
     def coloured_noise(self, key: Key, response: NDArray[np.complex128]) -> Array:
         """White noise of unit variance behind a filter, ``[K, B]``."""
-        grid, before, now = self.with_history()
+        grid, before, now = self.history
         white = normal_blocks(key, grid.blocks, self.block_samples)
         return self.filtered(white[before], white[now], response)
 

@@ -184,7 +184,8 @@ class Sensors:
         sg_offset_v: spread of SG offsets between recordings, from grasping again.
         sg_drift_mv: size of the SG's slow drift (prior, ours).
         pvdf_shear_v_per_n: PVDF volts per newton of friction, before the high-pass (prior, ours).
-        pvdf_highpass_hz: corner of the film and its amplifier (6.6 Hz at 10 MOhm, MSI manual).
+        pvdf_highpass_hz: corner of the film and its amplifier (6.6 Hz at 10 MOhm, MSI
+            manual), at least 2 Hz.
         pvdf_offset_mv: largest offset behind the high-pass; keep it at or below 2 mV.
         pvdf_drift_mv: size of the film's slow (pyroelectric) drift.
         num_bits: of the converter.
@@ -213,9 +214,13 @@ class Sensors:
         require_finite(self)
         if not 2 <= self.num_bits <= 32:
             raise ValueError(f"Sensors.num_bits must be 2 to 32, got {self.num_bits}")
-        for name in ("rail_v", "pvdf_highpass_hz"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"Sensors.{name} must be positive, got {getattr(self, name)}")
+        if not self.rail_v > 0:
+            raise ValueError(f"Sensors.rail_v must be positive, got {self.rail_v}")
+        if self.pvdf_highpass_hz < 2:
+            raise ValueError(
+                "Sensors.pvdf_highpass_hz must be at least 2, for slower films outlast a block of "
+                f"a quarter second, got {self.pvdf_highpass_hz}"
+            )
 
 
 @dataclass(frozen=True)
@@ -223,7 +228,8 @@ class Disturbances:
     """What is in the recording but is not slip.
 
     Args:
-        mains_mv: amplitude of the mains' fundamental.
+        mains_mv: amplitude of the mains' fundamental, the session's median (prior, ours: at
+            PHYSICS.md's 4 to 10 mV rest would exceed the 1.5 to 4 mV rms it asks for).
         mains_session_spread: its spread between sessions.
         mains_hz: nominal frequency; harmonics up to the ninth share a common phase.
         arm_transient_mv: ringing of the arm's modes at each start and stop, in every channel.
@@ -237,7 +243,7 @@ class Disturbances:
         ValueError: if a knob is negative or not finite.
     """
 
-    mains_mv: float = 4.0
+    mains_mv: float = 3.0
     mains_session_spread: float = 0.7
     mains_hz: float = 50.0
     arm_transient_mv: float = 50.0

@@ -68,7 +68,7 @@ def _prior(
     line_bandwidth: float = 0.1,
 ) -> Material:
     """A row of the table; the kinetic ratio is .75 to .95 for every material."""
-    line_share = 0.0 if wavelength_mm is None else (0.7 if character == "tacky" else 0.4)
+    line_share = 0.0 if wavelength_mm is None else (0.5 if character == "tacky" else 0.4)
     return Material(
         title,
         mu_s,
@@ -90,7 +90,7 @@ MATERIALS: dict[str, Material] = {
     "M3": _prior("fibreglass aluminium foil", 0.7, (2.5, 3.5), 14.0, "textured", (0.5, 1.5)),
     "M4": _prior("oil paper", 0.5, (3.0, 5.0), 12.0, "textured", (0.05, 0.5), 0.5),
     "M5": _prior("acrylic", 1.0, (0.02, 0.1), 8.0),
-    "M6": _prior("PVC tape", 1.1, (1.0, 2.0), 120.0, "tacky", (0.4, 1.2), 0.03),
+    "M6": _prior("PVC tape", 1.1, (1.0, 2.0), 120.0, "tacky", (0.8, 2.0), 0.03),
     "iron": _prior("iron", 0.7, (0.8, 3.0), 12.0),
     "cloth": _prior("duct tape", 0.8, (10.0, 20.0), 60.0, "rough", (0.5, 1.0)),
     "copper": _prior("copper", 0.6, (0.2, 0.8), 10.0),

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from tactslip_torch.simulation.grid import Grid
 from tactslip_torch.simulation.knobs import Stroke
 from tactslip_torch.simulation.randomness import Array
 
@@ -78,17 +80,25 @@ def arm_strokes(strokes: tuple[Stroke, ...], acceleration_m_s2: float) -> tuple[
     return tuple(plan)
 
 
-def arm_position_mm(plan: tuple[ArmStroke, ...], time_s: Array) -> Array:
-    """Where the arm is, over all strokes."""
-    position = np.zeros_like(time_s)
-    for stroke in plan:
-        position += stroke.travel_mm(time_s)
-    return position
+class Motion:
+    """The arm's motion on a grid, computed once for all elements.
 
+    Args:
+        plan: the arm's strokes.
+        grid: where.
 
-def arm_speed_mm_s(plan: tuple[ArmStroke, ...], time_s: Array) -> Array:
-    """How fast the arm is, over all strokes."""
-    speed = np.zeros_like(time_s)
-    for stroke in plan:
-        speed += stroke.speed_mm_s(time_s)
-    return speed
+    Attributes:
+        travel_mm: of every stroke from its own origin, ``[K, B]`` each.
+        position_mm: over all strokes, ``[K, B]``.
+    """
+
+    def __init__(self, plan: tuple[ArmStroke, ...], grid: Grid) -> None:
+        self.plan, self.grid = plan, grid
+        self.travel_mm = tuple(stroke.travel_mm(grid.time_s) for stroke in plan)
+        self.position_mm: Array = np.sum(self.travel_mm, axis=0)
+
+    @cached_property
+    def speed_mm_s(self) -> Array:
+        """Speed over all strokes, ``[K, B]``."""
+        speed: Array = np.sum([stroke.speed_mm_s(self.grid.time_s) for stroke in self.plan], axis=0)
+        return speed

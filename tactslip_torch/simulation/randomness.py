@@ -39,12 +39,13 @@ def normal_blocks(key: Key, blocks: NDArray[np.int64], block_samples: int) -> Ar
         - blocks: ``[K]``
         - output: ``[K, block_samples]``, row k a function of the key and of ``blocks[k]`` alone
     """
-    words = _philox_key(key)
+    bits = np.random.Philox(key=_philox_key(key))
+    normal, state = np.random.Generator(bits), bits.state
     noise = np.empty((len(blocks), block_samples))
     for row, block in zip(noise, blocks.tolist(), strict=True):
-        counter = np.array([0, 0, block + 1, 0], dtype=np.uint64)
-        bits = np.random.Philox(key=words, counter=counter)
-        np.random.Generator(bits).standard_normal(out=row)
+        state["state"]["counter"][2] = block + 1  # the counter's lower words run within the block
+        bits.state = state
+        normal.standard_normal(out=row)
     return noise
 
 

@@ -8,14 +8,15 @@ converter with rails. Last link of the chain in PHYSICS.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactslip_torch.simulation.friction import Slips, shear_share
 from tactslip_torch.simulation.grasp import Grasp, recording_key, session_key
-from tactslip_torch.simulation.grid import Grid, causal_response
-from tactslip_torch.simulation.motion import ArmStroke, arm_position_mm
+from tactslip_torch.simulation.grid import Grid
+from tactslip_torch.simulation.motion import Motion
 from tactslip_torch.simulation.randomness import Array, generator, lognormal, normal_blocks
 from tactslip_torch.simulation.scene import Scene
 from tactslip_torch.simulation.vibration import Vibration
@@ -68,30 +69,38 @@ def draw_front(scene: Scene) -> Front:
 
 
 def element_friction(
-    scene: Scene, grasp: Grasp, slips: Slips, plan: tuple[ArmStroke, ...], element: int, grid: Grid
+    scene: Scene, grasp: Grasp, slips: Slips, motion: Motion, element: int
 ) -> tuple[Array, Array]:
     """Normal force and friction force in newtons, ``[K, B]`` each; never above ``mu_s N``.
 
     The normal force has the surface's run-out and creeps after the grasp like the shear.
     """
-    angle = 2 * np.pi / RUNOUT_PERIOD_MM * arm_position_mm(plan, grid.time_s)
+    angle = 2 * np.pi / RUNOUT_PERIOD_MM * motion.position_mm
     runout = scene.contact.runout * np.sin(angle + grasp.runout_phase[element])
-    since_grasp_s = np.maximum(grid.time_s, 0.0) + 1.0
+    since_grasp_s = np.maximum(motion.grid.time_s, 0.0) + 1.0
     creep = np.exp(-since_grasp_s / (5.0 * grasp.relaxation_time_s[element]))
     normal_n = (
         grasp.load_n[element] * (1.0 + runout) * (1.0 + 0.3 * grasp.relaxation[element] * creep)
     )
-    share = shear_share(grasp, slips, plan, element, grid, scene.contact.recoil_s)
+    share = shear_share(grasp, slips, motion, element, scene.contact.recoil_s)
     return normal_n, grasp.surface.mu_s * normal_n * share
 
 
-def highpass_response(scene: Scene, grid: Grid) -> NDArray[np.complex128]:
-    """The film and its amplifier: first-order high-pass that passes no constant."""
-    f = grid.frequency_hz()
-    response = causal_response(f / np.hypot(f, scene.sensors.pvdf_highpass_hz))
-    taps = np.fft.irfft(response, 2 * grid.block_samples)[: grid.block_samples + 1]
-    taps -= taps.sum() / len(taps)
-    return np.asarray(np.fft.rfft(taps, 2 * grid.block_samples), dtype=np.complex128)
+@lru_cache(maxsize=8)
+def highpass_response(
+    corner_hz: float, block_samples: int, sample_rate_hz: float
+) -> NDArray[np.complex128]:
+    """The film and its amplifier: first-order high-pass that passes no constant, ``[B + 1]``.
+
+    The one-pole filter with a zero at 0 Hz, cut after one block and freed of what the cut leaves
+    at 0 Hz (e^-10 of the step at 6.6 Hz).
+    """
+    pole = np.exp(-2 * np.pi * corner_hz / sample_rate_hz)
+    taps = -(1 - pole) * pole ** np.arange(-1.0, block_samples)
+    taps[0] = 1.0
+    taps *= 0.5 * (1 + pole)
+    taps -= taps.mean()
+    return np.asarray(np.fft.rfft(taps, 2 * block_samples), dtype=np.complex128)
 
 
 def gauge_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: Vibration) -> Array:
@@ -111,12 +120,15 @@ def film_volts(scene: Scene, grid: Grid, friction_n: Array, vibration: Vibration
     Args:
         scene: whose sensors.
         grid: where the volts are wanted.
-        friction_n: friction on ``grid.with_history()``.
+        friction_n: friction on ``grid.history``.
         vibration: on ``grid``; behind the high-pass already.
     """
-    _, before, now = grid.with_history()
+    _, before, now = grid.history
     strain_v = scene.sensors.pvdf_shear_v_per_n * friction_n
-    slow = grid.filtered(strain_v[before], strain_v[now], highpass_response(scene, grid))
+    response = highpass_response(
+        scene.sensors.pvdf_highpass_hz, grid.block_samples, grid.sample_rate_hz
+    )
+    slow = grid.filtered(strain_v[before], strain_v[now], response)
     return slow + vibration.high + vibration.low
 
 

@@ -18,7 +18,7 @@ from tactslip_torch.simulation.disturbances import Common
 from tactslip_torch.simulation.friction import Slips, slips
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp
 from tactslip_torch.simulation.grid import Grid, block_samples_for
-from tactslip_torch.simulation.motion import ArmStroke, arm_strokes
+from tactslip_torch.simulation.motion import ArmStroke, Motion, arm_strokes
 from tactslip_torch.simulation.randomness import Array
 from tactslip_torch.simulation.scene import SIMULATION_VERSION, Scene
 from tactslip_torch.simulation.sensors import (
@@ -29,7 +29,7 @@ from tactslip_torch.simulation.sensors import (
     gauge_volts,
 )
 from tactslip_torch.simulation.timeline import Timeline, timeline_of
-from tactslip_torch.simulation.vibration import Vibration, element_vibration, shared_field
+from tactslip_torch.simulation.vibration import element_vibration, shared_field
 
 
 def simulate(
@@ -96,41 +96,24 @@ def _kinematic(
     indices: list[int],
 ) -> dict[int, Array]:
     """Volts of the channels asked for on the grid, ``[K, B]`` each."""
-    front, common = draw_front(scene), Common(scene, plan, grid)
-    felt = {index: np.zeros(grid.time_s.shape) for index in indices}
-    elements: dict[int, list[int]] = {}
-    for index in indices:
-        elements.setdefault(int(grasp.element_of_channel[index]), []).append(index)
-    touching = [element for element in elements if grasp.load_n[element] > 0]
-    if touching:
-        field = shared_field(scene, grasp, plan, grid)
-    for element in touching:
+    history, _, now = grid.history
+    motion, before = Motion(plan, grid), Motion(plan, history)
+    front, common = draw_front(scene), Common(scene, motion)
+    field = shared_field(scene, grasp, motion)
+    volts = {index: common.channel(index) for index in indices}
+    elements = {int(grasp.element_of_channel[index]) for index in indices}
+    for element in sorted(elements & set(grasp.touching.tolist())):
         vibration = element_vibration(scene, grasp, slipping, field, element)
-        signals = _element_volts(scene, plan, grasp, slipping, grid, element, vibration)
-        for index in elements[element]:
-            felt[index] = front.gain[index] * signals[scene.hand.channels[index].kind]
-    return {
-        index: front_end(scene, front, index, grid, felt[index] + common.channel(index))
-        for index in indices
-    }
-
-
-def _element_volts(
-    scene: Scene,
-    plan: tuple[ArmStroke, ...],
-    grasp: Grasp,
-    slipping: Slips,
-    grid: Grid,
-    element: int,
-    vibration: Vibration,
-) -> dict[str, Array]:
-    """What an SG and a PVDF film of unit gain feel of one touching element."""
-    history, _, now = grid.with_history()
-    normal_n, friction_n = element_friction(scene, grasp, slipping, plan, element, history)
-    return {
-        "SG": gauge_volts(scene, normal_n[now], friction_n[now], vibration),
-        "PVDF": film_volts(scene, grid, friction_n, vibration),
-    }
+        normal_n, friction_n = element_friction(scene, grasp, slipping, before, element)
+        for index in indices:
+            if grasp.element_of_channel[index] != element:
+                continue
+            if scene.hand.channels[index].kind == "SG":
+                felt = gauge_volts(scene, normal_n[now], friction_n[now], vibration)
+            else:
+                felt = film_volts(scene, grid, friction_n, vibration)
+            volts[index] += front.gain[index] * felt
+    return {index: front_end(scene, front, index, grid, volts[index]) for index in indices}
 
 
 def _wanted_samples(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tactslip_torch.simulation.friction import Slips, sliding_gate
 from tactslip_torch.simulation.grasp import Grasp, Surface, recording_key, session_key
 from tactslip_torch.simulation.grid import Grid, causal_response
-from tactslip_torch.simulation.motion import ArmStroke, arm_position_mm, arm_speed_mm_s
+from tactslip_torch.simulation.motion import Motion
 from tactslip_torch.simulation.randomness import Array, generator, lognormal
 from tactslip_torch.simulation.scene import Scene
 
@@ -25,6 +25,9 @@ REFERENCE_MM_S = 40.0
 
 LOW_BAND_HZ = 25.0
 """Where the low part of friction noise ends."""
+
+LINE_DAMPING = 0.5
+"""Damping ratio with which lines meet the skin: a patch is many bristles (prior, ours)."""
 
 STOP_PULSE_SHARE = 0.2
 """Burst of sticking again over that of letting go (ours)."""
@@ -62,16 +65,15 @@ class Field:
     lines: Array
 
 
-def shared_field(scene: Scene, grasp: Grasp, plan: tuple[ArmStroke, ...], grid: Grid) -> Field:
+def shared_field(scene: Scene, grasp: Grasp, motion: Motion) -> Field:
     """Levels and lines as the arm's speed and position make them."""
     surface, contact = grasp.surface, scene.contact
-    speed = arm_speed_mm_s(plan, grid.time_s)
-    relative = speed / REFERENCE_MM_S
+    relative = motion.speed_mm_s / REFERENCE_MM_S
     return Field(
-        grid=grid,
+        grid=motion.grid,
         friction_level=1e-3 * contact.friction_noise_mv * relative**contact.friction_noise_exponent,
         texture_level=1e-3 * surface.texture_mv * relative**surface.texture_exponent,
-        lines=_lines(scene, grasp, arm_position_mm(plan, grid.time_s), speed),
+        lines=_lines(scene, grasp, motion.position_mm, motion.speed_mm_s),
     )
 
 
@@ -83,10 +85,10 @@ def _lines(scene: Scene, grasp: Grasp, position_mm: Array, speed_mm_s: Array) ->
     """
     wavelengths_mm, weights = _line_table(scene, grasp.surface)
     out = np.zeros((2, len(weights), *position_mm.shape))
-    middle_hz, damping = float(np.median(grasp.resonance_hz)), float(grasp.damping[0])
+    middle_hz, damping = float(np.median(grasp.resonance_hz)), LINE_DAMPING
     for number, (wavelength, weight) in enumerate(zip(wavelengths_mm, weights, strict=True)):
         frequency = speed_mm_s / wavelength
-        passed = weight * _resonance(frequency, middle_hz, damping)
+        passed = weight * np.minimum(_resonance(frequency, middle_hz, damping), 1.0)
         passed *= np.clip(4.5 - 10.0 * frequency / scene.sample_rate_hz, 0.0, 1.0)
         phase = (2 * np.pi / wavelength) * position_mm
         np.multiply(passed, np.sin(phase), out=out[0, number])
