@@ -1,0 +1,158 @@
+import numpy as np
+import oracles
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactslip_torch.signals.filtering import ChannelFilter, savgol_filter
+
+WINDOWS = [(1, 0), (3, 1), (5, 2), (11, 1), (51, 1), (51, 3), (11, 0), (7, 6)]
+WINDOW_OF_CHANNEL = [51, 11, 51, 5]
+
+
+@pytest.mark.parametrize(("window", "order"), WINDOWS)
+@pytest.mark.parametrize("num_samples", [51, 52, 200, 333])
+@pytest.mark.parametrize("make", [oracles.random_bins, oracles.integer_bins])
+def test_equals_scipy(window, order, num_samples, make, rng):
+    x = make(rng, 40, num_samples)
+    actual = savgol_filter(torch.from_numpy(x), window, order)
+    oracles.assert_columns_close(actual, oracles.savgol(x, window, order))
+
+
+def test_default_order_is_one(rng):
+    x = oracles.random_bins(rng, 2, 60)
+    oracles.assert_columns_close(savgol_filter(torch.from_numpy(x), 11), oracles.savgol(x, 11, 1))
+
+
+@given(half=st.integers(1, 20), extra=st.integers(0, 30), seed=st.integers(0, 99), data=st.data())
+def test_equals_scipy_at_any_length(half, extra, seed, data):
+    window = 2 * half + 1
+    order = data.draw(st.integers(0, min(3, window - 1)))
+    x = oracles.random_bins(np.random.default_rng(seed), 20, window + extra)
+    actual = savgol_filter(torch.from_numpy(x), window, order)
+    oracles.assert_columns_close(actual, oracles.savgol(x, window, order))
+
+
+@pytest.mark.parametrize("window", [11, 51])
+def test_manners(window, rng, device):
+    x = torch.from_numpy(oracles.random_bins(rng, 4, 120)).to(device)
+    oracles.assert_manners(lambda x: savgol_filter(x, window), x)
+
+
+def test_float32_is_close_to_float64(rng):
+    x = torch.from_numpy(oracles.random_bins(rng, 3, 200))
+    actual = savgol_filter(x.float(), 51)
+    torch.testing.assert_close(actual.double(), savgol_filter(x, 51), rtol=1e-5, atol=1e-6)
+
+
+def test_gradcheck(rng):
+    x = torch.from_numpy(oracles.random_bins(rng, 2, 14)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: savgol_filter(x, 5, 2), x)
+
+
+@pytest.mark.parametrize("window", [3, 11, 51])
+@pytest.mark.parametrize("order", [1, 2])
+def test_polynomials_of_its_order_pass_unchanged(window, order):
+    t = torch.linspace(-1, 1, 120, dtype=torch.float64)
+    line = 3 + 2 * t - (4 * t**2 if order == 2 else 0)
+    torch.testing.assert_close(savgol_filter(line, window, order), line, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("window", "corner_hz"), [(11, 81.0), (51, 17.0)])
+def test_a_tone_at_the_stated_corner_loses_three_decibels(window, corner_hz):
+    t = torch.arange(4000, dtype=torch.float64) / 2000.0
+    tone = torch.sin(2 * torch.pi * corner_hz * t)
+    inside = slice(200, -200)
+    gain = savgol_filter(tone, window)[inside].std() / tone[inside].std()
+    assert 20 * torch.log10(gain) == pytest.approx(-3, abs=0.2)
+
+
+@pytest.mark.parametrize("window", [11, 51])
+def test_nothing_beyond_half_a_window_is_used(window, rng):
+    x = torch.from_numpy(oracles.random_bins(rng, 300))
+    changed = x.clone()
+    changed[200:] += 100
+    half = window // 2
+    before, after = savgol_filter(x, window), savgol_filter(changed, window)
+    torch.testing.assert_close(after[: 200 - half], before[: 200 - half], rtol=0, atol=1e-12)
+    assert (after[200 - half] - before[200 - half]).abs() > 1e-3
+
+
+def test_constant_and_zero_and_nan():
+    torch.testing.assert_close(
+        savgol_filter(torch.full((80,), 5.0, dtype=torch.float64), 11),
+        torch.full((80,), 5.0, dtype=torch.float64),
+        rtol=1e-14,
+        atol=0,
+    )
+    assert (savgol_filter(torch.zeros(80), 51) == 0).all()
+    x = torch.zeros(80)
+    x[40] = float("nan")
+    touched = savgol_filter(x, 11).isnan()
+    assert touched[35:46].all()
+    assert touched.sum() == 11
+
+
+@pytest.mark.parametrize(
+    ("num_samples", "window", "order", "message"),
+    [
+        (80, 10, 1, r"odd.*10"),
+        (80, 0, 0, r"odd.*0"),
+        (80, 5, 5, r"polyorder.*5"),
+        (80, 5, -1, r"polyorder.*-1"),
+        (50, 51, 1, r"50 samples.*51"),
+    ],
+)
+def test_errors_name_the_value(num_samples, window, order, message):
+    with pytest.raises(ValueError, match=message):
+        savgol_filter(torch.zeros(num_samples), window, order)
+
+
+def test_each_channel_gets_its_own_window(rng):
+    x = oracles.random_bins(rng, 4, 160)
+    expected = np.stack([oracles.savgol(x[c], w) for c, w in enumerate(WINDOW_OF_CHANNEL)])
+    actual = ChannelFilter(WINDOW_OF_CHANNEL)(torch.from_numpy(x))
+    oracles.assert_columns_close(actual, expected)
+    quadratic = np.stack([oracles.savgol(x[c], w, 2) for c, w in enumerate(WINDOW_OF_CHANNEL)])
+    actual = ChannelFilter(WINDOW_OF_CHANNEL, polyorder=2)(torch.from_numpy(x))
+    oracles.assert_columns_close(actual, quadratic)
+
+
+@pytest.mark.parametrize("num_samples", [1, 100, 101])
+def test_valid_is_the_centre_of_the_filtered_whole(num_samples, rng):
+    layer = ChannelFilter(WINDOW_OF_CHANNEL)
+    assert layer.context == 25
+    x = torch.from_numpy(oracles.random_bins(rng, 3, 4, num_samples + 50))
+    inside = slice(layer.context, layer.context + num_samples)
+    expected = np.stack(
+        [oracles.savgol(x[:, c].numpy(), w)[..., inside] for c, w in enumerate(WINDOW_OF_CHANNEL)],
+        axis=1,
+    )
+    actual = layer.valid(x)
+    assert actual.shape == (3, 4, num_samples)
+    torch.testing.assert_close(actual, torch.from_numpy(expected), rtol=1e-12, atol=1e-12)
+
+
+def test_channel_filter_manners(rng, device):
+    x = torch.from_numpy(oracles.random_bins(rng, 2, 4, 160)).to(device)
+    layer = ChannelFilter(WINDOW_OF_CHANNEL).to(device)
+    oracles.assert_manners(layer, x, num_axes=2)
+    oracles.assert_manners(layer.valid, x, num_axes=2)
+    assert torch.autograd.gradcheck(
+        ChannelFilter([3, 5]), torch.randn(2, 9, dtype=torch.float64, requires_grad=True)
+    )
+
+
+def test_channel_filter_errors():
+    layer = ChannelFilter(WINDOW_OF_CHANNEL)
+    with pytest.raises(ValueError, match=r"4.*\(3, 100\)"):
+        layer(torch.zeros(3, 100))
+    with pytest.raises(ValueError, match=r"4.*\(3, 100\)"):
+        layer.valid(torch.zeros(3, 100))
+    with pytest.raises(ValueError, match=r"25 samples of context.*50"):
+        layer.valid(torch.zeros(4, 50))
+    with pytest.raises(ValueError, match=r"50 samples.*51"):
+        layer(torch.zeros(4, 50))
+    with pytest.raises(ValueError, match=r"odd.*10"):
+        ChannelFilter([11, 10])

@@ -1,0 +1,236 @@
+import numpy as np
+import oracles
+import pytest
+import torch
+from sklearn.kernel_ridge import KernelRidge
+
+from tactslip_torch.model.kernel_elm import polynomial_kernel, solve_kernel_elm, solve_primal
+from tactslip_torch.model.quadratic import quadratic_features
+
+PENALTIES = [0.05, 0.3, 3.0, 1000.0]
+
+
+def draw(rng, num_bins=40, num_features=5):
+    z = rng.uniform(-1, 1, (num_bins, num_features))
+    targets = np.where(rng.uniform(size=num_bins) < 0.4, 1.0, -1.0)
+    weights = rng.uniform(0.2, 3, num_bins)
+    return z, targets, weights
+
+
+def tensors(*arrays):
+    return tuple(torch.from_numpy(a) for a in arrays)
+
+
+def close(actual, expected, tolerance=1e-10):
+    """Relative to the largest expected value: a solve mixes all of them."""
+    np.testing.assert_allclose(
+        actual.numpy(), expected, rtol=tolerance, atol=tolerance * np.abs(expected).max()
+    )
+
+
+# Kernel --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("offset", [0.0, 0.5, 2.0])
+def test_kernel_equals_the_oracle(degree, offset, rng):
+    a, b = rng.standard_normal((7, 4)), rng.standard_normal((9, 4))
+    actual = polynomial_kernel(*tensors(a, b), degree=degree, offset=offset)
+    close(actual, oracles.kernel(a, b, degree, offset), 1e-12)
+
+
+def test_kernel_defaults_and_manners(rng, device):
+    a, b = rng.standard_normal((6, 7, 4)), rng.standard_normal((9, 4))
+    close(polynomial_kernel(*tensors(a[0], b)), oracles.kernel(a[0], b), 1e-12)
+    b = torch.from_numpy(b).to(device)
+    oracles.assert_manners(
+        lambda a: polynomial_kernel(a, b.to(a)), torch.from_numpy(a).to(device), num_axes=2
+    )
+
+
+# Dual solve ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("penalty", PENALTIES)
+@pytest.mark.parametrize("weighted", [False, True])
+def test_dual_equals_sklearn(penalty, weighted, rng):
+    z, targets, weights = draw(rng)
+    ridge = KernelRidge(kernel="poly", degree=2, gamma=1, coef0=0.5, alpha=1 / penalty)
+    ridge.fit(z, targets, sample_weight=weights if weighted else None)
+    zt, tt, wt = tensors(z, targets, weights)
+    beta = solve_kernel_elm(polynomial_kernel(zt, zt), tt, penalty, wt if weighted else None)
+    close(beta, ridge.dual_coef_, 1e-8 if penalty > 100 else 1e-10)
+    new = rng.uniform(-1, 1, (11, 5))
+    close(polynomial_kernel(torch.from_numpy(new), zt) @ beta, ridge.predict(new))
+
+
+@pytest.mark.parametrize("penalty", PENALTIES)
+def test_dual_equals_the_oracle_and_solves_its_equation(penalty, rng):
+    z, targets, weights = draw(rng)
+    gram = oracles.kernel(z, z)
+    beta = solve_kernel_elm(*tensors(gram, targets), penalty, torch.from_numpy(weights))
+    close(beta, oracles.kernel_elm(gram, targets, penalty, weights), 1e-9)
+    residual = gram @ beta.numpy() + beta.numpy() / (penalty * weights) - targets
+    assert np.abs(residual).max() < 1e-10
+
+
+def test_a_weight_of_two_is_a_bin_seen_twice(rng):
+    z, targets, _ = draw(rng)
+    weights = rng.integers(1, 4, len(z))
+    new = torch.from_numpy(rng.uniform(-1, 1, (9, 5)))
+
+    def scores(z, targets, weights=None):
+        beta = solve_kernel_elm(polynomial_kernel(z, z), targets, 0.3, weights)
+        return polynomial_kernel(new, z) @ beta
+
+    zt, tt = tensors(z, targets)
+    repeated = tensors(np.repeat(z, weights, axis=0), np.repeat(targets, weights))
+    weighted = scores(zt, tt, torch.from_numpy(weights.astype(float)))
+    torch.testing.assert_close(weighted, scores(*repeated), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("num_bins", [10, 60])
+def test_an_infinite_penalty_is_the_pseudo_inverse(num_bins, rng):
+    """With 60 bins and 21 monomials the matrix is singular: the minimum-norm solution."""
+    z, targets, _ = draw(rng, num_bins)
+    gram = oracles.kernel(z, z)
+    beta = solve_kernel_elm(*tensors(gram, targets), float("inf"))
+    expected = np.linalg.lstsq(gram, targets, rcond=1e-12)[0]
+    close(beta, expected, 1e-7)
+    if num_bins < 21:
+        np.testing.assert_allclose(gram @ beta.numpy(), targets, rtol=1e-8)
+
+
+def test_dual_is_batched(rng):
+    problems = [draw(rng) for _ in range(6)]
+    grams = np.stack([oracles.kernel(z, z) for z, _, _ in problems]).reshape(2, 3, 40, 40)
+    targets = np.stack([t for _, t, _ in problems]).reshape(2, 3, 40)
+    weights = np.stack([w for _, _, w in problems]).reshape(2, 3, 40)
+    together = solve_kernel_elm(*tensors(grams, targets), 0.3, torch.from_numpy(weights))
+    assert together.shape == (2, 3, 40)
+    for i in np.ndindex(2, 3):
+        close(together[i], oracles.kernel_elm(grams[i], targets[i], 0.3, weights[i]))
+    infinite = solve_kernel_elm(*tensors(grams, targets), float("inf"))
+    single = solve_kernel_elm(*tensors(grams[1, 2], targets[1, 2]), np.inf)
+    close(infinite[1, 2], single.numpy(), 1e-7)
+
+
+def test_inputs_are_kept_and_dtype_is_followed(rng):
+    z, targets, weights = tensors(*draw(rng))
+    gram = polynomial_kernel(z, z)
+    copies = [t.clone() for t in (gram, targets, weights)]
+    expected = solve_kernel_elm(gram, targets, 0.3, weights)
+    solve_primal(quadratic_features(z), targets, 0.3, weights)
+    for tensor, copy in zip((gram, targets, weights), copies, strict=True):
+        assert torch.equal(tensor, copy)
+    actual = solve_kernel_elm(gram.float(), targets.float(), 0.3, weights.float())
+    assert actual.dtype == torch.float32
+    torch.testing.assert_close(actual.double(), expected, rtol=1e-3, atol=1e-4)
+    strided = torch.stack([gram, gram], -1)[..., 0]
+    torch.testing.assert_close(solve_kernel_elm(strided, targets, 0.3, weights), expected)
+
+
+@pytest.mark.parametrize("penalty", [0.3, float("inf")])
+def test_gradcheck_through_the_features(penalty, rng):
+    """Through the features: Cholesky reads one triangle, so the Gram matrix alone cannot."""
+    z, targets, weights = draw(rng, 8, 3)
+    new = torch.from_numpy(rng.uniform(-1, 1, (4, 3)))
+
+    def scores(z, targets, weights):
+        beta = solve_kernel_elm(
+            polynomial_kernel(z, z), targets, penalty, None if penalty == np.inf else weights
+        )
+        return polynomial_kernel(new, z) @ beta
+
+    inputs = [t.requires_grad_() for t in tensors(z, targets)]
+    weights = torch.from_numpy(weights).requires_grad_(penalty != np.inf)
+    assert torch.autograd.gradcheck(scores, (*inputs, weights))
+
+
+# Primal --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("penalty", PENALTIES)
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("num_bins", [12, 40, 200])
+def test_primal_equals_dual(penalty, weighted, num_bins, rng):
+    z, targets, weights = tensors(*draw(rng, num_bins))
+    weights = weights if weighted else None
+    features = quadratic_features(z, 0.5)
+    primal = features @ solve_primal(features, targets, penalty, weights)
+    gram = polynomial_kernel(z, z)
+    dual = gram @ solve_kernel_elm(gram, targets, penalty, weights)
+    close(primal, dual.numpy(), 1e-9)
+
+
+def test_primal_solves_its_equation(rng):
+    x, targets, weights = (
+        rng.standard_normal((30, 6)),
+        rng.standard_normal(30),
+        rng.uniform(1, 2, 30),
+    )
+    w = np.linalg.solve(
+        x.T @ np.diag(weights) @ x + np.eye(6) / 0.3, x.T @ np.diag(weights) @ targets
+    )
+    close(solve_primal(*tensors(x, targets), 0.3, torch.from_numpy(weights)), w)
+
+
+def test_gradcheck_of_the_primal(rng):
+    inputs = [t.requires_grad_() for t in tensors(*draw(rng, 9, 3))]
+    assert torch.autograd.gradcheck(lambda x, t, w: solve_primal(x, t, 0.5, w), inputs)
+
+
+# Errors and extremes -------------------------------------------------------------------------
+
+
+def test_one_bin():
+    beta = solve_kernel_elm(torch.tensor([[4.0]]), torch.tensor([1.0]), 0.5)
+    assert beta.item() == pytest.approx(1 / 6)
+
+
+def test_a_system_that_is_not_positive_definite_is_named():
+    gram = torch.diag(torch.tensor([1.0, -4.0]))
+    with pytest.raises(ValueError, match=r"not positive definite at penalty=1 in torch\.float32"):
+        solve_kernel_elm(gram, torch.ones(2), 1.0)
+    with pytest.raises(ValueError, match=r"not positive definite at penalty=1e\+20"):
+        solve_primal(torch.ones(3, 2), torch.ones(3), 1e20)
+
+
+def test_nan_is_an_error_not_an_answer():
+    gram = torch.eye(3)
+    gram[1, 1] = float("nan")
+    with pytest.raises(ValueError, match="not positive definite"):
+        solve_kernel_elm(gram, torch.ones(3), 1.0)
+
+
+@pytest.mark.parametrize("penalty", [0.0, -1.0, float("nan")])
+def test_penalty_must_be_positive(penalty):
+    with pytest.raises(ValueError, match=f"positive, got {penalty}"):
+        solve_kernel_elm(torch.eye(2), torch.ones(2), penalty)
+    with pytest.raises(ValueError, match=f"positive, got {penalty}"):
+        solve_primal(torch.eye(2), torch.ones(2), penalty)
+
+
+def test_shapes_must_agree():
+    with pytest.raises(ValueError, match=r"\(3, 2\).*\(2,\)"):
+        solve_kernel_elm(torch.zeros(3, 2), torch.ones(2), 1.0)
+    with pytest.raises(ValueError, match=r"\(2, 2\).*\(3,\)"):
+        solve_kernel_elm(torch.eye(2), torch.ones(3), 1.0)
+    with pytest.raises(ValueError, match=r"\(3, 2\).*\(2,\)"):
+        solve_primal(torch.zeros(3, 2), torch.ones(2), 1.0)
+    with pytest.raises(ValueError, match="weights"):
+        solve_kernel_elm(torch.eye(3), torch.ones(3), 1.0, torch.ones(1))
+    with pytest.raises(ValueError, match="weights"):
+        solve_primal(torch.zeros(3, 2), torch.ones(3), 1.0, torch.ones(1))
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan")])
+def test_weights_must_be_positive(bad):
+    weights = torch.tensor([1.0, bad, 1.0])
+    with pytest.raises(ValueError, match=r"weight|positive definite"):
+        solve_kernel_elm(10 * torch.eye(3), torch.ones(3), 1.0, weights)
+
+
+def test_the_primal_refuses_an_infinite_penalty():
+    with pytest.raises(ValueError, match="penalty=inf"):
+        solve_primal(torch.eye(2), torch.ones(2), float("inf"))
