@@ -1,8 +1,20 @@
 """Slip detection for robot hands that feel, in PyTorch (He et al. 2026, and beyond)."""
 
+from tactslip_torch.data.recording import Recording
 from tactslip_torch.features.pool import FeatureName, FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.simulation import Scene, simulate
 
 __version__ = "0.1.0"
 
-__all__ = ["Channel", "FeatureName", "FeaturePool", "HandLayout"]
+__all__ = [
+    "Channel",
+    "FeatureName",
+    "FeaturePool",
+    "HandLayout",
+    "Recording",
+    "Scene",
+    "SlipDetector",
+    "simulate",
+]

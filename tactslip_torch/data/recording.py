@@ -1,12 +1,33 @@
-"""A recording: one cycle of the protocol as the sensors gave it, with what is true of it."""
+"""A recording: one cycle of the protocol as the sensors gave it, with what is true of it.
+
+Where recordings come from is a ``RecordingSource``: a simulation, or files.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 from torch import Tensor
+
+from tactslip_torch.hand import HandLayout
+
+
+@dataclass(frozen=True, order=True)
+class RecordingId:
+    """Names a recording within its set.
+
+    Args:
+        material: what the hand slid on.
+        cycle: number of the cycle on that material, from 0.
+    """
+
+    material: str
+    cycle: int
+
+    def __str__(self) -> str:
+        return f"{self.material}/{self.cycle}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,3 +83,58 @@ class Recording:
     def duration_s(self) -> float:
         """Length in seconds."""
         return self.samples.shape[-1] / self.sample_rate_hz
+
+
+class Timeline(Protocol):
+    """When things happen in a recording, known before any sample is."""
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the recording."""
+
+    @property
+    def onsets_s(self) -> tuple[float, ...]:
+        """Exact onsets, one per stroke."""
+
+    @property
+    def annotated_onsets_s(self) -> tuple[float, ...]:
+        """The onsets as a person marked them."""
+
+    @property
+    def sliding_s(self) -> tuple[tuple[float, float], ...]:
+        """Start and end of each slide."""
+
+    @property
+    def speeds_mm_s(self) -> tuple[float, ...]:
+        """Steady speed of each stroke."""
+
+
+class RecordingSource(Protocol):
+    """A set of recordings that are made or read one at a time, when asked for."""
+
+    @property
+    def hand(self) -> HandLayout:
+        """The channels of every recording."""
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Of every recording."""
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether samples come from a simulation; every result says so."""
+
+    @property
+    def ids(self) -> tuple[RecordingId, ...]:
+        """The recordings, in a fixed order."""
+
+    def timeline(self, recording: RecordingId) -> Timeline:
+        """When things happen in a recording; cheap."""
+
+    def key(self, recording: RecordingId) -> Mapping[str, Any]:
+        """Everything that determines the samples, JSON-able; for caches."""
+
+    def load(
+        self, recording: RecordingId, windows: Sequence[tuple[float, float]] | None = None
+    ) -> Recording:
+        """The recording; samples outside the windows (seconds) may be NaN."""

@@ -244,7 +244,7 @@ def entropy(sample: Sample) -> Tensor:
     # the maximum always has the top level, so the second highest level joins it
     new_cell = (level[..., 1:] != level[..., :-1]) & (level[..., 1:] != ENTROPY_LEVELS)
     growth = _entropy_growth(sample.num).to(sample.x)
-    return torch.where(sample.is_flat, 0.0, growth[_rank_in_run(new_cell).int()].sum(-1))
+    return torch.where(sample.is_flat, 0.0, growth[_rank_in_run(new_cell).long()].sum(-1))
 
 
 def peak_factor(sample: Sample) -> Tensor:
@@ -385,11 +385,10 @@ def _rank_in_run(is_boundary: Tensor) -> Tensor:
 
     Shape:
         - is_boundary: ``[*, n - 1]``, bool: a new run starts behind this value
-        - output: ``[*, n]``, small integers
+        - output: ``[*, n]``, int32
     """
     num = is_boundary.shape[-1] + 1
-    dtype = torch.int16 if num <= torch.iinfo(torch.int16).max else torch.int32
-    position = torch.arange(num, dtype=dtype, device=is_boundary.device)
+    position = torch.arange(num, dtype=torch.int32, device=is_boundary.device)
     start = torch.where(is_boundary, position[1:], 0)
     start = torch.cat([torch.zeros_like(start[..., :1]), start], dim=-1)
     return position - _running_max(start)

@@ -204,6 +204,12 @@ class FeaturePool(nn.Module):
         magnitude = bins.abs().amax(-1)
         return span.isfinite() & (span > 64 * torch.finfo(bins.dtype).eps * magnitude)
 
+    def round_constants(self, dtype: torch.dtype) -> None:
+        """Keep the constants in another dtype from now on; for export, where it halves the file."""
+        for name, constant in self._constants.items():
+            if constant.is_floating_point():
+                self._constants[name] = constant.to(dtype)
+
     def _of_gauges(self, bins: Tensor) -> Tensor:
         gauges = bins[..., self._gauges, :]
         scale = gauges.detach().abs().amax(-1)

@@ -92,8 +92,10 @@ class ChannelFilter(nn.Module):
         super().__init__()
         self.window_lengths = tuple(int(length) for length in window_lengths)
         self.polyorder = polyorder
-        for length in sorted(set(self.window_lengths)):
-            fit_matrix(length, polyorder)  # raises for a bad frame now, not at the first signal
+        # float64 and outside the state: cast on use, so they never lose digits
+        self._kernels = {
+            length: fit_matrix(length, polyorder)[length // 2] for length in self.window_lengths
+        }
 
     @property
     def context(self) -> int:
@@ -137,8 +139,7 @@ class ChannelFilter(nn.Module):
         for length, chosen in self._groups():
             spare = self.context - length // 2
             kept = samples[..., chosen, spare : samples.shape[-1] - spare]
-            kernel = fit_matrix(length, self.polyorder)[length // 2].to(samples)
-            parts.append(_convolve_valid(kept, kernel))
+            parts.append(_convolve_valid(kept, self._kernels[length].to(samples)))
         return torch.cat(parts, dim=-2)[..., self._inverse(), :]
 
     def _check(self, samples: Tensor) -> None:

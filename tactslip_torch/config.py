@@ -1,0 +1,94 @@
+"""Where the configuration lives, and errors a person can read."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hydra.errors import InstantiationException
+
+CONF_HINT = "train.yaml"
+EXIT_BAD_INPUT = 2
+
+
+def conf_dir() -> Path:
+    """The ``conf`` folder: inside the package (wheel) or beside it (checkout, editable install).
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    here = Path(__file__).resolve().parent
+    for folder in (here / "conf", here.parent / "conf"):
+        if (folder / CONF_HINT).is_file():
+            return folder
+    raise FileNotFoundError(f"no conf folder with {CONF_HINT} in or beside {here}; reinstall")
+
+
+def unknown_choice(arguments: Sequence[str]) -> str | None:
+    """One line about the first argument that names an option its config group does not have.
+
+    Example:
+        >>> unknown_choice(["+exp=unseen4", "seed=3"]) is None
+        True
+        >>> unknown_choice(["split=seen7"])
+        'unknown split seen7; known: leave_one_material_out, random_bins, seen6, unseen4'
+    """
+    for argument in arguments:
+        key, found, value = argument.lstrip("+").partition("=")
+        group = conf_dir() / key
+        if argument.startswith("-") or not found or not key or not group.is_dir():
+            continue
+        known = sorted(path.stem for path in group.glob("*.yaml"))
+        for name in value.split(","):
+            if name and name not in known:
+                return f"unknown {key} {name}; known: {', '.join(known)}"
+        if key == "exp" and not argument.startswith("+"):
+            return f"write +exp={value}: experiments are added to the configuration"
+    return None
+
+
+def run_entry_point(main: Callable[[], Any]) -> None:
+    """Run a Hydra entry point; a choice that does not exist is one line and exit status 2."""
+    problem = unknown_choice(sys.argv[1:])
+    if problem:
+        fail(problem)
+    main()
+
+
+@contextmanager
+def errors_in_one_line() -> Iterator[None]:
+    """Turn what bad input raises into one line and exit status 2; other errors keep their trace.
+
+    Raises:
+        SystemExit: instead of the error.
+    """
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, OSError, InstantiationException) as error:
+        if os.environ.get("TACTSLIP_TRACEBACK"):
+            raise
+        fail(one_line(error))
+
+
+def fail(message: str) -> None:
+    """Print one line and exit with status 2.
+
+    Raises:
+        SystemExit: always.
+    """
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    raise SystemExit(EXIT_BAD_INPUT)
+
+
+def one_line(error: BaseException) -> str:
+    """What went wrong, without Hydra's wrapping."""
+    while isinstance(error, InstantiationException) and error.__cause__ is not None:
+        error = error.__cause__
+    text = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
+    if "Original Traceback" in text:  # from a worker: the last line is what was raised there
+        text = text.splitlines()[-1].partition(": ")[2]
+    return text or type(error).__name__

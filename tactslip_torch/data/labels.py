@@ -1,0 +1,154 @@
+"""Which bins of a recording are slip and which are not (REFERENCE.md section 1, *Labels*).
+
+``whole_slide`` is what the authors' scripts do and the published confusion matrices fit: one second
+of non-slip before each onset, the whole slide as slip, the onset moved 10 ms earlier.
+``half_second`` is what the paper's text says: half a second on either side of each onset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+Layout = Literal["whole_slide", "half_second"]
+OnsetSource = Literal["annotated", "exact"]
+
+
+@dataclass(frozen=True)
+class LabelRule:
+    """How bins are laid around onsets.
+
+    Args:
+        layout: ``"whole_slide"`` (published numbers) or ``"half_second"`` (the text).
+        onsets: ``"annotated"``, as a person marked them, or ``"exact"``, where known.
+        bin_ms: length of a bin.
+        hop_ms: distance between bins; ``None`` for no overlap, as in the paper.
+        shuffle_seed: if given, labels are permuted within each recording. A sanity check: what
+            is learned from such labels must score 50 % balanced accuracy.
+
+    Raises:
+        ValueError: for an unknown layout or onset source, or a length that is not positive.
+    """
+
+    layout: Layout = "whole_slide"
+    onsets: OnsetSource = "annotated"
+    bin_ms: float = 50.0
+    hop_ms: float | None = None
+    shuffle_seed: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, kinds in (("layout", Layout), ("onsets", OnsetSource)):
+            if getattr(self, name) not in get_args(kinds):
+                raise ValueError(
+                    f"labels.{name} must be one of {', '.join(get_args(kinds))}, "
+                    f"got {getattr(self, name)!r}"
+                )
+        for name in ("bin_ms", "hop_ms"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"labels.{name} must be positive, got {value}")
+
+
+@dataclass(frozen=True)
+class LabelledBins:
+    """Bins of one recording.
+
+    Args:
+        starts: ``[N]``, first sample of each bin, ascending within a stroke.
+        is_slip: ``[N]``, bool.
+        stroke: ``[N]``, index of the stroke each bin belongs to.
+        bin_samples: length of every bin.
+    """
+
+    starts: Tensor
+    is_slip: Tensor
+    stroke: Tensor
+    bin_samples: int
+
+
+def label_bins(
+    rule: LabelRule,
+    onsets_s: Sequence[float],
+    sliding_s: Sequence[tuple[float, float]],
+    duration_s: float,
+    sample_rate_hz: float,
+) -> LabelledBins:
+    """Lay bins around the onsets of a recording.
+
+    A slip bin lies wholly before the end of its slide, a non-slip bin wholly before the onset.
+
+    Args:
+        rule: the layout.
+        onsets_s: one per stroke, annotated or exact as the caller chose.
+        sliding_s: start and end of each slide; only the ends are used.
+        duration_s: length of the recording.
+        sample_rate_hz: of the recording.
+
+    Raises:
+        ValueError: if a bin would lie outside the recording, or a bin is no whole number of
+            samples.
+    """
+    bin_samples = _whole_samples(rule.bin_ms, sample_rate_hz, "bin_ms")
+    hop = bin_samples
+    if rule.hop_ms is not None:
+        hop = _whole_samples(rule.hop_ms, sample_rate_hz, "hop_ms")
+    lead_s, shift_s = (1.0, 0.010) if rule.layout == "whole_slide" else (0.5, 0.0)
+    starts, slips, strokes = [], [], []
+    for stroke, (onset_s, (_, end_s)) in enumerate(zip(onsets_s, sliding_s, strict=True)):
+        edge = round((onset_s - shift_s) * sample_rate_hz)
+        first = edge - round(lead_s * sample_rate_hz)
+        last = edge + round(lead_s * sample_rate_hz)
+        if rule.layout == "whole_slide":
+            last = int(end_s * sample_rate_hz)
+        if first < 0 or last > round(duration_s * sample_rate_hz):
+            raise ValueError(
+                f"stroke {stroke + 1} with its onset at {onset_s:.3f} s needs samples from "
+                f"{first} to {last}, outside the recording of {duration_s:.3f} s"
+            )
+        before = torch.arange(first, edge - bin_samples + 1, hop)
+        after = torch.arange(edge, max(last - bin_samples + 1, edge), hop)
+        starts += [before, after]
+        slips += [torch.zeros(len(before)), torch.ones(len(after))]
+        strokes += [torch.full((len(before) + len(after),), stroke)]
+    return LabelledBins(torch.cat(starts), torch.cat(slips).bool(), torch.cat(strokes), bin_samples)
+
+
+def needed_windows(
+    bins: LabelledBins, context_samples: int, duration_s: float, sample_rate_hz: float
+) -> list[tuple[float, float]]:
+    """The stretches of time that filtering the bins needs, merged where they touch, in seconds.
+
+    A stretch within two contexts of an end of the recording reaches to that end, so that the
+    filter sees the true edge.
+    """
+    num_samples = round(duration_s * sample_rate_hz)
+    windows: list[list[int]] = []
+    for start in bins.starts.sort().values.tolist():
+        low, high = start - context_samples, start + bins.bin_samples + context_samples
+        low = 0 if low < context_samples else low
+        high = num_samples if high > num_samples - context_samples else high
+        if windows and low <= windows[-1][1]:
+            windows[-1][1] = max(windows[-1][1], high)
+        else:
+            windows.append([low, high])
+    return [(low / sample_rate_hz, high / sample_rate_hz) for low, high in windows]
+
+
+def shuffled(is_slip: Tensor, seed: int, place: int) -> Tensor:
+    """Labels permuted within a recording, ``[N]``; ``place`` is the recording's own number."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + place)
+    return is_slip[torch.randperm(len(is_slip), generator=generator)]
+
+
+def _whole_samples(length_ms: float, sample_rate_hz: float, name: str) -> int:
+    samples = length_ms * sample_rate_hz / 1000
+    if abs(samples - round(samples)) > 1e-6 or round(samples) < 1:
+        raise ValueError(
+            f"labels.{name}={length_ms:g} is {samples:g} samples at {sample_rate_hz:g} Hz; "
+            "choose a whole number of samples"
+        )
+    return round(samples)

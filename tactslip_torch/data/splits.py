@@ -1,0 +1,185 @@
+"""Who is trained on and who is not (REFERENCE.md section 5, *Split*).
+
+A split gives every bin of every recording a role. The default groups by cycle, stratified by
+material: neighbouring bins of one slide never stand on both sides. The authors' split, random over
+bins, is here to show what that leaks.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.data.recording import RecordingId
+
+ROLES = ("train", "test", "unseen")
+
+
+@dataclass(frozen=True)
+class Split:
+    """Roles of recordings, or of their bins.
+
+    Args:
+        name: of the split or fold, for folders and tables.
+        roles: recording to ``"train"``, ``"test"`` or ``"unseen"``; others are not used.
+        test_share_of_bins: if given, bins of ``train`` recordings are sent to ``test`` at
+            random with this share (``random_bins``).
+        seed: of that draw.
+    """
+
+    name: str
+    roles: Mapping[RecordingId, str]
+    test_share_of_bins: float | None = None
+    seed: int = 0
+
+    def bin_roles(self, recording: RecordingId, num_bins: int) -> dict[str, Tensor]:
+        """For each role, which bins of a recording have it: ``[num_bins]``, bool."""
+        role = self.roles.get(recording)
+        masks = {name: torch.full((num_bins,), name == role) for name in ROLES}
+        if role == "train" and self.test_share_of_bins is not None:
+            place = sorted(self.roles).index(recording)
+            generator = torch.Generator().manual_seed(self.seed * 1_000_003 + place)
+            to_test = torch.rand(num_bins, generator=generator) < self.test_share_of_bins
+            masks["train"], masks["test"] = ~to_test, to_test
+        return masks
+
+    def having(self, *roles: str) -> list[RecordingId]:
+        """Recordings with any of the roles, sorted; those split by bin have train and test."""
+        wanted = set(roles)
+        if self.test_share_of_bins is not None and "test" in wanted:
+            wanted.add("train")
+        return sorted(recording for recording, role in self.roles.items() if role in wanted)
+
+
+def unseen4(
+    recordings: Sequence[RecordingId],
+    *,
+    seen: Sequence[str],
+    unseen: Sequence[str],
+    train_share: float = 0.8,
+    seed: int = 0,
+) -> list[Split]:
+    """Train and test on cycles of the seen materials, judge on all cycles of the unseen ones.
+
+    Raises:
+        ValueError: if a material is not in the set, is on both sides, or a role stays empty.
+    """
+    both = sorted(set(seen) & set(unseen))
+    if both:
+        raise ValueError(f"materials {', '.join(both)} are both seen and unseen; choose one side")
+    roles = _by_cycle(recordings, seen, train_share, seed)
+    for material in unseen:
+        roles |= dict.fromkeys(_cycles_of(recordings, material), "unseen")
+    return [_checked(Split("unseen4", roles), ("train", "test", "unseen"))]
+
+
+def seen6(
+    recordings: Sequence[RecordingId],
+    *,
+    seen: Sequence[str],
+    train_share: float = 0.8,
+    seed: int = 0,
+) -> list[Split]:
+    """Train and test on cycles of the seen materials only.
+
+    Raises:
+        ValueError: if a material is not in the set or a role stays empty.
+    """
+    roles = _by_cycle(recordings, seen, train_share, seed)
+    return [_checked(Split("seen6", roles), ("train", "test"))]
+
+
+def random_bins(
+    recordings: Sequence[RecordingId],
+    *,
+    seen: Sequence[str],
+    train_share: float = 0.8,
+    seed: int = 0,
+) -> list[Split]:
+    """The authors' split: bins of the seen materials at random, which leaks.
+
+    Neighbouring bins of one slide are on both sides, so its test score is no promise for
+    recordings that were never seen; the difference to ``seen6`` is the leak.
+
+    Raises:
+        ValueError: if a material is not in the set or the share is not in (0, 1).
+    """
+    _check_share(train_share)
+    roles = {
+        recording: "train" for material in seen for recording in _cycles_of(recordings, material)
+    }
+    return [_checked(Split("random_bins", roles, 1 - train_share, seed), ("train",))]
+
+
+def leave_one_material_out(
+    recordings: Sequence[RecordingId],
+    *,
+    materials: Sequence[str],
+    train_share: float = 0.8,
+    seed: int = 0,
+) -> list[Split]:
+    """One fold per material: train and test on the others' cycles, judge on its own.
+
+    Raises:
+        ValueError: if a material is not in the set, there are fewer than two, or a role stays
+            empty.
+    """
+    if len(materials) < 2:
+        raise ValueError(f"leaving one material out needs at least two, got {list(materials)}")
+    folds = []
+    for left_out in materials:
+        others = [material for material in materials if material != left_out]
+        fold = unseen4(
+            recordings, seen=others, unseen=[left_out], train_share=train_share, seed=seed
+        )[0]
+        folds.append(Split(f"without_{left_out}", fold.roles))
+    return folds
+
+
+def _by_cycle(
+    recordings: Sequence[RecordingId], materials: Sequence[str], train_share: float, seed: int
+) -> dict[RecordingId, str]:
+    """``train`` and ``test`` drawn within each material, at least one cycle each if there are two.
+
+    The draw of a material depends on the seed and its place among its own cycles alone, so leaving
+    another material out does not change it.
+    """
+    _check_share(train_share)
+    roles: dict[RecordingId, str] = {}
+    for material in materials:
+        cycles = _cycles_of(recordings, material)
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + zlib.crc32(material.encode()))
+        num_train = round(train_share * len(cycles))
+        if len(cycles) > 1:
+            num_train = min(max(num_train, 1), len(cycles) - 1)
+        order = torch.randperm(len(cycles), generator=generator).tolist()
+        for place, index in enumerate(order):
+            roles[cycles[index]] = "train" if place < num_train else "test"
+    return roles
+
+
+def _cycles_of(recordings: Sequence[RecordingId], material: str) -> list[RecordingId]:
+    cycles = sorted(recording for recording in recordings if recording.material == material)
+    if not cycles:
+        known = ", ".join(sorted({recording.material for recording in recordings}))
+        raise ValueError(f"no recording of material {material!r}; the set has {known or 'none'}")
+    return cycles
+
+
+def _check_share(train_share: float) -> None:
+    if not 0 < train_share < 1:
+        raise ValueError(f"split.train_share must lie between 0 and 1, got {train_share}")
+
+
+def _checked(split: Split, needed: Sequence[str]) -> Split:
+    for role in needed:
+        if role not in split.roles.values():
+            raise ValueError(
+                f"split {split.name}: no recording has the role {role!r}; "
+                "use more cycles or another train_share"
+            )
+    return split

@@ -1,0 +1,106 @@
+"""Judge a saved detector: ``python -m tactslip_torch.evaluate model=detector.pt split=unseen4``.
+
+Prints the tables and writes the figures that ``train`` does, for any set, labels and split. Says so
+where recordings the detector was trained on are among those it is judged on.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.recording import RecordingSource
+from tactslip_torch.data.splits import Split
+from tactslip_torch.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.experiment import (
+    common_facts,
+    feature_cache,
+    feature_rows,
+    make_trainer,
+    save_config,
+)
+from tactslip_torch.learning import SlipLearner
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.report.results import print_results, write_results
+from tactslip_torch.report.scores import merged_metrics
+
+
+def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
+    """Judge the detector of ``config.model`` and write the results.
+
+    Args:
+        config: composed from ``conf/evaluate.yaml``.
+        folder: where results go.
+
+    Returns:
+        The content of ``metrics.json``.
+
+    Raises:
+        ValueError: for bad input, in one line.
+        FileNotFoundError: if there is no such detector.
+    """
+    started = time.perf_counter()
+    detector = SlipDetector.load(config.model)
+    source: RecordingSource = instantiate(config.data, _convert_="all")
+    rule: LabelRule = instantiate(config.labels)
+    folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
+    save_config(config, folder)
+    parts: dict[str, dict[str, Any]] = {}
+    with feature_cache(config.cache) as cache:
+        filters = detector.channel_filter
+        maker = FeatureMaker(source, detector.pool, filters, rule, cache, torch.float64)
+        for fold in folds:
+            _warn_of_overlap(detector, fold, config)
+            learner = SlipLearner(detector.pool, filters, detector=detector)
+            trainer = make_trainer(config.trainer, folder, source)
+            data = SlipDataModule(maker, fold, config.num_workers)
+            trainer.test(learner, datamodule=data, verbose=False)
+            parts[fold.name] = learner.metrics["splits"]
+    roles = list(dict.fromkeys(role for splits in parts.values() for role in splits))
+    metrics = common_facts(source, detector.pool, config) | {
+        "splits": {
+            role: merged_metrics([splits[role] for splits in parts.values() if role in splits])
+            for role in roles
+        },
+        "selected": [str(name) for name in detector.selected_names],
+        "timing_s": {"total": time.perf_counter() - started},
+        "detector": detector.info,
+    }
+    rows = feature_rows(detector.selected_names, source.hand)
+    write_results(folder, metrics, rows)
+    print_results(metrics, rows)
+    print(f"\nresults in {folder}")
+    return metrics
+
+
+def _warn_of_overlap(detector: SlipDetector, fold: Split, config: DictConfig) -> None:
+    """Say which held-out recordings the detector was trained on, if any."""
+    if detector.info.get("seed") != config.seed:
+        return  # another seed simulates other recordings under the same names
+    held_out = {str(recording) for recording in fold.having("test", "unseen")}
+    known = sorted(held_out & set(detector.info.get("train_recordings", [])))
+    if known:
+        print(
+            f"note: {len(known)} of {len(held_out)} held-out recordings of {fold.name} were "
+            f"trained on (such as {known[0]}): their scores are training scores"
+        )
+
+
+@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="evaluate")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    with errors_in_one_line():
+        evaluate(config, Path(HydraConfig.get().runtime.output_dir))
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

@@ -1,0 +1,139 @@
+"""What an experiment is made of, built from its configuration, for ``train`` and ``evaluate``."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from hydra.utils import instantiate
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from omegaconf import DictConfig, OmegaConf
+
+import tactslip_torch
+from tactslip_torch.data.recording import RecordingSource
+from tactslip_torch.features.cache import FeatureCache, default_cache_folder
+from tactslip_torch.features.pool import FeatureName, FeaturePool
+from tactslip_torch.files import whole_file
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.progress import RecordingProgressBar
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.signals.spectrum import SpectrumMethod
+
+DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
+
+def feature_parts(
+    source: RecordingSource,
+    bin_ms: float,
+    *,
+    frames: Mapping[str, int],
+    polyorder: int,
+    wavelet: str,
+    level: int,
+    spectrum: SpectrumMethod,
+    dtype: str,
+) -> tuple[FeaturePool, ChannelFilter, torch.dtype]:
+    """Pool, filter and dtype from the ``features`` section.
+
+    Raises:
+        ValueError: if a kind of channel has no frame, or a value is none that exists.
+    """
+    if dtype not in DTYPES:
+        raise ValueError(f"features.dtype must be one of {', '.join(DTYPES)}, got {dtype!r}")
+    missing = sorted({channel.kind for channel in source.hand.channels} - set(frames))
+    if missing:
+        raise ValueError(f"features.frames has no frame for {', '.join(missing)} channels")
+    pool = FeaturePool(
+        source.hand,
+        source.sample_rate_hz,
+        bin_samples=round(bin_ms * source.sample_rate_hz / 1000),
+        wavelet=wavelet,
+        level=level,
+        spectrum=spectrum,
+    )
+    lengths = [frames[channel.kind] for channel in source.hand.channels]
+    return pool, ChannelFilter(lengths, polyorder), DTYPES[dtype]
+
+
+@contextmanager
+def feature_cache(setting: str) -> Iterator[FeatureCache]:
+    """The cache of ``cache=auto|off|FOLDER``; ``off`` keeps features for this run only.
+
+    Two passes need the features twice, so even ``off`` holds them on disk, in a temporary folder
+    that goes with the run.
+    """
+    if setting == "off":
+        with tempfile.TemporaryDirectory(prefix="tactslip-") as folder:
+            yield FeatureCache(folder)
+        return
+    cache = FeatureCache(default_cache_folder() if setting == "auto" else Path(setting))
+    yield cache
+    cache.prune()
+
+
+def make_trainer(
+    config: DictConfig,
+    folder: Path,
+    source: RecordingSource,
+    callbacks: Sequence[L.Callback] = (),
+) -> L.Trainer:
+    """The Lightning trainer of the ``trainer`` section, logging to TensorBoard and CSV."""
+    # Lightning's advertisements and a deprecation inside it are nothing a user can act on
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).*")
+    verb = "simulate, features" if source.is_simulated else "read, features"
+    trainer: L.Trainer = instantiate(
+        config,
+        default_root_dir=str(folder),
+        logger=[
+            TensorBoardLogger(str(folder), name="", version="tensorboard"),
+            CSVLogger(str(folder), name="", version="csv"),
+        ],
+        callbacks=[RecordingProgressBar(verb), *callbacks],
+        enable_checkpointing=False,
+    )
+    return trainer
+
+
+def save_config(config: DictConfig, folder: Path) -> None:
+    """Write the resolved configuration."""
+    with whole_file(folder / "config.yaml") as temporary:
+        temporary.write_text(OmegaConf.to_yaml(config, resolve=True))
+
+
+def feature_rows(names: Sequence[FeatureName], hand: HandLayout) -> list[dict[str, str]]:
+    """Features as plain rows, with the kind and finger of their channel, for tables and figures."""
+    rows = []
+    for name in names:
+        channel = hand.channel(name.channel)
+        rows.append(
+            {
+                "name": str(name),
+                "channel": name.channel,
+                "component": name.component,
+                "domain": name.domain,
+                "descriptor": name.descriptor,
+                "kind": channel.kind,
+                "finger": channel.finger,
+            }
+        )
+    return rows
+
+
+def common_facts(source: RecordingSource, pool: FeaturePool, config: DictConfig) -> dict[str, Any]:
+    """What every ``metrics.json`` says of its origin."""
+    return {
+        "simulated": source.is_simulated,
+        "experiment": config.name,
+        "seed": config.seed,
+        "labels": OmegaConf.to_container(config.labels, resolve=True),
+        "num_features_pool": len(pool.names),
+        "versions": {"tactslip_torch": tactslip_torch.__version__, "torch": torch.__version__},
+    }

@@ -1,0 +1,137 @@
+"""Write a detector as ONNX: ``python -m tactslip_torch.export model=detector.pt``.
+
+The graph takes raw bins with their filter context and gives scores, in float32. It holds the whole
+pool, matrices for every linear map, and no operator that is slow or missing in onnxruntime. A file
+is left only if onnxruntime gives torch's scores at batch sizes the graph was not traced with.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import logging
+import os
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import hydra
+import onnxruntime
+import torch
+from omegaconf import DictConfig
+from torch import Tensor, nn
+
+from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
+from tactslip_torch.files import whole_file
+from tactslip_torch.model.detector import SlipDetector
+
+OPSET = 20
+CHECKED_BATCHES = (1, 7)
+WORST_ERROR = 1e-3
+"""Largest allowed difference to float64 torch, as a share of the scores' standard deviation."""
+
+
+class _RawScore(nn.Module):
+    """``score_raw`` as ``forward``, which is what gets exported."""
+
+    def __init__(self, detector: SlipDetector) -> None:
+        super().__init__()
+        self.detector = detector
+
+    def forward(self, samples: Tensor) -> Tensor:
+        return self.detector.score_raw(samples)
+
+
+def export_onnx(detector: SlipDetector, path: str | os.PathLike[str]) -> float:
+    """Write ``samples [B, C, n + 2 * context] -> score [B]``, float32, and check it.
+
+    Returns:
+        The largest difference between onnxruntime and float64 torch over the check bins, as a
+        share of the scores' standard deviation.
+
+    Raises:
+        ValueError: if onnxruntime's scores differ by more than ``WORST_ERROR``; no file is left.
+    """
+    single = copy.deepcopy(detector).float().eval()
+    single.pool.round_constants(torch.float32)
+    traced = torch.randn(3, *_input_shape(detector))
+    with whole_file(path) as temporary:
+        # the exporter prints its progress and warns of its own internals
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings(), _quiet():
+            warnings.simplefilter("ignore")
+            torch.onnx.export(
+                _RawScore(single),
+                (traced,),
+                str(temporary),
+                dynamo=True,
+                external_data=False,
+                opset_version=OPSET,
+                input_names=["samples"],
+                output_names=["score"],
+                dynamic_shapes={"samples": {0: torch.export.Dim.DYNAMIC}},
+            )
+        worst = onnx_error(detector, temporary)
+        if not worst <= WORST_ERROR:
+            raise ValueError(
+                f"onnxruntime and torch differ by {worst:.2e} of the scores' standard deviation, "
+                f"more than {WORST_ERROR:g}: {os.fspath(path)} was not written"
+            )
+    return worst
+
+
+def onnx_error(detector: SlipDetector, path: str | os.PathLike[str]) -> float:
+    """Largest difference between an exported file and the detector in float64.
+
+    On noise of several sizes, at batch sizes the graph was not traced with; in units of the
+    standard deviation of the detector's scores there.
+    """
+    session = onnxruntime.InferenceSession(os.fspath(path), providers=["CPUExecutionProvider"])
+    generator = torch.Generator().manual_seed(0)
+    errors, scores = [], []
+    for batch in CHECKED_BATCHES:
+        size = 10 ** torch.linspace(-3, 0, batch)[:, None, None]
+        samples = size * torch.randn(batch, *_input_shape(detector), generator=generator)
+        with torch.no_grad():
+            expected = copy.deepcopy(detector).double().score_raw(samples.double())
+        got = torch.from_numpy(session.run(None, {"samples": samples.numpy()})[0])
+        if got.shape != expected.shape:
+            raise ValueError(
+                f"the graph gives scores {tuple(got.shape)} at batch {batch}, "
+                f"expected {tuple(expected.shape)}"
+            )
+        errors.append((got - expected).abs())
+        scores.append(expected)
+    return float(torch.cat(errors).max() / torch.cat(scores).std())
+
+
+def _input_shape(detector: SlipDetector) -> tuple[int, int]:
+    pool = detector.pool
+    return len(pool.hand), pool.bin_samples + 2 * detector.context
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the exporter's libraries from logging every rewrite."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="export")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    with errors_in_one_line():
+        output = Path(config.output or Path(config.model).with_name("model.onnx"))
+        worst = export_onnx(SlipDetector.load(config.model), output)
+        print(f"{output}: {output.stat().st_size} bytes, largest error {worst:.1e} score std")
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

@@ -1,0 +1,107 @@
+"""Features on disk, one file per recording, found again by everything that determines them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tactslip_torch.files import whole_file
+
+log = logging.getLogger(__name__)
+
+_MAGIC = b"TSFEAT01"
+_SHAPE = struct.Struct("<qq")
+_DIGEST_SIZE = 16
+
+
+def default_cache_folder() -> Path:
+    """``tactslip_torch`` in the user's cache folder (``XDG_CACHE_HOME`` or ``~/.cache``)."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "tactslip_torch"
+
+
+def cache_key(facts: Mapping[str, Any]) -> str:
+    """A file name for JSON-able facts: equal facts, equal name.
+
+    Example:
+        >>> cache_key({"a": 1, "b": 2}) == cache_key({"b": 2, "a": 1})
+        True
+    """
+    text = json.dumps(facts, sort_keys=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def source_digest(package: Path) -> str:
+    """A digest of every Python file below a folder, so that changed code is never served old."""
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+class FeatureCache:
+    """Float32 features by key. A damaged file counts as absent, and is written anew.
+
+    Args:
+        folder: made when first written to.
+        most_bytes: ``prune`` deletes the least recently used files beyond this.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], most_bytes: int = 4 * 2**30) -> None:
+        self.folder = Path(folder)
+        self.most_bytes = most_bytes
+
+    def load(self, key: str) -> Tensor | None:
+        """The features ``[N, F]``, or ``None`` if there are none or their file is damaged."""
+        path = self._path(key)
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        start = len(_MAGIC) + _DIGEST_SIZE
+        body = memoryview(content)[start:]
+        if content[: len(_MAGIC)] != _MAGIC or content[len(_MAGIC) : start] != _digest(body):
+            log.warning("cached features %s are damaged; computing them again", path)
+            return None
+        shape = _SHAPE.unpack(body[: _SHAPE.size])
+        os.utime(path)  # prune drops what was used longest ago
+        values = np.frombuffer(body[_SHAPE.size :], dtype="<f4").reshape(shape)
+        return torch.from_numpy(values.copy())
+
+    def store(self, key: str, features: Tensor) -> None:
+        """Write features ``[N, F]``, whole or not at all."""
+        values = np.ascontiguousarray(features.numpy(), dtype="<f4")
+        body = _SHAPE.pack(*values.shape) + values.tobytes()
+        with whole_file(self._path(key)) as temporary:
+            temporary.write_bytes(_MAGIC + _digest(body) + body)
+
+    def prune(self) -> None:
+        """Delete the least recently used files until the folder holds at most ``most_bytes``."""
+        found = []
+        for path in self.folder.glob("*/*.features"):
+            status = path.stat()
+            found.append((status.st_mtime, status.st_size, path))
+        total = sum(size for _, size, _ in found)
+        for _, size, path in sorted(found):
+            if total <= self.most_bytes:
+                return
+            path.unlink(missing_ok=True)
+            total -= size
+
+    def _path(self, key: str) -> Path:
+        return self.folder / key[:2] / f"{key}.features"
+
+
+def _digest(body: bytes | memoryview) -> bytes:
+    return hashlib.blake2b(body, digest_size=_DIGEST_SIZE).digest()

@@ -1,0 +1,46 @@
+"""What a run leaves behind: ``metrics.json``, figures, and tables in the terminal."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tactslip_torch.files import whole_file
+from tactslip_torch.report.figures import confusion_figure, selected_features_figure
+from tactslip_torch.report.tables import (
+    materials_table,
+    selected_table,
+    splits_table,
+    timing_table,
+)
+
+
+def write_results(
+    folder: Path, metrics: Mapping[str, Any], selected: Sequence[Mapping[str, str]]
+) -> None:
+    """Write ``metrics.json``, ``confusion.png`` and ``selected_features.png`` into a folder.
+
+    Args:
+        folder: made if it is not there.
+        metrics: JSON-able, with ``simulated`` and ``splits``.
+        selected: one mapping per selected feature, as ``selected_features_figure`` takes them.
+    """
+    with whole_file(folder / "metrics.json") as temporary:
+        temporary.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+    confusion_figure(metrics, folder / "confusion.png")
+    if selected:
+        selected_features_figure(
+            selected, folder / "selected_features.png", simulated=metrics["simulated"]
+        )
+
+
+def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, str]]) -> None:
+    """Print the tables of a run."""
+    parts = [splits_table(metrics), materials_table(metrics)]
+    if selected:
+        parts.append(selected_table(selected))
+    if metrics.get("timing_s"):
+        parts.append(timing_table(metrics["timing_s"]))
+    print("\n" + "\n\n".join(parts))

@@ -1,0 +1,66 @@
+"""The paper's set of recordings, simulated one at a time when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.simulation.materials import SEEN_MATERIALS, UNSEEN_MATERIALS
+from tactslip_torch.simulation.scene import paper_scenes
+from tactslip_torch.simulation.simulate import simulate
+from tactslip_torch.simulation.timeline import Timeline, timeline
+
+
+class SimulatedRecordings:
+    """A ``RecordingSource`` over ``paper_scenes``.
+
+    Args:
+        seed: of the whole set.
+        cycles: recordings per material.
+        materials: ids in ``MATERIALS``.
+        channels: rows for ``HandLayout.from_rows``; ``None`` for the paper's hand.
+        scene: overrides of any knob of the scenes.
+
+    Raises:
+        ValueError: as ``paper_scenes``.
+
+    Example:
+        >>> source = SimulatedRecordings(cycles=2, materials=["M1", "wood"])
+        >>> [str(recording) for recording in source.ids]
+        ['M1/0', 'M1/1', 'wood/0', 'wood/1']
+    """
+
+    is_simulated = True
+
+    def __init__(
+        self,
+        *,
+        seed: int = 0,
+        cycles: int = 28,
+        materials: Iterable[str] = SEEN_MATERIALS + UNSEEN_MATERIALS,
+        channels: Iterable[Mapping[str, str]] | None = None,
+        scene: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.hand = HandLayout.paper24() if channels is None else HandLayout.from_rows(channels)
+        scenes = paper_scenes(
+            seed=seed, cycles=cycles, materials=materials, hand=self.hand, **(scene or {})
+        )
+        self._scenes = {RecordingId(s.material, s.cycle): s for s in scenes}
+        self.ids = tuple(self._scenes)
+        self.sample_rate_hz = scenes[0].sample_rate_hz if scenes else 2000.0
+
+    def timeline(self, recording: RecordingId) -> Timeline:
+        """When things happen, without a sample being simulated."""
+        return timeline(self._scenes[recording])
+
+    def key(self, recording: RecordingId) -> Mapping[str, Any]:
+        """The scene, as plain values."""
+        return self._scenes[recording].to_dict()
+
+    def load(
+        self, recording: RecordingId, windows: Sequence[tuple[float, float]] | None = None
+    ) -> Recording:
+        """Simulate the recording, or the stretches of it that are asked for."""
+        return simulate(self._scenes[recording], windows=windows)

@@ -1,0 +1,174 @@
+"""Train and judge a detector: ``python -m tactslip_torch.train +exp=unseen4``.
+
+Simulates (or reads) the recordings, makes features, selects, solves, tests, and leaves
+``metrics.json``, ``detector.pt``, ``model.onnx``, figures, logs and the resolved configuration in
+``outputs/<name>/<time>``. ``--help`` and ``--cfg job`` show what can be set.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import hydra
+import lightning as L
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.recording import RecordingSource
+from tactslip_torch.data.splits import Split
+from tactslip_torch.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.experiment import (
+    common_facts,
+    feature_cache,
+    feature_parts,
+    feature_rows,
+    make_trainer,
+    save_config,
+)
+from tactslip_torch.export import export_onnx
+from tactslip_torch.files import whole_file
+from tactslip_torch.learning import SlipLearner
+from tactslip_torch.recipe import Recipe
+from tactslip_torch.report.results import print_results, write_results
+from tactslip_torch.report.scores import merged_metrics
+
+log = logging.getLogger(__name__)
+
+
+class SaveAfterPass(L.Callback):
+    """Writes ``last.ckpt`` after each pass, whole or not at all, for ``ckpt_path=``."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Save."""
+        if not getattr(trainer, "fast_dev_run", False):
+            with whole_file(self._folder / "last.ckpt") as temporary:
+                trainer.save_checkpoint(temporary)
+
+
+def train(config: DictConfig, folder: Path) -> dict[str, float]:
+    """Run an experiment and write its results.
+
+    Args:
+        config: composed from ``conf/train.yaml``.
+        folder: where results go.
+
+    Returns:
+        Accuracy and balanced accuracy of each role, such as ``"unseen/accuracy"``.
+
+    Raises:
+        ValueError: for bad input, in one line.
+    """
+    started = time.perf_counter()
+    L.seed_everything(config.seed, verbose=False)
+    source: RecordingSource = instantiate(config.data, _convert_="all")
+    rule: LabelRule = instantiate(config.labels)
+    recipe: Recipe = instantiate(config.detector, _convert_="all")
+    folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
+    pool, channel_filter, dtype = feature_parts(source, rule.bin_ms, **config.features)
+    if recipe.num_features > len(pool.names):
+        raise ValueError(
+            f"detector.num_features={recipe.num_features} exceeds the pool's {len(pool.names)}"
+        )
+    save_config(config, folder)
+    fold_metrics: dict[str, dict[str, Any]] = {}
+    with feature_cache(config.cache) as cache:
+        maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype)
+        for fold in folds:
+            place = folder if len(folds) == 1 else folder / fold.name
+            data = SlipDataModule(maker, fold, config.num_workers)
+            learner = SlipLearner(pool, channel_filter, recipe)
+            fold_metrics[fold.name] = _run_fold(config, place, data, learner)
+    metrics = common_facts(source, pool, config) | _combined(fold_metrics)
+    metrics["timing_s"]["total"] = time.perf_counter() - started
+    selected = [name for name in pool.names if str(name) in set(metrics["selected"])]
+    selected.sort(key=lambda name: metrics["selected"].index(str(name)))
+    rows = feature_rows(selected, source.hand)
+    write_results(folder, metrics, rows)
+    print_results(metrics, rows)
+    print(f"\nresults in {folder}")
+    return {
+        f"{role}/{name}": scores[name]
+        for role, scores in metrics["splits"].items()
+        for name in ("accuracy", "balanced_accuracy")
+        if scores[name] is not None
+    }
+
+
+def _run_fold(
+    config: DictConfig, folder: Path, data: SlipDataModule, learner: SlipLearner
+) -> dict[str, Any]:
+    """Fit, test, save and export one fold; what it found."""
+    source = data.maker.source
+    trainer = make_trainer(config.trainer, folder, source, [SaveAfterPass(folder)])
+    trainer.fit(learner, datamodule=data, ckpt_path=config.ckpt_path, weights_only=True)
+    started = time.perf_counter()
+    trainer.test(learner, datamodule=data, verbose=False)
+    tested = time.perf_counter()
+    assert learner.detector is not None  # fit makes it
+    detector = learner.detector
+    detector.info |= {
+        "simulated": source.is_simulated,
+        "experiment": config.name,
+        "seed": config.seed,
+        "split": data.split.name,
+        "train_recordings": [str(recording) for recording in data.split.having("train")],
+    }
+    detector.save(folder / "detector.pt")
+    if config.export:
+        export_onnx(detector, folder / "model.onnx")
+    seconds = dict(learner.seconds)
+    seconds |= {"test_pass": tested - started, "save_export": time.perf_counter() - tested}
+    return {
+        **learner.metrics,
+        **learner.facts,
+        "selected": [str(name) for name in detector.selected_names],
+        "timing_s": seconds,
+        "worker_s": learner.worker_seconds,
+    }
+
+
+def _combined(folds: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """One fold as it is; of several, confusions are summed and the shared selection is named."""
+    if len(folds) == 1:
+        return next(iter(folds.values()))
+    parts = list(folds.values())
+    roles = list(dict.fromkeys(role for part in parts for role in part["splits"]))
+    shared = set.intersection(*(set(part["selected"]) for part in parts))
+    return {
+        "splits": {
+            role: merged_metrics([p["splits"][role] for p in parts if role in p["splits"]])
+            for role in roles
+        },
+        "selected": [name for name in parts[0]["selected"] if name in shared],
+        "timing_s": _summed([part.pop("timing_s") for part in parts]),
+        "worker_s": _summed([part.pop("worker_s") for part in parts]),
+        "folds": folds,
+    }
+
+
+def _summed(parts: list[dict[str, float]]) -> dict[str, float]:
+    total: dict[str, float] = {}
+    for part in parts:
+        for stage, seconds in part.items():
+            total[stage] = total.get(stage, 0.0) + seconds
+    return total
+
+
+@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="train")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    with errors_in_one_line():
+        train(config, Path(HydraConfig.get().runtime.output_dir))
+
+
+if __name__ == "__main__":
+    run_entry_point(main)
