@@ -72,7 +72,7 @@ def simulate(
     volts = np.full((len(scene.hand), truth.num_samples), np.nan)
     if wanted and indices:
         grid = _covering_grid(scene, wanted)
-        rows = _kinematic(scene, plan, grasp, slipping, grid, indices)
+        rows = _RUNGS[scene.fidelity](scene, plan, grasp, slipping, grid, indices)
         for index in indices:
             _place(volts[index], rows[index], grid, wanted)
     return Recording(
@@ -114,6 +114,10 @@ def _kinematic(
                 felt = film_volts(scene, grid, friction_n, vibration)
             volts[index] += front.gain[index] * felt
     return {index: front_end(scene, front, index, grid, volts[index]) for index in indices}
+
+
+_RUNGS = {"kinematic": _kinematic}
+"""What computes each of ``FIDELITIES``: truth, windows and front end are shared by all rungs."""
 
 
 def _wanted_samples(
