@@ -1,0 +1,146 @@
+"""Scores of one split, counted per bin: confusion, accuracy and recalls, in JSON-safe values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def confusion_matrix(is_slip_true: Tensor, is_slip_predicted: Tensor) -> list[list[int]]:
+    """Number of bins by truth and prediction.
+
+    Returns ``[[non-slip as non-slip, non-slip as slip], [slip as non-slip, slip as slip]]``:
+    truth by row, prediction by column, non-slip first. No bins give zeros.
+
+    Shape:
+        - is_slip_true, is_slip_predicted: ``[N]``, bool
+
+    Raises:
+        ValueError: if the two are not bool vectors of one length.
+
+    Example:
+        >>> truth = torch.tensor([False, False, True, True, True])
+        >>> confusion_matrix(truth, torch.tensor([False, True, True, True, False]))
+        [[1, 1], [1, 2]]
+    """
+    for name, flags in (("is_slip_true", is_slip_true), ("is_slip_predicted", is_slip_predicted)):
+        if flags.dtype != torch.bool or flags.ndim != 1:
+            raise ValueError(f"{name} must be [N] bool, got {tuple(flags.shape)} {flags.dtype}")
+    if is_slip_true.shape != is_slip_predicted.shape:
+        raise ValueError(
+            "truth and prediction must have one length, "
+            f"got {len(is_slip_true)} and {len(is_slip_predicted)} bins"
+        )
+    cells = torch.bincount(2 * is_slip_true.long() + is_slip_predicted.long(), minlength=4)
+    (quiet_right, false_slip, missed_slip, slip_right) = cells.tolist()
+    return [[quiet_right, false_slip], [missed_slip, slip_right]]
+
+
+def split_metrics(confusion: Sequence[Sequence[int]]) -> dict[str, Any]:
+    """Scores of a confusion matrix, as fractions.
+
+    Returns ``accuracy``, ``balanced_accuracy`` (mean of the two recalls), ``non_slip_recall``,
+    ``slip_recall``, ``confusion`` and ``num_bins``. The recall of a class without bins is None,
+    and so is balanced accuracy then: a missing class is no perfect score.
+
+    Args:
+        confusion: as ``confusion_matrix`` returns it.
+
+    Example:
+        >>> split_metrics([[3, 1], [0, 4]])["balanced_accuracy"]
+        0.875
+        >>> split_metrics([[0, 0], [1, 3]])["balanced_accuracy"] is None
+        True
+    """
+    (quiet_right, false_slip), (missed_slip, slip_right) = confusion
+    num_bins = quiet_right + false_slip + missed_slip + slip_right
+    non_slip_recall = _ratio(quiet_right, quiet_right + false_slip)
+    slip_recall = _ratio(slip_right, missed_slip + slip_right)
+    balanced = None
+    if non_slip_recall is not None and slip_recall is not None:
+        balanced = (non_slip_recall + slip_recall) / 2
+    return {
+        "accuracy": _ratio(quiet_right + slip_right, num_bins),
+        "balanced_accuracy": balanced,
+        "non_slip_recall": non_slip_recall,
+        "slip_recall": slip_recall,
+        "confusion": [list(row) for row in confusion],
+        "num_bins": num_bins,
+    }
+
+
+def bin_metrics(
+    is_slip_true: Tensor,
+    is_slip_predicted: Tensor,
+    materials: Sequence[str],
+    speeds_mm_s: Sequence[float],
+) -> dict[str, Any]:
+    """Scores of a split: of all its bins, of each material, and of each stroke speed.
+
+    Returns what ``split_metrics`` returns plus ``per_material`` (in order of appearance) and
+    ``per_speed`` (slowest first; keys ``"20"``, ``"40"``, ...), each a dict of such scores.
+
+    Args:
+        is_slip_true: what each bin is.
+        is_slip_predicted: what the detector calls it.
+        materials: the material of each bin.
+        speeds_mm_s: the steady speed of the stroke each bin belongs to.
+
+    Shape:
+        - all four: ``[N]``
+
+    Raises:
+        ValueError: if the lengths differ or the tensors are not bool vectors.
+    """
+    whole = split_metrics(confusion_matrix(is_slip_true, is_slip_predicted))
+    num_bins = whole["num_bins"]
+    for name, labels in (("materials", materials), ("speeds_mm_s", speeds_mm_s)):
+        if len(labels) != num_bins:
+            raise ValueError(f"{name} must have one entry per bin, {num_bins}, got {len(labels)}")
+
+    def by_group(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
+        members: dict[str, list[int]] = {}
+        for position, label in enumerate(labels):
+            members.setdefault(label, []).append(position)
+        return {
+            label: split_metrics(confusion_matrix(is_slip_true[rows], is_slip_predicted[rows]))
+            for label, rows in members.items()
+        }
+
+    per_speed = by_group(f"{float(speed):g}" for speed in speeds_mm_s)
+    return {
+        **whole,
+        "per_material": by_group(materials),
+        "per_speed": {key: per_speed[key] for key in sorted(per_speed, key=float)},
+    }
+
+
+def merged_metrics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Scores of all bins of several ``bin_metrics`` together, from their summed confusions.
+
+    Example:
+        >>> half = {**split_metrics([[1, 0], [0, 1]]), "per_material": {}, "per_speed": {}}
+        >>> merged_metrics([half, half])["confusion"]
+        [[2, 0], [0, 2]]
+    """
+
+    def summed(members: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+        confusions = [torch.tensor(member["confusion"]) for member in members]
+        return split_metrics(torch.stack(confusions).sum(0).tolist())
+
+    groups: dict[str, dict[str, Any]] = {}
+    for kind in ("per_material", "per_speed"):
+        labels = dict.fromkeys(label for part in parts for label in part[kind])
+        groups[kind] = {
+            label: summed(part[kind][label] for part in parts if label in part[kind])
+            for label in labels
+        }
+    return {**summed(parts), **groups}
+
+
+def _ratio(part: int, whole: int) -> float | None:
+    """``part / whole``; None, JSON's null, where there is nothing to divide by."""
+    return part / whole if whole else None

@@ -1,0 +1,144 @@
+"""Tables for the terminal: plain aligned text, the paper's numbers beside ours.
+
+All of them read what ``metrics.json`` holds. Scores are printed in percent with two decimals,
+``-`` where there is none.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from tactslip_torch.report import published
+
+SIMULATED_LINE = "SIMULATED data: numbers of a simulated hand, not of the paper's"
+PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
+
+_SCORES = {
+    "accuracy": "accuracy %",
+    "balanced_accuracy": "balanced %",
+    "non_slip_recall": "non-slip %",
+    "slip_recall": "slip %",
+}
+
+
+def splits_table(metrics: Mapping[str, Any]) -> str:
+    """Accuracy, balanced accuracy, both recalls and bins of each split, the paper's row below.
+
+    The first line says SIMULATED where the data is.
+
+    Args:
+        metrics: the content of ``metrics.json``.
+    """
+    rows = []
+    for name, scores in metrics["splits"].items():
+        rows.append([name, *_score_cells(scores), str(scores["num_bins"])])
+        if name in published.SPLITS:
+            rows.append(["  paper", *_score_cells(vars(published.SPLITS[name])), "-"])
+    return _titled(metrics, _aligned(["split", *_SCORES.values(), "bins"], rows), PAPER_LINE)
+
+
+def materials_table(metrics: Mapping[str, Any]) -> str:
+    """The same scores within each split for each material and each stroke speed.
+
+    Args:
+        metrics: the content of ``metrics.json``.
+    """
+    rows = []
+    for name, split in metrics["splits"].items():
+        groups = dict(split.get("per_material", {}))
+        groups |= {f"{speed} mm/s": of for speed, of in split.get("per_speed", {}).items()}
+        for position, (group, scores) in enumerate(groups.items()):
+            first = name if position == 0 else ""
+            rows.append([first, group, *_score_cells(scores), str(scores["num_bins"])])
+    header = ["split", "group", *_SCORES.values(), "bins"]
+    return _titled(metrics, _aligned(header, rows, num_left=2))
+
+
+def timing_table(timing_s: Mapping[str, float]) -> str:
+    """Seconds of each stage and its share of the whole.
+
+    Args:
+        timing_s: seconds by stage. ``total`` is the whole if given, else their sum is.
+
+    Example:
+        >>> print(timing_table({"features": 30.0, "solve": 10.0}))
+        stage     seconds  share %
+        features    30.00    75.00
+        solve       10.00    25.00
+        total       40.00   100.00
+    """
+    stages = {name: float(value) for name, value in timing_s.items() if name != "total"}
+    total = float(timing_s.get("total", sum(stages.values())))
+    rows = [
+        [name, f"{seconds:.2f}", _percent(seconds / total if total else None)]
+        for name, seconds in [*stages.items(), ("total", total)]
+    ]
+    return _aligned(["stage", "seconds", "share %"], rows)
+
+
+def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
+    """How many selected features come from each kind, component, finger, domain, descriptor.
+
+    The paper's counts stand beside where it prints them; for descriptors it gives only an order,
+    so their column holds a rank such as ``#1``, and ``0`` for the two it never selects.
+
+    Args:
+        selected: one mapping per feature with ``channel``, ``component``, ``domain``,
+            ``descriptor``, ``kind`` and ``finger``.
+    """
+    by_finger: Counter[str] = Counter()
+    for counts in published.SELECTED_BY_FINGER.values():
+        by_finger.update(counts)
+    ranks = {name: f"#{rank}" for rank, name in enumerate(published.DESCRIPTORS_RANKED, 1)}
+    ranks |= dict.fromkeys(published.DESCRIPTORS_NEVER, "0")
+    beside: dict[str, Mapping[str, object]] = {
+        "kind": published.SELECTED_BY_KIND,
+        "component": {"D1": 0},
+        "finger": by_finger,
+        "domain": {},
+        "descriptor": ranks,
+    }
+    rows = []
+    for key, of_paper in beside.items():
+        ours = Counter(feature[key] for feature in selected)
+        for position, (value, count) in enumerate(_most_common(ours, of_paper)):
+            first = key if position == 0 else ""
+            rows.append([first, value, str(count), str(of_paper.get(value, "-"))])
+    rows.append(["all", "", str(len(selected)), str(published.NUM_SELECTED)])
+    table = _aligned(["selected by", "", "ours", "paper"], rows, num_left=2)
+    return (
+        f"{table}\npaper, in words: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
+    )
+
+
+def _most_common(ours: Counter[str], of_paper: Iterable[str]) -> list[tuple[str, int]]:
+    """Our counts, largest first, then what only the paper has, with 0."""
+    return ours.most_common() + [(name, 0) for name in of_paper if name not in ours]
+
+
+def _score_cells(scores: Mapping[str, Any]) -> list[str]:
+    return [_percent(scores[key]) for key in _SCORES]
+
+
+def _percent(fraction: float | None) -> str:
+    return "-" if fraction is None else f"{100 * fraction:.2f}"
+
+
+def _titled(metrics: Mapping[str, Any], table: str, *notes: str) -> str:
+    """The table under the line that no simulated number may be printed without."""
+    return "\n".join([*([SIMULATED_LINE] if metrics["simulated"] else []), table, *notes])
+
+
+def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]], num_left: int = 1) -> str:
+    """Columns padded to their widest cell: ``num_left`` flush left, the others flush right."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    lines = []
+    for row in [header, *rows]:
+        cells = [
+            cell.ljust(width) if position < num_left else cell.rjust(width)
+            for position, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
