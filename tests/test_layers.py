@@ -1,0 +1,256 @@
+"""Which module may import which (STYLE.md part 2): the table below, held against the sources."""
+
+import ast
+import sys
+from collections.abc import Iterable, Mapping
+from fnmatch import fnmatchcase
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "tactslip_torch"
+ROOT = Path(__file__).parents[1] / PACKAGE
+MAX_LINES = 300
+
+# Importer: what of ours it may import. "room.*" is every module of a room and its public names,
+# "*" is everything. A module matches exactly one line, so a new room has to be declared here.
+ARROWS: dict[str, tuple[str, ...]] = {
+    "hand": (),
+    "files": (),
+    "progress": (),
+    "data.recording": (),
+    "data.labels": ("data.recording",),
+    "data.splits": ("data.recording",),
+    "simulation.*": ("hand", "data.recording", "simulation.*"),
+    "signals.*": (),
+    "features.descriptors": (),
+    "features.selection": (),
+    "features.pool": ("signals.*", "features.descriptors", "hand"),
+    "features.cache": (),
+    "model.kernel_elm": ("model.quadratic", "model.scaling", "model.fit"),
+    "model.quadratic": ("model.kernel_elm", "model.scaling", "model.fit"),
+    "model.scaling": ("model.kernel_elm", "model.quadratic", "model.fit"),
+    "model.fit": ("model.kernel_elm", "model.quadratic", "model.scaling"),
+    "model.threshold": (),
+    "model.detector": ("features.*", "signals.*", "model.*", "hand"),
+    "report.*": ("report.*",),
+    "datamodule": ("data.*", "simulation.*", "signals.*", "features.*", "hand"),
+    "recipe": ("model.*", "features.*", "data.recording"),
+    "learning": ("model.*", "features.*", "report.*"),
+    "train": ("*",),
+    "evaluate": ("*",),
+    "export": ("*",),
+    "config": ("*",),
+}
+
+# Packages of others that only these modules may import.
+ONLY_IN: dict[str, tuple[str, ...]] = {
+    "hydra": ("train", "evaluate", "export", "config"),
+    "omegaconf": ("train", "evaluate", "export", "config"),
+    "lightning": ("datamodule", "learning", "train", "evaluate", "progress"),
+    "pytorch_lightning": (),
+    "ptwt": ("signals.wavelet",),
+    "pywt": ("signals.wavelet",),
+    "matplotlib": ("report.figures",),
+}
+
+# These need torch and the standard library alone.
+TORCH_ALONE = (
+    "features.selection",
+    "model.kernel_elm",
+    "model.quadratic",
+    "model.scaling",
+    "model.fit",
+    "model.threshold",
+)
+
+
+def modules_on_disk() -> dict[str, Path]:
+    """Every module of the package by its name without ``tactslip_torch.``; the top keeps it."""
+    found = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts) or PACKAGE] = path
+    return found
+
+
+def is_package(path: Path) -> bool:
+    return path.name == "__init__.py"
+
+
+def imports_of(
+    source: str, importer: str, modules: Iterable[str], *, package: bool = False
+) -> tuple[set[str], set[str]]:
+    """Modules of ours and packages of others that a source imports, wherever in it.
+
+    ``from a import b`` is module ``a.b`` if there is one, else ``a``.
+    """
+    known = set(modules)
+    here = [PACKAGE] + ([] if importer == PACKAGE else importer.split("."))
+    ours: set[str] = set()
+    others: set[str] = set()
+
+    def add(name: str, member: str = "") -> None:
+        if name.split(".")[0] != PACKAGE:
+            others.add(name.split(".")[0])
+            return
+        inner = name.removeprefix(PACKAGE).removeprefix(".")
+        whole = f"{inner}.{member}".strip(".")
+        ours.add(whole if whole in known else inner or PACKAGE)
+
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                add(alias.name)
+        elif isinstance(node, ast.ImportFrom):
+            up = node.level - (1 if package else 0)
+            start = here[: len(here) - up] if node.level else []
+            for alias in node.names:
+                add(".".join([*start, *filter(None, [node.module])]), alias.name)
+    return ours, others
+
+
+def is_allowed(name: str, patterns: Iterable[str]) -> bool:
+    return any(fnmatchcase(name, p) or name == p.removesuffix(".*") for p in patterns)
+
+
+def rules_for(module: str) -> list[str]:
+    return [pattern for pattern in ARROWS if fnmatchcase(module, pattern)]
+
+
+def violations(
+    source: str, importer: str, modules: Iterable[str], *, package: bool = False
+) -> list[str]:
+    """One line per import that the tables forbid; also if the module has not exactly one rule."""
+    ours, others = imports_of(source, importer, modules, package=package)
+    if package:  # a room's door shows what is inside; the front door shows anything
+        allowed: tuple[str, ...] = ("*",) if importer == PACKAGE else (f"{importer}.*",)
+    else:
+        rules = rules_for(importer)
+        if len(rules) != 1:
+            return [f"{importer} needs exactly one line in ARROWS, has {rules}"]
+        allowed = ARROWS[rules[0]]
+    found = [f"{importer} imports {name}" for name in sorted(ours) if not is_allowed(name, allowed)]
+    for name in sorted(others):
+        elsewhere = name in ONLY_IN and not is_allowed(importer, ONLY_IN[name])
+        too_much = importer in TORCH_ALONE and name not in {"torch", *sys.stdlib_module_names}
+        if elsewhere or too_much:
+            found.append(f"{importer} imports {name}")
+    return found
+
+
+def cycle_in(graph: Mapping[str, Iterable[str]]) -> list[str]:
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+# -------------------------------------------------------------------------------- the sources
+MODULES = modules_on_disk()
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_module_imports_only_what_it_may(module: str) -> None:
+    path = MODULES[module]
+    source = path.read_text(encoding="utf-8")
+    assert violations(source, module, MODULES, package=is_package(path)) == []
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_module_is_short(module: str) -> None:
+    num_lines = len(MODULES[module].read_text(encoding="utf-8").splitlines())
+    assert num_lines <= MAX_LINES, f"{module} has {num_lines} lines; it may hold two ideas"
+
+
+def test_no_import_cycle() -> None:
+    graph = {}
+    for module, path in MODULES.items():
+        source = path.read_text(encoding="utf-8")
+        graph[module] = imports_of(source, module, MODULES, package=is_package(path))[0]
+    assert cycle_in(graph) == []
+
+
+def test_the_package_was_found() -> None:
+    assert {PACKAGE, "hand", "report", "report.scores"} <= set(MODULES)
+
+
+def test_no_room_has_two_rules() -> None:
+    # "a.*" and "a.b" would both claim a.b
+    assert [name for name in ARROWS if "*" not in name and len(rules_for(name)) != 1] == []
+
+
+# -------------------------------------------------------------------------------- the checker
+HOUSE = [PACKAGE, "hand", "data", "data.recording", "signals", "signals.filtering"]
+HOUSE += ["model", "model.fit", "model.detector", "features", "features.pool", "report.scores"]
+
+
+@pytest.mark.parametrize(
+    ("importer", "source", "forbidden"),
+    [
+        ("signals.filtering", "from tactslip_torch.model.fit import fit", "model.fit"),
+        ("signals.filtering", "from tactslip_torch.model import fit", "model.fit"),
+        ("signals.filtering", "import tactslip_torch.model.fit as f", "model.fit"),
+        ("signals.filtering", "from ..model import fit", "model.fit"),
+        ("signals.filtering", "from .. import hand", "hand"),
+        ("signals.filtering", "from . import binning", "signals"),
+        ("signals.filtering", "def f():\n    from tactslip_torch import hand", "hand"),
+        ("hand", "from tactslip_torch import __version__", PACKAGE),
+        ("hand", "import tactslip_torch", PACKAGE),
+        ("simulation.scene", "from tactslip_torch.data import Recording", "data"),
+        (
+            "features.pool",
+            "from tactslip_torch.model.detector import SlipDetector",
+            "model.detector",
+        ),
+        ("report.tables", "from tactslip_torch.hand import HandLayout", "hand"),
+        ("learning", "import tactslip_torch.datamodule", "datamodule"),
+        ("learning", "from hydra.utils import instantiate", "hydra"),
+        ("model.detector", "import lightning as L", "lightning"),
+        ("features.pool", "import ptwt", "ptwt"),
+        ("model.fit", "import os, math, torch, numpy.linalg", "numpy"),
+    ],
+)
+def test_checker_finds_a_forbidden_import(importer: str, source: str, forbidden: str) -> None:
+    modules = [*HOUSE, "datamodule"]
+    assert violations(source, importer, modules) == [f"{importer} imports {forbidden}"]
+
+
+@pytest.mark.parametrize(
+    ("importer", "source"),
+    [
+        ("signals.filtering", "import math\nimport torch\nfrom torch import nn"),
+        ("signals.wavelet", "from ptwt.conv_transform import wavedec"),
+        ("simulation.scene", "from tactslip_torch.data.recording import Recording"),
+        ("simulation.scene", "from .motion import Motion\nfrom ..hand import HandLayout"),
+        ("model.detector", "from tactslip_torch.features import FeaturePool"),
+        ("train", "import hydra, lightning, tactslip_torch\nfrom tactslip_torch.model import fit"),
+        ("learning", "from tactslip_torch.report.scores import bin_metrics\nimport lightning"),
+    ],
+)
+def test_checker_lets_an_allowed_import_pass(importer: str, source: str) -> None:
+    assert violations(source, importer, [*HOUSE, "simulation.motion"]) == []
+
+
+def test_checker_on_the_doors_of_rooms() -> None:
+    source = "from .filtering import ChannelFilter"
+    assert violations(source, "signals", HOUSE, package=True) == []
+    assert imports_of(source, "signals", HOUSE, package=True)[0] == {"signals.filtering"}
+    source = "from tactslip_torch.hand import HandLayout"
+    assert violations(source, "signals", HOUSE, package=True) == ["signals imports hand"]
+    assert violations(source, PACKAGE, HOUSE, package=True) == []
+    assert imports_of("from .model.fit import fit", PACKAGE, HOUSE, package=True)[0] == {
+        "model.fit"
+    }
+
+
+def test_checker_wants_new_rooms_declared() -> None:
+    assert violations("", "cellar", HOUSE) == ["cellar needs exactly one line in ARROWS, has []"]
+    assert violations("", "model.attic", HOUSE) != []
+
+
+def test_checker_finds_a_cycle() -> None:
+    assert cycle_in({"a": ["b"], "b": ["c"], "c": []}) == []
+    assert set(cycle_in({"a": ["b"], "b": ["c"], "c": ["a"]})) == {"a", "b", "c"}
