@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-import tactslip_torch
 from tactslip_torch.data.labels import (
     LabelledBins,
     LabelRule,
@@ -98,7 +97,7 @@ class FeatureMaker:
         self.rule = rule
         self.cache = cache
         self.dtype = dtype
-        self._code = source_digest(Path(tactslip_torch.__file__).parent)
+        self._code = source_digest(Path(__file__).parent)
 
     def __call__(self, recording: RecordingId, split: Split) -> RecordingFeatures:
         """Features, labels and roles of one recording.

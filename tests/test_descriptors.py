@@ -14,8 +14,8 @@ from tactslip_torch.features.descriptors import (
     TIME_DESCRIPTORS,
     band_energy_ratio,
     describe,
-    settle,
 )
+from tactslip_torch.features.sample import settle
 
 EVERY = (*TIME_DESCRIPTORS, "spectral_centroid", "spectral_spread")
 UNSMOOTH = ("mode", "entropy")

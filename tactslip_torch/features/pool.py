@@ -17,9 +17,8 @@ from tactslip_torch.features.descriptors import (
     TIME_DESCRIPTORS,
     band_energy_ratio,
     describe,
-    is_constant,
-    settle,
 )
+from tactslip_torch.features.sample import is_constant, settle
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names

@@ -7,7 +7,6 @@ paper published is hatched.
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import FancyBboxPatch
 from matplotlib.ticker import MaxNLocator
 
+from tactslip_torch.files import whole_file
 from tactslip_torch.report import published
 
 _KIND_COLOURS = {"SG": "#E69F00", "PVDF": "#0072B2"}
@@ -288,11 +288,5 @@ def _percent(fraction: float | None) -> str:
 
 
 def _save(figure: Figure, path: str | Path) -> None:
-    """Write next to ``path`` first, then put in its place: no half a figure is ever seen."""
-    path = Path(path)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with whole_file(path) as unfinished:
         figure.savefig(unfinished, format="png", dpi=180, facecolor="white")
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
