@@ -61,7 +61,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
         for fold in folds:
             _warn_of_overlap(detector, fold, config)
             learner = SlipLearner(detector.pool, filters, detector=detector)
-            trainer = make_trainer(config.trainer, folder, source)
+            trainer = make_trainer(config.trainer, folder)
             data = SlipDataModule(maker, fold, config.num_workers)
             trainer.test(learner, datamodule=data, verbose=False)
             parts[fold.name] = learner.metrics["splits"]

@@ -81,14 +81,12 @@ def feature_cache(setting: str) -> Iterator[FeatureCache]:
 def make_trainer(
     config: DictConfig,
     folder: Path,
-    source: RecordingSource,
     callbacks: Sequence[L.Callback] = (),
 ) -> L.Trainer:
     """The Lightning trainer of the ``trainer`` section, logging to TensorBoard and CSV."""
     # Lightning's advertisements and a deprecation inside it are nothing a user can act on
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).*")
-    verb = "simulate, features" if source.is_simulated else "read, features"
     trainer: L.Trainer = instantiate(
         config,
         default_root_dir=str(folder),
@@ -96,7 +94,7 @@ def make_trainer(
             TensorBoardLogger(str(folder), name="", version="tensorboard"),
             CSVLogger(str(folder), name="", version="csv"),
         ],
-        callbacks=[RecordingProgressBar(verb), *callbacks],
+        callbacks=[RecordingProgressBar(), *callbacks],
         enable_checkpointing=False,
     )
     return trainer

@@ -8,6 +8,7 @@ neither.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from typing import Any, NamedTuple
 
 import lightning as L
@@ -72,6 +73,7 @@ class SlipLearner(L.LightningModule):
         self.metrics: dict[str, Any] = {}
         self.seconds: dict[str, float] = {}
         self.worker_seconds: dict[str, float] = {}
+        self._worked: dict[str, Counter[str]] = {}
         self._pass_started = 0.0
         self._moments = GroupedMoments(self.recipe, len(pool.names))
         self._columns: list[int] = []
@@ -184,6 +186,18 @@ class SlipLearner(L.LightningModule):
             self.pool, self.channel_filter, fitted.selected, fitted.scaler, fitted.head, self.facts
         )
 
+    def rates(self) -> dict[str, str]:
+        """How fast one worker goes through each stage it has met, for the progress bar."""
+        units = {"simulate": "recordings", "read": "recordings", "features": "bins"}
+        rates = {}
+        for stage, unit in (units | {"read_cache": "recordings"}).items():
+            if stage in self._worked:
+                rate = self._worked[stage][unit] / max(self.worker_seconds[stage], 1e-9)
+                rates[stage] = f"{rate:.0f} {unit}/s"
+        return rates
+
     def _count_seconds(self, batch: RecordingFeatures) -> None:
         for stage, seconds in batch.seconds.items():
             self.worker_seconds[stage] = self.worker_seconds.get(stage, 0.0) + seconds
+            done = self._worked.setdefault(stage, Counter())
+            done.update(recordings=1, bins=len(batch.is_slip))

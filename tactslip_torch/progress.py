@@ -8,7 +8,7 @@ from typing import Any
 from lightning.pytorch.callbacks import TQDMProgressBar
 from tqdm.auto import tqdm
 
-LEAD = 30
+LEAD = 31
 
 
 def bar(items: Iterable[Any], what: str, unit: str = "step") -> Iterable[Any]:
@@ -24,7 +24,7 @@ class RecordingProgressBar(TQDMProgressBar):
     """Lightning's bar, named after the pass that is running and counting recordings.
 
     Args:
-        verb: what making features includes, such as ``"simulate, features"``.
+        verb: what workers do, such as ``"features"``.
     """
 
     def __init__(self, verb: str = "features") -> None:
@@ -37,21 +37,30 @@ class RecordingProgressBar(TQDMProgressBar):
 
     def init_test_tqdm(self) -> Any:
         """The bar of the test pass."""
-        progress = self._named(super().init_test_tqdm())
-        progress.set_description_str(f"{self._verb + ', scores':{LEAD}}")
-        return progress
+        return self._named(super().init_test_tqdm())
 
     def on_train_epoch_start(self, trainer: Any, *args: Any) -> None:
         """Name the pass."""
         super().on_train_epoch_start(trainer, *args)
-        what = "moments" if trainer.current_epoch == 0 else "selected features"
-        self.train_progress_bar.set_description_str(f"{self._verb + ', ' + what:{LEAD}}")
+        what = "moments" if trainer.current_epoch == 0 else "selection"
+        self.train_progress_bar.set_description_str(self._stage(what))
 
-    def get_metrics(self, *args: Any) -> dict[str, Any]:
-        """Lightning's metrics without its version number."""
-        metrics = super().get_metrics(*args)
-        metrics.pop("v_num", None)
-        return dict(metrics)
+    def on_test_batch_start(self, *args: Any, **kwargs: Any) -> None:
+        """Name the pass; Lightning numbers its loaders instead."""
+        super().on_test_batch_start(*args, **kwargs)
+        self.test_progress_bar.set_description_str(self._stage("scores"))
+
+    def _stage(self, what: str) -> str:
+        return f"{self._verb + ', ' + what:{LEAD}}"
+
+    def get_metrics(self, trainer: Any, pl_module: Any) -> dict[str, Any]:
+        """The rate of each stage of making features, instead of Lightning's version number."""
+        return dict(pl_module.rates())
+
+    def on_test_batch_end(self, trainer: Any, pl_module: Any, *args: Any, **kwargs: Any) -> None:
+        """Show rates in the test pass as well."""
+        super().on_test_batch_end(trainer, pl_module, *args, **kwargs)
+        self.test_progress_bar.set_postfix(self.get_metrics(trainer, pl_module))
 
     @staticmethod
     def _named(progress: Any) -> Any:

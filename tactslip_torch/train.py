@@ -108,7 +108,7 @@ def _run_fold(
 ) -> dict[str, Any]:
     """Fit, test, save and export one fold; what it found."""
     source = data.maker.source
-    trainer = make_trainer(config.trainer, folder, source, [SaveAfterPass(folder)])
+    trainer = make_trainer(config.trainer, folder, [SaveAfterPass(folder)])
     trainer.fit(learner, datamodule=data, ckpt_path=config.ckpt_path, weights_only=True)
     started = time.perf_counter()
     trainer.test(learner, datamodule=data, verbose=False)

@@ -68,8 +68,7 @@ def mean_deviation(sample: Sample) -> Tensor:
 
 def std(sample: Sample) -> Tensor:
     """Standard deviation with ``n - 1`` in the denominator, ``[*]``."""
-    unbiased = (sample.variance * (sample.num / (sample.num - 1))).sqrt()
-    return torch.where(sample.is_flat, 0.0, sample.safe_span * unbiased)
+    return sample.safe_span * _relative_std(sample)
 
 
 def cv(sample: Sample) -> Tensor:
@@ -78,10 +77,12 @@ def cv(sample: Sample) -> Tensor:
     The mean's magnitude counts as at least 1e-6 of the rms (ours); 0 for a zero sample.
     """
     size = torch.where(sample.is_zero, 1.0, sample.magnitude)
-    relative_mean = mean(sample) / size
+    # the sign at a mean of exactly 0 needs the unscaled mean, denormals the scaled one
+    is_tiny = sample.magnitude < torch.finfo(sample.x.dtype).tiny / torch.finfo(sample.x.dtype).eps
+    relative_mean = torch.where(is_tiny, sample.by_magnitude.mean(-1), mean(sample) / size)
     floor = torch.maximum(relative_mean.abs(), CV_FLOOR * sample.rms)
     signed = torch.where(relative_mean < 0, -floor, floor)
-    return std(sample) / size / signed
+    return sample.safe_span / size * _relative_std(sample) / signed
 
 
 def iqr(sample: Sample) -> Tensor:
@@ -245,13 +246,21 @@ def _frequency_axis(sample: Sample) -> Tensor:
     return sample.frequency_hz.to(sample.x)
 
 
+def _relative_std(sample: Sample) -> Tensor:
+    """Standard deviation over the span, 0 for a constant, ``[*]``."""
+    unbiased = (sample.variance * (sample.num / (sample.num - 1))).sqrt()
+    return torch.where(sample.is_flat, 0.0, unbiased)
+
+
 def _hazen_quantile(sample: Sample, q: float) -> Tensor:
-    """Linear interpolation at the one-based position ``q n + 1/2``, ``[*]``."""
+    """Quantile above the minimum: linear at the one-based position ``q n + 1/2``, ``[*]``."""
     position = min(max(q * sample.num - 0.5, 0.0), sample.num - 1.0)
     below = int(position)
     above = min(below + 1, sample.num - 1)
     share = position - below
-    return sample.ordered[..., below] * (1 - share) + sample.ordered[..., above] * share
+    least = sample.ordered[..., 0]
+    low, high = sample.ordered[..., below] - least, sample.ordered[..., above] - least
+    return low * (1 - share) + high * share
 
 
 def _rank_in_run(is_boundary: Tensor) -> Tensor:

@@ -55,9 +55,11 @@ class ClassMoments:
         for index in (0, 1):
             chosen = features[labels.bool() == bool(index)].to("cpu", torch.float64)
             if len(chosen):
+                shifted = chosen - chosen[0]  # a constant has exactly its value and no spread
+                mean = shifted.mean(0)
                 fresh.count[index] = len(chosen)
-                fresh.mean[index] = chosen.mean(0)
-                fresh.sum_sq_dev[index] = (chosen - fresh.mean[index]).square().sum(0)
+                fresh.mean[index] = chosen[0] + mean
+                fresh.sum_sq_dev[index] = (shifted - mean).square().sum(0)
         merged = self.merge(fresh)
         self.count, self.mean, self.sum_sq_dev = merged.count, merged.mean, merged.sum_sq_dev
 

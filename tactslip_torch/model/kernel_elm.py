@@ -60,6 +60,7 @@ def solve_kernel_elm(
             f"expected gram [*, N, N] and targets [*, N] with one N, got {tuple(gram.shape)} "
             f"and {tuple(targets.shape)}"
         )
+    _check_weights(weights, targets)
     _check_penalty(penalty)
     if math.isinf(penalty):
         inverse: Tensor = torch.linalg.pinv(gram, hermitian=True)
@@ -93,6 +94,7 @@ def solve_primal(
             f"expected features [N, P] and targets [N], got {tuple(features.shape)} "
             f"and {tuple(targets.shape)}"
         )
+    _check_weights(weights, targets)
     weighted = features if weights is None else features * weights[:, None]
     return solve_normal_equations(features.mT @ weighted, weighted.mT @ targets, penalty)
 
@@ -122,6 +124,18 @@ def _cholesky_solve(system: Tensor, targets: Tensor, name: str, penalty: float) 
             "lower the penalty, scale the features, or solve in float64"
         )
     return torch.cholesky_solve(targets[..., None], factor).squeeze(-1)
+
+
+def _check_weights(weights: Tensor | None, targets: Tensor) -> None:
+    if weights is None:
+        return
+    if weights.shape != targets.shape:
+        raise ValueError(
+            f"weights must have one entry per bin, {tuple(targets.shape)}, "
+            f"got {tuple(weights.shape)}"
+        )
+    if not bool((weights > 0).all()):
+        raise ValueError(f"weights must be positive, got {float(weights.min()):g}")
 
 
 def _check_penalty(penalty: float) -> None:

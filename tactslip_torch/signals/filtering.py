@@ -73,8 +73,9 @@ def savgol_filter(x: Tensor, window_length: int, polyorder: int = 1) -> Tensor:
 
 def _convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
     """Correlate ``[*, T]`` with ``[W]``, keeping the ``T - W + 1`` full overlaps."""
-    flat = functional.conv1d(x.reshape(-1, 1, x.shape[-1]), kernel[None, None])
-    return flat.reshape(*x.shape[:-1], -1)
+    num_rows = x.shape[:-1].numel()
+    flat = functional.conv1d(x.reshape(num_rows, 1, x.shape[-1]), kernel[None, None])
+    return flat.reshape(*x.shape[:-1], flat.shape[-1])
 
 
 class ChannelFilter(nn.Module):

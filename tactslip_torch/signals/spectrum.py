@@ -30,6 +30,8 @@ def amplitude_spectrum(x: Tensor, method: SpectrumMethod = "reference") -> Tenso
     """
     num_samples = x.shape[-1]
     num_fft, scale = _transform(num_samples, method)
+    if not x.numel():  # the FFT refuses an empty batch
+        return x.new_zeros(*x.shape[:-1], len(scale))
     lines: Tensor = torch.fft.rfft(x, n=num_fft)[..., : len(scale)]
     return lines.abs() * scale.to(x)
 
