@@ -1,0 +1,93 @@
+"""A tiny set of recordings on a two-channel hand: fast, separable but not trivially, no simulator.
+
+Non-slip is noise; slip is a louder noise of a material's own colour. The level of every recording
+varies enough that some bins are on the wrong side.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.datamodule import FeatureMaker
+from tactslip_torch.features.cache import FeatureCache
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.hand import Channel, HandLayout
+from tactslip_torch.recipe import Recipe
+from tactslip_torch.signals.filtering import ChannelFilter
+
+SMALL_HAND = HandLayout(
+    (Channel("SG1", "SG", "index", "distal"), Channel("PVDF1", "PVDF", "index", "distal"))
+)
+RATE_HZ = 2000.0
+
+
+@dataclass(frozen=True)
+class SmallTimeline:
+    duration_s: float = 2.0
+    onsets_s: tuple[float, ...] = (1.1,)
+    annotated_onsets_s: tuple[float, ...] = (1.1,)
+    sliding_s: tuple[tuple[float, float], ...] = ((1.1, 1.95),)
+    speeds_mm_s: tuple[float, ...] = (20.0,)
+
+
+class SmallSet:
+    """A ``RecordingSource``; ``gains`` scales recordings, ``broken`` names one that holds a NaN."""
+
+    is_simulated = True
+    hand = SMALL_HAND
+    sample_rate_hz = RATE_HZ
+
+    def __init__(
+        self,
+        materials: Sequence[str] = ("a", "b", "c"),
+        cycles: int = 5,
+        gains: Mapping[RecordingId, float] | None = None,
+        broken: RecordingId | None = None,
+    ) -> None:
+        self.ids = tuple(RecordingId(m, c) for m in materials for c in range(cycles))
+        self.gains = dict(gains or {})
+        self.broken = broken
+        self.loads = 0
+
+    def timeline(self, recording: RecordingId) -> SmallTimeline:
+        return SmallTimeline()
+
+    def key(self, recording: RecordingId) -> dict[str, Any]:
+        gain = self.gains.get(recording, 1.0)
+        return {"id": str(recording), "gain": gain, "broken": recording == self.broken}
+
+    def load(
+        self, recording: RecordingId, windows: Sequence[tuple[float, float]] | None = None
+    ) -> Recording:
+        self.loads += 1
+        times = self.timeline(recording)
+        generator = torch.Generator().manual_seed(sum(str(recording).encode()) * 7919)
+        noise = torch.randn(2, round(times.duration_s * RATE_HZ), generator=generator)
+        onset = round(times.onsets_s[0] * RATE_HZ)
+        noise[:, onset:] *= 1.25 + 0.25 * torch.rand(1, generator=generator)
+        noise[0] += 1.0
+        noise = noise * self.gains.get(recording, 1.0)
+        if recording == self.broken:
+            noise[1, onset + 300] = torch.nan
+        return Recording(
+            noise,
+            RATE_HZ,
+            recording.material,
+            times.speeds_mm_s,
+            times.onsets_s,
+            times.sliding_s,
+        )
+
+
+def small_maker(source: SmallSet, cache: FeatureCache | None = None, **rule: Any) -> FeatureMaker:
+    return FeatureMaker(
+        source, FeaturePool(SMALL_HAND), ChannelFilter([51, 11]), LabelRule(**rule), cache
+    )
+
+
+def small_recipe(**changes: Any) -> Recipe:
+    return Recipe(**({"num_features": 10, "penalties": (0.1, 1.0), "fold_bins": 100} | changes))

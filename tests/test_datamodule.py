@@ -1,0 +1,122 @@
+import pytest
+import torch
+from small_set import RATE_HZ, SmallSet, small_maker
+
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.splits import random_bins, unseen4
+from tactslip_torch.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.features.cache import FeatureCache
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.signals.filtering import ChannelFilter, savgol_filter
+
+
+def split_of(source, **options):
+    return unseen4(source.ids, seen=["a", "b"], unseen=["c"], **options)[0]
+
+
+def test_features_are_those_of_the_filtered_bins():
+    source = SmallSet()
+    made = small_maker(source)(RecordingId("a", 1), split_of(source))
+    samples = source.load(RecordingId("a", 1)).samples.double()
+    filtered = torch.stack([savgol_filter(samples[0], 51), savgol_filter(samples[1], 11)])
+    edge = round((1.1 - 0.010) * RATE_HZ)
+    starts = [edge - 2000 + 100 * i for i in range(20)] + [edge + 100 * i for i in range(17)]
+    bins = torch.stack([filtered[:, s : s + 100] for s in starts])
+    torch.testing.assert_close(made.features, FeaturePool(source.hand)(bins).float())
+    assert made.is_slip.tolist() == [False] * 20 + [True] * 17
+    assert made.speed_mm_s.tolist() == [20.0] * 37
+
+
+def test_the_cache_saves_the_work_and_changes_nothing(tmp_path):
+    source = SmallSet()
+    maker = small_maker(source, FeatureCache(tmp_path))
+    first = maker(RecordingId("a", 0), split_of(source))
+    second = maker(RecordingId("a", 0), split_of(source))
+    assert source.loads == 1
+    assert torch.equal(first.features, second.features)
+    assert set(second.seconds) == {"read_cache"}
+
+
+def test_a_damaged_cache_entry_is_made_anew(tmp_path, caplog):
+    source = SmallSet()
+    maker = small_maker(source, FeatureCache(tmp_path))
+    first = maker(RecordingId("a", 0), split_of(source))
+    (path,) = tmp_path.glob("*/*.features")
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    again = maker(RecordingId("a", 0), split_of(source))
+    assert source.loads == 2
+    assert torch.equal(first.features, again.features)
+    assert "damaged" in caplog.text
+    assert path.read_bytes() != bytes(content)
+
+
+@pytest.mark.parametrize(
+    "change", [{"layout": "half_second"}, {"hop_ms": 25.0}, {"bin_ms": 50.0}], ids=str
+)
+def test_another_rule_is_another_cache_entry(tmp_path, change):
+    source = SmallSet()
+    cache = FeatureCache(tmp_path)
+    small_maker(source, cache)(RecordingId("a", 0), split_of(source))
+    small_maker(source, cache, **change)(RecordingId("a", 0), split_of(source))
+    assert source.loads == (1 if change == {"bin_ms": 50.0} else 2)
+
+
+def test_shuffled_labels_keep_their_counts_and_lose_their_order():
+    source = SmallSet()
+    plain = small_maker(source)(RecordingId("a", 0), split_of(source)).is_slip
+    maker = small_maker(source, shuffle_seed=3)
+    mixed = maker(RecordingId("a", 0), split_of(source)).is_slip
+    assert plain.sum() == mixed.sum()
+    assert not torch.equal(plain, mixed)
+    assert torch.equal(mixed, maker(RecordingId("a", 0), split_of(source)).is_slip)
+    assert not torch.equal(mixed, maker(RecordingId("a", 1), split_of(source)).is_slip)
+
+
+def test_a_sample_that_is_not_finite_is_named():
+    broken = RecordingId("b", 2)
+    source = SmallSet(broken=broken)
+    with pytest.raises(ValueError, match=r"b/2: channel PVDF1 is not finite near 1\.2\d+ s"):
+        small_maker(source)(broken, split_of(source))
+
+
+@pytest.mark.parametrize(
+    ("pool", "message"),
+    [
+        (
+            FeaturePool(HandLayout.paper24()),
+            r"expect 24 channels SG1..PVDF10, .* have 2 SG1..PVDF1",
+        ),
+        (FeaturePool(SmallSet.hand, 1000.0), r"expect 1000 Hz, the recordings have 2000 Hz"),
+        (
+            FeaturePool(SmallSet.hand, bin_samples=200),
+            r"bins of 200 samples, .*bin_ms=50 makes .*100",
+        ),
+    ],
+    ids=["channels", "rate", "bin"],
+)
+def test_parts_that_do_not_fit_are_refused(pool, message):
+    with pytest.raises(ValueError, match=message):
+        FeatureMaker(SmallSet(), pool, ChannelFilter([51, 11]), LabelRule())
+
+
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_loaders_give_the_recordings_of_their_roles_in_order(num_workers):
+    source = SmallSet()
+    data = SlipDataModule(small_maker(source), split_of(source), num_workers)
+    trained = [batch.recording for batch in data.train_dataloader()]
+    assert trained == data.split.having("train")
+    assert len(trained) == 8
+    assert [batch.recording for batch in data.test_dataloader()] == sorted(source.ids)
+
+
+def test_the_random_split_puts_bins_of_one_recording_on_both_sides():
+    source = SmallSet()
+    split = random_bins(source.ids, seen=["a", "b"])[0]
+    roles = small_maker(source)(RecordingId("a", 0), split).roles
+    assert roles["train"].any()
+    assert roles["test"].any()
+    assert torch.equal(roles["train"], ~roles["test"])

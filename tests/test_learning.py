@@ -1,0 +1,194 @@
+"""What the learner learns from, and that it learns from nothing else."""
+
+import lightning as L
+import pytest
+import torch
+from small_set import SmallSet, small_maker, small_recipe
+
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.splits import random_bins, seen6, unseen4
+from tactslip_torch.datamodule import SlipDataModule
+from tactslip_torch.learning import SlipLearner
+from tactslip_torch.simulation.source import SimulatedRecordings
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*isinstance.treespec, LeafSpec.*",
+    "ignore:The '.*_dataloader' does not have many workers",
+    "ignore:.*does not have many workers",
+)
+
+
+def trainer(**changes):
+    options = {
+        "accelerator": "cpu",
+        "max_epochs": 2,
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+    }
+    return L.Trainer(**(options | changes))
+
+
+def learn(source, split, maker=None, recipe=None):
+    maker = maker or small_maker(source)
+    data = SlipDataModule(maker, split, num_workers=0)
+    learner = SlipLearner(maker.pool, maker.channel_filter, recipe or small_recipe())
+    engine = trainer()
+    engine.fit(learner, datamodule=data)
+    engine.test(learner, datamodule=data, verbose=False)
+    return learner
+
+
+def unseen_c(source):
+    return unseen4(source.ids, seen=["a", "b"], unseen=["c"])[0]
+
+
+def learned_state(learner):
+    detector = learner.detector
+    return {
+        "selected": detector.selected,
+        "facts": learner.facts,
+        **detector.state_dict(),
+    }
+
+
+def assert_same(left, right):
+    assert left.keys() == right.keys()
+    for name, value in left.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, right[name]), name
+        else:
+            assert value == right[name], name
+
+
+def held_out_and_training():
+    source = SmallSet()
+    split = unseen_c(source)
+    return split.having("test", "unseen"), split.having("train")
+
+
+@pytest.mark.parametrize("place", range(3), ids=["a test cycle", "another", "an unseen material"])
+def test_held_out_recordings_change_nothing_that_is_learned(place):
+    held_out, _ = held_out_and_training()
+    chosen = [held_out[0], held_out[1], RecordingId("c", 3)][place]
+    assert chosen in held_out
+    plain, perturbed = SmallSet(), SmallSet(gains={chosen: 7.0})
+    before = learn(plain, unseen_c(plain))
+    after = learn(perturbed, unseen_c(perturbed))
+    assert_same(learned_state(before), learned_state(after))
+    assert before.metrics["splits"]["train"] == after.metrics["splits"]["train"]
+    assert before.metrics["splits"] != after.metrics["splits"]  # but it is judged by them
+
+
+def test_training_recordings_change_ranking_scaling_and_weights():
+    _, training = held_out_and_training()
+    plain, perturbed = SmallSet(), SmallSet(gains={training[0]: 7.0})
+    before = learned_state(learn(plain, unseen_c(plain)))
+    after = learned_state(learn(perturbed, unseen_c(perturbed)))
+    assert before["selected"] != after["selected"]
+    for name in ("scaler.maximum", "head.quadratic", "head.linear"):
+        assert not torch.equal(before[name], after[name]), name
+    assert before["facts"]["validation"] != after["facts"]["validation"]
+
+
+def test_held_out_bins_of_the_random_split_are_not_learned_from():
+    source = SmallSet()
+    split = random_bins(source.ids, seen=["a", "b", "c"])[0]
+    maker = small_maker(source)
+    before = learn(source, split, maker)
+
+    class Perturbed(type(maker)):
+        def __call__(self, recording, split):
+            made = super().__call__(recording, split)
+            noisy = torch.where(made.roles["test"][:, None], -9.0, made.features)
+            return made._replace(features=noisy)
+
+    after = learn(source, split, Perturbed(source, maker.pool, maker.channel_filter, maker.rule))
+    assert_same(learned_state(before), learned_state(after))
+    assert before.metrics["splits"]["test"] != after.metrics["splits"]["test"]
+
+
+def test_metrics_count_every_bin_once_in_its_role():
+    source = SmallSet()
+    splits = learn(source, unseen_c(source)).metrics["splits"]
+    assert {role: s["num_bins"] for role, s in splits.items()} == {
+        "train": 8 * 37,
+        "test": 2 * 37,
+        "unseen": 5 * 37,
+    }
+    assert list(splits["unseen"]["per_material"]) == ["c"]
+    assert list(splits["train"]["per_speed"]) == ["20"]
+
+
+def test_the_detector_judges_filtered_bins_as_the_test_did():
+    source = SmallSet()
+    learner = learn(source, unseen_c(source))
+    maker = small_maker(source)
+    right = total = 0
+    for recording in unseen_c(source).having("unseen"):
+        bins, labels = maker.filtered_bins(recording)
+        right += int(((learner.detector(bins) >= 0) == labels.is_slip).sum())
+        total += len(bins)
+    assert learner.metrics["splits"]["unseen"]["accuracy"] == pytest.approx(right / total)
+
+
+def test_a_finished_pass_survives_a_checkpoint(tmp_path):
+    source = SmallSet()
+    split = unseen_c(source)
+    maker = small_maker(source)
+    data = SlipDataModule(maker, split, num_workers=0)
+    whole = learn(source, split, maker)
+
+    first = SlipLearner(maker.pool, maker.channel_filter, small_recipe())
+    half = trainer(max_epochs=1)
+    half.fit(first, datamodule=data)
+    assert first.detector is None
+    half.save_checkpoint(tmp_path / "half.ckpt")
+
+    second = SlipLearner(maker.pool, maker.channel_filter, small_recipe())
+    engine = trainer()
+    engine.fit(second, datamodule=data, ckpt_path=tmp_path / "half.ckpt", weights_only=True)
+    assert "moments_pass" not in second.seconds
+    assert_same(learned_state(whole), learned_state(second))
+
+
+def test_a_test_without_a_detector_is_refused():
+    source = SmallSet()
+    maker = small_maker(source)
+    learner = SlipLearner(maker.pool, maker.channel_filter)
+    with pytest.raises(ValueError, match="nothing to test"):
+        trainer().test(learner, datamodule=SlipDataModule(maker, unseen_c(source), 0))
+
+
+def test_shuffled_labels_are_not_learned():
+    source = SmallSet(cycles=30)
+    split = seen6(source.ids, seen=["a", "b", "c"])[0]
+    honest = learn(source, split).metrics["splits"]["test"]["balanced_accuracy"]
+    shuffled = learn(source, split, small_maker(source, shuffle_seed=1))
+    judged = shuffled.metrics["splits"]["test"]
+    # 666 bins, independent labels: a standard deviation of 2 %
+    assert judged["num_bins"] == 18 * 37
+    assert abs(judged["balanced_accuracy"] - 0.5) < 0.08
+    assert honest > 0.75
+
+
+@pytest.mark.slow
+def test_on_the_simulated_hand_the_score_is_neither_trivial_nor_perfect(tmp_path):
+    from tactslip_torch.data.labels import LabelRule
+    from tactslip_torch.datamodule import FeatureMaker
+    from tactslip_torch.features.cache import FeatureCache
+    from tactslip_torch.features.pool import FeaturePool
+    from tactslip_torch.recipe import Recipe
+    from tactslip_torch.signals.filtering import ChannelFilter
+
+    source = SimulatedRecordings(cycles=4, materials=["M1", "M2", "M3", "M4", "M5", "M6"])
+    pool = FeaturePool(source.hand)
+    frames = [51 if channel.kind == "SG" else 11 for channel in source.hand.channels]
+    cache = FeatureCache(tmp_path)
+    maker = FeatureMaker(source, pool, ChannelFilter(frames), LabelRule(), cache)
+    split = seen6(source.ids, seen=["M1", "M2", "M3", "M4", "M5", "M6"])[0]
+    learner = learn(source, split, maker, Recipe(penalties=(0.1, 1.0), fold_bins=600))
+    ours = learner.metrics["splits"]["test"]["balanced_accuracy"]
+    rival = learner.metrics["baselines"]["best_single_feature"]["splits"]["test"]
+    assert rival["balanced_accuracy"] < ours < 1.0
