@@ -1,0 +1,300 @@
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactslip_torch import FeaturePool, HandLayout, Recording
+from tactslip_torch.data.labels import LabelRule, label_bins, needed_windows, shuffled
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.datamodule import FeatureMaker
+from tactslip_torch.signals.binning import bins_at
+from tactslip_torch.signals.filtering import ChannelFilter
+
+RATE = 2000.0
+ONSETS = (2.0, 9.0, 13.5)  # REFERENCE.md section 1, with slides of 100 mm at 20, 40, 60 mm/s
+SLIDES = ((2.0, 7.0), (9.0, 11.5), (13.5, 13.5 + 100 / 60))
+DURATION = 15.5
+
+
+def lay(rule=None, onsets=ONSETS, slides=SLIDES, duration_s=DURATION, rate=RATE):
+    return label_bins(rule or LabelRule(), onsets, slides, duration_s, rate)
+
+
+def of_stroke(bins, stroke, is_slip):
+    return bins.starts[(bins.stroke == stroke) & (bins.is_slip == is_slip)].tolist()
+
+
+# Layouts -------------------------------------------------------------------------------------
+
+
+def test_whole_slide_has_the_published_counts():
+    bins = lay()
+    assert int((~bins.is_slip).sum()) == 60
+    assert int(bins.is_slip.sum()) == 183
+    for stroke, num_slip in enumerate((100, 50, 33)):
+        assert len(of_stroke(bins, stroke, False)) == 20
+        assert len(of_stroke(bins, stroke, True)) == num_slip
+    assert bins.bin_samples == 100
+
+
+def test_whole_slide_moves_the_onset_ten_milliseconds_earlier():
+    bins = lay()
+    for stroke, (onset, (_, end)) in enumerate(zip(ONSETS, SLIDES, strict=True)):
+        before, after = of_stroke(bins, stroke, False), of_stroke(bins, stroke, True)
+        edge = onset - 0.010
+        np.testing.assert_allclose(before, (edge - 1 + 0.05 * np.arange(20)) * RATE, atol=1e-6)
+        np.testing.assert_allclose(after, (edge + 0.05 * np.arange(len(after))) * RATE, atol=1e-6)
+        assert (after[-1] + 100) / RATE <= end < (after[-1] + 200) / RATE
+
+
+def test_half_second_has_ten_and_ten_without_a_shift():
+    bins = lay(LabelRule(layout="half_second"))
+    assert len(bins.starts) == 60
+    for stroke, onset in enumerate(ONSETS):
+        before, after = of_stroke(bins, stroke, False), of_stroke(bins, stroke, True)
+        np.testing.assert_allclose(before, (onset - 0.5 + 0.05 * np.arange(10)) * RATE, atol=1e-6)
+        np.testing.assert_allclose(after, (onset + 0.05 * np.arange(10)) * RATE, atol=1e-6)
+
+
+def test_half_second_ignores_when_the_slide_ends():
+    shorter = tuple((start, end - 1) for start, end in SLIDES)
+    rule = LabelRule(layout="half_second")
+    assert torch.equal(lay(rule).starts, lay(rule, slides=shorter).starts)
+    assert len(lay(slides=shorter).starts) == 60 + 80 + 30 + 13
+
+
+@pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
+def test_a_hop_of_half_a_bin_doubles_the_bins_but_one(layout):
+    plain = lay(LabelRule(layout=layout))
+    dense = lay(LabelRule(layout=layout, hop_ms=25.0))
+    assert dense.bin_samples == 100
+    for stroke in range(3):
+        for is_slip in (False, True):
+            every = of_stroke(dense, stroke, is_slip)
+            assert every[::2][: len(of_stroke(plain, stroke, is_slip))] == of_stroke(
+                plain, stroke, is_slip
+            )
+            assert set(np.diff(every)) == {50}
+    assert len(of_stroke(dense, 0, False)) == 2 * len(of_stroke(plain, 0, False)) - 1
+
+
+def test_a_hop_longer_than_a_bin_leaves_gaps():
+    bins = lay(LabelRule(hop_ms=100.0))
+    assert len(of_stroke(bins, 0, False)) == 10
+    assert set(np.diff(of_stroke(bins, 0, True))) == {200}
+
+
+def test_bin_length_and_rate_scale_together():
+    bins = lay(LabelRule(bin_ms=25.0), rate=1000.0)
+    assert bins.bin_samples == 25
+    assert len(of_stroke(bins, 0, False)) == 40
+    assert of_stroke(bins, 0, True)[0] == 1990
+
+
+@given(
+    onset=st.floats(1.1, 3.0),
+    length=st.floats(0.0, 4.0),
+    hop_ms=st.sampled_from([None, 10.0, 50.0, 70.0]),
+)
+def test_no_bin_straddles_the_onset_or_the_end(onset, length, hop_ms):
+    bins = lay(LabelRule(hop_ms=hop_ms), (onset,), ((onset, onset + length),), 8.0)
+    ends = bins.starts + bins.bin_samples
+    edge = round((onset - 0.010) * RATE)
+    quiet, slip = ~bins.is_slip, bins.is_slip
+    assert int(bins.starts[quiet].min()) == edge - 2000
+    assert bool((ends[quiet] <= edge).all())
+    assert bool((bins.starts[slip] >= edge).all())
+    assert bool((ends[slip] <= (onset + length) * RATE + 1e-6).all())
+    hop = 100 if hop_ms is None else round(2 * hop_ms)
+    fits = int((onset + length) * RATE) - edge - 100
+    assert int(slip.sum()) == (fits // hop + 1 if fits >= 0 else 0)  # not one bin less
+
+
+def test_a_slide_shorter_than_a_bin_has_no_slip_bin():
+    bins = lay(onsets=(2.0,), slides=((2.0, 2.03),))
+    assert len(bins.starts) == 20
+    assert not bool(bins.is_slip.any())
+
+
+# Whose onsets --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("onsets", ["annotated", "exact"])
+def test_the_caller_chooses_the_onsets(onsets):
+    """``label_bins`` takes what it is given, whatever the rule says."""
+    moved = tuple(onset + 0.02 for onset in ONSETS)
+    rule = LabelRule(onsets=onsets)
+    assert torch.equal(lay(rule, moved).starts[:20], lay(rule).starts[:20] + 40)
+
+
+@pytest.mark.parametrize(("onsets", "expected_s"), [("annotated", 1.25), ("exact", 1.2)])
+def test_a_feature_maker_takes_the_onsets_its_rule_names(onsets, expected_s):
+    hand = HandLayout.from_rows(
+        [{"name": "film", "kind": "PVDF", "finger": "index", "segment": "distal"}]
+    )
+    noise = torch.randn(1, 6000, generator=torch.Generator().manual_seed(0))
+    trial = Recording(noise, RATE, "M1", (20.0,), (1.2,), ((1.2, 2.5),), (1.25,))
+    source = SimpleNamespace(
+        hand=hand,
+        sample_rate_hz=RATE,
+        is_simulated=False,
+        ids=(RecordingId("M1", 0),),
+        timeline=lambda recording: trial,
+        load=lambda recording, windows: trial,
+    )
+    maker = FeatureMaker(source, FeaturePool(hand), ChannelFilter([11]), LabelRule(onsets=onsets))
+    cut, bins = maker.filtered_bins(source.ids[0])
+    assert int(bins.starts[bins.is_slip][0]) == round((expected_s - 0.01) * RATE)
+    assert cut.shape == (len(bins.starts), 1, 100)
+
+
+# Errors --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"layout": "nope"}, "labels.layout must be one of whole_slide, half_second, got 'nope'"),
+        ({"onsets": "guessed"}, "labels.onsets must be one of annotated, exact, got 'guessed'"),
+        ({"bin_ms": 0.0}, "labels.bin_ms must be positive, got 0.0"),
+        ({"hop_ms": -50.0}, "labels.hop_ms must be positive, got -50.0"),
+        ({"bin_ms": float("nan")}, "labels.bin_ms must be positive, got nan"),
+    ],
+)
+def test_a_bad_rule_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        LabelRule(**change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"bin_ms": 50.2}, r"labels.bin_ms=50.2 is 100.4 samples at 2000 Hz; choose a whole"),
+        ({"hop_ms": 0.1}, r"labels.hop_ms=0.1 is 0.2 samples"),
+    ],
+)
+def test_no_whole_number_of_samples_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        lay(LabelRule(**change))
+
+
+@pytest.mark.parametrize("bin_ms", [33.0, 49.5, 0.5])
+def test_a_whole_number_of_samples_is_not(bin_ms):
+    assert lay(LabelRule(bin_ms=bin_ms)).bin_samples == round(2 * bin_ms)
+
+
+def test_a_bin_that_leaves_the_recording_is_refused_with_its_stroke():
+    with pytest.raises(ValueError, match=r"stroke 1 with its onset at 1.005 s needs samples from"):
+        lay(onsets=(1.005,), slides=((1.005, 3.0),))
+    with pytest.raises(ValueError, match=r"stroke 3 .* outside the recording of 15.100 s"):
+        lay(duration_s=15.1)
+    half = LabelRule(layout="half_second")
+    with pytest.raises(ValueError, match="stroke 1"):
+        lay(half, (0.4,), ((0.4, 3.0),))
+    with pytest.raises(ValueError, match=r"outside the recording of 2\.400 s"):
+        lay(half, (2.0,), ((2.0, 2.3),), 2.4)
+
+
+def test_bins_may_touch_both_ends_of_the_recording():
+    bins = lay(LabelRule(layout="half_second"), (0.5,), ((0.5, 1.0),), 1.0)
+    assert int(bins.starts[0]) == 0
+    assert int(bins.starts[-1]) + 100 == 2000
+
+
+def test_onsets_and_slides_must_go_together():
+    with pytest.raises(ValueError, match="zip"):
+        lay(onsets=ONSETS[:2])
+
+
+@pytest.mark.xfail(strict=True, raises=RuntimeError, reason="torch.arange is asked to go backwards")
+@pytest.mark.parametrize(
+    "rule",
+    [LabelRule(bin_ms=1100.0), LabelRule("half_second", bin_ms=600.0)],
+    ids=["whole_slide", "half_second"],
+)
+def test_a_bin_longer_than_the_stretch_before_the_onset_is_refused(rule):
+    with pytest.raises(ValueError, match=r"labels\.bin_ms"):
+        lay(rule)
+
+
+# Windows -------------------------------------------------------------------------------------
+
+
+def cases():
+    yield "paper", lay()
+    yield "half_second", lay(LabelRule(layout="half_second"))
+    yield "gaps", lay(LabelRule(hop_ms=150.0))
+    yield (
+        "close to both ends",
+        lay(LabelRule(layout="half_second"), (0.505, DURATION - 0.51), ((0.5, 1.0), (14.9, 15.4))),
+    )
+    yield (
+        "at both ends",
+        lay(LabelRule(layout="half_second"), (0.5, DURATION - 0.5), ((0.5, 1.0), (15.0, 15.5))),
+    )
+
+
+@pytest.mark.parametrize(("name", "bins"), list(cases()), ids=[name for name, _ in cases()])
+def test_windows_cover_every_bin_with_context_and_no_more(name, bins):
+    context, num_samples = 25, round(DURATION * RATE)
+    windows = [(low * RATE, high * RATE) for low, high in needed_windows(bins, 25, DURATION, RATE)]
+    np.testing.assert_allclose(windows, np.round(windows), atol=1e-6)
+    covered = np.zeros(num_samples, dtype=bool)
+    for low, high in windows:
+        covered[round(low) : round(high)] = True
+    needed = np.zeros(num_samples, dtype=bool)
+    for start in bins.starts.tolist():
+        needed[max(start - context, 0) : start + 100 + context] = True
+    assert covered[needed].all()
+    extra = np.flatnonzero(covered & ~needed)
+    assert bool(np.all((extra < 2 * context) | (extra >= num_samples - 2 * context)))
+
+
+@pytest.mark.parametrize(("name", "bins"), list(cases()), ids=[name for name, _ in cases()])
+def test_windows_ascend_with_gaps_between_them(name, bins):
+    windows = needed_windows(bins, 25, DURATION, RATE)
+    flat = [edge for window in windows for edge in window]
+    assert all(earlier < later for earlier, later in pairwise(flat))
+    assert flat[0] >= 0
+    assert flat[-1] <= DURATION
+
+
+def test_windows_merge_where_they_touch():
+    assert len(needed_windows(lay(), 25, DURATION, RATE)) == 3  # one per stroke
+    apart = lay(LabelRule(hop_ms=150.0), (2.0,), ((2.0, 2.03),))
+    num_bins = len(apart.starts)
+    assert len(needed_windows(apart, 0, DURATION, RATE)) == num_bins
+    assert len(needed_windows(apart, 99, DURATION, RATE)) == num_bins  # 2 samples between them
+    assert len(needed_windows(apart, 100, DURATION, RATE)) == 1
+
+
+@pytest.mark.parametrize(("name", "bins"), list(cases()), ids=[name for name, _ in cases()])
+def test_filtering_the_windows_alone_gives_the_same_bins(name, bins, rng):
+    """Samples outside the windows are NaN; not one of them reaches a bin."""
+    channel_filter = ChannelFilter([51, 11, 51])
+    samples = torch.from_numpy(rng.standard_normal((3, round(DURATION * RATE))))
+    partial = torch.full_like(samples, torch.nan)
+    for low, high in needed_windows(bins, channel_filter.context, DURATION, RATE):
+        window = slice(round(low * RATE), round(high * RATE))
+        partial[:, window] = samples[:, window]
+    assert bool(partial.isnan().any())
+    whole = bins_at(channel_filter(samples), bins.starts, bins.bin_samples)
+    cut = bins_at(channel_filter(partial), bins.starts, bins.bin_samples)
+    torch.testing.assert_close(cut, whole, rtol=0, atol=0)
+
+
+# Shuffled labels -----------------------------------------------------------------------------
+
+
+def test_shuffled_labels_keep_their_number_and_depend_on_seed_and_place():
+    is_slip = torch.arange(243) >= 60
+    once = shuffled(is_slip, 3, 5)
+    assert torch.equal(once, shuffled(is_slip, 3, 5))
+    assert int(once.sum()) == 183
+    assert not torch.equal(once, is_slip)
+    assert not torch.equal(once, shuffled(is_slip, 3, 6))
+    assert not torch.equal(once, shuffled(is_slip, 4, 5))

@@ -1,0 +1,229 @@
+import math
+
+import pytest
+import torch
+
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.splits import (
+    Split,
+    leave_one_material_out,
+    random_bins,
+    seen6,
+    unseen4,
+)
+
+SEEN = ["M1", "M2", "M3"]
+UNSEEN = ["iron", "wood"]
+
+
+def recordings(materials=(*SEEN, *UNSEEN), cycles=28):
+    return [RecordingId(material, cycle) for material in materials for cycle in range(cycles)]
+
+
+def of_role(split, role, material=None):
+    return {r for r, own in split.roles.items() if own == role and material in (None, r.material)}
+
+
+def drawn(**changes):
+    return unseen4(recordings(), **({"seen": SEEN, "unseen": UNSEEN} | changes))[0]
+
+
+# By cycle ------------------------------------------------------------------------------------
+
+
+def test_unseen4_stratifies_by_material():
+    split = drawn()
+    for material in SEEN:
+        assert len(of_role(split, "train", material)) == 22
+        assert len(of_role(split, "test", material)) == 6
+        assert not of_role(split, "unseen", material)
+    for material in UNSEEN:
+        assert len(of_role(split, "unseen", material)) == 28
+
+
+def test_every_recording_has_one_role():
+    split = drawn()
+    assert set(split.roles) == set(recordings())
+    having = [split.having(role) for role in ("train", "test", "unseen")]
+    assert sum(len(part) for part in having) == len(set().union(*having)) == 5 * 28
+
+
+def test_having_is_sorted_and_takes_several_roles():
+    split = drawn()
+    both = split.having("train", "test")
+    assert both == sorted(both)
+    assert {r.material for r in both} == set(SEEN)
+    assert len(both) == 3 * 28
+
+
+def test_materials_of_no_side_are_not_used():
+    split = drawn(seen=["M1"], unseen=["wood"])
+    assert {r.material for r in split.roles} == {"M1", "wood"}
+    masks = split.bin_roles(RecordingId("M2", 0), 5)
+    assert not any(bool(mask.any()) for mask in masks.values())
+
+
+def test_the_draw_depends_on_the_seed_alone():
+    assert drawn(seed=4).roles == drawn(seed=4).roles
+    assert drawn(seed=4).roles != drawn(seed=5).roles
+    shuffled = list(reversed(recordings()))
+    assert unseen4(shuffled, seen=SEEN, unseen=UNSEEN, seed=4)[0].roles == drawn(seed=4).roles
+
+
+def test_materials_draw_on_their_own():
+    """Another material more, less, or in another place does not move a cycle."""
+    for seen in (["M2"], ["M2", "M1"], ["M3", "M2"]):
+        split = drawn(seen=seen)
+        assert of_role(split, "test", "M2") == of_role(drawn(), "test", "M2")
+    cycles = [sorted(r.cycle for r in of_role(drawn(), "test", m)) for m in SEEN]
+    assert cycles[0] != cycles[1] or cycles[1] != cycles[2]
+
+
+def test_the_draw_does_not_follow_the_order_of_cycles():
+    """Wear and session drift go with the cycle's number: the last six must not be the test."""
+    tests = [sorted(r.cycle for r in of_role(drawn(seed=s), "test", "M1")) for s in range(5)]
+    assert all(cycles not in (list(range(6)), list(range(22, 28))) for cycles in tests)
+    assert len({tuple(cycles) for cycles in tests}) == 5
+
+
+@pytest.mark.parametrize(
+    ("cycles", "share", "num_train"), [(2, 0.99, 1), (2, 0.01, 1), (5, 0.8, 4)]
+)
+def test_both_sides_have_a_cycle_if_there_are_two(cycles, share, num_train):
+    split = seen6(recordings(cycles=cycles), seen=SEEN, train_share=share)[0]
+    for material in SEEN:
+        assert len(of_role(split, "train", material)) == num_train
+        assert len(of_role(split, "test", material)) == cycles - num_train
+
+
+def test_seen6_is_unseen4_without_the_unseen():
+    split = seen6(recordings(), seen=SEEN)[0]
+    assert split.name == "seen6"
+    assert split.roles == {r: role for r, role in drawn().roles.items() if role != "unseen"}
+
+
+def test_grouped_splits_never_divide_a_recording():
+    folds = [drawn(), seen6(recordings(), seen=SEEN)[0]]
+    folds += leave_one_material_out(recordings(), materials=SEEN)
+    for split in folds:
+        for recording, role in split.roles.items():
+            masks = split.bin_roles(recording, 7)
+            assert bool(masks[role].all())
+            assert sum(int(mask.sum()) for mask in masks.values()) == 7
+
+
+# By bin --------------------------------------------------------------------------------------
+
+
+def test_random_bins_sends_bins_of_every_recording_to_both_sides():
+    split = random_bins(recordings(), seen=SEEN)[0]
+    assert {r.material for r in split.roles} == set(SEEN)
+    num_test = 0
+    for recording in split.roles:
+        masks = split.bin_roles(recording, 243)
+        assert bool(masks["train"].any())
+        assert bool(masks["test"].any())
+        assert not bool((masks["train"] & masks["test"]).any())
+        assert bool((masks["train"] | masks["test"]).all())
+        assert not bool(masks["unseen"].any())
+        num_test += int(masks["test"].sum())
+    total = 84 * 243
+    assert abs(num_test - 0.2 * total) < 5 * math.sqrt(total * 0.2 * 0.8)  # five sigma
+
+
+def test_random_bins_draws_anew_for_every_recording_and_seed():
+    def mask(seed, recording):
+        return random_bins(recordings(), seen=SEEN, seed=seed)[0].bin_roles(recording, 243)["test"]
+
+    a, b = RecordingId("M1", 0), RecordingId("M2", 0)
+    assert torch.equal(mask(1, a), mask(1, a))
+    assert not torch.equal(mask(1, a), mask(1, b))
+    assert not torch.equal(mask(1, a), mask(2, a))
+
+
+def test_recordings_of_random_bins_are_in_both_loaders():
+    split = random_bins(recordings(), seen=SEEN)[0]
+    assert split.having("train") == split.having("test") == sorted(recordings(SEEN))
+    assert split.having("unseen") == []
+
+
+# One material out ----------------------------------------------------------------------------
+
+
+def test_one_fold_for_every_material():
+    materials = [*SEEN, *UNSEEN]
+    folds = leave_one_material_out(recordings(), materials=materials)
+    assert [fold.name for fold in folds] == [f"without_{material}" for material in materials]
+    for fold, left_out in zip(folds, materials, strict=True):
+        assert of_role(fold, "unseen") == set(recordings([left_out]))
+        others = [material for material in materials if material != left_out]
+        assert {r.material for r in fold.having("train", "test")} == set(others)
+        for material in others:
+            assert len(of_role(fold, "train", material)) == 22
+
+
+def test_folds_keep_a_materials_draw():
+    folds = leave_one_material_out(recordings(), materials=[*SEEN, *UNSEEN])
+    tests = [of_role(fold, "test", "M2") for fold in folds if "M2" not in fold.name]
+    assert len(tests) == 4
+    assert all(test == tests[0] for test in tests)
+
+
+# Errors --------------------------------------------------------------------------------------
+
+
+def test_an_unknown_material_is_named_with_those_there_are():
+    known = r"no recording of material 'M9'; the set has M1, M2, M3, iron, wood"
+    for make in (
+        lambda: drawn(seen=["M1", "M9"]),
+        lambda: drawn(unseen=["M9"]),
+        lambda: seen6(recordings(), seen=["M9"]),
+        lambda: random_bins(recordings(), seen=["M9"]),
+        lambda: leave_one_material_out(recordings(), materials=["M1", "M9"]),
+    ):
+        with pytest.raises(ValueError, match=known):
+            make()
+    with pytest.raises(ValueError, match="the set has none"):
+        seen6([], seen=["M1"])
+
+
+def test_a_material_on_both_sides_is_refused():
+    with pytest.raises(ValueError, match="materials M2, M3 are both seen and unseen"):
+        drawn(unseen=["wood", "M3", "M2"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "role"),
+    [({"seen": []}, "train"), ({"unseen": []}, "unseen")],
+)
+def test_an_empty_role_is_named(changes, role):
+    with pytest.raises(ValueError, match=f"split unseen4: no recording has the role '{role}'"):
+        drawn(**changes)
+
+
+def test_one_cycle_leaves_no_test():
+    with pytest.raises(ValueError, match="split seen6: no recording has the role 'test'"):
+        seen6(recordings(cycles=1), seen=SEEN)
+    with pytest.raises(ValueError, match="split random_bins: no recording has the role 'train'"):
+        random_bins(recordings(), seen=[])
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, -0.1, 1.5, float("nan")])
+def test_a_share_outside_zero_to_one_is_refused(share):
+    for make in (
+        lambda: drawn(train_share=share),
+        lambda: random_bins(recordings(), seen=SEEN, train_share=share),
+    ):
+        with pytest.raises(ValueError, match=r"split\.train_share must lie between 0 and 1"):
+            make()
+
+
+def test_one_material_cannot_be_left_out():
+    with pytest.raises(ValueError, match=r"needs at least two, got \['M1'\]"):
+        leave_one_material_out(recordings(), materials=["M1"])
+
+
+def test_a_split_without_shares_ignores_the_seed():
+    recording = RecordingId("M1", 0)
+    masks = [Split("s", {recording: "train"}, seed=s).bin_roles(recording, 9) for s in (0, 1)]
+    assert all(bool(mask["train"].all()) for mask in masks)
