@@ -17,11 +17,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import hydra
+import onnx
 import onnxruntime
 import torch
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
+import tactslip_torch
 from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.files import whole_file
 from tactslip_torch.model.detector import SlipDetector
@@ -71,6 +73,7 @@ def export_onnx(detector: SlipDetector, path: str | os.PathLike[str]) -> float:
                 output_names=["score"],
                 dynamic_shapes={"samples": {0: torch.export.Dim.DYNAMIC}},
             )
+        _describe_in_file(detector, temporary)
         worst = onnx_error(detector, temporary)
         if not worst <= WORST_ERROR:
             raise ValueError(
@@ -103,6 +106,23 @@ def onnx_error(detector: SlipDetector, path: str | os.PathLike[str]) -> float:
         errors.append((got - expected).abs())
         scores.append(expected)
     return float(torch.cat(errors).max() / torch.cat(scores).std())
+
+
+def _describe_in_file(detector: SlipDetector, path: Path) -> None:
+    """Put what a host must know of the input into the file's metadata."""
+    model = onnx.load(path)
+    facts = {
+        "tactslip_torch": tactslip_torch.__version__,
+        "channels": ",".join(detector.pool.hand.names),
+        "unit": "V",
+        "sample_rate_hz": f"{detector.pool.sample_rate_hz:g}",
+        "bin_samples": str(detector.pool.bin_samples),
+        "context_samples": str(detector.context),
+        "simulated": str(bool(detector.info.get("simulated", False))).lower(),
+        "slip_if_score_at_least": "0",
+    }
+    onnx.helper.set_model_props(model, facts)
+    onnx.save(model, path)
 
 
 def _input_shape(detector: SlipDetector) -> tuple[int, int]:

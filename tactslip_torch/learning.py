@@ -178,7 +178,7 @@ class SlipLearner(L.LightningModule):
         bins = CollectedBins.of(self.recipe, self._columns, self._collected)
         self._collected = []
         fitted = fit_detector(self.recipe, self._moments, bins, bar)
-        self.log("penalty", fitted.facts["penalty"], batch_size=1)
+        self.log("penalty", float(fitted.facts["penalty"]), batch_size=1)
         self.seconds |= fitted.seconds
         self.facts = fitted.facts
         self.threshold = fitted.threshold

@@ -7,6 +7,7 @@ bins that come in are training bins; what is held out of training never gets her
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -225,12 +226,12 @@ def fit_detector(
     head = fit_machine(training, penalty, recipe.offset, progress)
     seconds = {"validation": validated - started, "solve": time.perf_counter() - validated}
     facts = {
-        "penalty": penalty,
+        "penalty": penalty if math.isfinite(penalty) else "inf",  # JSON has no infinity
         "offset": recipe.offset,
         "num_training_bins": len(index),
         "validation": {
             "group_by": recipe.group_by,
-            "penalties": list(recipe.penalties),
+            "penalties": [p if math.isfinite(p) else "inf" for p in recipe.penalties],
             "balanced_accuracy": validation,
         },
     }

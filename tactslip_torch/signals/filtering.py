@@ -6,6 +6,7 @@ the 51-sample frame of the gauges. Centred, so it looks half a frame ahead: 2.5 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -73,7 +74,7 @@ def savgol_filter(x: Tensor, window_length: int, polyorder: int = 1) -> Tensor:
 
 def _convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
     """Correlate ``[*, T]`` with ``[W]``, keeping the ``T - W + 1`` full overlaps."""
-    num_rows = x.shape[:-1].numel()
+    num_rows = math.prod(x.shape[:-1])  # Size.numel would freeze the batch in an export
     flat = functional.conv1d(x.reshape(num_rows, 1, x.shape[-1]), kernel[None, None])
     return flat.reshape(*x.shape[:-1], flat.shape[-1])
 
