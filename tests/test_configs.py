@@ -1,0 +1,194 @@
+"""Every file of ``conf/``: it composes, what it names exists, and nothing in it is misspelt."""
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
+from hydra.utils import get_object, instantiate
+from omegaconf import OmegaConf
+
+from tactslip_torch.config import conf_dir
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.splits import ROLES, Split
+from tactslip_torch.experiment import feature_parts
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.recipe import Recipe
+from tactslip_torch.simulation.source import SimulatedRecordings
+
+EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "exp").glob("*.yaml"))
+OPTIONS = sorted(
+    (path.parent.name, path.stem)
+    for path in conf_dir().glob("*/*.yaml")
+    if path.parent.name != "exp"
+)
+SEEN = ["M1", "M2", "M3", "M4", "M5", "M6"]
+UNSEEN = ["iron", "cloth", "copper", "wood"]
+
+
+def composed(*overrides, name="train"):
+    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+        return compose(name, list(overrides))
+
+
+def folds_of(config):
+    source = instantiate(config.data, _convert_="all")
+    return source, instantiate(config.split, _convert_="all")(source.ids)
+
+
+def keys_of(section, prefix=""):
+    for key, value in section.items():
+        if isinstance(value, dict) and value:
+            yield from keys_of(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}"
+
+
+# Experiments ---------------------------------------------------------------------------------
+
+
+def test_the_experiments_of_the_paper_are_there():
+    assert {"unseen4", "seen6", "random_bins", "leave_one_material_out", "quick"} <= {*EXPERIMENTS}
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_an_experiment_composes_and_everything_it_names_exists(name):
+    config = composed(f"+exp={name}")
+    source, folds = folds_of(config)
+    rule = instantiate(config.labels)
+    assert isinstance(source, SimulatedRecordings)
+    assert isinstance(rule, LabelRule)
+    assert isinstance(instantiate(config.detector, _convert_="all"), Recipe)
+    pool, channel_filter, _ = feature_parts(source, rule.bin_ms, **config.features)
+    assert isinstance(pool, FeaturePool)
+    assert len(channel_filter.window_lengths) == len(source.hand)
+    assert folds
+    for fold in folds:
+        assert isinstance(fold, Split)
+        assert set(fold.roles) <= set(source.ids)
+        assert set(fold.roles.values()) <= set(ROLES)
+    assert len({fold.name for fold in folds}) == len(folds)  # each has a folder of its own
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_an_experiment_is_global_and_names_itself(name):
+    text = (conf_dir() / "exp" / f"{name}.yaml").read_text()
+    assert text.startswith("# @package _global_\n")
+    assert composed(f"+exp={name}").name == name
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_an_experiment_adds_no_key(name):
+    """A misspelt key in an experiment file is added silently, so hold it against its groups."""
+    content = yaml.safe_load((conf_dir() / "exp" / f"{name}.yaml").read_text())
+    groups = [
+        f"{key.removeprefix('override /')}={option}"
+        for entry in content.pop("defaults", [])
+        for key, option in entry.items()
+    ]
+    without = OmegaConf.to_container(composed(*groups))
+    known = set(keys_of(without))
+    assert set(keys_of(content)) <= known
+    assert set(keys_of(OmegaConf.to_container(composed(f"+exp={name}")))) == known
+
+
+def test_a_misspelt_key_would_be_seen():
+    """The check above, on content that fails it."""
+    known = set(keys_of(OmegaConf.to_container(composed())))
+    assert set(keys_of({"data": {"cycles": 2}, "split": {"seen": ["M1"]}, "name": "a"})) <= known
+    assert set(keys_of({"data": {"cycels": 2}, "nmae": "a"})) - known == {"data.cycels", "nmae"}
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_experiments_agree_on_the_seed(name):
+    config = OmegaConf.to_container(composed(f"+exp={name}", "seed=7"), resolve=True)
+    assert config["data"]["seed"] == config["split"]["seed"] == config["detector"]["seed"] == 7
+
+
+# What the published experiments are ------------------------------------------------------------
+
+
+def test_unseen4_is_the_papers_split():
+    config = composed("+exp=unseen4")
+    source, (fold,) = folds_of(config)
+    assert len(source.ids) == 280
+    counts = {}
+    for recording, role in fold.roles.items():
+        counts[recording.material, role] = counts.get((recording.material, role), 0) + 1
+    expected = {(m, "train"): 22 for m in SEEN} | {(m, "test"): 6 for m in SEEN}
+    assert counts == expected | {(m, "unseen"): 28 for m in UNSEEN}
+    assert config.labels.layout == "whole_slide"
+    assert config.detector.num_features == 120
+
+
+def test_seen6_and_random_bins_have_the_seen_materials_alone():
+    _, (grouped,) = folds_of(composed("+exp=seen6"))
+    _, (by_bin,) = folds_of(composed("+exp=random_bins"))
+    assert {r.material for r in grouped.roles} == {r.material for r in by_bin.roles} == set(SEEN)
+    assert grouped.test_share_of_bins is None
+    assert by_bin.test_share_of_bins == pytest.approx(0.2)
+
+
+def test_leave_one_material_out_leaves_each_out_once():
+    _, folds = folds_of(composed("+exp=leave_one_material_out"))
+    left_out = [{r.material for r in fold.having("unseen")} for fold in folds]
+    assert left_out == [{material} for material in SEEN + UNSEEN]
+
+
+def test_quick_is_small_and_has_every_role():
+    source, (fold,) = folds_of(composed("+exp=quick"))
+    assert len(source.ids) <= 10
+    assert set(fold.roles.values()) == set(ROLES)
+
+
+# The rest of conf/ ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_composes(group, option):
+    section = composed(f"{group}={option}")[group]
+    assert section
+    if group != "features":  # plain values, for ``feature_parts``
+        assert callable(get_object(section._target_))
+
+
+def test_recipe_and_rule_defaults_are_those_of_their_files():
+    """The file states what an experiment may change; the signature says the same."""
+    config = composed()
+    detector = instantiate(config.detector, _convert_="all")
+    assert list(detector.penalties) == list(Recipe().penalties)
+    assert Recipe(**{**vars(detector), "penalties": Recipe().penalties}) == Recipe()
+    assert instantiate(config.labels) == LabelRule()
+    half = instantiate(composed("labels=half_second").labels)
+    assert half == LabelRule(layout="half_second")
+
+
+@pytest.mark.parametrize("name", ["evaluate", "export"])
+def test_the_other_entry_points_compose(name):
+    config = composed("model=some/detector.pt", name=name)
+    assert config.model == "some/detector.pt"
+
+
+def test_evaluate_judges_on_the_same_defaults_as_train():
+    train = OmegaConf.to_container(composed(), resolve=True)
+    evaluate = OmegaConf.to_container(composed("model=a.pt", name="evaluate"), resolve=True)
+    for section in ("data", "labels", "split", "trainer", "seed"):
+        assert evaluate[section] == train[section]
+
+
+@pytest.mark.parametrize("section", ["data", "labels", "split", "detector"])
+def test_a_misspelt_key_is_refused_by_what_it_is_given_to(section):
+    config = composed(f"+{section}.misspelt=1")
+
+    def make():
+        made = instantiate(config[section], _convert_="all")
+        return made([]) if section == "split" else made
+
+    with pytest.raises((InstantiationException, TypeError), match="misspelt"):
+        make()
+
+
+def test_a_misspelt_feature_key_is_refused():
+    config = composed("+features.misspelt=1", "data.cycles=1")
+    source = instantiate(config.data, _convert_="all")
+    with pytest.raises(TypeError, match="misspelt"):
+        feature_parts(source, 50.0, **config.features)

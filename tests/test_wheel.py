@@ -1,0 +1,91 @@
+"""A wheel carries its configuration and runs where there is no checkout."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[1]
+INGREDIENTS = ("pyproject.toml", "README.md", "LICENSE", "conf", "tactslip_torch")
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory):
+    """What pip would install, in an empty folder; the checkout stays clean."""
+    copy = tmp_path_factory.mktemp("copy")
+    for name in INGREDIENTS:
+        if (ROOT / name).is_dir():
+            ignore = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(ROOT / name, copy / name, ignore=ignore)
+        else:
+            shutil.copy(ROOT / name, copy / name)
+    built = tmp_path_factory.mktemp("built")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(built)]
+    done = subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (wheel,) = built.glob("*.whl")
+    folder = tmp_path_factory.mktemp("site")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def run(unpacked, folder, *arguments):
+    environment = os.environ | {"PYTHONPATH": str(unpacked)}
+    command = [sys.executable, *arguments]
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def test_the_wheel_holds_the_package_and_its_configuration(unpacked):
+    package = unpacked / "tactslip_torch"
+    for name in ("conf", "data", "simulation", "signals", "features", "model", "report"):
+        assert (package / name).is_dir()
+    held = {p.relative_to(package / "conf") for p in (package / "conf").rglob("*.yaml")}
+    assert held == {p.relative_to(ROOT / "conf") for p in (ROOT / "conf").rglob("*.yaml")}
+    code = {p.relative_to(package) for p in package.rglob("*.py")}
+    ours = ROOT / "tactslip_torch"
+    assert code == {p.relative_to(ours) for p in ours.rglob("*.py")}
+
+
+def test_the_wheel_holds_nothing_else(unpacked):
+    top = {path.name for path in unpacked.iterdir()}
+    assert "tactslip_torch" in top
+    (info,) = top - {"tactslip_torch"}
+    assert info.endswith(".dist-info")
+    assert (unpacked / info / "licenses" / "LICENSE").is_file()
+
+
+def test_the_wheel_comes_before_the_checkout(unpacked, tmp_path):
+    """The editable install is on the path as well: without this the next tests prove nothing."""
+    code = "import tactslip_torch.config as c; print(c.__file__); print(c.conf_dir())"
+    done = run(unpacked, tmp_path, "-c", code)
+    assert done.returncode == 0, done.stderr
+    module, conf = done.stdout.split()
+    assert Path(module) == unpacked / "tactslip_torch" / "config.py"
+    assert Path(conf) == unpacked / "tactslip_torch" / "conf"
+
+
+def test_train_composes_its_experiment_from_the_wheel(unpacked, tmp_path):
+    done = run(unpacked, tmp_path, "-m", "tactslip_torch.train", "--cfg", "job", "+exp=unseen4")
+    assert done.returncode == 0, done.stderr
+    config = yaml.safe_load(done.stdout)
+    assert config["name"] == "unseen4"
+    assert config["split"]["_target_"] == "tactslip_torch.data.splits.unseen4"
+    assert config["split"]["unseen"] == ["iron", "cloth", "copper", "wood"]
+    assert not list(tmp_path.iterdir())  # showing a configuration leaves nothing behind
+
+
+def test_an_unknown_experiment_is_one_line_from_the_wheel(unpacked, tmp_path):
+    done = run(unpacked, tmp_path, "-m", "tactslip_torch.train", "+exp=nope")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: unknown exp nope; known: ")
+    assert done.stderr.count("\n") == 1
