@@ -1,0 +1,199 @@
+import copy
+import shutil
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from test_detector import noise, random_detector
+
+from tactslip_torch import export
+from tactslip_torch.export import export_onnx, onnx_error
+
+pytestmark = pytest.mark.onnx
+
+SLOW_OR_MISSING = {  # EXPORT.md trap 7, and what a solve or a loop over samples would leave
+    *("DFT", "STFT", "MelWeightMatrix", "Det", "Einsum"),
+    *("Loop", "Scan", "If", "SequenceMap", "Unique", "NonZero"),
+}
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return random_detector()
+
+
+@pytest.fixture(scope="module")
+def exported(detector, tmp_path_factory):
+    """The one export of this file (seconds), and the error it reports."""
+    path = tmp_path_factory.mktemp("export") / "deep" / "model.onnx"
+    before = {name: value.clone() for name, value in detector.state_dict().items()}
+    worst = export_onnx(detector, path)
+    for name, value in detector.state_dict().items():  # the detector stays as it was: float64
+        assert torch.equal(value, before[name])
+        assert value.dtype == torch.float64
+    return path, worst
+
+
+@pytest.fixture(scope="module")
+def session(exported):
+    return onnxruntime.InferenceSession(exported[0], providers=["CPUExecutionProvider"])
+
+
+@pytest.fixture(scope="module")
+def graph(exported):
+    return onnx.load(exported[0]).graph
+
+
+# The file ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("batch", [1, 2, 3, 7, 64])
+def test_onnxruntime_equals_torch(batch, detector, session):
+    """Three is the batch it was traced with; none of the others was seen by the exporter."""
+    samples = noise(batch, seed=batch)
+    expected = detector.score_raw(samples).numpy()
+    (got,) = session.run(None, {"samples": samples.numpy().astype(np.float32)})
+    assert got.dtype == np.float32
+    assert got.shape == (batch,)
+    spread = detector.score_raw(noise(64)).std().item()
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-3 * spread)
+
+
+def test_bins_of_a_batch_do_not_meet(session):
+    samples = noise(7).numpy().astype(np.float32)
+    (together,) = session.run(None, {"samples": samples})
+    alone = [session.run(None, {"samples": sample[None]})[0][0] for sample in samples]
+    np.testing.assert_allclose(together, alone, rtol=1e-5, atol=1e-5)
+
+
+def test_what_is_not_finite_gives_nan(detector, session):
+    samples = noise(3).numpy().astype(np.float32)
+    channel = detector.pool.hand.names.index(detector.selected_names[-1].channel)
+    samples[1, channel, 75] = np.nan
+    (scores,) = session.run(None, {"samples": samples})
+    assert np.isnan(scores).tolist() == [False, True, False]
+
+
+def test_input_and_output_are_named_float32_and_of_any_batch(graph):
+    (samples,), (score,) = graph.input, graph.output
+    assert (samples.name, score.name) == ("samples", "score")
+    for value in (samples, score):
+        assert value.type.tensor_type.elem_type == onnx.TensorProto.FLOAT
+        batch = value.type.tensor_type.shape.dim[0]
+        assert batch.dim_param
+        assert not batch.HasField("dim_value")
+    fixed = [dim.dim_value for dim in samples.type.tensor_type.shape.dim[1:]]
+    assert fixed == [24, 100 + 2 * 25]
+    assert len(score.type.tensor_type.shape.dim) == 1
+
+
+def test_another_dtype_or_shape_is_refused(session):
+    with pytest.raises(Exception, match="Unexpected input data type"):
+        session.run(None, {"samples": noise(1).numpy()})
+    with pytest.raises(Exception, match="invalid dimensions"):
+        session.run(None, {"samples": np.zeros((1, 23, 150), np.float32)})
+
+
+def test_no_operator_is_slow_or_missing(exported, graph):
+    operators = {node.op_type for node in graph.node}
+    assert "MatMul" in operators or "Gemm" in operators
+    assert not operators & SLOW_OR_MISSING
+    assert {node.domain for node in graph.node} <= {"", "ai.onnx"}
+    model = onnx.load(exported[0])
+    assert not model.functions
+    assert [(entry.domain, entry.version) for entry in model.opset_import] == [("", export.OPSET)]
+
+
+def test_no_constant_is_kept_in_double_precision(graph):
+    kinds = {tensor.data_type for tensor in graph.initializer}
+    assert onnx.TensorProto.DOUBLE not in kinds
+
+
+def test_the_file_is_whole_and_valid(exported):
+    path, _ = exported
+    onnx.checker.check_model(onnx.load(path), full_check=True)
+    assert [p.name for p in path.parent.iterdir()] == ["model.onnx"]  # no data beside, no rest
+
+
+# The check -----------------------------------------------------------------------------------
+
+
+def test_the_error_it_reports_is_small_and_comes_from_the_file(detector, exported):
+    path, worst = exported
+    assert 0 < worst <= export.WORST_ERROR
+    assert onnx_error(detector, path) == pytest.approx(worst)
+
+
+def changed_head(detector, by):
+    other = copy.deepcopy(detector)
+    other.head.linear[-1] += by
+    return other
+
+
+def test_the_error_grows_with_the_difference(detector, exported):
+    errors = [onnx_error(changed_head(detector, by), exported[0]) for by in (0.1, 1.0)]
+    assert export.WORST_ERROR < errors[0] < errors[1]
+
+
+def test_a_single_precision_detector_is_checked_in_double_precision(detector, exported):
+    single = copy.deepcopy(detector).float()
+    assert onnx_error(single, exported[0]) < export.WORST_ERROR
+
+
+@pytest.fixture
+def instant(exported, monkeypatch):
+    """The exporter hands out the file made before, so that only the check is new."""
+
+    def copy_file(module, arguments, path, **options):
+        shutil.copy(exported[0], path)
+
+    monkeypatch.setattr(torch.onnx, "export", copy_file)
+
+
+@pytest.mark.usefixtures("instant")
+def test_a_graph_that_differs_is_not_written(detector, tmp_path):
+    """The file is another detector's: the check runs it and sees."""
+    with pytest.raises(ValueError, match=r"onnxruntime and torch differ by .* was not written"):
+        export_onnx(changed_head(detector, 0.5), tmp_path / "model.onnx")
+    assert not list(tmp_path.iterdir())
+    export_onnx(detector, tmp_path / "model.onnx")
+    assert [path.name for path in tmp_path.iterdir()] == ["model.onnx"]
+
+
+@pytest.mark.usefixtures("instant")
+@pytest.mark.parametrize("worst", [1.0, float("nan")])
+def test_a_failed_check_leaves_no_file(detector, tmp_path, monkeypatch, worst):
+    monkeypatch.setattr(export, "onnx_error", lambda detector, path: worst)
+    with pytest.raises(ValueError, match=r"model\.onnx was not written"):
+        export_onnx(detector, tmp_path / "model.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("instant")
+def test_a_failed_check_keeps_the_file_that_was_there(detector, tmp_path, monkeypatch):
+    (tmp_path / "model.onnx").write_bytes(b"yesterday's")
+    monkeypatch.setattr(export, "onnx_error", lambda detector, path: 1.0)
+    with pytest.raises(ValueError, match="was not written"):
+        export_onnx(detector, tmp_path / "model.onnx")
+    assert (tmp_path / "model.onnx").read_bytes() == b"yesterday's"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def frozen(path, batch):
+    """A graph that only takes, or always gives, one batch size."""
+    shape = ("batch", 24, 150)
+    samples = onnx.helper.make_tensor_value_info("samples", onnx.TensorProto.FLOAT, shape)
+    score = onnx.helper.make_tensor_value_info("score", onnx.TensorProto.FLOAT, (batch,))
+    value = onnx.numpy_helper.from_array(np.zeros(batch, np.float32), "zeros")
+    node = onnx.helper.make_node("Identity", ["zeros"], ["score"])
+    graph = onnx.helper.make_graph([node], "frozen", [samples], [score], [value])
+    opset = onnx.helper.make_opsetid("", export.OPSET)
+    onnx.save(onnx.helper.make_model(graph, opset_imports=[opset], ir_version=10), path)
+
+
+def test_a_graph_frozen_to_one_batch_is_seen(detector, tmp_path):
+    frozen(tmp_path / "model.onnx", 1)
+    with pytest.raises(ValueError, match=r"gives scores \(1,\) at batch 7, expected \(7,\)"):
+        onnx_error(detector, tmp_path / "model.onnx")
