@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from test_detector import random_detector
 
-from tactslip_torch import FeaturePool, HandLayout, Scene, SlipDetector, simulate
+from tactslip_torch import Scene, simulate
 from tactslip_torch.export import export_onnx
-from tactslip_torch.model.quadratic import QuadraticForm
-from tactslip_torch.model.scaling import MinMaxScaler
-from tactslip_torch.signals.filtering import ChannelFilter
 
 PROGRAM = Path(__file__).parents[1] / "export" / "python" / "score.py"
 
@@ -20,18 +18,11 @@ PROGRAM = Path(__file__).parents[1] / "export" / "python" / "score.py"
 @pytest.mark.onnx
 @pytest.mark.slow
 def test_the_program_prints_the_scores_of_the_package(tmp_path):
-    hand = HandLayout.paper24()
-    pool = FeaturePool(hand)
-    frames = [51 if channel.kind == "SG" else 11 for channel in hand.channels]
+    detector = random_detector()
     recording = simulate(Scene("M1"), windows=[(1.0, 3.0)]).samples[:, 2000:6000]
-    filtered = ChannelFilter(frames)(recording.double())
     starts = range(25, 4000 - 125 + 1, 100)
+    filtered = detector.channel_filter(recording.double())
     bins = torch.stack([filtered[:, s : s + 100] for s in starts])
-    selected = list(range(5, 2582, 431))
-    scaler = MinMaxScaler.fit(pool.extract(bins)[:, selected])
-    weights = torch.linspace(-1, 1, 36, dtype=torch.float64).reshape(6, 6)
-    head = QuadraticForm(weights + weights.T, weights[0], torch.tensor(0.1, dtype=torch.float64))
-    detector = SlipDetector(pool, ChannelFilter(frames), selected, scaler, head)
     export_onnx(detector, tmp_path / "model.onnx")
     np.save(tmp_path / "recording.npy", recording.numpy())
 

@@ -173,7 +173,7 @@ class FeaturePool(nn.Module):
         is_zero = square.detach() == 0
         return size * torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
 
-    def extract(self, bins: Tensor, chunk_bins: int = 64) -> Tensor:
+    def extract(self, bins: Tensor, chunk_bins: int = 16) -> Tensor:
         """``forward`` in chunks that fit the processor's cache: same values, bounded memory.
 
         Shape:

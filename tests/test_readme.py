@@ -1,0 +1,41 @@
+"""What README.md shows is there and runs."""
+
+import re
+from pathlib import Path
+
+import pytest
+from test_detector import random_detector
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "README.md").read_text()
+
+
+def test_the_program_runs(tmp_path, monkeypatch, capsys):
+    (program,) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    random_detector().save("detector.pt")
+    exec(compile(program, "README.md", "exec"), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].endswith("torch.Size([8, 2582])")
+    assert re.fullmatch(r"tensor\(\[-?\d+\.\d+\]\)", lines[1])
+
+
+def test_every_link_and_picture_leads_somewhere():
+    targets = re.findall(r"\]\((?!https?:)([^)#]+)\)", TEXT)
+    assert len(targets) >= 4
+    for target in targets:
+        assert (ROOT / target).exists(), target
+
+
+@pytest.mark.parametrize("kind", ["exp", "labels"])
+def test_every_choice_it_names_exists(kind):
+    for name in re.findall(rf"\b{kind}=(\w+)", TEXT):
+        assert (ROOT / "conf" / kind / f"{name}.yaml").exists(), name
+
+
+def test_every_room_of_the_house_is_on_the_map():
+    package = ROOT / "tactslip_torch"
+    rooms = {path.name + "/" for path in package.iterdir() if (path / "__init__.py").exists()}
+    rooms |= {path.name for path in package.glob("*.py")} - {"__init__.py"}
+    section = TEXT.split("## The way through the house")[1].split("\n## ")[0]
+    assert {room for room in rooms if f"`{room}`" not in section} == set()
