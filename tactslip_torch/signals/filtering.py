@@ -6,12 +6,10 @@ the 51-sample frame of the gauges. Centred, so it looks half a frame ahead: 2.5 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 
 def fit_matrix(window_length: int, polyorder: int) -> Tensor:
@@ -73,10 +71,22 @@ def savgol_filter(x: Tensor, window_length: int, polyorder: int = 1) -> Tensor:
 
 
 def _convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
-    """Correlate ``[*, T]`` with ``[W]``, keeping the ``T - W + 1`` full overlaps."""
-    num_rows = math.prod(x.shape[:-1])  # Size.numel would freeze the batch in an export
-    flat = functional.conv1d(x.reshape(num_rows, 1, x.shape[-1]), kernel[None, None])
-    return flat.reshape(*x.shape[:-1], flat.shape[-1])
+    """Correlate ``[*, T]`` with ``[W]``, keeping the ``T - W + 1`` full overlaps.
+
+    A sum of shifted copies: in float64 over ten times faster than ``conv1d``, which unfolds.
+    """
+    num_kept = x.shape[-1] - len(kernel) + 1
+    total = x[..., :num_kept] * kernel[0]
+    for shift in range(1, len(kernel)):
+        total = torch.addcmul(total, x[..., shift : shift + num_kept], kernel[shift])
+    return total
+
+
+def _overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
+    """``_convolve_valid`` as a matrix ``[num_kept + W - 1, num_kept]``, for short signals."""
+    margin = kernel.new_zeros(num_kept - 1)
+    padded = torch.cat([margin, kernel, margin])
+    return padded.unfold(0, num_kept + len(kernel) - 1, 1).flip(0).T
 
 
 class ChannelFilter(nn.Module):
@@ -123,6 +133,8 @@ class ChannelFilter(nn.Module):
     def valid(self, samples: Tensor) -> Tensor:
         """Filter bins that come with their context, keeping only the bins.
 
+        One matrix product, so a NaN anywhere in a bin's frame makes the channel's whole bin NaN.
+
         Shape:
             - samples: ``[*, C, n + 2 * context]``
             - output: ``[*, C, n]``, equal to the filter over the whole recording
@@ -141,7 +153,8 @@ class ChannelFilter(nn.Module):
         for length, chosen in self._groups():
             spare = self.context - length // 2
             kept = samples[..., chosen, spare : samples.shape[-1] - spare]
-            parts.append(_convolve_valid(kept, self._kernels[length].to(samples)))
+            num_kept = samples.shape[-1] - 2 * self.context
+            parts.append(kept @ _overlap_matrix(self._kernels[length].to(samples), num_kept))
         return torch.cat(parts, dim=-2)[..., self._inverse(), :]
 
     def _check(self, samples: Tensor) -> None:
