@@ -10,9 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from hydra.errors import InstantiationException
+from omegaconf.errors import OmegaConfBaseException
 
 CONF_HINT = "train.yaml"
 EXIT_BAD_INPUT = 2
+BAD_INPUT = (
+    ValueError,
+    KeyError,
+    TypeError,
+    OSError,
+    InstantiationException,
+    OmegaConfBaseException,
+)
+"""What bad input raises, here or in the libraries that read it."""
 
 
 def conf_dir() -> Path:
@@ -68,7 +78,7 @@ def errors_in_one_line() -> Iterator[None]:
     """
     try:
         yield
-    except (ValueError, KeyError, TypeError, OSError, InstantiationException) as error:
+    except BAD_INPUT as error:
         if os.environ.get("TACTSLIP_TRACEBACK"):
             raise
         fail(one_line(error))

@@ -117,6 +117,10 @@ class FeatureMaker:
         roles = split.bin_roles(recording, len(is_slip))
         return RecordingFeatures(recording, features, is_slip, speeds, roles, seconds)
 
+    def key(self, recording: RecordingId) -> str:
+        """A digest of everything that determines the features of a recording."""
+        return self._key(recording, self._lay_bins(self.source.timeline(recording)))
+
     def filtered_bins(self, recording: RecordingId) -> tuple[Tensor, LabelledBins]:
         """The filtered bins ``[N, C, n]`` that features are taken from, and their labels."""
         times = self.source.timeline(recording)
@@ -216,6 +220,15 @@ class SlipDataModule(L.LightningDataModule):
     def test_dataloader(self) -> DataLoader[RecordingFeatures]:
         """Every recording with a role."""
         return self._loader(list(ROLES))
+
+    def fingerprint(self) -> str:
+        """A digest of everything that determines the training bins; for resuming."""
+        split = self.split
+        features = {
+            str(recording): self.maker.key(recording) for recording in split.having("train")
+        }
+        shared = [split.test_share_of_bins, split.seed, self.maker.rule.shuffle_seed]
+        return cache_key({"features": features, "shared": shared})
 
     def transfer_batch_to_device(self, batch: Any, device: Any, dataloader_idx: int) -> Any:
         """Features stay where they are: moments and solve run in float64 on the processor."""

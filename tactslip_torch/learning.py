@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import ROLES
-from tactslip_torch.datamodule import RecordingFeatures
+from tactslip_torch.datamodule import RecordingFeatures, SlipDataModule
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import ClassMoments
 from tactslip_torch.model.detector import SlipDetector
@@ -110,13 +110,23 @@ class SlipLearner(L.LightningModule):
             self._columns = self._moments.columns()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep what the first pass gathered, so that a run resumes behind it."""
+        """Keep what the first pass gathered, and of which bins."""
+        checkpoint["fingerprint"] = self._fingerprint()
         checkpoint["moments"] = {
             group: moments.state_dict() for group, moments in self._moments.groups.items()
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take up what ``on_save_checkpoint`` kept."""
+        """Take up what ``on_save_checkpoint`` kept.
+
+        Raises:
+            ValueError: if it was gathered from other recordings than those to be trained on.
+        """
+        if checkpoint["fingerprint"] != self._fingerprint():
+            raise ValueError(
+                "the checkpoint was gathered from other training bins; resume with the code, "
+                "data, labels, split and seed it was made with"
+            )
         for group, state in checkpoint["moments"].items():
             self._moments.groups[group] = ClassMoments.from_state_dict(state)
         self._columns = self._moments.columns()
@@ -173,6 +183,10 @@ class SlipLearner(L.LightningModule):
     def _is_single_pass(self) -> bool:
         """``fast_dev_run`` ends after one epoch, so that one does the work of both passes."""
         return bool(getattr(self.trainer, "fast_dev_run", False))
+
+    def _fingerprint(self) -> str:
+        data: SlipDataModule = self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning's
+        return data.fingerprint()
 
     def _solve(self) -> None:
         bins = CollectedBins.of(self.recipe, self._columns, self._collected)

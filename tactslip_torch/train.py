@@ -109,7 +109,8 @@ def _run_fold(
     """Fit, test, save and export one fold; what it found."""
     source = data.maker.source
     trainer = make_trainer(config.trainer, folder, [SaveAfterPass(folder)])
-    trainer.fit(learner, datamodule=data, ckpt_path=config.ckpt_path, weights_only=True)
+    checkpoint = _checkpoint(config.ckpt_path, data.split)
+    trainer.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     started = time.perf_counter()
     trainer.test(learner, datamodule=data, verbose=False)
     tested = time.perf_counter()
@@ -134,6 +135,23 @@ def _run_fold(
         "timing_s": seconds,
         "worker_s": learner.worker_seconds,
     }
+
+
+def _checkpoint(given: str | None, fold: Split) -> Path | None:
+    """The checkpoint to resume: the file given, or that of the run folder given, if it got so far.
+
+    Raises:
+        FileNotFoundError: if there is nothing at the path.
+    """
+    if given is None:
+        return None
+    path = Path(given)
+    if not path.exists():
+        raise FileNotFoundError(f"no checkpoint or run folder at {path}")
+    if path.is_file():
+        return path
+    found = [path / fold.name / "last.ckpt", path / "last.ckpt"]
+    return next((candidate for candidate in found if candidate.is_file()), None)
 
 
 def _combined(folds: dict[str, dict[str, Any]]) -> dict[str, Any]:

@@ -198,7 +198,6 @@ def test_parts_that_disagree_are_refused(detector):
         rebuilt(detector, channel_filter=ChannelFilter([11] * 23))
 
 
-@pytest.mark.xfail(strict=True, reason="indices are not checked; forward fails with IndexError")
 @pytest.mark.parametrize("index", [2582, -1])
 def test_a_feature_the_pool_does_not_have_is_refused(detector, index):
     with pytest.raises(ValueError, match="2582"):
@@ -380,10 +379,7 @@ def with_state(**changes):
         without("selected"),
         lambda content: content | {"config": "no json"},
         lambda content: content | {"selected": torch.arange(3)},
-        pytest.param(
-            lambda content: content | {"selected": [1, 2, 3]},
-            marks=pytest.mark.xfail(strict=True, raises=AttributeError, reason="passes through"),
-        ),
+        lambda content: content | {"selected": [1, 2, 3]},
         lambda content: content | {"state": {}},
         with_config(channels=[]),
         with_config(channels=[{"name": "film"}]),

@@ -192,3 +192,27 @@ def test_on_the_simulated_hand_the_score_is_neither_trivial_nor_perfect(tmp_path
     ours = learner.metrics["splits"]["test"]["balanced_accuracy"]
     rival = learner.metrics["baselines"]["best_single_feature"]["splits"]["test"]
     assert rival["balanced_accuracy"] < ours < 1.0
+
+
+@pytest.mark.parametrize("change", ["material", "gain"])
+def test_a_checkpoint_of_other_bins_is_refused(tmp_path, change):
+    source = SmallSet()
+    maker = small_maker(source)
+    half = trainer(max_epochs=1)
+    half.fit(
+        SlipLearner(maker.pool, maker.channel_filter, small_recipe()),
+        datamodule=SlipDataModule(maker, unseen_c(source), num_workers=0),
+    )
+    half.save_checkpoint(tmp_path / "half.ckpt")
+    split = unseen_c(source)
+    if change == "material":
+        split = unseen4(source.ids, seen=["a", "c"], unseen=["b"])[0]
+    else:
+        maker = small_maker(SmallSet(gains={split.having("train")[0]: 2.0}))
+    with pytest.raises(ValueError, match="other training bins"):
+        trainer().fit(
+            SlipLearner(maker.pool, maker.channel_filter, small_recipe()),
+            datamodule=SlipDataModule(maker, split, num_workers=0),
+            ckpt_path=tmp_path / "half.ckpt",
+            weights_only=True,
+        )

@@ -109,6 +109,11 @@ def label_bins(
                 f"stroke {stroke + 1} with its onset at {onset_s:.3f} s needs samples from "
                 f"{first} to {last}, outside the recording of {duration_s:.3f} s"
             )
+        if edge - first < bin_samples:
+            raise ValueError(
+                f"labels.bin_ms={rule.bin_ms:g} is longer than the {1000 * lead_s:g} ms before an "
+                f"onset that labels.layout={rule.layout} takes as non-slip"
+            )
         before = torch.arange(first, edge - bin_samples + 1, hop)
         after = torch.arange(edge, max(last - bin_samples + 1, edge), hop)
         starts += [before, after]

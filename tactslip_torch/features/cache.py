@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import logging
@@ -90,8 +91,9 @@ class FeatureCache:
         """Delete the least recently used files until the folder holds at most ``most_bytes``."""
         found = []
         for path in self.folder.glob("*/*.features"):
-            status = path.stat()
-            found.append((status.st_mtime, status.st_size, path))
+            with contextlib.suppress(FileNotFoundError):  # another run may prune as well
+                status = path.stat()
+                found.append((status.st_mtime, status.st_size, path))
         total = sum(size for _, size, _ in found)
         for _, size, path in sorted(found):
             if total <= self.most_bytes:

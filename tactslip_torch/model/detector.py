@@ -56,6 +56,12 @@ class SlipDetector(nn.Module):
                 f"{len(selected)} selected features, a scaler of {len(scaler.minimum)} and a head "
                 f"of {len(head.linear)}: the three must agree"
             )
+        outside = [int(i) for i in selected if not 0 <= i < len(pool.names)]
+        if outside:
+            raise ValueError(
+                f"selected features must lie in 0..{len(pool.names) - 1}, the pool's "
+                f"{len(pool.names)}, got {outside[0]}"
+            )
         if len(channel_filter.window_lengths) != len(pool.hand):
             raise ValueError(
                 f"a filter of {len(channel_filter.window_lengths)} channels does not fit a hand "
@@ -158,7 +164,7 @@ class SlipDetector(nn.Module):
             raise ValueError(f"{os.fspath(path)} is not a file of format {FORMAT!r}")
         try:
             return cls._from_content(content)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
             raise ValueError(f"{os.fspath(path)} is a damaged detector: {reason}") from error
 

@@ -162,7 +162,7 @@ def paper_scenes(
         cycles: recordings per material.
         materials: ids in ``MATERIALS``.
         hand: defaults to the paper's.
-        overrides: any field of ``Scene``, or directly any field of ``Contact``, ``Sensors`` or
+        overrides: any field of ``Scene``, strokes as mappings too, or directly any field of ``Contact``, ``Sensors`` or
             ``Disturbances``, such as the calibrated ``friction_noise_mv``, ``presliding_mm`` and
             ``burst_rate_hz``. A group may be a mapping of its fields.
 
@@ -194,6 +194,11 @@ def _listed(value: Any) -> Any:
 def _grouped(overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Overrides as fields of ``Scene``, the groups' own fields sorted into their groups."""
     values = dict(overrides)
+    if "strokes" in values:
+        values["strokes"] = tuple(
+            stroke if isinstance(stroke, Stroke) else Stroke(**stroke)
+            for stroke in values["strokes"]
+        )
     for name, group in _GROUPS.items():
         given = values.pop(name, None)
         base = given if isinstance(given, group) else group(**(given or {}))
