@@ -162,9 +162,9 @@ def paper_scenes(
         cycles: recordings per material.
         materials: ids in ``MATERIALS``.
         hand: defaults to the paper's.
-        overrides: any field of ``Scene``, strokes as mappings too, or directly any field of ``Contact``, ``Sensors`` or
+        overrides: any field of ``Scene``, or directly any field of ``Contact``, ``Sensors`` or
             ``Disturbances``, such as the calibrated ``friction_noise_mv``, ``presliding_mm`` and
-            ``burst_rate_hz``. A group may be a mapping of its fields.
+            ``burst_rate_hz``. A group or a stroke may be a mapping of its fields.
 
     Raises:
         ValueError: if a scene is bad, an override is no such field, or there is no cycle.
