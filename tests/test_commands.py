@@ -1,0 +1,630 @@
+"""The commands as a user runs them: what they leave behind, and what they say of bad input."""
+
+import json
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import onnx
+import pytest
+import torch
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+
+from tactslip_torch import HandLayout, Recording, SlipDetector
+from tactslip_torch.config import conf_dir, errors_in_one_line, one_line
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.evaluate import evaluate
+from tactslip_torch.train import train
+
+SCORES = {"accuracy", "balanced_accuracy", "non_slip_recall", "slip_recall"}
+ONE_SPLIT = SCORES | {"confusion", "num_bins", "per_material", "per_speed"}
+BAD_INPUT = (ValueError, KeyError, TypeError, OSError, InstantiationException)
+
+
+class TinyRecordings:
+    """Recordings of a stand-in for real sensors: two strokes, louder while the hand slides.
+
+    ``scene`` may hold ``slide_s``, ``quiet`` (materials that never slip long enough for a bin) and
+    ``rate``; ``channels`` how many of the four channels there are.
+    """
+
+    is_simulated = False
+
+    def __init__(self, seed, cycles, materials, channels=None, scene=None):
+        rows = [
+            {"name": f"{kind}{i}", "kind": kind, "finger": finger, "segment": "distal"}
+            for kind in ("SG", "PVDF")
+            for i, finger in enumerate(("index", "thumb"), 1)
+        ]
+        self.hand = HandLayout.from_rows(rows[-channels:] if channels else rows)
+        knobs = {"slide_s": 0.8, "quiet": (), "rate": 2000.0} | (scene or {})
+        self.sample_rate_hz = knobs["rate"]
+        self.ids = tuple(RecordingId(m, c) for m in materials for c in range(cycles))
+        self._seed, self._knobs = seed, knobs
+
+    def timeline(self, recording):
+        slide_s = 0.02 if recording.material in self._knobs["quiet"] else self._knobs["slide_s"]
+        onsets = (1.1, 3.1)
+        return SimpleNamespace(
+            duration_s=4.5,
+            onsets_s=onsets,
+            annotated_onsets_s=onsets,
+            sliding_s=tuple((onset, onset + slide_s) for onset in onsets),
+            speeds_mm_s=(20.0, 40.0),
+        )
+
+    def key(self, recording):
+        return {"tiny": str(recording), "seed": self._seed, "hand": self.hand.to_rows()} | {
+            name: list(value) if name == "quiet" else value for name, value in self._knobs.items()
+        }
+
+    def load(self, recording, windows=None):
+        times = self.timeline(recording)
+        seed = self._seed * 1009 + sum(recording.material.encode()) * 31 + recording.cycle
+        generator = torch.Generator().manual_seed(seed)
+        num_samples = round(times.duration_s * self.sample_rate_hz)
+        noise = torch.randn(len(self.hand), num_samples, generator=generator)
+        time_s = torch.arange(num_samples) / self.sample_rate_hz
+        for start, end in times.sliding_s:
+            noise[:, (time_s >= start) & (time_s < end)] *= 1.3
+        return Recording(
+            noise,
+            self.sample_rate_hz,
+            recording.material,
+            times.speeds_mm_s,
+            times.onsets_s,
+            times.sliding_s,
+        )
+
+
+TINY = (
+    "name=tiny",
+    "data._target_=test_commands.TinyRecordings",
+    "data.materials=[A,B,C]",
+    "data.cycles=4",
+    "split.seen=[A,B]",
+    "split.unseen=[C]",
+    "split.train_share=0.5",
+    "detector.num_features=10",
+    "detector.penalties=[0.1,1.0]",
+    "num_workers=0",
+    "export=false",
+)
+TINY_EVALUATE = tuple(o for o in TINY if not o.startswith(("detector", "export")))
+
+
+def composed(*overrides, name="train"):
+    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+        return compose(name, list(overrides))
+
+
+def run_train(folder, *overrides):
+    """What ``train`` returns, and what it wrote."""
+    returned = train(composed(*overrides), folder)
+    return returned, json.loads((folder / "metrics.json").read_text())
+
+
+def tensors(folder):
+    return SlipDetector.load(folder / "detector.pt").state_dict()
+
+
+def assert_same_detector(folder, other):
+    own, others = tensors(folder), tensors(other)
+    assert set(own) == set(others)
+    for name, value in own.items():
+        assert torch.equal(value, others[name]), name
+    selected = [SlipDetector.load(f / "detector.pt").selected for f in (folder, other)]
+    assert selected[0] == selected[1]
+
+
+def timeless(metrics):
+    return {key: value for key, value in metrics.items() if key not in ("timing_s", "worker_s")}
+
+
+def damage(cache):
+    """Flip a bit in the middle of every file."""
+    paths = [path for path in cache.rglob("*") if path.is_file()]
+    assert paths
+    for path in paths:
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+
+
+def assert_results(folder, metrics, roles, num_pool):
+    """The schema of ``metrics.json``, and that its numbers agree with each other."""
+    assert list(metrics["splits"]) == roles
+    for scores in metrics["splits"].values():
+        assert set(scores) == ONE_SPLIT
+        (quiet_right, false_slip), (missed, slip_right) = scores["confusion"]
+        num_bins = quiet_right + false_slip + missed + slip_right
+        assert scores["num_bins"] == num_bins > 0
+        assert scores["accuracy"] == pytest.approx((quiet_right + slip_right) / num_bins)
+        recalls = quiet_right / (quiet_right + false_slip), slip_right / (slip_right + missed)
+        assert (scores["non_slip_recall"], scores["slip_recall"]) == pytest.approx(recalls)
+        assert scores["balanced_accuracy"] == pytest.approx(sum(recalls) / 2)
+        for kind in ("per_material", "per_speed"):
+            assert sum(part["num_bins"] for part in scores[kind].values()) == num_bins
+            assert all(
+                set(part) == SCORES | {"confusion", "num_bins"} for part in scores[kind].values()
+            )
+    assert metrics["num_features_pool"] == num_pool
+    detector = SlipDetector.load(folder / "detector.pt")
+    assert metrics["selected"] == [str(name) for name in detector.selected_names]
+    assert all(seconds >= 0 for seconds in metrics["timing_s"].values())
+    assert metrics["timing_s"]["total"] > 0
+
+
+def assert_files(folder, *more):
+    for name in ("metrics.json", "detector.pt", "config.yaml", "last.ckpt", *more):
+        assert (folder / name).stat().st_size > 0, name
+    for name in ("confusion.png", "selected_features.png"):
+        assert (folder / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert list(folder.rglob("events.out.tfevents.*"))
+    assert not [path for path in folder.rglob("*") if ".tmp" in path.name]
+
+
+# A run on recordings that are not simulated ----------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    folder, cache = tmp_path_factory.mktemp("tiny"), tmp_path_factory.mktemp("cache")
+    returned, metrics = run_train(folder, *TINY, f"cache={cache}")
+    return SimpleNamespace(folder=folder, cache=cache, returned=returned, metrics=metrics)
+
+
+def test_a_run_leaves_its_results(tiny):
+    assert_files(tiny.folder)
+    assert_results(tiny.folder, tiny.metrics, ["train", "test", "unseen"], 2 * 13 + 2 * 240)
+    assert not (tiny.folder / "model.onnx").exists()  # export=false
+    config = yaml.safe_load((tiny.folder / "config.yaml").read_text())
+    assert config["split"]["seen"] == ["A", "B"]
+    assert config["data"]["seed"] == 0  # resolved
+
+
+def test_a_run_says_whether_its_recordings_are_simulated(tiny):
+    assert tiny.metrics["simulated"] is False
+    assert SlipDetector.load(tiny.folder / "detector.pt").info["simulated"] is False
+
+
+def test_bins_and_materials_are_where_the_split_puts_them(tiny):
+    splits = tiny.metrics["splits"]
+    assert {role: list(scores["per_material"]) for role, scores in splits.items()} == {
+        "train": ["A", "B"],
+        "test": ["A", "B"],
+        "unseen": ["C"],
+    }
+    per_recording = 2 * (20 + 16)  # 0.81 s of slide
+    num_bins = {role: scores["num_bins"] for role, scores in splits.items()}
+    assert num_bins == dict.fromkeys(("train", "test", "unseen"), 4 * per_recording)
+    assert all(list(scores["per_speed"]) == ["20", "40"] for scores in splits.values())
+
+
+def test_a_run_returns_its_scores_as_floats(tiny):
+    assert set(tiny.returned) == {
+        f"{role}/{name}"
+        for role in ("train", "test", "unseen")
+        for name in ("accuracy", "balanced_accuracy")
+    }
+    for key, value in tiny.returned.items():
+        role, name = key.split("/")
+        assert value == tiny.metrics["splits"][role][name]
+
+
+def test_the_detector_learned_something(tiny):
+    assert tiny.returned["unseen/balanced_accuracy"] > 0.7
+
+
+def test_a_warm_run_gives_the_same(tiny, tmp_path):
+    _, metrics = run_train(tmp_path, *TINY, f"cache={tiny.cache}")
+    assert timeless(metrics) == timeless(tiny.metrics)
+    assert_same_detector(tmp_path, tiny.folder)
+    assert "features" not in metrics["worker_s"]  # all came from the cache
+    assert "features" in tiny.metrics["worker_s"]
+
+
+def test_a_run_without_a_cache_gives_the_same_and_leaves_none(tiny, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    _, metrics = run_train(tmp_path / "run", *TINY, "cache=off")
+    assert timeless(metrics) == timeless(tiny.metrics)
+    assert not (tmp_path / "home").exists()
+    assert not list((tmp_path / "temporary").glob("tactslip-*"))
+
+
+def test_the_users_cache_folder_is_the_default(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    run_train(tmp_path / "run", *TINY, "data.cycles=2")
+    assert list((tmp_path / "home" / "tactslip_torch").rglob("*.features"))
+
+
+def test_damaged_features_are_made_again(tiny, tmp_path, caplog):
+    cache = tmp_path / "cache"
+    run_train(tmp_path / "first", *TINY, f"cache={cache}")
+    damage(cache)
+    _, metrics = run_train(tmp_path / "second", *TINY, f"cache={cache}")
+    assert "damaged" in caplog.text
+    assert timeless(metrics) == timeless(tiny.metrics)
+    assert_same_detector(tmp_path / "second", tiny.folder)
+    caplog.clear()
+    run_train(tmp_path / "third", *TINY, f"cache={cache}")
+    assert "damaged" not in caplog.text
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_the_number_of_workers_changes_nothing(tiny, tmp_path, num_workers):
+    overrides = [o for o in TINY if not o.startswith("num_workers")]
+    _, metrics = run_train(tmp_path, *overrides, f"num_workers={num_workers}", "cache=off")
+    assert_same_detector(tmp_path, tiny.folder)
+    assert timeless(metrics) == timeless(tiny.metrics)
+
+
+def test_another_seed_is_another_run(tiny, tmp_path):
+    _, metrics = run_train(tmp_path, *TINY, f"cache={tiny.cache}", "seed=1")
+    assert metrics["seed"] == 1
+    assert metrics["splits"] != tiny.metrics["splits"]
+
+
+def test_a_run_resumes_from_its_checkpoint(tiny, tmp_path):
+    """After the first pass: what it gathered is in the file, and the second pass finds it."""
+    overrides = (*TINY, f"cache={tiny.cache}")
+    with pytest.raises(ValueError, match="nothing to test"):
+        run_train(tmp_path / "first", *overrides, "trainer.max_epochs=1")
+    checkpoint = tmp_path / "first" / "last.ckpt"
+    _, metrics = run_train(tmp_path / "second", *overrides, f"ckpt_path={checkpoint}")
+    assert "moments_pass" not in metrics["timing_s"]
+    assert timeless(metrics) == timeless(tiny.metrics)
+    assert_same_detector(tmp_path / "second", tiny.folder)
+
+
+def test_a_fast_run_goes_all_the_way(tmp_path):
+    returned, metrics = run_train(tmp_path, *TINY, "cache=off", "trainer.fast_dev_run=true")
+    ((role, scores),) = metrics["splits"].items()  # one recording is judged, and has one role
+    assert scores["num_bins"] == 72
+    assert returned[f"{role}/accuracy"] == scores["accuracy"]
+    assert (tmp_path / "detector.pt").is_file()
+    assert not (tmp_path / "last.ckpt").exists()
+
+
+def test_one_fold_per_material_leaves_a_folder_each(tmp_path):
+    overrides = [o for o in TINY if not o.startswith("split")]
+    folds = ("split=leave_one_material_out", "split.materials=[A,B,C]", "split.train_share=0.5")
+    _, metrics = run_train(tmp_path, *overrides, *folds, "cache=off")
+    assert list(metrics["folds"]) == ["without_A", "without_B", "without_C"]
+    for name, fold in metrics["folds"].items():
+        assert (tmp_path / name / "detector.pt").is_file()
+        assert list(fold["splits"]["unseen"]["per_material"]) == [name.removeprefix("without_")]
+    total = metrics["splits"]["unseen"]
+    parts = [fold["splits"]["unseen"] for fold in metrics["folds"].values()]
+    assert total["num_bins"] == sum(part["num_bins"] for part in parts)
+    assert list(total["per_material"]) == ["A", "B", "C"]
+    shared = set.intersection(*(set(fold["selected"]) for fold in metrics["folds"].values()))
+    assert set(metrics["selected"]) == shared
+
+
+def test_the_checkpoint_of_a_fold_does_not_reach_another(tmp_path):
+    """Its moments hold bins of the material that the other fold leaves out."""
+    overrides = [o for o in TINY if not o.startswith("split")]
+    overrides += ["split=leave_one_material_out", "split.materials=[A,B,C]"]
+    overrides += [f"cache={tmp_path / 'cache'}"]
+    with pytest.raises(ValueError, match="nothing to test"):
+        run_train(tmp_path / "first", *overrides, "trainer.max_epochs=1")
+    checkpoint = tmp_path / "first" / "without_A" / "last.ckpt"
+    with pytest.raises(ValueError, match="gathered from other training bins") as caught:
+        run_train(tmp_path / "second", *overrides, f"ckpt_path={checkpoint}")
+    assert_one_line(caught.value, "split and seed it was made with")
+    assert (tmp_path / "second" / "without_A" / "detector.pt").is_file()  # its own fold resumed
+    assert not (tmp_path / "second" / "without_B" / "detector.pt").exists()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "data.cycles=6",
+        "data.seed=1",
+        "+data.scene.slide_s=0.7",
+        "split.seed=1",
+        "split.train_share=0.75",
+        "labels=half_second",
+        "features.spectrum=clean",
+    ],
+)
+def test_a_checkpoint_of_other_bins_is_refused(tiny, tmp_path, change):
+    checkpoint = f"ckpt_path={tiny.folder / 'last.ckpt'}"
+    config = composed(*TINY, "cache=off", checkpoint, change)
+    with pytest.raises(ValueError, match="gathered from other training bins"):
+        train(config, tmp_path)
+
+
+def test_random_bins_have_train_and_test_in_every_recording(tmp_path):
+    overrides = [o for o in TINY if not o.startswith("split")]
+    _, metrics = run_train(
+        tmp_path, *overrides, "cache=off", "split=random_bins", "split.seen=[A,B]"
+    )
+    splits = metrics["splits"]
+    assert list(splits) == ["train", "test"]
+    assert splits["train"]["num_bins"] + splits["test"]["num_bins"] == 2 * 4 * 72
+
+
+# Evaluate --------------------------------------------------------------------------------------
+
+
+def test_evaluate_gives_the_scores_of_the_run(tiny, tmp_path, capsys):
+    overrides = (*TINY_EVALUATE, f"cache={tiny.cache}", f"model={tiny.folder / 'detector.pt'}")
+    metrics = evaluate(composed(*overrides, name="evaluate"), tmp_path)
+    assert metrics["splits"] == tiny.metrics["splits"]
+    assert metrics == json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["simulated"] is False
+    for name in ("confusion.png", "selected_features.png", "config.yaml"):
+        assert (tmp_path / name).is_file()
+    assert "were trained on" not in capsys.readouterr().out
+
+
+def test_evaluate_tells_of_recordings_it_was_trained_on(tiny, tmp_path, capsys):
+    overrides = [o for o in TINY_EVALUATE if not o.startswith("split")]
+    swapped = ("split.seen=[B,C]", "split.unseen=[A]", "split.train_share=0.5")
+    model = f"model={tiny.folder / 'detector.pt'}"
+    config = composed(*overrides, *swapped, f"cache={tiny.cache}", model, name="evaluate")
+    evaluate(config, tmp_path)
+    out = capsys.readouterr().out
+    assert "note: 2 of 8 held-out recordings of unseen4 were trained on (such as A/" in out
+
+
+def evaluated(tiny, folder, *overrides):
+    model = f"model={tiny.folder / 'detector.pt'}"
+    return evaluate(
+        composed(*TINY_EVALUATE, "cache=off", model, *overrides, name="evaluate"), folder
+    )
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3 SG2"),
+        ("+data.scene.rate=1000.0", "the features expect 2000 Hz, the recordings have 1000 Hz"),
+        ("labels.bin_ms=100", "the features expect bins of 100 samples, labels.bin_ms=100 makes"),
+        ("split.seen=[A,Foo]", "no recording of material 'Foo'; the set has A, B, C"),
+    ],
+)
+def test_evaluate_refuses_what_does_not_fit_the_detector(tiny, tmp_path, override, line):
+    with pytest.raises(BAD_INPUT) as caught:
+        evaluated(tiny, tmp_path, override)
+    assert_one_line(caught.value, line)
+
+
+# Bad input -------------------------------------------------------------------------------------
+
+
+def assert_one_line(error, expected):
+    line = one_line(error)
+    assert expected in line
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (["data.materials=[M1,Foo]"], "unknown material 'Foo'; known are M1, M2"),
+        (["split.seen=[M1,Foo]"], "no recording of material 'Foo'; the set has M1, M2"),
+        (["split.unseen=[M1]"], "materials M1 are both seen and unseen"),
+        (["labels.layout=nope"], "labels.layout must be one of whole_slide, half_second"),
+        (["labels.onsets=felt"], "labels.onsets must be one of annotated, exact"),
+        (["labels.bin_ms=50.1"], "labels.bin_ms=50.1 is 100.2 samples at 2000 Hz"),
+        (["data.cycles=0"], "cycles must be at least 1, got 0"),
+        (["data.cycles=1"], "no recording has the role 'test'"),
+        (["split.unseen=[]"], "no recording has the role 'unseen'"),
+        (["split.train_share=1.2"], "split.train_share must lie between 0 and 1, got 1.2"),
+        (["features.dtype=float16"], "features.dtype must be one of float64, float32"),
+        (["features.frames={SG: 51}", "~features.frames.PVDF"], "no frame for PVDF channels"),
+        (["features.frames.SG=50"], "window_length must be odd"),
+        (["+features.misspelt=1"], "misspelt"),
+        (["detector.num_features=3000"], "detector.num_features=3000 exceeds the pool's 2582"),
+        (["detector.num_features=0"], "detector.num_features must be at least 1"),
+        (["detector.penalties=[]"], "detector.penalties must be positive, got []"),
+        (["detector.balance=smote"], "detector.balance must be one of undersample, weights"),
+        (["+data.scene.misspelt=1"], "unknown override misspelt"),
+        (["data.channels=[{name: film, kind: FSR, finger: index, segment: distal}]"], "FSR"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_bad_input_is_refused_before_anything_is_simulated(overrides, line, tmp_path, monkeypatch):
+    monkeypatch.setattr("tactslip_torch.simulation.source.simulate", None)
+    config = composed("num_workers=0", f"cache={tmp_path / 'cache'}", *overrides)
+    with pytest.raises(BAD_INPUT) as caught:
+        train(config, tmp_path / "run")
+    assert_one_line(caught.value, line)
+
+
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_an_absent_class_is_named(tmp_path, num_workers):
+    """Slides of 30 ms hold no bin of 50 ms: there is non-slip alone."""
+    overrides = [o for o in TINY if not o.startswith("num_workers")]
+    config = composed(
+        *overrides, "cache=off", "+data.scene.slide_s=0.03", f"num_workers={num_workers}"
+    )
+    with pytest.raises(ValueError, match="slip") as caught:
+        train(config, tmp_path)
+    assert_one_line(caught.value, "no slip")
+
+
+def test_a_class_absent_from_one_material_alone_is_named(tmp_path):
+    """Material B never slips: C cannot be chosen on it."""
+    config = composed(*TINY, "cache=off", "+data.scene.quiet=[B]")
+    with pytest.raises(ValueError, match="slip") as caught:
+        train(config, tmp_path)
+    assert_one_line(caught.value, "slip")
+
+
+def test_a_class_absent_from_what_is_judged_is_no_perfect_score(tmp_path):
+    returned, metrics = run_train(tmp_path, *TINY, "cache=off", "+data.scene.quiet=[C]")
+    scores = metrics["splits"]["unseen"]
+    assert scores["slip_recall"] is None
+    assert scores["balanced_accuracy"] is None
+    assert "unseen/balanced_accuracy" not in returned
+    assert scores["accuracy"] == scores["non_slip_recall"]
+
+
+def test_a_detector_that_was_not_given_is_asked_for(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop, errors_in_one_line():
+        evaluate(composed(name="evaluate"), tmp_path)
+    assert stop.value.code == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ")
+    assert "model" in err
+    assert err.count("\n") == 1
+
+
+def test_strokes_can_be_configured():
+    """``scene`` takes any knob of the scenes; ``Scene.from_dict`` knows how."""
+    strokes = "+data.scene.strokes=[{speed_mm_s: 30.0, distance_mm: 50.0}]"
+    source = instantiate(composed(strokes, "data.cycles=1").data, _convert_="all")
+    assert source.timeline(source.ids[0]).speeds_mm_s == (30.0,)
+
+
+# Real processes --------------------------------------------------------------------------------
+
+FAILURES = {
+    "unknown experiment": (["train", "+exp=nope"], "unknown exp nope; known: leave_one"),
+    "unknown material": (
+        ["train", "+exp=quick", "data.materials=[M1,Foo]", "split.seen=[M1]", "split.unseen=[Foo]"],
+        "unknown material 'Foo'; known are M1",
+    ),
+    "unknown layout": (["train", "labels.layout=nope"], "labels.layout must be one of whole_slide"),
+    "missing detector": (["evaluate", "model=missing.pt"], "no detector at missing.pt"),
+    "nothing to export": (["export", "model=missing.pt"], "no detector at missing.pt"),
+}
+
+
+def environment():
+    return {k: v for k, v in os.environ.items() if k != "TACTSLIP_TRACEBACK"}
+
+
+@pytest.fixture(scope="module")
+def failures(tmp_path_factory):
+    """All of them at once: each spends its time importing."""
+    started = {
+        name: subprocess.Popen(
+            [sys.executable, "-m", f"tactslip_torch.{entry}", *arguments],
+            cwd=tmp_path_factory.mktemp("failure"),
+            env=environment(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for name, ((entry, *arguments), _) in FAILURES.items()
+    }
+    return {name: (*process.communicate(), process.returncode) for name, process in started.items()}
+
+
+@pytest.mark.parametrize("name", FAILURES)
+def test_bad_input_is_one_line_and_a_failing_exit(name, failures):
+    out, err, code = failures[name]
+    assert code == 2, err
+    assert out == ""
+    assert err.startswith("error: ")
+    assert FAILURES[name][1] in err
+    assert err.count("\n") == 1
+
+
+# The quick experiment, on the simulated hand -----------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    folder, cache = tmp_path_factory.mktemp("quick"), tmp_path_factory.mktemp("cache")
+    _, metrics = run_train(folder, "+exp=quick", "num_workers=0", f"cache={cache}")
+    return SimpleNamespace(folder=folder, cache=cache, metrics=metrics)
+
+
+@pytest.mark.slow
+def test_quick_leaves_everything(quick):
+    assert_files(quick.folder, "model.onnx")
+    assert_results(quick.folder, quick.metrics, ["train", "test", "unseen"], 2582)
+    assert quick.metrics["simulated"] is True
+    assert len(quick.metrics["selected"]) == 120
+    materials = {r: list(s["per_material"]) for r, s in quick.metrics["splits"].items()}
+    seen = ["M1", "M4", "M6"]
+    assert materials == {"train": seen, "test": seen, "unseen": ["iron"]}
+    for scores in quick.metrics["splits"].values():
+        assert list(scores["per_speed"]) == ["20", "40", "60"]
+    non_slip = {r: sum(s["confusion"][0]) for r, s in quick.metrics["splits"].items()}
+    assert non_slip == {"train": 3 * 60, "test": 3 * 60, "unseen": 2 * 60}
+    onnx.checker.check_model(onnx.load(quick.folder / "model.onnx"))
+
+
+@pytest.mark.slow
+def test_a_warm_quick_run_gives_the_same(quick, tmp_path):
+    overrides = ("+exp=quick", "num_workers=0", f"cache={quick.cache}", "export=false")
+    _, metrics = run_train(tmp_path, *overrides)
+    assert timeless(metrics) == timeless(quick.metrics)
+    assert_same_detector(tmp_path, quick.folder)
+
+
+@pytest.mark.slow
+def test_simulation_in_workers_gives_the_same_bytes(quick, tmp_path):
+    run_train(tmp_path, "+exp=quick", "num_workers=2", "cache=off", "export=false")
+    assert_same_detector(tmp_path, quick.folder)
+
+
+@pytest.mark.slow
+def test_damaged_features_of_the_simulation_are_made_again(quick, tmp_path, caplog):
+    overrides = ("+exp=quick", "num_workers=0", f"cache={tmp_path / 'cache'}", "export=false")
+    run_train(tmp_path / "first", *overrides)
+    damage(tmp_path / "cache")
+    _, metrics = run_train(tmp_path / "second", *overrides)
+    assert "damaged" in caplog.text
+    assert timeless(metrics) == timeless(quick.metrics)
+
+
+@pytest.mark.slow
+def test_quick_resumes(quick, tmp_path):
+    overrides = ("+exp=quick", "num_workers=0", f"cache={quick.cache}", "export=false")
+    with pytest.raises(ValueError, match="nothing to test"):
+        run_train(tmp_path / "first", *overrides, "trainer.max_epochs=1")
+    checkpoint = tmp_path / "first" / "last.ckpt"
+    run_train(tmp_path / "second", *overrides, f"ckpt_path={checkpoint}")
+    assert_same_detector(tmp_path / "second", quick.folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(path.stem for path in (conf_dir() / "exp").glob("*.yaml")))
+def test_every_experiment_runs_fast(name, tmp_path):
+    """One recording of each pass; the whole set is named, not simulated."""
+    overrides = (f"+exp={name}", "num_workers=0", f"cache={tmp_path / 'cache'}", "export=false")
+    _, metrics = run_train(tmp_path / "run", *overrides, "trainer.fast_dev_run=true")
+    assert metrics["splits"]
+
+
+def run_entry(folder, entry, *arguments):
+    command = [sys.executable, "-m", f"tactslip_torch.{entry}", *arguments]
+    return subprocess.run(
+        command, cwd=folder, env=environment(), capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.slow
+def test_evaluate_works_as_a_command(quick, tmp_path):
+    split = ("data.cycles=2", "data.materials=[M1,M4,M6,iron]", "split.seen=[M1,M4,M6]")
+    split += ("split.unseen=[iron]", "split.train_share=0.5", f"cache={quick.cache}")
+    model = f"model={quick.folder / 'detector.pt'}"
+    done = run_entry(tmp_path, "evaluate", model, *split, "hydra.run.dir=judged")
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((tmp_path / "judged" / "metrics.json").read_text())
+    assert metrics["splits"] == quick.metrics["splits"]
+    assert metrics["simulated"] is True
+
+
+@pytest.mark.slow
+@pytest.mark.onnx
+def test_export_works_as_a_command(quick, tmp_path):
+    model = f"model={quick.folder / 'detector.pt'}"
+    done = run_entry(tmp_path, "export", model, "output=out/small.onnx")
+    assert done.returncode == 0, done.stderr
+    onnx.checker.check_model(onnx.load(tmp_path / "out" / "small.onnx"))
+    assert [path.name for path in tmp_path.rglob("*")] == ["out", "small.onnx"]
