@@ -1,8 +1,8 @@
 """The published experiments over several seeds: ``python -m benchmarks.seeds``.
 
-Trains every experiment on every seed (finished runs in ``--runs`` are kept, so it resumes), writes
-``benchmarks/results/seeds.json`` and the figure beside it, and puts the table of means and spreads
-between the markers in README.md. Every number in that table comes from here.
+Trains every experiment on every seed (runs in ``--runs`` that this code finished are kept, so it
+resumes), writes ``benchmarks/results/seeds.json`` and the pictures beside it, and puts the table of
+means and spreads between the markers in README.md. Every number in that table comes from here.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from tactslip_torch.features.cache import source_digest
 from tactslip_torch.files import whole_file
 from tactslip_torch.report import published
+from tactslip_torch.report.figures import pipeline_figure
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -34,13 +36,13 @@ COMMAND = "python -m benchmarks.seeds"
 
 
 def run(experiment: str, seed: int, folder: Path) -> dict[str, Any]:
-    """The metrics of one run, from its folder if it is finished there, else trained now.
+    """The metrics of one run, from its folder if this code finished it there, else trained now.
 
     Raises:
         RuntimeError: if the training fails.
     """
     place = folder / f"{experiment}-{seed}"
-    if not (place / "metrics.json").exists():
+    if not _is_finished(place):
         command = [sys.executable, "-m", "tactslip_torch.train", *EXPERIMENTS[experiment]]
         command += [f"seed={seed}", "export=false", f"hydra.run.dir={place}"]
         print(f"{experiment}, seed {seed}: {' '.join(command[1:])}", flush=True)
@@ -76,7 +78,7 @@ def table(rows: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
         rows: experiment to the rows of its seeds.
     """
     head = ["experiment", "bins judged", *(name.replace("_", " ") + " %" for name in SCORES)]
-    head += ["best single feature, balanced %"]
+    head += ["best single selected feature, balanced %"]
     lines = [head, ["---"] * len(head)]
     for experiment, runs in rows.items():
         for role in runs[0]["splits"]:
@@ -101,7 +103,11 @@ def figure(rows: Mapping[str, Sequence[Mapping[str, Any]]], path: Path) -> None:
     for place, (experiment, role) in enumerate(names):
         values = [100 * run["splits"][role]["balanced_accuracy"] for run in rows[experiment]]
         rivals = [100 * run["best_single_feature"][role] for run in rows[experiment]]
-        labels = ("ours, one dot per seed", "best single feature") if place == 0 else (None, None)
+        labels = (
+            ("ours, one dot per seed", "best single selected feature")
+            if place == 0
+            else (None, None)
+        )
         axes.plot(values, [place] * len(values), "o", color="#0072b2", alpha=0.7, label=labels[0])
         axes.plot(rivals, [place] * len(rivals), "|", color="#d55e00", ms=9, label=labels[1])
         paper = published.SPLITS.get(role)
@@ -150,10 +156,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with whole_file(RESULTS / "seeds.json") as temporary:
         temporary.write_text(json.dumps(rows, indent=1) + "\n")
     figure(rows, RESULTS / "seeds.png")
+    pipeline_figure(RESULTS / "pipeline.png")
     readme = ROOT / "README.md"
     with whole_file(readme) as temporary:
         temporary.write_text(between_markers(readme.read_text(), "seeds", table(rows)))
     print(table(rows))
+
+
+def _is_finished(place: Path) -> bool:
+    """Whether the folder holds the metrics of a run of this very code."""
+    if not (place / "metrics.json").exists():
+        return False
+    made_by = json.loads((place / "metrics.json").read_text())["versions"]["code"]
+    return bool(made_by == source_digest(ROOT / "tactslip_torch"))
 
 
 def _spread(values: Sequence[float]) -> str:

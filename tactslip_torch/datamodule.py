@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import time
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,7 +84,7 @@ class FeatureMaker:
         if pool.sample_rate_hz != source.sample_rate_hz:
             raise ValueError(
                 f"the features expect {pool.sample_rate_hz:g} Hz, the recordings have "
-                f"{source.sample_rate_hz:g} Hz; set features.sample_rate_hz or resample"
+                f"{source.sample_rate_hz:g} Hz; make the features for that rate, or resample"
             )
         bin_samples = round(rule.bin_ms * source.sample_rate_hz / 1000)
         if pool.bin_samples != bin_samples:
@@ -188,7 +189,7 @@ class FeatureMaker:
             "filter": [self.channel_filter.window_lengths, self.channel_filter.polyorder],
             "dtype": str(self.dtype),
             "code": self._code,
-            "torch": torch.__version__,
+            "libraries": [version(name) for name in ("torch", "numpy", "ptwt", "PyWavelets")],
         }
         return cache_key(facts)
 

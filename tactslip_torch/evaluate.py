@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
@@ -22,12 +21,14 @@ from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
 from tactslip_torch.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.experiment import (
+    DTYPES,
     common_facts,
     feature_cache,
     feature_rows,
     make_trainer,
     save_config,
 )
+from tactslip_torch.features.cache import cache_key
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report.results import print_results, write_results
@@ -55,11 +56,14 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     save_config(config, folder)
     parts: dict[str, dict[str, Any]] = {}
+    overlaps: dict[str, dict[str, list[str]]] = {}
     with feature_cache(config.cache) as cache:
         filters = detector.channel_filter
-        maker = FeatureMaker(source, detector.pool, filters, rule, cache, torch.float64)
+        dtype = DTYPES[detector.info.get("features_dtype", "float64")]
+        maker = FeatureMaker(source, detector.pool, filters, rule, cache, dtype)
         for fold in folds:
-            _warn_of_overlap(detector, fold, config)
+            overlaps[fold.name] = overlap(detector, source, fold)
+            _note(fold, overlaps[fold.name])
             learner = SlipLearner(detector.pool, filters, detector=detector)
             trainer = make_trainer(config.trainer, folder)
             data = SlipDataModule(maker, fold, config.num_workers)
@@ -71,8 +75,10 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             role: merged_metrics([splits[role] for splits in parts.values() if role in splits])
             for role in roles
         },
+        "baselines": learner.metrics["baselines"] if len(folds) == 1 else {},
         "selected": [str(name) for name in detector.selected_names],
         "timing_s": {"total": time.perf_counter() - started},
+        "overlap": overlaps,
         "detector": detector.info,
     }
     rows = feature_rows(detector.selected_names, source.hand)
@@ -82,17 +88,27 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     return metrics
 
 
-def _warn_of_overlap(detector: SlipDetector, fold: Split, config: DictConfig) -> None:
-    """Say which held-out recordings the detector was trained on, if any."""
-    if detector.info.get("seed") != config.seed:
-        return  # another seed simulates other recordings under the same names
-    held_out = {str(recording) for recording in fold.having("test", "unseen")}
-    known = sorted(held_out & set(detector.info.get("train_recordings", [])))
-    if known:
-        print(
-            f"note: {len(known)} of {len(held_out)} held-out recordings of {fold.name} were "
-            f"trained on (such as {known[0]}): their scores are training scores"
-        )
+def overlap(detector: SlipDetector, source: RecordingSource, fold: Split) -> dict[str, list[str]]:
+    """What a fold holds out that the detector was trained on: recordings, and materials.
+
+    Recordings are compared by everything that determines them, not by name.
+    """
+    known = set(detector.info.get("train_recordings", {}).values())
+    held_out = fold.having("test", "unseen")
+    materials = {recording.material for recording in fold.having("unseen")}
+    return {
+        "recordings": [str(r) for r in held_out if cache_key(source.key(r)) in known],
+        "unseen_materials": sorted(materials & set(detector.info.get("train_materials", []))),
+    }
+
+
+def _note(fold: Split, found: dict[str, list[str]]) -> None:
+    for what, names in found.items():
+        if names:
+            print(
+                f"note: the detector was trained on {len(names)} {what.replace('_', ' ')} that "
+                f"{fold.name} holds out (such as {names[0]}): not a held-out score"
+            )
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="evaluate")

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import tactslip_torch
 from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.features.cache import FeatureCache, default_cache_folder
+from tactslip_torch.features.cache import FeatureCache, default_cache_folder, source_digest
 from tactslip_torch.features.pool import FeatureName, FeaturePool
 from tactslip_torch.files import whole_file
 from tactslip_torch.hand import HandLayout
@@ -63,17 +63,19 @@ def feature_parts(
 
 
 @contextmanager
-def feature_cache(setting: str) -> Iterator[FeatureCache]:
+def feature_cache(setting: str | bool | None) -> Iterator[FeatureCache]:
     """The cache of ``cache=auto|off|FOLDER``; ``off`` keeps features for this run only.
 
     Two passes need the features twice, so even ``off`` holds them on disk, in a temporary folder
     that goes with the run.
     """
-    if setting == "off":
+    if setting in ("off", False, None):  # YAML reads a bare off as false
         with tempfile.TemporaryDirectory(prefix="tactslip-") as folder:
             yield FeatureCache(folder)
         return
-    cache = FeatureCache(default_cache_folder() if setting == "auto" else Path(setting))
+    cache = FeatureCache(
+        default_cache_folder() if setting in ("auto", True) else Path(str(setting)).expanduser()
+    )
     yield cache
     cache.prune()
 
@@ -133,5 +135,9 @@ def common_facts(source: RecordingSource, pool: FeaturePool, config: DictConfig)
         "seed": config.seed,
         "labels": OmegaConf.to_container(config.labels, resolve=True),
         "num_features_pool": len(pool.names),
-        "versions": {"tactslip_torch": tactslip_torch.__version__, "torch": torch.__version__},
+        "versions": {
+            "tactslip_torch": tactslip_torch.__version__,
+            "torch": torch.__version__,
+            "code": source_digest(Path(tactslip_torch.__file__).parent),
+        },
     }

@@ -69,6 +69,8 @@ class SlipLearner(L.LightningModule):
         self.recipe = recipe or Recipe()
         self.detector = detector
         self.threshold: FeatureThreshold | None = None
+        if detector and "rival" in detector.info:
+            self.threshold = FeatureThreshold(**detector.info["rival"])
         self.facts: dict[str, Any] = {}
         self.metrics: dict[str, Any] = {}
         self.seconds: dict[str, float] = {}
@@ -122,10 +124,10 @@ class SlipLearner(L.LightningModule):
         Raises:
             ValueError: if it was gathered from other recordings than those to be trained on.
         """
-        if checkpoint["fingerprint"] != self._fingerprint():
+        if checkpoint.get("fingerprint") != self._fingerprint():
             raise ValueError(
                 "the checkpoint was gathered from other training bins; resume with the code, "
-                "data, labels, split and seed it was made with"
+                "data, labels, split, validation groups and seed it was made with"
             )
         for group, state in checkpoint["moments"].items():
             self._moments.groups[group] = ClassMoments.from_state_dict(state)
@@ -146,7 +148,8 @@ class SlipLearner(L.LightningModule):
         assert self.detector is not None  # on_test_start
         self._count_seconds(batch)
         chosen = batch.features[:, list(self.detector.selected)].double()
-        says_slip = self.detector.score_features(chosen) >= 0
+        device = self.detector.head.linear.device  # Lightning may have moved it
+        says_slip = self.detector.score_features(chosen.to(device)).cpu() >= 0
         rival = self.threshold(chosen) if self.threshold else torch.zeros_like(says_slip)
         for role, mask in batch.roles.items():
             if bool(mask.any()):
@@ -186,7 +189,7 @@ class SlipLearner(L.LightningModule):
 
     def _fingerprint(self) -> str:
         data: SlipDataModule = self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning's
-        return data.fingerprint()
+        return f"{data.fingerprint()} by {self.recipe.group_by}"
 
     def _solve(self) -> None:
         bins = CollectedBins.of(self.recipe, self._columns, self._collected)
@@ -196,8 +199,9 @@ class SlipLearner(L.LightningModule):
         self.seconds |= fitted.seconds
         self.facts = fitted.facts
         self.threshold = fitted.threshold
+        info = self.facts | {"rival": fitted.threshold.to_dict()}
         self.detector = SlipDetector(
-            self.pool, self.channel_filter, fitted.selected, fitted.scaler, fitted.head, self.facts
+            self.pool, self.channel_filter, fitted.selected, fitted.scaler, fitted.head, info
         )
 
     def rates(self) -> dict[str, str]:

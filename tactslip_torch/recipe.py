@@ -70,6 +70,7 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "penalties", tuple(float(p) for p in self.penalties))
         choices = {
             "score_variance": ("pooled", "welch"),
             "balance": ("undersample", "weights"),

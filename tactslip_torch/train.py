@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
+from tactslip_torch.config import conf_dir, errors_in_one_line, one_line, run_entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
@@ -32,24 +32,29 @@ from tactslip_torch.experiment import (
     save_config,
 )
 from tactslip_torch.export import export_onnx
+from tactslip_torch.features.cache import cache_key
 from tactslip_torch.files import whole_file
 from tactslip_torch.learning import SlipLearner
+from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.report.results import print_results, write_results
-from tactslip_torch.report.scores import merged_metrics
+from tactslip_torch.report.scores import merged_metrics, summed_metrics
 
 log = logging.getLogger(__name__)
 
 
-class SaveAfterPass(L.Callback):
-    """Writes ``last.ckpt`` after each pass, whole or not at all, for ``ckpt_path=``."""
+class SaveAfterFirstPass(L.Callback):
+    """Writes ``last.ckpt`` behind the first pass, whole or not at all, for ``ckpt_path=``.
+
+    Not behind the second: resuming repeats that and the solve, which read features from the cache.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Save."""
-        if not getattr(trainer, "fast_dev_run", False):
+        if trainer.current_epoch == 0 and not getattr(trainer, "fast_dev_run", False):
             with whole_file(self._folder / "last.ckpt") as temporary:
                 trainer.save_checkpoint(temporary)
 
@@ -89,12 +94,14 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             fold_metrics[fold.name] = _run_fold(config, place, data, learner)
     metrics = common_facts(source, pool, config) | _combined(fold_metrics)
     metrics["timing_s"]["total"] = time.perf_counter() - started
-    selected = [name for name in pool.names if str(name) in set(metrics["selected"])]
-    selected.sort(key=lambda name: metrics["selected"].index(str(name)))
-    rows = feature_rows(selected, source.hand)
+    by_name = {str(name): name for name in pool.names}
+    rows = feature_rows([by_name[name] for name in metrics["selected"]], source.hand)
     write_results(folder, metrics, rows)
     print_results(metrics, rows)
     print(f"\nresults in {folder}")
+    problems = [fold["onnx"] for fold in fold_metrics.values() if isinstance(fold["onnx"], str)]
+    if problems:
+        raise ValueError(f"all but model.onnx is written: {problems[0]}")
     return {
         f"{role}/{name}": scores[name]
         for role, scores in metrics["splits"].items()
@@ -108,33 +115,49 @@ def _run_fold(
 ) -> dict[str, Any]:
     """Fit, test, save and export one fold; what it found."""
     source = data.maker.source
-    trainer = make_trainer(config.trainer, folder, [SaveAfterPass(folder)])
+    trainer = make_trainer(config.trainer, folder, [SaveAfterFirstPass(folder)])
     checkpoint = _checkpoint(config.ckpt_path, data.split)
     trainer.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    if learner.detector is None:
+        raise ValueError(
+            "the fit ended before its second pass; leave trainer.max_epochs at 2, and resume with "
+            f"ckpt_path={folder}"
+        )
     started = time.perf_counter()
     trainer.test(learner, datamodule=data, verbose=False)
     tested = time.perf_counter()
-    assert learner.detector is not None  # fit makes it
     detector = learner.detector
+    trained = data.split.having("train")
     detector.info |= {
         "simulated": source.is_simulated,
         "experiment": config.name,
         "seed": config.seed,
         "split": data.split.name,
-        "train_recordings": [str(recording) for recording in data.split.having("train")],
+        "features_dtype": config.features.dtype,
+        "train_materials": sorted({recording.material for recording in trained}),
+        "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
     }
     detector.save(folder / "detector.pt")
-    if config.export:
-        export_onnx(detector, folder / "model.onnx")
+    onnx = _export(detector, folder / "model.onnx") if config.export else None
     seconds = dict(learner.seconds)
     seconds |= {"test_pass": tested - started, "save_export": time.perf_counter() - tested}
     return {
         **learner.metrics,
         **learner.facts,
         "selected": [str(name) for name in detector.selected_names],
+        "onnx": onnx,
         "timing_s": seconds,
         "worker_s": learner.worker_seconds,
     }
+
+
+def _export(detector: SlipDetector, path: Path) -> dict[str, float] | str:
+    """Write the ONNX file; its error, or why there is none: what was learned must not be lost."""
+    try:
+        return {"error": export_onnx(detector, path)}
+    except Exception as error:  # the exporter raises many kinds
+        log.exception("model.onnx was not written")
+        return one_line(error).splitlines()[0]
 
 
 def _checkpoint(given: str | None, fold: Split) -> Path | None:
@@ -160,11 +183,20 @@ def _combined(folds: dict[str, dict[str, Any]]) -> dict[str, Any]:
         return next(iter(folds.values()))
     parts = list(folds.values())
     roles = list(dict.fromkeys(role for part in parts for role in part["splits"]))
+    rivals = [part["baselines"]["best_single_feature"]["splits"] for part in parts]
     shared = set.intersection(*(set(part["selected"]) for part in parts))
     return {
         "splits": {
             role: merged_metrics([p["splits"][role] for p in parts if role in p["splits"]])
             for role in roles
+        },
+        "baselines": {
+            "best_single_feature": {
+                "feature": "each fold's own",
+                "splits": {
+                    role: summed_metrics([r[role] for r in rivals if role in r]) for role in roles
+                },
+            }
         },
         "selected": [name for name in parts[0]["selected"] if name in shared],
         "timing_s": _summed([part.pop("timing_s") for part in parts]),

@@ -187,6 +187,14 @@ def test_prune_of_no_folder_is_nothing(cache):
     assert not cache.folder.exists()
 
 
+def test_prune_leaves_files_that_another_run_is_writing(tmp_path):
+    cache, keys = filled(tmp_path, most_files=0)
+    unfinished = tmp_path / keys[0][:2] / f".{keys[0]}.123.tmp.features"
+    unfinished.write_bytes(b"half")
+    cache.prune()
+    assert [path.name for path in tmp_path.rglob("*.features")] == [unfinished.name]
+
+
 def test_prune_bears_files_that_vanish_meanwhile(tmp_path):
     """Another run prunes, or renames its temporary file, between the listing and the look."""
     cache, keys = filled(tmp_path, most_files=5)

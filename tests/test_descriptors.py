@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
+from torch.autograd import forward_ad
 
 from tactslip_torch.features.descriptors import (
     SPECTRUM_DESCRIPTORS,
@@ -526,3 +527,36 @@ def test_errors_name_what_was_passed():
     for name in ("spectral_centroid", "spectral_spread"):
         with pytest.raises(ValueError, match=rf"{name}.*frequency_hz="):
             describe(x, [name])
+
+
+# Derivatives that autograd does not take backwards ------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script. is deprecated")  # torch's own, in jvp
+@pytest.mark.parametrize("name", ["median", "iqr", "range", "kurtosis"])
+def test_forward_derivatives_equal_backward_ones(name, rng):
+    """NumPy's sort knows nothing of tangents, so it must not be used where there is one."""
+    x = torch.from_numpy(rng.standard_normal(20))
+    direction = torch.from_numpy(rng.standard_normal(20))
+
+    def value(values):
+        return describe(values, [name]).squeeze(-1)
+
+    leaf = x.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(value(leaf), leaf)
+    expected = gradient @ direction
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(x, direction)
+        tangent = forward_ad.unpack_dual(value(dual)).tangent
+    torch.testing.assert_close(tangent, expected)
+    torch.testing.assert_close(torch.func.jvp(value, (x,), (direction,))[1], expected)
+
+
+def test_vmap_equals_a_batch(rng):
+    x = torch.from_numpy(rng.standard_normal((5, 20)))
+    names = [name for name in EVERY if name != "correlation"][:13]
+
+    def values(row):
+        return describe(row, names)
+
+    torch.testing.assert_close(torch.vmap(values)(x), values(x))

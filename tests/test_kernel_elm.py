@@ -231,6 +231,20 @@ def test_weights_must_be_positive(bad):
         solve_kernel_elm(10 * torch.eye(3), torch.ones(3), 1.0, weights)
 
 
-def test_the_primal_refuses_an_infinite_penalty():
-    with pytest.raises(ValueError, match="penalty=inf"):
-        solve_primal(torch.eye(2), torch.ones(2), float("inf"))
+@pytest.mark.parametrize("num_bins", [8, 40])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_an_infinite_penalty_is_the_limit_of_large_ones_and_keeps_the_weights(
+    rng, num_bins, weighted
+):
+    """Fewer bins than features, and more: minimum-norm (weighted) least squares either way."""
+    features = torch.from_numpy(rng.standard_normal((num_bins, 12)))
+    targets = torch.from_numpy(rng.choice([-1.0, 1.0], num_bins))
+    weights = torch.from_numpy(rng.uniform(0.2, 3.0, num_bins)) if weighted else None
+    root = np.sqrt(weights.numpy()) if weighted else np.ones(num_bins)
+    expected, *_ = np.linalg.lstsq(
+        features.numpy() * root[:, None], targets.numpy() * root, rcond=None
+    )
+    primal = solve_primal(features, targets, float("inf"), weights)
+    beta = solve_kernel_elm(features @ features.T, targets, float("inf"), weights)
+    np.testing.assert_allclose(primal.numpy(), expected, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose((features.T @ beta).numpy(), expected, rtol=1e-7, atol=1e-9)

@@ -196,7 +196,24 @@ def test_a_bin_that_leaves_the_recording_is_refused_with_its_stroke():
     with pytest.raises(ValueError, match="stroke 1"):
         lay(half, (0.4,), ((0.4, 3.0),))
     with pytest.raises(ValueError, match=r"outside the recording of 2\.400 s"):
-        lay(half, (2.0,), ((2.0, 2.3),), 2.4)
+        lay(half, (2.0,), ((2.0, 2.45),), 2.4)
+
+
+def test_no_bin_is_slip_behind_the_end_of_its_slide():
+    bins = lay(LabelRule(layout="half_second"), (2.0,), ((2.0, 2.23),), 5.0)
+    ends = (bins.starts[bins.is_slip] + bins.bin_samples) / 2000
+    assert len(ends) == 4
+    assert float(ends.max()) <= 2.23
+
+
+@pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
+def test_no_bin_is_non_slip_within_the_slide_before(layout):
+    """A pause of 0.3 s leaves less than the layout asks for."""
+    onsets, slides = (2.0, 3.3), ((2.0, 3.0), (3.3, 4.3))
+    bins = lay(LabelRule(layout=layout), onsets, slides, 5.0)
+    quiet = bins.starts[~bins.is_slip & (bins.stroke == 1)] / 2000
+    assert float(quiet.min()) >= 3.0
+    assert 0 < len(quiet) <= 6
 
 
 def test_bins_may_touch_both_ends_of_the_recording():
@@ -260,6 +277,18 @@ def test_windows_ascend_with_gaps_between_them(name, bins):
     assert all(earlier < later for earlier, later in pairwise(flat))
     assert flat[0] >= 0
     assert flat[-1] <= DURATION
+
+
+def test_windows_close_to_an_end_reach_it():
+    """Within two contexts, so that the filter sees the true edge."""
+    half = LabelRule(layout="half_second")
+    for start, reaches in ((0, True), (30, True), (49, True), (50, False)):
+        onset = 0.5 + start / RATE
+        windows = needed_windows(lay(half, (onset,), ((onset, 2.0),)), 25, DURATION, RATE)
+        assert (windows[0][0] == 0) == reaches
+        onset = DURATION - onset
+        windows = needed_windows(lay(half, (onset,), ((onset, DURATION),)), 25, DURATION, RATE)
+        assert (windows[-1][1] == DURATION) == reaches
 
 
 def test_windows_merge_where_they_touch():

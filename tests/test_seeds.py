@@ -6,6 +6,7 @@ import statistics
 import pytest
 
 from benchmarks import seeds
+from tactslip_torch.features.cache import source_digest
 
 
 def run(seed, balanced, role="test"):
@@ -64,9 +65,25 @@ def test_only_what_stands_between_the_markers_is_replaced():
 def test_a_finished_run_is_not_trained_again(tmp_path, monkeypatch):
     folder = tmp_path / "unseen4-0"
     folder.mkdir()
-    (folder / "metrics.json").write_text('{"seed": 0}')
+    code = source_digest(seeds.ROOT / "tactslip_torch")
+    metrics = {"seed": 0, "versions": {"code": code}}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
     monkeypatch.setattr(seeds.subprocess, "run", lambda *a, **k: pytest.fail("trained"))
-    assert seeds.run("unseen4", 0, tmp_path) == {"seed": 0}
+    assert seeds.run("unseen4", 0, tmp_path) == metrics
+
+
+def test_a_run_of_other_code_is_trained_again(tmp_path, monkeypatch):
+    folder = tmp_path / "unseen4-0"
+    folder.mkdir()
+    (folder / "metrics.json").write_text(json.dumps({"seed": 0, "versions": {"code": "other"}}))
+    commands = []
+
+    class Done:
+        returncode = 0
+
+    monkeypatch.setattr(seeds.subprocess, "run", lambda c, **k: commands.append(c) or Done)
+    seeds.run("unseen4", 0, tmp_path)
+    assert "+exp=unseen4" in commands[0]
 
 
 def test_a_failed_training_is_an_error(tmp_path, monkeypatch):

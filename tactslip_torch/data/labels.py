@@ -7,6 +7,7 @@ of non-slip before each onset, the whole slide as slip, the onset moved 10 ms ea
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -79,7 +80,8 @@ def label_bins(
 ) -> LabelledBins:
     """Lay bins around the onsets of a recording.
 
-    A slip bin lies wholly before the end of its slide, a non-slip bin wholly before the onset.
+    A slip bin lies wholly before the end of its slide, a non-slip bin wholly between the end of the
+    slide before and the onset.
 
     Args:
         rule: the layout.
@@ -98,12 +100,13 @@ def label_bins(
         hop = _whole_samples(rule.hop_ms, sample_rate_hz, "hop_ms")
     lead_s, shift_s = (1.0, 0.010) if rule.layout == "whole_slide" else (0.5, 0.0)
     starts, slips, strokes = [], [], []
+    previous_end = 0
     for stroke, (onset_s, (_, end_s)) in enumerate(zip(onsets_s, sliding_s, strict=True)):
         edge = round((onset_s - shift_s) * sample_rate_hz)
         first = edge - round(lead_s * sample_rate_hz)
-        last = edge + round(lead_s * sample_rate_hz)
-        if rule.layout == "whole_slide":
-            last = int(end_s * sample_rate_hz)
+        last = int(end_s * sample_rate_hz)
+        if rule.layout == "half_second":
+            last = min(last, edge + round(lead_s * sample_rate_hz))
         if first < 0 or last > round(duration_s * sample_rate_hz):
             raise ValueError(
                 f"stroke {stroke + 1} with its onset at {onset_s:.3f} s needs samples from "
@@ -115,10 +118,12 @@ def label_bins(
                 f"onset that labels.layout={rule.layout} takes as non-slip"
             )
         before = torch.arange(first, edge - bin_samples + 1, hop)
+        before = before[before >= previous_end]
         after = torch.arange(edge, max(last - bin_samples + 1, edge), hop)
         starts += [before, after]
         slips += [torch.zeros(len(before)), torch.ones(len(after))]
         strokes += [torch.full((len(before) + len(after),), stroke)]
+        previous_end = math.ceil(end_s * sample_rate_hz)
     return LabelledBins(torch.cat(starts), torch.cat(slips).bool(), torch.cat(strokes), bin_samples)
 
 

@@ -90,7 +90,7 @@ class FeatureCache:
     def prune(self) -> None:
         """Delete the least recently used files until the folder holds at most ``most_bytes``."""
         found = []
-        for path in self.folder.glob("*/*.features"):
+        for path in self.folder.glob("*/[!.]*.features"):  # a dot begins one being written
             with contextlib.suppress(FileNotFoundError):  # another run may prune as well
                 status = path.stat()
                 found.append((status.st_mtime, status.st_size, path))

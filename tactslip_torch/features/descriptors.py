@@ -109,7 +109,8 @@ def energy(sample: Sample) -> Tensor:
 def entropy(sample: Sample) -> Tensor:
     """Shannon entropy of the amplitude histogram in bits, ``[*]``; 0 for a constant.
 
-    Values are quantised to 256 levels between their extremes, with exact halves rounded up; the
+    Values are quantised to 256 levels between their extremes, exact halves rounded up (in float32
+    rounding decides them); the
     distinct levels serve as histogram *edges*, so the two highest occupied ones share one cell.
     Piecewise constant: its gradient is 0 wherever it exists, and none flows.
     """

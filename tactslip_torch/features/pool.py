@@ -112,7 +112,8 @@ class FeaturePool(nn.Module):
               of a channel that holds a NaN or Inf
 
         Raises:
-            ValueError: if the number of channels or samples is another, or bins are not floating.
+            ValueError: if the number of channels or samples is another, or bins are neither float32
+                nor float64.
         """
         self._check(bins)
         films = bins[..., self._films, :]
@@ -174,7 +175,7 @@ class FeaturePool(nn.Module):
         return size * torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
 
     def extract(self, bins: Tensor, chunk_bins: int = 16) -> Tensor:
-        """``forward`` in chunks that fit the processor's cache: same values, bounded memory.
+        """``forward`` in chunks that fit the processor's cache: bounded memory, equal to rounding.
 
         Shape:
             - bins: ``[N, C, n]``
@@ -226,8 +227,8 @@ class FeaturePool(nn.Module):
                 f"expected bins [*, {len(self.hand)}, {self.bin_samples}] (channels, samples), "
                 f"got {tuple(bins.shape)}"
             )
-        if not bins.is_floating_point():
-            raise ValueError(f"expected floating-point bins in volts, got {bins.dtype}")
+        if bins.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"expected float32 or float64 bins in volts, got {bins.dtype}")
 
 
 def _pool_names(hand: HandLayout, level: int) -> tuple[FeatureName, ...]:

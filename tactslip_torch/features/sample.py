@@ -8,11 +8,13 @@ denormals and 1e30 neither cancel nor overflow.
 
 from __future__ import annotations
 
+import contextlib
 from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 
 def is_constant(x: Tensor, scale: Tensor) -> Tensor:
@@ -62,11 +64,14 @@ class Sample:
 
     @cached_property
     def ordered(self) -> Tensor:
-        """Sorted values, ``[*, n]``; NumPy's vectorised sort where no gradient is asked for."""
+        """Sorted values, ``[*, n]``; NumPy's vectorised sort where no derivative is asked for."""
         x = self.x
-        if x.device.type != "cpu" or x.requires_grad or torch.compiler.is_compiling():
-            return torch.sort(x, dim=-1).values
-        return torch.from_numpy(np.sort(x.numpy(), axis=-1))
+        if x.device.type == "cpu" and not (x.requires_grad or torch.compiler.is_compiling()):
+            has_tangent = forward_ad.unpack_dual(x).tangent is not None
+            with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
+                if not has_tangent:
+                    return torch.from_numpy(np.sort(x.numpy(), axis=-1))
+        return torch.sort(x, dim=-1).values
 
     @cached_property
     def span(self) -> Tensor:

@@ -97,6 +97,21 @@ class SlipDetector(nn.Module):
         index = torch.tensor(self.selected, device=bins.device)
         return self.score_features(self.pool(bins).index_select(-1, index)).to(bins.dtype)
 
+    def validity(self, bins: Tensor) -> Tensor:
+        """Whether every channel the score depends on can be trusted (``FeaturePool.validity``).
+
+        Shape:
+            - bins: ``[*, C, n]``, filtered
+            - output: ``[*]``, bool
+
+        Raises:
+            ValueError: as ``forward``.
+        """
+        needed = {name.channel for name in self.selected_names}
+        used = [i for i, name in enumerate(self.pool.hand.names) if name in needed]
+        valid: Tensor = self.pool.validity(bins)[..., used].all(-1)
+        return valid
+
     def score_features(self, features: Tensor) -> Tensor:
         """Score selected, unscaled features.
 

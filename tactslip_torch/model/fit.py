@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -102,8 +103,8 @@ def fit_machine(
 ) -> QuadraticForm:
     """Solve the degree-2 kernel machine and fold it into its quadratic form.
 
-    Through the primal when there are more bins than monomials (7381 for 120 features) and the
-    penalty is finite, through the dual otherwise; both give the same machine.
+    Through the primal when there are more bins than monomials (7381 for 120 features), through the
+    dual otherwise; both give the same machine.
 
     Args:
         bins: scaled training bins in float64.
@@ -115,7 +116,7 @@ def fit_machine(
         ValueError: if the system is not positive definite.
     """
     num_bins, num_features = bins.features.shape
-    if num_bins > num_quadratic_features(num_features) and penalty < float("inf"):
+    if num_bins > num_quadratic_features(num_features):
         weights = _solve_primal_in_chunks(bins, penalty, offset, progress)
         return from_primal(weights, num_features, offset)
     gram = polynomial_kernel(bins.features, bins.features, offset=offset)
@@ -167,4 +168,6 @@ def _solve_primal_in_chunks(
         for top in range(0, size, BLOCK_FEATURES):
             end = min(top + BLOCK_FEATURES, size)
             normal[top:end, :end].addmm_(weighted[:, top:end].mT, monomials[:, :end])
+    if math.isinf(penalty):  # the pseudo-inverse reads both triangles
+        normal = normal.tril() + normal.tril(-1).mT
     return solve_normal_equations(normal, moment, penalty)

@@ -29,8 +29,8 @@ def solve_kernel_elm(
     """Output weights of the kernel machine: ``(gram + diag(1 / (penalty * weights)))^-1 targets``.
 
     One Cholesky factorisation, no inverse. Differentiable in ``gram`` and ``targets``. With
-    ``penalty=inf`` the minimum-norm solution through the Moore-Penrose pseudo-inverse, the
-    paper's wording.
+    ``penalty=inf`` the minimum-norm (weighted) least-squares solution through the Moore-Penrose
+    pseudo-inverse, the paper's wording.
 
     Args:
         gram: kernel matrix of the training bins, symmetric, positive semi-definite; only its
@@ -63,8 +63,9 @@ def solve_kernel_elm(
     _check_weights(weights, targets)
     _check_penalty(penalty)
     if math.isinf(penalty):
-        inverse: Tensor = torch.linalg.pinv(gram, hermitian=True)
-        return (inverse @ targets[..., None]).squeeze(-1)
+        root = torch.ones_like(targets) if weights is None else weights.sqrt()
+        weighted = root[..., :, None] * gram * root[..., None, :]
+        return root * _pseudo_solve(weighted, root * targets)
     ridge = torch.full_like(targets, 1 / penalty) if weights is None else 1 / (penalty * weights)
     return _cholesky_solve(gram + torch.diag_embed(ridge), targets, "gram + I/C", penalty)
 
@@ -80,14 +81,14 @@ def solve_primal(
     Args:
         features: explicit feature map of the training bins, such as ``quadratic_features``.
         targets: +1 for slip and -1 for non-slip.
-        penalty: the paper's ``C``, positive and finite.
+        penalty: the paper's ``C``, positive; ``inf`` for the minimum-norm least squares.
         weights: positive weight of each bin; default 1.
 
     Shape:
         - features: ``[N, P]``; targets, weights: ``[N]``; output: ``[P]``
 
     Raises:
-        ValueError: as ``solve_kernel_elm``; an infinite penalty is refused (use the dual).
+        ValueError: as ``solve_kernel_elm``.
     """
     if features.shape[:1] != targets.shape:
         raise ValueError(
@@ -110,10 +111,15 @@ def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Te
     """
     _check_penalty(penalty)
     if math.isinf(penalty):
-        raise ValueError("the primal needs a finite penalty; solve the dual for penalty=inf")
+        return _pseudo_solve(normal, moment)
     ridged = normal.clone()
     ridged.diagonal().add_(1 / penalty)
     return _cholesky_solve(ridged, moment, "X'WX + I/C", penalty)
+
+
+def _pseudo_solve(system: Tensor, targets: Tensor) -> Tensor:
+    inverse: Tensor = torch.linalg.pinv(system, hermitian=True)
+    return (inverse @ targets[..., None]).squeeze(-1)
 
 
 def _cholesky_solve(system: Tensor, targets: Tensor, name: str, penalty: float) -> Tensor:

@@ -35,10 +35,6 @@ SPLITS: Mapping[str, PublishedSplit] = MappingProxyType(
     }
 )
 
-MAJORITY_CLASS_ACCURACY = 0.753
-"""What calling every bin slip would score on the paper's bins: 24.66 % of them are non-slip."""
-
-NUM_FEATURES_POOL = 2582
 NUM_SELECTED = 120
 
 SELECTED_BY_KIND: Mapping[str, int] = MappingProxyType({"SG": 6, "PVDF": 114})

@@ -118,6 +118,12 @@ def bin_metrics(
     }
 
 
+def summed_metrics(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """``split_metrics`` of all bins of several such together."""
+    confusions = [torch.tensor(part["confusion"]) for part in parts]
+    return split_metrics(torch.stack(confusions).sum(0).tolist())
+
+
 def merged_metrics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Scores of all bins of several ``bin_metrics`` together, from their summed confusions.
 
@@ -126,19 +132,14 @@ def merged_metrics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         >>> merged_metrics([half, half])["confusion"]
         [[2, 0], [0, 2]]
     """
-
-    def summed(members: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-        confusions = [torch.tensor(member["confusion"]) for member in members]
-        return split_metrics(torch.stack(confusions).sum(0).tolist())
-
     groups: dict[str, dict[str, Any]] = {}
     for kind in ("per_material", "per_speed"):
         labels = dict.fromkeys(label for part in parts for label in part[kind])
         groups[kind] = {
-            label: summed(part[kind][label] for part in parts if label in part[kind])
+            label: summed_metrics(part[kind][label] for part in parts if label in part[kind])
             for label in labels
         }
-    return {**summed(parts), **groups}
+    return {**summed_metrics(parts), **groups}
 
 
 def _ratio(part: int, whole: int) -> float | None:

@@ -32,8 +32,11 @@ def splits_table(metrics: Mapping[str, Any]) -> str:
         metrics: the content of ``metrics.json``.
     """
     rows = []
+    rival = metrics.get("baselines", {}).get("best_single_feature")
     for name, scores in metrics["splits"].items():
         rows.append([name, *_score_cells(scores), str(scores["num_bins"])])
+        if rival and name in rival["splits"]:
+            rows.append(["  one feature", *_score_cells(rival["splits"][name]), "-"])
         if name in published.SPLITS:
             rows.append(["  paper", *_score_cells(vars(published.SPLITS[name])), "-"])
     return _titled(metrics, _aligned(["split", *_SCORES.values(), "bins"], rows), PAPER_LINE)
