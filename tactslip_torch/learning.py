@@ -77,6 +77,7 @@ class SlipLearner(L.LightningModule):
         self.worker_seconds: dict[str, float] = {}
         self._worked: dict[str, Counter[str]] = {}
         self._pass_started = 0.0
+        self._num_threads = torch.get_num_threads()
         self._moments = GroupedMoments(self.recipe, len(pool.names))
         self._columns: list[int] = []
         self._collected: list[tuple[RecordingId, Tensor, Tensor]] = []
@@ -87,8 +88,10 @@ class SlipLearner(L.LightningModule):
         return []
 
     def on_train_epoch_start(self) -> None:
-        """Start the clock of a pass."""
+        """Start the clock of a pass; the processors belong to those who make features."""
         self._pass_started = time.perf_counter()
+        self._num_threads = torch.get_num_threads()
+        torch.set_num_threads(1)
 
     def training_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
         """Gather moments in the first epoch, selected features in the second."""
@@ -104,6 +107,7 @@ class SlipLearner(L.LightningModule):
 
     def on_train_epoch_end(self) -> None:
         """Rank after the first epoch, solve after the second."""
+        torch.set_num_threads(self._num_threads)
         name = "moments_pass" if self.current_epoch == 0 else "selection_pass"
         self.seconds[name] = time.perf_counter() - self._pass_started
         if self._collected:
@@ -142,6 +146,8 @@ class SlipLearner(L.LightningModule):
         if self.detector is None:
             raise ValueError("nothing to test: fit first, or give the learner a detector")
         self._judged = {role: [] for role in ROLES}
+        self._num_threads = torch.get_num_threads()
+        torch.set_num_threads(1)
 
     def test_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
         """Score the bins of one recording."""
@@ -160,6 +166,7 @@ class SlipLearner(L.LightningModule):
 
     def on_test_epoch_end(self) -> None:
         """Turn decisions into metrics."""
+        torch.set_num_threads(self._num_threads)
         self.metrics = {"splits": {}, "baselines": {}}
         rivals: dict[str, Any] = {}
         for role, parts in self._judged.items():

@@ -9,6 +9,8 @@ import torch
 from hypothesis import settings
 
 settings.register_profile("default", deadline=None, derandomize=True, max_examples=40)
+torch.set_num_threads(1)  # two processes with two threads each on two cores spend hours waiting
+
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 

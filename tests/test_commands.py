@@ -274,7 +274,7 @@ def test_another_seed_is_another_run(tiny, tmp_path):
 def test_a_run_resumes_from_its_checkpoint(tiny, tmp_path):
     """After the first pass: what it gathered is in the file, and the second pass finds it."""
     overrides = (*TINY, f"cache={tiny.cache}")
-    with pytest.raises(ValueError, match="nothing to test"):
+    with pytest.raises(ValueError, match="ended before its second pass"):
         run_train(tmp_path / "first", *overrides, "trainer.max_epochs=1")
     checkpoint = tmp_path / "first" / "last.ckpt"
     _, metrics = run_train(tmp_path / "second", *overrides, f"ckpt_path={checkpoint}")
@@ -313,14 +313,21 @@ def test_the_checkpoint_of_a_fold_does_not_reach_another(tmp_path):
     overrides = [o for o in TINY if not o.startswith("split")]
     overrides += ["split=leave_one_material_out", "split.materials=[A,B,C]"]
     overrides += [f"cache={tmp_path / 'cache'}"]
-    with pytest.raises(ValueError, match="nothing to test"):
+    with pytest.raises(ValueError, match="ended before its second pass"):
         run_train(tmp_path / "first", *overrides, "trainer.max_epochs=1")
     checkpoint = tmp_path / "first" / "without_A" / "last.ckpt"
     with pytest.raises(ValueError, match="gathered from other training bins") as caught:
         run_train(tmp_path / "second", *overrides, f"ckpt_path={checkpoint}")
-    assert_one_line(caught.value, "split and seed it was made with")
+    assert_one_line(caught.value, "seed it was made with")
     assert (tmp_path / "second" / "without_A" / "detector.pt").is_file()  # its own fold resumed
     assert not (tmp_path / "second" / "without_B" / "detector.pt").exists()
+
+
+def test_a_finished_run_can_be_taken_up_again(tiny, tmp_path):
+    checkpoint = f"ckpt_path={tiny.folder / 'last.ckpt'}"
+    _, metrics = run_train(tmp_path, *TINY, f"cache={tiny.cache}", checkpoint)
+    assert timeless(metrics) == timeless(tiny.metrics)
+    assert_same_detector(tmp_path, tiny.folder)
 
 
 @pytest.mark.parametrize(
@@ -363,7 +370,7 @@ def test_evaluate_gives_the_scores_of_the_run(tiny, tmp_path, capsys):
     assert metrics["simulated"] is False
     for name in ("confusion.png", "selected_features.png", "config.yaml"):
         assert (tmp_path / name).is_file()
-    assert "were trained on" not in capsys.readouterr().out
+    assert "note:" not in capsys.readouterr().out
 
 
 def test_evaluate_tells_of_recordings_it_was_trained_on(tiny, tmp_path, capsys):
@@ -371,9 +378,21 @@ def test_evaluate_tells_of_recordings_it_was_trained_on(tiny, tmp_path, capsys):
     swapped = ("split.seen=[B,C]", "split.unseen=[A]", "split.train_share=0.5")
     model = f"model={tiny.folder / 'detector.pt'}"
     config = composed(*overrides, *swapped, f"cache={tiny.cache}", model, name="evaluate")
-    evaluate(config, tmp_path)
+    (found,) = evaluate(config, tmp_path)["overlap"].values()
+    assert len(found["recordings"]) == 2  # half of A's cycles; of B the same ones are tested
+    assert {name.partition("/")[0] for name in found["recordings"]} == {"A"}
+    assert found["unseen_materials"] == ["A"]
     out = capsys.readouterr().out
-    assert "note: 2 of 8 held-out recordings of unseen4 were trained on (such as A/" in out
+    assert "note: the detector was trained on 2 recordings" in out
+    assert "A/" in out
+
+
+def test_recordings_of_another_seed_are_others_under_the_same_names(tiny, tmp_path, capsys):
+    config = composed(*TINY_EVALUATE, "data.seed=1", "split.seed=1", "cache=off", name="evaluate")
+    config.model = str(tiny.folder / "detector.pt")
+    (found,) = evaluate(config, tmp_path)["overlap"].values()
+    assert found["recordings"] == []
+    assert "trained on 2 recordings" not in capsys.readouterr().out
 
 
 def evaluated(tiny, folder, *overrides):
@@ -585,7 +604,7 @@ def test_damaged_features_of_the_simulation_are_made_again(quick, tmp_path, capl
 @pytest.mark.slow
 def test_quick_resumes(quick, tmp_path):
     overrides = ("+exp=quick", "num_workers=0", f"cache={quick.cache}", "export=false")
-    with pytest.raises(ValueError, match="nothing to test"):
+    with pytest.raises(ValueError, match="ended before its second pass"):
         run_train(tmp_path / "first", *overrides, "trainer.max_epochs=1")
     checkpoint = tmp_path / "first" / "last.ckpt"
     run_train(tmp_path / "second", *overrides, f"ckpt_path={checkpoint}")

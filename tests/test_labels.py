@@ -60,7 +60,7 @@ def test_half_second_has_ten_and_ten_without_a_shift():
         np.testing.assert_allclose(after, (onset + 0.05 * np.arange(10)) * RATE, atol=1e-6)
 
 
-def test_half_second_ignores_when_the_slide_ends():
+def test_half_second_does_not_follow_a_slide_that_goes_on():
     shorter = tuple((start, end - 1) for start, end in SLIDES)
     rule = LabelRule(layout="half_second")
     assert torch.equal(lay(rule).starts, lay(rule, slides=shorter).starts)
