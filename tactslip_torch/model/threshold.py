@@ -50,5 +50,9 @@ def best_threshold(features: Tensor, is_slip: Tensor) -> FeatureThreshold:
     below = torch.where(values[1:] > values[:-1], below, 0.0)  # no cut between equal values
     best = below.abs().flatten().argmax()
     row, index = divmod(int(best), features.shape[1])
-    threshold = float((values[row, index] + values[row + 1, index]) / 2)
-    return FeatureThreshold(index, threshold, -1 if below[row, index] > 0 else 1)
+    sign = -1 if below[row, index] > 0 else 1
+    lower, upper = float(values[row, index]), float(values[row + 1, index])
+    threshold = lower + (upper - lower) / 2
+    if threshold in (lower, upper):  # neighbouring floats: the side that is not slip
+        threshold = lower if sign > 0 else upper
+    return FeatureThreshold(index, threshold, sign)
