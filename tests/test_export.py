@@ -111,6 +111,14 @@ def test_no_constant_is_kept_in_double_precision(graph):
     assert onnx.TensorProto.DOUBLE not in kinds
 
 
+def test_the_file_says_what_a_host_must_know_of_its_input(detector, session):
+    facts = session.get_modelmeta().custom_metadata_map
+    assert facts["channels"].split(",") == list(detector.pool.hand.names)
+    expected = {"unit": "V", "sample_rate_hz": "2000", "bin_samples": "100"}
+    expected |= {"context_samples": "25", "slip_if_score_at_least": "0", "simulated": "true"}
+    assert {name: facts[name] for name in expected} == expected
+
+
 def test_the_file_is_whole_and_valid(exported):
     path, _ = exported
     onnx.checker.check_model(onnx.load(path), full_check=True)
