@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.errors import InstantiationException
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 CONF_HINT = "train.yaml"
 EXIT_BAD_INPUT = 2
@@ -95,10 +96,15 @@ def fail(message: str) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """What went wrong, without Hydra's wrapping."""
+    """What went wrong, without Hydra's wrapping, behind the section of the configuration."""
+    section = ""
     while isinstance(error, InstantiationException) and error.__cause__ is not None:
+        place = re.search(r"full_key: (\S+)", str(error))
+        section = f"{place[1]}: " if place else ""
         error = error.__cause__
+    if isinstance(error, MissingMandatoryValue):
+        return f"no value for {error.full_key}; give {error.full_key}=..."
     text = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
     if "Original Traceback" in text:  # from a worker: the last line is what was raised there
         text = text.splitlines()[-1].partition(": ")[2]
-    return text or type(error).__name__
+    return section + (text or type(error).__name__)

@@ -31,7 +31,7 @@ from tactslip_torch.experiment import (
     make_trainer,
     save_config,
 )
-from tactslip_torch.export import export_onnx
+from tactslip_torch.export import export_onnx, float32_error
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.files import whole_file
 from tactslip_torch.learning import SlipLearner
@@ -73,6 +73,8 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         ValueError: for bad input, in one line.
     """
     started = time.perf_counter()
+    if not isinstance(config.seed, int):
+        raise ValueError(f"seed must be a whole number, got {config.seed!r}")
     L.seed_everything(config.seed, verbose=False)
     source: RecordingSource = instantiate(config.data, _convert_="all")
     rule: LabelRule = instantiate(config.labels)
@@ -152,9 +154,9 @@ def _run_fold(
 
 
 def _export(detector: SlipDetector, path: Path) -> dict[str, float] | str:
-    """Write the ONNX file; its error, or why there is none: what was learned must not be lost."""
+    """Write the ONNX file; its errors, or why there is none: what was learned must not be lost."""
     try:
-        return {"error": export_onnx(detector, path)}
+        return {"error": export_onnx(detector, path), **float32_error(detector)}
     except Exception as error:  # the exporter raises many kinds
         log.exception("model.onnx was not written")
         return one_line(error).splitlines()[0]

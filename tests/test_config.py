@@ -4,6 +4,8 @@ import pytest
 import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from omegaconf.errors import MissingMandatoryValue
 from torch.utils.data import DataLoader
 
 from tactslip_torch import config
@@ -210,3 +212,17 @@ def test_a_trace_can_be_asked_for(monkeypatch):
     monkeypatch.setenv("TACTSLIP_TRACEBACK", "1")
     with pytest.raises(ValueError, match="bad"), errors_in_one_line():
         raise ValueError("bad")
+
+
+def test_a_wrong_type_is_named_with_its_section():
+    target = "tactslip_torch.simulation.source.SimulatedRecordings"
+    choices = OmegaConf.create({"data": {"_target_": target, "cycles": "abc"}})
+    with pytest.raises(InstantiationException) as caught:
+        instantiate(choices.data)
+    assert one_line(caught.value).startswith("data: ")
+
+
+def test_a_value_that_is_missing_is_asked_for():
+    with pytest.raises(MissingMandatoryValue) as caught:
+        OmegaConf.create({"model": "???"}).model  # noqa: B018  # the look itself raises
+    assert one_line(caught.value) == "no value for model; give model=..."

@@ -9,7 +9,9 @@ import torch
 from test_detector import noise, random_detector
 
 from tactslip_torch import export
-from tactslip_torch.export import export_onnx, onnx_error
+from tactslip_torch.export import export_onnx, float32_error, onnx_error
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.scaling import MinMaxScaler
 
 pytestmark = pytest.mark.onnx
 
@@ -205,3 +207,15 @@ def test_a_graph_frozen_to_one_batch_is_seen(detector, tmp_path):
     frozen(tmp_path / "model.onnx", 1)
     with pytest.raises(ValueError, match=r"gives scores \(1,\) at batch 7, expected \(7,\)"):
         onnx_error(detector, tmp_path / "model.onnx")
+
+
+def test_what_single_precision_costs_is_measured(detector):
+    """A detector without steps loses little; one that reads a mode by rounding, more."""
+    cost = float32_error(detector)
+    assert 0 < cost["float32_median"] <= cost["float32_p95"] < 1e-2
+    assert 0 <= cost["float32_flips"] < 0.05
+    mode = [i for i, n in enumerate(detector.pool.names) if n.descriptor == "mode"][20:32]
+    bins = detector.channel_filter.valid(noise(64, seed=99))
+    scaler = MinMaxScaler.fit(detector.pool(bins)[:, mode])
+    stepping = SlipDetector(detector.pool, detector.channel_filter, mode, scaler, detector.head)
+    assert float32_error(stepping)["float32_p95"] > 10 * cost["float32_p95"]

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from hydra._internal.utils import get_args_parser
 from test_detector import random_detector
 
 ROOT = Path(__file__).parents[1]
@@ -39,3 +40,11 @@ def test_every_room_of_the_house_is_on_the_map():
     rooms |= {path.name for path in package.glob("*.py")} - {"__init__.py"}
     section = TEXT.split("## The way through the house")[1].split("\n## ")[0]
     assert {room for room in rooms if f"`{room}`" not in section} == set()
+
+
+def test_hydra_reads_the_sweep_it_shows():
+    """Overrides on both sides of -m are refused."""
+    (arguments,) = re.findall(r"`\.\.\. ([^`]*-m [^`]+)`", TEXT)
+    read = get_args_parser().parse_args(arguments.split())
+    assert read.multirun
+    assert read.overrides == ["+exp=unseen4", "seed=0,1,2"]
