@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Sized
 from typing import Any
 
@@ -28,16 +29,17 @@ class RecordingProgressBar(TQDMProgressBar):
     """
 
     def __init__(self, verb: str = "features") -> None:
-        super().__init__(refresh_rate=1)
+        # a terminal is redrawn at every recording, a log file is not filled with bars
+        super().__init__(refresh_rate=1 if sys.stderr.isatty() else 50)
         self._verb = verb
 
     def init_train_tqdm(self) -> Any:
-        """The bar of both training passes."""
-        return self._named(super().init_train_tqdm())
+        """The bar of both training passes, on standard error: standard output is for results."""
+        return tqdm(unit=" recording", dynamic_ncols=True, disable=self.is_disabled, smoothing=0)
 
     def init_test_tqdm(self) -> Any:
         """The bar of the test pass."""
-        return self._named(super().init_test_tqdm())
+        return self.init_train_tqdm()
 
     def on_train_epoch_start(self, trainer: Any, *args: Any) -> None:
         """Name the pass."""
@@ -60,9 +62,4 @@ class RecordingProgressBar(TQDMProgressBar):
     def on_test_batch_end(self, trainer: Any, pl_module: Any, *args: Any, **kwargs: Any) -> None:
         """Show rates in the test pass as well."""
         super().on_test_batch_end(trainer, pl_module, *args, **kwargs)
-        self.test_progress_bar.set_postfix(self.get_metrics(trainer, pl_module))
-
-    @staticmethod
-    def _named(progress: Any) -> Any:
-        progress.unit = " recording"
-        return progress
+        self.test_progress_bar.set_postfix(self.get_metrics(trainer, pl_module), refresh=False)
