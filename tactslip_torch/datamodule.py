@@ -99,6 +99,7 @@ class FeatureMaker:
         self.cache = cache
         self.dtype = dtype
         self._code = source_digest(Path(__file__).parent)
+        self._libraries = [version(name) for name in ("torch", "numpy", "ptwt", "PyWavelets")]
 
     def __call__(self, recording: RecordingId, split: Split) -> RecordingFeatures:
         """Features, labels and roles of one recording.
@@ -189,7 +190,7 @@ class FeatureMaker:
             "filter": [self.channel_filter.window_lengths, self.channel_filter.polyorder],
             "dtype": str(self.dtype),
             "code": self._code,
-            "libraries": [version(name) for name in ("torch", "numpy", "ptwt", "PyWavelets")],
+            "libraries": self._libraries,
         }
         return cache_key(facts)
 
