@@ -1,0 +1,69 @@
+"""Which batches a statistic holds, so that none is counted twice and none taken out unseen."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+
+from torch import Tensor
+
+
+class Ledger:
+    """Batch ids and a digest of what each batch held.
+
+    Args:
+        entries: id to digest.
+    """
+
+    def __init__(self, entries: Mapping[str, str] | None = None) -> None:
+        self.entries = dict(entries or {})
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def add(self, batch_id: str, digest: str) -> None:
+        """Note a batch.
+
+        Raises:
+            ValueError: if the id is there already.
+        """
+        if batch_id in self.entries:
+            raise ValueError(f"batch {batch_id!r} is in these statistics already; add it once")
+        self.entries[batch_id] = digest
+
+    def remove(self, batch_id: str, digest: str) -> None:
+        """Strike a batch out.
+
+        Raises:
+            ValueError: if it was never added, or held something else.
+        """
+        if batch_id not in self.entries:
+            raise ValueError(f"batch {batch_id!r} was never added to these statistics")
+        if self.entries[batch_id] != digest:
+            raise ValueError(
+                f"batch {batch_id!r} was added with other content; remove what was added"
+            )
+        del self.entries[batch_id]
+
+    def merge(self, other: Ledger) -> None:
+        """Take over the entries of another ledger.
+
+        Raises:
+            ValueError: if a batch is in both; nothing is taken over then.
+        """
+        both = sorted(self.entries.keys() & other.entries.keys())
+        if both:
+            raise ValueError(
+                f"{len(both)} batches are in both statistics, such as {both[0]!r}; "
+                "merge each shard once"
+            )
+        self.entries |= other.entries
+
+
+def content_digest(*tensors: Tensor) -> str:
+    """A digest of dtype, shape and bytes of tensors."""
+    digest = hashlib.blake2b(digest_size=16)
+    for tensor in tensors:
+        digest.update(f"{tensor.dtype}{tuple(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
