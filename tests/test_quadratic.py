@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactslip_torch.model.kernel_elm import solve_kernel_elm, solve_primal
+from tactslip_torch.model.kernels import Polynomial, RadialBasis
 from tactslip_torch.model.quadratic import (
     QuadraticForm,
     collapse,
@@ -23,24 +24,26 @@ def assert_sum_close(actual, terms):
 @given(
     num_bins=st.integers(1, 60),
     num_features=st.integers(1, 12),
+    degree=st.sampled_from([1, 2]),
     offset=st.sampled_from([0.0, 0.5, 3.0]),
     seed=st.integers(0, 99),
 )
-def test_collapse_equals_the_kernel_sum(num_bins, num_features, offset, seed):
+def test_collapse_equals_the_kernel_sum(num_bins, num_features, degree, offset, seed):
     rng = np.random.default_rng(seed)
     support, z = (
         rng.standard_normal((num_bins, num_features)),
         rng.standard_normal((7, num_features)),
     )
     beta = rng.standard_normal(num_bins) * 10.0 ** rng.integers(-3, 3, num_bins)
-    form = collapse(torch.from_numpy(support), torch.from_numpy(beta), offset)
-    assert_sum_close(form(torch.from_numpy(z)), oracles.kernel(z, support, 2, offset) * beta)
+    kernel = Polynomial(degree, offset)
+    form = collapse(torch.from_numpy(support), torch.from_numpy(beta), kernel)
+    assert_sum_close(form(torch.from_numpy(z)), oracles.kernel(z, support, degree, offset) * beta)
 
 
 def test_collapse_at_the_papers_size(rng):
     support, z = rng.uniform(-1, 1, (300, 120)), rng.uniform(-1, 1, (20, 120))
     beta = rng.standard_normal(300)
-    form = collapse(torch.from_numpy(support), torch.from_numpy(beta), 0.5)
+    form = collapse(torch.from_numpy(support), torch.from_numpy(beta))
     assert form.quadratic.shape == (120, 120)
     assert_sum_close(form(torch.from_numpy(z)), oracles.kernel(z, support) * beta)
     torch.testing.assert_close(form.quadratic, form.quadratic.T, rtol=1e-12, atol=1e-12)
@@ -82,7 +85,7 @@ def test_both_roads_lead_to_one_form(weighted, rng):
     targets[::3] = -1
     weights = torch.from_numpy(rng.uniform(0.5, 2, 50)) if weighted else None
     gram = torch.from_numpy(oracles.kernel(z.numpy(), z.numpy()))
-    dual = collapse(z, solve_kernel_elm(gram, targets, 0.3, weights), 0.5)
+    dual = collapse(z, solve_kernel_elm(gram, targets, 0.3, weights))
     primal = from_primal(solve_primal(quadratic_features(z, 0.5), targets, 0.3, weights), 4, 0.5)
     for name in ("quadratic", "linear", "constant"):
         torch.testing.assert_close(
@@ -123,12 +126,52 @@ def test_manners_and_gradcheck(rng, device):
     torch.testing.assert_close(gradient, by_hand, rtol=1e-12, atol=1e-12)
 
 
-def test_gradcheck_of_collapse(rng):
+@pytest.mark.parametrize("degree", [1, 2])
+def test_gradcheck_of_collapse(degree, rng):
     support = torch.from_numpy(rng.standard_normal((6, 3))).requires_grad_()
     beta = torch.from_numpy(rng.standard_normal(6)).requires_grad_()
     z = torch.from_numpy(rng.standard_normal((4, 3)))
-    assert torch.autograd.gradcheck(lambda s, b: collapse(s, b, 0.5)(z), (support, beta))
-    assert torch.autograd.gradcheck(lambda z: quadratic_features(z, 0.5), support)
+    kernel = Polynomial(degree, 0.5)
+    assert torch.autograd.gradcheck(lambda s, b: collapse(s, b, kernel)(z), (support, beta))
+
+
+def test_gradcheck_of_the_explicit_features(rng):
+    z = torch.from_numpy(rng.standard_normal((6, 3))).requires_grad_()
+    assert torch.autograd.gradcheck(lambda z: quadratic_features(z, 0.5), z)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_form_is_folded_in_double_precision_whatever_comes_in(degree, rng):
+    """20 000 terms that cancel: sums in float32 would be off in the third digit."""
+    support = torch.from_numpy(rng.uniform(-1, 1, (20000, 3))).float()
+    beta = torch.from_numpy(rng.choice([-1e4, 1e4], 20000)).float()
+    z = rng.uniform(-1, 1, (5, 3))
+    form = collapse(support, beta, Polynomial(degree, 0.5))
+    assert {value.dtype for value in form.state_dict().values()} == {torch.float64}
+    kernel = (z @ support.double().numpy().T + 0.5) ** degree
+    assert_sum_close(form(torch.from_numpy(z)), kernel * beta.double().numpy())
+
+
+@pytest.mark.parametrize("kernel", [Polynomial(3), RadialBasis(0.1)], ids=str)
+def test_a_kernel_that_does_not_fold_is_named(kernel):
+    with pytest.raises(ValueError, match=r"does not fold .* KernelSum") as caught:
+        collapse(torch.zeros(2, 3), torch.ones(2), kernel)
+    assert str(kernel) in str(caught.value)
+
+
+def test_the_papers_head_costs_14520_multiply_adds_and_58_kilobytes(rng):
+    """Whatever the number of training bins; 120 features, in single precision."""
+    costs = set()
+    for num_bins in (3, 300):
+        support = torch.from_numpy(rng.uniform(-1, 1, (num_bins, 120)))
+        form = collapse(support, torch.ones(num_bins))
+        numbers = sum(value.numel() for value in form.state_dict().values())
+        assert form.cost == (120 * 120 + 120, 8 * numbers)
+        assert form.num_features == 120
+        costs.add(form.float().cost)
+    (cost,) = costs
+    assert cost.num_bytes < 60_000
+    assert str(cost) == "14.5 k multiply-adds a bin and 58.1 kB"
 
 
 def test_the_form_is_saved_with_its_state(rng):

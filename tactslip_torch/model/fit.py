@@ -15,6 +15,7 @@ from tactslip_torch.model.kernel_elm import (
     solve_kernel_elm,
     solve_normal_equations,
 )
+from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.quadratic import (
     QuadraticForm,
     collapse,
@@ -121,7 +122,7 @@ def fit_machine(
         return from_primal(weights, num_features, offset)
     gram = polynomial_kernel(bins.features, bins.features, offset=offset)
     beta = solve_kernel_elm(gram, bins.targets, penalty, bins.weights)
-    return collapse(bins.features, beta, offset)
+    return collapse(bins.features, beta, Polynomial(2, offset))
 
 
 def validation_scores(

@@ -2,7 +2,7 @@
 
 ``sum_i beta_i (z_i . z + c)^2 = z' Q z + l' z + a`` with ``Q = Z' diag(beta) Z``,
 ``l = 2 c Z' beta`` and ``a = c^2 sum(beta)``: exact, and of one size whatever the number of
-training bins.
+training bins. Degree 1 likewise, with ``Q = 0``, ``l = Z' beta`` and ``a = c sum(beta)``.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import math
 
 import torch
 from torch import Tensor, nn
+
+from tactslip_torch.model.kernels import PAPER_KERNEL, Cost, Kernel, Polynomial
 
 
 class QuadraticForm(nn.Module):
@@ -41,6 +43,17 @@ class QuadraticForm(nn.Module):
         self.register_buffer("linear", linear.clone())
         self.register_buffer("constant", constant.clone())
 
+    @property
+    def num_features(self) -> int:
+        """How many features it takes."""
+        return self.linear.shape[-1]
+
+    @property
+    def cost(self) -> Cost:
+        """Multiply-adds a bin and bytes, whatever the number of training bins."""
+        num_values = self.num_features * (self.num_features + 1)
+        return Cost(num_values, (num_values + 1) * self.linear.element_size())
+
     def forward(self, z: Tensor) -> Tensor:
         """The score.
 
@@ -51,17 +64,36 @@ class QuadraticForm(nn.Module):
         return ((z @ self.quadratic + self.linear) * z).sum(-1) + self.constant
 
 
-def collapse(support: Tensor, beta: Tensor, offset: float = 0.5) -> QuadraticForm:
-    """Fold a degree-2 kernel sum into its quadratic form.
+def collapse(support: Tensor, beta: Tensor, kernel: Kernel = PAPER_KERNEL) -> QuadraticForm:
+    """Fold a kernel sum of degree 1 or 2 into its quadratic form.
+
+    Sums and result are in float64 whatever comes in: the terms are many and cancel. Differentiable
+    in both tensors.
+
+    Args:
+        support: scaled training bins.
+        beta: their output weights.
+        kernel: a polynomial of degree 1 or 2.
 
     Shape:
-        - support: ``[N, K]``, scaled training bins
-        - beta: ``[N]``, their output weights
+        - support: ``[N, K]``
+        - beta: ``[N]``
+
+    Raises:
+        ValueError: for a kernel that does not fold.
     """
-    pull = support.mT @ beta
-    return QuadraticForm(
-        support.mT @ (support * beta[:, None]), 2 * offset * pull, offset**2 * beta.sum()
-    )
+    if not isinstance(kernel, Polynomial) or not kernel.collapses:
+        raise ValueError(
+            f"{kernel} does not fold into a quadratic form, polynomials of degree 1 and 2 do; "
+            "keep the sum as a KernelSum"
+        )
+    support, beta = support.double(), beta.double()
+    pull, total = support.mT @ beta, beta.sum()
+    if kernel.degree == 1:
+        flat = support.new_zeros(support.shape[1], support.shape[1])
+        return QuadraticForm(flat, pull, kernel.offset * total)
+    bend = support.mT @ (support * beta[:, None])
+    return QuadraticForm(bend, 2 * kernel.offset * pull, kernel.offset**2 * total)
 
 
 def num_quadratic_features(num_features: int) -> int:
