@@ -4,9 +4,11 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from sklearn.preprocessing import MinMaxScaler as Reference
 
-from tactslip_torch.model.scaling import MinMaxScaler
+from tactslip_torch.model.scaling import FeatureScaler, signed_log
 
 
 @pytest.mark.parametrize("num_bins", [2, 3, 50])
@@ -14,7 +16,7 @@ def test_equals_sklearn(num_bins, rng):
     train = rng.standard_normal((num_bins, 6)) * 10.0 ** rng.integers(-6, 7, 6) + 3
     new = train.mean(0) + 2 * rng.standard_normal((80, 6)) * train.std(0)
     reference = Reference(feature_range=(-1, 1), clip=True).fit(train)
-    scaler = MinMaxScaler.fit(torch.from_numpy(train))
+    scaler = FeatureScaler.fit(torch.from_numpy(train))
     for features in (train, new):
         actual = scaler(torch.from_numpy(features))
         np.testing.assert_allclose(actual, reference.transform(features), rtol=1e-9, atol=1e-9)
@@ -23,8 +25,8 @@ def test_equals_sklearn(num_bins, rng):
 
 def test_fit_and_the_constructor_are_the_same(rng):
     train = torch.from_numpy(rng.standard_normal((20, 4)))
-    fitted = MinMaxScaler.fit(train)
-    given = MinMaxScaler(train.min(0).values, train.max(0).values)
+    fitted = FeatureScaler.fit(train)
+    given = FeatureScaler(train.min(0).values, train.max(0).values)
     assert torch.equal(fitted.minimum, given.minimum)
     assert torch.equal(fitted.maximum, given.maximum)
     scaled = fitted(train)
@@ -33,7 +35,7 @@ def test_fit_and_the_constructor_are_the_same(rng):
 
 
 def test_what_leaves_the_range_is_clipped():
-    scaler = MinMaxScaler(torch.tensor([0.0, -4.0]), torch.tensor([2.0, 4.0]))
+    scaler = FeatureScaler(torch.tensor([0.0, -4.0]), torch.tensor([2.0, 4.0]))
     features = torch.tensor([[0.5, 0.0], [-9.0, 1e30], [math.inf, -math.inf]])
     assert scaler(features).tolist() == [[-0.5, 0.0], [-1.0, 1.0], [1.0, -1.0]]
 
@@ -41,15 +43,15 @@ def test_what_leaves_the_range_is_clipped():
 def test_a_constant_feature_becomes_zero(rng):
     train = torch.from_numpy(rng.standard_normal((5, 3)))
     train[:, 1] = 0.1
-    scaler = MinMaxScaler.fit(train)
+    scaler = FeatureScaler.fit(train)
     scaled = scaler(torch.tensor([[0.0, 0.1, 0.0], [0.0, 99.0, 0.0]], dtype=torch.float64))
     assert (scaled[:, 1] == 0).all()
-    alone = MinMaxScaler.fit(train[:1])
+    alone = FeatureScaler.fit(train[:1])
     assert (alone(train) == 0).all()
 
 
 def test_nan_stays_nan():
-    scaler = MinMaxScaler(torch.tensor([0.0, 1.0]), torch.tensor([2.0, 1.0]))
+    scaler = FeatureScaler(torch.tensor([0.0, 1.0]), torch.tensor([2.0, 1.0]))
     scaled = scaler(torch.tensor([[math.nan, 1.0], [1.0, math.nan]]))
     assert scaled[0, 0].isnan()
     assert scaled[1, 1].isnan()
@@ -60,29 +62,29 @@ def test_nan_stays_nan():
 def test_manners(rng, device):
     train = torch.from_numpy(rng.standard_normal((20, 4))).to(device)
     scaler = {
-        torch.float64: MinMaxScaler.fit(train),
-        torch.float32: MinMaxScaler.fit(train.float()),
+        torch.float64: FeatureScaler.fit(train),
+        torch.float32: FeatureScaler.fit(train.float()),
     }
     features = torch.from_numpy(2 * rng.standard_normal((6, 4))).to(device)
     oracles.assert_manners(lambda x: scaler[x.dtype](x), features)
 
 
 def test_gradcheck_and_the_gradient_where_clipped(rng):
-    scaler = MinMaxScaler(-torch.ones(3).double(), torch.ones(3).double())
+    scaler = FeatureScaler(-torch.ones(3).double(), torch.ones(3).double())
     features = torch.from_numpy(rng.uniform(-0.9, 0.9, (4, 3))).requires_grad_()
     assert torch.autograd.gradcheck(scaler, features)
     outside = torch.tensor([[3.0, -3.0, 0.5]], dtype=torch.float64, requires_grad=True)
     scaler(outside).sum().backward()
     assert outside.grad.tolist() == [[0, 0, 1]]
-    still = MinMaxScaler(torch.ones(1), torch.ones(1))
+    still = FeatureScaler(torch.ones(1), torch.ones(1))
     at = torch.tensor([[1.0], [2.0]], requires_grad=True)
     still(at).sum().backward()
     assert at.grad.tolist() == [[0], [0]]
 
 
 def test_the_range_is_saved_with_the_state(rng):
-    scaler = MinMaxScaler.fit(torch.from_numpy(rng.standard_normal((20, 4))))
-    other = MinMaxScaler(torch.zeros(4), torch.ones(4)).double()
+    scaler = FeatureScaler.fit(torch.from_numpy(rng.standard_normal((20, 4))))
+    other = FeatureScaler(torch.zeros(4), torch.ones(4)).double()
     other.load_state_dict(scaler.state_dict())
     features = torch.from_numpy(rng.standard_normal((5, 4)))
     assert torch.equal(other(features), scaler(features))
@@ -91,10 +93,227 @@ def test_the_range_is_saved_with_the_state(rng):
 
 def test_errors_name_the_feature():
     with pytest.raises(ValueError, match=r"\(2,\).*\(3,\)"):
-        MinMaxScaler(torch.zeros(2), torch.ones(3))
+        FeatureScaler(torch.zeros(2), torch.ones(3))
     with pytest.raises(ValueError, match=r"feature 1.*1 and 0"):
-        MinMaxScaler(torch.tensor([0.0, 1.0]), torch.tensor([1.0, 0.0]))
+        FeatureScaler(torch.tensor([0.0, 1.0]), torch.tensor([1.0, 0.0]))
     with pytest.raises(ValueError, match=r"feature 0.*nan"):
-        MinMaxScaler.fit(torch.tensor([[math.nan, 1.0], [0.0, 2.0]]))
+        FeatureScaler.fit(torch.tensor([[math.nan, 1.0], [0.0, 2.0]]))
     with pytest.raises(ValueError, match=r"feature 1.*inf"):
-        MinMaxScaler.fit(torch.tensor([[0.0, math.inf], [0.0, 2.0]]))
+        FeatureScaler.fit(torch.tensor([[0.0, math.inf], [0.0, 2.0]]))
+    with pytest.raises(ValueError, match=r"feature 0.*-3e\+38 and 3e\+38"):
+        FeatureScaler(torch.tensor([-3e38]), torch.tensor([3e38]))
+    with pytest.raises(ValueError, match=r"at least one bin, got \(0, 2\)"):
+        FeatureScaler.fit(torch.zeros(0, 2))
+    for tail in (-0.1, 0.5, math.nan):
+        with pytest.raises(ValueError, match=rf"\[0, 0\.5\), got {tail}"):
+            FeatureScaler.fit(torch.zeros(3, 2), tail=tail)
+    for bad in (math.nan, math.inf):
+        with pytest.raises(ValueError, match=rf"feature 1.*{bad}"):
+            FeatureScaler.fit(torch.tensor([[0.0, bad], [0.0, 2.0]]), compress=True, tail=0.1)
+    with pytest.raises(ValueError, match=r"knee.*\(2,\), got \(3,\)"):
+        FeatureScaler(torch.zeros(2), torch.ones(2), torch.ones(3))
+    for bad in (0.0, -1.0, math.inf, math.nan):
+        with pytest.raises(
+            ValueError, match=rf"feature 1: knee .* positive and finite, got {bad:g}"
+        ):
+            FeatureScaler(torch.zeros(2), torch.ones(2), torch.tensor([1.0, bad]))
+
+
+# -------------------------------------------------------------------------------- compression
+TINY, HUGE = 1e-30, 1e30
+DTYPES = [torch.float32, torch.float64]
+
+
+def signed_log_of(features, knee):
+    """The definition in float64, which holds every ratio of two float32 numbers."""
+    features, knee = np.float64(features), np.float64(knee)
+    return np.sign(features) * knee * np.log1p(np.abs(features) / knee)
+
+
+def magnitudes(low=TINY, high=HUGE):
+    return st.floats(math.log(low), math.log(high)).map(math.exp)
+
+
+def signed(low=TINY, high=HUGE):
+    return st.one_of(st.just(0.0), magnitudes(low, high), magnitudes(low, high).map(lambda f: -f))
+
+
+def heavy_tailed(rng, num_bins=301, num_features=7):
+    """Cauchy, with a column of 0, one mostly 0, one constant, one tiny and one huge."""
+    features = rng.standard_cauchy((num_bins, num_features))
+    features[:, 1] = 0
+    features[:, 2] = np.where(np.arange(num_bins) % 10 == 0, features[:, 2], 0)
+    features[:, 3] = -0.3
+    features[:, 4] *= 1e-28
+    features[:, 5] *= 1e25
+    return features
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@given(features=st.lists(signed(), min_size=1, max_size=8), knee=magnitudes())
+def test_signed_log_equals_numpy_at_any_magnitude(dtype, features, knee):
+    features, knee = torch.tensor(features, dtype=dtype), torch.tensor([knee], dtype=dtype)
+    actual = signed_log(features[:, None], knee)[:, 0]
+    expected = signed_log_of(features.numpy(), knee.numpy())
+    eps, tiny = torch.finfo(dtype).eps, torch.finfo(dtype).tiny
+    np.testing.assert_allclose(actual.numpy(), expected, rtol=8 * eps, atol=2 * tiny * float(knee))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@given(
+    features=st.lists(signed(1e-45, 3e38), min_size=2, max_size=20), knee=magnitudes(1e-44, 3e38)
+)
+def test_signed_log_is_monotone_odd_and_finite(dtype, features, knee):
+    ordered = torch.tensor(sorted(features), dtype=dtype)[:, None]
+    bent = signed_log(ordered, torch.tensor([knee], dtype=dtype))
+    assert bent.isfinite().all()
+    assert (bent.diff(dim=0) >= 0).all()
+    assert torch.equal(signed_log(-ordered, torch.tensor([knee], dtype=dtype)), -bent)
+    assert (bent.abs() <= ordered.abs() * (1 + 4 * torch.finfo(dtype).eps)).all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_signed_log_takes_no_step_back_where_the_ratio_passes_the_largest_float(dtype):
+    largest = torch.finfo(dtype).max
+    for knee in (0.5, 2.0**-20, 0.99, 0.23039142787456512):  # the last is one where logs round back
+        edge = torch.tensor(largest, dtype=dtype) * torch.tensor(knee, dtype=dtype)
+        around = [edge]
+        for _ in range(50):
+            around.append(torch.nextafter(around[-1], torch.tensor(math.inf, dtype=dtype)))
+            around.insert(0, torch.nextafter(around[0], torch.tensor(0.0, dtype=dtype)))
+        bent = signed_log(torch.stack(around)[:, None], torch.tensor([knee], dtype=dtype))
+        assert (bent.diff(dim=0) >= 0).all()
+        assert bent.isfinite().all()
+    ends = signed_log(torch.tensor([[largest], [-largest]], dtype=dtype), torch.tensor([1e-30]))
+    assert ends.isfinite().all()
+    assert ends[0] == -ends[1] > 0
+
+
+@given(feature=signed(), knee=magnitudes())
+def test_the_derivative_of_signed_log_is_that_of_the_definition(feature, knee):
+    at = torch.tensor([[feature]], dtype=torch.float64, requires_grad=True)
+    signed_log(at, torch.tensor([knee], dtype=torch.float64)).sum().backward()
+    assert at.grad.item() == pytest.approx(knee / (knee + abs(feature)), rel=1e-12)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("zero", [0.0, -0.0])
+def test_the_derivative_at_zero_is_one(zero, dtype):
+    at = torch.full((1, 3), zero, dtype=dtype, requires_grad=True)
+    signed_log(at, torch.tensor([1e-30, 1.0, 1e30], dtype=dtype)).sum().backward()
+    assert at.grad.tolist() == [[1, 1, 1]]
+
+
+def test_gradients_are_finite_at_the_ends_of_float32():
+    largest = torch.finfo(torch.float32).max
+    at = torch.tensor([[largest], [-largest], [1e-45], [-1e-45]], requires_grad=True)
+    for knee in (1e-36, 1.0, 1e36):
+        (gradient,) = torch.autograd.grad(signed_log(at, torch.tensor([knee])).sum(), at)
+        assert gradient.isfinite().all()
+        assert (gradient >= 0).all()
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script. is deprecated")  # torch's own, in jvp
+def test_gradcheck_with_a_knee(rng):
+    features = torch.from_numpy(rng.standard_normal((4, 3))).requires_grad_()
+    knee = torch.tensor([0.1, 1.0, 30.0], dtype=torch.float64)
+    edge = signed_log(torch.full((3,), 9.0, dtype=torch.float64), knee)
+    scaler = FeatureScaler(-edge, edge, knee)
+    assert torch.autograd.gradcheck(scaler, features, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(scaler, features)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.parametrize("tail", [0.0, 0.02, 0.25])
+@pytest.mark.parametrize("num_bins", [300, 301])
+def test_fit_equals_numpy(dtype, compress, tail, num_bins, rng):
+    train = torch.from_numpy(heavy_tailed(rng, num_bins)).to(dtype)
+    scaler = FeatureScaler.fit(train, compress=compress, tail=tail)
+    values = train.numpy().astype(np.float64)
+    if compress:
+        size = np.abs(values)
+        knee = np.median(size, axis=0)
+        knee = np.where(knee > 0, knee, size.max(0))
+        knee = np.where(knee > 0, knee, 1.0)
+        np.testing.assert_allclose(scaler.knee, knee, rtol=1e-6)
+        values = signed_log_of(values, knee)
+    else:
+        assert scaler.knee is None
+    low, high = np.quantile(values, [tail, 1 - tail], axis=0)
+    low, high = np.where(low < high, [low, high], [values.min(0), values.max(0)])
+    rtol = 1e-5 if dtype == torch.float32 else 1e-12
+    np.testing.assert_allclose(scaler.minimum, low, rtol=rtol)
+    np.testing.assert_allclose(scaler.maximum, high, rtol=rtol)
+    assert scaler.minimum.dtype == scaler.maximum.dtype == dtype
+    new = np.concatenate([train.numpy(), heavy_tailed(rng) * 3]).astype(np.float64)
+    bent = signed_log_of(new, knee) if compress else new
+    width = np.where(high > low, high - low, 1.0)
+    expected = np.where(high > low, np.clip(2 * (bent - low) / width - 1, -1, 1), 0)
+    actual = scaler(torch.from_numpy(new).to(dtype))
+    assert actual.dtype == dtype
+    np.testing.assert_allclose(actual.numpy(), expected, atol=10 * rtol)
+    inside = scaler(train).abs() < 1
+    clipped = 1 - inside.double().mean(0)
+    assert (clipped[[0, 4, 5, 6]] <= 2 * tail + 2 / num_bins + 1e-9).all()
+
+
+def test_a_tail_of_equal_values_falls_back_to_all_of_the_range():
+    train = torch.zeros(100, 2)
+    train[0, 0], train[1, 0] = -1.0, 3.0
+    for compress in (False, True):
+        scaler = FeatureScaler.fit(train, tail=0.1, compress=compress)
+        assert scaler(train)[:2, 0].tolist() == [-1, 1]
+        assert (scaler(train)[:, 1] == 0).all()
+
+
+def test_compression_keeps_the_order_and_spreads_the_bulk(rng):
+    train = torch.from_numpy(rng.standard_cauchy((2001, 1)))
+    plain, bent = FeatureScaler.fit(train), FeatureScaler.fit(train, compress=True, tail=0.01)
+    ordered = train.sort(0).values
+    assert (bent(ordered).diff(dim=0) >= 0).all()
+    assert bent(train).std() > 5 * plain(train).std()
+
+
+def test_one_bin_will_do():
+    scaler = FeatureScaler.fit(torch.tensor([[2.0, 0.0]]), compress=True, tail=0.2)
+    assert scaler.knee.tolist() == [2, 1]
+    assert scaler(torch.tensor([[5.0, 5.0]])).tolist() == [[0, 0]]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_scaled_values_are_finite_and_bounded_up_to_the_largest_float(dtype):
+    largest = torch.finfo(dtype).max
+    scaler = FeatureScaler(
+        torch.tensor([-1e-29, -2.0, -1.0], dtype=dtype),
+        torch.tensor([1e-29, 1.0, 5.0], dtype=dtype),
+        torch.tensor([1e-30, 1.0, 1e30], dtype=dtype),
+    )
+    at = torch.tensor([[largest] * 3, [-largest] * 3], dtype=dtype, requires_grad=True)
+    scaled = scaler(at)
+    assert scaled.tolist() == [[1, 1, 1], [-1, -1, -1]]
+    scaled.sum().backward()
+    assert at.grad.tolist() == [[0, 0, 0], [0, 0, 0]]
+    beyond = torch.tensor([[math.inf, -math.inf, math.nan]], dtype=dtype)
+    assert scaler(beyond)[0, :2].tolist() == [1, -1]
+    assert scaler(beyond)[0, 2].isnan()
+
+
+def test_manners_with_a_knee(rng, device):
+    train = torch.from_numpy(rng.standard_cauchy((40, 4))).to(device)
+    scaler = {
+        dtype: FeatureScaler.fit(train.to(dtype), compress=True, tail=0.05) for dtype in DTYPES
+    }
+    features = torch.from_numpy(rng.standard_cauchy((6, 4))).to(device)
+    oracles.assert_manners(lambda x: scaler[x.dtype](x), features)
+
+
+def test_a_knee_is_saved_and_none_leaves_the_state_as_it_was(rng):
+    train = torch.from_numpy(rng.standard_cauchy((30, 2)))
+    assert set(FeatureScaler.fit(train).state_dict()) == {"minimum", "maximum"}
+    fitted = FeatureScaler.fit(train, compress=True)
+    state = fitted.state_dict()
+    assert set(state) == {"minimum", "maximum", "knee"}
+    again = FeatureScaler(state["minimum"], state["maximum"], state.get("knee"))
+    assert torch.equal(again(train), fitted(train))
+    assert fitted.float().knee.dtype == torch.float32

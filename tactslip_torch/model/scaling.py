@@ -1,29 +1,60 @@
-"""Min-max scaling to [-1, 1], fitted on training bins (REFERENCE.md section 5)."""
+"""Scaling to [-1, 1], fitted on training bins, with a signed log before it on request.
+
+REFERENCE.md section 5 has the plain range of the training bins. Compression and ranges between
+quantiles are ours, for features whose tails are heavy on real recordings.
+"""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor, nn
 
 
-class MinMaxScaler(nn.Module):
-    """Scales every feature to [-1, 1] by the range of the training bins and clips the rest.
+def signed_log(features: Tensor, knee: Tensor) -> Tensor:
+    """``sign(f) * knee * log1p(|f| / knee)``: nearly ``f`` below the knee, logarithmic above.
+
+    Monotone, odd, with derivative ``knee / (knee + |f|)``, 1 at 0. Finite for every finite ``f``,
+    also where ``|f| / knee`` passes the largest float; NaN stays NaN.
+
+    Shape:
+        - features, output: ``[*, K]``
+        - knee: ``[K]``, positive
+    """
+    is_negative = features < 0
+    size = torch.where(is_negative, -features, features)  # abs() has derivative 0 at 0
+    ratio = size / knee
+    is_far = ratio.isinf()
+    near = ratio.log1p()
+    far = torch.where(is_far, size, 1.0).log() - knee.log()
+    far = far.clamp(min=math.log(torch.finfo(far.dtype).max))  # no step back where near ends
+    bent = knee * torch.where(is_far, far, near)
+    return torch.where(is_negative, -bent, bent)
+
+
+class FeatureScaler(nn.Module):
+    """Takes a range of every feature to [-1, 1] and clips the rest.
 
     Clipping is ours: a quadratic kernel grows with the fourth power of what leaves the range.
-    A feature that was constant in training becomes 0.
+    A feature whose range is a point becomes 0.
 
     Args:
-        minimum: ``[K]``, smallest training value of each feature.
-        maximum: ``[K]``, largest.
+        minimum: ``[K]``, what becomes -1, of the compressed feature if there is a knee.
+        maximum: ``[K]``, what becomes 1.
+        knee: ``[K]``, of ``signed_log``, which comes first; without it features are not
+            compressed.
 
     Raises:
-        ValueError: if shapes disagree, a value is not finite or a minimum exceeds its maximum.
+        ValueError: if shapes disagree, a range is not finite, a minimum exceeds its maximum or a
+            knee is not positive and finite.
     """
 
     minimum: Tensor
     maximum: Tensor
+    knee: Tensor | None
 
-    def __init__(self, minimum: Tensor, maximum: Tensor) -> None:
+    def __init__(self, minimum: Tensor, maximum: Tensor, knee: Tensor | None = None) -> None:
         super().__init__()
         if minimum.shape != maximum.shape:
             raise ValueError(
@@ -31,19 +62,60 @@ class MinMaxScaler(nn.Module):
                 f"and {tuple(maximum.shape)}"
             )
         bad = ~(minimum.isfinite() & maximum.isfinite() & (minimum <= maximum))
+        bad |= ~(maximum - minimum).isfinite()
         if bool(bad.any()):
             i = int(bad.nonzero()[0])
             raise ValueError(
                 f"feature {i}: expected finite minimum <= maximum, got "
                 f"{float(minimum[i]):g} and {float(maximum[i]):g}"
             )
+        if knee is not None:
+            if knee.shape != minimum.shape:
+                raise ValueError(
+                    f"knee must have the shape of minimum, {tuple(minimum.shape)}, "
+                    f"got {tuple(knee.shape)}"
+                )
+            bad = ~(knee.isfinite() & (knee > 0))
+            if bool(bad.any()):
+                i = int(bad.nonzero()[0])
+                raise ValueError(
+                    f"feature {i}: knee must be positive and finite, got {float(knee[i]):g}"
+                )
         self.register_buffer("minimum", minimum.clone())
         self.register_buffer("maximum", maximum.clone())
+        self.register_buffer("knee", None if knee is None else knee.clone())
 
     @classmethod
-    def fit(cls, features: Tensor) -> MinMaxScaler:
-        """The scaler of training bins ``[N, K]``, ``N >= 1``."""
-        return cls(features.amin(0), features.amax(0))
+    def fit(cls, features: Tensor, *, compress: bool = False, tail: float = 0.0) -> FeatureScaler:
+        """The scaler of training bins.
+
+        Args:
+            features: the bins, at least one, finite.
+            compress: put a knee at the median of ``|f|`` of each feature; at its maximum where
+                the median is 0, at 1 where that is 0 too.
+            tail: share of the bins at either end of a feature that may be clipped: the range
+                lies between the quantiles ``tail`` and ``1 - tail`` of the compressed values,
+                interpolated linearly as ``numpy.quantile`` does, and is that of all bins where
+                the two coincide.
+
+        Shape:
+            - features: ``[N, K]``
+
+        Raises:
+            ValueError: if there is no bin, a value is not finite or ``tail`` is not in [0, 0.5).
+        """
+        if not 0 <= tail < 0.5:
+            raise ValueError(f"tail must lie in [0, 0.5), got {tail}")
+        if features.ndim != 2 or not len(features):
+            raise ValueError(
+                f"expected features [N, K] with at least one bin, got {tuple(features.shape)}"
+            )
+        if not compress and tail == 0:
+            return cls(features.amin(0), features.amax(0))
+        cls(features.amin(0), features.amax(0))  # refuses what is not finite, by feature
+        columns = [_range_of(column, compress, tail) for column in features.unbind(1)]
+        minimum, maximum, knee = (torch.stack(part) for part in zip(*columns, strict=True))
+        return cls(minimum, maximum, knee if compress else None)
 
     def forward(self, features: Tensor) -> Tensor:
         """Scale bins; NaN stays NaN, gradients are 0 where a value is clipped.
@@ -51,8 +123,35 @@ class MinMaxScaler(nn.Module):
         Shape:
             - features, output: ``[*, K]``
         """
+        if self.knee is not None:
+            features = signed_log(features, self.knee)
         width = self.maximum - self.minimum
         is_constant = width == 0
         relative = (features - self.minimum) / torch.where(is_constant, 1.0, width)
         scaled = (2 * relative - 1).clamp(-1, 1)
         return torch.where(is_constant, 0 * relative.clamp(0, 0), scaled)
+
+
+MinMaxScaler = FeatureScaler
+
+
+def _range_of(column: Tensor, compress: bool, tail: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Minimum, maximum and knee of one feature; sorting one at a time keeps memory small."""
+    ordered = column.sort().values
+    knee = torch.ones_like(ordered[0])
+    if compress:
+        size = column.abs().sort().values
+        candidates = torch.stack([_quantile(size, 0.5), size[-1], knee])
+        knee = candidates[(candidates > 0).nonzero()[0, 0]]
+        ordered = signed_log(ordered, knee)
+    low, high = _quantile(ordered, tail), -_quantile(-ordered.flip(0), tail)
+    if bool(low < high):
+        return low, high, knee
+    return ordered[0], ordered[-1], knee
+
+
+def _quantile(ordered: Tensor, share: float) -> Tensor:
+    """``numpy.quantile`` of ascending values, for a share below 1."""
+    position = share * (len(ordered) - 1)
+    index = math.floor(position)
+    return torch.lerp(ordered[index], ordered[min(index + 1, len(ordered) - 1)], position - index)
