@@ -1,5 +1,4 @@
 import io
-import json
 import os
 import pickle
 import zipfile
@@ -9,8 +8,12 @@ import pytest
 import torch
 
 from tactslip_torch import FeaturePool, HandLayout, SlipDetector
+from tactslip_torch.files import load_table, save_table
+from tactslip_torch.model.detector import FORMAT
+from tactslip_torch.model.kernel_sum import KernelSum
+from tactslip_torch.model.kernels import Polynomial, RadialBasis
 from tactslip_torch.model.quadratic import QuadraticForm
-from tactslip_torch.model.scaling import MinMaxScaler
+from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -27,8 +30,11 @@ def noise(num_bins, seed=0, num_samples=150):
     return torch.from_numpy(size * rng.standard_normal((num_bins, 24, num_samples)) + offset)
 
 
-def random_detector(seed=0):
-    """A detector nobody trained: three features of each kind, a scaler that fits, a random head."""
+def random_detector(seed=0, kernel=None, compress=False):
+    """A detector nobody trained: three features of each kind, a scaler that fits, a random head.
+
+    The head is a quadratic form, or the sum of ``kernel`` over random bins.
+    """
     rng = np.random.default_rng(seed)
     pool = FeaturePool(HandLayout.paper24())
     channel_filter = ChannelFilter([51] * 14 + [11] * 10)
@@ -43,13 +49,24 @@ def random_detector(seed=0):
     features = pool(channel_filter.valid(noise(64, seed=99)))[:, selected]
     num = len(selected)
     quadratic = torch.from_numpy(rng.standard_normal((num, num))) / num
-    head = QuadraticForm(
-        quadratic + quadratic.T,
-        torch.from_numpy(rng.standard_normal(num)),
-        torch.tensor(0.1, dtype=torch.float64),
-    )
+    linear = torch.from_numpy(rng.standard_normal(num))
+    head = QuadraticForm(quadratic + quadratic.T, linear, torch.tensor(0.1, dtype=torch.float64))
+    if kernel is not None:
+        support = torch.from_numpy(rng.uniform(-1, 1, (30, num)))
+        head = KernelSum(support, torch.from_numpy(rng.standard_normal(30)), kernel)
     info = {"simulated": True, "seed": seed, "penalty": 0.3, "train_recordings": ["M1/0"]}
-    return SlipDetector(pool, channel_filter, selected, MinMaxScaler.fit(features), head, info)
+    scaler = FeatureScaler.fit(features, compress=compress)
+    return SlipDetector(pool, channel_filter, selected, scaler, head, info)
+
+
+VARIANTS = {
+    "quadratic form": {},
+    "knee": {"compress": True},
+    "cubic": {"kernel": Polynomial(3, 0.5)},
+    "radial basis": {"kernel": RadialBasis(0.2)},
+    "radial basis and knee": {"kernel": RadialBasis(0.2), "compress": True},
+}
+"""Arguments of ``random_detector`` for every kind of head and scaler."""
 
 
 @pytest.fixture(scope="module")
@@ -66,14 +83,25 @@ def saved(detector, tmp_path):
 # Scores --------------------------------------------------------------------------------------
 
 
-def test_the_score_is_the_quadratic_form_of_scaled_features(detector):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_score_is_the_head_of_scaled_features(variant):
+    detector = random_detector(**VARIANTS[variant])
     bins = detector.channel_filter.valid(noise(5))
     features = detector.pool(bins).numpy()[:, list(detector.selected)]
+    if detector.scaler.knee is not None:
+        knee = detector.scaler.knee.numpy()
+        features = np.sign(features) * knee * np.log1p(np.abs(features) / knee)
     low, high = detector.scaler.minimum.numpy(), detector.scaler.maximum.numpy()
     z = np.clip(2 * (features - low) / (high - low) - 1, -1, 1)
-    quadratic, linear = detector.head.quadratic.numpy(), detector.head.linear.numpy()
-    expected = np.einsum("ni,ij,nj->n", z, quadratic, z) + z @ linear + 0.1
-    np.testing.assert_allclose(detector(bins).numpy(), expected, rtol=1e-10, atol=1e-12)
+    state = {name: value.numpy() for name, value in detector.head.state_dict().items()}
+    if "cubic" in variant:
+        expected = (z @ state["support"].T + 0.5) ** 3 @ state["beta"]
+    elif "radial" in variant:
+        distance = ((z[:, None] - state["support"]) ** 2).sum(-1)
+        expected = np.exp(-0.2 * distance) @ state["beta"]
+    else:
+        expected = np.einsum("ni,ij,nj->n", z, state["quadratic"], z) + z @ state["linear"] + 0.1
+    np.testing.assert_allclose(detector(bins).numpy(), expected, rtol=1e-9, atol=1e-11)
 
 
 def test_scores_differ_between_bins(detector):
@@ -115,8 +143,9 @@ def test_the_score_has_the_dtype_of_the_bins(detector, dtype):
     assert torch.equal(samples, before)
 
 
-def test_in_single_precision_the_scores_hardly_move():
-    detector = random_detector()
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_in_single_precision_the_scores_hardly_move(variant):
+    detector = random_detector(**VARIANTS[variant])
     samples = noise(32)
     exact = detector.score_raw(samples)
     single = detector.float().score_raw(samples.float())
@@ -126,7 +155,9 @@ def test_in_single_precision_the_scores_hardly_move():
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("kind", ["SG", "PVDF"])
-def test_what_is_not_finite_gives_nan_and_no_number(detector, bad, kind):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_what_is_not_finite_gives_nan_and_no_number(variant, bad, kind):
+    detector = random_detector(**VARIANTS[variant])
     channel = next(n.channel for n in detector.selected_names if n.channel.startswith(kind))
     samples = noise(3)
     samples[1, detector.pool.hand.names.index(channel), 75] = bad
@@ -143,7 +174,9 @@ def test_a_channel_no_feature_needs_may_be_broken(detector):
     torch.testing.assert_close(detector.score_raw(samples), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_gradients_reach_the_samples(detector):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_gradients_reach_the_samples(variant):
+    detector = random_detector(**VARIANTS[variant])
     samples = noise(2).requires_grad_()
     detector.score_raw(samples).sum().backward()
     assert bool(samples.grad.isfinite().all())
@@ -193,7 +226,7 @@ def test_parts_that_disagree_are_refused(detector):
     with pytest.raises(ValueError, match="11 selected features, a scaler of 12 and a head of 12"):
         rebuilt(detector, selected=detector.selected[:-1])
     with pytest.raises(ValueError, match="12 selected features, a scaler of 3 and a head of 12"):
-        rebuilt(detector, scaler=MinMaxScaler(-torch.ones(3), torch.ones(3)))
+        rebuilt(detector, scaler=FeatureScaler(-torch.ones(3), torch.ones(3)))
     with pytest.raises(ValueError, match="a filter of 23 channels does not fit a hand of 24"):
         rebuilt(detector, channel_filter=ChannelFilter([11] * 23))
 
@@ -207,14 +240,19 @@ def test_a_feature_the_pool_does_not_have_is_refused(detector, index):
 # Files -----------------------------------------------------------------------------------------
 
 
-def test_what_is_saved_comes_back_bit_by_bit(detector, saved):
-    loaded = SlipDetector.load(saved)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_what_is_saved_comes_back_bit_by_bit(variant, tmp_path):
+    detector = random_detector(**VARIANTS[variant])
+    detector.save(tmp_path / "detector.pt")
+    loaded = SlipDetector.load(tmp_path / "detector.pt")
     samples = noise(8)
     assert torch.equal(loaded.score_raw(samples), detector.score_raw(samples))
     assert torch.equal(loaded.score_raw(samples.float()), detector.score_raw(samples.float()))
     assert loaded.info == detector.info
     assert loaded.selected_names == detector.selected_names
     assert loaded.pool.hand == detector.pool.hand
+    assert type(loaded.head) is type(detector.head)
+    assert set(loaded.state_dict()) == set(detector.state_dict())
     for name, value in detector.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], value)
         assert loaded.state_dict()[name].dtype == torch.float64
@@ -239,7 +277,7 @@ def test_a_detector_of_another_hand_comes_back(tmp_path, rng):
     bins = torch.from_numpy(rng.standard_normal((9, 2, 64 + 30)))
     features = pool(channel_filter.valid(bins))[:, [3, 100]]
     head = QuadraticForm(torch.eye(2).double(), torch.ones(2).double(), torch.zeros(()).double())
-    own = SlipDetector(pool, channel_filter, [3, 100], MinMaxScaler.fit(features), head)
+    own = SlipDetector(pool, channel_filter, [3, 100], FeatureScaler.fit(features), head)
     own.save(tmp_path / "a.pt")
     loaded = SlipDetector.load(tmp_path / "a.pt")
     assert torch.equal(loaded.score_raw(bins), own.score_raw(bins))
@@ -256,10 +294,10 @@ def test_a_single_precision_detector_comes_back_as_one(tmp_path):
     assert torch.equal(loaded.score_raw(samples), single.score_raw(samples))
 
 
-def test_the_file_is_a_plain_table(saved):
-    content = torch.load(saved, weights_only=True)
-    assert set(content) == {"format", "config", "selected", "state"}
-    assert json.loads(content["config"])["info"]["simulated"] is True
+def test_the_file_is_a_plain_table(detector, saved):
+    facts, tensors = load_table(saved, FORMAT)
+    assert facts["info"]["simulated"] is True
+    assert set(tensors) == set(detector.state_dict())
 
 
 def test_a_failed_save_leaves_the_old_file(detector, saved, monkeypatch):
@@ -300,8 +338,8 @@ def test_nothing_in_a_file_is_executed(how, saved, tmp_path):
     elif how == "torch.save":
         torch.save(Trap(mark), path)
     else:
-        torch.save(torch.load(saved, weights_only=True) | {"state": Trap(mark)}, path)
-    with pytest.raises(ValueError, match=r"trap\.pt is not a readable detector"):
+        torch.save(torch.load(saved, weights_only=True) | {"tensors": Trap(mark)}, path)
+    with pytest.raises(ValueError, match=r"trap\.pt is damaged or no file of ours"):
         SlipDetector.load(path)
     assert not mark.exists()
 
@@ -333,7 +371,8 @@ def other_tensor():
 def test_another_file_is_refused_in_one_line(content, tmp_path):
     path = tmp_path / "detector.pt"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"detector\.pt is not a") as caught:
+    wanted = r"detector\.pt (is damaged or no file of ours|must be of format)"
+    with pytest.raises(ValueError, match=wanted) as caught:
         SlipDetector.load(path)
     assert "\n" not in str(caught.value)
 
@@ -342,9 +381,17 @@ def test_another_file_is_refused_in_one_line(content, tmp_path):
 def test_a_truncated_file_is_refused_in_one_line(share, saved):
     content = saved.read_bytes()
     saved.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(ValueError, match="is not a readable detector") as caught:
+    with pytest.raises(ValueError, match="is damaged or no file of ours") as caught:
         SlipDetector.load(saved)
     assert "\n" not in str(caught.value)
+
+
+def test_a_number_that_changed_is_noticed(saved):
+    content = torch.load(saved, weights_only=True)
+    content["tensors"]["head.linear"][3] += 1e-9
+    torch.save(content, saved)
+    with pytest.raises(ValueError, match="is damaged"):
+        SlipDetector.load(saved)
 
 
 def test_a_missing_file_is_named(tmp_path):
@@ -353,52 +400,57 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 def without(key):
-    return lambda content: {k: v for k, v in content.items() if k != key}
+    return lambda facts, state: ({k: v for k, v in facts.items() if k != key}, state)
 
 
-def with_config(**changes):
-    def change(content):
-        return content | {"config": json.dumps(json.loads(content["config"]) | changes)}
-
-    return change
+def with_facts(**changes):
+    return lambda facts, state: (facts | changes, state)
 
 
 def with_state(**changes):
-    def change(content):
-        changed = {name.replace("__", "."): value for name, value in changes.items()}
-        return content | {"state": content["state"] | changed}
-
-    return change
+    changed = {name.replace("__", "."): value for name, value in changes.items()}
+    return lambda facts, state: (facts, state | changed)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        without("config"),
-        without("state"),
+        without("kernel"),
         without("selected"),
-        lambda content: content | {"config": "no json"},
-        lambda content: content | {"selected": torch.arange(3)},
-        lambda content: content | {"selected": [1, 2, 3]},
-        lambda content: content | {"state": {}},
-        with_config(channels=[]),
-        with_config(channels=[{"name": "film"}]),
-        with_config(window_lengths=[50] * 24),
-        with_config(window_lengths=[51] * 23),
-        with_config(pool={"rate": 2000.0}),
+        without("info"),
+        lambda facts, state: ([], state),
+        lambda facts, state: (facts, {}),
+        with_facts(selected=[0, 1, 2]),
+        with_facts(selected=["a"] * 12),
+        with_facts(channels=[]),
+        with_facts(channels=[{"name": "film"}]),
+        with_facts(window_lengths=[50] * 24),
+        with_facts(window_lengths=[51] * 23),
+        with_facts(pool={"rate": 2000.0}),
+        with_facts(kernel={"kind": "polynomial", "degree": 3, "offset": 0.5}),
+        with_facts(kernel={"kind": "sigmoid"}),
         with_state(scaler__minimum=torch.full((12,), torch.nan)),
+        with_state(scaler__elbow=torch.ones(12)),
         with_state(head__quadratic=torch.zeros(12)),
     ],
 )
-def test_a_damaged_table_is_refused_in_one_line(change, saved):
-    torch.save(change(torch.load(saved, weights_only=True)), saved)
+def test_what_describes_no_detector_is_refused_in_one_line(change, saved):
+    """Whole files, so the digest fits; another program wrote them."""
+    save_table(saved, FORMAT, *change(*load_table(saved, FORMAT)))
     with pytest.raises(ValueError, match="is a damaged detector: ") as caught:
         SlipDetector.load(saved)
     assert "\n" not in str(caught.value)
 
 
+def test_a_file_of_an_earlier_version_is_named_as_such(tmp_path):
+    old = {"format": "tactslip_torch detector 1", "config": "{}", "selected": torch.arange(3)}
+    torch.save(old, tmp_path / "old.pt")
+    with pytest.raises(ValueError, match=r"old\.pt was made by an earlier version; train again"):
+        SlipDetector.load(tmp_path / "old.pt")
+
+
 def test_a_later_format_is_refused(saved):
     content = torch.load(saved, weights_only=True)
-    torch.save(content | {"format": "tactslip_torch detector 2"}, saved)
-    with pytest.raises(ValueError, match="is not a file of format 'tactslip_torch detector 1'"):
+    torch.save(content | {"format": "tactslip_torch detector 3"}, saved)
+    with pytest.raises(ValueError, match="must be of format 'tactslip_torch detector 2', got"):
         SlipDetector.load(saved)

@@ -6,12 +6,12 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from test_detector import noise, random_detector
+from test_detector import VARIANTS, noise, random_detector
 
 from tactslip_torch import export
 from tactslip_torch.export import export_onnx, float32_error, onnx_error
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.scaling import MinMaxScaler
+from tactslip_torch.model.scaling import FeatureScaler
 
 pytestmark = pytest.mark.onnx
 
@@ -127,6 +127,67 @@ def test_the_file_is_whole_and_valid(exported):
     assert [p.name for p in path.parent.iterdir()] == ["model.onnx"]  # no data beside, no rest
 
 
+# Heads and scalers ---------------------------------------------------------------------------
+
+
+class ScoreFeatures(torch.nn.Module):
+    """What differs between kinds of detectors: the way from selected features to a score."""
+
+    def __init__(self, detector):
+        super().__init__()
+        self.detector = detector
+
+    def forward(self, features):
+        return self.detector.score_features(features)
+
+
+def run_tail(module, traced, inputs, path):
+    """Export a part of a detector as ``export_onnx`` exports the whole, and run it."""
+    export._write_graph(module, traced, path)
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    return [session.run(None, {"samples": one.numpy()})[0] for one in inputs], onnx.load(path).graph
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_head_and_scaler_comes_through(variant, tmp_path):
+    """The rest of the graph is the same for all; making it takes many times as long."""
+    detector = random_detector(**VARIANTS[variant])
+    bins = detector.channel_filter.valid(noise(65, seed=1))
+    features = detector.pool(bins)[:, list(detector.selected)]
+    expected = detector.score_features(features)
+    tail = ScoreFeatures(copy.deepcopy(detector).float())
+    parts = [features.float()[cut] for cut in (slice(0, 1), slice(1, 65))]
+    got, graph = run_tail(tail, features[:3].float(), parts, tmp_path / "tail.onnx")
+    assert [len(part) for part in got] == [1, 64]
+    spread = float(expected.std())
+    np.testing.assert_allclose(np.concatenate(got), expected.numpy(), rtol=0, atol=1e-4 * spread)
+    operators = {node.op_type for node in graph.node}
+    assert "MatMul" in operators or "Gemm" in operators
+    assert not operators & SLOW_OR_MISSING
+    assert ("Log" in operators) == ("knee" in variant)
+    assert ("Exp" in operators) == ("radial" in variant)
+    assert onnx.TensorProto.DOUBLE not in {tensor.data_type for tensor in graph.initializer}
+
+
+def test_a_knee_survives_the_missing_log1p(rng, tmp_path):
+    """Heavy tails, zeros with few spikes, tiny units, both signs, and far below the knee."""
+    columns = [
+        np.exp(4 * rng.standard_normal(2000)),
+        np.where(rng.uniform(size=2000) < 0.7, 0.0, 1e-3 * rng.uniform(size=2000)),
+        1e-9 * np.exp(4 * rng.standard_normal(2000)),
+        rng.standard_normal(2000) ** 5,
+        np.where(np.arange(2000) < 900, 1e-7 * rng.standard_normal(2000), 1.0),
+    ]
+    features = np.stack(columns, axis=1)
+    scaler = FeatureScaler.fit(torch.from_numpy(features), compress=True, tail=0.01)
+    knee, low, high = (value.numpy() for value in (scaler.knee, scaler.minimum, scaler.maximum))
+    bent = np.sign(features) * knee * np.log1p(np.abs(features) / knee)
+    expected = np.clip(2 * (bent - low) / (high - low) - 1, -1, 1)
+    single = torch.from_numpy(features).float()
+    (got,), _ = run_tail(scaler.float(), single[:3], [single], tmp_path / "scaler.onnx")
+    np.testing.assert_allclose(got, expected, rtol=0, atol=2e-6)
+
+
 # The check -----------------------------------------------------------------------------------
 
 
@@ -216,6 +277,6 @@ def test_what_single_precision_costs_is_measured(detector):
     assert 0 <= cost["float32_flips"] < 0.05
     mode = [i for i, n in enumerate(detector.pool.names) if n.descriptor == "mode"][20:32]
     bins = detector.channel_filter.valid(noise(64, seed=99))
-    scaler = MinMaxScaler.fit(detector.pool(bins)[:, mode])
+    scaler = FeatureScaler.fit(detector.pool(bins)[:, mode])
     stepping = SlipDetector(detector.pool, detector.channel_filter, mode, scaler, detector.head)
     assert float32_error(stepping)["float32_p95"] > 10 * cost["float32_p95"]

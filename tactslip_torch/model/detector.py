@@ -5,7 +5,6 @@ A file is a plain table of tensors and JSON text; loading it executes nothing.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,28 +13,40 @@ import torch
 from torch import Tensor, nn
 
 from tactslip_torch.features.pool import FeatureName, FeaturePool
-from tactslip_torch.files import whole_file
+from tactslip_torch.files import load_table, save_table
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.kernel_sum import KernelSum
+from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.model.quadratic import QuadraticForm
-from tactslip_torch.model.scaling import MinMaxScaler
+from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 
-FORMAT = "tactslip_torch detector 1"
+Head = QuadraticForm | KernelSum
+"""A quadratic form of fixed size, or the sum over training bins of a kernel that does not fold."""
+
+FORMAT = "tactslip_torch detector 2"
+EARLIER_FORMAT = "tactslip_torch detector 1"
 
 
 class SlipDetector(nn.Module):
     """The fitted pipeline from filtered or raw samples to a score.
 
-    Features are computed in the dtype of the bins; scaling and the quadratic form in the dtype of
-    the detector (float64 as fitted; ``detector.float()`` for float32).
+    Features are computed in the dtype of the bins; scaling and head in the dtype of the detector
+    (float64 as fitted; ``detector.float()`` for float32).
 
     Args:
-        pool: what features there are.
+        pool: what features there are, F of C channels.
         channel_filter: the Savitzky-Golay filter of each channel.
-        selected: pool indices of the features in use.
+        selected: pool indices of the K features in use, best first.
         scaler: of the selected features.
         head: the machine on scaled features.
         info: JSON-able facts about the training, kept in the file.
+
+    Shape:
+        - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
+        - score: ``[*]``, dtype of ``bins``; at least 0 means slip
+        - inside: ``bins -> features [*, F] -> selected [*, K] -> scaled [*, K] -> score [*]``
+        - raw samples, for ``score_raw``: ``[*, C, n + 2 * context]``
 
     Raises:
         ValueError: if the parts disagree about the number of channels or features.
@@ -46,15 +57,15 @@ class SlipDetector(nn.Module):
         pool: FeaturePool,
         channel_filter: ChannelFilter,
         selected: Sequence[int],
-        scaler: MinMaxScaler,
-        head: QuadraticForm,
+        scaler: FeatureScaler,
+        head: Head,
         info: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        if not len(selected) == len(scaler.minimum) == len(head.linear):
+        if not len(selected) == len(scaler.minimum) == head.num_features:
             raise ValueError(
                 f"{len(selected)} selected features, a scaler of {len(scaler.minimum)} and a head "
-                f"of {len(head.linear)}: the three must agree"
+                f"of {head.num_features}: the three must agree"
             )
         outside = [int(i) for i in selected if not 0 <= i < len(pool.names)]
         if outside:
@@ -119,7 +130,7 @@ class SlipDetector(nn.Module):
             - features: ``[*, K]`` in the order of ``selected``
             - output: ``[*]``, dtype of the detector
         """
-        score: Tensor = self.head(self.scaler(features.to(self.head.linear.dtype)))
+        score: Tensor = self.head(self.scaler(features.to(self.scaler.minimum.dtype)))
         return score
 
     def score_raw(self, samples: Tensor) -> Tensor:
@@ -137,8 +148,8 @@ class SlipDetector(nn.Module):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the detector to one file, whole or not at all."""
-        pool = self.pool
-        config = {
+        pool, head = self.pool, self.head
+        facts = {
             "channels": pool.hand.to_rows(),
             "pool": {
                 "sample_rate_hz": pool.sample_rate_hz,
@@ -149,16 +160,12 @@ class SlipDetector(nn.Module):
             },
             "window_lengths": list(self.channel_filter.window_lengths),
             "polyorder": self.channel_filter.polyorder,
+            "selected": list(self.selected),
+            "kernel": head.kernel.to_dict() if isinstance(head, KernelSum) else None,
             "info": self.info,
         }
-        content = {
-            "format": FORMAT,
-            "config": json.dumps(config),
-            "selected": torch.tensor(self.selected),
-            "state": {name: value.cpu() for name, value in self.state_dict().items()},
-        }
-        with whole_file(path) as temporary:
-            torch.save(content, temporary)
+        state = {name: value.cpu() for name, value in self.state_dict().items()}
+        save_table(path, FORMAT, facts, state)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SlipDetector:
@@ -166,32 +173,45 @@ class SlipDetector(nn.Module):
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if it is not a detector file, or a damaged one.
+            ValueError: if it is not a detector file, a damaged one, or of an earlier version.
         """
+        name = os.fspath(path)
         try:
-            content = torch.load(path, map_location="cpu", weights_only=True)
+            facts, state = load_table(path, FORMAT)
         except FileNotFoundError:
-            raise FileNotFoundError(f"no detector at {os.fspath(path)}") from None
-        except Exception as error:  # torch.load raises many kinds for a file that is not its own
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ValueError(f"{os.fspath(path)} is not a readable detector: {reason}") from error
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(f"{os.fspath(path)} is not a file of format {FORMAT!r}")
+            raise FileNotFoundError(f"no detector at {name}") from None
+        except ValueError as error:
+            if str(error).endswith(f"got {EARLIER_FORMAT!r}"):
+                raise ValueError(
+                    f"{name} was made by an earlier version; train again, or evaluate it with "
+                    "that version"
+                ) from None
+            raise
         try:
-            return cls._from_content(content)
+            return cls._from_facts(facts, state)
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
-            raise ValueError(f"{os.fspath(path)} is a damaged detector: {reason}") from error
+            raise ValueError(f"{name} is a damaged detector: {reason}") from error
 
     @classmethod
-    def _from_content(cls, content: Mapping[str, Any]) -> SlipDetector:
-        config = json.loads(content["config"])
-        state = content["state"]
+    def _from_facts(cls, facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> SlipDetector:
+        def part(prefix: str) -> dict[str, Any]:
+            return {
+                name.removeprefix(prefix): value
+                for name, value in state.items()
+                if name.startswith(prefix)
+            }
+
+        head: Head
+        if facts["kernel"] is None:
+            head = QuadraticForm(**part("head."))
+        else:
+            head = KernelSum(**part("head."), kernel=kernel_from_dict(facts["kernel"]))
         return cls(
-            FeaturePool(HandLayout.from_rows(config["channels"]), **config["pool"]),
-            ChannelFilter(config["window_lengths"], config["polyorder"]),
-            content["selected"].tolist(),
-            MinMaxScaler(state["scaler.minimum"], state["scaler.maximum"]),
-            QuadraticForm(state["head.quadratic"], state["head.linear"], state["head.constant"]),
-            config["info"],
+            FeaturePool(HandLayout.from_rows(facts["channels"]), **facts["pool"]),
+            ChannelFilter(facts["window_lengths"], facts["polyorder"]),
+            facts["selected"],
+            FeatureScaler(**part("scaler.")),
+            head,
+            facts["info"],
         )
