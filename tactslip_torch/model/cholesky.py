@@ -1,0 +1,189 @@
+"""Cholesky factorisation and solves with the same bits for any number of threads.
+
+LAPACK's own routines split their work over the threads they find, and round accordingly. Here a
+matrix is cut into tiles of fixed shape, each computed by one thread (``threads.for_each``). All of
+it works on row-major storage, reads the lower triangle alone and makes no copy of it.
+
+Reference:
+    Golub and Van Loan, Matrix Computations, 4th ed., sections 4.2.6 (block Cholesky) and 3.1.4
+    (block substitution).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.threads import for_each
+
+_PANEL = 384  # columns that are factorised at a time
+_TILE = 256  # rows of a panel, or right-hand sides, that one thread computes at a time
+_FEW = 256  # right-hand sides; up to here the threads share every band of one solve
+_BAND = 512  # rows of a factor that a solve reads at a time
+_STRIP = 128  # rows of a band that one thread reads at a time, for few right-hand sides
+_WIDTH = 1024  # columns of a band, likewise
+
+
+def cholesky_(matrix: Tensor) -> None:
+    """Overwrite the lower triangle of a matrix with its Cholesky factor: ``L L' = matrix``.
+
+    Left-looking, in place. What stands above the diagonal is neither read nor written.
+
+    Args:
+        matrix: symmetric and positive definite, row-major; spoilt if an error is raised.
+
+    Shape:
+        - matrix: ``[n, n]``, float64 or float32
+
+    Raises:
+        ValueError: if the matrix is not square and row-major, or not positive definite.
+    """
+    _check_square(matrix, "matrix")
+    for start in range(0, len(matrix), _PANEL):
+        _factorise_panel(matrix, start, min(start + _PANEL, len(matrix)))
+
+
+def forward_solve(factor: Tensor, right: Tensor) -> Tensor:
+    """``L^-1 right``.
+
+    Args:
+        factor: ``L``; of ``factor`` only the lower triangle is read. May be a view of a larger
+            factor, such as ``factor[o:, o:]``.
+        right: the right-hand sides; kept.
+
+    Shape:
+        - factor: ``[m, m]``; right, output: ``[m, r]``
+
+    Raises:
+        ValueError: if shapes or dtypes disagree.
+    """
+    _check_system(factor, right)
+    rows = right.mT.clone(memory_format=torch.contiguous_format)  # [r, m], one system a row
+    _by_systems(lambda some: _forward_(factor, some), rows)
+    return rows.mT
+
+
+def cholesky_solve(factor: Tensor, right: Tensor) -> Tensor:
+    """``(L L')^-1 right``.
+
+    Args:
+        factor: ``L``, as in ``forward_solve``.
+        right: the right-hand sides; kept.
+
+    Shape:
+        - factor: ``[m, m]``; right, output: ``[m]`` or ``[m, r]``
+
+    Raises:
+        ValueError: if shapes or dtypes disagree.
+    """
+    if right.ndim == 1:
+        return cholesky_solve(factor, right[:, None])[:, 0]
+    _check_system(factor, right)
+    rows = right.mT.clone(memory_format=torch.contiguous_format)
+
+    def solve(some: Tensor) -> None:
+        _forward_(factor, some)
+        _backward_(factor, some)
+
+    _by_systems(solve, rows)
+    return rows.mT
+
+
+def _factorise_panel(matrix: Tensor, start: int, end: int) -> None:
+    """Columns ``start`` to ``end`` of the factor, all columns before them being final."""
+    left = matrix[start:end, :start]
+    corner = matrix[start:end, start:end]
+    work = corner.clone()  # LAPACK and tiles write to a whole square; the upper triangle is theirs
+    below = range(end, len(matrix), _TILE)
+
+    def update(row: int) -> None:
+        if row < end:
+            stop = min(row + _TILE, end)
+            tile = work[row - start : stop - start, : stop - start]
+        else:
+            stop = min(row + _TILE, len(matrix))
+            tile = matrix[row:stop, start:end]
+        tile.addmm_(matrix[row:stop, :start], left[: tile.shape[1]].mT, alpha=-1)
+
+    def factorise(lower: Tensor) -> None:
+        factor, info = torch.linalg.cholesky_ex(work)
+        if info:
+            raise ValueError(
+                f"matrix is not positive definite at row {start + int(info) - 1} in "
+                f"{matrix.dtype}; add more to its diagonal (a lower penalty)"
+            )
+        corner.copy_(torch.where(lower, factor, corner))
+
+    def divide(row: int) -> None:
+        tile = matrix[row : row + _TILE, start:end]
+        tile.copy_(torch.linalg.solve_triangular(corner.mT, tile, upper=True, left=False))
+
+    for_each(update, [*range(start, end, _TILE), *below])
+    for_each(factorise, [torch.ones_like(corner, dtype=torch.bool).tril_()])
+    for_each(divide, below)
+
+
+def _by_systems(solve: Callable[[Tensor], None], rows: Tensor) -> None:
+    """Few systems share the threads; of many, each thread takes a tile at a time."""
+    if len(rows) <= _FEW:
+        solve(rows)
+    else:
+        for_each(solve, rows.split(_TILE))
+
+
+def _forward_(factor: Tensor, rows: Tensor) -> None:
+    """``L^-1`` on every row of ``[r, m]``, in place; reads the factor once, from the top."""
+    for start in range(0, len(factor), _BAND):
+        end = min(start + _BAND, len(factor))
+        done = rows[:, :start].mT
+
+        def reduce(row: int) -> None:
+            strip = slice(row, min(row + _STRIP, end))  # noqa: B023
+            rows[:, strip].mT.addmm_(factor[strip, :start], done, alpha=-1)  # noqa: B023
+
+        def divide(corner: Tensor) -> None:
+            part = rows[:, start:end].mT  # noqa: B023
+            part.copy_(torch.linalg.solve_triangular(corner, part, upper=False))
+
+        if start:
+            for_each(reduce, range(start, end, _STRIP))
+        for_each(divide, [factor[start:end, start:end]])
+
+
+def _backward_(factor: Tensor, rows: Tensor) -> None:
+    """``L'^-1`` on every row of ``[r, m]``, in place; reads the same bands, from the bottom."""
+    for start in reversed(range(0, len(factor), _BAND)):
+        band = factor[start : start + _BAND]
+        part = rows[:, start : start + _BAND].mT
+
+        def divide(corner: Tensor) -> None:
+            part.copy_(torch.linalg.solve_triangular(corner.mT, part, upper=True))  # noqa: B023
+
+        def reduce(column: int) -> None:
+            width = slice(column, min(column + _WIDTH, start))  # noqa: B023
+            rows[:, width].mT.addmm_(band[:, width].mT, part, alpha=-1)  # noqa: B023
+
+        for_each(divide, [band[:, start : start + _BAND]])
+        for_each(reduce, range(0, start, _WIDTH))
+
+
+def _check_square(matrix: Tensor, name: str) -> None:
+    num = matrix.shape[-1]
+    if matrix.shape != (num, num) or matrix.stride(-1) != 1:
+        raise ValueError(
+            f"{name} must be [n, n] and row-major, got {tuple(matrix.shape)} with strides "
+            f"{tuple(matrix.stride())}"
+        )
+    if not matrix.is_floating_point():
+        raise ValueError(f"{name} must be floating, got {matrix.dtype}")
+
+
+def _check_system(factor: Tensor, right: Tensor) -> None:
+    _check_square(factor, "factor")
+    if right.ndim != 2 or len(right) != len(factor) or right.dtype != factor.dtype:
+        raise ValueError(
+            f"right must have {len(factor)} rows of {factor.dtype} for this factor, got "
+            f"{tuple(right.shape)} of {right.dtype}"
+        )
