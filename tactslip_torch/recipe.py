@@ -31,6 +31,7 @@ from tactslip_torch.model.fit import (
     fit_machine,
     validation_scores,
 )
+from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import MinMaxScaler
 from tactslip_torch.model.threshold import FeatureThreshold, best_threshold
@@ -224,7 +225,7 @@ def fit_detector(
     scaler = MinMaxScaler.fit(features)
     index, weights = _draw(recipe, bins.is_slip, "fit")
     training = TrainingBins(scaler(features[index]), bins.is_slip[index], weights)
-    head = fit_machine(training, penalty, recipe.offset, progress)
+    head = fit_machine(training, penalty, Polynomial(2, recipe.offset), progress)
     seconds = {"validation": validated - started, "solve": time.perf_counter() - validated}
     facts = {
         "penalty": penalty if math.isfinite(penalty) else "inf",  # JSON has no infinity

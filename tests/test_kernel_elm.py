@@ -4,7 +4,14 @@ import pytest
 import torch
 from sklearn.kernel_ridge import KernelRidge
 
-from tactslip_torch.model.kernel_elm import polynomial_kernel, solve_kernel_elm, solve_primal
+from tactslip_torch.model.kernel_elm import (
+    solve_kernel_elm,
+    solve_kernel_elm_,
+    solve_normal_equations,
+    solve_normal_equations_,
+    solve_primal,
+)
+from tactslip_torch.model.kernels import PAPER_KERNEL
 from tactslip_torch.model.quadratic import quadratic_features
 
 PENALTIES = [0.05, 0.3, 3.0, 1000.0]
@@ -28,26 +35,6 @@ def close(actual, expected, tolerance=1e-10):
     )
 
 
-# Kernel --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("degree", [1, 2, 3])
-@pytest.mark.parametrize("offset", [0.0, 0.5, 2.0])
-def test_kernel_equals_the_oracle(degree, offset, rng):
-    a, b = rng.standard_normal((7, 4)), rng.standard_normal((9, 4))
-    actual = polynomial_kernel(*tensors(a, b), degree=degree, offset=offset)
-    close(actual, oracles.kernel(a, b, degree, offset), 1e-12)
-
-
-def test_kernel_defaults_and_manners(rng, device):
-    a, b = rng.standard_normal((6, 7, 4)), rng.standard_normal((9, 4))
-    close(polynomial_kernel(*tensors(a[0], b)), oracles.kernel(a[0], b), 1e-12)
-    b = torch.from_numpy(b).to(device)
-    oracles.assert_manners(
-        lambda a: polynomial_kernel(a, b.to(a)), torch.from_numpy(a).to(device), num_axes=2
-    )
-
-
 # Dual solve ----------------------------------------------------------------------------------
 
 
@@ -58,10 +45,10 @@ def test_dual_equals_sklearn(penalty, weighted, rng):
     ridge = KernelRidge(kernel="poly", degree=2, gamma=1, coef0=0.5, alpha=1 / penalty)
     ridge.fit(z, targets, sample_weight=weights if weighted else None)
     zt, tt, wt = tensors(z, targets, weights)
-    beta = solve_kernel_elm(polynomial_kernel(zt, zt), tt, penalty, wt if weighted else None)
+    beta = solve_kernel_elm(PAPER_KERNEL(zt, zt), tt, penalty, wt if weighted else None)
     close(beta, ridge.dual_coef_, 1e-8 if penalty > 100 else 1e-10)
     new = rng.uniform(-1, 1, (11, 5))
-    close(polynomial_kernel(torch.from_numpy(new), zt) @ beta, ridge.predict(new))
+    close(PAPER_KERNEL(torch.from_numpy(new), zt) @ beta, ridge.predict(new))
 
 
 @pytest.mark.parametrize("penalty", PENALTIES)
@@ -80,8 +67,8 @@ def test_a_weight_of_two_is_a_bin_seen_twice(rng):
     new = torch.from_numpy(rng.uniform(-1, 1, (9, 5)))
 
     def scores(z, targets, weights=None):
-        beta = solve_kernel_elm(polynomial_kernel(z, z), targets, 0.3, weights)
-        return polynomial_kernel(new, z) @ beta
+        beta = solve_kernel_elm(PAPER_KERNEL(z, z), targets, 0.3, weights)
+        return PAPER_KERNEL(new, z) @ beta
 
     zt, tt = tensors(z, targets)
     repeated = tensors(np.repeat(z, weights, axis=0), np.repeat(targets, weights))
@@ -117,7 +104,7 @@ def test_dual_is_batched(rng):
 
 def test_inputs_are_kept_and_dtype_is_followed(rng):
     z, targets, weights = tensors(*draw(rng))
-    gram = polynomial_kernel(z, z)
+    gram = PAPER_KERNEL(z, z)
     copies = [t.clone() for t in (gram, targets, weights)]
     expected = solve_kernel_elm(gram, targets, 0.3, weights)
     solve_primal(quadratic_features(z), targets, 0.3, weights)
@@ -138,9 +125,9 @@ def test_gradcheck_through_the_features(penalty, rng):
 
     def scores(z, targets, weights):
         beta = solve_kernel_elm(
-            polynomial_kernel(z, z), targets, penalty, None if penalty == np.inf else weights
+            PAPER_KERNEL(z, z), targets, penalty, None if penalty == np.inf else weights
         )
-        return polynomial_kernel(new, z) @ beta
+        return PAPER_KERNEL(new, z) @ beta
 
     inputs = [t.requires_grad_() for t in tensors(z, targets)]
     weights = torch.from_numpy(weights).requires_grad_(penalty != np.inf)
@@ -158,7 +145,7 @@ def test_primal_equals_dual(penalty, weighted, num_bins, rng):
     weights = weights if weighted else None
     features = quadratic_features(z, 0.5)
     primal = features @ solve_primal(features, targets, penalty, weights)
-    gram = polynomial_kernel(z, z)
+    gram = PAPER_KERNEL(z, z)
     dual = gram @ solve_kernel_elm(gram, targets, penalty, weights)
     close(primal, dual.numpy(), 1e-9)
 
@@ -178,6 +165,71 @@ def test_primal_solves_its_equation(rng):
 def test_gradcheck_of_the_primal(rng):
     inputs = [t.requires_grad_() for t in tensors(*draw(rng, 9, 3))]
     assert torch.autograd.gradcheck(lambda x, t, w: solve_primal(x, t, 0.5, w), inputs)
+
+
+# In place ------------------------------------------------------------------------------------
+
+
+def lower(matrix):
+    """What an in-place solve gets: nothing sensible above the diagonal."""
+    return torch.where(torch.ones_like(matrix, dtype=torch.bool).tril(), matrix, torch.nan)
+
+
+@pytest.mark.parametrize("penalty", [*PENALTIES, np.inf])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_dual_in_place_equals_the_oracle(penalty, weighted, rng):
+    """Two hundred bins of 21 monomials: the kernel matrix alone is singular."""
+    z, targets, weights = draw(rng, 200)
+    weights = weights if weighted else np.ones(200)
+    gram = lower(torch.from_numpy(oracles.kernel(z, z)))
+    beta = solve_kernel_elm_(gram, torch.from_numpy(targets), penalty, torch.from_numpy(weights))
+    if np.isinf(penalty):
+        root = np.sqrt(weights)
+        across = root[:, None] * oracles.kernel(z, z) * root
+        expected = root * np.linalg.lstsq(across, root * targets, rcond=1e-12)[0]
+    else:
+        expected = oracles.kernel_elm(oracles.kernel(z, z), targets, penalty, weights)
+    close(beta, expected, 1e-7 if penalty > 100 else 1e-9)
+
+
+@pytest.mark.parametrize("penalty", [*PENALTIES, np.inf])
+def test_normal_equations_in_place_equal_those_that_keep_their_matrix(penalty, rng):
+    x, targets = rng.standard_normal((30, 6)), rng.standard_normal(30)
+    normal, moment = tensors(x.T @ x, x.T @ targets)
+    expected = np.linalg.solve(x.T @ x + np.eye(6) / penalty, x.T @ targets)
+    close(solve_normal_equations(normal, moment, penalty), expected)
+    close(solve_normal_equations_(lower(normal), moment, penalty), expected)
+
+
+def test_there_is_no_second_matrix(rng):
+    """The factor lies where the matrix was, and only targets and weights are kept."""
+    z, targets, weights = tensors(*draw(rng))
+    gram = PAPER_KERNEL(z, z)
+    system = gram + torch.diag(1 / (0.3 * weights))
+    copies = targets.clone(), weights.clone()
+    solve_kernel_elm_(gram, targets, 0.3, weights)
+    torch.testing.assert_close(gram.tril() @ gram.tril().mT, system, rtol=1e-12, atol=1e-12)
+    assert torch.equal(targets, copies[0])
+    assert torch.equal(weights, copies[1])
+
+
+def test_errors_in_place_are_those_of_the_others():
+    bad = torch.diag(torch.tensor([1.0, -4.0]))
+    with pytest.raises(ValueError, match=r"gram \+ I/C at penalty=1: .*not positive definite"):
+        solve_kernel_elm_(bad.clone(), torch.ones(2), 1.0)
+    with pytest.raises(ValueError, match=r"X'WX \+ I/C at penalty=1: .*not positive definite"):
+        solve_normal_equations_(bad.clone(), torch.ones(2), 1.0)
+    with pytest.raises(ValueError, match="not positive definite"):
+        solve_kernel_elm_(torch.full((2, 2), torch.nan), torch.ones(2), 1.0)
+    for penalty in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match=f"positive, got {penalty}"):
+            solve_kernel_elm_(torch.eye(2), torch.ones(2), penalty)
+        with pytest.raises(ValueError, match=f"positive, got {penalty}"):
+            solve_normal_equations_(torch.eye(2), torch.ones(2), penalty)
+    with pytest.raises(ValueError, match=r"\(2, 2\).*\(3,\)"):
+        solve_kernel_elm_(torch.eye(2), torch.ones(3), 1.0)
+    with pytest.raises(ValueError, match="weights must be positive"):
+        solve_kernel_elm_(torch.eye(2), torch.ones(2), 1.0, torch.tensor([1.0, 0.0]))
 
 
 # Errors and extremes -------------------------------------------------------------------------

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,11 +12,12 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model.kernel_elm import (
-    polynomial_kernel,
     solve_kernel_elm,
-    solve_normal_equations,
+    solve_kernel_elm_,
+    solve_normal_equations_,
 )
-from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.kernel_sum import KernelSum
+from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, lower_gram
 from tactslip_torch.model.quadratic import (
     QuadraticForm,
     collapse,
@@ -24,7 +26,10 @@ from tactslip_torch.model.quadratic import (
     quadratic_features,
 )
 
+log = logging.getLogger(__name__)
+
 Balance = Literal["undersample", "weights"]
+Route = Literal["auto", "primal", "dual"]
 Progress = Callable[[Iterable[int], str], Iterable[int]]
 """Wraps a range so that its progress shows; gets the range and what is being done."""
 
@@ -40,11 +45,26 @@ class TrainingBins:
         features: ``[N, K]`` in [-1, 1].
         is_slip: ``[N]``, bool.
         weights: ``[N]``, positive, or ``None`` for 1 each.
+
+    Raises:
+        ValueError: if shapes disagree or a weight is not positive.
     """
 
     features: Tensor
     is_slip: Tensor
     weights: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        shapes = [tuple(self.features.shape), tuple(self.is_slip.shape)]
+        if self.weights is not None:
+            shapes.append(tuple(self.weights.shape))
+        if len(shapes[0]) != 2 or any(shape != shapes[0][:1] for shape in shapes[1:]):
+            raise ValueError(
+                "expected features [N, K], is_slip [N] and weights [N] with one N, got "
+                f"{', '.join(map(str, shapes))}"
+            )
+        if self.weights is not None and not bool((self.weights > 0).all()):
+            raise ValueError(f"weights must be positive, got {float(self.weights.min()):g}")
 
     @property
     def targets(self) -> Tensor:
@@ -99,30 +119,46 @@ def balanced_choice(
 def fit_machine(
     bins: TrainingBins,
     penalty: float,
-    offset: float = 0.5,
+    kernel: Kernel = PAPER_KERNEL,
     progress: Progress | None = None,
-) -> QuadraticForm:
-    """Solve the degree-2 kernel machine and fold it into its quadratic form.
+    route: Route = "auto",
+) -> QuadraticForm | KernelSum:
+    """Solve the kernel machine, and fold it into its quadratic form where the kernel folds.
 
-    Through the primal when there are more bins than monomials (7381 for 120 features), through the
-    dual otherwise; both give the same machine.
+    Through the primal when there are more bins than monomials (7381 for 120 features at degree 2,
+    121 at degree 1), through the dual otherwise and for every kernel that does not fold; both give
+    the same machine. The primal takes one matrix of monomials by monomials whatever the number of
+    bins; the dual takes one of bins by bins.
 
     Args:
         bins: scaled training bins in float64.
         penalty: the paper's ``C``; ``inf`` for the pseudo-inverse.
-        offset: the paper's ``c``.
+        kernel: of the machine.
         progress: shows the progress of the primal's accumulation.
+        route: ``"auto"``, or the one to take.
 
     Raises:
-        ValueError: if the system is not positive definite.
+        ValueError: if the system is not positive definite, or the primal is asked of a kernel
+            that does not fold.
     """
+    if route not in ("auto", "primal", "dual"):
+        raise ValueError(f"route must be 'auto', 'primal' or 'dual', got {route!r}")
     num_bins, num_features = bins.features.shape
-    if num_bins > num_quadratic_features(num_features):
-        weights = _solve_primal_in_chunks(bins, penalty, offset, progress)
-        return from_primal(weights, num_features, offset)
-    gram = polynomial_kernel(bins.features, bins.features, offset=offset)
-    beta = solve_kernel_elm(gram, bins.targets, penalty, bins.weights)
-    return collapse(bins.features, beta, Polynomial(2, offset))
+    if isinstance(kernel, Polynomial) and kernel.collapses:
+        linear = kernel.degree == 1
+        num_monomials = num_features + 1 if linear else num_quadratic_features(num_features)
+        if route == "primal" or (route == "auto" and num_bins > num_monomials):
+            solve = _solve_linear_primal if linear else _solve_quadratic_primal
+            return solve(bins, penalty, kernel.offset, progress)
+    elif route == "primal":
+        raise ValueError(f"{kernel} has no primal of fixed size; take route='dual' or 'auto'")
+    gram = lower_gram(kernel, bins.features)
+    beta = solve_kernel_elm_(gram, bins.targets, penalty, bins.weights)
+    if kernel.collapses:
+        return collapse(bins.features, beta, kernel)
+    machine = KernelSum(bins.features, beta, kernel)
+    log.info(machine.cost_note)
+    return machine
 
 
 def validation_scores(
@@ -136,8 +172,9 @@ def validation_scores(
     Raises:
         ValueError: if a class is absent from the held-out bins, or a solve fails.
     """
-    gram = polynomial_kernel(train.features, train.features, offset=offset)
-    across = polynomial_kernel(held_out.features, train.features, offset=offset)
+    kernel = Polynomial(2, offset)
+    gram = kernel(train.features, train.features)
+    across = kernel(held_out.features, train.features)
     is_slip = held_out.is_slip
     if bool(is_slip.all()) or not bool(is_slip.any()):
         raise ValueError("a validation fold needs held-out bins of both classes")
@@ -150,17 +187,33 @@ def validation_scores(
     return scores
 
 
-def _solve_primal_in_chunks(
+def _solve_linear_primal(
     bins: TrainingBins, penalty: float, offset: float, progress: Progress | None
-) -> Tensor:
-    """``solve_primal`` on ``quadratic_features``, never holding them all; lower triangle only."""
-    num_bins, num_features = bins.features.shape
+) -> QuadraticForm:
+    """Degree 1: one unknown per feature, and one for the constant."""
+    num_features = bins.features.shape[1]
+    normal = bins.features.new_zeros(num_features + 1, num_features + 1)
+    moment = bins.features.new_zeros(num_features + 1)
+    for chunk in _chunks(bins, progress):
+        z = bins.features[chunk]
+        x = torch.cat([z, torch.full_like(z[:, :1], math.sqrt(offset))], dim=-1)
+        weighted = x if bins.weights is None else x * bins.weights[chunk, None]
+        normal.addmm_(weighted.mT, x)
+        moment.addmv_(weighted.mT, bins.targets[chunk])
+    solved = solve_normal_equations_(normal, moment, penalty)
+    flat = solved.new_zeros(num_features, num_features)
+    return QuadraticForm(flat, solved[:-1], math.sqrt(offset) * solved[-1])
+
+
+def _solve_quadratic_primal(
+    bins: TrainingBins, penalty: float, offset: float, progress: Progress | None
+) -> QuadraticForm:
+    """Degree 2, never holding the monomials of all bins; lower triangle only."""
+    num_features = bins.features.shape[1]
     size = num_quadratic_features(num_features)
     normal = bins.features.new_zeros(size, size)
     moment = bins.features.new_zeros(size)
-    starts: Iterable[int] = range(0, num_bins, CHUNK_BINS)
-    for start in starts if progress is None else progress(starts, "normal equations"):
-        chunk = slice(start, start + CHUNK_BINS)
+    for chunk in _chunks(bins, progress):
         monomials = quadratic_features(bins.features[chunk], offset)
         weighted = monomials
         if bins.weights is not None:
@@ -169,6 +222,10 @@ def _solve_primal_in_chunks(
         for top in range(0, size, BLOCK_FEATURES):
             end = min(top + BLOCK_FEATURES, size)
             normal[top:end, :end].addmm_(weighted[:, top:end].mT, monomials[:, :end])
-    if math.isinf(penalty):  # the pseudo-inverse reads both triangles
-        normal = normal.tril() + normal.tril(-1).mT
-    return solve_normal_equations(normal, moment, penalty)
+    return from_primal(solve_normal_equations_(normal, moment, penalty), num_features, offset)
+
+
+def _chunks(bins: TrainingBins, progress: Progress | None) -> Iterator[slice]:
+    starts: Iterable[int] = range(0, len(bins.features), CHUNK_BINS)
+    for start in starts if progress is None else progress(starts, "normal equations"):
+        yield slice(start, start + CHUNK_BINS)

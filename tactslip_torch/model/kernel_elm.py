@@ -1,8 +1,9 @@
-"""The polynomial kernel extreme learning machine, solved in closed form (paper section IV-E).
+"""The kernel extreme learning machine, solved in closed form (paper section IV-E).
 
 On targets of +-1 this is kernel ridge regression with ``alpha = 1 / C``; with class weights it is
 the weighted ELM of Zong, Huang and Chen (2013). Two routes to the same machine: dual, one
-unknown per training bin, and primal, one unknown per monomial of the features.
+unknown per training bin, and primal, one unknown per monomial of the features. Functions whose
+name ends in ``_`` solve within the matrix they are given; the others are differentiable.
 """
 
 from __future__ import annotations
@@ -12,15 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-
-def polynomial_kernel(a: Tensor, b: Tensor, degree: int = 2, offset: float = 0.5) -> Tensor:
-    """Kernel matrix ``(a b' + offset) ** degree``.
-
-    Shape:
-        - a: ``[*, N, K]``; b: ``[*, M, K]``; output: ``[*, N, M]``
-    """
-    gram: Tensor = (a @ b.mT + offset) ** degree
-    return gram
+from tactslip_torch.model.cholesky import cholesky_, cholesky_solve
 
 
 def solve_kernel_elm(
@@ -54,20 +47,34 @@ def solve_kernel_elm(
         >>> solve_kernel_elm(torch.eye(2), torch.tensor([1.0, -1.0]), penalty=1.0)
         tensor([ 0.5000, -0.5000])
     """
-    num_bins = gram.shape[-1]
-    if gram.shape[-2] != num_bins or targets.shape[-1] != num_bins:
-        raise ValueError(
-            f"expected gram [*, N, N] and targets [*, N] with one N, got {tuple(gram.shape)} "
-            f"and {tuple(targets.shape)}"
-        )
-    _check_weights(weights, targets)
-    _check_penalty(penalty)
+    _check_system(gram, targets, weights, penalty)
     if math.isinf(penalty):
         root = torch.ones_like(targets) if weights is None else weights.sqrt()
         weighted = root[..., :, None] * gram * root[..., None, :]
         return root * _pseudo_solve(weighted, root * targets)
-    ridge = torch.full_like(targets, 1 / penalty) if weights is None else 1 / (penalty * weights)
-    return _cholesky_solve(gram + torch.diag_embed(ridge), targets, "gram + I/C", penalty)
+    ridge = torch.diag_embed(_ridge(targets, penalty, weights))
+    return _cholesky_solve(gram + ridge, targets, "gram + I/C", penalty)
+
+
+def solve_kernel_elm_(
+    gram: Tensor, targets: Tensor, penalty: float, weights: Tensor | None = None
+) -> Tensor:
+    """``solve_kernel_elm`` within the matrix it is given: no second one of its size.
+
+    The factor overwrites ``gram``; the bits do not depend on the number of threads. Not
+    differentiable. The pseudo-inverse of ``penalty=inf`` takes further matrices all the same.
+
+    Shape:
+        - gram: ``[N, N]``, row-major; targets, weights, output: ``[N]``
+
+    Raises:
+        ValueError: as ``solve_kernel_elm``.
+    """
+    if math.isinf(penalty):
+        return solve_kernel_elm(gram, targets, penalty, weights)
+    _check_system(gram, targets, weights, penalty)
+    gram.diagonal().add_(_ridge(targets, penalty, weights))
+    return _cholesky_solve_(gram, targets, "gram + I/C", penalty)
 
 
 def solve_primal(
@@ -104,7 +111,8 @@ def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Te
     """``(normal + I / penalty)^-1 moment``; what ``solve_primal`` does once the sums are known.
 
     Shape:
-        - normal: ``[P, P]``, ``X' W X``; moment: ``[P]``, ``X' W t``; output: ``[P]``
+        - normal: ``[P, P]``, ``X' W X``, only its lower triangle is read; moment: ``[P]``,
+          ``X' W t``; output: ``[P]``
 
     Raises:
         ValueError: as ``solve_primal``.
@@ -115,6 +123,27 @@ def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Te
     ridged = normal.clone()
     ridged.diagonal().add_(1 / penalty)
     return _cholesky_solve(ridged, moment, "X'WX + I/C", penalty)
+
+
+def solve_normal_equations_(normal: Tensor, moment: Tensor, penalty: float) -> Tensor:
+    """``solve_normal_equations`` within the matrix it is given, as ``solve_kernel_elm_`` does.
+
+    Shape:
+        - normal: ``[P, P]``, row-major, only its lower triangle is read; moment, output: ``[P]``
+
+    Raises:
+        ValueError: as ``solve_primal``.
+    """
+    if math.isinf(penalty):
+        return solve_normal_equations(normal, moment, penalty)
+    _check_penalty(penalty)
+    normal.diagonal().add_(1 / penalty)
+    return _cholesky_solve_(normal, moment, "X'WX + I/C", penalty)
+
+
+def _ridge(targets: Tensor, penalty: float, weights: Tensor | None) -> Tensor:
+    """``1 / (penalty * weights)`` of every bin."""
+    return torch.full_like(targets, 1 / penalty) if weights is None else 1 / (penalty * weights)
 
 
 def _pseudo_solve(system: Tensor, targets: Tensor) -> Tensor:
@@ -130,6 +159,25 @@ def _cholesky_solve(system: Tensor, targets: Tensor, name: str, penalty: float) 
             "lower the penalty, scale the features, or solve in float64"
         )
     return torch.cholesky_solve(targets[..., None], factor).squeeze(-1)
+
+
+def _cholesky_solve_(system: Tensor, targets: Tensor, name: str, penalty: float) -> Tensor:
+    try:
+        cholesky_(system)
+    except ValueError as error:
+        raise ValueError(f"{name} at penalty={penalty:g}: {error}") from error
+    return cholesky_solve(system, targets)
+
+
+def _check_system(gram: Tensor, targets: Tensor, weights: Tensor | None, penalty: float) -> None:
+    num_bins = gram.shape[-1]
+    if gram.shape[-2] != num_bins or targets.shape[-1] != num_bins:
+        raise ValueError(
+            f"expected gram [*, N, N] and targets [*, N] with one N, got {tuple(gram.shape)} "
+            f"and {tuple(targets.shape)}"
+        )
+    _check_weights(weights, targets)
+    _check_penalty(penalty)
 
 
 def _check_weights(weights: Tensor | None, targets: Tensor) -> None:
