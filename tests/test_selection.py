@@ -8,7 +8,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
+from tactslip_torch.features import selection
+from tactslip_torch.features.selection import (
+    ClassMoments,
+    rank_distinct,
+    rank_features,
+    t_scores,
+)
 
 VARIANCES = ["pooled", "welch"]
 
@@ -18,25 +24,27 @@ def draw(rng, num_bins=80, num_features=12, share=0.3):
     labels[:4] = 0, 0, 1, 1
     features = rng.standard_normal((num_bins, num_features)) * 10.0 ** rng.integers(-3, 4, 12)
     features += labels[:, None] * rng.uniform(-1, 1, num_features) * features.std(0)
-    return features, labels
+    return features.astype(np.float32), labels
 
 
 def moments_of(features, labels):
     moments = ClassMoments(features.shape[1])
-    moments.update(torch.as_tensor(features), torch.as_tensor(labels))
+    moments.update(torch.as_tensor(features).float(), torch.as_tensor(labels))
     return moments
 
 
+def double(features):
+    """What the moments saw, for references in float64."""
+    return np.asarray(features, dtype=np.float32).astype(np.float64)
+
+
 def assert_same(actual, expected):
-    """Up to rounding: means of size s are known to eps s, which moves a sum of n squared
-    deviations Q by up to 2 eps s sqrt(n Q) when parts are put together."""
-    assert torch.equal(actual.count, expected.count)
-    size = expected.mean.abs().amax(0) + expected.sum_sq_dev.sqrt()
-    assert ((actual.mean - expected.mean).abs() <= 1e-14 * size).all()
-    count = expected.count.sum()
-    rounding = 20 * oracles.EPS * size * (expected.sum_sq_dev * count).sqrt()
-    error = (actual.sum_sq_dev - expected.sum_sq_dev).abs()
-    assert (error <= 1e-12 * expected.sum_sq_dev + rounding).all()
+    """To the last bit."""
+    for name in ("count", "mean", "sum_sq_dev"):
+        assert torch.equal(getattr(actual, name), getattr(expected, name))
+    actual, expected = actual.state_dict(), expected.state_dict()
+    assert actual.keys() == expected.keys()
+    assert all(torch.equal(actual[name], expected[name]) for name in actual)
 
 
 @pytest.mark.parametrize("as_type", [torch.long, torch.bool, torch.float64])
@@ -44,7 +52,7 @@ def test_moments_equal_numpy(as_type, rng):
     features, labels = draw(rng)
     moments = moments_of(features, torch.from_numpy(labels).to(as_type))
     for label in (0, 1):
-        of_class = features[labels == label]
+        of_class = double(features)[labels == label]
         assert moments.count[label] == len(of_class)
         np.testing.assert_allclose(moments.mean[label], of_class.mean(0), rtol=1e-12, atol=1e-12)
         expected = of_class.var(0) * len(of_class)
@@ -57,7 +65,7 @@ def test_moments_equal_numpy(as_type, rng):
 def test_scores_equal_scipy(variance, share, rng):
     features, labels = draw(rng, share=share)
     actual = t_scores(moments_of(features, labels), variance)
-    expected = oracles.t_scores(features, labels, variance)
+    expected = oracles.t_scores(double(features), labels, variance)
     np.testing.assert_allclose(actual, expected, rtol=1e-10)
 
 
@@ -72,10 +80,11 @@ def test_the_default_is_pooled_and_both_agree_on_balanced_classes(rng):
 
 @pytest.mark.parametrize("variance", VARIANCES)
 def test_scores_do_not_depend_on_unit_or_offset(variance, rng):
-    features, labels = draw(rng)
-    before = t_scores(moments_of(features / features.std(0), labels), variance)
-    after = t_scores(moments_of(1e5 - 3 * features / features.std(0), labels), variance)
-    torch.testing.assert_close(after, before, rtol=1e-8, atol=1e-8)
+    features = rng.integers(-500, 500, (80, 12))
+    labels = (rng.uniform(size=80) < 0.3).astype(int)
+    before = t_scores(moments_of(features, labels), variance)
+    after = t_scores(moments_of(2**20 - 4 * features, labels), variance)  # exact in float32
+    torch.testing.assert_close(after, before, rtol=1e-11, atol=1e-11)
 
 
 @given(
@@ -86,7 +95,7 @@ def test_scores_do_not_depend_on_unit_or_offset(variance, rng):
 )
 def test_merged_parts_equal_the_whole_in_any_split_and_order(cuts, order, seed, offset):
     features, labels = draw(np.random.default_rng(seed))
-    features = features + offset
+    features = (features + offset).astype(np.float32)
     edges = [0, *sorted(cuts), 80]
     parts = [moments_of(features[a:b], labels[a:b]) for a, b in itertools.pairwise(edges)]
     whole = moments_of(features, labels)
@@ -95,36 +104,43 @@ def test_merged_parts_equal_the_whole_in_any_split_and_order(cuts, order, seed, 
     updated = ClassMoments(12)
     for a, b in itertools.pairwise(edges):
         updated.update(torch.from_numpy(features[a:b]), torch.from_numpy(labels[a:b]))
-    assert_same(updated, whole)
+        assert_same(updated, moments_of(features[:b], labels[:b]))  # also between updates
+    assert_same(ClassMoments.from_state_dict(whole.state_dict()), whole)
 
 
 def test_merge_is_a_tree_as_well_as_a_chain_and_changes_neither_part(rng):
     features, labels = draw(rng)
     a, b, c, d = (moments_of(features[i::4], labels[i::4]) for i in range(4))
-    means = [part.mean.clone() for part in (a, b, c, d)]
+    states = [part.state_dict() for part in (a, b, c, d)]
     assert_same(a.merge(b).merge(c.merge(d)), moments_of(features, labels))
     assert_same(d.merge(a).merge(c).merge(b), moments_of(features, labels))
-    for part, mean in zip((a, b, c, d), means, strict=True):
-        assert torch.equal(part.mean, mean)
+    for part, state in zip((a, b, c, d), states, strict=True):
+        assert_same(part, ClassMoments.from_state_dict(state))
+
+
+def test_what_is_removed_was_never_there(rng):
+    features, labels = draw(rng)
+    moments = moments_of(features, labels)
+    assert (moments.mean != 0).all()
+    moments.remove(torch.from_numpy(features[20:50]), torch.from_numpy(labels[20:50]))
+    rest = np.r_[0:20, 50:80]
+    assert_same(moments, moments_of(features[rest], labels[rest]))
+    with pytest.raises(ValueError, match="never added"):
+        moments.remove(torch.full((1, 12), 1e30), torch.ones(1))
+    assert_same(moments, moments_of(features[rest], labels[rest]))
 
 
 def test_moments_do_not_cancel_on_a_large_offset(rng):
-    features = 1e6 + 1e-3 * rng.standard_normal((50, 3))
+    features = double(1e6 + rng.standard_normal((50, 3)))
     labels = np.arange(50) % 2
     expected = oracles.t_scores(features - 1e6, labels)
-    np.testing.assert_allclose(t_scores(moments_of(features, labels)), expected, rtol=1e-5)
-
-
-def test_float32_features_are_gathered_in_float64(rng):
-    features, labels = draw(rng)
-    moments = moments_of(features.astype(np.float32), labels)
-    assert_same(moments, moments_of(features.astype(np.float32).astype(np.float64), labels))
+    np.testing.assert_allclose(t_scores(moments_of(features, labels)), expected, rtol=1e-8)
 
 
 @pytest.mark.parametrize("variance", VARIANCES)
 def test_a_feature_that_never_moves(variance):
     labels = torch.tensor([0, 0, 0, 1, 1])
-    features = torch.zeros(5, 3, dtype=torch.float64)
+    features = torch.zeros(5, 3)
     features[:, 1] = 7.0
     features[3:, 2] = 1.0
     assert t_scores(moments_of(features, labels), variance).tolist() == [0, 0, math.inf]
@@ -135,21 +151,10 @@ def test_a_feature_that_never_moves(variance):
 @pytest.mark.parametrize("num_parts", [1, 7])
 def test_a_constant_of_any_value_never_outranks_a_feature(variance, level, num_parts, rng):
     """A dead channel's features are equal in every bin, whatever the rounding of their mean."""
-    features = torch.full((701, 1), level, dtype=torch.float64)
+    features = torch.full((701, 1), level)
     labels = torch.from_numpy(rng.uniform(size=701) < 0.3)
     parts = [moments_of(features[i::num_parts], labels[i::num_parts]) for i in range(num_parts)]
     assert t_scores(ClassMoments.merged(parts), variance).tolist() == [0]
-
-
-@pytest.mark.parametrize("variance", VARIANCES)
-def test_a_nan_feature_has_a_nan_score_and_spoils_no_other(variance, rng):
-    features, labels = draw(rng)
-    clean = t_scores(moments_of(features, labels), variance)
-    features[5, 3] = math.nan
-    scores = t_scores(moments_of(features, labels), variance)
-    assert scores[3].isnan()
-    others = [i for i in range(12) if i != 3]
-    torch.testing.assert_close(scores[others], clean[others], rtol=1e-12, atol=0)
 
 
 @given(
@@ -166,6 +171,118 @@ def test_ranking_is_by_score_then_index_with_nan_last(scores, data):
     ranked = rank_features(torch.tensor(scores, dtype=torch.float64), num)
     assert ranked.dtype == torch.long
     assert ranked.tolist() == expected
+
+
+# -------------------------------------------------------------------------------- rank_distinct
+def within_class_correlation(features, is_slip):
+    """NumPy's, of what is left without class means; 0 for a constant."""
+    features = double(features)
+    for label in (False, True):
+        if (is_slip == label).any():
+            features[is_slip == label] -= features[is_slip == label].mean(0)
+    features[:, np.abs(features).max(0) < 1e-12] = 0
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(np.abs(np.corrcoef(features, rowvar=False)))
+
+
+def distinct(scores, features, is_slip, num, most_correlation):
+    """The definition, one feature at a time."""
+    correlation = within_class_correlation(features, is_slip)
+    order = sorted(range(len(scores)), key=lambda i: (-scores[i], i))
+    taken = []
+    for i in order:
+        if all(correlation[i, j] <= most_correlation for j in taken):
+            taken.append(i)
+    return (taken + [i for i in order if i not in taken])[:num]
+
+
+def families(rng, num_bins, num_features, num_sources=9):
+    """Features that repeat a few sources, with classes far apart, and a column of each kind."""
+    is_slip = rng.uniform(size=num_bins) < 0.6
+    sources = rng.standard_normal((num_bins, num_sources))
+    noise = rng.choice([0.1, 0.5, 2.0], num_features) * rng.standard_normal(
+        (num_bins, num_features)
+    )
+    features = sources[:, rng.integers(num_sources, size=num_features)] + noise
+    features *= rng.choice([-1, 1], num_features) * 10.0 ** rng.integers(-9, 9, num_features)
+    features += 5 * is_slip[:, None] * features.std(0)  # between classes, which does not count
+    features[:, num_features // 2] = 0.1
+    return features.astype(np.float32), is_slip
+
+
+@pytest.mark.parametrize("most_correlation", [0.3, 0.7, 0.95])
+@pytest.mark.parametrize("num", [1, 9, 40, 300])
+def test_distinct_features_equal_the_definition(most_correlation, num, rng):
+    """300 features: more than one block of candidates."""
+    features, is_slip = families(rng, 120, 300)
+    scores = rng.permutation(300) / 7
+    actual = rank_distinct(
+        torch.from_numpy(scores),
+        torch.from_numpy(features),
+        torch.from_numpy(is_slip),
+        num,
+        most_correlation,
+    )
+    assert actual.dtype == torch.long
+    assert actual.tolist() == distinct(scores, features, is_slip, num, most_correlation)
+
+
+def test_the_best_of_the_skipped_fill_what_is_missing_in_order(rng):
+    source = torch.from_numpy(rng.standard_normal(30)).float()
+    features = torch.stack([source, 2 * source, -source, source**2, 3 * source], dim=1)
+    is_slip = torch.arange(30) % 2 == 0
+    scores = torch.tensor([1.0, 5.0, 4.0, 3.0, 2.0])
+    assert rank_distinct(scores, features, is_slip, 2, 0.9).tolist() == [1, 3]
+    assert rank_distinct(scores, features, is_slip, 4, 0.9).tolist() == [1, 3, 2, 4]
+    assert rank_distinct(scores, features, is_slip, 5, 0.9).tolist() == [1, 3, 2, 4, 0]
+    assert rank_distinct(scores, features, is_slip, 3, 1.0).tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("level", [0.0, 0.1, 1e30, 1e-45])
+def test_a_constant_repeats_nothing(level, rng):
+    features = torch.from_numpy(rng.standard_normal((31, 4))).float()
+    features[:, 1:3] = level
+    ranked = rank_distinct(torch.tensor([1.0, 4, 3, 2]), features, torch.arange(31) % 2, 4, 0.0)
+    assert ranked[:2].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])
+@pytest.mark.parametrize("repeats", [(2.0, 0.0), (-1.0, 3.0)])
+def test_a_repeat_is_found_at_any_size_and_offset(size, repeats, rng):
+    source = torch.from_numpy(rng.integers(-99, 99, 40)).double()
+    factor, offset = repeats
+    features = torch.stack([source, factor * source + offset], dim=1) * size
+    ranked = rank_distinct(torch.tensor([2.0, 1.0]), features.float(), torch.zeros(40), 1, 1 - 1e-6)
+    assert ranked.tolist() == [0]
+    other = torch.from_numpy(rng.standard_normal((40, 1)))
+    ranked = rank_distinct(
+        torch.tensor([3.0, 2.0, 1.0]),
+        torch.cat([features, other * size], dim=1).float(),
+        torch.zeros(40),
+        2,
+        1 - 1e-6,
+    )
+    assert ranked.tolist() == [0, 2]
+
+
+def test_without_bins_and_with_nan_scores_the_ranking_stands():
+    scores = torch.tensor([1.0, math.nan, 3.0, math.inf])
+    empty = torch.zeros(0, 4), torch.zeros(0)
+    assert rank_distinct(scores, *empty, 4, 0.5).tolist() == [3, 2, 0, 1]
+
+
+def test_correlations_are_close_and_exact_in_any_order_of_summation(rng):
+    """What makes the choice the same on any number of threads; shuffled bins are other sums."""
+    features, is_slip = families(rng, 4000, 50)
+    expected = within_class_correlation(features, is_slip)
+    features, is_slip = torch.from_numpy(features), torch.from_numpy(is_slip)
+    units = selection._unit_deviations(features, is_slip)
+    correlation = selection._correlation(units, units)
+    np.testing.assert_allclose(correlation, expected, atol=1e-7)
+    order = torch.from_numpy(rng.permutation(4000))
+    shuffled = selection._unit_deviations(features[order], is_slip[order])
+    assert torch.equal(shuffled, units[:, order])
+    assert torch.equal(selection._correlation(shuffled, shuffled), correlation)
 
 
 def test_errors():
@@ -186,3 +303,23 @@ def test_errors():
         ClassMoments(3).merge(ClassMoments(4))
     with pytest.raises(ValueError, match="no moments"):
         ClassMoments.merged([])
+    with pytest.raises(ValueError, match=r"float64; hand float32, as the data module does"):
+        ClassMoments(3).update(torch.zeros(5, 3).double(), torch.zeros(5))
+    broken = torch.zeros(5, 3)
+    broken[4, 2] = math.nan
+    with pytest.raises(ValueError, match="got nan in row 4, column 2"):
+        ClassMoments(3).update(broken, torch.zeros(5))
+
+
+def test_errors_of_distinct_features():
+    given = torch.zeros(3), torch.zeros(5, 3), torch.zeros(5)
+    for num in (0, 4):
+        with pytest.raises(ValueError, match=rf"1\.\.3, got {num}"):
+            rank_distinct(*given, num, 0.9)
+    for share in (-0.1, 1.1, math.nan):
+        with pytest.raises(ValueError, match=rf"most_correlation must lie in 0\.\.1, got {share}"):
+            rank_distinct(*given, 2, share)
+    with pytest.raises(ValueError, match=r"\[5, 4\], got \(5, 3\)"):
+        rank_distinct(torch.zeros(4), *given[1:], 2, 0.9)
+    with pytest.raises(ValueError, match=r"\[6, 3\], got \(5, 3\)"):
+        rank_distinct(*given[:2], torch.zeros(6), 2, 0.9)

@@ -7,61 +7,76 @@ each bin, and the ranking of a validation fold is a merge of what the other grou
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cached_property
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.exact_sums import ExactSums, Totals
+
 ScoreVariance = Literal["pooled", "welch"]
 CLASS_NAMES = ("non-slip", "slip")
+_BLOCK = 128  # features whose correlations are looked at together
+_GRID = 2.0**26  # an inner product of unit vectors on a grid so fine is exact in float64
 
 
 class ClassMoments:
-    """Count, mean and sum of squared deviations of every feature in both classes, in float64.
+    """Count, mean and sum of squared deviations of every feature in both classes.
+
+    Exact sums stand behind them: moments do not depend on the order of bins or on how they were
+    sharded, and a constant feature has no spread at all.
 
     Args:
         num_features: length of a feature vector.
-
-    Attributes:
-        count: ``[2]``, non-slip first.
-        mean: ``[2, F]``.
-        sum_sq_dev: ``[2, F]``.
-
-    Reference:
-        Chan, Golub and LeVeque (1983), The American Statistician 37(3), 242-247.
     """
 
     def __init__(self, num_features: int) -> None:
-        self.count = torch.zeros(2, dtype=torch.float64)
-        self.mean = torch.zeros(2, num_features, dtype=torch.float64)
-        self.sum_sq_dev = torch.zeros(2, num_features, dtype=torch.float64)
+        self._sums = ExactSums(num_features, num_classes=2)
+
+    @property
+    def num_features(self) -> int:
+        """Length of a feature vector."""
+        return self._sums.words.shape[2]
+
+    @property
+    def count(self) -> Tensor:
+        """Bins of each class so far, ``[2]``, float64, non-slip first."""
+        return self._sums.count.double()
+
+    @property
+    def mean(self) -> Tensor:
+        """``[2, F]``, float64; 0 without bins."""
+        return self._totals.mean
+
+    @property
+    def sum_sq_dev(self) -> Tensor:
+        """Sums of squared deviations from the mean, ``[2, F]``, float64."""
+        return self._totals.sum_sq_dev
 
     def update(self, features: Tensor, labels: Tensor) -> None:
-        """Add bins.
+        """Add bins; nothing on an error.
 
         Shape:
-            - features: ``[N, F]``
+            - features: ``[N, F]``, float32, finite
             - labels: ``[N]``, 1 or True for slip
 
         Raises:
-            ValueError: if shapes disagree.
+            ValueError: for another shape or dtype, or a value that is not finite.
         """
-        if features.shape != (len(labels), self.mean.shape[-1]):
-            raise ValueError(
-                f"expected features [{len(labels)}, {self.mean.shape[-1]}], "
-                f"got {tuple(features.shape)}"
-            )
-        fresh = ClassMoments(self.mean.shape[-1])
-        for index in (0, 1):
-            chosen = features[labels.bool() == bool(index)].to("cpu", torch.float64)
-            if len(chosen):
-                shifted = chosen - chosen[0]  # a constant has exactly its value and no spread
-                mean = shifted.mean(0)
-                fresh.count[index] = len(chosen)
-                fresh.mean[index] = chosen[0] + mean
-                fresh.sum_sq_dev[index] = (shifted - mean).square().sum(0)
-        merged = self.merge(fresh)
-        self.count, self.mean, self.sum_sq_dev = merged.count, merged.mean, merged.sum_sq_dev
+        self._check(features, labels)
+        self._sums.update(features, labels.bool())
+        self.__dict__.pop("_totals", None)
+
+    def remove(self, features: Tensor, labels: Tensor) -> None:
+        """Take out bins that were added, exactly.
+
+        Raises:
+            ValueError: as for ``update``, or if what would remain cannot be moments of bins.
+        """
+        self._check(features, labels)
+        self._sums.remove(features, labels.bool())
+        self.__dict__.pop("_totals", None)
 
     def merge(self, other: ClassMoments) -> ClassMoments:
         """The moments of both sets of bins together, as a new object.
@@ -69,46 +84,53 @@ class ClassMoments:
         Raises:
             ValueError: if the numbers of features differ.
         """
-        if self.mean.shape != other.mean.shape:
-            raise ValueError(
-                f"cannot merge moments of {self.mean.shape[-1]} and {other.mean.shape[-1]} features"
-            )
-        merged = ClassMoments(self.mean.shape[-1])
-        merged.count = self.count + other.count
-        share = (other.count / merged.count.clamp(min=1))[:, None]
-        apart = other.mean - self.mean
-        merged.mean = self.mean + apart * share
-        between = apart.square() * self.count[:, None] * share
-        merged.sum_sq_dev = self.sum_sq_dev + other.sum_sq_dev + between
-        return merged
+        return self.merged([self, other])
 
     @classmethod
     def merged(cls, parts: Iterable[ClassMoments]) -> ClassMoments:
         """All parts together.
 
         Raises:
-            ValueError: if there is none.
+            ValueError: if there is none, or the numbers of features differ.
         """
-        parts = list(parts)
-        if not parts:
-            raise ValueError("no moments to merge")
-        total = cls(parts[0].mean.shape[-1])
+        total = None
         for part in parts:
-            total = total.merge(part)
+            total = total or cls(part.num_features)
+            if total.num_features != part.num_features:
+                raise ValueError(
+                    f"cannot merge moments of {total.num_features} and {part.num_features} features"
+                )
+            total._sums.merge(part._sums)
+        if total is None:
+            raise ValueError("no moments to merge")
         return total
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Plain tensors, for checkpoints."""
-        return {"count": self.count, "mean": self.mean, "sum_sq_dev": self.sum_sq_dev}
+        """Plain tensors, for files and checkpoints."""
+        return self._sums.state_dict()
 
     @classmethod
     def from_state_dict(cls, state: dict[str, Tensor]) -> ClassMoments:
         """The moments that ``state_dict`` described."""
-        moments = cls(state["mean"].shape[-1])
-        moments.count = state["count"]
-        moments.mean = state["mean"]
-        moments.sum_sq_dev = state["sum_sq_dev"]
+        moments = cls(0)
+        moments._sums = ExactSums.from_state_dict(state)
         return moments
+
+    @cached_property
+    def _totals(self) -> Totals:
+        return self._sums.totals()
+
+    def _check(self, features: Tensor, labels: Tensor) -> None:
+        if features.shape != (len(labels), self.num_features):
+            raise ValueError(
+                f"expected features [{len(labels)}, {self.num_features}], "
+                f"got {tuple(features.shape)}"
+            )
+        if features.dtype != torch.float32:
+            raise ValueError(
+                f"moments are exact sums of float32 features, got {features.dtype}; "
+                "hand float32, as the data module does"
+            )
 
 
 def t_scores(moments: ClassMoments, variance: ScoreVariance = "pooled") -> Tensor:
@@ -164,3 +186,71 @@ def rank_features(scores: Tensor, num: int) -> Tensor:
         raise ValueError(f"num must lie in 1..{len(scores)}, got {num}")
     comparable = torch.where(scores.isnan(), -1.0, scores)
     return comparable.argsort(descending=True, stable=True)[:num]
+
+
+def rank_distinct(
+    scores: Tensor, features: Tensor, is_slip: Tensor, num: int, most_correlation: float
+) -> Tensor:
+    """The best features that do not repeat each other, best first.
+
+    Goes down the ranking and skips a feature whose correlation with one already taken exceeds
+    ``most_correlation``. Where fewer than ``num`` remain, the best of the skipped ones follow.
+    Correlation is the absolute one of Pearson within classes: of deviations from the mean of the
+    bin's class, over all bins; that of a constant is 0. Deviations are rounded to a grid, on
+    which inner products are exact, so the choice does not depend on the number of threads.
+
+    Args:
+        scores: of all features, as for ``rank_features``.
+        features: a sample of training bins, float32 and finite.
+        is_slip: their classes.
+        num: how many features to take.
+        most_correlation: in [0, 1]; 1 skips none.
+
+    Shape:
+        - scores: ``[F]``
+        - features: ``[n, F]``
+        - is_slip: ``[n]``
+        - output: ``[num]``, int64
+
+    Raises:
+        ValueError: if shapes disagree, or ``num`` or ``most_correlation`` is out of range.
+    """
+    if not 0 <= most_correlation <= 1:
+        raise ValueError(f"most_correlation must lie in 0..1, got {most_correlation}")
+    if features.shape != (len(is_slip), len(scores)):
+        raise ValueError(
+            f"expected features [{len(is_slip)}, {len(scores)}], got {tuple(features.shape)}"
+        )
+    rank_features(scores, num)  # refuses a num out of range
+    taken = torch.empty(num, len(features), dtype=torch.float64)
+    chosen: list[int] = []
+    skipped: list[int] = []
+    for block in rank_features(scores, len(scores)).split(_BLOCK):
+        units = _unit_deviations(features[:, block], is_slip)
+        repeats = (_correlation(units, taken[: len(chosen)]) > most_correlation).any(-1)
+        is_near = _correlation(units, units) > most_correlation
+        for row, index in enumerate(block.tolist()):
+            if repeats[row]:
+                skipped.append(index)
+                continue
+            taken[len(chosen)] = units[row]
+            chosen.append(index)
+            if len(chosen) == num:
+                return torch.tensor(chosen)
+            repeats |= is_near[row]
+    return torch.tensor(chosen + skipped[: num - len(chosen)])
+
+
+def _unit_deviations(features: Tensor, is_slip: Tensor) -> Tensor:
+    """Deviations from class means, about of norm ``_GRID`` and integer, ``[F, n]``, float64."""
+    moments = ClassMoments(features.shape[1])
+    moments.update(features, is_slip)
+    size = moments.sum_sq_dev.sum(0).sqrt()
+    deviations = features.cpu() - moments.mean[is_slip.cpu().long()]
+    return (deviations * (_GRID / torch.where(size == 0, 1.0, size))).round().T.contiguous()
+
+
+def _correlation(a: Tensor, b: Tensor) -> Tensor:
+    """Absolute correlations of unit deviations ``[A, n]`` and ``[B, n]``, at most 1, ``[A, B]``."""
+    size = a.square().sum(-1).sqrt()[:, None] * b.square().sum(-1).sqrt()
+    return torch.where(size == 0, 0.0, (a @ b.T).abs() / size).clamp(max=1)
