@@ -12,6 +12,7 @@ from tactslip_torch.model.quadratic import (
     collapse,
     from_primal,
     quadratic_features,
+    sum_of_quadratic_features,
 )
 
 
@@ -63,6 +64,19 @@ def test_explicit_features_multiply_to_the_kernel(num_features, offset, seed):
     expected = oracles.kernel(z, z, 2, offset)
     norms = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     assert (np.abs((phi @ phi.T).numpy() - expected) <= 1e-12 * norms + 1e-15).all()
+
+
+@given(
+    num_features=st.integers(1, 10),
+    offset=st.sampled_from([0.0, 0.5, 3.0]),
+    seed=st.integers(0, 99),
+)
+def test_explicit_features_are_summed_without_making_them(num_features, offset, seed):
+    rng = np.random.default_rng(seed)
+    z, beta = rng.standard_normal((6, num_features)), rng.standard_normal(6)
+    terms = quadratic_features(torch.from_numpy(z), offset).numpy().T * beta
+    total = sum_of_quadratic_features(torch.from_numpy(z), torch.from_numpy(beta), offset)
+    assert_sum_close(total, terms)
 
 
 def test_7381_features_of_the_papers_120():

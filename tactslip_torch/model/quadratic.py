@@ -120,6 +120,21 @@ def quadratic_features(z: Tensor, offset: float = 0.5) -> Tensor:
     return torch.cat([*squares, math.sqrt(2 * offset) * z, last], dim=-1)
 
 
+def sum_of_quadratic_features(z: Tensor, beta: Tensor, offset: float = 0.5) -> Tensor:
+    """``quadratic_features(z, offset).mT @ beta`` without making them.
+
+    Shape:
+        - z: ``[N, K]``; beta: ``[N]``
+        - output: ``[(K + 1)(K + 2) / 2]``
+    """
+    num = z.shape[-1]
+    rows, columns = torch.triu_indices(num, num, device=z.device)
+    squares = (z.mT @ (z * beta[:, None]))[rows, columns]
+    squares = torch.where(rows == columns, squares, math.sqrt(2) * squares)
+    linear = math.sqrt(2 * offset) * (z.mT @ beta)
+    return torch.cat([squares, linear, offset * beta.sum()[None]])
+
+
 def from_primal(weights: Tensor, num_features: int, offset: float = 0.5) -> QuadraticForm:
     """The quadratic form that weights of ``quadratic_features`` stand for.
 
