@@ -297,8 +297,9 @@ def test_errors():
     for num in (4, 0, -1):
         with pytest.raises(ValueError, match=rf"1\.\.3, got {num}"):
             rank_features(torch.zeros(3), num)
-    with pytest.raises(ValueError, match=r"5, 3.*\(5, 4\)"):
-        ClassMoments(3).update(torch.zeros(5, 4), torch.zeros(5))
+    for shape, of_labels in [((5, 4), (5,)), ((5, 3), (4,)), ((5, 3), (5, 1)), ((5, 3), ())]:
+        with pytest.raises(ValueError, match=rf"\[N, 3\] and .*\({shape[0]}, {shape[1]}\) and \("):
+            ClassMoments(3).update(torch.zeros(shape), torch.zeros(of_labels))
     with pytest.raises(ValueError, match="3 and 4 features"):
         ClassMoments(3).merge(ClassMoments(4))
     with pytest.raises(ValueError, match="no moments"):

@@ -121,10 +121,10 @@ class ClassMoments:
         return self._sums.totals()
 
     def _check(self, features: Tensor, labels: Tensor) -> None:
-        if features.shape != (len(labels), self.num_features):
+        if labels.ndim != 1 or features.shape != (len(labels), self.num_features):
             raise ValueError(
-                f"expected features [{len(labels)}, {self.num_features}], "
-                f"got {tuple(features.shape)}"
+                f"expected features [N, {self.num_features}] and labels [N], "
+                f"got {tuple(features.shape)} and {tuple(labels.shape)}"
             )
         if features.dtype != torch.float32:
             raise ValueError(
