@@ -39,11 +39,16 @@ def test_inside_there_is_one_thread_and_outside_as_many_as_before(number):
         for_each(lambda _: inside.append(torch.get_num_threads()), range(4))
         assert torch.get_num_threads() == number
     assert inside == [1] * 8
-    fresh = []
-    thread = threading.Thread(target=lambda: fresh.append(torch.get_num_threads()))
+
+
+def test_making_the_threads_leaves_the_number_for_others():
+    torch.set_num_threads(5)  # of no other test, so the pool is made here
+    for_each(lambda _: None, range(5))
+    numbers = [torch.get_num_threads()]
+    thread = threading.Thread(target=lambda: numbers.append(torch.get_num_threads()))
     thread.start()
     thread.join()
-    assert fresh == [number]  # a thread that has not computed yet takes the process's number
+    assert numbers == [5, 5]  # a thread that has not computed yet takes the process's number
 
 
 def test_a_product_inside_occupies_one_processor():
