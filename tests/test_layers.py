@@ -62,7 +62,15 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "model.fourth_moments",
         "model.cholesky",
     ),
+    "model.downdate": (
+        "model.kernels",
+        "model.quadratic",
+        "model.fourth_moments",
+        "model.cholesky",
+        "threads",
+    ),
     "model.held_out": (
+        "model.downdate",
         "model.fit",
         "model.kernels",
         "model.kernel_elm",
@@ -106,7 +114,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "pytorch_lightning": (),
     "ptwt": ("signals.wavelet",),
     "pywt": ("signals.wavelet",),
-    "matplotlib": ("report.figures",),
+    "matplotlib": ("report.figures", "report.crossval", "report.validation"),
 }
 
 # These need torch and the standard library alone.
@@ -127,6 +135,7 @@ TORCH_ALONE = (
     "model.fourth_moments",
     "model.sufficient",
     "model.fit",
+    "model.downdate",
     "model.held_out",
     "model.threshold",
 )
