@@ -123,11 +123,22 @@ def add_products_(
             f"expected float64 z [N, K] and weights [N], got {tuple(z.shape)} {z.dtype} "
             f"and {tuple(weights.shape)} {weights.dtype}"
         )
-    chunks = list(zip(z.split(_CHUNK_BINS), weights.split(_CHUNK_BINS), strict=True))
     if grid_bits is not None:
-        _check_room(chunks, 2.0 ** (_ROOM_BITS - grid_bits))
-    for some, their_weights in chunks:
-        _add_chunk_(total, some, their_weights, grid_bits, sign)
+        check_room(z, weights, grid_bits)
+    for chunk in zip(z.split(_CHUNK_BINS), weights.split(_CHUNK_BINS), strict=True):
+        _add_chunk_(total, *chunk, grid_bits, sign)
+
+
+def check_room(z: Tensor, weights: Tensor, grid_bits: int) -> None:
+    """Refuse what ``add_products_`` does, by the largest product that each bin may have."""
+    room = 2.0 ** (_ROOM_BITS - grid_bits)
+    most = weights.abs() * z.abs().amax(dim=1).clamp(min=1) ** 4
+    for number, some in enumerate(most.split(_CHUNK_BINS)):
+        if not some.sum() < room:
+            raise ValueError(
+                f"{len(some)} bins from {number * _CHUNK_BINS} on may sum to {some.sum():g}, and "
+                f"this grid holds sums below {room:g}; scale them down or take fewer grid_bits"
+            )
 
 
 def from_grid(total: Tensor, grid_bits: int) -> Tensor:
@@ -287,14 +298,3 @@ def _check_sums(total: Tensor, layout: ProductSums, dtype: torch.dtype) -> None:
             f"sums of {layout.num_features} features must be {layout.num_held} contiguous {dtype}, "
             f"got {tuple(total.shape)} {total.dtype}"
         )
-
-
-def _check_room(chunks: list[tuple[Tensor, Tensor]], room: float) -> None:
-    """Refuse bins whose sums the rounding cannot hold, by the largest product each may have."""
-    for number, (z, weights) in enumerate(chunks):
-        most = float((weights.abs() * z.abs().amax(dim=1).clamp(min=1) ** 4).sum())
-        if not most < room:
-            raise ValueError(
-                f"{len(z)} bins from {number * _CHUNK_BINS} on may sum to {most:g}, and this grid "
-                f"holds sums below {room:g}; scale them down or take fewer grid_bits"
-            )
