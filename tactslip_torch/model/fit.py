@@ -11,6 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from tactslip_torch.model.fourth_moments import ProductSums, add_products_, normal_matrix
 from tactslip_torch.model.kernel_elm import (
     solve_kernel_elm,
     solve_kernel_elm_,
@@ -23,7 +24,7 @@ from tactslip_torch.model.quadratic import (
     collapse,
     from_primal,
     num_quadratic_features,
-    quadratic_features,
+    sum_of_quadratic_features,
 )
 
 log = logging.getLogger(__name__)
@@ -34,7 +35,6 @@ Progress = Callable[[Iterable[int], str], Iterable[int]]
 """Wraps a range so that its progress shows; gets the range and what is being done."""
 
 CHUNK_BINS = 2048
-BLOCK_FEATURES = 1024
 
 
 @dataclass(frozen=True)
@@ -208,20 +208,15 @@ def _solve_linear_primal(
 def _solve_quadratic_primal(
     bins: TrainingBins, penalty: float, offset: float, progress: Progress | None
 ) -> QuadraticForm:
-    """Degree 2, never holding the monomials of all bins; lower triangle only."""
+    """Degree 2: one unknown per monomial, from sums of fixed size."""
     num_features = bins.features.shape[1]
-    size = num_quadratic_features(num_features)
-    normal = bins.features.new_zeros(size, size)
-    moment = bins.features.new_zeros(size)
+    total = bins.features.new_zeros(ProductSums(num_features).num_held)
+    pull = bins.targets if bins.weights is None else bins.targets * bins.weights
     for chunk in _chunks(bins, progress):
-        monomials = quadratic_features(bins.features[chunk], offset)
-        weighted = monomials
-        if bins.weights is not None:
-            weighted = monomials * bins.weights[chunk, None]
-        moment += weighted.mT @ bins.targets[chunk]
-        for top in range(0, size, BLOCK_FEATURES):
-            end = min(top + BLOCK_FEATURES, size)
-            normal[top:end, :end].addmm_(weighted[:, top:end].mT, monomials[:, :end])
+        weights = None if bins.weights is None else bins.weights[chunk]
+        add_products_(total, bins.features[chunk], weights)
+    normal = normal_matrix(total, num_features, offset)
+    moment = sum_of_quadratic_features(bins.features, pull, offset)
     return from_primal(solve_normal_equations_(normal, moment, penalty), num_features, offset)
 
 
