@@ -258,9 +258,10 @@ def test_what_is_saved_comes_back_bit_by_bit(variant, tmp_path):
         assert loaded.state_dict()[name].dtype == torch.float64
 
 
-def test_saving_twice_gives_the_same_tensors(detector, tmp_path):
+def test_saving_twice_gives_the_same_file(detector, tmp_path):
     detector.save(tmp_path / "a.pt")
     SlipDetector.load(tmp_path / "a.pt").save(tmp_path / "b.pt")
+    assert (tmp_path / "b.pt").read_bytes() == (tmp_path / "a.pt").read_bytes()
     loaded = SlipDetector.load(str(tmp_path / "b.pt"))
     assert torch.equal(loaded.score_raw(noise(4)), detector.score_raw(noise(4)))
 
@@ -303,8 +304,8 @@ def test_the_file_is_a_plain_table(detector, saved):
 def test_a_failed_save_leaves_the_old_file(detector, saved, monkeypatch):
     before = saved.read_bytes()
 
-    def full(content, path):
-        path.write_bytes(b"half")
+    def full(content, file):
+        file.write(b"half")
         raise OSError("no space left on device")
 
     monkeypatch.setattr(torch, "save", full)

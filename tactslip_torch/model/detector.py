@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from tactslip_torch.features.pool import FeatureName, FeaturePool
-from tactslip_torch.files import load_table, save_table
+from tactslip_torch.files import load_table, save_table, table_form
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import kernel_from_dict
@@ -177,16 +177,14 @@ class SlipDetector(nn.Module):
         """
         name = os.fspath(path)
         try:
-            facts, state = load_table(path, FORMAT)
-        except FileNotFoundError:
-            raise FileNotFoundError(f"no detector at {name}") from None
-        except ValueError as error:
-            if str(error).endswith(f"got {EARLIER_FORMAT!r}"):
+            if table_form(path) == EARLIER_FORMAT:
                 raise ValueError(
                     f"{name} was made by an earlier version; train again, or evaluate it with "
                     "that version"
-                ) from None
-            raise
+                )
+            facts, state = load_table(path, FORMAT)
+        except FileNotFoundError:
+            raise FileNotFoundError(f"no detector at {name}") from None
         try:
             return cls._from_facts(facts, state)
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
