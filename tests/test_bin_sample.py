@@ -1,0 +1,240 @@
+import hashlib
+import json
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactslip_torch.features.bin_sample import BinSample, bin_keys
+
+NUM = 3
+
+
+def key_of(recording, index):
+    text = f"{recording}:{index}".encode()
+    return int(hashlib.blake2b(text, digest_size=8).hexdigest(), 16)
+
+
+def make_recordings(sizes, seed=0):
+    """(name, group, features, is_slip) of each; a feature tells recording and bin apart."""
+    rng = np.random.default_rng(seed)
+    recordings = []
+    for number, size in enumerate(sizes):
+        features = rng.standard_normal((size, NUM)).astype(np.float32)
+        is_slip = rng.uniform(size=size) < 0.6
+        group = "abc"[int(rng.integers(3))]
+        # of several lengths, and in another order as text than as numbers
+        name = f"{group}/{number}"
+        recordings.append((name, group, torch.from_numpy(features), torch.from_numpy(is_slip)))
+    return recordings
+
+
+def sample_of(recordings, most):
+    sample = BinSample(most)
+    for recording in recordings:
+        sample.update(*recording)
+    return sample
+
+
+def sorted_at_once(recordings, most):
+    """All bins of each stratum by (key, recording, bin), the first of them."""
+    strata = {}
+    for name, group, features, is_slip in recordings:
+        for index in range(len(is_slip)):
+            bins = strata.setdefault((group, bool(is_slip[index])), [])
+            bins.append((key_of(name, index), name, index, features[index].tolist()))
+    chosen = []
+    for (group, label), bins in strata.items():
+        kept = sorted(bins)[:most]
+        chosen += [(*bin[1:], group, label, len(bins) / len(kept)) for bin in kept]
+    seen = {name: len(bins) for name, bins in strata.items()}
+    return sorted(chosen), seen
+
+
+def rows_of(bins):
+    return [
+        (
+            bins.recording_names[bins.recording[i]],
+            int(bins.bin_index[i]),
+            bins.features[i].tolist(),
+            bins.group_names[bins.group[i]],
+            bool(bins.is_slip[i]),
+            float(bins.represents[i]),
+        )
+        for i in range(len(bins.features))
+    ]
+
+
+def assert_same(a, b):
+    a, b = a.state_dict(), b.state_dict()
+    assert a["facts"] == b["facts"]
+    assert a["tensors"].keys() == b["tensors"].keys()
+    for name, tensor in a["tensors"].items():
+        assert tensor.dtype == b["tensors"][name].dtype
+        assert torch.equal(tensor, b["tensors"][name])
+
+
+recordings_of_any_sizes = st.builds(
+    make_recordings, st.lists(st.integers(0, 9), max_size=14), st.integers(0, 99)
+)
+
+
+@given(recordings=recordings_of_any_sizes, most=st.integers(1, 12))
+def test_a_sample_equals_sorting_all_keys_at_once(recordings, most):
+    sample = sample_of(recordings, most)
+    chosen, seen = sorted_at_once(recordings, most)
+    bins = sample.bins()
+    assert rows_of(bins) == chosen
+    assert sample.num_seen == seen
+    assert list(sample.num_seen) == sorted(seen)
+    assert bins.group_names == tuple(sorted({group for group, _ in seen}))
+    assert bins.recording_names == tuple(sorted({row[0] for row in chosen}))
+    assert bins.features.dtype == torch.float32
+    assert bins.is_slip.dtype == torch.bool
+    assert bins.group.dtype == bins.recording.dtype == bins.bin_index.dtype == torch.int64
+    assert bins.represents.dtype == torch.float64
+
+
+@given(
+    recordings=recordings_of_any_sizes,
+    most=st.integers(0, 12),
+    order=st.randoms(use_true_random=False),
+    num_shards=st.integers(1, 4),
+)
+def test_any_order_and_sharding_gives_the_same_sample(recordings, most, order, num_shards):
+    whole = sample_of(recordings, most)
+    order.shuffle(recordings)
+    shards = [sample_of(recordings[i::num_shards], most) for i in range(num_shards)]
+    order.shuffle(shards)
+    merged = BinSample(most)
+    for shard in shards:
+        merged.merge(shard)
+    assert_same(merged, whole)
+    assert_same(sample_of(recordings, most), whole)
+
+
+@given(recordings=recordings_of_any_sizes, most=st.integers(1, 5), cut=st.integers(0, 14))
+def test_a_sample_goes_on_from_its_state(recordings, most, cut):
+    before = sample_of(recordings[:cut], most)
+    state = before.state_dict()
+    facts = json.loads(json.dumps(state["facts"]))
+    restored = BinSample.from_state_dict({"facts": facts, "tensors": state["tensors"]})
+    assert_same(restored, before)
+    for recording in recordings[cut:]:
+        restored.update(*recording)
+    assert_same(restored, sample_of(recordings, most))
+    assert_same(BinSample.from_state_dict(state), before)  # the state was left alone
+
+
+def test_merge_leaves_the_other_sample_alone():
+    recordings = make_recordings([9] * 8)
+    other = sample_of(recordings[:4], 5)
+    merged = BinSample(5)
+    merged.merge(other)
+    for recording in recordings[4:]:
+        merged.update(*recording)
+    assert_same(other, sample_of(recordings[:4], 5))
+    for recording in recordings[4:]:
+        other.update(*recording)
+    assert_same(other, merged)
+
+
+def test_the_input_may_change_afterwards():
+    name, group, features, is_slip = make_recordings([9])[0]
+    sample = sample_of([(name, group, features, is_slip)], 9)
+    before = sample.bins().features
+    features.zero_()
+    assert torch.equal(sample.bins().features, before)
+    assert (before != 0).all()
+
+
+def test_represents_adds_up_to_all_bins():
+    recordings = make_recordings([40] * 9)
+    sample = sample_of(recordings, 7)
+    bins = sample.bins()
+    totals = Counter()
+    for _, _, _, group, label, represents in rows_of(bins):
+        totals[group, label] += represents
+    assert totals == pytest.approx(sample.num_seen)
+    assert sum(sample.num_seen.values()) == 360
+    assert all(kept <= 7 for kept in Counter((r[3], r[4]) for r in rows_of(bins)).values())
+
+
+def test_every_bin_is_as_likely_as_any_other():
+    """1000 of 20000 bins: a twentieth of each recording, quarter and value, within 5 sigma."""
+    sample = BinSample(1000)
+    values = torch.arange(20_000.0)[:, None]
+    for number in range(20):
+        rows = slice(1000 * number, 1000 * (number + 1))
+        sample.update(f"r{number}", "a", values[rows], torch.ones(1000))
+    bins = sample.bins()
+    quarters = torch.bincount(bins.bin_index // 250)
+    assert ((quarters - 250).abs() < 5 * (1000 * 0.25 * 0.75) ** 0.5).all()
+    by_recording = torch.bincount(bins.recording, minlength=20)
+    assert ((by_recording - 50).abs() < 5 * 50**0.5).all()
+    assert abs(float(bins.features.mean()) - 10_000) < 5 * 20_000 / 12**0.5 / 1000**0.5
+
+
+def test_memory_is_that_of_the_sample():
+    sample = BinSample(10)
+    for number in range(50):
+        sample.update(f"r{number}", "a", torch.zeros(100, 4), torch.zeros(100))
+    assert sum(part.rows.numel() for part in sample._strata.values()) == 40
+
+
+def test_a_sample_of_none_counts():
+    sample = sample_of(make_recordings([9, 9]), 0)
+    assert sum(sample.num_seen.values()) == 18
+    bins = sample.bins()
+    assert bins.features.shape == (0, NUM)
+    assert len(bins.represents) == 0
+    assert BinSample(3).bins().features.shape == (0, 0)
+    assert BinSample(3).bins().group_names == ()
+    assert_same(BinSample.from_state_dict(BinSample(3).state_dict()), BinSample(3))
+
+
+def test_labels_of_any_type_and_strided_features_with_gradients():
+    name, group, features, is_slip = make_recordings([9])[0]
+    strided = torch.stack([features, features], dim=-1)[..., 0].requires_grad_()
+    sample = sample_of([(name, group, strided, is_slip.double())], 4)
+    assert_same(sample, sample_of([(name, group, features, is_slip)], 4))
+    assert not sample.bins().features.requires_grad
+
+
+def test_keys_are_the_hash_in_0_to_1():
+    keys = bin_keys("M1/3", 1000)
+    expected = [key_of("M1/3", index) / 2**64 for index in range(1000)]
+    np.testing.assert_allclose(keys, expected, rtol=0, atol=2.0**-53)
+    assert keys.dtype == torch.float64
+    assert ((keys >= 0) & (keys < 1)).all()
+    assert abs(float(keys.mean()) - 0.5) < 5 / (12 * 1000) ** 0.5
+    assert bin_keys("M1/3", 0).shape == (0,)
+    sample = BinSample(10)
+    sample.update("M1/3", "a", torch.zeros(1000, 1), torch.zeros(1000))
+    assert sample.bins().bin_index.tolist() == sorted(keys.argsort()[:10].tolist())
+
+
+def test_what_is_refused_changes_nothing():
+    recordings = make_recordings([9, 9])
+    sample = sample_of(recordings, 4)
+    features, labels = torch.zeros(5, NUM), torch.zeros(5)
+    for bins, match in [
+        ((features, torch.zeros(4)), r"got \(5, 3\) and \(4,\)"),
+        ((features[0], torch.zeros(3)), r"got \(3,\) and \(3,\)"),
+        ((features.double(), labels), r"float32 features, got torch\.float64"),
+        ((torch.zeros(5, 4), labels), r"bins of 3 features, got 4"),
+    ]:
+        with pytest.raises(ValueError, match=match):
+            sample.update("new", "a", *bins)
+    with pytest.raises(ValueError, match="samples of 4 and of 5 bins"):
+        sample.merge(BinSample(5))
+    wide = BinSample(4)
+    wide.update("new", "a", torch.zeros(5, 4), labels)
+    with pytest.raises(ValueError, match="bins of 3 features, got 4"):
+        sample.merge(wide)
+    assert_same(sample, sample_of(recordings, 4))
+    with pytest.raises(ValueError, match=r"0 bins or more .* got -1"):
+        BinSample(-1)
