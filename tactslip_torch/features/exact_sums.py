@@ -147,9 +147,8 @@ class ExactSums:
             raise ValueError(f"expected float32 values, got {values.dtype}; hand values.float()")
         if values.ndim != 2 or values.shape[1] != num_columns:
             raise ValueError(f"expected values [N, {num_columns}], got {tuple(values.shape)}")
-        finite = values.isfinite()
-        if not bool(finite.all()):
-            row, column = (~finite).nonzero()[0].tolist()
+        if values.numel() and not bool(torch.stack(values.aminmax()).isfinite().all()):
+            row, column = (~values.isfinite()).nonzero()[0].tolist()
             raise ValueError(
                 f"expected finite values, got {float(values[row, column])} in row {row}, "
                 f"column {column}"
