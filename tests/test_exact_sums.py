@@ -185,6 +185,7 @@ def test_nothing_is_an_empty_sum():
         (torch.zeros(3), None, r"\[N, 3\], got \(3,\)"),
         (torch.tensor([[0, 0, 0], [0, math.nan, 0]]), None, "got nan in row 1, column 1"),
         (torch.tensor([[0, 0, 0], [0, 0, -math.inf]]), None, "got -inf in row 1, column 2"),
+        (torch.tensor([[0, math.inf, 0], [0, 0, 0]]), None, "got inf in row 0, column 1"),
         (torch.zeros(2, 3), torch.zeros(3), r"classes of 2 rows, got \(3,\)"),
         (torch.zeros(2, 3), torch.tensor([0, 2]), r"0\.\.1, got 0\.\.2"),
         (torch.zeros(2, 3), torch.tensor([-1, 0]), r"0\.\.1, got -1\.\.0"),
