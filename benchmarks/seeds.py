@@ -26,10 +26,11 @@ from tactslip_torch.report.figures import pipeline_figure
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 EXPERIMENTS: dict[str, tuple[str, ...]] = {
-    "unseen4": ("+exp=unseen4",),
-    "random_bins": ("+exp=random_bins",),
-    "half_second": ("+exp=unseen4", "labels=half_second"),
-    "shuffled": ("+exp=seen6", "labels.shuffle_seed=1"),
+    "unseen4": ("+exp=unseen4", "recipe=paper"),
+    "unseen4 robust": ("+exp=unseen4", "recipe=robust"),
+    "random_bins": ("+exp=random_bins", "recipe=paper"),
+    "half_second": ("+exp=unseen4", "recipe=paper", "labels=half_second"),
+    "shuffled": ("+exp=seen6", "recipe=paper", "labels.shuffle_seed=1"),
 }
 SCORES = ("accuracy", "balanced_accuracy", "non_slip_recall", "slip_recall")
 COMMAND = "python -m benchmarks.seeds"
@@ -41,7 +42,7 @@ def run(experiment: str, seed: int, folder: Path) -> dict[str, Any]:
     Raises:
         RuntimeError: if the training fails.
     """
-    place = folder / f"{experiment}-{seed}"
+    place = folder / f"{experiment.replace(' ', '-')}-{seed}"
     if not _is_finished(place):
         command = [sys.executable, "-m", "tactslip_torch.train", *EXPERIMENTS[experiment]]
         command += [f"seed={seed}", "export=false", f"hydra.run.dir={place}"]

@@ -4,6 +4,7 @@ from tactslip_torch.data.recording import Recording
 from tactslip_torch.features.pool import FeatureName, FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.sufficient import SufficientStats
 from tactslip_torch.simulation import Scene, simulate
 
 __version__ = "0.1.0"
@@ -16,5 +17,6 @@ __all__ = [
     "Recording",
     "Scene",
     "SlipDetector",
+    "SufficientStats",
     "simulate",
 ]

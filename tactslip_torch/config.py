@@ -63,11 +63,21 @@ def unknown_choice(arguments: Sequence[str]) -> str | None:
 
 
 def run_entry_point(main: Callable[[], Any]) -> None:
-    """Run a Hydra entry point; a choice that does not exist is one line and exit status 2."""
+    """Run a Hydra entry point; a choice that does not exist is one line and exit status 2.
+
+    Of the processes that torchrun starts, the first alone gets a folder for its results.
+    """
     problem = unknown_choice(sys.argv[1:])
     if problem:
         fail(problem)
+    if "TORCHELASTIC_RUN_ID" in os.environ and not is_first_process():
+        sys.argv += ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
     main()
+
+
+def is_first_process() -> bool:
+    """Whether this is the only process of a run, or the one that writes and speaks for all."""
+    return os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0")) == "0"
 
 
 @contextmanager
@@ -86,12 +96,13 @@ def errors_in_one_line() -> Iterator[None]:
 
 
 def fail(message: str) -> None:
-    """Print one line and exit with status 2.
+    """Print one line, if this process is the first, and exit with status 2.
 
     Raises:
         SystemExit: always.
     """
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    if is_first_process():
+        print(f"error: {' '.join(message.split())}", file=sys.stderr)
     raise SystemExit(EXIT_BAD_INPUT)
 
 

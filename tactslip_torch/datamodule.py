@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -199,13 +200,14 @@ class SlipDataModule(L.LightningDataModule):
     """Recordings of a split as batches of one recording each, made by workers.
 
     The training loader holds the recordings with training bins, always in one order; the test
-    loader all that have a role.
+    loader all that have a role. Of several processes each gets every so-many-th recording: none
+    is padded with recordings of another, as Lightning's own sampler would.
 
     Args:
         maker: makes features of a recording.
         split: who has which role.
         num_workers: processes that make features; 0 makes them in this one, ``None`` takes as
-            many as there are processors, at most 8.
+            many as there are processors, at most 8, shared by the processes of a machine.
     """
 
     def __init__(self, maker: FeatureMaker, split: Split, num_workers: int | None = None) -> None:
@@ -214,14 +216,27 @@ class SlipDataModule(L.LightningDataModule):
         self.split = split
         processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
         self.num_workers = min(processors, 8) if num_workers is None else num_workers
+        self._shares_processors = num_workers is None
+
+    def about(self) -> dict[str, Any]:
+        """What bins and features are, as JSON-able facts: statistics of others do not mix."""
+        pool = self.maker.pool
+        return {
+            "channels": pool.hand.to_rows(),
+            "pool": pool.facts(),
+            "window_lengths": list(self.maker.channel_filter.window_lengths),
+            "polyorder": self.maker.channel_filter.polyorder,
+            "features_dtype": str(self.maker.dtype).removeprefix("torch."),
+            "training_bins": self.fingerprint(),
+        }
 
     def train_dataloader(self) -> DataLoader[RecordingFeatures]:
-        """Recordings with training bins."""
-        return self._loader(["train"])
+        """This process's share of the recordings with training bins."""
+        return self.loader(["train"], *self._share())
 
     def test_dataloader(self) -> DataLoader[RecordingFeatures]:
-        """Every recording with a role."""
-        return self._loader(list(ROLES))
+        """This process's share of the recordings with a role."""
+        return self.loader(list(ROLES), *self._share())
 
     def fingerprint(self) -> str:
         """A digest of everything that determines the training bins; for resuming."""
@@ -236,13 +251,33 @@ class SlipDataModule(L.LightningDataModule):
         """Features stay where they are: moments and solve run in float64 on the processor."""
         return batch
 
-    def _loader(self, roles: list[str]) -> DataLoader[RecordingFeatures]:
+    def loader(
+        self, roles: Sequence[str], part: int = 0, parts: int = 1
+    ) -> DataLoader[RecordingFeatures]:
+        """Recordings with any of the roles, every ``parts``-th of them from ``part`` on.
+
+        Raises:
+            ValueError: if there are more parts than recordings.
+        """
+        recordings = self.split.having(*roles)
+        if parts > len(recordings):
+            raise ValueError(
+                f"{parts} workers for {len(recordings)} recordings; use fewer processes or shards"
+            )
+        workers = self.num_workers
+        if self._shares_processors and self.trainer is not None:
+            workers = max(1, workers // self.trainer.num_devices)
         return DataLoader(
-            _SplitRecordings(self.maker, self.split, self.split.having(*roles)),
+            _SplitRecordings(self.maker, self.split, recordings[part::parts]),
             batch_size=None,
-            num_workers=self.num_workers,
-            persistent_workers=self.num_workers > 0,
+            num_workers=workers,
+            persistent_workers=workers > 0,
         )
+
+    def _share(self) -> tuple[int, int]:
+        if self.trainer is None:
+            return 0, 1
+        return self.trainer.global_rank, self.trainer.world_size
 
 
 class _SplitRecordings(Dataset[RecordingFeatures]):

@@ -1,29 +1,33 @@
 """What is learned from bins: two passes over the training recordings, then judgement.
 
-The first pass gathers class moments of every feature, one set per validation group. The second
-collects the selected features, and ``recipe`` makes a detector of them. Held-out recordings enter
-neither.
+The first pass surveys all features of the training bins; its end plans the detector. The second
+gathers what the plan needs, and ``fitting`` solves. Held-out recordings enter neither. Of several
+processes each sees its share of the recordings; what they learned is put together once a pass.
 """
 
 from __future__ import annotations
 
+import json
 import time
 from collections import Counter
 from typing import Any, NamedTuple
 
 import lightning as L
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.datamodule import RecordingFeatures, SlipDataModule
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.selection import ClassMoments
+from tactslip_torch.features.survey import Survey
+from tactslip_torch.fitting import Plan, TrainingPass, plan_detector
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import FeatureThreshold
 from tactslip_torch.progress import bar
-from tactslip_torch.recipe import CollectedBins, GroupedMoments, Recipe, fit_detector
+from tactslip_torch.ranks import from_first_rank, of_all_ranks, sum_over_ranks
+from tactslip_torch.recipe import Recipe
 from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -31,7 +35,7 @@ from tactslip_torch.signals.filtering import ChannelFilter
 class _Judged(NamedTuple):
     """Decisions on bins of one recording, ``[N]`` each."""
 
-    material: str
+    recording: RecordingId
     truth: Tensor
     says_slip: Tensor
     rival_says_slip: Tensor
@@ -78,10 +82,12 @@ class SlipLearner(L.LightningModule):
         self._worked: dict[str, Counter[str]] = {}
         self._pass_started = 0.0
         self._num_threads = torch.get_num_threads()
-        self._moments = GroupedMoments(self.recipe, len(pool.names))
-        self._columns: list[int] = []
-        self._collected: list[tuple[RecordingId, Tensor, Tensor]] = []
+        self._survey = Survey(len(pool.names), self.recipe.sample_bins)
+        self._plan: Plan | None = None
+        self._second: TrainingPass | None = None
         self._judged: dict[str, list[_Judged]] = {}
+        # nothing is trained by it: torch's DistributedDataParallel refuses a module without one
+        self._anchor = nn.Parameter(torch.zeros(()))
 
     def configure_optimizers(self) -> list[Any]:
         """No optimiser: the fit is a solve."""
@@ -90,37 +96,49 @@ class SlipLearner(L.LightningModule):
     def on_train_epoch_start(self) -> None:
         """Start the clock of a pass; the processors belong to those who make features."""
         self._pass_started = time.perf_counter()
+        if self._plan is not None:
+            self._second = TrainingPass(self._plan)
         self._num_threads = torch.get_num_threads()
         torch.set_num_threads(1)
 
     def training_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
-        """Gather moments in the first epoch, selected features in the second."""
+        """Survey in the first epoch, gather what the plan needs in the second."""
         self._count_seconds(batch)
         mask = batch.roles["train"]
         features, is_slip = batch.features[mask], batch.is_slip[mask]
-        if self.current_epoch == 0:
-            self._moments.update(batch.recording, features, is_slip)
-        if self._is_single_pass:
-            self._columns = list(range(len(self.pool.names)))
-        if self._columns:
-            self._collected.append((batch.recording, features[:, self._columns], is_slip))
+        if self._second is None:
+            group = self.recipe.group(batch.recording)
+            self._survey.update(str(batch.recording), group, features, is_slip)
+        else:
+            self._second.update(str(batch.recording), features, is_slip)
 
     def on_train_epoch_end(self) -> None:
-        """Rank after the first epoch, solve after the second."""
+        """Plan after the first epoch, solve after the second."""
         torch.set_num_threads(self._num_threads)
-        name = "moments_pass" if self.current_epoch == 0 else "selection_pass"
-        self.seconds[name] = time.perf_counter() - self._pass_started
-        if self._collected:
-            self._solve()
-        else:
-            self._columns = self._moments.columns()
+        passed = time.perf_counter()
+        name = "survey_pass" if self._second is None else "training_pass"
+        self.seconds[name] = passed - self._pass_started
+        if self._second is not None:
+            sum_over_ranks(self._second)
+            self._solve(self._second)
+            return
+        parts = of_all_ranks(self._survey)
+        self._survey = parts[0]
+        for part in parts[1:]:
+            self._survey.merge(part)
+        self._plan = from_first_rank(lambda: plan_detector(self.recipe, self._survey, bar))
+        self.seconds["validation"] = time.perf_counter() - passed
+        if self._is_single_pass:
+            self._second = self._sampled()
+            self._solve(self._second)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep what the first pass gathered, and of which bins."""
+        """Keep what the first pass planned, and of which bins."""
+        if self._plan is None:
+            return
         checkpoint["fingerprint"] = self._fingerprint()
-        checkpoint["moments"] = {
-            group: moments.state_dict() for group, moments in self._moments.groups.items()
-        }
+        checkpoint["plan"] = json.dumps(self._plan.facts())
+        checkpoint["scaler"] = dict(self._plan.frame.scaler.state_dict())
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take up what ``on_save_checkpoint`` kept.
@@ -131,11 +149,10 @@ class SlipLearner(L.LightningModule):
         if checkpoint.get("fingerprint") != self._fingerprint():
             raise ValueError(
                 "the checkpoint was gathered from other training bins; resume with the code, "
-                "data, labels, split, validation groups and seed it was made with"
+                "data, labels, split, recipe and seed it was made with"
             )
-        for group, state in checkpoint["moments"].items():
-            self._moments.groups[group] = ClassMoments.from_state_dict(state)
-        self._columns = self._moments.columns()
+        scaler = FeatureScaler(**checkpoint["scaler"])
+        self._plan = Plan.of(json.loads(checkpoint["plan"]), scaler)
 
     def on_test_start(self) -> None:
         """Forget what an earlier test judged.
@@ -154,7 +171,7 @@ class SlipLearner(L.LightningModule):
         assert self.detector is not None  # on_test_start
         self._count_seconds(batch)
         chosen = batch.features[:, list(self.detector.selected)].double()
-        device = self.detector.head.linear.device  # Lightning may have moved it
+        device = next(self.detector.buffers()).device  # Lightning may have moved it
         says_slip = self.detector.score_features(chosen.to(device)).cpu() >= 0
         rival = self.threshold(chosen) if self.threshold else torch.zeros_like(says_slip)
         for role, mask in batch.roles.items():
@@ -162,17 +179,20 @@ class SlipLearner(L.LightningModule):
                 decisions = (
                     part[mask] for part in (batch.is_slip, says_slip, rival, batch.speed_mm_s)
                 )
-                self._judged[role].append(_Judged(batch.recording.material, *decisions))
+                self._judged[role].append(_Judged(batch.recording, *decisions))
 
     def on_test_epoch_end(self) -> None:
         """Turn decisions into metrics."""
         torch.set_num_threads(self._num_threads)
         self.metrics = {"splits": {}, "baselines": {}}
         rivals: dict[str, Any] = {}
-        for role, parts in self._judged.items():
+        shares = of_all_ranks(self._judged)
+        for role in ROLES:
+            parts = [part for share in shares for part in share[role]]
+            parts.sort(key=lambda part: part.recording)
             if not parts:
                 continue
-            materials = [part.material for part in parts for _ in part.truth]
+            materials = [part.recording.material for part in parts for _ in part.truth]
             truth = torch.cat([part.truth for part in parts])
             says_slip = torch.cat([part.says_slip for part in parts])
             rival = torch.cat([part.rival_says_slip for part in parts])
@@ -196,19 +216,35 @@ class SlipLearner(L.LightningModule):
 
     def _fingerprint(self) -> str:
         data: SlipDataModule = self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning's
-        return f"{data.fingerprint()} by {self.recipe.group_by}"
+        return f"{data.fingerprint()} by {self.recipe}"
 
-    def _solve(self) -> None:
-        bins = CollectedBins.of(self.recipe, self._columns, self._collected)
-        self._collected = []
-        fitted = fit_detector(self.recipe, self._moments, bins, bar)
-        self.log("penalty", float(fitted.facts["penalty"]), batch_size=1)
-        self.seconds |= fitted.seconds
-        self.facts = fitted.facts
-        self.threshold = fitted.threshold
-        info = self.facts | {"rival": fitted.threshold.to_dict()}
+    def _sampled(self) -> TrainingPass:
+        """What a second pass would gather, of the bins the first one sampled."""
+        assert self._plan is not None  # on_train_epoch_end
+        sample = self._survey.sample.bins()
+        gathered = TrainingPass(self._plan)
+        gathered.update("sample", sample.features, sample.is_slip)
+        return gathered
+
+    def _solve(self, gathered: TrainingPass) -> None:
+        started = time.perf_counter()
+        plan = gathered.plan
+        head = from_first_rank(lambda: gathered.solve(bar))
+        self.log("penalty", plan.penalty, batch_size=1)
+        self.threshold = plan.threshold
+        facts = plan.facts()
+        self.facts = {"recipe": self.recipe.name} | {
+            name: facts[name] for name in ("kernel", "penalty", "balance", "num_bins", "validation")
+        }
+        self.facts["head"] = head.cost._asdict()
+        self.seconds["solve"] = time.perf_counter() - started
         self.detector = SlipDetector(
-            self.pool, self.channel_filter, fitted.selected, fitted.scaler, fitted.head, info
+            self.pool,
+            self.channel_filter,
+            plan.frame.selected,
+            plan.frame.scaler,
+            head,
+            self.facts | {"rival": plan.threshold.to_dict()},
         )
 
     def rates(self) -> dict[str, str]:

@@ -12,9 +12,12 @@ from tqdm.auto import tqdm
 LEAD = 31
 
 
-def bar(items: Iterable[Any], what: str, unit: str = "step") -> Iterable[Any]:
+def bar(
+    items: Iterable[Any], what: str, unit: str = "step", total: int | None = None
+) -> Iterable[Any]:
     """``items`` with a progress bar on standard error that shows rate and time left."""
-    total = len(items) if isinstance(items, Sized) else None
+    if total is None and isinstance(items, Sized):
+        total = len(items)
     shown: Iterable[Any] = tqdm(
         items, desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", dynamic_ncols=True
     )

@@ -16,9 +16,16 @@ import hydra
 import lightning as L
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
+from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig
 
-from tactslip_torch.config import conf_dir, errors_in_one_line, one_line, run_entry_point
+from tactslip_torch.config import (
+    conf_dir,
+    errors_in_one_line,
+    is_first_process,
+    one_line,
+    run_entry_point,
+)
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
@@ -43,10 +50,11 @@ from tactslip_torch.report.scores import merged_metrics, summed_metrics
 log = logging.getLogger(__name__)
 
 
-class SaveAfterFirstPass(L.Callback):
+class SaveAfterFirstPass(Checkpoint):
     """Writes ``last.ckpt`` behind the first pass, whole or not at all, for ``ckpt_path=``.
 
-    Not behind the second: resuming repeats that and the solve, which read features from the cache.
+    Not behind the second: resuming repeats that and the solve, which read features from the
+    cache. A ``Checkpoint`` is called behind the learner's own end of an epoch, with its plan.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -55,8 +63,11 @@ class SaveAfterFirstPass(L.Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Save."""
         if trainer.current_epoch == 0 and not getattr(trainer, "fast_dev_run", False):
-            with whole_file(self._folder / "last.ckpt") as temporary:
-                trainer.save_checkpoint(temporary)
+            if trainer.is_global_zero:
+                with whole_file(self._folder / "last.ckpt") as temporary:
+                    trainer.save_checkpoint(temporary)
+            else:  # saving is done in step; only the first process writes
+                trainer.save_checkpoint(self._folder / "last.ckpt")
 
 
 def train(config: DictConfig, folder: Path) -> dict[str, float]:
@@ -78,14 +89,16 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     L.seed_everything(config.seed, verbose=False)
     source: RecordingSource = instantiate(config.data, _convert_="all")
     rule: LabelRule = instantiate(config.labels)
-    recipe: Recipe = instantiate(config.detector, _convert_="all")
+    recipe: Recipe = instantiate(config.recipe, _convert_="all")
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     pool, channel_filter, dtype = feature_parts(source, rule.bin_ms, **config.features)
-    if recipe.num_features > len(pool.names):
+    if recipe.sizes[-1] > len(pool.names):
         raise ValueError(
-            f"detector.num_features={recipe.num_features} exceeds the pool's {len(pool.names)}"
+            f"recipe.num_features={recipe.sizes[-1]} exceeds the pool's {len(pool.names)}"
         )
-    save_config(config, folder)
+    is_first = is_first_process()
+    if is_first:
+        save_config(config, folder)
     fold_metrics: dict[str, dict[str, Any]] = {}
     with feature_cache(config.cache) as cache:
         maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype)
@@ -98,9 +111,10 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     metrics["timing_s"]["total"] = time.perf_counter() - started
     by_name = {str(name): name for name in pool.names}
     rows = feature_rows([by_name[name] for name in metrics["selected"]], source.hand)
-    write_results(folder, metrics, rows)
-    print_results(metrics, rows)
-    print(f"\nresults in {folder}")
+    if is_first:
+        write_results(folder, metrics, rows)
+        print_results(metrics, rows)
+        print(f"\nresults in {folder}")
     problems = [fold["onnx"] for fold in fold_metrics.values() if isinstance(fold["onnx"], str)]
     if problems:
         raise ValueError(f"all but model.onnx is written: {problems[0]}")
@@ -139,8 +153,10 @@ def _run_fold(
         "train_materials": sorted({recording.material for recording in trained}),
         "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
     }
-    detector.save(folder / "detector.pt")
-    onnx = _export(detector, folder / "model.onnx") if config.export else None
+    onnx: dict[str, float] | str | None = None
+    if trainer.is_global_zero:
+        detector.save(folder / "detector.pt")
+        onnx = _export(detector, folder / "model.onnx") if config.export else None
     seconds = dict(learner.seconds)
     seconds |= {"test_pass": tested - started, "save_export": time.perf_counter() - tested}
     return {

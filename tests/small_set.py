@@ -90,4 +90,4 @@ def small_maker(source: SmallSet, cache: FeatureCache | None = None, **rule: Any
 
 
 def small_recipe(**changes: Any) -> Recipe:
-    return Recipe(**({"num_features": 10, "penalties": (0.1, 1.0), "fold_bins": 100} | changes))
+    return Recipe(**({"num_features": 10, "penalties": (0.1, 1.0), "sample_bins": 50} | changes))

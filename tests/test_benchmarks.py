@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from benchmarks import train as bench
 from tactslip_torch.report.tables import SIMULATED_LINE
 
-TIMING_S = {"moments_pass": 4.0, "selection_pass": 1.0, "solve": 0.5, "test_pass": 3.0, "total": 9}
+TIMING_S = {"survey_pass": 4.0, "training_pass": 1.0, "solve": 0.5, "test_pass": 3.0, "total": 9}
 COLD_WORKER_S = {"simulate": 6.0, "features": 2.0, "read_cache": 0.5}
 MACHINE = {"processor": "abacus", "cores": "2 of 4 cores"}
 SECONDS = st.dictionaries(
@@ -259,6 +259,6 @@ def test_quick_benchmark_writes_its_numbers(
 def assert_complete(rows: Sequence[Mapping[str, Any]], kind: str, wall_s: float) -> None:
     """Every second of the process is some stage's, and none is counted twice."""
     seconds = {row["stage"]: row[kind]["median"] for row in rows}
-    assert {"start-up", "moments_pass", "solve", "test_pass", "other"} <= set(seconds)
+    assert {"start-up", "survey_pass", "solve", "test_pass", "other"} <= set(seconds)
     assert sum(seconds.values()) == pytest.approx(wall_s)
     assert min(seconds.values()) >= 0

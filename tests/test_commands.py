@@ -89,12 +89,12 @@ TINY = (
     "split.seen=[A,B]",
     "split.unseen=[C]",
     "split.train_share=0.5",
-    "detector.num_features=10",
-    "detector.penalties=[0.1,1.0]",
+    "recipe.num_features=10",
+    "recipe.penalties=[0.1,1.0]",
     "num_workers=0",
     "export=false",
 )
-TINY_EVALUATE = tuple(o for o in TINY if not o.startswith(("detector", "export")))
+TINY_EVALUATE = tuple(o for o in TINY if not o.startswith(("recipe", "export")))
 
 
 def composed(*overrides, name="train"):
@@ -280,7 +280,7 @@ def test_a_run_resumes_from_its_checkpoint(tiny, tmp_path):
         run_train(tmp_path / "first", *overrides, "trainer.max_epochs=1")
     checkpoint = tmp_path / "first" / "last.ckpt"
     _, metrics = run_train(tmp_path / "second", *overrides, f"ckpt_path={checkpoint}")
-    assert "moments_pass" not in metrics["timing_s"]
+    assert "survey_pass" not in metrics["timing_s"]
     assert timeless(metrics) == timeless(tiny.metrics)
     assert_same_detector(tmp_path / "second", tiny.folder)
 
@@ -445,10 +445,10 @@ def assert_one_line(error, expected):
         (["features.frames={SG: 51}", "~features.frames.PVDF"], "no frame for PVDF channels"),
         (["features.frames.SG=50"], "window_length must be odd"),
         (["+features.misspelt=1"], "misspelt"),
-        (["detector.num_features=3000"], "detector.num_features=3000 exceeds the pool's 2582"),
-        (["detector.num_features=0"], "detector.num_features must be at least 1"),
-        (["detector.penalties=[]"], "detector.penalties must be positive, got []"),
-        (["detector.balance=smote"], "detector.balance must be one of undersample, weights"),
+        (["recipe.num_features=3000"], "recipe.num_features=3000 exceeds the pool's 2582"),
+        (["recipe.num_features=0"], "recipe.num_features must be at least 1"),
+        (["recipe.penalties=[]"], "recipe.penalties must be positive, got []"),
+        (["recipe.balance=smote"], "recipe.balance must be one of undersample, weights"),
         (["+data.scene.misspelt=1"], "unknown override misspelt"),
         (["data.channels=[{name: film, kind: FSR, finger: index, segment: distal}]"], "FSR"),
     ],

@@ -57,7 +57,7 @@ def test_an_experiment_composes_and_everything_it_names_exists(name):
     rule = instantiate(config.labels)
     assert isinstance(source, SimulatedRecordings)
     assert isinstance(rule, LabelRule)
-    assert isinstance(instantiate(config.detector, _convert_="all"), Recipe)
+    assert isinstance(instantiate(config.recipe, _convert_="all"), Recipe)
     pool, channel_filter, _ = feature_parts(source, rule.bin_ms, **config.features)
     assert isinstance(pool, FeaturePool)
     assert len(channel_filter.window_lengths) == len(source.hand)
@@ -101,7 +101,7 @@ def test_a_misspelt_key_would_be_seen():
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_experiments_agree_on_the_seed(name):
     config = OmegaConf.to_container(composed(f"+exp={name}", "seed=7"), resolve=True)
-    assert config["data"]["seed"] == config["split"]["seed"] == config["detector"]["seed"] == 7
+    assert config["data"]["seed"] == config["split"]["seed"] == 7
 
 
 # What the published experiments are ------------------------------------------------------------
@@ -117,7 +117,8 @@ def test_unseen4_is_the_papers_split():
     expected = {(m, "train"): 22 for m in SEEN} | {(m, "test"): 6 for m in SEEN}
     assert counts == expected | {(m, "unseen"): 28 for m in UNSEEN}
     assert config.labels.layout == "whole_slide"
-    assert config.detector.num_features == 120
+    assert config.recipe.name == "paper"
+    assert config.recipe.num_features == 120
 
 
 def test_seen6_and_random_bins_have_the_seen_materials_alone():
@@ -154,12 +155,19 @@ def test_every_option_composes(group, option):
 def test_recipe_and_rule_defaults_are_those_of_their_files():
     """The file states what an experiment may change; the signature says the same."""
     config = composed()
-    detector = instantiate(config.detector, _convert_="all")
-    assert list(detector.penalties) == list(Recipe().penalties)
-    assert Recipe(**{**vars(detector), "penalties": Recipe().penalties}) == Recipe()
+    assert instantiate(config.recipe, _convert_="all") == Recipe()
     assert instantiate(config.labels) == LabelRule()
     half = instantiate(composed("labels=half_second").labels)
     assert half == LabelRule(layout="half_second")
+
+
+def test_the_robust_recipe_differs_from_the_papers():
+    robust = instantiate(composed("recipe=robust").recipe, _convert_="all")
+    assert robust.name == "robust"
+    assert (robust.compress, robust.balance) == (True, "weights")
+    assert robust.tail > 0
+    assert robust.most_correlation < 1
+    assert Recipe(**robust.facts()) == robust
 
 
 @pytest.mark.parametrize("name", ["evaluate", "export"])
@@ -175,7 +183,7 @@ def test_evaluate_judges_on_the_same_defaults_as_train():
         assert evaluate[section] == train[section]
 
 
-@pytest.mark.parametrize("section", ["data", "labels", "split", "detector"])
+@pytest.mark.parametrize("section", ["data", "labels", "split", "recipe"])
 def test_a_misspelt_key_is_refused_by_what_it_is_given_to(section):
     config = composed(f"+{section}.misspelt=1")
 

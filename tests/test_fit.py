@@ -6,9 +6,7 @@ from sklearn.kernel_ridge import KernelRidge
 from tactslip_torch.model import fit
 from tactslip_torch.model.fit import (
     TrainingBins,
-    balanced_choice,
     fit_machine,
-    validation_scores,
 )
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, RadialBasis
@@ -47,83 +45,6 @@ def ridge(bins, penalty, kernel=PAPER_KERNEL):
 
 
 # Balance -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("num_quiet", "num_slip"), [(60, 183), (183, 60), (7, 7)])
-def test_undersampling_keeps_the_smaller_class_whole(num_quiet, num_slip):
-    is_slip = labels(num_quiet, num_slip)
-    index, weights = balanced_choice(is_slip, "undersample", generator())
-    assert weights is None
-    smaller = min(num_quiet, num_slip)
-    assert int(is_slip[index].sum()) == smaller
-    assert len(index) == 2 * smaller
-    assert bool((index.diff() > 0).all())  # ascending, none twice
-    rare = num_slip <= num_quiet
-    assert set((is_slip == rare).nonzero().squeeze(-1).tolist()) <= set(index.tolist())
-
-
-def test_undersampling_draws_all_over_the_larger_class():
-    is_slip = torch.arange(1000) >= 100
-    index, _ = balanced_choice(is_slip, "undersample", generator())
-    drawn = index[is_slip[index]].double()
-    assert abs(float(drawn.mean()) - 550) < 5 * 900 / np.sqrt(12 * 100)
-
-
-def test_the_draw_follows_the_generator():
-    is_slip = labels(60, 183)
-    first, second, other = (
-        balanced_choice(is_slip, "undersample", generator(s))[0] for s in (1, 1, 2)
-    )
-    assert torch.equal(first, second)
-    assert not torch.equal(first, other)
-
-
-@pytest.mark.parametrize("most", [None, 50])
-def test_weights_give_each_class_one_total(most):
-    is_slip = labels(60, 183)
-    index, weights = balanced_choice(is_slip, "weights", generator(), most)
-    assert len(index) == len(weights) == (243 if most is None else 49)  # 12 and 37, rounded down
-    assert weights.dtype == torch.float64
-    slip = is_slip[index]
-    torch.testing.assert_close(weights[slip].sum(), weights[~slip].sum(), rtol=1e-12, atol=0)
-    assert float(weights.sum()) == pytest.approx(len(index))  # as much as without weights
-
-
-def test_balanced_classes_weigh_one():
-    _, weights = balanced_choice(labels(20, 20), "weights", generator())
-    torch.testing.assert_close(weights, torch.ones(40, dtype=torch.float64), rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("balance", ["undersample", "weights"])
-@pytest.mark.parametrize("most", [2, 3, 10, 99])
-def test_at_most_so_many_bins_of_both_classes(balance, most):
-    is_slip = labels(5, 500)
-    index, weights = balanced_choice(is_slip, balance, generator(), most)
-    assert 2 <= len(index) <= most
-    slip = is_slip[index]
-    assert bool(slip.any())
-    assert not bool(slip.all())
-    assert weights is None or len(weights) == len(index)
-    if balance == "undersample":
-        assert int(slip.sum()) == len(index) // 2
-
-
-def test_a_limit_above_the_number_of_bins_changes_nothing():
-    is_slip = labels(60, 183)
-    free = balanced_choice(is_slip, "undersample", generator())[0]
-    assert torch.equal(free, balanced_choice(is_slip, "undersample", generator(), 120)[0])
-
-
-@pytest.mark.parametrize(("value", "name"), [(True, "non-slip"), (False, "slip")])
-@pytest.mark.parametrize("balance", ["undersample", "weights"])
-def test_an_absent_class_is_named(value, name, balance):
-    with pytest.raises(ValueError, match=f"both classes, got no {name} bin"):
-        balanced_choice(torch.full((9,), value), balance, generator())
-
-
-def test_an_unknown_balance_is_refused():
-    with pytest.raises(ValueError, match="balance must be 'undersample' or 'weights', got 'smote'"):
-        balanced_choice(labels(3, 3), "smote", generator())
 
 
 def test_targets_are_plus_one_for_slip():
@@ -285,43 +206,3 @@ def test_a_penalty_that_is_not_positive_is_refused(num_bins, penalty, rng):
 
 
 # Validation ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("num_bins", [9, 60])
-def test_validation_equals_refitting_for_every_penalty(num_bins, weighted, rng):
-    train, held_out = draw(rng, num_bins, weighted=weighted), draw(rng, 200)
-    truth = held_out.is_slip.numpy()
-    penalties = [0.05, 0.3, 3.0, 50.0]
-    expected = []
-    for penalty in penalties:
-        says_slip = ridge(train, penalty).predict(held_out.features.numpy()) >= 0
-        expected.append((says_slip[truth].mean() + (~says_slip[~truth]).mean()) / 2)
-    assert validation_scores(train, held_out, penalties) == pytest.approx(expected, abs=1e-12)
-    assert len(set(expected)) > 1
-
-
-def test_validation_follows_the_offset(rng):
-    train, held_out = draw(rng, 30), draw(rng, 100)
-    machine = fit_machine(train, 0.3, Polynomial(2, 2.0))
-    says_slip, truth = machine(held_out.features) >= 0, held_out.is_slip
-    recalls = says_slip[truth].double().mean(), (~says_slip[~truth]).double().mean()
-    scores = validation_scores(train, held_out, [0.3], offset=2.0)
-    assert scores == pytest.approx([float(sum(recalls)) / 2])
-
-
-def test_held_out_bins_do_not_move_each_others_scores(rng):
-    """The score of two halves is the mean of theirs where both have the same classes."""
-    train, held_out = draw(rng, 30), draw(rng, 40)
-    twice = TrainingBins(held_out.features.repeat(2, 1), held_out.is_slip.repeat(2))
-    assert validation_scores(train, twice, [0.1, 3.0]) == pytest.approx(
-        validation_scores(train, held_out, [0.1, 3.0])
-    )
-
-
-@pytest.mark.parametrize("value", [True, False])
-def test_a_class_absent_from_the_held_out_bins_is_refused(value, rng):
-    held_out = draw(rng, 10)
-    one_class = TrainingBins(held_out.features, torch.full((10,), value))
-    with pytest.raises(ValueError, match="held-out bins of both classes"):
-        validation_scores(draw(rng, 12), one_class, [0.3])

@@ -85,7 +85,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "report.*": ("report.*", "files"),
     "datamodule": ("data.*", "simulation.*", "signals.*", "features.*", "hand"),
     "recipe": ("model.*", "features.*", "data.recording"),
-    "fitting": ("recipe", "model.*", "features.*"),
+    "fitting": ("recipe", "model.*", "features.*", "ledger"),
     "learning": (
         "datamodule",
         "data.*",
@@ -96,7 +96,9 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "fitting",
         "report.*",
         "progress",
+        "ranks",
     ),
+    "ranks": ("fitting", "ledger"),
     "experiment": ("*",),
     "train": ("*",),
     "evaluate": ("*",),

@@ -1,154 +1,163 @@
+"""The recipe's choices, on what a first pass learned of random bins."""
+
+import numpy as np
 import pytest
 import torch
 
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
-from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.features.survey import Survey
 from tactslip_torch.recipe import (
-    CollectedBins,
-    GroupedMoments,
     Recipe,
-    chosen_penalty,
-    fit_detector,
-    validate,
+    bin_weights,
+    choose_frame,
+    kept_shares,
+    recalls_mean,
+    stand_for,
 )
 
 NUM = 30
 
 
-def quiet(items, what):
-    return items
-
-
-def make_parts(rng, materials="abc", cycles=2, bins=40):
+def make_parts(rng, materials="abc", cycles=2, bins=40, share=0.5):
     """Recordings of random bins; features 0..4 tell the classes apart, more so for later ones."""
     parts = []
     for material in materials:
         for cycle in range(cycles):
-            is_slip = torch.from_numpy(rng.random(bins) < 0.5)
+            is_slip = torch.from_numpy(rng.random(bins) < share)
             features = torch.from_numpy(rng.standard_normal((bins, NUM)))
             features[:, :5] += torch.arange(1, 6) * 0.4 * is_slip[:, None]
-            parts.append((RecordingId(material, cycle), features, is_slip))
+            parts.append((RecordingId(material, cycle), features.float(), is_slip))
     return parts
 
 
-def gathered(recipe, parts):
-    moments = GroupedMoments(recipe, NUM)
-    for part in parts:
-        moments.update(*part)
-    columns = moments.columns()
-    picked = [(recording, features[:, columns], s) for recording, features, s in parts]
-    return moments, CollectedBins.of(recipe, columns, picked)
-
-
-def test_ranking_is_that_of_all_bins_together(rng):
-    parts = make_parts(rng)
-    recipe = Recipe(num_features=4)
-    whole = ClassMoments(NUM)
-    whole.update(torch.cat([p[1] for p in parts]), torch.cat([p[2] for p in parts]))
-    expected = rank_features(t_scores(whole), 4).tolist()
-    assert gathered(recipe, parts)[0].ranking() == expected
-    assert set(expected) <= {1, 2, 3, 4, 0}
-
-
-def test_a_fold_is_ranked_without_its_group(rng):
-    parts = make_parts(rng)
+def surveyed(recipe, parts):
+    survey = Survey(NUM, recipe.sample_bins)
     for recording, features, is_slip in parts:
-        if recording.material == "b":  # only material b knows feature 20
-            features[:, 20] += 4.0 * is_slip
-    moments, bins = gathered(Recipe(num_features=6), parts)
-    assert 20 in moments.ranking()
-    assert 20 not in moments.ranking(without="b")
-    assert set(moments.ranking(without="a")) <= set(bins.columns)
+        survey.update(str(recording), recipe.group(recording), features, is_slip)
+    return survey
 
 
-def test_the_order_of_recordings_does_not_matter(rng):
+def together(parts):
+    return torch.cat([p[1] for p in parts]).double(), torch.cat([p[2] for p in parts])
+
+
+def test_ranking_is_by_the_t_statistic_of_all_bins_together(rng):
+    from scipy.stats import ttest_ind
+
     parts = make_parts(rng)
-    recipe = Recipe(num_features=5, penalties=(0.1, 1.0))
-    forward = fit_detector(recipe, *gathered(recipe, parts), quiet)
-    backward = fit_detector(recipe, *gathered(recipe, parts[::-1]), quiet)
-    assert forward.selected == backward.selected
-    assert forward.facts == backward.facts
-    torch.testing.assert_close(forward.head.quadratic, backward.head.quadratic, rtol=0, atol=1e-12)
+    features, is_slip = together(parts)
+    scores = np.abs(ttest_ind(features[is_slip], features[~is_slip]).statistic)
+    frame = choose_frame(Recipe(num_features=4), surveyed(Recipe(), parts))
+    assert list(frame.selected) == np.argsort(-scores)[:4].tolist()
 
 
-def test_validation_equals_a_fold_done_by_hand(rng):
+def test_the_papers_scaler_has_the_exact_range_of_every_training_bin(rng):
     parts = make_parts(rng)
-    recipe = Recipe(num_features=3, penalties=(0.1, 3.0), balance="weights")
-    moments, bins = gathered(recipe, parts)
-    found = validate(recipe, moments, bins, quiet)
-    assert sorted(found) == ["a", "b", "c"]
-
-    train = [p for p in parts if p[0].material != "b"]
-    held = [p for p in parts if p[0].material == "b"]
-    x, s = torch.cat([p[1] for p in train]), torch.cat([p[2] for p in train])
-    own = ClassMoments(NUM)
-    own.update(x, s)
-    selected = rank_features(t_scores(own), 3)
-    low, high = x[:, selected].amin(0), x[:, selected].amax(0)
-
-    def scale(features):
-        return (2 * (features[:, selected] - low) / (high - low) - 1).clamp(-1, 1)
-
-    weights = torch.where(s, len(s) / (2 * s.sum()), len(s) / (2 * (~s).sum())).double()
-    y, t = torch.cat([p[1] for p in held]), torch.cat([p[2] for p in held])
-    for penalty, score in zip((0.1, 3.0), found["b"], strict=True):
-        head = fit_machine(TrainingBins(scale(x), s, weights), penalty)
-        says = head(scale(y)) >= 0
-        recalls = says[t].double().mean() + (~says[~t]).double().mean()
-        assert score == pytest.approx(float(recalls / 2))
+    recipe = Recipe(num_features=3, sample_bins=2)  # far fewer than there are
+    frame = choose_frame(recipe, surveyed(recipe, parts))
+    features = together(parts)[0][:, list(frame.selected)]
+    assert torch.equal(frame.scaler.maximum, features.amax(0))
+    assert torch.equal(frame.scaler.minimum, features.amin(0))
+    scaled = frame(together(parts)[0])
+    assert scaled.amax(0).tolist() == [1, 1, 1]
+    assert scaled.amin(0).tolist() == [-1, -1, -1]
 
 
-def test_the_best_mean_wins_and_the_smaller_of_equals():
-    recipe = Recipe(penalties=(1.0, 0.1, 0.5))
-    assert chosen_penalty(recipe, {"a": [0.9, 0.8, 0.9], "b": [0.7, 0.9, 0.7]}) == 0.1
-    assert chosen_penalty(recipe, {"a": [0.9, 0.8, 0.9]}) == 0.5
-
-
-def test_one_group_leaves_nothing_to_validate(rng, caplog):
-    recipe = Recipe(num_features=3, penalties=(0.1, 0.2, 3.0))
-    fitted = fit_detector(recipe, *gathered(recipe, make_parts(rng, "a")), quiet)
-    assert fitted.facts["penalty"] == 0.2
-    assert "unvalidated" in caplog.text
-
-
-def test_cycles_can_be_the_groups(rng):
-    recipe = Recipe(num_features=3, group_by="cycle")
-    moments, _ = gathered(recipe, make_parts(rng, "a", cycles=7))
-    assert moments.folds() == ["0", "1", "2", "3", "4"]
-
-
-def test_the_scaler_sees_all_training_bins_and_the_machine_a_balanced_draw(rng):
+def test_tails_are_compressed_and_clipped_on_request(rng):
     parts = make_parts(rng)
-    recipe = Recipe(num_features=3, penalties=(1.0,))
-    moments, bins = gathered(recipe, parts)
-    fitted = fit_detector(recipe, moments, bins, quiet)
-    features = torch.cat([p[1] for p in parts])[:, fitted.selected]
-    assert torch.equal(fitted.scaler.maximum, features.amax(0))
-    assert torch.equal(fitted.scaler.minimum, features.amin(0))
-    slips = int(bins.is_slip.sum())
-    assert fitted.facts["num_training_bins"] == 2 * min(slips, len(bins.is_slip) - slips)
+    parts[0][1][0, :5] = 1e6  # an outlier in one bin
+    recipe = Recipe(num_features=3, compress=True, tail=0.05)
+    frame = choose_frame(recipe, surveyed(recipe, parts))
+    features = together(parts)[0][:, list(frame.selected)]
+    bent = features.sign() * (features.abs() / frame.scaler.knee).log1p() * frame.scaler.knee
+    share = (bent > frame.scaler.maximum).double().mean(0)
+    assert ((share > 0.02) & (share <= 0.05)).all()
+    assert frame(together(parts)[0]).abs().amax() == 1
+    assert (frame.scaler.maximum < 10).all()
 
 
-def test_a_class_that_is_absent_is_named(rng):
+def test_near_duplicates_are_passed_over(rng):
+    parts = make_parts(rng)
+    for _, features, _ in parts:  # feature 10 says what feature 4 says
+        features[:, 10] = features[:, 4] + 1e-3 * torch.from_numpy(rng.standard_normal(40)).float()
+    with_both = choose_frame(Recipe(num_features=3), surveyed(Recipe(), parts)).selected
+    recipe = Recipe(num_features=3, most_correlation=0.9)
+    without = choose_frame(recipe, surveyed(recipe, parts)).selected
+    assert {4, 10} <= set(with_both)
+    assert len({4, 10} & set(without)) == 1
+    assert {3, 2} <= set(without)
+
+
+def test_the_first_features_of_a_frame(rng):
+    recipe = Recipe(num_features=[2, 5], compress=True)
+    parts = make_parts(rng)
+    frame = choose_frame(recipe, surveyed(recipe, parts))
+    assert len(frame.selected) == 5
+    features = together(parts)[0]
+    assert torch.equal(frame.first(2)(features), frame(features)[:, :2])
+
+
+@pytest.mark.parametrize("balance", ["undersample", "weights"])
+def test_both_balances_give_the_classes_one_weight(balance, rng):
+    recipe = Recipe(balance=balance)
+    _, is_slip = together(make_parts(rng, share=0.8))
+    counts = [int((~is_slip).sum()), int(is_slip.sum())]
+    weights = bin_weights(recipe, counts, is_slip)
+    totals = [float(weights[is_slip == value].sum()) for value in (False, True)]
+    assert totals[0] == pytest.approx(totals[1], rel=1e-12)
+    expected = 2 * min(counts) if balance == "undersample" else sum(counts)
+    assert sum(totals) == pytest.approx(expected)
+    assert kept_shares(recipe, counts)[0] == 1.0  # non-slip is the smaller class
+
+
+def test_a_sample_stands_for_all_bins(rng):
+    recipe = Recipe(sample_bins=7, balance="weights")
+    survey = surveyed(recipe, make_parts(rng, share=0.8))
+    sample = survey.sample.bins()
+    assert len(sample.is_slip) == 3 * 2 * 7
+    weights = stand_for(sample, recipe, survey.moments.count.tolist())
+    assert float(weights.sum()) == pytest.approx(240)
+
+
+def test_an_absent_class_is_named(rng):
     parts = [(r, f, torch.ones_like(s)) for r, f, s in make_parts(rng)]
-    moments = GroupedMoments(Recipe(num_features=3), NUM)
-    for part in parts:
-        moments.update(*part)
     with pytest.raises(ValueError, match="no non-slip bin"):
-        moments.columns()
+        choose_frame(Recipe(num_features=3), surveyed(Recipe(), parts))
+    with pytest.raises(ValueError, match="no non-slip bin"):
+        bin_weights(Recipe(), [0, 5], torch.ones(5, dtype=torch.bool))
+
+
+def test_recalls_mean_by_hand():
+    truth = torch.tensor([False, False, True, True, True, True])
+    says = torch.tensor([False, True, True, True, True, False])
+    assert recalls_mean(says, truth) == pytest.approx((1 / 2 + 3 / 4) / 2)
+    weights = torch.tensor([3.0, 1.0, 1.0, 1.0, 1.0, 3.0], dtype=torch.float64)
+    assert recalls_mean(says, truth, weights) == pytest.approx((3 / 4 + 3 / 6) / 2)
+    assert recalls_mean(says[:2], truth[:2]) is None
+
+
+def test_groups_are_materials_or_fifths_of_the_cycles():
+    assert Recipe().group(RecordingId("M1", 7)) == "M1"
+    assert Recipe(group_by="cycle").group(RecordingId("M1", 7)) == "2"
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"balance": "none"}, r"detector.balance must be one of undersample, weights, got 'none'"),
-        ({"score_variance": "x"}, r"detector.score_variance must be one of pooled, welch"),
-        ({"group_by": "x"}, r"detector.group_by must be one of material, cycle"),
-        ({"penalties": ()}, r"detector.penalties must be positive, got \[\]"),
-        ({"penalties": (0.1, 0.0)}, r"detector.penalties must be positive"),
-        ({"num_features": 0}, r"detector.num_features must be at least 1"),
-        ({"offset": -1.0}, r"detector.offset must not be negative"),
+        ({"balance": "none"}, r"recipe.balance must be one of undersample, weights, got 'none'"),
+        ({"score_variance": "x"}, r"recipe.score_variance must be one of pooled, welch"),
+        ({"group_by": "x"}, r"recipe.group_by must be one of material, cycle"),
+        ({"kernel": "x"}, r"recipe.kernel must be one of polynomial, rbf"),
+        ({"kernel": "rbf"}, r"recipe.kernel=rbf needs recipe.gamma"),
+        ({"penalties": ()}, r"recipe.penalties must be positive, got \[\]"),
+        ({"penalties": (0.1, 0.0)}, r"recipe.penalties must be positive"),
+        ({"penalties": float("nan")}, r"recipe.penalties must be positive"),
+        ({"num_features": 0}, r"recipe.num_features must be at least 1"),
+        ({"offsets": -1.0}, r"recipe.offsets must not be negative"),
+        ({"tail": 0.5}, r"recipe.tail must lie in \[0, 0.5\)"),
+        ({"most_correlation": 0.0}, r"recipe.most_correlation must lie in \(0, 1\]"),
+        ({"sample_bins": 1}, r"recipe.sample_bins must be at least 2"),
+        ({"degree": 0}, r"degree of the kernel must be a whole number"),
     ],
     ids=str,
 )

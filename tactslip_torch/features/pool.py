@@ -7,6 +7,7 @@ For the paper's hand 14 gauges x 13 descriptors + 10 films x (8 branches x (14 t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -101,6 +102,16 @@ class FeaturePool(nn.Module):
             "sine": lines.imag.contiguous(),
             "frequency_hz": frequency_axis_hz(bin_samples, sample_rate_hz, spectrum),
             "is_approximation": torch.tensor([n[0] == "A" for n in branch_names(level)]),
+        }
+
+    def facts(self) -> dict[str, Any]:
+        """All arguments but the hand, as JSON-able values; ``FeaturePool(hand, **facts)``."""
+        return {
+            "sample_rate_hz": self.sample_rate_hz,
+            "bin_samples": self.bin_samples,
+            "wavelet": self.wavelet,
+            "level": self.level,
+            "spectrum": self.spectrum,
         }
 
     def forward(self, bins: Tensor) -> Tensor:

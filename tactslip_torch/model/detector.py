@@ -151,13 +151,7 @@ class SlipDetector(nn.Module):
         pool, head = self.pool, self.head
         facts = {
             "channels": pool.hand.to_rows(),
-            "pool": {
-                "sample_rate_hz": pool.sample_rate_hz,
-                "bin_samples": pool.bin_samples,
-                "wavelet": pool.wavelet,
-                "level": pool.level,
-                "spectrum": pool.spectrum,
-            },
+            "pool": pool.facts(),
             "window_lengths": list(self.channel_filter.window_lengths),
             "polyorder": self.channel_filter.polyorder,
             "selected": list(self.selected),

@@ -1,10 +1,10 @@
-"""Fitting the machine to training bins: balance, C, and the solve (REFERENCE.md section 5)."""
+"""Fitting the machine to training bins by the cheaper route (REFERENCE.md section 5)."""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,7 +13,6 @@ from torch import Tensor
 
 from tactslip_torch.model.fourth_moments import ProductSums, add_products_, normal_matrix
 from tactslip_torch.model.kernel_elm import (
-    solve_kernel_elm,
     solve_kernel_elm_,
     solve_normal_equations_,
 )
@@ -29,7 +28,6 @@ from tactslip_torch.model.quadratic import (
 
 log = logging.getLogger(__name__)
 
-Balance = Literal["undersample", "weights"]
 Route = Literal["auto", "primal", "dual"]
 Progress = Callable[[Iterable[int], str], Iterable[int]]
 """Wraps a range so that its progress shows; gets the range and what is being done."""
@@ -70,50 +68,6 @@ class TrainingBins:
     def targets(self) -> Tensor:
         """+1 for slip, -1 for non-slip, ``[N]``."""
         return torch.where(self.is_slip, 1.0, -1.0).to(self.features)
-
-
-def balanced_choice(
-    is_slip: Tensor, balance: Balance, generator: torch.Generator, most: int | None = None
-) -> tuple[Tensor, Tensor | None]:
-    """Which bins to train on, and with what weight.
-
-    ``undersample`` (the authors') draws as many bins of the larger class as the smaller one has;
-    ``weights`` (Zong et al. 2013) keeps all and gives each class the same total weight.
-
-    Args:
-        is_slip: ``[N]``, bool.
-        balance: how the classes are balanced.
-        generator: of the draw.
-        most: keep at most so many bins, drawn at random within the classes.
-
-    Shape:
-        - output: indices ``[M]``, ascending, and weights ``[M]`` (float64) or ``None``
-
-    Raises:
-        ValueError: if a class is absent (named) or the balance is unknown.
-    """
-    members = [(is_slip == value).nonzero().squeeze(-1) for value in (False, True)]
-    for name, own in zip(("non-slip", "slip"), members, strict=True):
-        if not len(own):
-            raise ValueError(f"training needs bins of both classes, got no {name} bin")
-    if balance == "undersample":
-        smaller = min(len(own) for own in members)
-        counts = [smaller, smaller]
-    elif balance == "weights":
-        counts = [len(own) for own in members]
-    else:
-        raise ValueError(f"balance must be 'undersample' or 'weights', got {balance!r}")
-    if most is not None and sum(counts) > most:
-        counts = [max(1, count * most // sum(counts)) for count in counts]
-    drawn = [
-        own[torch.randperm(len(own), generator=generator)[:count]]
-        for own, count in zip(members, counts, strict=True)
-    ]
-    index = torch.cat(drawn).sort().values
-    if balance == "undersample":
-        return index, None
-    share = torch.tensor([len(index) / (2 * count) for count in counts], dtype=torch.float64)
-    return index, share[is_slip[index].long()]
 
 
 def fit_machine(
@@ -159,32 +113,6 @@ def fit_machine(
     machine = KernelSum(bins.features, beta, kernel)
     log.info(machine.cost_note)
     return machine
-
-
-def validation_scores(
-    train: TrainingBins,
-    held_out: TrainingBins,
-    penalties: Sequence[float],
-    offset: float = 0.5,
-) -> list[float]:
-    """Balanced accuracy on held-out bins for every penalty, from one kernel matrix.
-
-    Raises:
-        ValueError: if a class is absent from the held-out bins, or a solve fails.
-    """
-    kernel = Polynomial(2, offset)
-    gram = kernel(train.features, train.features)
-    across = kernel(held_out.features, train.features)
-    is_slip = held_out.is_slip
-    if bool(is_slip.all()) or not bool(is_slip.any()):
-        raise ValueError("a validation fold needs held-out bins of both classes")
-    scores = []
-    for penalty in penalties:
-        beta = solve_kernel_elm(gram, train.targets, penalty, train.weights)
-        says_slip = across @ beta >= 0
-        recalls = (says_slip[is_slip].double().mean(), (~says_slip[~is_slip]).double().mean())
-        scores.append(float(sum(recalls) / 2))
-    return scores
 
 
 def _solve_linear_primal(

@@ -132,9 +132,6 @@ class FeatureScaler(nn.Module):
         return torch.where(is_constant, 0 * relative.clamp(0, 0), scaled)
 
 
-MinMaxScaler = FeatureScaler
-
-
 def _range_of(column: Tensor, compress: bool, tail: float) -> tuple[Tensor, Tensor, Tensor]:
     """Minimum, maximum and knee of one feature; sorting one at a time keeps memory small."""
     ordered = column.sort().values

@@ -15,12 +15,13 @@ from tactslip_torch.report.tables import (
     splits_table,
     timing_table,
 )
+from tactslip_torch.report.validation import validation_figure, validation_table
 
 
 def write_results(
     folder: Path, metrics: Mapping[str, Any], selected: Sequence[Mapping[str, str]]
 ) -> None:
-    """Write ``metrics.json``, ``confusion.png`` and ``selected_features.png`` into a folder.
+    """Write ``metrics.json`` and the figures of a run into a folder.
 
     Args:
         folder: made if it is not there.
@@ -30,10 +31,11 @@ def write_results(
     with whole_file(folder / "metrics.json") as temporary:
         temporary.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
     confusion_figure(metrics, folder / "confusion.png")
+    simulated = metrics["simulated"]
     if selected:
-        selected_features_figure(
-            selected, folder / "selected_features.png", simulated=metrics["simulated"]
-        )
+        selected_features_figure(selected, folder / "selected_features.png", simulated=simulated)
+    if metrics.get("validation"):
+        validation_figure(metrics["validation"], folder / "validation.png", simulated=simulated)
 
 
 def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, str]]) -> None:
@@ -41,6 +43,8 @@ def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, st
     parts = [splits_table(metrics), materials_table(metrics)]
     if selected:
         parts.append(selected_table(selected))
+    if metrics.get("validation"):
+        parts.append(validation_table(metrics["validation"], simulated=metrics["simulated"]))
     if metrics.get("timing_s"):
         parts.append(timing_table(metrics["timing_s"]))
     print("\n" + "\n\n".join(parts))

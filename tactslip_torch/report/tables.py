@@ -39,7 +39,7 @@ def splits_table(metrics: Mapping[str, Any]) -> str:
             rows.append(["  one feature", *_score_cells(rival["splits"][name]), "-"])
         if name in published.SPLITS:
             rows.append(["  paper", *_score_cells(vars(published.SPLITS[name])), "-"])
-    return _titled(metrics, _aligned(["split", *_SCORES.values(), "bins"], rows), PAPER_LINE)
+    return _titled(metrics, aligned(["split", *_SCORES.values(), "bins"], rows), PAPER_LINE)
 
 
 def materials_table(metrics: Mapping[str, Any]) -> str:
@@ -56,7 +56,7 @@ def materials_table(metrics: Mapping[str, Any]) -> str:
             first = name if position == 0 else ""
             rows.append([first, group, *_score_cells(scores), str(scores["num_bins"])])
     header = ["split", "group", *_SCORES.values(), "bins"]
-    return _titled(metrics, _aligned(header, rows, num_left=2))
+    return _titled(metrics, aligned(header, rows, num_left=2))
 
 
 def timing_table(timing_s: Mapping[str, float]) -> str:
@@ -78,7 +78,7 @@ def timing_table(timing_s: Mapping[str, float]) -> str:
         [name, f"{seconds:.2f}", _percent(seconds / total if total else None)]
         for name, seconds in [*stages.items(), ("total", total)]
     ]
-    return _aligned(["stage", "seconds", "share %"], rows)
+    return aligned(["stage", "seconds", "share %"], rows)
 
 
 def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
@@ -110,7 +110,7 @@ def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
             first = key if position == 0 else ""
             rows.append([first, value, str(count), str(of_paper.get(value, "-"))])
     rows.append(["all", "", str(len(selected)), str(published.NUM_SELECTED)])
-    table = _aligned(["selected by", "", "ours", "paper"], rows, num_left=2)
+    table = aligned(["selected by", "", "ours", "paper"], rows, num_left=2)
     return (
         f"{table}\npaper, in words: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
     )
@@ -134,7 +134,7 @@ def _titled(metrics: Mapping[str, Any], table: str, *notes: str) -> str:
     return "\n".join([*([SIMULATED_LINE] if metrics["simulated"] else []), table, *notes])
 
 
-def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]], num_left: int = 1) -> str:
+def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], num_left: int = 1) -> str:
     """Columns padded to their widest cell: ``num_left`` flush left, the others flush right."""
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     lines = []

@@ -1,0 +1,126 @@
+"""Every choice of unseen materials, each learned without them."""
+
+import itertools
+import json
+from math import comb
+
+import pytest
+import torch
+from small_set import SmallSet, small_maker, small_recipe
+from test_commands import composed
+
+from tactslip_torch.crossval import Materials, crossval, judge
+from tactslip_torch.data.splits import seen6
+from tactslip_torch.datamodule import SlipDataModule
+from tactslip_torch.report.crossval import PAPERS_UNSEEN, crossval_table, material_scores
+
+TINY = (
+    "data._target_=test_commands.TinyRecordings",
+    "data.materials=[A,B,C,D]",
+    "data.cycles=3",
+    "num_unseen=2",
+    "train_bins=20",
+    "recipes.paper.num_features=8",
+    "recipes.paper.penalties=[0.1,1.0]",
+    "recipes.robust.num_features=[4,8]",
+    "recipes.robust.penalties=[0.01,0.1]",
+)
+
+
+def read(source):
+    by_cycle = seen6(source.ids, seen=["a", "b", "c"])[0]
+    maker = small_maker(source)
+    materials = Materials(len(maker.pool.names), 30, 2000)
+    for batch in SlipDataModule(maker, by_cycle, 0).loader(["train", "test"]):
+        materials.update(batch, by_cycle.roles[batch.recording])
+    return materials
+
+
+@pytest.mark.parametrize("balance", ["undersample", "weights"])
+def test_an_unseen_material_teaches_nothing(balance):
+    recipe = small_recipe(balance=balance)
+    plain = SmallSet()
+    louder = SmallSet(gains={r: 5.0 for r in plain.ids if r.material == "c"})
+    before, after = judge(read(plain), recipe, ["c"]), judge(read(louder), recipe, ["c"])
+    assert before["test"] == after["test"]
+    assert before["penalty"] == after["penalty"]
+    assert before["unseen"] != after["unseen"]
+    seen = judge(read(louder), recipe, ["a"])
+    assert seen["test"] != judge(read(plain), recipe, ["a"])["test"]
+
+
+def test_a_score_is_the_mean_recall_on_all_bins_of_the_unseen_materials():
+    source = SmallSet()
+    materials = read(source)
+    found = judge(materials, small_recipe(), ["a", "c"])
+    bins = materials.bins_of(["a", "c"], ("train", "test"))
+    assert len(bins.is_slip) == 2 * 5 * 37  # every bin of both materials: none was sampled away
+    assert set(found["per_material"]) == {"a", "c"}
+    assert found["unseen"] == pytest.approx(sum(found["per_material"].values()) / 2)
+
+
+def test_the_command_judges_every_choice_with_every_recipe(tmp_path, capsys):
+    found = crossval(composed(*TINY, name="crossval"), tmp_path)
+    assert json.loads((tmp_path / "crossval.json").read_text()) == found
+    choices = {frozenset(pair) for pair in itertools.combinations("ABCD", 2)}
+    for splits in found["splits"].values():
+        assert len(splits) == comb(4, 2)
+        assert {frozenset(split["materials"]) for split in splits} == choices
+        assert all(0 <= split["unseen"] <= 1 for split in splits)
+        assert len(material_scores(splits, "A")) == 3
+    assert {split["num_features"] for split in found["splits"]["paper"]} == {8}
+    assert {split["num_features"] for split in found["splits"]["robust"]} <= {4, 8}
+    assert (tmp_path / "crossval.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "config.yaml").exists()
+    out = capsys.readouterr().out
+    assert crossval_table(found) in out
+    assert "SIMULATED" not in out  # the stand-in says it is not
+
+
+def test_the_number_of_processes_changes_nothing(tmp_path):
+    alone = crossval(composed(*TINY, "num_workers=0", name="crossval"), tmp_path / "0")
+    several = crossval(composed(*TINY, "num_workers=2", name="crossval"), tmp_path / "2")
+    assert alone["splits"] == several["splits"]
+
+
+def test_the_table_by_hand():
+    splits = [
+        {
+            "materials": [*PAPERS_UNSEEN],
+            "unseen": 0.5,
+            "test": 0.9,
+            "per_material": {"iron": 0.5},
+        },
+        {"materials": ["M1"], "unseen": 0.7, "test": None, "per_material": {"M1": 0.7}},
+    ]
+    found = {
+        "simulated": True,
+        "num_unseen": 1,
+        "train_bins": 9,
+        "materials": ["M1", "iron"],
+        "splits": {"paper": splits},
+    }
+    lines = crossval_table(found).splitlines()
+    assert lines[0].startswith("SIMULATED")
+    rows = [line.split() for line in lines]
+    assert ["paper", "test", "90.00", "0.00", *["90.00"] * 4, "90.00", "1"] in rows
+    unseen = ["paper", "unseen", "60.00", "14.14", "50.00", "50.00", "60.00", "70.00"]
+    unseen += ["50.00", "2"]
+    assert unseen in rows
+    assert ["iron", "50.00", "0.00"] in rows
+
+
+@pytest.mark.parametrize("num", [0, 3, 9])
+def test_too_few_materials_to_train_on_is_refused(tmp_path, num):
+    config = composed(*TINY, f"num_unseen={num}", name="crossval")
+    with pytest.raises(ValueError, match=f"num_unseen must leave two of 4 .* got {num}"):
+        crossval(config, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_pass_keeps_training_and_test_cycles_apart():
+    materials = read(SmallSet())
+    assert {name: len(s.ledger) for name, s in materials.surveys.items()} == dict.fromkeys("abc", 4)
+    test = materials.bins_of(["b"], ("test",))
+    assert len(test.is_slip) == 37
+    assert torch.equal(test.represents, torch.ones(37, dtype=torch.float64))

@@ -1,0 +1,138 @@
+"""Plans and passes: what is chosen, and that neither order nor workers matter."""
+
+import json
+
+import pytest
+import torch
+from test_recipe import make_parts, surveyed, together
+
+from tactslip_torch.fitting import Plan, TrainingPass, plan_detector
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.recipe import Recipe, recalls_mean
+
+
+def quiet(items, what):
+    return items
+
+
+def planned(recipe, parts):
+    return plan_detector(recipe, surveyed(recipe, parts), quiet)
+
+
+def passed(plan, parts):
+    gathered = TrainingPass(plan)
+    for recording, features, is_slip in parts:
+        gathered.update(str(recording), features, is_slip)
+    return gathered
+
+
+def assert_same_head(one, other):
+    for name, value in one.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name]), name
+
+
+FEW = {"num_features": 4, "penalties": (0.1, 3.0), "sample_bins": 500}
+
+
+def test_validation_equals_refits_without_the_group(rng):
+    parts = make_parts(rng)
+    plan = planned(Recipe(**FEW, balance="weights"), parts)
+    features, is_slip = together(parts)
+    z = plan.frame(features)
+    weights = (len(is_slip) / (2 * torch.bincount(is_slip.long()).double()))[is_slip.long()]
+    rows = torch.tensor([material == "b" for r, _, s in parts for material in r.material * len(s)])
+    assert [row["penalty"] for row in plan.validation] == [0.1, 3.0]
+    for row in plan.validation:
+        others = TrainingBins(z[~rows], is_slip[~rows], weights[~rows])
+        says_slip = fit_machine(others, row["penalty"])(z[rows]) >= 0
+        expected = recalls_mean(says_slip, is_slip[rows])
+        assert row["balanced_accuracy"]["b"] == pytest.approx(expected)
+        assert row["mean"] == pytest.approx(sum(row["balanced_accuracy"].values()) / 3)
+    best = max(row["mean"] for row in plan.validation)
+    assert plan.penalty == min(r["penalty"] for r in plan.validation if r["mean"] == best)
+
+
+def test_size_offset_and_penalty_are_chosen_together(rng):
+    recipe = Recipe(num_features=[5, 2], offsets=[0.5, 2.0], penalties=(0.1, 1.0))
+    plan = planned(recipe, make_parts(rng))
+    assert len(plan.validation) == 8
+    best = max(plan.validation, key=lambda row: row["mean"])
+    assert len(plan.frame.selected) == best["num_features"] == plan.frame.scaler.minimum.numel()
+    assert (plan.kernel.to_dict(), plan.penalty) == (best["kernel"], best["penalty"])
+
+
+@pytest.mark.parametrize("bins", [10, 40], ids=["bins kept", "sums"])
+@pytest.mark.parametrize("balance", ["undersample", "weights"])
+def test_neither_order_nor_workers_change_a_bit(bins, balance, rng):
+    parts = make_parts(rng, bins=bins, share=0.7)
+    recipe = Recipe(**FEW | {"num_features": 12}, balance=balance)
+    plan, other = planned(recipe, parts), planned(recipe, parts[::-1])
+    assert plan.facts() == other.facts()
+    assert plan.adds_up == (bins == 40)  # 91 monomials of 12 features
+    whole = passed(plan, parts)
+    shares = [passed(plan, parts[start::3]) for start in (2, 0, 1)]
+    for share in shares[1:]:
+        shares[0].merge(share)
+    assert_same_head(whole.solve(), shares[0].solve())
+
+
+def test_the_machine_of_sums_is_the_machine_of_bins(rng):
+    parts = make_parts(rng, bins=60, share=0.7)
+    plan = planned(Recipe(**FEW, balance="weights"), parts)
+    assert plan.adds_up
+    features, is_slip = together(parts)
+    weights = (len(is_slip) / (2 * torch.bincount(is_slip.long()).double()))[is_slip.long()]
+    z = plan.frame(features)
+    by_bins = fit_machine(TrainingBins(z, is_slip, weights), plan.penalty, plan.kernel)
+    by_sums = passed(plan, parts).solve()
+    torch.testing.assert_close(by_sums(z), by_bins(z), rtol=1e-9, atol=1e-9)
+
+
+def test_undersampling_keeps_about_as_many_slips_as_non_slips(rng):
+    parts = make_parts(rng, cycles=8, share=0.8)
+    plan = planned(Recipe(**FEW), parts)
+    non_slips = int((~together(parts)[1]).sum())
+    kept = passed(plan, parts).stats.count.tolist()
+    assert kept[0] == non_slips
+    assert abs(kept[1] - non_slips) < 5 * non_slips**0.5
+    assert plan.num_bins == 2 * non_slips
+
+
+def test_other_kernels_keep_their_bins(rng):
+    parts = make_parts(rng, bins=60)
+    for recipe in (Recipe(**FEW, degree=3), Recipe(**FEW, kernel="rbf", gamma=0.3)):
+        plan = planned(recipe, parts)
+        assert not plan.adds_up
+        head = passed(plan, parts).solve()
+        features, is_slip = together(parts)
+        assert recalls_mean(head(plan.frame(features)) >= 0, is_slip) > 0.8
+        assert head.num_features == 4
+
+
+def test_one_group_leaves_nothing_to_validate(rng, caplog):
+    plan = planned(Recipe(num_features=3, penalties=(0.1, 0.2, 3.0)), make_parts(rng, "a"))
+    assert plan.penalty == 0.2
+    assert plan.validation == []
+    assert "unvalidated" in caplog.text
+
+
+def test_a_single_choice_is_taken_as_it_is(rng):
+    plan = planned(Recipe(num_features=3, penalties=float("inf")), make_parts(rng))
+    assert plan.penalty == float("inf")
+    assert plan.validation == []
+
+
+def test_a_plan_survives_its_facts(rng):
+    plan = planned(Recipe(**FEW, compress=True), make_parts(rng))
+    again = Plan.of(json.loads(json.dumps(plan.facts(), allow_nan=False)), plan.frame.scaler)
+    assert again.facts() == plan.facts()
+    assert again == plan
+
+
+def test_a_recording_counts_once(rng):
+    parts = make_parts(rng, bins=60)
+    gathered = passed(planned(Recipe(**FEW), parts), parts)
+    with pytest.raises(ValueError, match="already"):
+        gathered.update(str(parts[0][0]), parts[0][1], parts[0][2])
+    with pytest.raises(ValueError, match="both statistics"):
+        gathered.merge(passed(gathered.plan, parts[:1]))

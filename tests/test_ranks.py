@@ -1,0 +1,74 @@
+"""Several processes under Lightning: the detector of one, bit for bit."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_commands import TINY, assert_same_detector, run_train
+
+from tactslip_torch import SlipDetector
+
+HERE = Path(__file__).parent
+MANY = ("data.cycles=8", "split.train_share=0.75")
+SUMS = ("recipe.num_features=10",)  # 66 monomials: more bins than that, so sums are made
+BINS = ("recipe.num_features=40",)  # 861 monomials: fewer bins, so bins are kept
+pytestmark = pytest.mark.slow
+
+
+def launched(folder, *overrides, torchrun=0):
+    start = [sys.executable, "-m"]
+    if torchrun:
+        start += ["torch.distributed.run", f"--nproc_per_node={torchrun}", "--standalone", "-m"]
+    command = [*start, "tactslip_torch.train", *TINY, *MANY, f"hydra.run.dir={folder}", *overrides]
+    environment = {k: v for k, v in os.environ.items() if k != "TACTSLIP_TRACEBACK"}
+    environment |= {"PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        command, cwd=folder.parent, env=environment, capture_output=True, text=True, timeout=300
+    )
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return f"cache={tmp_path_factory.mktemp('cache')}"
+
+
+@pytest.mark.parametrize("route", [SUMS, BINS], ids=["sums", "bins"])
+@pytest.mark.parametrize("ranks", [2, 4])
+def test_processes_learn_what_one_does(ranks, route, cache, tmp_path):
+    _, alone = run_train(tmp_path / "alone", *TINY, *MANY, *route, cache)
+    done = launched(
+        tmp_path / "ddp", *route, cache, "trainer.strategy=ddp", f"trainer.devices={ranks}"
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert_same_detector(tmp_path / "alone", tmp_path / "ddp")
+    together = json.loads((tmp_path / "ddp" / "metrics.json").read_text())
+    assert together["splits"] == alone["splits"]
+    assert done.stdout.count("results in") == 1
+    trained = [SlipDetector.load(tmp_path / n / "detector.pt").info for n in ("alone", "ddp")]
+    assert trained[0] == trained[1]
+
+
+def test_torchrun_starts_it_as_well(cache, tmp_path):
+    run_train(tmp_path / "alone", *TINY, *MANY, cache)
+    done = launched(
+        tmp_path / "ddp", cache, "trainer.strategy=ddp", "trainer.devices=2", torchrun=2
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert_same_detector(tmp_path / "alone", tmp_path / "ddp")
+    assert {path.name for path in tmp_path.iterdir()} == {"alone", "ddp"}
+
+
+def test_more_processes_than_recordings_is_one_line(cache, tmp_path):
+    done = launched(
+        tmp_path / "ddp",
+        cache,
+        "data.cycles=2",
+        "split.train_share=0.5",
+        "trainer.strategy=ddp",
+        "trainer.devices=3",
+    )
+    assert done.returncode != 0
+    assert "3 workers for 2 recordings; use fewer processes or shards" in done.stderr
