@@ -1,14 +1,15 @@
-"""Held-out residuals of large groups in the primal, by conjugate gradients on one factor.
+"""Held-out residuals in the primal from the factor of all bins: by blocks, or by iteration.
 
 Without a group's bins the normal matrix is ``A - B B'`` with ``B = Phi_g' W_g^1/2``, and a factor
 of that costs a fit. But the residuals ``e`` that the machine without the group leaves on the
 group's bins obey ``(I - B' A^-1 B) W^1/2 e = W^1/2 (t - Phi v)`` with ``v`` and ``A = L L'`` those
-of all bins. The matrix is symmetric with eigenvalues in (0, 1]; applying it takes two triangular
-solves, which all groups share, and a quadratic form on the group's features.
+of all bins. The matrix is symmetric with eigenvalues in (0, 1]. For a small group it is formed and
+factorised. For large ones conjugate gradients need its products alone: two triangular solves,
+which all groups share, a quadratic form of the group's features, and its transpose.
 
 Reference:
-    Golub and Van Loan, Matrix Computations, 4th ed., sections 11.3.3 (conjugate gradients) and
-    10.1.2 (their coefficients are those of a Lanczos matrix, hence the smallest eigenvalue).
+    Golub and Van Loan, Matrix Computations, 4th ed., sections 11.3 (conjugate gradients) and 10.1
+    (Lanczos: their steps tell the smallest eigenvalue).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from tactslip_torch.model.cholesky import cholesky_solve
+from tactslip_torch.model.cholesky import cholesky_, cholesky_solve
 from tactslip_torch.model.fourth_moments import ProductSums, add_products_, normal_matrix
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.quadratic import (
@@ -34,6 +35,7 @@ from tactslip_torch.threads import for_each
 
 MOST_ITERATIONS = 600
 TOLERANCE = 1e-9  # of the residuals, in units of the targets
+_PROBE_TOLERANCE = 0.03  # well below what a random vector has of any eigenvector
 LEAST_EIGENVALUE = 1e-6  # below, the rounding of the factor shows in the scores
 
 
@@ -109,6 +111,7 @@ class _Descent:
     z: Tensor
     root: Tensor  # of the weights
     rest: Tensor  # what is still to be explained
+    enough: float  # error of the solution that is
     direction: Tensor = field(init=False)
     found: Tensor = field(init=False)
     steps: list[tuple[float, float]] = field(default_factory=list)  # alpha and beta of each
@@ -124,7 +127,8 @@ class _Descent:
         """One step, given ``A^-1 B direction``."""
         image = self.direction - self.root * monomials.head(answer)(self.z)
         square = float(self.rest.square().sum())
-        alpha = square / float((self.direction * image).sum())
+        curve = float((self.direction * image).sum())
+        alpha = square / curve if curve > 0 else math.nan  # the matrix is singular in float64
         self.found.add_(self.direction, alpha=alpha)
         self.rest.sub_(image, alpha=alpha)
         beta = float(self.rest.square().sum()) / square
@@ -132,14 +136,15 @@ class _Descent:
         self.steps.append((alpha, beta))
 
     def is_done(self) -> bool:
-        """Whether the error, at most ``|rest|`` over the smallest eigenvalue, is small enough.
+        """Whether the error, at most ``|rest|`` over the smallest eigenvalue, is small enough."""
+        return bool(self.steps) and self.is_above(float(self.rest.norm()) / self.enough)
 
-        The smallest eigenvalue is that of the tridiagonal matrix of the steps so far. It lies
-        above ``least`` if and only if every pivot of that matrix less ``least`` is positive.
+    def is_above(self, least: float) -> bool:
+        """Whether the smallest eigenvalue, as far as the steps tell, is larger than ``least``.
+
+        They make a tridiagonal matrix, whose smallest eigenvalue falls to that of the group. It
+        is larger if and only if every pivot of the matrix less ``least`` is positive.
         """
-        least = max(float(self.rest.norm()) / TOLERANCE, LEAST_EIGENVALUE)
-        if not least < 1:
-            return False
         pivot, link, square = 1.0, 0.0, 0.0
         for alpha, beta in self.steps:
             pivot = 1 / alpha + link - least - square / pivot
@@ -149,7 +154,34 @@ class _Descent:
         return True
 
 
-def residuals_without_groups(
+def residuals_by_block(left: Tensor, right: Tensor, groups: Sequence[tuple[int, int]]) -> Tensor:
+    """``left^-1 right``, with the matrices ``I - B' A^-1 B`` of small groups along the diagonal.
+
+    Args:
+        left: 0 between groups; only its lower triangle is read.
+        right: as in ``residuals_by_iteration``.
+        groups: likewise.
+
+    Shape:
+        - left: ``[n, n]``; right, output: ``[n]``
+
+    Raises:
+        ValueError: if a group (named) leaves too little.
+    """
+    factor = left.clone()
+    try:
+        cholesky_(factor)
+        low = factor.diagonal().square() < LEAST_EIGENVALUE
+    except ValueError:
+        row = max(int(torch.linalg.cholesky_ex(left).info) - 1, 0)
+        low = torch.arange(len(left)) == row
+    if bool(low.any()):
+        ends = torch.tensor([size for _, size in groups]).cumsum(0)
+        raise _untold(groups[int((ends <= low.nonzero()[0]).sum())][0])
+    return cholesky_solve(factor, right)
+
+
+def residuals_by_iteration(
     factor: Tensor,
     monomials: Monomials,
     z: Tensor,
@@ -159,7 +191,9 @@ def residuals_without_groups(
 ) -> Tensor:
     """``(I - B' A^-1 B)^-1 right`` for each of several groups of bins.
 
-    The error of each is at most ``TOLERANCE``, beyond what the rounding of ``L`` brings.
+    The error of each is at most ``TOLERANCE``, beyond what the rounding of ``L`` brings. What the
+    eigenvectors of tiny eigenvalues are to ``right`` is as tiny, so that it may not show them; a
+    random vector beside does.
 
     Args:
         factor: ``L`` of the normal matrix of all bins.
@@ -173,28 +207,25 @@ def residuals_without_groups(
         - factor: ``[P, P]``; z: ``[N, K]``; roots, right, output: ``[N]``
 
     Raises:
-        ValueError: if a group (named) takes too many iterations.
+        ValueError: if a group (named) leaves too little, or takes too many iterations.
     """
     sizes = [size for _, size in groups]
-    parts = zip(*(x.split(sizes) for x in (z, roots, right)), strict=True)
-    descents = [_Descent(part, root, rest.clone()) for part, root, rest in parts]
-    going = list(range(len(groups)))
+    draws = torch.randn(right.shape, generator=torch.Generator().manual_seed(0), dtype=right.dtype)
+    enough = TOLERANCE * min(1.0, float(roots.min()))
+    descents = []
+    for start, tolerance in ((right, enough), (draws, _PROBE_TOLERANCE)):
+        parts = zip(z.split(sizes), roots.split(sizes), start.clone().split(sizes), strict=True)
+        descents += [_Descent(own, root, rest, tolerance) for own, root, rest in parts]
+    going = list(zip(descents, [*groups, *groups], strict=True))
     for _ in range(MOST_ITERATIONS):
-        going = [index for index in going if not descents[index].is_done()]
+        _step(factor, monomials, [descent for descent, _ in going])
+        for descent, (name, _) in going:
+            if not descent.is_above(LEAST_EIGENVALUE):
+                raise _untold(name)
+        going = [(descent, group) for descent, group in going if not descent.is_done()]
         if not going:
-            break
-        _step(factor, monomials, [descents[index] for index in going])
-    else:
-        raise untold(groups[going[0]][0])
-    return torch.cat([descent.found for descent in descents])
-
-
-def untold(name: int) -> ValueError:
-    """The error for a group whose bins are almost alone in what they tell."""
-    return ValueError(
-        f"the machine without group {name} is too far from the machine of all bins to be told "
-        "from it in float64; lower the penalty, or refit without the group"
-    )
+            return torch.cat([descent.found for descent in descents[: len(groups)]])
+    raise _untold(going[0][1][0])
 
 
 def _step(factor: Tensor, monomials: Monomials, descents: Sequence[_Descent]) -> None:
@@ -210,3 +241,11 @@ def _step(factor: Tensor, monomials: Monomials, descents: Sequence[_Descent]) ->
     for_each(ask, range(len(descents)))
     answers = cholesky_solve(factor, asked.mT)
     for_each(take, range(len(descents)))
+
+
+def _untold(name: int) -> ValueError:
+    """The error for a group whose bins are almost alone in what they tell."""
+    return ValueError(
+        f"the machine without group {name} is too far from the machine of all bins to be told "
+        "from it in float64; lower the penalty, or refit without the group"
+    )

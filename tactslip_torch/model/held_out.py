@@ -21,12 +21,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model.cholesky import cholesky_, cholesky_solve, forward_solve
-from tactslip_torch.model.downdate import (
-    LEAST_EIGENVALUE,
-    Monomials,
-    residuals_without_groups,
-    untold,
-)
+from tactslip_torch.model.downdate import Monomials, residuals_by_block, residuals_by_iteration
 from tactslip_torch.model.fit import Route, TrainingBins
 from tactslip_torch.model.kernel_elm import solve_kernel_elm_, solve_normal_equations_
 from tactslip_torch.model.kernel_sum import KernelSum
@@ -36,7 +31,10 @@ from tactslip_torch.threads import for_each
 
 _TILE = 256  # bins whose columns one thread solves at a time
 _CHUNK = 1024  # bins in whole groups that are treated together, unless one group is larger
-_LARGE = 512  # bins; in the primal larger groups go by conjugate gradients
+_ITERATIONS = 60  # that conjugate gradients usually take
+_WAIT = 30  # groups whose triangular solves take as long as reading a factor does
+
+Groups = Sequence[tuple[int, int]]  # name and number of bins of each
 
 
 class HeldOutFit(NamedTuple):
@@ -80,8 +78,7 @@ class HeldOut:
         _check_groups(names, member, bins.is_slip)
         rank = counts.argsort(stable=True)  # large groups last: the later, the cheaper
         order = rank.argsort()[member].argsort(stable=True)
-        self._names: list[int] = names[rank].tolist()
-        self._sizes: list[int] = counts[rank].tolist()
+        self._groups = list(zip(names[rank].tolist(), counts[rank].tolist(), strict=True))
         self._order, self._kernel = order, kernel
         self._z, self._targets = bins.features[order], bins.targets[order]
         weights = torch.ones_like(bins.targets) if bins.weights is None else bins.weights
@@ -119,13 +116,13 @@ class HeldOut:
         factor, targets = self._system.clone(), self._targets
         beta = solve_kernel_elm_(factor, targets, penalty, self._weights)
         residuals = torch.empty_like(beta)
-        for _, sizes, part in _chunks(self._names, self._sizes):
-            if len(sizes) == 1 and part.stop == len(beta):  # the last group's answer is in L
+        for groups, part in _chunks(self._groups):
+            if len(groups) == 1 and part.stop == len(beta):  # the last group's answer is in L
                 before = targets[: part.start, None]
                 known = forward_solve(factor[: part.start, : part.start], before)
                 residuals[part] = targets[part] - (factor[part, : part.start] @ known)[:, 0]
             else:
-                inverse = _inverse_within(factor, part, sizes)
+                inverse = _inverse_within(factor, part, groups)
                 cholesky_(inverse)
                 residuals[part] = cholesky_solve(inverse, beta[part])
         fold = collapse if self._kernel.collapses else KernelSum
@@ -138,14 +135,14 @@ class HeldOut:
         roots = self._weights.sqrt()
         right = roots * (self._targets - head(z))
         solved = torch.empty_like(right)
-        small = sum(size <= _LARGE for size in self._sizes)
-        for names, sizes, part in _chunks(self._names[:small], self._sizes[:small]):
-            left = _left_within(factor, monomials, z[part], roots[part], sizes)
-            solved[part] = _solve_left(left, right[part], names, sizes)
-        if small < len(self._sizes):
-            part = slice(sum(self._sizes[:small]), len(z))
-            groups = list(zip(self._names[small:], self._sizes[small:], strict=True))
-            solved[part] = residuals_without_groups(
+        small = _num_small(self._groups, monomials.number)
+        for groups, part in _chunks(self._groups[:small]):
+            left = _left_within(factor, monomials, z[part], roots[part], groups)
+            solved[part] = residuals_by_block(left, right[part], groups)
+        if small < len(self._groups):
+            groups = self._groups[small:]
+            part = slice(len(z) - sum(size for _, size in groups), len(z))
+            solved[part] = residuals_by_iteration(
                 factor, monomials, z[part], roots[part], right[part], groups
             )
         return head, solved / roots
@@ -162,42 +159,55 @@ def _monomials_of(kernel: Kernel, z: Tensor, route: Route) -> Monomials | None:
     return None if route == "dual" or (route == "auto" and fewer) else monomials
 
 
-def _chunks(
-    names: Sequence[int], sizes: Sequence[int]
-) -> Iterator[tuple[Sequence[int], Sequence[int], slice]]:
-    """Names and sizes of whole groups, and their bins: as many as fit a chunk, at least one."""
+def _num_small(groups: Groups, num_monomials: int) -> int:
+    """How many of the groups, by ascending size, cost less as blocks than by iterations.
+
+    In units of ``P^2 / 2`` multiply-adds a block costs a triangular solve for each bin, products
+    of those, and a factor; an iteration two triangular solves, a quadratic form and its transpose.
+    """
+    savings = []
+    for _, size in groups:
+        share = size / num_monomials
+        block = size * (1 + share + share**2 / 3)
+        savings.append(block - _ITERATIONS * (2 + 8 * share))
+    large = [saving for saving in savings if saving > 0]
+    return len(groups) - (len(large) if sum(large) > _ITERATIONS * 2 * _WAIT else 0)
+
+
+def _chunks(groups: Groups) -> Iterator[tuple[Groups, slice]]:
+    """Whole groups and their bins: as many as fit a chunk, at least one."""
     first = start = width = 0
-    for last, size in enumerate(sizes):
+    for last, (_, size) in enumerate(groups):
         if last > first and width + size > _CHUNK:
-            yield names[first:last], sizes[first:last], slice(start, start + width)
+            yield groups[first:last], slice(start, start + width)
             first, start, width = last, start + width, 0
         width += size
     if width:
-        yield names[first:], sizes[first:], slice(start, start + width)
+        yield groups[first:], slice(start, start + width)
 
 
-def _inverse_within(factor: Tensor, part: slice, sizes: Sequence[int]) -> Tensor:
+def _inverse_within(factor: Tensor, part: slice, groups: Groups) -> Tensor:
     """``(L L')^-1`` between bins of one group, 0 across groups; lower triangle.
 
     From columns of ``L^-1``, which are 0 above the diagonal, so ``L`` is read from there on.
 
     Shape:
-        - factor: ``[N, N]``; sizes: sum to the n bins of ``part``; output: ``[n, n]``
+        - factor: ``[N, N]``; output: ``[n, n]`` for the n bins of ``part``
     """
     columns = factor.new_zeros(part.stop - part.start, len(factor) - part.start)  # one a row
 
     def fill(start: int) -> None:
         stop, shift = min(start + _TILE, part.stop), part.start
-        ones = torch.eye(len(factor) - start, stop - start, dtype=factor.dtype)
+        ones = factor.new_zeros(len(factor) - start, stop - start).fill_diagonal_(1)
         solved = forward_solve(factor[start:, start:], ones)
         columns[start - shift : stop - shift, start - shift :] = solved.mT
 
     for_each(fill, range(part.start, part.stop, _TILE))
-    return _products_within(columns, sizes, triangular=True)
+    return _products_within(columns, groups, triangular=True)
 
 
 def _left_within(
-    factor: Tensor, monomials: Monomials, z: Tensor, roots: Tensor, sizes: Sequence[int]
+    factor: Tensor, monomials: Monomials, z: Tensor, roots: Tensor, groups: Groups
 ) -> Tensor:
     """``I - W^1/2 Phi (L L')^-1 Phi' W^1/2`` between bins of one group, 0 across; lower triangle.
 
@@ -212,24 +222,25 @@ def _left_within(
         columns[tile] = forward_solve(factor, scaled.mT).mT
 
     for_each(fill, range(0, len(z), _TILE))
-    left = _products_within(columns, sizes, triangular=False).neg_()
+    left = _products_within(columns, groups, triangular=False).neg_()
     left.diagonal().add_(1)
     return left
 
 
-def _products_within(columns: Tensor, sizes: Sequence[int], *, triangular: bool) -> Tensor:
+def _products_within(columns: Tensor, groups: Groups, *, triangular: bool) -> Tensor:
     """Products of columns of one group, 0 across groups; lower triangle.
 
     Args:
         columns: one a row.
-        sizes: columns in each group.
+        groups: that the columns are of.
         triangular: whether column ``i`` is 0 before its entry ``i``.
 
     Shape:
         - columns: ``[n, m]``; output: ``[n, n]``
     """
-    group = torch.repeat_interleave(torch.tensor(sizes))
-    ends = torch.tensor(sizes).cumsum(0)[group].tolist()  # of the group of each column
+    sizes = torch.tensor([size for _, size in groups])
+    group = torch.repeat_interleave(sizes)
+    ends = sizes.cumsum(0)[group].tolist()  # of the group of each column
     products = columns.new_zeros(len(columns), len(columns))
 
     def multiply(start: int) -> None:
@@ -242,26 +253,6 @@ def _products_within(columns: Tensor, sizes: Sequence[int], *, triangular: bool)
 
     for_each(multiply, range(0, len(columns), _TILE))
     return products
-
-
-def _solve_left(left: Tensor, right: Tensor, names: Sequence[int], sizes: Sequence[int]) -> Tensor:
-    """``left^-1 right``, refused for a group (named) that has too little left.
-
-    Shape:
-        - left: ``[n, n]``; right, output: ``[n]``
-    """
-    factor = left.clone()
-    try:
-        cholesky_(factor)
-    except ValueError:
-        bad = [max(int(torch.linalg.cholesky_ex(left).info) - 1, 0)]
-    else:
-        bad = (factor.diagonal().square() < LEAST_EIGENVALUE).nonzero().flatten().tolist()
-    if bad:
-        raise untold(
-            [name for name, size in zip(names, sizes, strict=True) for _ in range(size)][bad[0]]
-        )
-    return cholesky_solve(factor, right)
 
 
 def _check_bins(bins: TrainingBins, groups: Tensor) -> None:
