@@ -1,0 +1,140 @@
+"""What the kernel machine costs at any size: ``python -m benchmarks.model [--quick]``.
+
+Six measurements on synthetic features (``model_measure``): the size and latency of the head,
+accumulating beside bare BLAS, fitting beside scikit-learn, folds in closed form beside refits,
+memory at any number of bins, and many workers. Prints tables and the limits the project has set
+itself, and keeps numbers and figure in ``benchmarks/results``.
+
+The one run at a million bins: ``python -m benchmarks.model --only any_size --bins 1000000``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+from threadpoolctl import threadpool_info  # type: ignore[import-untyped]
+
+from benchmarks.model_clocks import on_threads
+from benchmarks.model_figure import PANELS, figure
+from benchmarks.model_measure import SECTIONS
+from benchmarks.model_report import limit_rows, ratios, report_text
+from benchmarks.model_sizes import QUICK, Sizes
+from benchmarks.model_worker import WorkerFailedError
+from benchmarks.train import machine_facts
+from tactslip_torch.files import whole_file
+
+RESULTS = Path(__file__).parent / "results"
+EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
+
+
+def measure(sizes: Sizes, names: Sequence[str], threads: int, quick: bool) -> dict[str, Any]:
+    """The report: facts, the sections named, and what follows from them. JSON-able.
+
+    Args:
+        sizes: how much.
+        names: of ``SECTIONS``.
+        threads: for PyTorch and every BLAS.
+        quick: whether the sizes are too small to mean anything.
+    """
+    machine = machine_facts()
+    with on_threads(threads):
+        sections = {name: SECTIONS[name](sizes) for name in names}
+    settings = asdict(sizes)
+    return {
+        "synthetic": True,
+        "quick": quick,
+        "machine": machine,
+        "threads": threads,
+        "versions": versions(),
+        "settings": settings,
+        "sections": sections,
+        "ratios": ratios(sections),
+        "limits": limit_rows(sections, settings),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of the libraries that do the work, and of the BLAS in them."""
+    names = ("torch", "numpy", "scipy", "scikit-learn", "tactslip_torch")
+    found = {"python": platform.python_version()} | {name: metadata.version(name) for name in names}
+    own = re.search(r"BLAS_INFO=(\w+)", torch.__config__.show())
+    blas = {
+        f"{info['internal_api']} {info['version']}"
+        for info in threadpool_info()
+        if info["user_api"] == "blas"
+    }
+    known = [f"{own[1]} in torch"] if own else []
+    return found | {"BLAS": " and ".join([*known, *sorted(blas)])}
+
+
+def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.model",
+        description="Time the kernel machine on synthetic features, beside BLAS and scikit-learn.",
+    )
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, to see that it runs")
+    parser.add_argument(
+        "--only", nargs="+", choices=SECTIONS, metavar="SECTION", help="of %(choices)s"
+    )
+    parser.add_argument("--bins", type=int, metavar="N", help="of any_size")
+    parser.add_argument("--repeat", type=int, metavar="N", help="of what takes seconds")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), metavar="N")
+    for name, suffix in (("json", "numbers"), ("figure", "figure")):
+        text = f"where the {suffix} go (benchmarks/results, if all is measured in full)"
+        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
+    parsed = parser.parse_args(arguments)
+    for name in ("bins", "repeat", "threads"):
+        value = getattr(parsed, name)
+        if value is not None and value < 1:
+            parser.error(f"--{name} must be at least 1, got {value}")
+    for name in ("json", "figure"):
+        path = getattr(parsed, name)
+        if path and path.is_dir():
+            parser.error(f"--{name} needs a file, {path} is a folder")
+    if parsed.figure and parsed.only and not set(parsed.only) & set(PANELS):
+        parser.error(f"--figure shows {', '.join(PANELS)}; measure one of them")
+    if not (parsed.quick or parsed.only):
+        parsed.json = parsed.json or RESULTS / "model.json"
+        parsed.figure = parsed.figure or RESULTS / "model.png"
+    return parsed
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; the exit status."""
+    parsed = _arguments(arguments)
+    sizes = QUICK if parsed.quick else Sizes()
+    if parsed.bins:
+        sizes = replace(sizes, any_bins=parsed.bins)
+    if parsed.repeat:
+        sizes = replace(sizes, repeats=parsed.repeat)
+    names = [name for name in SECTIONS if parsed.only is None or name in parsed.only]
+    try:
+        report = measure(sizes, names, parsed.threads, parsed.quick)
+    except WorkerFailedError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_FAILED
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    print(report_text(report))
+    if parsed.json:
+        with whole_file(parsed.json) as temporary:
+            temporary.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+        print(f"\nnumbers in {parsed.json}")
+    if parsed.figure:
+        figure(report, parsed.figure)
+        print(f"\nfigure in {parsed.figure}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
