@@ -71,7 +71,7 @@ class Recipe:
     penalties: float | Sequence[float] = (0.05, 0.08, 0.1, 0.13, 0.17, 0.2, 0.25, 0.3, 1.0, 3.0)
     balance: Balance = "undersample"
     group_by: GroupBy = "material"
-    sample_bins: int = 500
+    sample_bins: int = 400
 
     def __post_init__(self) -> None:
         for name in ("num_features", "offsets", "penalties"):

@@ -1,5 +1,6 @@
 """What README.md shows is there and runs."""
 
+import json
 import re
 from pathlib import Path
 
@@ -11,14 +12,19 @@ ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text()
 
 
-def test_the_program_runs(tmp_path, monkeypatch, capsys):
-    (program,) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+def test_the_programs_run(tmp_path, monkeypatch, capsys):
+    first, second = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     random_detector().save("detector.pt")
-    exec(compile(program, "README.md", "exec"), {})
+    exec(compile(first, "README.md", "exec"), {})
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("torch.Size([8, 2582])")
     assert re.fullmatch(r"tensor\(\[-?\d+\.\d+\]\)", lines[1])
+    exec(compile(second, "README.md", "exec"), {})
+    (line,) = capsys.readouterr().out.splitlines()
+    scores, counts = re.fullmatch(r"tensor\((.*), dtype=.*\) tensor\((.*)\)", line).groups()
+    assert len(json.loads(scores)) == 3
+    assert sum(json.loads(counts)) == 8 * 200
 
 
 def test_every_link_and_picture_leads_somewhere():
