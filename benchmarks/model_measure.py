@@ -87,7 +87,7 @@ def accumulation(sizes: Sizes) -> dict[str, Any]:
             "dsyrk": partial(_dsyrk, monomials, torch.zeros_like(square)),
             "gemm": partial(square.addmm_, monomials.mT, monomials),
         }
-        found = in_turns(calls, sizes.repeats + 1, f"accumulation of {num_bins}")
+        found = in_turns(calls, sizes.repeats, f"accumulation of {num_bins}")
         rows.append(
             {"batch_bins": num_bins} | {f"{name}_s": taken for name, (taken, _) in found.items()}
         )

@@ -68,7 +68,9 @@ def validation_figure(
             scores = [100 * (r["balanced_accuracy"][group] or float("nan")) for r in own]
             axes.plot(penalties, scores, color=colour, lw=0.7, alpha=0.5)
             if place == len(choices) - 1:
-                axes.annotate(group, (penalties[-1], scores[-1]), fontsize=8, color="#666666")
+                axes.annotate(
+                    f"  {group}", (penalties[-1], scores[-1]), fontsize=8, color="#666666"
+                )
     chosen = next(row for row in rows if row["mean"] == best)
     axes.plot(chosen["penalty"], 100 * best, "*", color="black", markersize=14, label="chosen")
     axes.set_xscale("log")
