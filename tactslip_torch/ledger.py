@@ -66,6 +66,7 @@ def content_digest(*tensors: Tensor) -> str:
     digest = hashlib.blake2b(digest_size=16)
     for tensor in tensors:
         digest.update(f"{tensor.dtype}{tuple(tensor.shape)}".encode())
-        content = tensor.detach().cpu().contiguous().view(-1).view(torch.uint8)
-        digest.update(content.numpy().data)  # no copy, and NumPy need not know the dtype
+        if tensor.numel():  # an empty one may have strides that no view of bytes takes
+            content = tensor.detach().cpu().contiguous().view(-1).view(torch.uint8)
+            digest.update(content.numpy().data)  # no copy, and NumPy need not know the dtype
     return digest.hexdigest()

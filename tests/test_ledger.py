@@ -95,3 +95,9 @@ def test_a_digest_does_not_see_layout_gradients_or_device(dtype, device):
     assert content_digest(tensor.to(device)) == digest
     if dtype.is_floating_point:
         assert content_digest(tensor.requires_grad_()) == digest
+
+
+def test_an_empty_array_has_a_digest():
+    empty = torch.from_numpy(np.zeros((0, 3)))
+    assert content_digest(empty) == content_digest(torch.zeros(0, 3, dtype=torch.float64))
+    assert content_digest(empty) != content_digest(torch.zeros(3, 0, dtype=torch.float64))

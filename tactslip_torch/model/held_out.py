@@ -53,7 +53,10 @@ class HeldOut:
     """Exact leave-one-group-out scores for any number of values of C.
 
     Through the primal or the dual as ``fit_machine``. The matrix that does not depend on C is kept,
-    ``[P, P]`` or ``[N, N]``, and ``at`` takes another one of that size.
+    ``[P, P]`` or ``[N, N]``, and ``at`` takes another one of that size. Beyond the fit it costs
+    about one and a half factorisations in the dual. In the primal all large groups together cost
+    two triangular solves an iteration, of which there are some 30 to 200, more with C; a bin of
+    the small ones costs ``P^2 / 2`` multiply-adds.
 
     Args:
         bins: scaled training bins in float64.
