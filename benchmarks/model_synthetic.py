@@ -1,6 +1,7 @@
 """Synthetic features for timing the kernel machine: no hand, no simulation, any number of bins.
 
-Bins are correlated and bounded as scaled features are, and labels follow a noisy quadratic rule.
+Bins are bounded and correlated much as the 120 scaled features of the simulated hand are, and
+labels follow a quadratic rule with noise that mislabels one bin in ten.
 Batch ``i`` depends on the seed and on ``i`` alone, so any shard makes its own.
 """
 
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 _RULE, _TRAINING, _HELD_OUT = range(3)  # streams of random numbers
-_RANK = 8  # of what the features have in common
-_COMMON, _OWN, _NOISE = 0.9, 0.5, 0.3
+_RANK, _DECAY = 16, 0.7  # of what the features have in common, the first factor strongest
+_COMMON, _OWN = 0.45, 0.15  # standard deviations before the squashing
+_NOISE = 0.3  # of the labels' score
 _SAMPLE = 4096  # bins that settle where the rule divides
 
 
@@ -69,7 +71,9 @@ class SyntheticBins:
     def _rule(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """How features are mixed ``[rank, K]``, directions of the labels ``[3, K]``, threshold."""
         rng = np.random.default_rng([self.seed, _RULE])
-        mix = rng.normal(size=(_RANK, self.num_features)) * _COMMON / np.sqrt(_RANK)
+        mix = rng.normal(size=(_RANK, self.num_features))
+        mix *= np.arange(1.0, _RANK + 1)[:, None] ** -_DECAY
+        mix *= _COMMON / np.sqrt(np.square(mix).sum(axis=0).mean())
         directions = rng.normal(size=(3, _RANK)) @ mix
         z = _features(rng, _SAMPLE, mix)
         directions /= _along(z, directions).std(axis=1)[:, None]

@@ -15,7 +15,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
+from tactslip_torch.config import (
+    conf_dir,
+    errors_in_one_line,
+    is_first_process,
+    run_entry_point,
+)
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
@@ -54,7 +59,9 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     source: RecordingSource = instantiate(config.data, _convert_="all")
     rule: LabelRule = instantiate(config.labels)
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
-    save_config(config, folder)
+    is_first = is_first_process()
+    if is_first:
+        save_config(config, folder)
     parts: dict[str, dict[str, Any]] = {}
     overlaps: dict[str, dict[str, list[str]]] = {}
     with feature_cache(config.cache) as cache:
@@ -63,7 +70,8 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
         maker = FeatureMaker(source, detector.pool, filters, rule, cache, dtype)
         for fold in folds:
             overlaps[fold.name] = overlap(detector, source, fold)
-            _note(fold, overlaps[fold.name])
+            if is_first:
+                _note(fold, overlaps[fold.name])
             learner = SlipLearner(detector.pool, filters, detector=detector)
             trainer = make_trainer(config.trainer, folder)
             data = SlipDataModule(maker, fold, config.num_workers)
@@ -82,9 +90,10 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
         "detector": detector.info,
     }
     rows = feature_rows(detector.selected_names, source.hand)
-    write_results(folder, metrics, rows)
-    print_results(metrics, rows)
-    print(f"\nresults in {folder}")
+    if is_first:
+        write_results(folder, metrics, rows)
+        print_results(metrics, rows)
+        print(f"\nresults in {folder}")
     return metrics
 
 
