@@ -1,7 +1,4 @@
-"""Seconds of calls that are compared: made in turns, so that drift of the machine hits all alike.
-
-What comes back are medians.
-"""
+"""Seconds of calls that are compared, made in turns: drift of the machine hits all alike."""
 
 from __future__ import annotations
 
@@ -29,8 +26,8 @@ def timed(call: Callable[[], Any]) -> tuple[float, Any]:
 
 def in_turns(
     calls: Mapping[str, Callable[[], object]], repeats: int, what: str
-) -> dict[str, tuple[float, Any]]:
-    """Median seconds of each of several long calls, made in turns, and its last result."""
+) -> dict[str, tuple[list[float], Any]]:
+    """Seconds of every repeat of several long calls, made in turns, and the last result of each."""
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     results: dict[str, Any] = {}
     for repeat in range(repeats):
@@ -39,7 +36,7 @@ def in_turns(
             taken, results[name] = timed(call)
             seconds[name].append(taken)
             say(f"{what}, {repeat + 1} of {repeats}: {name} {taken:.2f} s")
-    return {name: (median(seconds[name]), results[name]) for name in calls}
+    return {name: (seconds[name], results[name]) for name in calls}
 
 
 def in_shuffled_turns(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -90,7 +91,7 @@ def _fit(axes: Axes, numbers: Mapping[str, Any], report: Mapping[str, Any]) -> N
     names = [
         f"{row['name']}\n(scikit-learn)" if row["name"] in peers else row["name"] for row in rows
     ]
-    seconds = [row["seconds"] for row in rows]
+    seconds = [median(row["seconds"]) for row in rows]
     axes.scatter(seconds, range(len(rows)), s=60, c=colors)
     for place, value in enumerate(seconds):
         axes.annotate(
@@ -120,7 +121,7 @@ def _folds(axes: Axes, numbers: Mapping[str, Any], report: Mapping[str, Any]) ->
     )
     for place, row in enumerate(numbers["rows"]):
         for shift, (label, color, parts) in zip((-0.27, 0.0, 0.27), kinds, strict=True):
-            seconds = sum(row[part] for part in parts)
+            seconds = sum(median(row[part]) for part in parts)
             first = label if place == 0 else None
             bar = axes.bar(place + shift, seconds, 0.25, color=color, label=first)
             axes.bar_label(bar, fmt="%.3g", fontsize=8)

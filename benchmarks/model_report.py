@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from statistics import median
 from typing import Any
 
 from tactslip_torch.report.tables import aligned
@@ -19,7 +20,7 @@ MEMORY_GB = 1.5
 
 # ------------------------------------------------------------------------------------- numbers
 def ratios(sections: Mapping[str, Any]) -> dict[str, Any]:
-    """What is compared, from what was measured in the same run.
+    """What is compared, from what was measured in the same run; medians of the repeats.
 
     Args:
         sections: name to numbers; any of ``SECTIONS``.
@@ -34,24 +35,32 @@ def ratios(sections: Mapping[str, Any]) -> dict[str, Any]:
     if "accumulation" in sections:
         found["update"] = {
             str(row["batch_bins"]): {
-                f"of_{bare}": row[f"{bare}_s"] / row["update_s"] for bare in ("dsyrk", "gemm")
+                f"of_{bare}": _paired(row[f"{bare}_s"], row["update_s"])
+                for bare in ("dsyrk", "gemm")
             }
             for row in sections["accumulation"]["rows"]
         }
     if "fit" in sections:
         seconds = {row["name"]: row["seconds"] for row in sections["fit"]["rows"]}
         found["over_kernel_ridge"] = {
-            name: taken / seconds["KernelRidge"] for name, taken in seconds.items()
+            name: _paired(taken, seconds["KernelRidge"]) for name, taken in seconds.items()
         }
     if "folds" in sections:
         found["folds"] = {
             str(row["num_bins"]): {
-                "over_fit": row["closed_s"] / row["fit_s"],
-                "over_refits": row["closed_s"] / (row["fit_s"] + row["refits_s"]),
+                "over_fit": _paired(row["closed_s"], row["fit_s"]),
+                "over_refits": _paired(
+                    row["closed_s"], map(sum, zip(row["fit_s"], row["refits_s"], strict=True))
+                ),
             }
             for row in sections["folds"]["rows"]
         }
     return found
+
+
+def _paired(seconds: Iterable[float], others: Iterable[float]) -> float:
+    """Median over the repeats of the ratio within a repeat: drift between repeats cancels."""
+    return median(a / b for a, b in zip(seconds, others, strict=True))
 
 
 def limit_rows(sections: Mapping[str, Any], settings: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -179,7 +188,10 @@ def _accumulation_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> st
     header = ["accumulation", "s / 1000 bins", "dsyrk", "gemm", "of dsyrk", "of gemm"]
     rows = []
     for row in numbers["rows"]:
-        each = [row[f"{name}_s"] * 1000 / row["batch_bins"] for name in ("update", "dsyrk", "gemm")]
+        each = [
+            median(row[f"{name}_s"]) * 1000 / row["batch_bins"]
+            for name in ("update", "dsyrk", "gemm")
+        ]
         shares = of["update"][str(row["batch_bins"])].values()
         cells = [*(f"{value:.3f}" for value in each), *(f"{share:.2f}" for share in shares)]
         rows.append([f"batches of {row['batch_bins']}", *cells])
@@ -190,7 +202,7 @@ def _fit_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
     rows = [
         [
             row["name"],
-            f"{row['seconds']:.2f}",
+            f"{median(row['seconds']):.2f}",
             f"{of['over_kernel_ridge'][row['name']]:.3f}",
             f"{100 * row['accuracy']:.2f}",
             "-" if row["difference"] is None else f"{row['difference']:.1e}",
@@ -208,7 +220,7 @@ def _folds_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
     header += ["folds / fit", "/ refits", "scores - refits"]
     rows = []
     for row in numbers["rows"]:
-        seconds = [f"{row[f'{name}_s']:.2f}" for name in ("fit", "closed", "refits")]
+        seconds = [f"{median(row[f'{name}_s']):.2f}" for name in ("fit", "closed", "refits")]
         over = [f"{value:.2f}" for value in of["folds"][str(row["num_bins"])].values()]
         rows.append([f"{row['num_bins']} bins", *seconds, *over, f"{row['difference']:.1e}"])
     return f"{aligned(header, rows)}\n/ refits: fit and folds in closed form / fit and refits"
