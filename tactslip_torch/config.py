@@ -77,7 +77,15 @@ def run_entry_point(main: Callable[[], Any]) -> None:
 
 def is_first_process() -> bool:
     """Whether this is the only process of a run, or the one that writes and speaks for all."""
-    return os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0")) == "0"
+    return process_number() == 0
+
+
+def process_number() -> int:
+    """The rank of this process in its run, by what torchrun, Lightning or SLURM has set."""
+    for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK"):
+        if name in os.environ:
+            return int(os.environ[name])
+    return 0
 
 
 @contextmanager
@@ -96,13 +104,13 @@ def errors_in_one_line() -> Iterator[None]:
 
 
 def fail(message: str) -> None:
-    """Print one line, if this process is the first, and exit with status 2.
+    """Print one line, with the number of the process if there are several, exit with status 2.
 
     Raises:
         SystemExit: always.
     """
-    if is_first_process():
-        print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    who = "" if is_first_process() else f" in process {process_number()}"
+    print(f"error{who}: {' '.join(message.split())}", file=sys.stderr, flush=True)
     raise SystemExit(EXIT_BAD_INPUT)
 
 

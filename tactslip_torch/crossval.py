@@ -4,7 +4,9 @@ The paper judges one choice of four unseen materials; out of ten there are 210. 
 and for each recipe, features are ranked and scaled, K and C chosen, and a machine fitted on the
 other materials alone; then it is judged on the unseen ones and on held-out cycles of the seen ones.
 Fits take a bounded sample of bins (``train_bins`` of each material and class), so that all splits
-take minutes. Leaves ``crossval.json``, ``crossval.png`` and the resolved configuration.
+take minutes; each sampled bin weighs what it stands for, so the balance of a recipe enters as
+weights only. Validation groups are the materials. Leaves ``crossval.json``, ``crossval.png`` and
+the resolved configuration.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,8 +37,8 @@ from tactslip_torch.experiment import feature_cache, feature_parts, save_config
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.files import whole_file
-from tactslip_torch.fitting import plan_detector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.planning import plan_detector
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe, recalls_mean, stand_for
 from tactslip_torch.report.crossval import crossval_figure, crossval_table
@@ -153,9 +156,8 @@ def crossval(config: DictConfig, folder: Path) -> dict[str, Any]:
     materials = _read(config, source, names)
     choices = list(itertools.combinations(names, num_unseen))
     jobs = [(recipe, unseen) for recipe in recipes.values() for unseen in choices]
-    results: dict[str, list[dict[str, Any]]] = {name: [] for name in recipes}
-    for (recipe, _), result in zip(jobs, _each(materials, jobs, config.num_workers), strict=True):
-        results[recipe.name].append(result)
+    found_in_order = iter(_each(materials, jobs, config.num_workers))
+    results = {name: [next(found_in_order) for _ in choices] for name in recipes}
     found = {
         "simulated": source.is_simulated,
         "seed": config.seed,
@@ -202,11 +204,12 @@ def _each(
     global _shared
     _shared = materials
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    count = count if num_workers is None else num_workers
+    count = min(count, 8) if num_workers is None else num_workers
     if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
         return [_job(job) for job in bar(jobs, "splits", "split")]
-    with multiprocessing.get_context("fork").Pool(count, torch.set_num_threads, (1,)) as pool:
-        return list(bar(pool.imap(_job, jobs), "splits", "split", total=len(jobs)))
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(count, context, torch.set_num_threads, (1,)) as pool:
+        return list(bar(pool.map(_job, jobs), "splits", "split", total=len(jobs)))
 
 
 def _job(job: tuple[Recipe, Sequence[str]]) -> dict[str, Any]:

@@ -262,7 +262,7 @@ class SlipDataModule(L.LightningDataModule):
         recordings = self.split.having(*roles)
         if parts > len(recordings):
             raise ValueError(
-                f"{parts} workers for {len(recordings)} recordings; use fewer processes or shards"
+                f"{parts} processes or shards for {len(recordings)} recordings; use fewer"
             )
         workers = self.num_workers
         if self._shares_processors and self.trainer is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -86,7 +87,11 @@ def make_trainer(
     folder: Path,
     callbacks: Sequence[L.Callback] = (),
 ) -> L.Trainer:
-    """The Lightning trainer of the ``trainer`` section, logging to TensorBoard and CSV."""
+    """The Lightning trainer of the ``trainer`` section, logging to TensorBoard and CSV.
+
+    Raises:
+        ValueError: if torchrun started another number of processes than it has.
+    """
     # Lightning's advertisements and a deprecation inside it are nothing a user can act on
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).*")
@@ -100,6 +105,12 @@ def make_trainer(
         callbacks=[RecordingProgressBar(), *callbacks],
         enable_checkpointing=any(isinstance(callback, Checkpoint) for callback in callbacks),
     )
+    started = int(os.environ.get("WORLD_SIZE", "1"))
+    if started != trainer.world_size:
+        raise ValueError(
+            f"{started} processes were started, the trainer has {trainer.world_size}; add "
+            "trainer.strategy=ddp trainer.devices=PROCESSES_OF_A_HOST trainer.num_nodes=HOSTS"
+        )
     return trainer
 
 

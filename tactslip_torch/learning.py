@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import lightning as L
@@ -21,10 +22,11 @@ from tactslip_torch.data.splits import ROLES
 from tactslip_torch.datamodule import RecordingFeatures, SlipDataModule
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.fitting import Plan, TrainingPass, plan_detector
+from tactslip_torch.fitting import TrainingPass
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import FeatureThreshold
+from tactslip_torch.planning import Plan, plan_detector
 from tactslip_torch.progress import bar
 from tactslip_torch.ranks import from_first_rank, of_all_ranks, sum_over_ranks
 from tactslip_torch.recipe import Recipe
@@ -222,7 +224,7 @@ class SlipLearner(L.LightningModule):
         """What a second pass would gather, of the bins the first one sampled."""
         assert self._plan is not None  # on_train_epoch_end
         sample = self._survey.sample.bins()
-        gathered = TrainingPass(self._plan)
+        gathered = TrainingPass(replace(self._plan, shares=(1.0, 1.0)))
         gathered.update("sample", sample.features, sample.is_slip)
         return gathered
 

@@ -1,9 +1,11 @@
-"""Which batches a statistic holds, so that none is counted twice and none taken out unseen."""
+"""Which batches a statistic holds, and of what: none twice, none taken out unseen, none mixed."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -70,3 +72,28 @@ def content_digest(*tensors: Tensor) -> str:
             content = tensor.detach().cpu().contiguous().view(-1).view(torch.uint8)
             digest.update(content.numpy().data)  # no copy, and NumPy need not know the dtype
     return digest.hexdigest()
+
+
+def first_difference(ours: Any, theirs: Any, name: str = "") -> str:
+    """The path of the first differing key of nested mappings and lists, with both values."""
+    if ours == theirs:
+        return ""
+    if type(ours) is type(theirs) is list:
+        ours, theirs = dict(enumerate(ours)), dict(enumerate(theirs))
+    if type(ours) is type(theirs) is dict:
+        for key in sorted(ours.keys() | theirs.keys()):
+            ours_there = ours.get(key, _ABSENT)
+            found = first_difference(ours_there, theirs.get(key, _ABSENT), f"{name}.{key}")
+            if found:
+                return found
+    return f"{name.removeprefix('.')}: {_shown(ours)} and {_shown(theirs)}"
+
+
+_ABSENT = object()
+
+
+def _shown(value: Any) -> str:
+    if value is _ABSENT:
+        return "nothing"
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -29,14 +29,14 @@ def of_all_ranks(own: Made) -> list[Made]:
 
 
 def from_first_rank(make: Callable[[], Made]) -> Made:
-    """What the first process makes, or the error it raises, in every process."""
+    """What the first process makes, in every process; its error as well, so that none waits."""
     if _num_ranks() == 1:
         return make()
     box: list[Any] = [None, None]
     if torch.distributed.get_rank() == 0:
         try:
             box[0] = make()
-        except ValueError as error:
+        except Exception as error:
             box[1] = error
     torch.distributed.broadcast_object_list(box)
     if box[1] is not None:
@@ -55,9 +55,12 @@ def sum_over_ranks(gathered: TrainingPass) -> None:
                 gathered.merge(part)
         return
     stats = gathered.stats
-    shares = of_all_ranks((stats.ledger, stats.count))
+    shares = of_all_ranks((stats.ledger, stats.count, stats.sums[:, 0].tolist()))
     stats.ledger = Ledger()
-    for ledger, _ in shares:
+    for ledger, _, _ in shares:
         stats.ledger.merge(ledger)  # refuses a recording that two of them saw
-    stats.count = torch.stack([count for _, count in shares]).sum(0)
+    own = torch.distributed.get_rank()
+    others = [brought for rank, (_, _, brought) in enumerate(shares) if rank != own]
+    stats.check_capacity([sum(of_class) for of_class in zip(*others, strict=True)])
+    stats.count = torch.stack([count for _, count, _ in shares]).sum(0)
     torch.distributed.all_reduce(stats.sums)

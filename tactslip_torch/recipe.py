@@ -7,6 +7,7 @@ and ``crossval`` without.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
@@ -42,7 +43,7 @@ class Recipe:
         most_correlation: features that correlate more than this within the classes with one
             already taken are passed over (ours); 1 takes them all.
         compress: scale the signed log of the features (ours).
-        tail: share of training bins beyond the scaled range on either side; they are clipped.
+        tail: share of sampled bins beyond the scaled range on either side; they are clipped.
         kernel: ``"polynomial"`` or ``"rbf"``.
         degree: of the polynomial; 1 and 2 fold into a form of fixed size, others do not.
         offsets: values of the polynomial's ``c`` to choose from.
@@ -52,7 +53,8 @@ class Recipe:
         group_by: what a validation fold leaves out: a ``"material"`` or a fifth of the
             ``"cycle"`` numbers (ours; the authors' search is not described).
         sample_bins: bins of each group and class that the first pass keeps for quantiles,
-            correlations and validation.
+            correlations, the single-feature rival and validation. Exact ranges and the t-test take
+            every bin.
 
     Raises:
         ValueError: for an unknown name or a number that is not positive.
@@ -91,9 +93,15 @@ class Recipe:
             raise ValueError(f"recipe.num_features must be at least 1, got {list(self.sizes)}")
         if self.sample_bins < 2:
             raise ValueError(f"recipe.sample_bins must be at least 2, got {self.sample_bins}")
-        penalties, offsets = _several(self.penalties), _several(self.offsets)
+        if any(size != int(size) for size in self.sizes):
+            raise ValueError(f"recipe.num_features must be whole numbers, got {list(self.sizes)}")
+        penalties, offsets = self.penalties_ascending, _several(self.offsets)
         if not penalties or any(not value > 0 for value in penalties):
             raise ValueError(f"recipe.penalties must be positive, got {list(penalties)}")
+        if len(penalties) > 1 and not math.isfinite(penalties[-1]):
+            raise ValueError(
+                "recipe.penalties: validation needs finite values; give inf alone, or leave it out"
+            )
         if not offsets or any(not value >= 0 for value in offsets):
             raise ValueError(f"recipe.offsets must not be negative, got {list(offsets)}")
         if not 0 <= self.tail < 0.5:
@@ -109,7 +117,23 @@ class Recipe:
     @property
     def sizes(self) -> tuple[int, ...]:
         """Numbers of features to choose from, ascending."""
-        return tuple(sorted(int(size) for size in _several(self.num_features)))
+        return tuple(sorted(_several(self.num_features)))
+
+    @property
+    def penalties_ascending(self) -> tuple[float, ...]:
+        """Values of C to choose from, as numbers."""
+        return tuple(sorted(float(penalty) for penalty in _several(self.penalties)))
+
+    def check_pool(self, num_features: int) -> None:
+        """Refuse a pool that has fewer features than are to be selected.
+
+        Raises:
+            ValueError: if it has.
+        """
+        if self.sizes[-1] > num_features:
+            raise ValueError(
+                f"recipe.num_features={self.sizes[-1]} exceeds the pool's {num_features}"
+            )
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
@@ -120,8 +144,9 @@ class Recipe:
 
     def facts(self) -> dict[str, Any]:
         """All arguments as JSON-able values; ``Recipe(**facts)`` is the same again."""
-        facts = asdict(self)
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in facts.items()}
+        facts = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+        inf = not math.isfinite(self.penalties_ascending[-1])
+        return facts | ({"penalties": ["inf"]} if inf else {})  # JSON has no infinity
 
     def group(self, recording: RecordingId) -> str:
         """The validation group of a recording."""
@@ -230,4 +255,5 @@ def stand_for(sample: SampledBins, recipe: Recipe, counts: Sequence[float]) -> T
 
 
 def _several(value: Any) -> tuple[Any, ...]:
-    return tuple(value) if isinstance(value, Sequence) else (value,)
+    is_several = isinstance(value, Sequence) and not isinstance(value, str)
+    return tuple(value) if is_several else (value,)

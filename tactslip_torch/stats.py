@@ -1,14 +1,18 @@
 """Fit on any batch scheduler, without an engine: ``python -m tactslip_torch.stats action=...``.
 
-    for k in $(seq 16); do ... action=collect shard=$k/16 out=survey-$k.stats; done
-    ... action=merge 'inputs=survey-*.stats' out=survey.stats
-    ... action=plan inputs=survey.stats out=plan.stats
-    for k in $(seq 16); do ... action=collect plan=plan.stats shard=$k/16 out=sums-$k.stats; done
-    ... action=merge 'inputs=sums-*.stats' out=sums.stats
-    ... action=solve plan=plan.stats inputs=sums.stats out=detector.pt
+    alias stats='python -m tactslip_torch.stats'
+    for k in $(seq 16); do stats +exp=unseen4 action=collect shard=$k/16 out=survey-$k.stats; done
+    stats action=merge 'inputs=survey-*.stats' out=survey.stats
+    stats action=plan inputs=survey.stats out=plan.stats
+    for k in $(seq 16); do
+        stats +exp=unseen4 action=collect plan=plan.stats shard=$k/16 out=sums-$k.stats; done
+    stats action=merge 'inputs=sums-*.stats' out=sums.stats
+    stats action=solve plan=plan.stats inputs=sums.stats out=detector.pt
 
-Every file is whole or absent, so a lost shard is made again. Merging is exact, in any order, and
-the detector is the one that a single process makes.
+``collect`` alone reads data, labels, split, features and recipe; the others read what it wrote.
+Every file is whole or absent, so a lost shard is made again. Merging is exact, in any order. The
+detector is bit for bit the one that ``train`` makes of more bins than monomials (7381 for 120
+features); of fewer ``train`` keeps the bins, and the two agree to rounding.
 """
 
 from __future__ import annotations
@@ -32,16 +36,19 @@ from tactslip_torch.features.cache import FeatureCache, cache_key
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.files import load_table, save_table, table_form
-from tactslip_torch.fitting import Plan, plan_detector, solve_sums, training_part
+from tactslip_torch.fitting import solve_sums, training_part
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.ledger import first_difference
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.sufficient import SufficientStats
+from tactslip_torch.planning import Plan, adds_up, plan_detector
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.signals.filtering import ChannelFilter
 
 PLAN_FORM = "tactslip_torch plan 1"
+_CONSEQUENCES = ("plan", "recordings", "training_bins")  # of other differences
 
 
 def stats(config: DictConfig) -> str:
@@ -54,14 +61,23 @@ def stats(config: DictConfig) -> str:
     actions = {"collect": _collect, "merge": _merge, "plan": _plan, "solve": _solve}
     if config.action not in actions:
         raise ValueError(f"action must be one of {', '.join(actions)}, got {config.action!r}")
+    read = [config.plan] if config.plan else []
+    read += _inputs(config.inputs) if config.action != "collect" else []
+    if Path(config.out).resolve() in {Path(path).resolve() for path in read}:
+        raise ValueError(f"out={config.out} is read by this action; give another name")
     return f"{actions[config.action](config)} in {config.out}"
 
 
 def _collect(config: DictConfig) -> str:
     """Survey a shard of the training recordings or, with a plan, add up what that needs."""
     recipe: Recipe = instantiate(config.recipe, _convert_="all")
+    if not all(adds_up(kernel) for kernel in recipe.kernels):
+        raise ValueError(
+            "sums need recipe.kernel=polynomial recipe.degree=2; train fits other kernels"
+        )
     with feature_cache(config.cache) as cache:
         data = _data(config, cache)
+        recipe.check_pool(len(data.maker.pool.names))
         about = _about(config, recipe, data)
         part, parts = _shard(config.shard)
         loader = bar(data.loader(["train"], part - 1, parts), f"shard {config.shard}", "recording")
@@ -92,9 +108,13 @@ def _merge(config: DictConfig) -> str:
         other = _read(path)
         if type(merged) is not type(other):
             raise ValueError(f"{paths[0]} and {path} are of two kinds; merge surveys or sums alone")
-        merged.merge(other)  # type: ignore[arg-type]  # of one type
-    merged.save(config.out)
+        _check_same(other.about, merged.about, path, paths[0])
+        try:
+            merged.merge(other)  # type: ignore[arg-type]  # of one type
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
     missing = set(merged.about["recordings"]) - set(merged.ledger.entries)
+    merged.save(config.out)
     return f"{len(paths)} shards, {len(merged.ledger)} recordings, {len(missing)} missing"
 
 
@@ -185,7 +205,10 @@ def _inputs(given: Any) -> list[str]:
 
 
 def _read(path: str) -> Survey | SufficientStats:
-    return Survey.load(path) if "survey" in table_form(path) else SufficientStats.load(path)
+    found = Survey.load(path) if "survey" in table_form(path) else SufficientStats.load(path)
+    if "recordings" not in found.about:
+        raise ValueError(f"{path} was not made by action=collect; merge it in Python")
+    return found
 
 
 def _only(given: Any, kind: type[Any]) -> Any:
@@ -201,10 +224,10 @@ def _read_plan(path: str) -> tuple[Plan, dict[str, Any]]:
 
 
 def _check_same(ours: Mapping[str, Any], theirs: Mapping[str, Any], what: str, other: str) -> None:
-    for name in sorted(ours.keys() | theirs.keys()):
-        if ours.get(name) != theirs.get(name):
+    for name in sorted(ours.keys() | theirs.keys(), key=lambda key: (key in _CONSEQUENCES, key)):
+        if found := first_difference(ours.get(name), theirs.get(name), name):
             raise ValueError(
-                f"{what} and {other} differ in {name}; use one data set, one configuration and "
+                f"{what} and {other} differ in {found}; use one data set, one configuration and "
                 "one version of the code for all shards"
             )
 

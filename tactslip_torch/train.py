@@ -92,10 +92,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     recipe: Recipe = instantiate(config.recipe, _convert_="all")
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     pool, channel_filter, dtype = feature_parts(source, rule.bin_ms, **config.features)
-    if recipe.sizes[-1] > len(pool.names):
-        raise ValueError(
-            f"recipe.num_features={recipe.sizes[-1]} exceeds the pool's {len(pool.names)}"
-        )
+    recipe.check_pool(len(pool.names))
     is_first = is_first_process()
     if is_first:
         save_config(config, folder)
@@ -137,7 +134,7 @@ def _run_fold(
     if learner.detector is None:
         raise ValueError(
             "the fit ended before its second pass; leave trainer.max_epochs at 2, and resume with "
-            f"ckpt_path={folder}"
+            "ckpt_path=THE_FOLDER_OF_THIS_RUN"
         )
     started = time.perf_counter()
     trainer.test(learner, datamodule=data, verbose=False)

@@ -28,8 +28,9 @@ BAD_INPUT = (ValueError, KeyError, TypeError, OSError, InstantiationException)
 class TinyRecordings:
     """Recordings of a stand-in for real sensors: two strokes, louder while the hand slides.
 
-    ``scene`` may hold ``slide_s``, ``quiet`` (materials that never slip long enough for a bin) and
-    ``rate``; ``channels`` how many of the four channels there are.
+    ``scene`` may hold ``slide_s``, ``quiet`` (materials that never slip long enough for a bin),
+    ``broken`` (a recording that ends in NaN) and ``rate``; ``channels`` how many of the four
+    channels there are.
     """
 
     is_simulated = False
@@ -41,7 +42,7 @@ class TinyRecordings:
             for i, finger in enumerate(("index", "thumb"), 1)
         ]
         self.hand = HandLayout.from_rows(rows[-channels:] if channels else rows)
-        knobs = {"slide_s": 0.8, "quiet": (), "rate": 2000.0} | (scene or {})
+        knobs = {"slide_s": 0.8, "quiet": (), "rate": 2000.0, "broken": ""} | (scene or {})
         self.sample_rate_hz = knobs["rate"]
         self.ids = tuple(RecordingId(m, c) for m in materials for c in range(cycles))
         self._seed, self._knobs = seed, knobs
@@ -71,6 +72,8 @@ class TinyRecordings:
         time_s = torch.arange(num_samples) / self.sample_rate_hz
         for start, end in times.sliding_s:
             noise[:, (time_s >= start) & (time_s < end)] *= 1.3
+        if str(recording) == self._knobs["broken"]:
+            noise[0, 2000:] = torch.nan
         return Recording(
             noise,
             self.sample_rate_hz,

@@ -77,6 +77,18 @@ def test_the_command_judges_every_choice_with_every_recipe(tmp_path, capsys):
     assert "SIMULATED" not in out  # the stand-in says it is not
 
 
+def test_recipes_are_told_apart_by_their_keys(tmp_path):
+    third = ("+recipe@recipes.welch=paper", "recipes.welch.num_features=4")
+    third += ("recipes.welch.penalties=0.1",)
+    found = crossval(composed(*TINY, *third, "num_unseen=1", name="crossval"), tmp_path)
+    assert {name: len(splits) for name, splits in found["splits"].items()} == {
+        "paper": 4,
+        "robust": 4,
+        "welch": 4,
+    }
+    assert {split["num_features"] for split in found["splits"]["welch"]} == {4}
+
+
 def test_the_number_of_processes_changes_nothing(tmp_path):
     alone = crossval(composed(*TINY, "num_workers=0", name="crossval"), tmp_path / "0")
     several = crossval(composed(*TINY, "num_workers=2", name="crossval"), tmp_path / "2")

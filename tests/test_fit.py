@@ -107,7 +107,7 @@ def test_the_two_routes_agree(num_features, num_bins, kernel, weighted, rng):
         assert (np.abs(primal - terms.sum(-1)) <= 1e-9 * scale).all()
 
 
-@pytest.mark.parametrize(("kernel", "crossover"), [(PAPER_KERNEL, 10), (Polynomial(1, 0.5), 4)])
+@pytest.mark.parametrize(("kernel", "crossover"), [(PAPER_KERNEL, 16), (Polynomial(1, 0.5), 4)])
 def test_many_bins_go_through_the_primal_and_few_do_not(kernel, crossover, rng, monkeypatch):
     few, many = draw(rng, crossover), draw(rng, crossover + 1)
     monkeypatch.setattr(fit, "solve_kernel_elm_", None)  # the primal has no need of it

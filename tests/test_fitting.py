@@ -1,13 +1,16 @@
 """Plans and passes: what is chosen, and that neither order nor workers matter."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 from test_recipe import make_parts, surveyed, together
 
-from tactslip_torch.fitting import Plan, TrainingPass, plan_detector
+from tactslip_torch import planning
+from tactslip_torch.fitting import TrainingPass
 from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.planning import Plan, plan_detector
 from tactslip_torch.recipe import Recipe, recalls_mean
 
 
@@ -114,6 +117,46 @@ def test_one_group_leaves_nothing_to_validate(rng, caplog):
     assert plan.penalty == 0.2
     assert plan.validation == []
     assert "unvalidated" in caplog.text
+
+
+def test_unvalidated_it_is_the_middle_penalty_of_the_most_features(rng, caplog):
+    recipe = Recipe(num_features=[2, 3], offsets=[0.5, 2.0], penalties=(3.0, 0.1, 0.2))
+    plan = planned(recipe, make_parts(rng, "a"))
+    assert (len(plan.frame.selected), plan.penalty) == (3, 0.2)
+    assert "K=3" in caplog.text
+
+
+def test_groups_of_one_class_each_cannot_validate(rng):
+    parts = [
+        (recording, features, torch.full_like(is_slip, recording.material in "ab"))
+        for recording, features, is_slip in make_parts(rng, "abcd")
+    ]
+    with pytest.raises(ValueError, match="no validation group has bins of both classes"):
+        planned(Recipe(**FEW), parts)
+
+
+@pytest.mark.parametrize("change", [{"degree": 3}, {"kernel": "rbf", "gamma": 0.3}], ids=str)
+@pytest.mark.parametrize("balance", ["undersample", "weights"])
+def test_thinned_bins_stand_for_all(change, balance, rng, monkeypatch, caplog):
+    parts = make_parts(rng, cycles=5, bins=80, share=0.6)
+    recipe = Recipe(**FEW | {"penalties": 0.01}, balance=balance, **change)
+    whole = planned(recipe, parts)
+    monkeypatch.setattr(planning, "MOST_KEPT_BINS", 300)
+    thinned = planned(recipe, parts)
+    assert (whole.stands_for, thinned.num_bins) == (1.0, 300)
+    assert thinned.stands_for == pytest.approx(whole.num_bins / 300, rel=1e-3)
+    assert "takes 300 of" in caplog.text
+    z = whole.frame(together(parts)[0])
+    full, few = (passed(plan, parts).solve()(z) for plan in (whole, thinned))
+    lighter = passed(replace(thinned, stands_for=1.0), parts).solve()(z)
+    assert (few - full).square().mean() < 0.5 * (lighter - full).square().mean()
+
+
+def test_degree_one_takes_every_bin(rng, monkeypatch):
+    monkeypatch.setattr(planning, "MOST_KEPT_BINS", 50)
+    parts = make_parts(rng)
+    plan = planned(Recipe(**FEW, degree=1, balance="weights"), parts)
+    assert sum(len(z) for z, _ in passed(plan, parts).bins.values()) == plan.num_bins == 240
 
 
 def test_a_single_choice_is_taken_as_it_is(rng):

@@ -196,8 +196,8 @@ def test_the_head_is_the_machine_of_all_bins(num_bins, kernel, weighted, rng):
 @pytest.mark.parametrize(
     ("num_bins", "kernel", "route"),
     [
-        (15, PAPER_KERNEL, "dual"),  # 4 features: 15 monomials of degree 2, 5 of degree 1
-        (16, PAPER_KERNEL, "primal"),
+        (23, PAPER_KERNEL, "dual"),  # 4 features: 15 monomials, 70 sums at degree 2; 5 at degree 1
+        (24, PAPER_KERNEL, "primal"),
         (5, LINE, "dual"),
         (6, LINE, "primal"),
         (60, CUBIC, "dual"),

@@ -85,7 +85,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "report.*": ("report.*", "files"),
     "datamodule": ("data.*", "simulation.*", "signals.*", "features.*", "hand"),
     "recipe": ("model.*", "features.*", "data.recording"),
-    "fitting": ("recipe", "model.*", "features.*", "ledger"),
+    "planning": ("recipe", "model.*", "features.*"),
+    "fitting": ("planning", "model.*", "features.*", "ledger"),
     "learning": (
         "datamodule",
         "data.*",
@@ -93,6 +94,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "features.*",
         "model.*",
         "recipe",
+        "planning",
         "fitting",
         "report.*",
         "progress",

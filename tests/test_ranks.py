@@ -61,6 +61,37 @@ def test_torchrun_starts_it_as_well(cache, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"alone", "ddp"}
 
 
+def test_what_another_process_cannot_read_is_named(cache, tmp_path):
+    scene = "+data.scene.broken=A/1"  # the second of the training recordings
+    done = launched(tmp_path / "ddp", "cache=off", scene, "trainer.strategy=ddp",
+                    "trainer.devices=2")  # fmt: skip
+    assert done.returncode != 0
+    assert "error in process 1: A/1: channel" in done.stderr
+    assert "is not finite near" in done.stderr
+
+
+def test_torchrun_without_its_strategy_is_refused(cache, tmp_path):
+    done = launched(tmp_path / "ddp", cache, torchrun=2)
+    assert done.returncode != 0
+    assert "2 processes were started, the trainer has 1; add trainer.strategy=ddp" in done.stderr
+    assert {path.name for path in tmp_path.iterdir()} <= {"ddp"}
+
+
+def test_folds_with_uneven_shares_under_several_processes(cache, tmp_path):
+    folds = ("split=leave_one_material_out", "split.materials=[A,B,C]")
+    folds += ("data.cycles=5", "split.train_share=0.6")
+    plain = [o for o in TINY if not o.startswith("split.")]
+    _, alone = run_train(tmp_path / "alone", *plain, *folds, cache)
+    command = [sys.executable, "-m", "tactslip_torch.train", *plain, *folds]
+    command += [cache, f"hydra.run.dir={tmp_path / 'ddp'}", "trainer.strategy=ddp"]
+    environment = dict(os.environ) | {"PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([*command, "trainer.devices=4"], cwd=tmp_path, env=environment,
+                          capture_output=True, text=True, timeout=300)  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    together = json.loads((tmp_path / "ddp" / "metrics.json").read_text())
+    assert together["splits"] == alone["splits"]
+
+
 def test_more_processes_than_recordings_is_one_line(cache, tmp_path):
     done = launched(
         tmp_path / "ddp",
@@ -71,4 +102,4 @@ def test_more_processes_than_recordings_is_one_line(cache, tmp_path):
         "trainer.devices=3",
     )
     assert done.returncode != 0
-    assert "3 workers for 2 recordings; use fewer processes or shards" in done.stderr
+    assert "3 processes or shards for 2 recordings; use fewer" in done.stderr

@@ -1,5 +1,7 @@
 """The recipe's choices, on what a first pass learned of random bins."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -136,6 +138,13 @@ def test_recalls_mean_by_hand():
     assert recalls_mean(says[:2], truth[:2]) is None
 
 
+def test_facts_are_json_even_of_an_infinite_penalty():
+    for recipe in (Recipe(), Recipe(penalties=float("inf")), Recipe(num_features=[3, 5])):
+        again = Recipe(**json.loads(json.dumps(recipe.facts(), allow_nan=False)))
+        assert again.penalties_ascending == recipe.penalties_ascending
+        assert again.sizes == recipe.sizes
+
+
 def test_groups_are_materials_or_fifths_of_the_cycles():
     assert Recipe().group(RecordingId("M1", 7)) == "M1"
     assert Recipe(group_by="cycle").group(RecordingId("M1", 7)) == "2"
@@ -152,6 +161,8 @@ def test_groups_are_materials_or_fifths_of_the_cycles():
         ({"penalties": ()}, r"recipe.penalties must be positive, got \[\]"),
         ({"penalties": (0.1, 0.0)}, r"recipe.penalties must be positive"),
         ({"penalties": float("nan")}, r"recipe.penalties must be positive"),
+        ({"penalties": (0.1, float("inf"))}, r"validation needs finite values"),
+        ({"num_features": 1.5}, r"recipe.num_features must be whole numbers, got \[1.5\]"),
         ({"num_features": 0}, r"recipe.num_features must be at least 1"),
         ({"offsets": -1.0}, r"recipe.offsets must not be negative"),
         ({"tail": 0.5}, r"recipe.tail must lie in \[0, 0.5\)"),

@@ -117,7 +117,7 @@ def test_a_damaged_shard_is_refused_and_nothing_is_lost(made, tmp_path, kind, ha
         ("features.level=3", "pool"),
         ("data.channels=3", "channels"),
         ("labels.bin_ms=100", "pool"),
-        ("seed=5", "recordings"),
+        ("seed=5", "seed: 0 and 5"),
         ("features.dtype=float32", "features_dtype"),
     ],
 )
@@ -143,7 +143,7 @@ def test_a_plan_of_other_data_is_refused(made, tmp_path):
         ("collect", ("shard=0/3",), "shard must be like 3/16"),
         ("collect", ("shard=4/3",), "shard must be like 3/16"),
         ("collect", ("shard=x",), "shard must be like 3/16"),
-        ("collect", ("shard=1/99",), "99 workers for 12 recordings"),
+        ("collect", ("shard=1/99",), "99 processes or shards for 12 recordings"),
         ("merge", (), "no inputs"),
         ("merge", ("inputs=nowhere-*.stats",), "no file fits inputs=nowhere"),
         ("merge", ("inputs=nowhere.stats",), "no file at nowhere.stats"),
@@ -159,6 +159,45 @@ def test_bad_input_is_one_line(tmp_path, action, overrides, line):
     assert line in str(error.value)
     assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_output_never_takes_the_place_of_an_input(made, tmp_path):
+    folder, cache, *_ = made
+    plan = tmp_path / "plan.stats"
+    shutil.copy(folder / "plan.stats", plan)
+    shutil.copy(folder / "survey.stats", tmp_path / "survey.stats")
+    for action, out, override in (
+        ("collect", plan, f"plan={plan}"),
+        ("plan", tmp_path / "survey.stats", f"inputs={tmp_path / 'survey.stats'}"),
+        ("merge", tmp_path / "survey.stats", f"inputs={tmp_path}/surv*.stats"),
+    ):
+        before = out.read_bytes()
+        with pytest.raises(ValueError, match="is read by this action; give another name"):
+            act(action, out, cache, override)
+        assert out.read_bytes() == before
+
+
+def test_a_kernel_that_does_not_add_up_is_refused_at_once(tmp_path):
+    for override in ("recipe.degree=3", "recipe.degree=1"):
+        with pytest.raises(ValueError, match=r"sums need recipe.kernel=polynomial"):
+            act("collect", tmp_path / "survey.stats", override)
+    with pytest.raises(ValueError, match=r"recipe.num_features=3000 exceeds"):
+        act("collect", tmp_path / "survey.stats", "recipe.num_features=3000")
+
+
+def test_few_bins_agree_with_train_to_rounding(made, tmp_path):
+    _, cache, *_ = made
+    few = ("recipe.num_features=40", cache)  # 861 monomials
+    run_train(tmp_path, *TINY, *MANY, *few)
+    act("collect", tmp_path / "survey.stats", *few)
+    act("plan", tmp_path / "plan.stats", f"inputs={tmp_path / 'survey.stats'}")
+    plan = f"plan={tmp_path / 'plan.stats'}"
+    act("collect", tmp_path / "sums.stats", *few, plan)
+    act("solve", tmp_path / "shards.pt", f"inputs={tmp_path / 'sums.stats'}", plan)
+    ours = SlipDetector.load(tmp_path / "shards.pt").head
+    theirs = SlipDetector.load(tmp_path / "detector.pt").head
+    z = torch.rand(50, 40, dtype=torch.float64) * 2 - 1
+    torch.testing.assert_close(ours(z), theirs(z), rtol=1e-8, atol=1e-8)
 
 
 def test_files_of_two_kinds_do_not_mix(made, tmp_path):

@@ -333,12 +333,18 @@ def test_a_batch_is_added_once_and_taken_out_as_it_was():
         (SufficientStats(3, ABOUT), "num_features: 4 and 3"),
         (SufficientStats(NUM, ABOUT, grid_bits=30), "grid_bits: 38 and 30"),
         (SufficientStats(NUM), "about.hand: .* and nothing"),
-        (SufficientStats(NUM, ABOUT | {"scaler": "quantile"}), "about.scaler: range and quantile"),
+        (
+            SufficientStats(NUM, ABOUT | {"scaler": "quantile"}),
+            'about.scaler: "range" and "quantile"',
+        ),
         (
             SufficientStats(NUM, ABOUT | {"hand": {"name": "paper24", "channels": ["SG1", "SG2"]}}),
-            "about.hand.channels.1: PVDF1 and SG2",
+            'about.hand.channels.1: "PVDF1" and "SG2"',
         ),
-        (SufficientStats(NUM, ABOUT | {"names": ["x" * 99]}), r"about.names: nothing and \['x+\.+"),
+        (
+            SufficientStats(NUM, ABOUT | {"names": ["x" * 99]}),
+            r"about.names: nothing and \[\"x+\.+",
+        ),
         (stats_of(make_batches()), "8 batches are in both statistics, such as 'M0/0'"),
     ],
 )

@@ -13,7 +13,7 @@ from torch import Tensor
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.selection import ClassMoments
 from tactslip_torch.files import load_table, save_table
-from tactslip_torch.ledger import Ledger, content_digest
+from tactslip_torch.ledger import Ledger, content_digest, first_difference
 
 FORMAT = "tactslip_torch survey 1"
 
@@ -95,7 +95,7 @@ class Survey:
         """
         ours = {"about": self.about, "sample_bins": self.sample.most}
         theirs = {"about": other.about, "sample_bins": other.sample.most}
-        if difference := _first_difference(ours, theirs):
+        if difference := first_difference(ours, theirs):
             raise ValueError(f"cannot merge surveys that differ in {difference}")
         moments = self.moments.merge(other.moments)
         self.ledger.merge(other.ledger)
@@ -159,28 +159,3 @@ def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {
         name.removeprefix(prefix): part for name, part in tensors.items() if name.startswith(prefix)
     }
-
-
-def _first_difference(ours: Any, theirs: Any, name: str = "") -> str:
-    """The path of the first differing key of nested mappings and lists, with both values."""
-    if ours == theirs:
-        return ""
-    if type(ours) is type(theirs) is list:
-        ours, theirs = dict(enumerate(ours)), dict(enumerate(theirs))
-    if type(ours) is type(theirs) is dict:
-        for key in sorted(ours.keys() | theirs.keys()):
-            ours_there = ours.get(key, _ABSENT)
-            found = _first_difference(ours_there, theirs.get(key, _ABSENT), f"{name}.{key}")
-            if found:
-                return found
-    return f"{name.removeprefix('.')}: {_shown(ours)} and {_shown(theirs)}"
-
-
-_ABSENT = object()
-
-
-def _shown(value: Any) -> str:
-    if value is _ABSENT:
-        return "nothing"
-    text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from tactslip_torch.model.cholesky import cholesky_, cholesky_solve, forward_solve
 from tactslip_torch.model.downdate import Monomials, residuals_by_block, residuals_by_iteration
-from tactslip_torch.model.fit import Route, TrainingBins
+from tactslip_torch.model.fit import Route, TrainingBins, takes_dual
 from tactslip_torch.model.kernel_elm import solve_kernel_elm_, solve_normal_equations_
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, lower_gram
@@ -158,8 +158,8 @@ def _monomials_of(kernel: Kernel, z: Tensor, route: Route) -> Monomials | None:
             raise ValueError(f"{kernel} has no primal of fixed size; take route='dual' or 'auto'")
         return None
     monomials = Monomials(kernel, z.shape[1])
-    fewer = len(z) <= monomials.number
-    return None if route == "dual" or (route == "auto" and fewer) else monomials
+    cheaper = takes_dual(kernel, len(z), z.shape[1])
+    return None if route == "dual" or (route == "auto" and cheaper) else monomials
 
 
 def _num_small(groups: Groups, num_monomials: int) -> int:

@@ -12,14 +12,14 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from tactslip_torch.files import load_table, save_table
-from tactslip_torch.ledger import Ledger, content_digest
+from tactslip_torch.ledger import Ledger, content_digest, first_difference
 from tactslip_torch.model.cholesky import cholesky_, cholesky_solve
 from tactslip_torch.model.fourth_moments import (
     ProductSums,
@@ -34,7 +34,6 @@ from tactslip_torch.model.quadratic import QuadraticForm, from_primal
 FORMAT = "tactslip_torch sums 1"
 _CLASSES = ("non-slip", "slip")
 _MOST = 2**62  # of any sum: half of what int64 holds
-_SHOWN = 60  # characters of a value in an error
 
 
 class SufficientStats:
@@ -110,7 +109,7 @@ class SufficientStats:
         """
         z, is_slip, weights = self._checked(batch_id, z, is_slip, weights)
         steps = 2.0**self.grid_bits
-        self._check_capacity([int(weights[of].sum() * steps) for of in (~is_slip, is_slip)])
+        self.check_capacity([int(weights[of].sum() * steps) for of in (~is_slip, is_slip)])
         self.ledger.add(batch_id, content_digest(z, is_slip, weights))
         self._add(z, is_slip, weights, 1)
 
@@ -140,9 +139,9 @@ class SufficientStats:
                 number of features or in the grid, or if there is no room.
         """
         for name in ("num_features", "grid_bits", "about"):
-            if found := _first_difference(getattr(self, name), getattr(other, name), name):
+            if found := first_difference(getattr(self, name), getattr(other, name), name):
                 raise ValueError(f"cannot merge sums that differ in {found}")
-        self._check_capacity(other.sums[:, 0].tolist())
+        self.check_capacity(other.sums[:, 0].tolist())
         self.ledger.merge(other.ledger)
         self.sums += other.sums
         self.count += other.count
@@ -264,8 +263,17 @@ class SufficientStats:
             raise ValueError(f"batch {batch_id!r}: {error}") from None
         return z, is_slip, weights
 
-    def _check_capacity(self, brought: list[int]) -> None:
-        """The first sum, of weights, is the largest: no product of four is above 1."""
+    def check_capacity(self, brought: Sequence[int]) -> None:
+        """Refuse what the sums have no room for.
+
+        The first sum, of weights, is the largest: no product of four is above 1.
+
+        Args:
+            brought: what is to be added to the first sum of non-slip and of slip.
+
+        Raises:
+            ValueError: if that is too much.
+        """
         for name, held, more in zip(_CLASSES, self.sums[:, 0].tolist(), brought, strict=True):
             if held + more > _MOST:
                 raise ValueError(
@@ -279,21 +287,3 @@ class SufficientStats:
             if bool(of.any()):
                 add_products_(self.sums[label], z[of], weights[of], self.grid_bits, sign)
             self.count[label] += sign * int(of.sum())
-
-
-def _first_difference(ours: Any, theirs: Any, name: str) -> str:
-    """The path of the first differing key of nested mappings and lists, with both values."""
-    if type(ours) is type(theirs) is list:
-        ours, theirs = dict(enumerate(ours)), dict(enumerate(theirs))
-    if type(ours) is type(theirs) is dict:
-        for key in sorted(ours.keys() | theirs.keys()):
-            our, their = ours.get(key, "nothing"), theirs.get(key, "nothing")
-            if found := _first_difference(our, their, f"{name}.{key}"):
-                return found
-        return ""
-    return "" if ours == theirs else f"{name}: {_shown(ours)} and {_shown(theirs)}"
-
-
-def _shown(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."

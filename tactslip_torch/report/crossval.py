@@ -41,6 +41,9 @@ def split_rows(found: Mapping[str, Any]) -> list[list[str]]:
     for name, splits in found["splits"].items():
         for role in ("test", "unseen"):
             scores = sorted(_scores(splits, role))
+            if not scores:
+                rows.append([name, role, *["-"] * 7, "0"])
+                continue
             of_all = [mean(scores), _spread(scores), scores[0], _quantile(scores, 0.05)]
             of_all += [median(scores), scores[-1]]
             cells = _percents(*of_all, _of_paper(splits, role))
@@ -92,9 +95,11 @@ def material_scores(splits: Sequence[Mapping[str, Any]], material: str) -> list[
 
 def _distribution(axes: Axes, found: Mapping[str, Any]) -> None:
     """Splits in the order of their scores; the paper's own choice is marked."""
-    for colour, (name, splits) in zip(_COLOURS, found["splits"].items(), strict=False):
-        ordered = sorted(splits, key=lambda split: float(split["unseen"] or 0))
-        scores = [100 * float(split["unseen"] or 0) for split in ordered]
+    for number, (name, splits) in enumerate(found["splits"].items()):
+        colour = _COLOURS[number % len(_COLOURS)]
+        known = [split for split in splits if split["unseen"] is not None]
+        ordered = sorted(known, key=lambda split: float(split["unseen"]))
+        scores = [100 * float(split["unseen"]) for split in ordered]
         share = [(place + 0.5) / len(scores) for place in range(len(scores))]
         label = f"{name}: mean {mean(scores):.1f}"
         axes.plot(scores, share, color=colour, linewidth=2, label=label)

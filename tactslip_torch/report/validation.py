@@ -38,7 +38,7 @@ def validation_table(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> s
                 worst,
             ]
         )
-    header = ["chosen", "K", "kernel", "C", "held-out %", "worst %", "group"]
+    header = ["chosen", "K", "kernel", "C", "validation %", "worst %", "group"]
     head = [SIMULATED_LINE] if simulated else []
     return "\n".join([*head, aligned(header, cells)])
 
@@ -75,7 +75,7 @@ def validation_figure(
     axes.plot(chosen["penalty"], 100 * best, "*", color="black", markersize=14, label="chosen")
     axes.set_xscale("log")
     axes.set_xlabel("C")
-    axes.set_ylabel("balanced accuracy on held-out groups, %")
+    axes.set_ylabel("balanced accuracy, group left out, ranking held, %")
     kind = " (simulated data)" if simulated else ""
     axes.set_title(f"Choice on training groups left out one at a time{kind}", fontsize=11)
     axes.grid(color="#DDDDDD")

@@ -1,0 +1,208 @@
+"""From a first pass to a plan: features, scaling, K, c and C.
+
+All is chosen from what the first pass learned of the training bins. Pure of any engine.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from tactslip_torch.features.survey import Survey
+from tactslip_torch.model.fit import TrainingBins
+from tactslip_torch.model.held_out import HeldOut
+from tactslip_torch.model.kernels import Kernel, Polynomial, kernel_from_dict
+from tactslip_torch.model.quadratic import num_quadratic_features
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.model.threshold import FeatureThreshold, best_threshold
+from tactslip_torch.recipe import (
+    Frame,
+    Recipe,
+    choose_frame,
+    kept_shares,
+    recalls_mean,
+    stand_for,
+)
+
+log = logging.getLogger(__name__)
+
+MOST_KEPT_BINS = 8192
+"""So many bins at most for a kernel that does not fold: its machine is a matrix of bins by bins."""
+
+Progress = Callable[[Iterable[Any], str], Iterable[Any]]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is decided before the second pass.
+
+    Args:
+        frame: which features, how scaled.
+        kernel: of the machine.
+        penalty: the paper's ``C``.
+        balance: how the classes are balanced.
+        shares: of non-slip and slip bins that are trained on.
+        stands_for: how many bins each of those stands for, as in validation.
+        num_bins: how many bins are trained on; about, where shares are below 1.
+        threshold: the best single selected feature, a rival to be reported beside.
+        validation: one row per choice: what was chosen from, and the balanced accuracy of
+            each held-out group.
+    """
+
+    frame: Frame
+    kernel: Kernel
+    penalty: float
+    balance: str
+    shares: tuple[float, float]
+    stands_for: float
+    num_bins: int
+    threshold: FeatureThreshold
+    validation: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def adds_up(self) -> bool:
+        """Whether training bins become sums of fixed size; few bins, or other kernels, do not."""
+        fewer = self.num_bins <= num_quadratic_features(len(self.frame.selected))
+        return adds_up(self.kernel) and not fewer
+
+    def facts(self) -> dict[str, Any]:
+        """JSON-able; ``Plan.of`` takes it together with the tensors of the scaler."""
+        return {
+            "selected": list(self.frame.selected),
+            "kernel": self.kernel.to_dict(),
+            "penalty": _json_number(self.penalty),
+            "balance": self.balance,
+            "shares": list(self.shares),
+            "stands_for": self.stands_for,
+            "num_bins": self.num_bins,
+            "rival": self.threshold.to_dict(),
+            "validation": self.validation,
+        }
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any], scaler: FeatureScaler) -> Plan:
+        """The plan that ``facts`` described."""
+        return cls(
+            frame=Frame(tuple(facts["selected"]), scaler),
+            kernel=kernel_from_dict(facts["kernel"]),
+            penalty=float(facts["penalty"]),
+            balance=facts["balance"],
+            shares=(facts["shares"][0], facts["shares"][1]),
+            stands_for=facts["stands_for"],
+            num_bins=facts["num_bins"],
+            threshold=FeatureThreshold(**facts["rival"]),
+            validation=list(facts["validation"]),
+        )
+
+
+def plan_detector(recipe: Recipe, survey: Survey, progress: Progress) -> Plan:
+    """Rank, scale, and choose K, c and C by closed-form validation on held-out groups.
+
+    A held-out score is that of the machine refitted without the bin's group, from one
+    factorisation per choice (``model.held_out``), with ranking and scaling held. So it chooses,
+    but it is not what may be reported: for that, ranking and scaling are redone (``crossval``).
+
+    Raises:
+        ValueError: if a class is absent or a solve fails.
+    """
+    frame = choose_frame(recipe, survey)
+    sample = survey.sample.bins()
+    counts = survey.moments.count.tolist()
+    weights = stand_for(sample, recipe, counts)
+    choices = [
+        (size, kernel, penalty)
+        for size in recipe.sizes
+        for kernel in recipe.kernels
+        for penalty in recipe.penalties_ascending
+    ]
+    rows: list[dict[str, Any]] = []
+    if len(choices) > 1 and len(sample.group_names) > 1:
+        bins = TrainingBins(frame(sample.features), sample.is_slip, weights)
+        rows = _validate(bins, sample.group, sample.group_names, choices, progress)
+        best = max(row["mean"] for row in rows)
+        place = next(i for i, row in enumerate(rows) if row["mean"] == best)
+    else:
+        num = len(recipe.penalties_ascending)  # of the most features and the last kernel
+        place = len(choices) - num + num // 2
+        if len(choices) > 1:
+            log.warning("K=%d, %s, C=%g are taken unvalidated: one group", *choices[place])
+    size, kernel, penalty = choices[place]
+    shares = kept_shares(recipe, counts)
+    num_bins = sum(count * share for count, share in zip(counts, shares, strict=True))
+    stands_for = 1.0
+    if num_bins > MOST_KEPT_BINS and not kernel.collapses:
+        log.warning(
+            "%s takes %d of %d training bins: its machine does not fold to a fixed size",
+            kernel,
+            MOST_KEPT_BINS,
+            num_bins,
+        )
+        stands_for = num_bins / MOST_KEPT_BINS
+        shares = [share / stands_for for share in shares]
+        num_bins = MOST_KEPT_BINS
+    frame = frame.first(size)
+    selected = sample.features[:, list(frame.selected)].double()
+    return Plan(
+        frame=frame,
+        kernel=kernel,
+        penalty=penalty,
+        balance=recipe.balance,
+        shares=(shares[0], shares[1]),
+        stands_for=stands_for,
+        num_bins=round(num_bins),
+        threshold=best_threshold(selected, sample.is_slip),
+        validation=rows,
+    )
+
+
+def _validate(
+    bins: TrainingBins,
+    groups: Tensor,
+    names: Sequence[str],
+    choices: Sequence[tuple[int, Kernel, float]],
+    progress: Progress,
+) -> list[dict[str, Any]]:
+    rows = []
+    machine: HeldOut | None = None
+    made_of: Any = None
+    for number in progress(range(len(choices)), "choose C on held-out groups"):
+        size, kernel, penalty = choices[number]
+        if made_of != (size, kernel):
+            few = TrainingBins(bins.features[:, :size], bins.is_slip, bins.weights)
+            machine, made_of = HeldOut(few, groups, kernel), (size, kernel)
+        assert machine is not None
+        says_slip = machine.at(penalty).scores >= 0
+        by_group = {
+            name: recalls_mean(says_slip[groups == index], bins.is_slip[groups == index])
+            for index, name in enumerate(names)
+        }
+        known = [value for value in by_group.values() if value is not None]
+        if not known:
+            raise ValueError(
+                "no validation group has bins of both classes; take another recipe.group_by, or "
+                "one value of recipe.penalties"
+            )
+        rows.append(
+            {
+                "num_features": size,
+                "kernel": kernel.to_dict(),
+                "penalty": penalty,
+                "mean": sum(known) / len(known),
+                "balanced_accuracy": by_group,
+            }
+        )
+    return rows
+
+
+def adds_up(kernel: Kernel) -> bool:
+    """Whether training bins add up to sums of fixed size, as they do for degree 2."""
+    return isinstance(kernel, Polynomial) and kernel.degree == 2
+
+
+def _json_number(value: float) -> float | str:
+    return value if math.isfinite(value) else "inf"  # JSON has no infinity
