@@ -111,7 +111,9 @@ def fit(sizes: Sizes) -> dict[str, Any]:
 
     calls: dict[str, Callable[[], Any]] = {
         "fit_machine": lambda: fit_machine(bins, sizes.penalty, sizes.kernel),
-        "fit_machine, dual": lambda: fit_machine(bins, sizes.penalty, sizes.kernel, route="dual"),
+        "fit_machine, primal": lambda: fit_machine(
+            bins, sizes.penalty, sizes.kernel, route="primal"
+        ),
         "SufficientStats": additive,
         "KernelRidge": lambda: ridge.fit(z.numpy(), bins.targets.numpy()),
         "SVC": lambda: _svc(sizes).fit(*_numpy(z, is_slip)),

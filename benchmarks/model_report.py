@@ -100,10 +100,11 @@ def _limits(
         yield f"accumulation speed, batches of {num}", measured, limit, ok
     if "fit" in sections:
         for row in sections["fit"]["rows"]:
-            if row["name"] not in ("KernelRidge", "SVC"):
-                over = of["over_kernel_ridge"][row["name"]]
-                what = f"seconds of {row['name']} / KernelRidge"
+            if row["name"] == "fit_machine":  # the others show what another route would cost
+                over = of["over_kernel_ridge"]["fit_machine"]
+                what = "seconds, fit_machine / KernelRidge"
                 yield what, f"{over:.3f}", f"< {OVER_RIDGE:g}", over < OVER_RIDGE
+            if row["name"] not in ("KernelRidge", "SVC"):
                 what = f"scores of {row['name']} - KernelRidge"
                 ok = row["difference"] < SCORE_DIFFERENCE
                 yield what, f"{row['difference']:.1e}", f"< {SCORE_DIFFERENCE:g}", ok

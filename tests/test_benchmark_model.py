@@ -165,7 +165,7 @@ def test_every_limit_can_be_met() -> None:
         ("latency over training bins, most / least, one", "size__rows__1__head_s__1", 1.101e-5),
         ("latency over training bins, most / least, 256", "size__rows__0__head_s__256", 0.94e-4),
         ("latency, SVC / head", "size__svc__seconds__1", 20 * 1.05e-5),
-        ("seconds of fit_machine / KernelRidge", "fit__rows__0__seconds", [16.1]),
+        ("seconds, fit_machine / KernelRidge", "fit__rows__0__seconds", [16.1]),
         ("scores of fit_machine - KernelRidge", "fit__rows__0__difference", 1e-7),
         ("fit and folds / fit, 6000", "folds__rows__0__fit_s", [1.6]),
         ("fit and folds / refits, 6000", "folds__rows__0__refits_s", [6.0]),
