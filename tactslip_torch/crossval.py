@@ -32,8 +32,9 @@ from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, seen6
-from tactslip_torch.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.experiment import feature_cache, feature_parts, save_config
+from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.files import whole_file

@@ -24,7 +24,7 @@ from tactslip_torch.config import (
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
-from tactslip_torch.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.experiment import (
     DTYPES,
     common_facts,
@@ -33,6 +33,7 @@ from tactslip_torch.experiment import (
     make_trainer,
     save_config,
 )
+from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector

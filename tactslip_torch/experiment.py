@@ -106,7 +106,7 @@ def make_trainer(
         enable_checkpointing=any(isinstance(callback, Checkpoint) for callback in callbacks),
     )
     started = int(os.environ.get("WORLD_SIZE", "1"))
-    if started != trainer.world_size:
+    if "TORCHELASTIC_RUN_ID" in os.environ and started != trainer.world_size:
         raise ValueError(
             f"{started} processes were started, the trainer has {trainer.world_size}; add "
             "trainer.strategy=ddp trainer.devices=PROCESSES_OF_A_HOST trainer.num_nodes=HOSTS"

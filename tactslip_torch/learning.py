@@ -19,7 +19,8 @@ from torch import Tensor, nn
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import ROLES
-from tactslip_torch.datamodule import RecordingFeatures, SlipDataModule
+from tactslip_torch.datamodule import SlipDataModule
+from tactslip_torch.feature_maker import RecordingFeatures
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.fitting import TrainingPass
@@ -105,6 +106,8 @@ class SlipLearner(L.LightningModule):
 
     def training_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
         """Survey in the first epoch, gather what the plan needs in the second."""
+        if not batch:  # NOTHING
+            return
         self._count_seconds(batch)
         mask = batch.roles["train"]
         features, is_slip = batch.features[mask], batch.is_slip[mask]

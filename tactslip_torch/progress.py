@@ -47,7 +47,7 @@ class RecordingProgressBar(TQDMProgressBar):
     def on_train_epoch_start(self, trainer: Any, *args: Any) -> None:
         """Name the pass."""
         super().on_train_epoch_start(trainer, *args)
-        what = "moments" if trainer.current_epoch == 0 else "selection"
+        what = "survey" if trainer.current_epoch == 0 else "sums"
         self.train_progress_bar.set_description_str(self._stage(what))
 
     def on_test_batch_start(self, *args: Any, **kwargs: Any) -> None:

@@ -30,8 +30,9 @@ from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
-from tactslip_torch.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.experiment import feature_cache, feature_parts
+from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache, cache_key
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey

@@ -29,7 +29,7 @@ from tactslip_torch.config import (
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
-from tactslip_torch.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.experiment import (
     common_facts,
     feature_cache,
@@ -39,6 +39,7 @@ from tactslip_torch.experiment import (
     save_config,
 )
 from tactslip_torch.export import export_onnx, float32_error
+from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.files import whole_file
 from tactslip_torch.learning import SlipLearner

@@ -12,7 +12,7 @@ import torch
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.datamodule import FeatureMaker
+from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout

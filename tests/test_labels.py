@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tactslip_torch import FeaturePool, HandLayout, Recording
 from tactslip_torch.data.labels import LabelRule, label_bins, needed_windows, shuffled
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.datamodule import FeatureMaker
+from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
 

@@ -176,7 +176,7 @@ def test_shuffled_labels_are_not_learned():
 @pytest.mark.slow
 def test_on_the_simulated_hand_the_score_is_neither_trivial_nor_perfect(tmp_path):
     from tactslip_torch.data.labels import LabelRule
-    from tactslip_torch.datamodule import FeatureMaker
+    from tactslip_torch.feature_maker import FeatureMaker
     from tactslip_torch.features.cache import FeatureCache
     from tactslip_torch.features.pool import FeaturePool
     from tactslip_torch.recipe import Recipe

@@ -1,0 +1,192 @@
+"""Features of one recording: simulated or read, filtered, cut into bins, described, and cached."""
+
+from __future__ import annotations
+
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.data.labels import (
+    LabelledBins,
+    LabelRule,
+    label_bins,
+    needed_windows,
+    shuffled,
+)
+from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource, Timeline
+from tactslip_torch.data.splits import Split
+from tactslip_torch.features.cache import FeatureCache, cache_key, source_digest
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.signals.binning import bins_at
+from tactslip_torch.signals.filtering import ChannelFilter
+
+
+class RecordingFeatures(NamedTuple):
+    """What the learner sees of one recording.
+
+    Shape:
+        - features: ``[N, F]``, float32, the whole pool
+        - is_slip: ``[N]``, bool
+        - speed_mm_s: ``[N]``, steady speed of the stroke of each bin
+        - roles: role to ``[N]``, bool
+    """
+
+    recording: RecordingId
+    features: Tensor
+    is_slip: Tensor
+    speed_mm_s: Tensor
+    roles: dict[str, Tensor]
+    seconds: dict[str, float]
+
+
+class FeatureMaker:
+    """Features of a recording of a source, computed or from the cache.
+
+    Args:
+        source: the recordings.
+        pool: the features; its bin length and rate must fit source and rule.
+        channel_filter: the filter of each channel.
+        rule: where the bins lie and what they are.
+        cache: where features are kept, if they are.
+        dtype: in which features are computed; they are handed on in float32.
+
+    Raises:
+        ValueError: if rate, channels or bin length of the parts disagree.
+    """
+
+    def __init__(
+        self,
+        source: RecordingSource,
+        pool: FeaturePool,
+        channel_filter: ChannelFilter,
+        rule: LabelRule,
+        cache: FeatureCache | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        if pool.hand != source.hand:
+            raise ValueError(
+                f"the features expect {len(pool.hand)} channels {pool.hand.names[0]}.."
+                f"{pool.hand.names[-1]}, the recordings have {len(source.hand)} "
+                f"{source.hand.names[0]}..{source.hand.names[-1]}; use the hand of the recordings"
+            )
+        if pool.sample_rate_hz != source.sample_rate_hz:
+            raise ValueError(
+                f"the features expect {pool.sample_rate_hz:g} Hz, the recordings have "
+                f"{source.sample_rate_hz:g} Hz; make the features for that rate, or resample"
+            )
+        bin_samples = round(rule.bin_ms * source.sample_rate_hz / 1000)
+        if pool.bin_samples != bin_samples:
+            raise ValueError(
+                f"the features expect bins of {pool.bin_samples} samples, labels.bin_ms="
+                f"{rule.bin_ms:g} makes bins of {bin_samples}"
+            )
+        self.source = source
+        self.pool = pool
+        self.channel_filter = channel_filter
+        self.rule = rule
+        self.cache = cache
+        self.dtype = dtype
+        self._code = source_digest(Path(__file__).parent)
+        self._libraries = [version(name) for name in ("torch", "numpy", "ptwt", "PyWavelets")]
+
+    def __call__(self, recording: RecordingId, split: Split) -> RecordingFeatures:
+        """Features, labels and roles of one recording.
+
+        Raises:
+            ValueError: if bins leave the recording or a sample they need is not finite.
+        """
+        times = self.source.timeline(recording)
+        bins = self._lay_bins(times)
+        seconds: dict[str, float] = {}
+        features = self._features(recording, times, bins, seconds)
+        is_slip = bins.is_slip
+        if self.rule.shuffle_seed is not None:
+            place = self.source.ids.index(recording)
+            is_slip = shuffled(is_slip, self.rule.shuffle_seed, place)
+        speeds = torch.tensor(times.speeds_mm_s)[bins.stroke]
+        roles = split.bin_roles(recording, len(is_slip))
+        return RecordingFeatures(recording, features, is_slip, speeds, roles, seconds)
+
+    def key(self, recording: RecordingId) -> str:
+        """A digest of everything that determines the features of a recording."""
+        return self._key(recording, self._lay_bins(self.source.timeline(recording)))
+
+    def filtered_bins(self, recording: RecordingId) -> tuple[Tensor, LabelledBins]:
+        """The filtered bins ``[N, C, n]`` that features are taken from, and their labels."""
+        times = self.source.timeline(recording)
+        bins = self._lay_bins(times)
+        return self._filter(recording, self._load(recording, times, bins), bins), bins
+
+    def _lay_bins(self, times: Timeline) -> LabelledBins:
+        onsets = times.annotated_onsets_s if self.rule.onsets == "annotated" else times.onsets_s
+        return label_bins(
+            self.rule, onsets, times.sliding_s, times.duration_s, self.source.sample_rate_hz
+        )
+
+    def _features(
+        self,
+        recording: RecordingId,
+        times: Timeline,
+        bins: LabelledBins,
+        seconds: dict[str, float],
+    ) -> Tensor:
+        started = time.perf_counter()
+        key = self._key(recording, bins)
+        cached = None if self.cache is None else self.cache.load(key)
+        if cached is not None and cached.shape == (len(bins.starts), len(self.pool.names)):
+            seconds["read_cache"] = time.perf_counter() - started
+            return cached
+        loaded = self._load(recording, times, bins)
+        seconds["simulate" if self.source.is_simulated else "read"] = _lap(started, seconds)
+        filtered = self._filter(recording, loaded, bins)
+        seconds["filter"] = _lap(started, seconds)
+        with torch.no_grad():
+            features = self.pool.extract(filtered).float()
+        seconds["features"] = _lap(started, seconds)
+        if self.cache is not None:
+            self.cache.store(key, features)
+        seconds["write_cache"] = _lap(started, seconds)
+        return features
+
+    def _load(self, recording: RecordingId, times: Timeline, bins: LabelledBins) -> Recording:
+        windows = needed_windows(
+            bins, self.channel_filter.context, times.duration_s, self.source.sample_rate_hz
+        )
+        return self.source.load(recording, windows)
+
+    def _filter(self, recording: RecordingId, loaded: Recording, bins: LabelledBins) -> Tensor:
+        filtered = self.channel_filter(loaded.samples.to(self.dtype))
+        cut = bins_at(filtered, bins.starts, bins.bin_samples)  # [N, C, n]
+        bad = (~cut.isfinite()).nonzero()
+        if len(bad):
+            index, channel, sample = bad[0].tolist()
+            raise ValueError(
+                f"{recording}: channel {self.pool.hand.names[channel]} is not finite near "
+                f"{(int(bins.starts[index]) + sample) / self.source.sample_rate_hz:.4f} s; "
+                "repair or leave out the recording"
+            )
+        return cut
+
+    def _key(self, recording: RecordingId, bins: LabelledBins) -> str:
+        pool = self.pool
+        facts: dict[str, Any] = {
+            "recording": dict(self.source.key(recording)),
+            "starts": bins.starts.tolist(),
+            "bin_samples": bins.bin_samples,
+            "wavelet": [pool.wavelet, pool.level],
+            "spectrum": pool.spectrum,
+            "filter": [self.channel_filter.window_lengths, self.channel_filter.polyorder],
+            "dtype": str(self.dtype),
+            "code": self._code,
+            "libraries": self._libraries,
+        }
+        return cache_key(facts)
+
+
+def _lap(started: float, seconds: dict[str, float]) -> float:
+    """Seconds since ``started`` that no earlier stage has."""
+    return time.perf_counter() - started - sum(seconds.values())
