@@ -68,6 +68,7 @@ def row(metrics: Mapping[str, Any]) -> dict[str, Any]:
             role: scores["balanced_accuracy"] for role, scores in rivals.items()
         },
         "penalty": metrics["penalty"],
+        "validation": max((row["mean"] for row in metrics.get("validation", [])), default=None),
         "selected": metrics["selected"],
     }
 
