@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import platform
 import subprocess
 import sys
@@ -25,6 +24,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
+from benchmarks.machine import machine_facts
 from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE
 
@@ -325,29 +325,6 @@ def _aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 # ---------------------------------------------------------------------------------------- runs
-def machine_facts() -> dict[str, str]:
-    """Processor, cores this process may use, and how busy the machine is already."""
-    every = os.cpu_count() or 1
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else every
-    facts = {"processor": processor_name(), "cores": f"{usable} of {every} cores"}
-    if hasattr(os, "getloadavg"):
-        facts["load"] = f"load {os.getloadavg()[0]:.1f} before the runs"
-    return facts
-
-
-def processor_name() -> str:
-    """The processor's name for people, else the architecture."""
-    try:
-        content = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        content = ""
-    for line in content.splitlines():
-        key, _, value = line.partition(":")
-        if key.strip() == "model name":
-            return value.strip()
-    return platform.processor() or platform.machine()
-
-
 def measure(experiment: str, repeats: int) -> list[TrainingRun]:
     """Run cold and warm, ``repeats`` times, each time from an empty cache.
 

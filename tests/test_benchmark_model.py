@@ -12,13 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.kernel_ridge import KernelRidge
 
-from benchmarks import model as bench
-from benchmarks import model_clocks as clocks
-from benchmarks import model_measure as measure
-from benchmarks import model_report as reports
-from benchmarks import model_worker as worker
-from benchmarks.model_sizes import QUICK, Sizes
-from benchmarks.model_synthetic import SyntheticBins, num_batches
+from benchmarks import clocks
+from benchmarks.model import __main__ as bench
+from benchmarks.model import measure, worker
+from benchmarks.model import report as reports
+from benchmarks.model.sizes import QUICK, Sizes
+from benchmarks.model.synthetic import SyntheticBins, num_batches
 from tactslip_torch.model.fit import TrainingBins
 
 SETTINGS = {"num_features": 120, "penalty": 0.1, "offset": 0.5, "repeats": 3}

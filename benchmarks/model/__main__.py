@@ -1,6 +1,6 @@
 """What the kernel machine costs at any size: ``python -m benchmarks.model [--quick]``.
 
-Six measurements on synthetic features (``model_measure``): the size and latency of the head,
+Six measurements on synthetic features (``measure``): the size and latency of the head,
 accumulating beside bare BLAS, fitting beside scikit-learn, folds in closed form beside refits,
 memory at any number of bins, and many workers. Prints tables and the limits the project has set
 itself, and keeps numbers and figure in ``benchmarks/results``.
@@ -12,28 +12,24 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
-import re
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch
-from threadpoolctl import threadpool_info  # type: ignore[import-untyped]
 
-from benchmarks.model_clocks import on_threads
-from benchmarks.model_figure import PANELS, figure
-from benchmarks.model_measure import SECTIONS
-from benchmarks.model_report import limit_rows, ratios, report_text
-from benchmarks.model_sizes import QUICK, Sizes
-from benchmarks.model_worker import WorkerFailedError
-from benchmarks.train import machine_facts
+from benchmarks.clocks import on_threads
+from benchmarks.machine import machine_facts, versions
+from benchmarks.model.figure import PANELS, figure
+from benchmarks.model.measure import SECTIONS
+from benchmarks.model.report import limit_rows, ratios, report_text
+from benchmarks.model.sizes import QUICK, Sizes
+from benchmarks.model.worker import WorkerFailedError
 from tactslip_torch.files import whole_file
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
 
 
@@ -61,20 +57,6 @@ def measure(sizes: Sizes, names: Sequence[str], threads: int, quick: bool) -> di
         "ratios": ratios(sections),
         "limits": limit_rows(sections, settings),
     }
-
-
-def versions() -> dict[str, str]:
-    """Of the libraries that do the work, and of the BLAS in them."""
-    names = ("torch", "numpy", "scipy", "scikit-learn", "tactslip_torch")
-    found = {"python": platform.python_version()} | {name: metadata.version(name) for name in names}
-    own = re.search(r"BLAS_INFO=(\w+)", torch.__config__.show())
-    blas = {
-        f"{info['internal_api']} {info['version']}"
-        for info in threadpool_info()
-        if info["user_api"] == "blas"
-    }
-    known = [f"{own[1]} in torch"] if own else []
-    return found | {"BLAS": " and ".join([*known, *sorted(blas)])}
 
 
 def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from benchmarks.model_synthetic import SyntheticBins
+from benchmarks.model.synthetic import SyntheticBins
 from tactslip_torch.model.kernels import Polynomial
 
 

@@ -1,6 +1,6 @@
 """The six measurements of ``benchmarks.model``: seconds, bytes and differences, no judgement.
 
-What is compared is measured in turns in one process. Data is synthetic (``model_synthetic``).
+What is compared is measured in turns in one process. Data is synthetic (``synthetic``).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from sklearn.kernel_ridge import KernelRidge
 from sklearn.svm import SVC
 from torch import Tensor
 
-from benchmarks.model_clocks import in_shuffled_turns, in_turns, on_threads, say
-from benchmarks.model_sizes import Sizes
-from benchmarks.model_worker import Worker
+from benchmarks.clocks import in_shuffled_turns, in_turns, on_threads, say
+from benchmarks.model.sizes import Sizes
+from benchmarks.model.worker import Worker
 from tactslip_torch.ledger import content_digest
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.held_out import HeldOut

@@ -18,7 +18,7 @@ from typing import IO, Any, cast
 
 import torch
 
-from benchmarks.model_synthetic import SyntheticBins, num_batches
+from benchmarks.model.synthetic import SyntheticBins, num_batches
 from tactslip_torch.model.sufficient import SufficientStats
 
 _REPORTS = 20  # progress lines of a job that takes long
@@ -34,11 +34,11 @@ class Worker:
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.model_worker"],
+            [sys.executable, "-m", "benchmarks.model.worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            cwd=Path(__file__).parents[1],
+            cwd=Path(__file__).parents[2],
         )
         self._jobs = cast(IO[str], self._process.stdin)
         self._answers = cast(IO[str], self._process.stdout)

@@ -1,0 +1,1 @@
+"""What the kernel machine costs at any size: ``python -m benchmarks.model``."""
