@@ -1,9 +1,11 @@
 """Slip detection for robot hands that feel, in PyTorch (He et al. 2026, and beyond)."""
 
 from tactslip_torch.data.recording import Recording
-from tactslip_torch.features.pool import FeatureName, FeaturePool
+from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.judgement import Judgement
 from tactslip_torch.model.sufficient import SufficientStats
 from tactslip_torch.simulation import Scene, simulate
 
@@ -14,6 +16,7 @@ __all__ = [
     "FeatureName",
     "FeaturePool",
     "HandLayout",
+    "Judgement",
     "Recording",
     "Scene",
     "SlipDetector",

@@ -21,7 +21,8 @@ from omegaconf import DictConfig, OmegaConf
 import tactslip_torch
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.features.cache import FeatureCache, default_cache_folder, source_digest
-from tactslip_torch.features.pool import FeatureName, FeaturePool
+from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.files import whole_file
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.progress import RecordingProgressBar
@@ -59,6 +60,7 @@ def feature_parts(
         wavelet=wavelet,
         level=level,
         spectrum=spectrum,
+        arithmetic="native" if dtype == "float32" else "double",
     )
     lengths = [frames[channel.kind] for channel in source.hand.channels]
     return pool, ChannelFilter(lengths, polyorder), DTYPES[dtype]

@@ -178,7 +178,7 @@ class FeatureMaker:
             "starts": bins.starts.tolist(),
             "bin_samples": bins.bin_samples,
             "wavelet": [pool.wavelet, pool.level],
-            "spectrum": pool.spectrum,
+            "spectrum": [pool.spectrum, pool.arithmetic],
             "filter": [self.channel_filter.window_lengths, self.channel_filter.polyorder],
             "dtype": str(self.dtype),
             "code": self._code,

@@ -6,8 +6,7 @@ For the paper's hand 14 gauges x 13 descriptors + 10 films x (8 branches x (14 t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -19,34 +18,13 @@ from tactslip_torch.features.descriptors import (
     band_energy_ratio,
     describe,
 )
+from tactslip_torch.features.names import pool_names
 from tactslip_torch.features.sample import is_constant, settle
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names
 
-
-@dataclass(frozen=True)
-class FeatureName:
-    """What a feature is, and of what.
-
-    Args:
-        channel: channel name, such as ``"PVDF3"``.
-        component: ``"raw"`` (SG) or a branch, ``"A1"`` to ``"D4"``.
-        domain: ``"time"`` or ``"freq"``.
-        descriptor: name in ``descriptors.py``, or ``"band_energy_ratio"``.
-
-    Example:
-        >>> str(FeatureName("PVDF3", "A2", "freq", "kurtosis"))
-        'PVDF3 A2 freq kurtosis'
-    """
-
-    channel: str
-    component: str
-    domain: str
-    descriptor: str
-
-    def __str__(self) -> str:
-        return f"{self.channel} {self.component} {self.domain} {self.descriptor}"
+Arithmetic = Literal["double", "native"]
 
 
 class FeaturePool(nn.Module):
@@ -56,6 +34,10 @@ class FeaturePool(nn.Module):
     in float64 through ptwt and torch.fft. Follows the dtype and the device of its input. Gradients
     flow wherever the descriptor is differentiable.
 
+    float32 bins are computed in float64 and rounded once at the end, unless ``arithmetic`` is
+    ``"native"``. In float32 throughout, entropy and mode step in other places than in float64, and
+    a branch much smaller than its bin drowns in rounding.
+
     Args:
         hand: the channels, in the order in which bins hold them.
         sample_rate_hz: of the bins.
@@ -63,9 +45,11 @@ class FeaturePool(nn.Module):
         wavelet: name of the wavelet.
         level: number of wavelet levels.
         spectrum: ``"reference"`` (the authors') or ``"clean"`` (ours).
+        arithmetic: ``"double"``, or ``"native"`` to compute in the dtype of the bins.
 
     Raises:
-        ValueError: if the rate is not positive, or the bin is too short for the levels.
+        ValueError: if the rate is not positive, the bin is too short for the levels, or the
+            arithmetic is unknown.
 
     Example:
         >>> pool = FeaturePool(HandLayout.paper24())
@@ -82,19 +66,25 @@ class FeaturePool(nn.Module):
         wavelet: str = "rbio2.2",
         level: int = 4,
         spectrum: SpectrumMethod = "reference",
+        arithmetic: Arithmetic = "double",
     ) -> None:
         super().__init__()
         if not sample_rate_hz > 0:
             raise ValueError(f"sample_rate_hz must be positive, got {sample_rate_hz}")
+        if arithmetic not in get_args(Arithmetic):
+            raise ValueError(
+                f"arithmetic must be one of {', '.join(get_args(Arithmetic))}, got {arithmetic!r}"
+            )
         self.hand = hand
         self.sample_rate_hz = float(sample_rate_hz)
         self.bin_samples = bin_samples
         self.wavelet = wavelet
         self.level = level
         self.spectrum: SpectrumMethod = spectrum
+        self.arithmetic: Arithmetic = arithmetic
         self._gauges = list(hand.indices("SG"))
         self._films = list(hand.indices("PVDF"))
-        self.names = _pool_names(hand, level)
+        self.names = pool_names(hand, level)
         lines = spectrum_matrix(bin_samples, spectrum)
         self._constants = {  # float64; cast to the bins' dtype on use, so they never lose digits
             "branches": branch_matrix(bin_samples, wavelet, level),
@@ -112,6 +102,7 @@ class FeaturePool(nn.Module):
             "wavelet": self.wavelet,
             "level": self.level,
             "spectrum": self.spectrum,
+            "arithmetic": self.arithmetic,
         }
 
     def forward(self, bins: Tensor) -> Tensor:
@@ -119,14 +110,28 @@ class FeaturePool(nn.Module):
 
         Shape:
             - bins: ``[*, C, n]``
-            - output: ``[*, F]``, every value finite where the bins are; NaN for every feature
-              of a channel that holds a NaN or Inf
+            - output: ``[*, F]``, dtype of ``bins``, every value finite where the bins are; NaN for
+              every feature of a channel that holds a NaN or Inf. What is beyond the dtype, an
+              energy or a gradient, saturates at its largest finite number.
 
         Raises:
             ValueError: if the number of channels or samples is another, or bins are neither float32
                 nor float64.
         """
         self._check(bins)
+        return saturating(self._describe(self.widen(bins)), bins.dtype)
+
+    def widen(self, x: Tensor) -> Tensor:
+        """Samples in the dtype that features are computed in; filter after it, not before."""
+        if self.arithmetic == "native" or x.dtype == torch.float64:
+            return x
+        wide = x.double()
+        if wide.requires_grad:  # what flows back is rounded to the dtype of the samples
+            most = torch.finfo(x.dtype).max
+            wide.register_hook(lambda gradient: gradient.clamp(-most, most))
+        return wide
+
+    def _describe(self, bins: Tensor) -> Tensor:
         films = bins[..., self._films, :]
         scale = films.detach().abs().amax(-1)  # [*, films]
         branches = self.branches(films)  # [*, films, branches, n]
@@ -211,9 +216,10 @@ class FeaturePool(nn.Module):
             ValueError: as ``forward``.
         """
         self._check(bins)
-        span = bins.amax(-1) - bins.amin(-1)
-        magnitude = bins.abs().amax(-1)
-        return span.isfinite() & (span > 64 * torch.finfo(bins.dtype).eps * magnitude)
+        high, low = bins.amax(-1), bins.amin(-1)
+        magnitude = torch.maximum(high, -low)
+        is_alive = high - low > 64 * torch.finfo(bins.dtype).eps * magnitude
+        return high.isfinite() & low.isfinite() & is_alive
 
     def round_constants(self, dtype: torch.dtype) -> None:
         """Keep the constants in another dtype from now on; for export, where it halves the file."""
@@ -242,24 +248,9 @@ class FeaturePool(nn.Module):
             raise ValueError(f"expected float32 or float64 bins in volts, got {bins.dtype}")
 
 
-def _pool_names(hand: HandLayout, level: int) -> tuple[FeatureName, ...]:
-    names = [
-        FeatureName(hand.names[i], "raw", "time", descriptor)
-        for i in hand.indices("SG")
-        for descriptor in COMMON_DESCRIPTORS
-    ]
-    domains = (("time", TIME_DESCRIPTORS), ("freq", SPECTRUM_DESCRIPTORS))
-    for channel in (hand.names[i] for i in hand.indices("PVDF")):
-        names += [
-            FeatureName(channel, f"{kind}{m}", domain, descriptor)
-            for m in range(1, level + 1)
-            for domain, descriptors in domains
-            for kind in "AD"
-            for descriptor in descriptors
-        ]
-        names += [
-            FeatureName(channel, f"{kind}{m}", "freq", "band_energy_ratio")
-            for kind in "AD"
-            for m in range(1, level + 1)
-        ]
-    return tuple(names)
+def saturating(x: Tensor, dtype: torch.dtype) -> Tensor:
+    """``x`` in another dtype; what is beyond its range becomes its largest finite number."""
+    most = torch.finfo(dtype).max
+    if torch.finfo(x.dtype).max <= most:
+        return x.to(dtype)
+    return x.clamp(-most, most).to(dtype)

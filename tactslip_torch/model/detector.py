@@ -12,9 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.pool import FeatureName, FeaturePool
+from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.pool import FeaturePool, saturating
 from tactslip_torch.files import load_table, save_table, table_form
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.judgement import Judgement, Nonfinite, check_nonfinite
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.model.quadratic import QuadraticForm
@@ -41,16 +43,20 @@ class SlipDetector(nn.Module):
         scaler: of the selected features.
         head: the machine on scaled features.
         info: JSON-able facts about the training, kept in the file.
+        typical: scaled features that stand in for those of a missing channel, such as the mean of
+            the training bins; default 0, the middle of their range.
 
     Shape:
         - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
         - score: ``[*]``, dtype of ``bins``; at least 0 means slip
         - inside: ``bins -> features [*, F] -> selected [*, K] -> scaled [*, K] -> score [*]``
-        - raw samples, for ``score_raw``: ``[*, C, n + 2 * context]``
+        - raw samples, for ``score_raw`` and ``judge_raw``: ``[*, C, n + 2 * context]``
 
     Raises:
         ValueError: if the parts disagree about the number of channels or features.
     """
+
+    typical: Tensor
 
     def __init__(
         self,
@@ -60,6 +66,7 @@ class SlipDetector(nn.Module):
         scaler: FeatureScaler,
         head: Head,
         info: Mapping[str, Any] | None = None,
+        typical: Tensor | None = None,
     ) -> None:
         super().__init__()
         if not len(selected) == len(scaler.minimum) == head.num_features:
@@ -78,12 +85,21 @@ class SlipDetector(nn.Module):
                 f"a filter of {len(channel_filter.window_lengths)} channels does not fit a hand "
                 f"of {len(pool.hand)}"
             )
+        if typical is None:
+            typical = torch.zeros_like(scaler.minimum)
+        if typical.shape != scaler.minimum.shape or not bool((typical.abs() <= 1).all()):
+            raise ValueError(
+                f"typical must be {len(scaler.minimum)} scaled features in [-1, 1], got "
+                f"{tuple(typical.shape)} of at most {float(typical.abs().max()):g}"
+            )
         self.pool = pool
         self.channel_filter = channel_filter
         self.scaler = scaler
         self.head = head
         self.selected = tuple(int(i) for i in selected)
         self.info = dict(info or {})
+        self.register_buffer("typical", typical.to(scaler.minimum))
+        self._channel_of = [pool.hand.names.index(name.channel) for name in self.selected_names]
 
     @property
     def selected_names(self) -> tuple[FeatureName, ...]:
@@ -98,6 +114,8 @@ class SlipDetector(nn.Module):
     def forward(self, bins: Tensor) -> Tensor:
         """Score filtered bins; at least 0 means slip, NaN where a needed value is not finite.
 
+        ``judge`` is for programs that must go on when a sensor fails.
+
         Shape:
             - bins: ``[*, C, n]``
             - output: ``[*]``, dtype of ``bins``
@@ -105,8 +123,53 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: if the number of channels or samples is another.
         """
-        index = torch.tensor(self.selected, device=bins.device)
-        return self.score_features(self.pool(bins).index_select(-1, index)).to(bins.dtype)
+        return saturating(self.score_features(self._features(bins)), bins.dtype)
+
+    def score_raw(self, samples: Tensor) -> Tensor:
+        """Filter and score raw bins that come with ``context`` samples on each side.
+
+        Shape:
+            - samples: ``[*, C, n + 2 * context]``, volts
+            - output: ``[*]``, dtype of ``samples``
+
+        Raises:
+            ValueError: if the number of channels or samples is another.
+        """
+        return saturating(self(self._filter(samples)), samples.dtype)
+
+    def judge(self, bins: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
+        """Score filtered bins of a hand whose sensors may fail: a finite score, and its validity.
+
+        Args:
+            bins: in volts.
+            nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing,
+                ``typical`` features stand in for its own, and the score is not valid.
+                ``"raise"``: refuse.
+
+        Shape:
+            - bins: ``[*, C, n]``
+
+        Raises:
+            ValueError: if the number of channels or samples is another, or under ``"raise"`` for
+                a NaN or Inf, naming bin, channel and sample.
+        """
+        check_nonfinite(nonfinite, bins, self.pool.hand.names)
+        return self._judge(bins, self.pool.validity(bins))
+
+    def judge_raw(self, samples: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
+        """``judge`` for raw bins that come with ``context`` samples on each side.
+
+        A NaN or Inf in the context of a bin makes the channel missing as well.
+
+        Shape:
+            - samples: ``[*, C, n + 2 * context]``, volts
+
+        Raises:
+            ValueError: as ``judge``.
+        """
+        check_nonfinite(nonfinite, samples, self.pool.hand.names)
+        bins = self._filter(samples)
+        return self._judge(bins, self.pool.validity(bins.to(samples.dtype)))
 
     def validity(self, bins: Tensor) -> Tensor:
         """Whether every channel the score depends on can be trusted (``FeaturePool.validity``).
@@ -118,10 +181,7 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: as ``forward``.
         """
-        needed = {name.channel for name in self.selected_names}
-        used = [i for i, name in enumerate(self.pool.hand.names) if name in needed]
-        valid: Tensor = self.pool.validity(bins)[..., used].all(-1)
-        return valid
+        return self._needed(self.pool.validity(bins))
 
     def score_features(self, features: Tensor) -> Tensor:
         """Score selected, unscaled features.
@@ -130,21 +190,32 @@ class SlipDetector(nn.Module):
             - features: ``[*, K]`` in the order of ``selected``
             - output: ``[*]``, dtype of the detector
         """
-        score: Tensor = self.head(self.scaler(features.to(self.scaler.minimum.dtype)))
+        score: Tensor = self.head(self._scale(features))
         return score
 
-    def score_raw(self, samples: Tensor) -> Tensor:
-        """Filter and score raw bins that come with ``context`` samples on each side.
+    def _judge(self, bins: Tensor, is_trusted: Tensor) -> Judgement:
+        is_missing = ~bins.isfinite().all(-1)
+        scaled = self._scale(self._features(torch.where(is_missing[..., None], 0.0, bins)))
+        scaled = torch.where(is_missing[..., self._channel_of], self.typical, scaled)
+        score = saturating(self.head(scaled), bins.dtype)
+        return Judgement(score, self._needed(is_trusted), is_missing)
 
-        Shape:
-            - samples: ``[*, C, n + 2 * context]``, volts
-            - output: ``[*]``
+    def _filter(self, samples: Tensor) -> Tensor:
+        filtered: Tensor = self.channel_filter.valid(self.pool.widen(samples))
+        return filtered
 
-        Raises:
-            ValueError: if the number of channels or samples is another.
-        """
-        score: Tensor = self(self.channel_filter.valid(samples))
-        return score
+    def _features(self, bins: Tensor) -> Tensor:
+        index = torch.tensor(self.selected, device=bins.device)
+        selected: Tensor = self.pool(bins).index_select(-1, index)
+        return selected
+
+    def _scale(self, features: Tensor) -> Tensor:
+        scaled: Tensor = self.scaler(saturating(features, self.scaler.minimum.dtype))
+        return scaled
+
+    def _needed(self, is_trusted: Tensor) -> Tensor:
+        """Whether all channels in use are trusted, ``[*, C] -> [*]``."""
+        return is_trusted[..., sorted(set(self._channel_of))].all(-1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the detector to one file, whole or not at all."""
@@ -206,4 +277,5 @@ class SlipDetector(nn.Module):
             FeatureScaler(**part("scaler.")),
             head,
             facts["info"],
+            state.get("typical"),
         )
