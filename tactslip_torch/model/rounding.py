@@ -1,0 +1,175 @@
+"""What rounding can do to a quadratic form over the box of scaled features: a bound, and a search.
+
+The bound counts roundings (Higham 2002, chapter 3): a value that ``n`` of them have met is off by
+the factor ``1 + theta``, ``|theta| <= gamma(n) = n u / (1 - n u)``. In ``z' Q z + l' z + a`` of K
+features an entry of Q meets at most ``2 K + 3``: one when it is stored in the narrower dtype, one
+product and K sums in the row, one product and K sums over the rows. That count is of no order of
+summation, and an FMA only saves some of it, so the bound holds for any BLAS, thread count and batch
+size that computes in the dtype. TF32 and bfloat16 products are not of it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.model.quadratic import QuadraticForm
+
+_WIDE = 2.0**-52  # twice the unit roundoff of the float64 sums below
+_KEPT, _VARIED, _ROUNDS = 16, 32, 16
+
+
+class RoundingBound(NamedTuple):
+    """What a score may be off by.
+
+    Args:
+        error: largest possible difference to the exact score; infinite where it overflows.
+        overflows: whether a coefficient or a sum may pass the largest number of the dtype.
+    """
+
+    error: float
+    overflows: bool
+
+
+def gamma(count: int, dtype: torch.dtype) -> float:
+    """``n u / (1 - n u)`` for ``n`` roundings, ``u`` half an eps; infinite from ``n u = 1`` on."""
+    share = count * torch.finfo(dtype).eps / 2  # exact: a whole number times a power of 2
+    return math.nextafter(share / (1 - share), math.inf) if share < 1 else math.inf
+
+
+def rounding_bound(head: QuadraticForm, dtype: torch.dtype = torch.float32) -> RoundingBound:
+    """How far a head may be off, computed in ``dtype``, for any z of that dtype in ``[-1, 1]^K``.
+
+    Its own coefficients are taken as exact, so that storing them in ``dtype`` counts. Underflow
+    counts as well, also where the processor flushes subnormal numbers to 0.
+
+    Args:
+        head: the quadratic form, as fitted.
+        dtype: in which it is stored and computed.
+
+    Raises:
+        ValueError: if a coefficient is NaN.
+
+    Reference:
+        Higham (2002), Accuracy and Stability of Numerical Algorithms, lemma 3.1 and section 3.1.
+
+    Example:
+        >>> one = torch.ones(1, 1, dtype=torch.float64)
+        >>> head = QuadraticForm(one, one[0], one[0, 0])
+        >>> f"{rounding_bound(head).error / 2**-24:.3f}"  # 5 + 4 + 2 roundings
+        '11.000'
+    """
+    num = head.num_features
+    quadratic, linear, constant = (
+        float(part.detach().double().abs().sum())
+        for part in (head.quadratic, head.linear, head.constant)
+    )
+    if math.isnan(quadratic + linear + constant):
+        raise ValueError("a coefficient of the head is NaN; fit it again")
+    facts = torch.finfo(dtype)
+    most = gamma(2 * num + 3, dtype)
+    outward = 1 + (num + 4) ** 2 * _WIDE  # the sums above and the few steps below, in float64
+    # what each of 3 K^2 + 3 K + 1 results loses if it is too small for the dtype
+    underflow = (3 * num * (num + 1) + 1) * facts.tiny * (1 + most)
+    largest = ((quadratic + linear + constant) * (1 + most) + underflow) * outward
+    if not largest < facts.max:
+        return RoundingBound(math.inf, True)
+    rounded = (
+        most * quadratic + gamma(2 * num + 2, dtype) * linear + gamma(num + 1, dtype) * constant
+    )
+    return RoundingBound((rounded + underflow) * outward, False)
+
+
+def worst_error(
+    head: QuadraticForm,
+    dtype: torch.dtype = torch.float32,
+    *,
+    seed: int = 0,
+    num_points: int = 2048,
+    also: Tensor | None = None,
+) -> float:
+    """The worst error that a search over the box finds; infinite for a score that is not finite.
+
+    In ``dtype`` against float64, both on the same z of ``dtype``; so it is known to the
+    ``rounding_bound`` of float64. Looks at points and corners at random, at the signs of
+    eigenvectors and rows of Q, at corners where the rounding of the coefficients adds up, and at
+    what varies the worst of them.
+
+    Args:
+        head: the quadratic form, as fitted.
+        dtype: in which it is stored and computed.
+        seed: of the search.
+        num_points: random ones to begin with.
+        also: points to look at, scaled bins for instance.
+
+    Shape:
+        - also: ``[N, K]``, within ``[-1, 1]``
+
+    Raises:
+        ValueError: if ``also`` has another number of features or leaves the box.
+    """
+    exact, rounded = _stored(head, torch.float64), _stored(head, dtype)
+    generator = torch.Generator().manual_seed(seed)
+    parts = [_starts(exact, rounded, num_points, generator)]
+    if also is not None:
+        if also.ndim != 2 or also.shape[1] != head.num_features or bool((also.abs() > 1).any()):
+            raise ValueError(
+                f"expected points [N, {head.num_features}] within [-1, 1], got "
+                f"{tuple(also.shape)}; scale them first"
+            )
+        parts.append(also.detach().cpu().double())
+    points = torch.cat(parts).to(dtype)
+    errors = _errors(exact, rounded, points)
+    worst = float(errors.max())
+    for _ in range(_ROUNDS):
+        best = points[errors.topk(min(_KEPT, len(errors))).indices]
+        points = torch.cat([best, _varied(best, generator)])
+        errors = _errors(exact, rounded, points)
+        worst = max(worst, float(errors.max()))  # a point in another batch is rounded otherwise
+    return worst
+
+
+def _stored(head: QuadraticForm, dtype: torch.dtype) -> QuadraticForm:
+    parts = (head.quadratic, head.linear, head.constant)
+    return QuadraticForm(*(part.detach().cpu().to(dtype) for part in parts))
+
+
+def _errors(exact: QuadraticForm, rounded: QuadraticForm, points: Tensor) -> Tensor:
+    errors: Tensor = (rounded(points).double() - exact(points.double())).abs()
+    return errors.nan_to_num(nan=math.inf, posinf=math.inf)
+
+
+def _starts(
+    exact: QuadraticForm, rounded: QuadraticForm, num_points: int, generator: torch.Generator
+) -> Tensor:
+    """Points to begin with, ``[M, K]`` in float64."""
+    num = exact.num_features
+    inside = 2 * torch.rand(num_points, num, generator=generator, dtype=torch.float64) - 1
+    corners = _sign(torch.randn(num_points, num, generator=generator, dtype=torch.float64))
+    rows = _sign(exact.quadratic)
+    parts = [inside, corners, rows, -rows, _sign(exact.linear)[None], torch.ones(1, num)]
+    lost = rounded.quadratic.double() - exact.quadratic
+    if bool(lost.isfinite().all()) and bool(exact.quadratic.isfinite().all()):
+        vectors = torch.linalg.eigh(exact.quadratic + exact.quadratic.mT).eigenvectors.mT
+        parts += [_sign(vectors), -_sign(vectors), vectors / vectors.abs().amax(1, keepdim=True)]
+        uphill = corners
+        for _ in range(8):  # each step adds up more of what storing the coefficients lost
+            uphill = _sign(uphill @ (lost + lost.mT))
+        parts.append(uphill)
+    return torch.cat(parts)
+
+
+def _sign(x: Tensor) -> Tensor:
+    return torch.where(x < 0, -1.0, 1.0).double()
+
+
+def _varied(points: Tensor, generator: torch.Generator) -> Tensor:
+    """Copies of points with some coordinates turned round and some drawn anew."""
+    many = points.repeat_interleave(_VARIED, 0)
+    draw = torch.rand(3, *many.shape, generator=generator, dtype=torch.float64)
+    drawn = (2 * draw[0] - 1).to(points.dtype)
+    many = torch.where(draw[1] < 0.04, -many, many)
+    return torch.where(draw[2] < 0.02, drawn, many)
