@@ -163,13 +163,21 @@ class FeatureMaker:
         cut = bins_at(filtered, bins.starts, bins.bin_samples)  # [N, C, n]
         bad = (~cut.isfinite()).nonzero()
         if len(bad):
-            index, channel, sample = bad[0].tolist()
-            raise ValueError(
-                f"{recording}: channel {self.pool.hand.names[channel]} is not finite near "
-                f"{(int(bins.starts[index]) + sample) / self.source.sample_rate_hz:.4f} s; "
-                "repair or leave out the recording"
-            )
+            index, channel, _ = bad[0].tolist()
+            raise ValueError(self._broken(recording, loaded, int(bins.starts[index]), channel))
         return cut
+
+    def _broken(self, recording: RecordingId, loaded: Recording, start: int, channel: int) -> str:
+        """What to say of a channel whose filtered bin from sample ``start`` on is not finite."""
+        reach = self.channel_filter.window_lengths[channel] // 2
+        begin = max(start - reach, 0)
+        near = loaded.samples[channel, begin : start + self.pool.bin_samples + reach]
+        place = int((~near.isfinite()).nonzero()[0])
+        return (
+            f"{recording}: channel {self.pool.hand.names[channel]}, sample {begin + place} "
+            f"({(begin + place) / self.source.sample_rate_hz:.4f} s) is {float(near[place])}; "
+            "repair or leave out the recording"
+        )
 
     def _key(self, recording: RecordingId, bins: LabelledBins) -> str:
         pool = self.pool

@@ -250,6 +250,7 @@ class SlipLearner(L.LightningModule):
             plan.frame.scaler,
             head,
             self.facts | {"rival": plan.threshold.to_dict()},
+            plan.typical,
         )
 
     def rates(self) -> dict[str, str]:

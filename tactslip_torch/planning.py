@@ -50,6 +50,8 @@ class Plan:
         stands_for: how many bins each of those stands for, as in validation.
         num_bins: how many bins are trained on; about, where shares are below 1.
         threshold: the best single selected feature, a rival to be reported beside.
+        typical: mean of the scaled features, both classes counting alike; it stands in where a
+            sensor is missing.
         validation: one row per choice: what was chosen from, and the balanced accuracy of
             each held-out group.
     """
@@ -62,6 +64,7 @@ class Plan:
     stands_for: float
     num_bins: int
     threshold: FeatureThreshold
+    typical: tuple[float, ...]
     validation: list[dict[str, Any]] = field(default_factory=list)
 
     @property
@@ -81,6 +84,7 @@ class Plan:
             "stands_for": self.stands_for,
             "num_bins": self.num_bins,
             "rival": self.threshold.to_dict(),
+            "typical": list(self.typical),
             "validation": self.validation,
         }
 
@@ -96,6 +100,7 @@ class Plan:
             stands_for=facts["stands_for"],
             num_bins=facts["num_bins"],
             threshold=FeatureThreshold(**facts["rival"]),
+            typical=tuple(facts["typical"]),
             validation=list(facts["validation"]),
         )
 
@@ -156,8 +161,15 @@ def plan_detector(recipe: Recipe, survey: Survey, progress: Progress) -> Plan:
         stands_for=stands_for,
         num_bins=round(num_bins),
         threshold=best_threshold(selected, sample.is_slip),
+        typical=_typical(frame(sample.features), sample.is_slip, weights),
         validation=rows,
     )
+
+
+def _typical(scaled: Tensor, is_slip: Tensor, weights: Tensor) -> tuple[float, ...]:
+    """Mean of scaled features ``[N, K]``, both classes counting alike; K numbers."""
+    means = [weights[mine] @ scaled[mine] / weights[mine].sum() for mine in (is_slip, ~is_slip)]
+    return tuple(((means[0] + means[1]) / 2).tolist())
 
 
 def _validate(

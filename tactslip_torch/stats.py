@@ -149,6 +149,7 @@ def _solve(config: DictConfig) -> str:
         | {name: about[name] for name in ("simulated", "experiment", "seed", "split")}
         | {"features_dtype": about["features_dtype"], "train_recordings": about["recordings"]}
         | {"train_materials": about["materials"]},
+        plan.typical,
     )
     detector.save(config.out)
     return f"detector of {int(sums.count.sum())} bins"

@@ -168,7 +168,7 @@ class Failing(torch.utils.data.Dataset):
 @pytest.mark.parametrize(
     "error",
     [
-        ValueError("M1/3: channel SG2 is not finite near 1.2500 s; repair: or leave out"),
+        ValueError("M1/3: channel SG2, sample 2500 (1.2500 s) is nan; repair: or leave out"),
         KeyError("no channel 'SG99' in this hand"),
         OSError("disk: gone"),
     ],

@@ -44,7 +44,7 @@ def test_shapes_of_the_kinds() -> None:
 
 def test_bad_arguments() -> None:
     generator = torch.Generator()
-    with pytest.raises(ValueError, match="kind must be one of plain, .*, got 'odd'"):
+    with pytest.raises(ValueError, match=r"kind must be one of plain, .*, got 'odd'"):
         extreme_bins("odd", (3, 4), generator)
     with pytest.raises(ValueError, match=r"at least two samples, got shape \(3, 1\)"):
         extreme_bins("zero", (3, 1), generator)

@@ -165,6 +165,16 @@ def test_a_single_choice_is_taken_as_it_is(rng):
     assert plan.validation == []
 
 
+def test_typical_features_lie_midway_between_the_classes(rng):
+    parts = make_parts(rng, share=0.2)
+    plan = planned(Recipe(**FEW), parts)
+    features, is_slip = together(parts)
+    z = plan.frame(features)
+    assert 0 < is_slip.double().mean() < 0.4
+    expected = (z[is_slip].mean(0) + z[~is_slip].mean(0)) / 2  # the sample holds every bin
+    torch.testing.assert_close(torch.tensor(plan.typical, dtype=torch.float64), expected)
+
+
 def test_a_plan_survives_its_facts(rng):
     plan = planned(Recipe(**FEW, compress=True), make_parts(rng))
     again = Plan.of(json.loads(json.dumps(plan.facts(), allow_nan=False)), plan.frame.scaler)

@@ -221,12 +221,6 @@ class FeaturePool(nn.Module):
         is_alive = high - low > 64 * torch.finfo(bins.dtype).eps * magnitude
         return high.isfinite() & low.isfinite() & is_alive
 
-    def round_constants(self, dtype: torch.dtype) -> None:
-        """Keep the constants in another dtype from now on; for export, where it halves the file."""
-        for name, constant in self._constants.items():
-            if constant.is_floating_point():
-                self._constants[name] = constant.to(dtype)
-
     def _of_gauges(self, bins: Tensor) -> Tensor:
         gauges = bins[..., self._gauges, :]
         scale = gauges.detach().abs().amax(-1)

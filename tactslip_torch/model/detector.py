@@ -66,7 +66,7 @@ class SlipDetector(nn.Module):
         scaler: FeatureScaler,
         head: Head,
         info: Mapping[str, Any] | None = None,
-        typical: Tensor | None = None,
+        typical: Tensor | Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         if not len(selected) == len(scaler.minimum) == head.num_features:
@@ -85,8 +85,7 @@ class SlipDetector(nn.Module):
                 f"a filter of {len(channel_filter.window_lengths)} channels does not fit a hand "
                 f"of {len(pool.hand)}"
             )
-        if typical is None:
-            typical = torch.zeros_like(scaler.minimum)
+        typical = torch.as_tensor([0.0] * len(selected) if typical is None else typical)
         if typical.shape != scaler.minimum.shape or not bool((typical.abs() <= 1).all()):
             raise ValueError(
                 f"typical must be {len(scaler.minimum)} scaled features in [-1, 1], got "
@@ -98,7 +97,7 @@ class SlipDetector(nn.Module):
         self.head = head
         self.selected = tuple(int(i) for i in selected)
         self.info = dict(info or {})
-        self.register_buffer("typical", typical.to(scaler.minimum))
+        self.register_buffer("typical", typical.to(scaler.minimum, copy=True))
         self._channel_of = [pool.hand.names.index(name.channel) for name in self.selected_names]
 
     @property
@@ -169,7 +168,9 @@ class SlipDetector(nn.Module):
         """
         check_nonfinite(nonfinite, samples, self.pool.hand.names)
         bins = self._filter(samples)
-        return self._judge(bins, self.pool.validity(bins.to(samples.dtype)))
+        rounded = bins.to(samples.dtype)  # sensors resolve no more than their samples do
+        judged = self._judge(bins, self.pool.validity(rounded))
+        return judged._replace(score=saturating(judged.score, samples.dtype))
 
     def validity(self, bins: Tensor) -> Tensor:
         """Whether every channel the score depends on can be trusted (``FeaturePool.validity``).

@@ -1,0 +1,188 @@
+"""Scores with their validity, and what becomes of NaN and Inf."""
+
+import copy
+
+import pytest
+import torch
+from test_detector import noise, random_detector
+
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.files import load_table, save_table
+from tactslip_torch.model.detector import FORMAT, SlipDetector
+from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
+
+BAD = [float("nan"), float("inf"), -float("inf")]
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return random_detector()
+
+
+def used_channel(detector):
+    return detector.pool.hand.names.index(detector.selected_names[0].channel)
+
+
+def unused_channel(detector):
+    used = {name.channel for name in detector.selected_names}
+    return next(i for i, name in enumerate(detector.pool.hand.names) if name not in used)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_healthy_bins_are_scored_as_ever(dtype, detector):
+    samples = noise(9).to(dtype)
+    judged = detector.judge_raw(samples)
+    assert judged.score.dtype == dtype
+    assert torch.equal(judged.score, detector.score_raw(samples))
+    assert judged.is_valid.tolist() == [True] * 9
+    assert not judged.is_missing.any()
+    bins = detector.channel_filter.valid(samples)
+    assert torch.equal(detector.judge(bins).score, detector(bins))
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_a_missing_channel_gives_its_typical_features(bad, detector):
+    """The score is that of features computed by hand, with the channel's own replaced."""
+    typical = torch.linspace(-0.9, 0.9, len(detector.selected), dtype=torch.float64)
+    detector = SlipDetector(
+        detector.pool,
+        detector.channel_filter,
+        detector.selected,
+        detector.scaler,
+        detector.head,
+        typical=typical,
+    )
+    bins = detector.channel_filter.valid(noise(4))
+    channel = used_channel(detector)
+    scaled = detector.scaler(detector.pool(bins)[2, list(detector.selected)])
+    name = detector.pool.hand.names[channel]
+    for place, feature in enumerate(detector.selected_names):
+        if feature.channel == name:
+            scaled[place] = typical[place]
+    bins[2, channel, 50] = bad
+    judged = detector.judge(bins)
+    assert judged.is_valid.tolist() == [True, True, False, True]
+    assert judged.is_missing.nonzero().tolist() == [[2, channel]]
+    torch.testing.assert_close(judged.score[2], detector.head(scaled), rtol=1e-14, atol=0)
+    assert detector(bins)[2].isnan()
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_a_channel_no_feature_needs_does_not_spoil_validity(bad, detector):
+    samples = noise(3)
+    expected = detector.judge_raw(samples)
+    samples[1, unused_channel(detector)] = bad
+    judged = detector.judge_raw(samples)
+    assert torch.equal(judged.score, expected.score)
+    assert judged.is_valid.all()
+    assert judged.is_missing[1].sum() == 1
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_raise_names_bin_channel_and_sample(bad, detector):
+    samples = noise(6).reshape(2, 3, 24, 150)
+    samples[1, 2, 14, 149] = bad
+    with pytest.raises(
+        ValueError,
+        match=rf"bin 1, 2, channel PVDF1, sample 149 is {bad}; repair .* nonfinite='mask'",
+    ):
+        detector.judge_raw(samples, nonfinite="raise")
+    healthy = noise(2)
+    judged = detector.judge_raw(healthy, nonfinite="raise")
+    assert torch.equal(judged.score, detector.score_raw(healthy))
+
+
+def test_one_bin_without_batch_axes(detector):
+    samples = noise(1)[0]
+    judged = detector.judge_raw(samples)
+    assert judged.score.shape == judged.is_valid.shape == ()
+    assert judged.is_missing.shape == (24,)
+    samples[3, 0] = torch.nan
+    with pytest.raises(ValueError, match=r"^channel SG4, sample 0 is nan"):
+        detector.judge_raw(samples, nonfinite="raise")
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("kind", EXTREMES)
+def test_every_extreme_gives_a_finite_score_or_a_flag(kind, dtype, detector):
+    generator = torch.Generator().manual_seed(3)
+    samples = extreme_bins(kind, (16, 24, 150), generator, dtype)
+    judged = detector.judge_raw(samples)
+    assert judged.score.isfinite().all()
+    if kind in ("constant", "zero"):
+        assert not judged.is_valid.any()
+    if kind in ("plain", "integers", "rails", "alternating"):
+        assert judged.is_valid.float().mean() > 0.9
+
+
+def test_all_channels_missing_gives_the_typical_score(detector):
+    judged = detector.judge(torch.full((2, 24, 100), torch.nan))
+    expected = detector.head(detector.typical)
+    torch.testing.assert_close(judged.score.double(), expected.expand(2), rtol=1e-6, atol=1e-7)
+    assert not judged.is_valid.any()
+
+
+def test_gradients_stay_finite_beside_a_missing_channel(detector):
+    samples = noise(2)
+    samples[0, used_channel(detector), 70] = torch.nan
+    samples.requires_grad_(True)
+    detector.judge_raw(samples).score.sum().backward()
+    gradient = samples.grad
+    assert gradient is not None
+    kept = torch.ones(24, dtype=torch.bool)
+    kept[used_channel(detector)] = False
+    assert gradient[:, kept].isfinite().all()
+    assert gradient[0, kept].abs().max() > 0
+
+
+def test_an_unknown_policy_is_refused(detector):
+    with pytest.raises(ValueError, match="nonfinite must be 'mask' or 'raise', got 'drop'"):
+        detector.judge_raw(noise(1), nonfinite="drop")
+
+
+def test_typical_features_are_kept_in_the_file(detector, tmp_path):
+    typical = torch.full((len(detector.selected),), 0.25, dtype=torch.float64)
+    parts = (detector.pool, detector.channel_filter, detector.selected, detector.scaler)
+    SlipDetector(*parts, detector.head, typical=typical).save(tmp_path / "a.pt")
+    loaded = SlipDetector.load(tmp_path / "a.pt")
+    assert torch.equal(loaded.typical, typical)
+    facts, state = load_table(tmp_path / "a.pt", FORMAT)  # as written before there were any
+    del state["typical"], facts["pool"]["arithmetic"]
+    save_table(tmp_path / "b.pt", FORMAT, facts, state)
+    older = SlipDetector.load(tmp_path / "b.pt")
+    assert not older.typical.any()
+    assert older.pool.arithmetic == "double"
+
+
+@pytest.mark.parametrize("typical", [torch.zeros(3), torch.full((12,), 1.5)])
+def test_typical_features_that_are_none_are_refused(typical, detector):
+    parts = (detector.pool, detector.channel_filter, detector.selected, detector.scaler)
+    with pytest.raises(ValueError, match="typical must be 12 scaled features in"):
+        SlipDetector(*parts, detector.head, typical=typical)
+
+
+# Arithmetic ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", EXTREMES)
+def test_float32_samples_are_scored_as_in_float64_but_for_the_head(kind, detector):
+    samples = extreme_bins(kind, (8, 24, 150), torch.Generator().manual_seed(4), torch.float32)
+    inside = detector.pool(detector.channel_filter.valid(samples.double()))
+    single = copy.deepcopy(detector).float()
+    z = single.scaler(inside[:, list(detector.selected)].float())
+    judged = single.judge_raw(samples)
+    torch.testing.assert_close(judged.score, single.head(z), rtol=1e-6, atol=1e-6)
+
+
+def test_widening_happens_once_and_before_the_filter(detector):
+    samples = noise(2).float()
+    assert detector.pool.widen(samples).dtype == torch.float64
+    native = FeaturePool(detector.pool.hand, arithmetic="native")
+    assert native.widen(samples) is samples
+    wide = samples.double()
+    assert detector.pool.widen(wide) is wide
+
+
+def test_an_unknown_arithmetic_is_refused(detector):
+    with pytest.raises(ValueError, match="arithmetic must be one of double, native, got 'half'"):
+        FeaturePool(detector.pool.hand, arithmetic="half")
