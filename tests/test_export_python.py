@@ -35,7 +35,19 @@ def test_the_program_prints_the_scores_of_the_package(tmp_path):
     expected = detector(bins)
     shown = torch.tensor([float(row[2]) for row in rows], dtype=torch.float64)
     torch.testing.assert_close(shown, expected, rtol=0, atol=1e-3 * float(expected.std()) + 1e-4)
-    assert [row[-1] == "slip" for row in rows] == (shown >= 0).tolist()
+    assert [row[3:] == ["slip"] for row in rows] == (shown >= 0).tolist()
+    assert "not valid" not in done.stdout
+
+    broken = recording.numpy().copy()
+    broken[detector.pool.hand.names.index(detector.selected_names[0].channel), 1234] = np.nan
+    np.save(tmp_path / "recording.npy", broken)
+    done = subprocess.run(
+        [sys.executable, PROGRAM, *arguments], capture_output=True, text=True, check=True
+    )
+    marked = [s for s, line in zip(starts, done.stdout.splitlines(), strict=True) if "not" in line]
+    assert marked
+    assert all(s - 25 <= 1234 < s + 125 for s in marked)
+    assert "nan" not in done.stdout
 
     np.save(tmp_path / "recording.npy", recording.numpy()[:7])
     failed = subprocess.run(

@@ -3,7 +3,8 @@
     python score.py model.onnx recording.npy
 
 ``recording.npy`` holds volts, [channels, samples], in the order that the model names. Prints
-one line per bin: start in seconds, score, and slip where the score is at least 0.
+one line per bin: start in seconds, score, slip where the score is at least 0, and a warning where
+a channel in use is dead or held a NaN or Inf: such a score is a guess without that channel.
 """
 
 import sys
@@ -12,8 +13,10 @@ import numpy as np
 import onnxruntime
 
 
-def score_recording(model_path: str, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bin starts in seconds, and the scores of all bins that have their context, ``[N]`` each."""
+def score_recording(
+    model_path: str, samples: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Start in seconds, score and validity of all bins that have their context, ``[N]`` each."""
     session = onnxruntime.InferenceSession(model_path, providers=["CPUExecutionProvider"])
     facts = session.get_modelmeta().custom_metadata_map
     num_channels = len(facts["channels"].split(","))
@@ -24,16 +27,18 @@ def score_recording(model_path: str, samples: np.ndarray) -> tuple[np.ndarray, n
         raise ValueError(f"a bin needs {length + 2 * context} samples, got {samples.shape[1]}")
     windows = np.lib.stride_tricks.sliding_window_view(samples, length + 2 * context, axis=1)
     bins = np.ascontiguousarray(windows[:, ::length].swapaxes(0, 1), dtype=np.float32)
-    scores = session.run(["score"], {"samples": bins})[0]
+    scores, valid = session.run(["score", "valid"], {"samples": bins})
     starts = context + length * np.arange(len(bins))
-    return starts / float(facts["sample_rate_hz"]), scores
+    return starts / float(facts["sample_rate_hz"]), scores, valid
 
 
 def main(model_path: str, recording_path: str) -> None:
     """Print the table."""
-    starts, scores = score_recording(model_path, np.load(recording_path, allow_pickle=False))
-    for start, score in zip(starts, scores, strict=True):
-        print(f"{start:9.4f} s  {score:+9.4f}  {'slip' if score >= 0 else ''}".rstrip())
+    recording = np.load(recording_path, allow_pickle=False)
+    for start, score, valid in zip(*score_recording(model_path, recording), strict=True):
+        verdict = "slip" if score >= 0 else ""
+        warning = "" if valid else "not valid: a sensor is dead or broken"
+        print(f"{start:9.4f} s  {score:+9.4f}  {verdict:4}  {warning}".rstrip())
 
 
 if __name__ == "__main__":

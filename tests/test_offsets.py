@@ -1,0 +1,83 @@
+"""A small vibration on a large offset in float32: right, or flagged. Silence is not allowed."""
+
+import numpy as np
+import pytest
+import torch
+
+from tactslip_torch import FeaturePool, HandLayout
+from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
+
+SHAPES = ("cv", "skewness", "kurtosis", "peak_factor", "correlation", "entropy")
+SHAPES += ("spectral_centroid", "spectral_spread", "band_energy_ratio")
+
+
+@pytest.fixture(scope="module")
+def pool():
+    return FeaturePool(HandLayout.paper24())
+
+
+def vibrations(kind, num_bins, rng):
+    """Unit vibrations ``[num_bins, 24, 100]``."""
+    t = np.arange(100) / 2000
+    if kind == "noise":
+        return rng.standard_normal((num_bins, 24, 100))
+    hertz = rng.uniform(20, 400, (num_bins, 24, 1))
+    phase = rng.uniform(0, 2 * np.pi, (num_bins, 24, 1))
+    return np.sin(2 * np.pi * hertz * t + phase)
+
+
+@pytest.mark.parametrize("vibration", [1e-2, 1e-3])
+@pytest.mark.parametrize("kind", ["noise", "tone"])
+def test_float32_is_right_or_flagged_at_an_offset_of_1e3(kind, vibration, pool, rng):
+    """Against float64 on the same float32 input; a tone leaves branches of rounding alone."""
+    wide = 1e3 + vibration * vibrations(kind, 40, rng)
+    bins = torch.from_numpy(wide).float()
+    single, double = pool(bins).double(), pool(bins.double())
+    flagged = ~pool.validity(bins)
+    channel = torch.tensor([pool.hand.names.index(name.channel) for name in pool.names])
+    excused = flagged[:, channel]
+    error = (single - double).abs() / double.abs().clamp(min=torch.finfo(torch.float32).tiny)
+    for descriptors, limit in ((("std",), 0.01), (SHAPES, 0.05)):
+        mine = torch.tensor([name.descriptor in descriptors for name in pool.names])
+        assert mine.any()
+        assert bool(((error < limit) | excused | ~mine).all())
+    if vibration == 1e-2:
+        assert not flagged.any()
+
+
+def test_a_branch_far_smaller_than_its_bin_is_kept(pool, rng):
+    """Once replaced by 0 in float32, unflagged: its span is below 16 eps32 of the offset."""
+    t = torch.arange(100) / 2000
+    bins = (1e3 + 1e-2 * torch.sin(2 * torch.pi * 50 * t)).expand(24, 100)
+    branch = next(i for i, n in enumerate(pool.names) if str(n) == "PVDF1 D1 time std")
+    assert pool(bins.float())[branch] > 0
+    native = FeaturePool(pool.hand, arithmetic="native")
+    assert native(bins.float())[branch] == 0
+    assert pool.validity(bins.float()).all()
+
+
+@pytest.mark.parametrize("kind", EXTREMES)
+def test_float32_bins_give_what_they_give_in_float64_rounded_once(kind, pool):
+    bins = extreme_bins(kind, (6, 24, 100), torch.Generator().manual_seed(7), torch.float32)
+    most = torch.finfo(torch.float32).max
+    single = pool(bins)
+    assert single.dtype == torch.float32
+    assert bool(single.isfinite().all())
+    assert torch.equal(single, pool(bins.double()).clamp(-most, most).float())
+
+
+@pytest.mark.parametrize("kind", EXTREMES)
+def test_gradients_of_float32_bins_are_finite(kind, pool):
+    bins = extreme_bins(kind, (2, 24, 100), torch.Generator().manual_seed(8), torch.float32)
+    bins.requires_grad_()
+    pool(bins).sum().backward()
+    assert bins.grad is not None
+    assert bins.grad.dtype == torch.float32
+    assert bool(bins.grad.isfinite().all())
+
+
+def test_validity_of_a_span_that_overflows(pool):
+    """Rail to rail at the end of float64: the span is infinite, the samples are not."""
+    bins = torch.full((24, 100), torch.finfo(torch.float64).max, dtype=torch.float64)
+    bins[:, ::2] *= -1
+    assert pool.validity(bins).all()
