@@ -5,10 +5,10 @@ from __future__ import annotations
 import random
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from statistics import median
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from statistics import median, quantiles
+from typing import Any, NamedTuple
 
 import torch
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
@@ -39,26 +39,72 @@ def in_turns(
     return {name: (seconds[name], results[name]) for name in calls}
 
 
+class Way(NamedTuple):
+    """A short call, and what it runs under: entered and left while the clock stands."""
+
+    call: Callable[[], object]
+    under: Callable[[], AbstractContextManager[Any]] = nullcontext
+
+
 def in_shuffled_turns(
     calls: Mapping[str, Callable[[], object]], rounds: int, seed: int
 ) -> dict[str, float]:
-    """Median seconds of each of several short calls.
+    """Median seconds of each of several short calls, timed as ``shuffled_rounds`` does."""
+    ways = {name: Way(call) for name, call in calls.items()}
+    return {name: median(taken) for name, taken in shuffled_rounds(ways, rounds, seed).items()}
+
+
+def shuffled_rounds(ways: Mapping[str, Way], rounds: int, seed: int) -> dict[str, list[float]]:
+    """Seconds of each of several short calls in every round.
 
     Every round times a block of each, in an order of its own and after one call that is not
     timed: a neighbour that sweeps the caches must not cost always the same one.
     """
     shuffle = random.Random(seed)
-    repeats = {name: _calls_in_block(call) for name, call in calls.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    repeats: dict[str, int] = {}
+    for name, way in ways.items():
+        with way.under():
+            repeats[name] = _calls_in_block(way.call)
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(rounds):
-        for name in shuffle.sample(list(calls), len(calls)):
-            call = calls[name]
-            call()
-            started = time.perf_counter()
-            for _ in range(repeats[name]):
+        for name in shuffle.sample(list(ways), len(ways)):
+            call = ways[name].call
+            with ways[name].under():
                 call()
-            seconds[name].append((time.perf_counter() - started) / repeats[name])
-    return {name: median(values) for name, values in seconds.items()}
+                started = time.perf_counter()
+                for _ in range(repeats[name]):
+                    call()
+                taken = time.perf_counter() - started
+            seconds[name].append(taken / repeats[name])
+    return seconds
+
+
+class Ratio(NamedTuple):
+    """How much one call takes over another: the middle of the rounds, and half of them between.
+
+    Attributes:
+        median: of the ratios within each round; drift between rounds cancels.
+        low: their first quartile.
+        high: their third.
+    """
+
+    median: float
+    low: float
+    high: float
+
+
+def paired_ratio(seconds: Sequence[float], others: Sequence[float]) -> Ratio:
+    """What ``seconds`` are of ``others``, round by round.
+
+    Example:
+        >>> paired_ratio([1.0, 6.0, 3.0], [1.0, 3.0, 2.0])
+        Ratio(median=1.5, low=1.25, high=1.75)
+    """
+    ratios = [a / b for a, b in zip(seconds, others, strict=True)]
+    if len(ratios) < 2:
+        return Ratio(*ratios * 3)
+    low, middle, high = quantiles(ratios, n=4, method="inclusive")
+    return Ratio(middle, low, high)
 
 
 def _calls_in_block(call: Callable[[], object]) -> int:

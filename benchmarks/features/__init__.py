@@ -1,0 +1,1 @@
+"""What features and scores cost: ``python -m benchmarks.features``."""

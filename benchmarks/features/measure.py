@@ -1,0 +1,114 @@
+"""The measurements of ``benchmarks.features``: seconds of every round, no judgement.
+
+Bins are simulated: those of one recording, filtered as in training. What is compared is timed in
+one process, in an order of its own in every round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.clocks import Way, on_threads, say, shuffled_rounds
+from benchmarks.features.guards_off import guards_off, textbook
+from benchmarks.features.sizes import Sizes
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.feature_maker import FeatureMaker
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.simulation.source import SimulatedRecordings
+
+ARITHMETIC = {
+    "float64": (torch.float64, "double"),
+    "float32, computed in float64": (torch.float32, "double"),
+    "float32 throughout": (torch.float32, "native"),
+}
+NUM_FEATURES = 120  # of the detector that is timed
+
+
+def extract(sizes: Sizes) -> dict[str, Any]:
+    """Features of bins with guards, without, and by the textbook."""
+    rows = []
+    for threads in sizes.threads:
+        say(f"extract on {threads} threads")
+        ways: dict[str, Way] = {}
+        for name, (dtype, arithmetic) in ARITHMETIC.items():
+            pool = FeaturePool(HandLayout.paper24(), arithmetic=arithmetic)  # type: ignore[arg-type]
+            call = partial(pool.extract, simulated_bins(sizes.bins).to(dtype))
+            ways |= {
+                f"{name} guards": Way(call),
+                f"{name} off": Way(call, guards_off),
+                f"{name} textbook": Way(call, textbook),
+            }
+        with torch.inference_mode(), on_threads(threads):
+            seconds = shuffled_rounds(ways, sizes.rounds, sizes.seed)
+        rows += [
+            {"bins": sizes.bins, "arithmetic": name, "threads": threads}
+            | {f"{kind}_s": seconds[f"{name} {kind}"] for kind in ("guards", "off", "textbook")}
+            for name in ARITHMETIC
+        ]
+    return {"rows": rows}
+
+
+def score(sizes: Sizes) -> dict[str, Any]:
+    """``SlipDetector.judge`` beside its bare score without guards."""
+    rows = []
+    for threads in sizes.threads:
+        for num_bins in sizes.scored:
+            say(f"scores of {num_bins} at a time on {threads} threads")
+            bins = simulated_bins(num_bins)
+            ways: dict[str, Way] = {}
+            for name, dtype in (("float64", torch.float64), ("float32", torch.float32)):
+                judge = untrained_detector().to(dtype)
+                cast = bins.to(dtype)
+                ways |= {
+                    f"{name} guards": Way(partial(judge.judge, cast, "mask")),
+                    f"{name} off": Way(partial(judge, cast), guards_off),
+                }
+            with torch.inference_mode(), on_threads(threads):
+                seconds = shuffled_rounds(ways, sizes.rounds, sizes.seed)
+            rows += [
+                {"bins": num_bins, "arithmetic": name, "threads": threads}
+                | {f"{kind}_s": seconds[f"{name} {kind}"] for kind in ("guards", "off")}
+                for name in ("float64", "float32")
+            ]
+    return {"rows": rows}
+
+
+SECTIONS: dict[str, Callable[[Sizes], dict[str, Any]]] = {"extract": extract, "score": score}
+
+
+# ---------------------------------------------------------------------------------------- parts
+@cache
+def _recording() -> Tensor:
+    source = SimulatedRecordings(cycles=1, materials=["M1"])
+    maker = FeatureMaker(
+        source, FeaturePool(source.hand), ChannelFilter([51] * 14 + [11] * 10), LabelRule()
+    )
+    return maker.filtered_bins(source.ids[0])[0]
+
+
+def simulated_bins(num: int) -> Tensor:
+    """Filtered bins ``[num, 24, 100]`` of a simulated recording, over and over; float64."""
+    bins = _recording()
+    return bins[torch.arange(num) % len(bins)].clone()
+
+
+@torch.no_grad()
+def untrained_detector() -> SlipDetector:
+    """A detector of the usual size that nobody trained: its time is that of any."""
+    pool = FeaturePool(HandLayout.paper24())
+    selected = list(range(0, len(pool.names), len(pool.names) // NUM_FEATURES))[:NUM_FEATURES]
+    scaler = FeatureScaler.fit(pool.extract(simulated_bins(64))[:, selected], compress=True)
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(NUM_FEATURES + 1, NUM_FEATURES, generator=generator, dtype=torch.float64)
+    head = QuadraticForm(weights[1:] + weights[1:].T, weights[0], weights[0, 0])
+    return SlipDetector(pool, ChannelFilter([51] * 14 + [11] * 10), selected, scaler, head)

@@ -1,0 +1,133 @@
+"""What follows from the measurements of ``benchmarks.features``: ratios, limits, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import median
+from typing import Any
+
+from benchmarks.clocks import paired_ratio
+from tactslip_torch.report.tables import aligned
+
+SIMULATED_LINE = "SIMULATED bins: what features and scores cost, nothing about a real hand"
+QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
+MOST_OVER_OFF = 1.10  # what the guards may cost, as the project has set itself
+WIDE, NATIVE = "float32, computed in float64", "float32 throughout"
+_TITLES = {"extract": "features", "score": "scores with validity"}
+_KINDS = ("off", "textbook")  # what seconds with guards are compared with
+
+
+# ------------------------------------------------------------------------------------- numbers
+def ratios(sections: Mapping[str, Any]) -> dict[str, Any]:
+    """Seconds with guards over seconds without, of calls timed in the same rounds.
+
+    Args:
+        sections: name to numbers; any of ``SECTIONS``.
+
+    Returns:
+        By section one row per measured row, with ``over_off`` and ``over_textbook``: medians and
+        quartiles of the ratios within rounds. Under ``"wide_over_native"``, by threads, what it
+        costs to compute float32 bins in float64.
+    """
+    found: dict[str, Any] = {
+        name: [_over(row) for row in of["rows"]] for name, of in sections.items()
+    }
+    rows = sections.get("extract", {}).get("rows", ())
+    seconds = {(row["arithmetic"], row["threads"]): row["guards_s"] for row in rows}
+    found["wide_over_native"] = {
+        str(threads): paired_ratio(taken, seconds[NATIVE, threads])._asdict()
+        for (name, threads), taken in seconds.items()
+        if name == WIDE and (NATIVE, threads) in seconds
+    }
+    return found
+
+
+def _over(row: Mapping[str, Any]) -> dict[str, Any]:
+    facts = {name: row[name] for name in ("arithmetic", "threads", "bins")}
+    return facts | {
+        f"over_{kind}": paired_ratio(row["guards_s"], row[f"{kind}_s"])._asdict()
+        for kind in _KINDS
+        if f"{kind}_s" in row
+    }
+
+
+def limit_rows(sections: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Every limit beside what was measured, and whether it holds.
+
+    Args:
+        sections: name to numbers; limits of absent ones are left out.
+    """
+    of = ratios(sections)
+    return [
+        {
+            "what": f"{_TITLES[name]}, guards / off, {_about(row)}",
+            "measured": _spread(row["over_off"]),
+            "limit": f"<= {MOST_OVER_OFF:.2f}",
+            "ok": row["over_off"]["median"] <= MOST_OVER_OFF,
+        }
+        for name in sections
+        for row in of[name]
+    ]
+
+
+# -------------------------------------------------------------------------------------- tables
+def report_text(report: Mapping[str, Any]) -> str:
+    """What is printed.
+
+    Args:
+        report: settings, facts and sections, as ``--json`` keeps them.
+    """
+    parts = [_heading(report)]
+    parts += [_table(name, of, report["ratios"]) for name, of in report["sections"].items()]
+    parts += [_wide_line(report["ratios"]["wide_over_native"])]
+    rows = [
+        [row["what"], row["measured"], row["limit"], "met" if row["ok"] else "MISSED"]
+        for row in report["limits"]
+    ]
+    parts.append(aligned(["limits", "median, quartiles", "limit", ""], rows))
+    parts.append("guards off replaces " + ", ".join(report["replaced"]))
+    return "\n\n".join([*filter(None, parts), *([QUICK_LINE] if report["quick"] else [])])
+
+
+def _heading(report: Mapping[str, Any]) -> str:
+    lines = [
+        f"features and scores, {report['settings']['rounds']} rounds of each call",
+        f"machine   {', '.join(report['machine'].values())}",
+        f"versions  {', '.join(f'{name} {of}' for name, of in report['versions'].items())}",
+        SIMULATED_LINE,
+    ]
+    return "\n".join(lines + ([QUICK_LINE] if report["quick"] else []))
+
+
+def _table(name: str, numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
+    kinds = [kind for kind in _KINDS if f"{kind}_s" in numbers["rows"][0]]
+    header = [_TITLES[name], "threads", "bins at once", "guards, us/bin"]
+    header += [f"{kind}, us/bin" for kind in kinds] + [f"guards / {kind}" for kind in kinds]
+    rows = []
+    for row, ratio in zip(numbers["rows"], of[name], strict=True):
+        cells = [row["arithmetic"], str(row["threads"]), str(row["bins"])]
+        cells += [_per_bin(row[f"{kind}_s"], row["bins"]) for kind in ("guards", *kinds)]
+        rows.append(cells + [f"{ratio[f'over_{kind}']['median']:.3f}" for kind in kinds])
+    note = "\ntextbook: neither guards nor shifted and scaled sums" if "textbook" in kinds else ""
+    return aligned(header, rows) + note
+
+
+def _wide_line(of: Mapping[str, Any]) -> str:
+    on = [f"{_spread(ratio)} on {_threads(threads)}" for threads, ratio in of.items()]
+    return f"{WIDE} / {NATIVE}: {', '.join(on)} (a choice, not a guard)" if on else ""
+
+
+def _about(row: Mapping[str, Any]) -> str:
+    return f"{row['arithmetic']}, {row['bins']} at once, {_threads(row['threads'])}"
+
+
+def _threads(number: int | str) -> str:
+    return f"{number} thread" + ("" if int(number) == 1 else "s")
+
+
+def _spread(ratio: Mapping[str, float]) -> str:
+    return f"{ratio['median']:.3f} ({ratio['low']:.3f} to {ratio['high']:.3f})"
+
+
+def _per_bin(seconds: Sequence[float], bins: int) -> str:
+    return f"{1e6 * median(seconds) / bins:.0f}"
