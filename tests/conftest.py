@@ -1,17 +1,39 @@
-"""Fixtures every test file may ask for."""
+"""Fixtures every test file may ask for, and the seed of everything that is generated."""
 
 import os
 import zlib
 
+import generated
 import numpy as np
 import pytest
 import torch
-from hypothesis import settings
+from hypothesis import is_hypothesis_test, seed, settings
 
-settings.register_profile("default", deadline=None, derandomize=True, max_examples=40)
+settings.register_profile(
+    "default", deadline=None, derandomize=False, database=None, max_examples=40
+)
 torch.set_num_threads(1)  # two processes with two threads each on two cores spend hours waiting
 
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Each hypothesis test draws by the seed of the run and its own name, in any selection."""
+    if config.getoption("--hypothesis-seed", None) is not None:
+        return  # hypothesis sees to it
+    for item in items:
+        test = getattr(item, "obj", None)
+        if test is not None and is_hypothesis_test(test):
+            name = item.nodeid.split("[")[0]
+            seed(f"{generated.SEED} {name}")(test)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if num := generated.num_generated():
+        terminalreporter.write_line(
+            f"property tests: {num} generated bins, seed {generated.SEED} "
+            f"(TACTSLIP_SEED={generated.SEED} pytest ... repeats them)"
+        )
 
 
 @pytest.fixture
