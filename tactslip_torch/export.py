@@ -6,8 +6,7 @@ It holds the whole pool, matrices for every linear map, and no operator that is 
 onnxruntime. A file is left only if onnxruntime gives torch's scores and flags at batch sizes the
 graph was not traced with, on dead and broken channels too.
 
-ONNX has no ``log1p``: a scaler's knee becomes ``Log(1 + x)``, off by some float32 eps of the knee.
-A feature that comes near 0 has a range about as wide as its knee, so scaled it is off by as little.
+ONNX has no ``log1p``: a scaler's knee becomes ``Log(1 + x)``, off by some float64 eps of the knee.
 """
 
 from __future__ import annotations

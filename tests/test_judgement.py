@@ -9,6 +9,7 @@ from test_detector import noise, random_detector
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.files import load_table, save_table
 from tactslip_torch.model.detector import FORMAT, SlipDetector
+from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 
 BAD = [float("nan"), float("inf"), -float("inf")]
@@ -168,10 +169,25 @@ def test_typical_features_that_are_none_are_refused(typical, detector):
 def test_float32_samples_are_scored_as_in_float64_but_for_the_head(kind, detector):
     samples = extreme_bins(kind, (8, 24, 150), torch.Generator().manual_seed(4), torch.float32)
     inside = detector.pool(detector.channel_filter.valid(samples.double()))
+    z = detector.scaler(inside[:, list(detector.selected)])
     single = copy.deepcopy(detector).float()
-    z = single.scaler(inside[:, list(detector.selected)].float())
-    judged = single.judge_raw(samples)
-    torch.testing.assert_close(judged.score, single.head(z), rtol=1e-6, atol=1e-6)
+    assert torch.equal(single.judge_raw(samples).score, single.head(z.float()))
+
+
+def test_a_feature_far_from_zero_keeps_its_digits_in_a_float32_detector():
+    """Once scaled in float32: a mean of 1e3 V that moves by 1e-2 V was off by a third of a
+    percent of its range."""
+    detector = random_detector()
+    means = [i for i, n in enumerate(detector.pool.names) if str(n).endswith("raw time mean")][:12]
+    generator = torch.Generator().manual_seed(6)
+    bins = 1e3 + 1e-2 * torch.randn(200, 24, 1, generator=generator, dtype=torch.float64)
+    bins = bins + 1e-2 * torch.randn(200, 24, 100, generator=generator, dtype=torch.float64)
+    scaler = FeatureScaler.fit(detector.pool(bins)[:, means])
+    parts = (detector.pool, detector.channel_filter, means, scaler, detector.head)
+    samples = bins[:, :, :1] + torch.zeros(200, 24, 150)
+    exact = SlipDetector(*parts).score_raw(samples.float().double())
+    single = SlipDetector(*parts).float().score_raw(samples.float())
+    assert float((single - exact).abs().max() / exact.std()) < 1e-5
 
 
 def test_widening_happens_once_and_before_the_filter(detector):

@@ -6,7 +6,7 @@ A file is a plain table of tensors and JSON text; loading it executes nothing.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -33,8 +33,9 @@ EARLIER_FORMAT = "tactslip_torch detector 1"
 class SlipDetector(nn.Module):
     """The fitted pipeline from filtered or raw samples to a score.
 
-    Features are computed in the dtype of the bins; scaling and head in the dtype of the detector
-    (float64 as fitted; ``detector.float()`` for float32).
+    Of float32 bins too, features are computed and scaled in float64 (``FeaturePool.arithmetic``):
+    offsets cancel there. The head works in the dtype of the detector, float64 as fitted;
+    ``detector.float()`` for float32.
 
     Args:
         pool: what features there are, F of C channels.
@@ -97,7 +98,7 @@ class SlipDetector(nn.Module):
         self.head = head
         self.selected = tuple(int(i) for i in selected)
         self.info = dict(info or {})
-        self.register_buffer("typical", typical.to(scaler.minimum, copy=True))
+        self.register_buffer("typical", typical.to(next(head.buffers()), copy=True))
         self._channel_of = [pool.hand.names.index(name.channel) for name in self.selected_names]
 
     @property
@@ -207,12 +208,20 @@ class SlipDetector(nn.Module):
 
     def _features(self, bins: Tensor) -> Tensor:
         index = torch.tensor(self.selected, device=bins.device)
-        selected: Tensor = self.pool(bins).index_select(-1, index)
+        selected: Tensor = self.pool(self.pool.widen(bins)).index_select(-1, index)
         return selected
 
     def _scale(self, features: Tensor) -> Tensor:
         scaled: Tensor = self.scaler(saturating(features, self.scaler.minimum.dtype))
-        return scaled
+        return scaled.to(self.typical.dtype)
+
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SlipDetector:
+        """What ``float()`` and ``to()`` do to every tensor; ranges of features stay as they are."""
+        exact = dict(self.scaler.named_buffers())
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch has no annotations
+        for name, value in exact.items():
+            setattr(self.scaler, name, value.to(getattr(self.scaler, name).device))
+        return self
 
     def _needed(self, is_trusted: Tensor) -> Tensor:
         """Whether all channels in use are trusted, ``[*, C] -> [*]``."""
