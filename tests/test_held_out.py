@@ -301,7 +301,7 @@ def test_a_primal_of_a_kernel_that_does_not_fold_is_refused(rng):
 
 @pytest.mark.usefixtures("primal")
 @pytest.mark.parametrize("size", [1, 20])
-@pytest.mark.parametrize("penalty", [1e8, 1e12])
+@pytest.mark.parametrize("penalty", [1e7, 1e8])
 def test_a_bin_alone_in_a_feature_is_refused_by_name_where_float64_ends(penalty, size, rng):
     """Only bin 25 has the last feature: its leverage is 1 but for about 1 / penalty."""
     bins, groups = draw(rng, 80, 4), torch.arange(80) // size + 100

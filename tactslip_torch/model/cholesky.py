@@ -5,12 +5,13 @@ matrix is cut into tiles of fixed shape, each computed by one thread (``threads.
 it works on row-major storage, reads the lower triangle alone and makes no copy of it.
 
 Reference:
-    Golub and Van Loan, Matrix Computations, 4th ed., sections 4.2.6 (block Cholesky) and 3.1.4
-    (block substitution).
+    Golub and Van Loan, Matrix Computations, 4th ed., sections 4.2.6 (block Cholesky), 3.1.4
+    (block substitution) and 11.5 (preconditioned conjugate gradients).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -24,6 +25,8 @@ _FEW = 256  # right-hand sides; up to here the threads share every band of one s
 _BAND = 512  # rows of a factor that a solve reads at a time
 _STRIP = 128  # rows of a band that one thread reads at a time, for few right-hand sides
 _WIDTH = 1024  # columns of a band, likewise
+_MOST_STEPS = 40  # of conjugate gradients
+_CONVERGED = 1e-12  # error of their solution, relative
 
 
 def cholesky_(matrix: Tensor) -> None:
@@ -89,6 +92,103 @@ def cholesky_solve(factor: Tensor, right: Tensor) -> Tensor:
 
     _by_systems(solve, rows)
     return rows.mT
+
+
+def mirror_(matrix: Tensor, *, upper: bool = False) -> None:
+    """Copy the lower triangle of a matrix above its diagonal, where a factor leaves it alone.
+
+    Args:
+        matrix: ``[n, n]``, row-major; overwritten.
+        upper: copy the upper triangle below the diagonal instead.
+    """
+    _check_square(matrix, "matrix")
+    num = len(matrix)
+
+    def copy(row: int) -> None:
+        rows = slice(row, min(row + _TILE, num))
+        for column in range(0, row, _TILE):
+            columns = slice(column, column + _TILE)
+            source, goal = matrix[rows, columns], matrix[columns, rows].mT
+            if upper:
+                source, goal = goal, source
+            goal.copy_(source)
+        corner = matrix[rows, rows]
+        half = corner.mT if upper else corner
+        corner.copy_(half.tril() + half.tril(-1).mT)
+
+    for_each(copy, range(0, num, _TILE))
+
+
+def symmetric_product(matrix: Tensor, diagonal: Tensor, vector: Tensor) -> Tensor:
+    """``A vector``, where ``A`` has this diagonal and what stands above that of ``matrix``.
+
+    Shape:
+        - matrix: ``[n, n]``; diagonal, vector, output: ``[n]``
+    """
+    product = diagonal * vector
+
+    def add(row: int) -> None:
+        rows, end = slice(row, row + _TILE), row + _TILE
+        corner, own = matrix[rows, rows].triu(1), vector[rows]
+        product[rows] += corner @ own + corner.mT @ own
+        product[rows] += matrix[rows, end:] @ vector[end:]
+        product[rows] += matrix[:row, rows].mT @ vector[:row]
+
+    for_each(add, range(0, len(matrix), _TILE))
+    return product
+
+
+def refine(matrix: Tensor, diagonal: Tensor, right: Tensor) -> tuple[Tensor, int, float]:
+    """Solve ``A x = right`` with the factor of a neighbour of ``A``, by conjugate gradients.
+
+    Args:
+        matrix: below its diagonal and on it the factor; above it what ``A`` has there.
+        diagonal: of ``A``.
+        right: the right-hand side; kept.
+
+    Shape:
+        - matrix: ``[n, n]``; diagonal, right: ``[n]``
+
+    Returns:
+        The solution, the number of steps, and the norm of its error in units of its own: both that
+        which ``A`` gives, as far as the factor tells.
+    """
+    x, rest = torch.zeros_like(right), right.clone()
+    direction = cholesky_solve(matrix, rest)
+    first = square = float((rest * direction).sum())
+    steps = 0
+    while steps < _MOST_STEPS and square > _CONVERGED**2 * first:
+        image = symmetric_product(matrix, diagonal, direction)
+        curve = float((direction * image).sum())
+        if not curve > 0:  # A is not positive definite in its dtype
+            break
+        x.add_(direction, alpha=square / curve)
+        rest.sub_(image, alpha=square / curve)
+        turned = cholesky_solve(matrix, rest)
+        before, square = square, float((rest * turned).sum())
+        direction.mul_(square / before).add_(turned)
+        steps += 1
+    rest = right - symmetric_product(matrix, diagonal, x)
+    left = float((rest * cholesky_solve(matrix, rest)).sum())
+    return x, steps, math.sqrt(left / first) if left > 0 else 0.0
+
+
+def check_finite(matrix: Tensor, right: Tensor, name: str) -> None:
+    """Name the first number that is not.
+
+    Shape:
+        - matrix: ``[*, n, n]``, its lower triangle is read; right: ``[*, n]``
+
+    Raises:
+        ValueError: if there is one.
+    """
+    for what, values in ((name, matrix.tril()), (f"right-hand side of {name}", right)):
+        if not bool(values.isfinite().all()):
+            place = (~values.isfinite()).nonzero()[0].tolist()
+            raise ValueError(
+                f"{what} must be finite, got {float(values[tuple(place)])} at {place}; leave out "
+                "or mask the bin it comes from"
+            )
 
 
 def _factorise_panel(matrix: Tensor, start: int, end: int) -> None:

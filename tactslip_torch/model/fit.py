@@ -37,7 +37,7 @@ CHUNK_BINS = 2048
 
 @dataclass(frozen=True)
 class TrainingBins:
-    """Scaled training bins of the machine, in float64.
+    """Scaled training bins of the machine, in float64 or to be promoted to it exactly.
 
     Args:
         features: ``[N, K]`` in [-1, 1].
@@ -69,6 +69,11 @@ class TrainingBins:
         """+1 for slip, -1 for non-slip, ``[N]``."""
         return torch.where(self.is_slip, 1.0, -1.0).to(self.features)
 
+    def double(self) -> TrainingBins:
+        """The same bins in float64."""
+        weights = None if self.weights is None else self.weights.double()
+        return TrainingBins(self.features.double(), self.is_slip, weights)
+
 
 def fit_machine(
     bins: TrainingBins,
@@ -81,21 +86,23 @@ def fit_machine(
 
     Through the primal or the dual, whichever ``takes_dual`` finds cheaper; both give the same
     machine. The primal takes one matrix of monomials by monomials (7381 for 120 features) whatever
-    the number of bins; the dual takes one of bins by bins.
+    the number of bins; the dual takes one of bins by bins. In float64, and however close to
+    singular (``symmetric_solve``); ``solved`` of the machine says how it went.
 
     Args:
-        bins: scaled training bins in float64.
+        bins: scaled training bins; float32 is promoted exactly.
         penalty: the paper's ``C``; ``inf`` for the pseudo-inverse.
         kernel: of the machine.
         progress: shows the progress of the primal's accumulation.
         route: ``"auto"``, or the one to take.
 
     Raises:
-        ValueError: if the system is not positive definite, or the primal is asked of a kernel
-            that does not fold.
+        ValueError: if a number is not finite, or the primal is asked of a kernel that does not
+            fold.
     """
     if route not in ("auto", "primal", "dual"):
         raise ValueError(f"route must be 'auto', 'primal' or 'dual', got {route!r}")
+    bins = bins.double()
     num_bins, num_features = bins.features.shape
     if isinstance(kernel, Polynomial) and kernel.collapses:
         if route == "primal" or (
@@ -106,11 +113,19 @@ def fit_machine(
     elif route == "primal":
         raise ValueError(f"{kernel} has no primal of fixed size; take route='dual' or 'auto'")
     gram = lower_gram(kernel, bins.features)
-    beta = solve_kernel_elm_(gram, bins.targets, penalty, bins.weights)
+    beta, report = solve_kernel_elm_(
+        gram,
+        bins.targets,
+        penalty,
+        bins.weights,
+        restore=lambda spoilt: lower_gram(kernel, bins.features, spoilt),
+    )
     if kernel.collapses:
-        return collapse(bins.features, beta, kernel)
-    machine = KernelSum(bins.features, beta, kernel)
-    log.info(machine.cost_note)
+        machine: QuadraticForm | KernelSum = collapse(bins.features, beta, kernel)
+    else:
+        machine = KernelSum(bins.features, beta, kernel)
+        log.info(machine.cost_note)
+    machine.solved = report
     return machine
 
 
@@ -141,9 +156,11 @@ def _solve_linear_primal(
         weighted = x if bins.weights is None else x * bins.weights[chunk, None]
         normal.addmm_(weighted.mT, x)
         moment.addmv_(weighted.mT, bins.targets[chunk])
-    solved = solve_normal_equations_(normal, moment, penalty)
+    solved, report = solve_normal_equations_(normal, moment, penalty)
     flat = solved.new_zeros(num_features, num_features)
-    return QuadraticForm(flat, solved[:-1], math.sqrt(offset) * solved[-1])
+    machine = QuadraticForm(flat, solved[:-1], math.sqrt(offset) * solved[-1])
+    machine.solved = report
+    return machine
 
 
 def _solve_quadratic_primal(
@@ -158,7 +175,11 @@ def _solve_quadratic_primal(
         add_products_(total, bins.features[chunk], weights)
     normal = normal_matrix(total, num_features, offset)
     moment = sum_of_quadratic_features(bins.features, pull, offset)
-    return from_primal(solve_normal_equations_(normal, moment, penalty), num_features, offset)
+    del total
+    weights, report = solve_normal_equations_(normal, moment, penalty)
+    machine = from_primal(weights, num_features, offset)
+    machine.solved = report
+    return machine
 
 
 def _chunks(bins: TrainingBins, progress: Progress | None) -> Iterator[slice]:

@@ -29,6 +29,7 @@ from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, lower
 from tactslip_torch.model.quadratic import QuadraticForm, collapse
 from tactslip_torch.threads import for_each
 
+MOST_CONDITION = 1e10  # of all bins; above, the scores of a group left out lose their digits
 _TILE = 256  # bins whose columns one thread solves at a time
 _CHUNK = 1024  # bins in whole groups that are treated together, unless one group is larger
 _ITERATIONS = 60  # that conjugate gradients usually take
@@ -65,7 +66,7 @@ class HeldOut:
         route: ``"auto"``, or the one to take.
 
     Raises:
-        ValueError: if shapes or dtypes disagree, all bins are one group, leaving a group (named)
+        ValueError: if shapes disagree, all bins are one group, leaving a group (named)
             out leaves one class, or the primal is asked of a kernel that does not fold.
     """
 
@@ -117,7 +118,9 @@ class HeldOut:
 
     def _dual(self, penalty: float) -> tuple[QuadraticForm | KernelSum, Tensor]:
         factor, targets = self._system.clone(), self._targets
-        beta = solve_kernel_elm_(factor, targets, penalty, self._weights)
+        beta, report = solve_kernel_elm_(
+            factor, targets, penalty, self._weights, most_condition=MOST_CONDITION
+        )
         residuals = torch.empty_like(beta)
         for groups, part in _chunks(self._groups):
             if len(groups) == 1 and part.stop == len(beta):  # the last group's answer is in L
@@ -129,12 +132,18 @@ class HeldOut:
                 cholesky_(inverse)
                 residuals[part] = cholesky_solve(inverse, beta[part])
         fold = collapse if self._kernel.collapses else KernelSum
-        return fold(self._z, beta, self._kernel), residuals
+        head = fold(self._z, beta, self._kernel)
+        head.solved = report
+        return head, residuals
 
     def _primal(self, penalty: float, monomials: Monomials) -> tuple[QuadraticForm, Tensor]:
         factor, z = self._system.clone(), self._z
         moment = monomials.gather(z, self._weights * self._targets)
-        head = monomials.head(solve_normal_equations_(factor, moment, penalty))
+        weights, report = solve_normal_equations_(
+            factor, moment, penalty, most_condition=MOST_CONDITION
+        )
+        head = monomials.head(weights)
+        head.solved = report
         roots = self._weights.sqrt()
         right = roots * (self._targets - head(z))
         solved = torch.empty_like(right)

@@ -9,11 +9,21 @@ name ends in ``_`` solve within the matrix they are given; the others are differ
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.model.cholesky import cholesky_, cholesky_solve
+from tactslip_torch.model.cholesky import check_finite
+from tactslip_torch.model.symmetric_solve import (
+    LARGEST_ERROR_FROM_FLOAT32,
+    Solution,
+    condition_of,
+    largest_condition,
+    solve_symmetric_,
+)
+
+_EPS = torch.finfo(torch.float64).eps
 
 
 def solve_kernel_elm(
@@ -21,9 +31,14 @@ def solve_kernel_elm(
 ) -> Tensor:
     """Output weights of the kernel machine: ``(gram + diag(1 / (penalty * weights)))^-1 targets``.
 
-    One Cholesky factorisation, no inverse. Differentiable in ``gram`` and ``targets``. With
-    ``penalty=inf`` the minimum-norm (weighted) least-squares solution through the Moore-Penrose
-    pseudo-inverse, the paper's wording.
+    One Cholesky factorisation, no inverse. Differentiable in ``gram`` and ``targets``. Where the
+    system is too close to singular for that (``symmetric_solve`` has the rule), components of the
+    weighted Gram matrix that are rounding noise are left out: they add nothing to any score, and
+    derivatives are those at constant rank. With ``penalty=inf`` that is the minimum-norm (weighted)
+    least-squares solution through the Moore-Penrose pseudo-inverse, the paper's wording.
+
+    Solved in float64. A float32 ``gram`` carries its rounding times the condition into the
+    solution: it is refused where that exceeds 1e-2.
 
     Args:
         gram: kernel matrix of the training bins, symmetric, positive semi-definite; only its
@@ -36,8 +51,8 @@ def solve_kernel_elm(
         - gram: ``[*, N, N]``; targets, weights, output: ``[*, N]``
 
     Raises:
-        ValueError: if shapes disagree, ``penalty`` is not positive, or the system is not positive
-            definite in its dtype.
+        ValueError: if shapes disagree, ``penalty`` is not positive, a number is not finite,
+            ``gram`` is not positive semi-definite, or float32 is not enough.
 
     Reference:
         Huang, Zhou, Ding and Zhang (2012), IEEE Trans. SMC-B 42(2), 513-529. Equals ``dual_coef_``
@@ -48,21 +63,31 @@ def solve_kernel_elm(
         tensor([ 0.5000, -0.5000])
     """
     _check_system(gram, targets, weights, penalty)
-    if math.isinf(penalty):
-        root = torch.ones_like(targets) if weights is None else weights.sqrt()
-        weighted = root[..., :, None] * gram * root[..., None, :]
-        return root * _pseudo_solve(weighted, root * targets)
-    ridge = torch.diag_embed(_ridge(targets, penalty, weights))
-    return _cholesky_solve(gram + ridge, targets, "gram + I/C", penalty)
+    weights = torch.ones_like(targets) if weights is None else weights
+    return _solve(gram, targets, penalty, weights, "gram")
 
 
 def solve_kernel_elm_(
-    gram: Tensor, targets: Tensor, penalty: float, weights: Tensor | None = None
-) -> Tensor:
-    """``solve_kernel_elm`` within the matrix it is given: no second one of its size.
+    gram: Tensor,
+    targets: Tensor,
+    penalty: float,
+    weights: Tensor | None = None,
+    *,
+    restore: Callable[[Tensor], object] | None = None,
+    most_condition: float | None = None,
+) -> Solution:
+    """``solve_kernel_elm`` within the matrix it is given, and a report: ``solve_symmetric_``.
 
-    The factor overwrites ``gram``; the bits do not depend on the number of threads. Not
-    differentiable. The pseudo-inverse of ``penalty=inf`` takes further matrices all the same.
+    Not differentiable. The factor overwrites ``gram``; the bits do not depend on the number of
+    threads.
+
+    Args:
+        gram: as in ``solve_kernel_elm``.
+        targets: likewise.
+        penalty: likewise.
+        weights: likewise.
+        restore: as in ``solve_symmetric_``.
+        most_condition: likewise.
 
     Shape:
         - gram: ``[N, N]``, row-major; targets, weights, output: ``[N]``
@@ -70,11 +95,10 @@ def solve_kernel_elm_(
     Raises:
         ValueError: as ``solve_kernel_elm``.
     """
-    if math.isinf(penalty):
-        return solve_kernel_elm(gram, targets, penalty, weights)
     _check_system(gram, targets, weights, penalty)
-    gram.diagonal().add_(_ridge(targets, penalty, weights))
-    return _cholesky_solve_(gram, targets, "gram + I/C", penalty)
+    return solve_symmetric_(
+        gram, targets, penalty, weights, name="gram", restore=restore, most_condition=most_condition
+    )
 
 
 def solve_primal(
@@ -103,8 +127,10 @@ def solve_primal(
             f"and {tuple(targets.shape)}"
         )
     _check_weights(weights, targets)
-    weighted = features if weights is None else features * weights[:, None]
-    return solve_normal_equations(features.mT @ weighted, weighted.mT @ targets, penalty)
+    x = features.double()  # exact, so that only the result is rounded
+    weighted = x if weights is None else x * weights[:, None]
+    moment = weighted.mT @ targets.double()
+    return solve_normal_equations(x.mT @ weighted, moment, penalty).to(features.dtype)
 
 
 def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Tensor:
@@ -118,14 +144,12 @@ def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Te
         ValueError: as ``solve_primal``.
     """
     _check_penalty(penalty)
-    if math.isinf(penalty):
-        return _pseudo_solve(normal, moment)
-    ridged = normal.clone()
-    ridged.diagonal().add_(1 / penalty)
-    return _cholesky_solve(ridged, moment, "X'WX + I/C", penalty)
+    return _solve(normal, moment, penalty, torch.ones_like(moment), "X'WX")
 
 
-def solve_normal_equations_(normal: Tensor, moment: Tensor, penalty: float) -> Tensor:
+def solve_normal_equations_(
+    normal: Tensor, moment: Tensor, penalty: float, *, most_condition: float | None = None
+) -> Solution:
     """``solve_normal_equations`` within the matrix it is given, as ``solve_kernel_elm_`` does.
 
     Shape:
@@ -134,39 +158,88 @@ def solve_normal_equations_(normal: Tensor, moment: Tensor, penalty: float) -> T
     Raises:
         ValueError: as ``solve_primal``.
     """
-    if math.isinf(penalty):
-        return solve_normal_equations(normal, moment, penalty)
     _check_penalty(penalty)
-    normal.diagonal().add_(1 / penalty)
-    return _cholesky_solve_(normal, moment, "X'WX + I/C", penalty)
+    return solve_symmetric_(normal, moment, penalty, name="X'WX", most_condition=most_condition)
 
 
-def _ridge(targets: Tensor, penalty: float, weights: Tensor | None) -> Tensor:
-    """``1 / (penalty * weights)`` of every bin."""
-    return torch.full_like(targets, 1 / penalty) if weights is None else 1 / (penalty * weights)
-
-
-def _pseudo_solve(system: Tensor, targets: Tensor) -> Tensor:
-    inverse: Tensor = torch.linalg.pinv(system, hermitian=True)
-    return (inverse @ targets[..., None]).squeeze(-1)
-
-
-def _cholesky_solve(system: Tensor, targets: Tensor, name: str, penalty: float) -> Tensor:
-    factor, info = torch.linalg.cholesky_ex(system)
-    if bool(info.any()):
+def _solve(system: Tensor, right: Tensor, penalty: float, weights: Tensor, name: str) -> Tensor:
+    """``(system + diag(1 / (penalty weights)))^-1 right``, differentiable; batched, in float64."""
+    given, eps = right.dtype, torch.finfo(system.dtype).eps
+    system, right, weights = system.double(), right.double(), weights.double()
+    check_finite(system, right, name)
+    if math.isinf(penalty):
+        return _pseudo_solve(system, right, penalty, weights, eps, name).to(given)
+    ridged = system + torch.diag_embed(1 / (penalty * weights))
+    factor, info = torch.linalg.cholesky_ex(ridged)
+    conditions = _conditions(ridged.detach(), factor.detach(), info)
+    most = largest_condition(right.shape[-1], eps)
+    singular = torch.tensor([not condition <= most for condition in conditions])
+    singular = singular.view(info.shape).to(info.device)
+    if eps > _EPS and bool(singular.any()):
         raise ValueError(
-            f"{name} is not positive definite at penalty={penalty:g} in {system.dtype}; "
-            "lower the penalty, scale the features, or solve in float64"
+            f"{name} + I/C at penalty={penalty:g} has condition {max(conditions):.1e}, too much "
+            "for a matrix in float32; make it in float64, or lower the penalty"
         )
-    return torch.cholesky_solve(targets[..., None], factor).squeeze(-1)
+    if bool(singular.any()):
+        safe = torch.where(singular[..., None, None], torch.eye(right.shape[-1]).to(right), ridged)
+        solved = torch.cholesky_solve(right[..., None], torch.linalg.cholesky(safe)).squeeze(-1)
+        escalated = _pseudo_solve(system, right, penalty, weights, eps, name)
+        return torch.where(singular[..., None], escalated, solved)
+    return torch.cholesky_solve(right[..., None], factor).squeeze(-1).to(given)
 
 
-def _cholesky_solve_(system: Tensor, targets: Tensor, name: str, penalty: float) -> Tensor:
-    try:
-        cholesky_(system)
-    except ValueError as error:
-        raise ValueError(f"{name} at penalty={penalty:g}: {error}") from error
-    return cholesky_solve(system, targets)
+def _pseudo_solve(
+    system: Tensor, right: Tensor, penalty: float, weights: Tensor, eps: float, name: str
+) -> Tensor:
+    """Likewise, without the components of ``sqrt(w) system sqrt(w)`` that are rounding noise.
+
+    ``(M + I/C)^-1`` on the span of ``M`` is ``(I + M^+/C)^-1 M^+``: of these one is well-posed and
+    the other has derivatives.
+    """
+    roots = weights.sqrt()
+    weighted = roots[..., :, None] * system * roots[..., None, :]
+    noise = right.shape[-1] * eps
+    _check_spectrum(torch.linalg.eigvalsh(weighted.detach()), noise, eps, name)
+    inverse: Tensor = torch.linalg.pinv(weighted, rtol=noise, hermitian=True)
+    solved = inverse @ (roots * right)[..., None]
+    if not math.isinf(penalty):
+        ridged = inverse / penalty + torch.eye(right.shape[-1]).to(inverse)
+        solved = torch.cholesky_solve(solved, torch.linalg.cholesky(ridged))
+    return roots * solved.squeeze(-1)
+
+
+def _conditions(system: Tensor, factor: Tensor, info: Tensor) -> list[float]:
+    """Of each matrix of a batch; infinite where its factorisation failed."""
+    num = system.shape[-1]
+    return [
+        math.inf if failed else condition_of(matrix, lower.contiguous())
+        for matrix, lower, failed in zip(
+            system.reshape(-1, num, num).cpu(),
+            factor.reshape(-1, num, num).cpu(),
+            info.reshape(-1).tolist(),
+            strict=True,
+        )
+    ]
+
+
+def _check_spectrum(values: Tensor, noise: float, eps: float, name: str) -> None:
+    """That a matrix is positive semi-definite and, in float32, tells what is kept of it."""
+    top, low = values.amax(-1, keepdim=True), values.amin(-1, keepdim=True)
+    wrong = (low < -10 * noise * top.clamp(min=0)).flatten()
+    if bool(wrong.any()):
+        place = int(wrong.nonzero()[0])
+        raise ValueError(
+            f"{name} is not positive semi-definite: it has the eigenvalue "
+            f"{float(low.flatten()[place]):.3g} beside {float(top.flatten()[place]):.3g}; it must "
+            "be a sum of squares"
+        )
+    least = torch.where(values > noise * top, values, top).amin(-1, keepdim=True)
+    if eps > _EPS and bool((eps * top > LARGEST_ERROR_FROM_FLOAT32 * least).any()):
+        condition = float((top / least).max())
+        raise ValueError(
+            f"{name} at penalty=inf has condition {condition:.1e}, too much for a matrix in "
+            "float32; make it in float64, or lower the penalty"
+        )
 
 
 def _check_system(gram: Tensor, targets: Tensor, weights: Tensor | None, penalty: float) -> None:

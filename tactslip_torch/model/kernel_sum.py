@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.model.kernels import Cost, Kernel
+from tactslip_torch.model.kernels import Cost, Kernel, Solved
 
 
 class KernelSum(nn.Module):
@@ -19,6 +19,9 @@ class KernelSum(nn.Module):
         support: ``[N, K]``, scaled training bins.
         beta: ``[N]``, their output weights.
         kernel: of the machine.
+
+    Attributes:
+        solved: how its numbers were solved for; ``None`` if read from a file or made by hand.
 
     Raises:
         ValueError: if shapes disagree.
@@ -35,6 +38,7 @@ class KernelSum(nn.Module):
 
     def __init__(self, support: Tensor, beta: Tensor, kernel: Kernel) -> None:
         super().__init__()
+        self.solved: Solved | None = None
         if support.ndim != 2 or beta.shape != support.shape[:1]:
             raise ValueError(
                 "expected support [N, K] and beta [N] with one N, got "

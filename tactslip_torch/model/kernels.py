@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -134,21 +134,37 @@ def kernel_from_dict(values: Mapping[str, Any]) -> Kernel:
         raise ValueError(f"{numbers} does not describe a {values['kind']} kernel") from error
 
 
-def lower_gram(kernel: Kernel, z: Tensor) -> Tensor:
+def lower_gram(kernel: Kernel, z: Tensor, out: Tensor | None = None) -> Tensor:
     """Kernel matrix of bins with themselves, for a Cholesky: only its lower triangle is filled.
 
     ``kernel(z, z)`` needs two more matrices of that size on the way; this needs none. Not
     differentiable.
 
+    Args:
+        kernel: of the machine.
+        z: the bins.
+        out: write it here instead, where it need not be 0.
+
     Shape:
-        - z: ``[N, K]``; output: ``[N, N]``, above the diagonal 0 or the kernel
+        - z: ``[N, K]``; output: ``[N, N]``, above the diagonal what was there or the kernel
     """
-    gram = z.new_zeros(len(z), len(z))
+    gram = z.new_zeros(len(z), len(z)) if out is None else out
     with torch.no_grad():
         for start in range(0, len(z), _GRAM_ROWS):
             end = start + _GRAM_ROWS
             gram[start:end, :end] = kernel(z[start:end], z[:end])
     return gram
+
+
+class Solved(Protocol):
+    """What a head remembers of the solve it comes from; ``SolveReport`` is one."""
+
+    @property
+    def condition(self) -> float:
+        """Of the system."""
+
+    def facts(self) -> dict[str, Any]:
+        """JSON-able."""
 
 
 class Cost(NamedTuple):

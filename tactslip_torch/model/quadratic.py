@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.model.kernels import PAPER_KERNEL, Cost, Kernel, Polynomial
+from tactslip_torch.model.kernels import PAPER_KERNEL, Cost, Kernel, Polynomial, Solved
 
 
 class QuadraticForm(nn.Module):
@@ -22,6 +22,9 @@ class QuadraticForm(nn.Module):
         quadratic: ``[K, K]``, symmetric.
         linear: ``[K]``.
         constant: a scalar tensor.
+
+    Attributes:
+        solved: how its numbers were solved for; ``None`` if read from a file or made by hand.
 
     Raises:
         ValueError: if shapes disagree.
@@ -33,6 +36,7 @@ class QuadraticForm(nn.Module):
 
     def __init__(self, quadratic: Tensor, linear: Tensor, constant: Tensor) -> None:
         super().__init__()
+        self.solved: Solved | None = None
         num = linear.shape[-1]
         if quadratic.shape != (num, num) or linear.shape != (num,) or constant.shape != ():
             raise ValueError(

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from tactslip_torch.files import load_table, save_table
 from tactslip_torch.ledger import Ledger, content_digest, first_difference
-from tactslip_torch.model.cholesky import cholesky_, cholesky_solve
 from tactslip_torch.model.fourth_moments import (
     ProductSums,
     add_products_,
@@ -30,6 +29,7 @@ from tactslip_torch.model.fourth_moments import (
     normal_matrix,
 )
 from tactslip_torch.model.quadratic import QuadraticForm, from_primal
+from tactslip_torch.model.symmetric_solve import solve_symmetric_
 
 FORMAT = "tactslip_torch sums 1"
 _CLASSES = ("non-slip", "slip")
@@ -180,7 +180,9 @@ class SufficientStats:
         """The kernel machine of degree 2 of all bins: what ``solve_primal`` makes of them.
 
         Takes one float64 matrix of ``P`` by ``P`` monomials beside the sums (436 MB for 120
-        features). The same bits on any number of threads, but for ``penalty=inf``.
+        features). The same bits on any number of threads. The grid leaves an error in that matrix;
+        where C makes so much of it that it would show (a thousandth), components up to its size
+        are left out, and a machine that needs components near it is refused.
 
         Args:
             penalty: the paper's ``C``; ``inf`` for the pseudo-inverse, which takes several such
@@ -191,28 +193,22 @@ class SufficientStats:
                 bins' own.
 
         Raises:
-            ValueError: if a class is absent, an argument is not allowed, or the system is not
-                positive definite.
+            ValueError: if a class is absent, an argument is not allowed, or the grid is too coarse
+                for this penalty.
 
         Reference:
             Zong, Huang and Chen (2013), Neurocomputing 101, 229-242 (weighted ELM).
         """
-        normal, moment = self._normal_equations(penalty, offset, num_features, balance)
-        if math.isinf(penalty):
-            weights = torch.linalg.pinv(normal, hermitian=True) @ moment
-        else:
-            normal.diagonal().add_(1 / penalty)
-            try:
-                cholesky_(normal)
-            except ValueError as error:
-                raise ValueError(f"X'WX + I/C at penalty={penalty:g}: {error}") from error
-            weights = cholesky_solve(normal, moment)
-        return from_primal(weights, num_features or self.num_features, offset)
+        normal, moment, noise = self._normal_equations(penalty, offset, num_features, balance)
+        weights, report = solve_symmetric_(normal, moment, penalty, name="X'WX", noise=noise)
+        machine = from_primal(weights, num_features or self.num_features, offset)
+        machine.solved = report
+        return machine
 
     def _normal_equations(
         self, penalty: float, offset: float, num_features: int | None, balance: str
-    ) -> tuple[Tensor, Tensor]:
-        """``X' W X`` and ``X' W t``."""
+    ) -> tuple[Tensor, Tensor, float]:
+        """``X' W X``, ``X' W t``, and what the grid does to the first."""
         if not penalty > 0:
             raise ValueError(f"penalty (the paper's C) must be positive, got {penalty}")
         if not 0 <= offset < math.inf:
@@ -229,7 +225,11 @@ class SufficientStats:
         moment = moment_vector(slip, *terms) - moment_vector(rest, *terms)
         rest += slip
         del slip
-        return normal_matrix(rest, *terms), moment
+        normal = normal_matrix(rest, *terms)
+        # every 256 bins or fewer are off by half a step at most; the size is that of random signs
+        parts = float(self.count.sum()) / 256 + 2 * len(self.ledger)
+        step = 2.0**-self.grid_bits * float(scale.max()) * max(2.0, 2 * offset, offset**2)
+        return normal, moment, 2 * step * math.sqrt(parts * len(normal))
 
     def _checked(
         self, batch_id: str, z: Tensor, is_slip: Tensor, weights: Tensor | None

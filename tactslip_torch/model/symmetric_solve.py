@@ -1,0 +1,291 @@
+"""``(A + diag(1 / (C w))) x = b`` for a positive semi-definite A, however close to singular.
+
+Three rungs, and a report of the one that was taken:
+
+- *Cholesky*, wherever it succeeds and the condition, estimated for the system scaled to a diagonal
+  of ones, is below both 1e12 and ``1 / (n eps)``. Bit for bit what ``cholesky_`` and
+  ``cholesky_solve`` give: no later rung ever touches a well-posed answer.
+- *Jittered*: the factor of the system with a little more on its diagonal preconditions conjugate
+  gradients on the system itself, so the answer is that of the system asked for. Taken if they
+  converge to a solution small enough that its rounding does not show.
+- *Eigen*: ``sqrt(w) A sqrt(w)`` without its ridge is decomposed, and what is rounding noise is
+  dropped: eigenvalues up to ``n eps`` of the largest. Such components add nothing to any score of
+  a training bin, but with a large C they would fill x with rounding. An infinite C comes here
+  at once: the minimum-norm least-squares solution.
+
+Reference:
+    Higham (2002), Accuracy and Stability of Numerical Algorithms, 2nd ed., sections 10.1 and 12;
+    Golub and Van Loan, Matrix Computations, 4th ed., sections 5.5 (rank) and 11.5 (preconditioned
+    conjugate gradients).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.model.cholesky import check_finite, cholesky_, cholesky_solve, mirror_, refine
+from tactslip_torch.model.condition import SolveReport, inverse_growth, inverse_norm, scaled_norm
+from tactslip_torch.threads import for_each
+
+log = logging.getLogger(__name__)
+
+LARGEST_ERROR_FROM_FLOAT32 = 1e-2  # of a solution whose matrix came in float32
+_EPS = torch.finfo(torch.float64).eps
+_MOST_CONDITION = 1e12  # of what a plain Cholesky may solve
+_SURE = 1e8  # a condition that the ridge keeps below this needs no better estimate
+_JITTERS = (4.0, 400.0)  # in units of n eps of the diagonal
+_ENOUGH = 1e-9  # relative error of what conjugate gradients find
+_LEAST_TOLD = 1e-3  # of what is kept, that errors in the matrix itself may be
+
+
+class Solution(NamedTuple):
+    """Of a system, and how it was come by.
+
+    Attributes:
+        x: ``[n]``, in the dtype of the matrix.
+        report: on the solve.
+    """
+
+    x: Tensor
+    report: SolveReport
+
+
+def solve_symmetric_(
+    matrix: Tensor,
+    right: Tensor,
+    penalty: float,
+    weights: Tensor | None = None,
+    *,
+    name: str = "matrix",
+    restore: Callable[[Tensor], object] | None = None,
+    noise: float = 0.0,
+    most_condition: float | None = None,
+) -> Solution:
+    """``(matrix + diag(1 / (penalty weights)))^-1 right``, within the matrix.
+
+    Needs no second matrix of its size for the first two rungs: the system stays above the
+    diagonal, or ``restore`` writes it again. The eigendecomposition takes four more. The same bits
+    for any number of threads. A float32 matrix is promoted (to one more), and carries an error of
+    ``eps32``: refused if that times the condition exceeds 1e-2.
+
+    Args:
+        matrix: symmetric, positive semi-definite, row-major; its lower triangle is read. If the
+            report says ``"cholesky"`` and it is float64, it holds the factor afterwards.
+        right: kept.
+        penalty: the paper's ``C``, positive; ``inf`` for minimum-norm (weighted) least squares.
+        weights: positive weight of each unknown; default 1.
+        name: of the matrix, for errors.
+        restore: writes the lower triangle of the matrix again into its argument.
+        noise: size (2-norm) of the error that the matrix comes with beyond rounding.
+        most_condition: raise an error instead of leaving the first rung, or above this condition.
+
+    Shape:
+        - matrix: ``[n, n]``; right, weights: ``[n]``
+
+    Raises:
+        ValueError: if a number is not finite, the matrix is not positive semi-definite, its
+            errors drown the solution, or a later rung is needed and not allowed.
+
+    Example:
+        >>> twice = torch.ones(2, 2, dtype=torch.float64)  # one bin, twice
+        >>> x, report = solve_symmetric_(twice, twice[0], penalty=1e30)
+        >>> x, report.method, report.rank
+        (tensor([0.5000, 0.5000], dtype=torch.float64), 'eigen', 1)
+    """
+    given = matrix.dtype
+    system = _System(
+        matrix if given == torch.float64 else matrix.double(),
+        right.double(),
+        penalty,
+        torch.ones_like(right, dtype=torch.float64) if weights is None else weights.double(),
+        name,
+        restore if given == torch.float64 else None,
+        noise,
+        str(given).removeprefix("torch."),
+        torch.finfo(given).eps,
+    )
+    x, report = system.solve(most_condition)
+    return Solution(x.to(given), report)
+
+
+def largest_condition(size: int, eps: float = _EPS) -> float:
+    """Up to which a plain Cholesky solves a system that came with this relative error."""
+    most = min(_MOST_CONDITION, 1 / (size * _EPS))
+    return most if eps <= _EPS else min(most, LARGEST_ERROR_FROM_FLOAT32 / eps)
+
+
+def condition_of(matrix: Tensor, factor: Tensor) -> float:
+    """Estimate for a positive definite matrix scaled to a diagonal of ones, from its factor.
+
+    Shape:
+        - matrix, factor: ``[n, n]``, row-major; only their lower triangles are read
+    """
+    scale = matrix.diagonal().sqrt()
+    return scaled_norm(matrix, scale) * inverse_norm(factor, scale)
+
+
+@dataclass
+class _System:
+    """A system on its way down the rungs; arguments of ``solve_symmetric_``, in float64."""
+
+    matrix: Tensor
+    right: Tensor
+    penalty: float
+    weights: Tensor
+    name: str
+    restore: Callable[[Tensor], object] | None
+    noise: float
+    dtype: str
+    eps: float  # of what the matrix came in
+
+    def __post_init__(self) -> None:
+        self.ridge = 1 / (self.penalty * self.weights)
+        if not (self.penalty > 0 and bool(self.ridge.isfinite().all())):
+            raise ValueError(
+                f"penalty (the paper's C) must be positive, and so large that 1 / (C w) is finite, "
+                f"got {self.penalty}"
+            )
+        self.bare = self.matrix.diagonal().clone()
+        self.whole = self.bare + self.ridge
+        self.scale = torch.where(self.whole > 0, self.whole, 1.0).sqrt()
+        self.matrix.diagonal().copy_(self.whole)
+        self.norm = scaled_norm(self.matrix, self.scale)
+        if not (math.isfinite(self.norm) and bool(self.right.isfinite().all())):
+            check_finite(self.matrix, self.right, self.name)
+            raise ValueError(f"{self.name} overflows float64; scale the features")
+
+    def solve(self, most: float | None) -> Solution:
+        if math.isinf(self.penalty):
+            return self.by_eigen()
+        if most is None and self.restore is None:
+            mirror_(self.matrix)
+        bound = self.bound()
+        try:
+            cholesky_(self.matrix)
+        except ValueError as failure:
+            return self.escalated(most, math.inf, str(failure))
+        x = cholesky_solve(self.matrix, self.right)
+        inverse = inverse_growth(self.matrix, self.scale, x) if bound <= _SURE else 0.0
+        inverse = min(inverse or inverse_norm(self.matrix, self.scale), bound / self.norm)
+        condition = self.norm * inverse
+        drowned = self.noise * min(inverse / float(self.whole.min()), float(1 / self.ridge.min()))
+        error = max(self.eps * condition, drowned)
+        limit = min(largest_condition(len(x), self.eps), math.inf if most is None else most)
+        if condition > limit or drowned > _LEAST_TOLD:
+            return self.escalated(most, condition, "rounding drowns the solution")
+        return Solution(x, self.report("cholesky", condition, error, len(x)))
+
+    def bound(self) -> float:
+        """Of the condition: the norm over the least eigenvalue that the ridge leaves."""
+        least = float((self.ridge / self.whole).min())
+        return self.norm / least if least > 0 else math.inf
+
+    def escalated(self, most: float | None, condition: float, reason: str) -> Solution:
+        figure = f"{self.name} + I/C at penalty={self.penalty:g} has condition {condition:.1e}"
+        if math.isinf(condition):
+            figure = f"{self.name} + I/C at penalty={self.penalty:g}: {reason}"
+        if self.eps > _EPS:
+            wanted = "make it in float64, or lower the penalty"
+            raise ValueError(f"{figure}, too much for a matrix in {self.dtype}; {wanted}")
+        if most is not None:
+            raise ValueError(f"{figure}, wanted up to {most:.0e}; lower the penalty")
+        log.warning("%s, too much for a plain Cholesky in float64", figure)
+        solution = self.by_refinement(condition) if self.noise == 0 else None
+        if solution is None:
+            solution = self.by_eigen()
+        log.warning("%s: solved by %s", self.name, solution.report)
+        return solution
+
+    def reset(self) -> None:
+        """The system as it was given, without its ridge, in both triangles."""
+        if self.restore is None:
+            mirror_(self.matrix, upper=True)
+            self.matrix.diagonal().copy_(self.bare)
+        else:
+            self.restore(self.matrix)
+            mirror_(self.matrix)
+
+    def by_refinement(self, condition: float) -> Solution | None:
+        """Conjugate gradients behind the factor of a jittered system; none if they do not tell."""
+        for size in _JITTERS:
+            jitter = size * len(self.right) * _EPS
+            self.reset()
+            self.matrix.diagonal().copy_(self.whole * (1 + jitter))
+            try:
+                cholesky_(self.matrix)
+            except ValueError:
+                continue
+            x, steps, residual = refine(self.matrix, self.whole, self.right)
+            least = torch.linalg.vector_norm(self.right / self.scale)
+            rounding = _EPS * self.norm * float(torch.linalg.vector_norm(self.scale * x) / least)
+            if residual <= _ENOUGH and rounding <= _ENOUGH:
+                condition = min(condition, self.norm * inverse_norm(self.matrix, self.scale))
+                report = self.report("jittered", condition, max(rounding, residual), len(x))
+                return Solution(
+                    x, replace(report, jitter=jitter, refinements=steps, residual=residual)
+                )
+            return None
+        return None
+
+    def by_eigen(self) -> Solution:
+        """Without the components that are rounding noise."""
+        if not math.isinf(self.penalty):
+            self.reset()
+        roots = self.weights.sqrt()
+        self.matrix.mul_(roots).mul_(roots[:, None])
+        found: list[tuple[Tensor, float, float, int]] = []
+        for_each(lambda matrix: found.append(self.truncated(matrix, roots)), [self.matrix])
+        x, condition, error, rank = found[0]
+        if error > (_LEAST_TOLD if self.noise > 0 else LARGEST_ERROR_FROM_FLOAT32) and (
+            self.noise > 0 or self.eps > _EPS
+        ):
+            raise ValueError(
+                f"{self.name} at penalty={self.penalty:g} has condition {condition:.1e}, too much "
+                f"for the error it came with ({self.dtype}); lower the penalty, or make it exactly"
+            )
+        return Solution(x, self.report("eigen", condition, error, rank))
+
+    def truncated(self, matrix: Tensor, roots: Tensor) -> tuple[Tensor, float, float, int]:
+        """Solution, condition, error and rank; on one thread, for the bits."""
+        values, vectors = torch.linalg.eigh(matrix)
+        top, low = float(values[-1]), float(values[0])
+        rounding = max(self.eps * max(top, -low), self.noise)
+        cutoff = max(len(values) * self.eps * top, self.noise)
+        if low < -max(10 * cutoff, 0.0):
+            raise ValueError(
+                f"{self.name} is not positive semi-definite: it has the eigenvalue {low:.3g} "
+                f"beside {top:.3g}; it must be a sum of squares"
+            )
+        kept = values > cutoff
+        rank = int(kept.sum())
+        ridge = 1 / self.penalty
+        parts = vectors.mT @ (roots * self.right)
+        parts = torch.where(kept, parts / torch.where(kept, values + ridge, 1.0), 0.0)
+        least = float(values[len(values) - rank] + ridge) if rank else math.inf
+        return roots * (vectors @ parts), (top + ridge) / least, rounding / least, rank
+
+    def report(
+        self,
+        method: Literal["cholesky", "jittered", "eigen"],
+        condition: float,
+        error: float,
+        rank: int,
+    ) -> SolveReport:
+        bound = self.bound()
+        return SolveReport(
+            method,
+            self.dtype,
+            len(self.right),
+            self.penalty,
+            condition,
+            bound if math.isfinite(bound) else None,
+            rank,
+            error,
+        )
