@@ -1,0 +1,288 @@
+"""What holds of the pool for every bin there can be: extremes and ordinary ones, side by side."""
+
+import math
+
+import generated
+import numpy as np
+import oracles
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tactslip_torch import FeaturePool, HandLayout
+from tactslip_torch.signals.wavelet import branch_matrix
+from tactslip_torch.simulation.extremes import extreme_bins
+
+HAND = HandLayout.paper24()
+NUM = 100
+POOL = FeaturePool(HAND)
+NAMES = oracles.pool_names()
+PLAIN = [" ".join(name) for name in NAMES]
+CHANNEL_OF = {name: i for i, name in enumerate(HAND.names)}
+OWNER = torch.tensor([CHANNEL_OF[name[0]] for name in NAMES])  # of each column
+DTYPES = [torch.float64, torch.float32]
+BINS_OF_FILE = 5000
+
+
+def columns(descriptor, domain=None):
+    """Columns of a descriptor, in an order that all descriptors of a domain share."""
+    return [i for i, n in enumerate(NAMES) if n[3] == descriptor and domain in (None, n[2])]
+
+
+def assert_none(wrong, batch, what):
+    """No feature of ``wrong [N, 2582]`` is True."""
+    found = batch.blame(wrong, PLAIN, CHANNEL_OF)
+    assert not found, f"{what}: {found}"
+
+
+def scattered(wrong, where):
+    """Flags of some columns, among all columns."""
+    whole = torch.zeros(len(wrong), len(NAMES), dtype=torch.bool)
+    whole[:, where] = wrong
+    return whole
+
+
+def batches(num, dtype):
+    return generated.batches(num, dtype, len(HAND), NUM)
+
+
+# Values --------------------------------------------------------------------------------------
+
+SLACK = 16 * NUM  # eps that sums of 100 may cost a bound
+SKEWNESS, KURTOSIS = 98 / math.sqrt(99), 98 + 1 / 99
+
+
+def bounds_of(features, dtype):
+    """Name, columns and what must not exceed 0, for bounds that need the features alone."""
+    slack = SLACK * torch.finfo(dtype).eps
+    f = features.double()
+    for name, low, high in (
+        ("skewness", -SKEWNESS, SKEWNESS),
+        ("kurtosis", 1, KURTOSIS),
+        ("peak_factor", -10, 10),
+        ("entropy", 0, math.log2(NUM)),
+        ("correlation", -1, 1),
+        ("band_energy_ratio", 0, 1),
+        ("spectral_centroid", 0, 1980),
+        ("spectral_spread", 0, 990),
+        ("cv", -1e6 * math.sqrt(100 / 99), 1e6 * math.sqrt(100 / 99)),
+    ):
+        here = columns(name)
+        excess = torch.maximum(low - f[:, here], f[:, here] - high)
+        yield name, here, excess - slack * max(abs(low), abs(high))
+    for domain in ("time", "freq"):
+        span, std = f[:, columns("range", domain)], f[:, columns("std", domain)]
+        least = slack * span + torch.finfo(dtype).tiny  # below it there are no digits
+        for name, excess in {
+            "range": -span,
+            "iqr": f[:, columns("iqr", domain)] - span,
+            "mean_deviation": f[:, columns("mean_deviation", domain)] - std,
+            "std": torch.maximum(
+                std - span * 0.5 * math.sqrt(100 / 99), span / math.sqrt(198) - std
+            ),
+            "energy": -f[:, columns("energy", domain)],
+            "kurtosis": f[:, columns("skewness", domain)] ** 2
+            + 1
+            - f[:, columns("kurtosis", domain)] * (1 + slack),  # Pearson's inequality
+        }.items():
+            yield name, columns(name, domain), excess - (slack if name == "kurtosis" else least)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@settings(max_examples=44)
+@given(data=st.data())
+def test_every_value_is_finite_and_within_its_bounds(dtype, data):
+    batch = data.draw(batches(32, dtype))
+    features = POOL.extract(batch.bins)
+    assert features.dtype == dtype
+    assert_none(~features.isfinite(), batch, "not finite")
+    for name, where, excess in bounds_of(features, dtype):
+        assert_none(scattered(excess > 0, where), batch, f"beyond the bounds of {name}")
+    ratios = features[:, columns("band_energy_ratio")].double().unflatten(-1, (10, 8)).sum(-1)
+    is_zero = (batch.bins[:, 14:] == 0).all(-1)
+    slack = SLACK * torch.finfo(dtype).eps
+    assert torch.equal(ratios == 0, is_zero)
+    assert (ratios[~is_zero] - 1).abs().max() <= slack
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@settings(max_examples=8)
+@given(data=st.data())
+def test_locations_lie_between_the_extremes(dtype, data):
+    """mean, median and mode, of gauges by their bins and of films by NumPy's product."""
+    batch = data.draw(batches(32, dtype))
+    features, bins = POOL(batch.bins).double(), batch.bins.double().numpy()
+    eps = torch.finfo(dtype).eps
+    weights = branch_matrix(NUM).numpy()
+    first = bins[:, 14:, :1]
+    offset = np.where(np.arange(8) % 2 == 0, first, 0)[..., None]  # of approximations A
+    branches = np.einsum("bij,ncj->ncbi", weights, bins[:, 14:] - first) + offset
+    room = 1e3 * oracles.EPS * np.abs(bins).max(-1)
+    for name in ("mean", "median", "mode"):
+        for where, values, slack in (
+            (columns(name, "time")[:14], bins[:, :14], room[:, :14]),
+            (columns(name, "time")[14:], branches, room[:, 14:, None]),
+        ):
+            actual = features[:, where].numpy()
+            low, high = values.min(-1), values.max(-1)
+            slack = slack + eps * np.maximum(np.abs(low), np.abs(high)) + torch.finfo(dtype).tiny
+            order = by_pool(low.shape)
+            wrong = (actual < (low - slack)[order]) | (actual > (high + slack)[order])
+            assert_none(scattered(torch.from_numpy(wrong), where), batch, f"{name} outside")
+
+
+def by_pool(shape):
+    """Indices that flatten ``[N, C]`` or ``[N, films, branches]`` to the order of columns."""
+    return (slice(None), *np.unravel_index(np.arange(math.prod(shape[1:])), shape[1:]))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@settings(max_examples=20)
+@given(data=st.data())
+def test_validity_is_its_rule(dtype, data):
+    """In longdouble, where neither the span nor 64 eps of the magnitude is rounded."""
+    batch = data.draw(batches(16, dtype))
+    bins = batch.bins.clone()
+    bins[0, 5, 3], bins[1, 20, 99], bins[2, 0, 0] = math.nan, math.inf, -math.inf
+    exact = bins.numpy().astype(np.longdouble)
+    with np.errstate(invalid="ignore"):  # the NaN and Inf just put there
+        span, size = np.ptp(exact, axis=-1), np.abs(exact).max(-1)
+    expected = np.isfinite(size) & (span > 64 * np.longdouble(torch.finfo(dtype).eps) * size)
+    assert np.array_equal(POOL.validity(bins).numpy(), expected)
+
+
+@settings(max_examples=25)
+@given(batch=batches(32, torch.float32))
+def test_float32_bins_give_what_they_give_in_float64_rounded_once(batch):
+    largest = torch.finfo(torch.float32).max
+    exact = POOL(batch.bins.double())
+    expected = exact.clamp(-largest, largest).float()
+    assert_none(POOL(batch.bins) != expected, batch, "float32 differs")
+
+
+# Gradients -----------------------------------------------------------------------------------
+
+
+OVERFLOWS = pytest.mark.xfail(
+    reason="between film and branch a saturated gradient overflows, and Inf - Inf is NaN"
+)
+ROUNDED = pytest.mark.xfail(reason="64 eps times a denormal magnitude is itself rounded")
+
+
+def where_not_finite(bins):
+    """Channels of the bins in which the gradient of the sum of all features is not finite."""
+    bins = bins.clone().requires_grad_()
+    POOL(bins).backward(torch.ones(len(bins), len(NAMES), dtype=bins.dtype))
+    return (~bins.grad.isfinite()).any(-1).nonzero().tolist()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@settings(max_examples=12)
+@given(data=st.data())
+def test_gradients_are_finite(dtype, data):
+    """Denormals have a test of their own."""
+    batch = data.draw(batches(8, dtype))
+    bad = [(HAND.names[c], batch.kinds[row][c]) for row, c in where_not_finite(batch.bins)]
+    assert [place for place in bad if place[1] != "denormal"] == []
+
+
+@pytest.mark.parametrize("dtype", [pytest.param(torch.float64, marks=OVERFLOWS), torch.float32])
+def test_gradients_of_denormals_are_finite(dtype):
+    bins = extreme_bins("denormal", (8, len(HAND), NUM), generated.generator(0), dtype)
+    assert where_not_finite(bins) == []
+
+
+def ends_of(dtype):
+    """Rails as high as a branch and its spectrum can hold, and bins of a few of the least."""
+    facts, source = torch.finfo(dtype), generated.generator(0)
+    sign = torch.where(torch.rand((2, 24, NUM), generator=source) < 0.5, -1, 1).to(dtype)
+    few = torch.randint(-2, 3, (2, 24, NUM), generator=source).to(dtype)
+    highest = facts.max if dtype == torch.float32 else facts.max / 64
+    return torch.cat([sign * highest, few * (facts.tiny * facts.eps)])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_values_are_finite_at_both_ends_of_the_dtype(dtype):
+    wrong = (~POOL(ends_of(dtype)).isfinite()).any(0).nonzero().flatten()
+    assert [PLAIN[column] for column in wrong.tolist()] == []
+
+
+@pytest.mark.parametrize("dtype", [pytest.param(torch.float64, marks=OVERFLOWS), torch.float32])
+def test_gradients_are_finite_at_both_ends_of_the_dtype(dtype):
+    assert where_not_finite(ends_of(dtype)) == []
+
+
+@ROUNDED
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_validity_where_64_eps_of_the_magnitude_is_denormal(dtype):
+    """A span of 6 quanta is more than 5.5; the product of the rule must not be rounded to 6."""
+    facts = torch.finfo(dtype)
+    quantum, share = facts.tiny * facts.eps, round(1 / (64 * facts.eps))
+    bins = torch.full((24, NUM), (5 * share + share // 2 + 1) * quantum, dtype=dtype)
+    bins[:, 7] -= 6 * quantum
+    assert POOL.validity(bins).all()
+
+
+# Who influences whom -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@settings(max_examples=10)
+@given(data=st.data())
+def test_a_channel_speaks_for_itself_alone(dtype, data):
+    """Bit by bit, whatever the other channels become."""
+    batch, other = data.draw(batches(16, dtype)), data.draw(batches(16, dtype))
+    is_kept = torch.rand(16, 24, generator=generated.generator(batch.drawn)) < 0.5
+    mixed = torch.where(is_kept[..., None], batch.bins, other.bins)
+    expected = torch.where(is_kept[:, OWNER], POOL(batch.bins), POOL(other.bins))
+    assert_none(POOL(mixed) != expected, batch, "another channel shows")
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("dtype", DTYPES)
+@settings(max_examples=5)
+@given(data=st.data())
+def test_nan_and_inf_spoil_their_channel_alone(dtype, bad, data):
+    """Every feature of the channel is NaN; every other keeps every bit."""
+    batch = data.draw(batches(16, dtype))
+    source = generated.generator(batch.drawn)
+    is_hit = torch.rand(16, 24, generator=source) < 0.2
+    sample = torch.randint(NUM, (16, 24, 1), generator=source)
+    hits = is_hit[..., None] & (torch.arange(NUM) == sample)
+    features = POOL(torch.where(hits, bad, batch.bins))
+    is_own = is_hit[:, OWNER]
+    assert_none(is_own & ~features.isnan(), batch, "a silent number")
+    assert_none(~is_own & (features != POOL(batch.bins)), batch, "another channel shows")
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@settings(max_examples=8)
+@given(data=st.data())
+def test_a_bin_speaks_for_itself_alone(dtype, data):
+    """Bit by bit, whatever the other bins are, NaN too, and however the batch is folded."""
+    batch, other = data.draw(batches(16, dtype)), data.draw(batches(16, dtype))
+    is_kept = torch.rand(16, generator=generated.generator(batch.drawn)) < 0.5
+    others = torch.where(torch.arange(16)[:, None, None] % 3 == 0, math.nan, other.bins)
+    mixed = torch.where(is_kept[:, None, None], batch.bins, others)
+    features = POOL(batch.bins)
+    wrong = is_kept[:, None] & (POOL(mixed) != features)
+    assert_none(wrong, batch, "another bin shows")
+    folded = POOL(batch.bins.reshape(2, 8, 24, NUM)).flatten(0, 1)
+    assert_none(folded != features, batch, "folding shows")
+
+
+# How much was seen ---------------------------------------------------------------------------
+
+
+def test_enough_bins_were_generated(request):
+    """Last in the file; where only some of its tests run, there is nothing to count."""
+    ran = {
+        getattr(item, "originalname", "")
+        for item in request.session.items
+        if item.path == request.path
+    }
+    own = {name for name in globals() if name.startswith("test_")}
+    if own - ran:
+        pytest.skip("not the whole file runs")
+    assert generated.num_generated() >= BINS_OF_FILE
