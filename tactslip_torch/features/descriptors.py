@@ -8,9 +8,29 @@ Extremes (our rules): a sample whose span is below ``16 * eps * scale`` counts a
 replaced by its mean beforehand (``settle``); it then has std, cv, skewness, correlation and
 entropy 0 and kurtosis 3. A zero sample has peak factor 0; a zero spectrum has centroid, spread and
 band energy ratios 0. Moments are two-pass, on values shifted by a sample and scaled by the span, so
-large offsets, denormals and 1e30 neither cancel nor overflow. Energies saturate at the largest
-finite number of the dtype. Gradients of replaced or tied values are 0 or one-sided, never NaN.
-A NaN or Inf among the values makes every descriptor NaN: never a silent number.
+large offsets, denormals and 1e30 neither cancel nor overflow; values whose squares leave the dtype
+are first multiplied by a power of two (``stretch``). What is beyond the largest finite number of
+the dtype (an energy, the range of +-1.7e308) saturates there with gradient 0, and so does a
+gradient (of the order of 1/span, for denormals). Gradients of replaced or tied values are 0 or
+one-sided, never NaN. A NaN or Inf among the values makes every descriptor NaN: never a silent
+number.
+
+Errors at most, to first order in the dtype's eps: n values of span S, mean m, standard deviation s
+(with n), k = S/s <= sqrt(2 n), r = mean(abs(x - m)^3) / s^3; c centroid, f largest frequency. What
+has a unit adds the smallest float. Held against 50 digits in ``tests/test_descriptors_exact.py``:
+
+=================  ===============================  ==============  ================================
+mean               eps ((n/2 + 1) S + abs(m))       skewness        eps ((2n + 11) k
+median             eps abs(median)                                  + (2n + 5k + 12) r)
+mode               exact but for its tolerance      kurtosis        eps ((2n + 14) k r
+range              eps range                                        + (2n + 7k + 15) kurtosis)
+mean deviation     eps (n + 3) S                    energy          eps n/2 energy + n smallest
+std                eps (2 S + (n + 4) std)          entropy         eps n (entropy + 2), +-1 level
+cv                 that of std and of its divisor   peak factor     eps (n/4 + 2) peak factor
+iqr                10 eps iqr                       correlation     eps (n + 8 + 4 k + 4 k')
+centroid           eps (n + 1) c                    spread          eps ((n + 2) c
+band energy ratio  eps (n + branches) ratio                         + (n/2 + 2) spread)
+=================  ===============================  ==============  ================================
 """
 
 from __future__ import annotations
@@ -20,24 +40,27 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.sample import Sample
+from tactslip_torch.features.sample import Sample, bounded_gradient, rank_in_run, stretch
 
 EPS64 = torch.finfo(torch.float64).eps
 ENTROPY_LEVELS = 255
 RUN_TOLERANCE = {torch.float64: 1e-12, torch.float32: 2.0**-20}
+HALF_SLACK = {torch.float64: 1e-9, torch.float32: 2.0**-13}
 CV_FLOOR = 1e-6
 
 
 def mean(sample: Sample) -> Tensor:
     """Arithmetic mean, ``[*]``."""
-    first = sample.x[..., 0].detach()
-    return first + sample.safe_span * sample.shifted_mean.squeeze(-1)
+    return sample.mean / sample.stretch
 
 
 def median(sample: Sample) -> Tensor:
     """Middle value, or the mean of the two middle values for even ``n``, ``[*]``."""
-    middle = sample.ordered[..., (sample.num - 1) // 2 : sample.num // 2 + 1]
-    return middle.mean(-1)
+    if sample.num % 2:
+        return sample.ordered[..., sample.num // 2]
+    early = sample.stretch.clamp(0.5, 1.0)  # huge values are halved before they are added
+    middle = sample.ordered[..., sample.num // 2 - 1 : sample.num // 2 + 1]
+    return (middle * early[..., None]).sum(-1) * (0.5 / early)
 
 
 def mode(sample: Sample) -> Tensor:
@@ -48,27 +71,28 @@ def mode(sample: Sample) -> Tensor:
     rounding. The result is the first value of the longest run. Not differentiable where the
     longest run changes; elsewhere the gradient is that of the value returned.
     """
-    tolerance = RUN_TOLERANCE.get(sample.x.dtype, 2.0**-8) * sample.scale[..., None]
-    ordered = sample.ordered.detach()
-    apart = ordered[..., 1:] - ordered[..., :-1] > tolerance
-    rank = _rank_in_run(apart)
+    tolerance = RUN_TOLERANCE.get(sample.x.dtype, 2.0**-8) * (sample.scale * sample.stretch)
+    apart = sample.ranked[..., 1:] - sample.ranked[..., :-1] > tolerance[..., None]
+    rank = rank_in_run(apart)
     last = rank.argmax(-1, keepdim=True)  # the first maximum: the end of the first longest run
     return sample.ordered.gather(-1, last - rank.gather(-1, last).long()).squeeze(-1)
 
 
 def range_(sample: Sample) -> Tensor:
     """Largest minus smallest value, ``[*]``."""
-    return sample.span
+    return sample.span / sample.stretch
 
 
 def mean_deviation(sample: Sample) -> Tensor:
     """Mean absolute deviation from the mean, ``[*]``."""
-    return sample.safe_span * sample.deviation.abs().mean(-1)
+    return sample.centred.abs().mean(-1) / sample.stretch
 
 
 def std(sample: Sample) -> Tensor:
     """Standard deviation with ``n - 1`` in the denominator, ``[*]``."""
-    return sample.safe_span * _relative_std(sample)
+    # not by the span, which as a factor would make denormals of the gradient on its way back
+    square = (sample.centred * sample.centred).mean(-1)
+    return _unbiased_root(sample, torch.where(sample.is_flat, 1.0, square)) / sample.stretch
 
 
 def cv(sample: Sample) -> Tensor:
@@ -76,18 +100,24 @@ def cv(sample: Sample) -> Tensor:
 
     The mean's magnitude counts as at least 1e-6 of the rms (ours); 0 for a zero sample.
     """
-    size = torch.where(sample.is_zero, 1.0, sample.magnitude)
-    # the sign at a mean of exactly 0 needs the unscaled mean, denormals the scaled one
-    is_tiny = sample.magnitude < torch.finfo(sample.x.dtype).tiny / torch.finfo(sample.x.dtype).eps
-    relative_mean = torch.where(is_tiny, sample.by_magnitude.mean(-1), mean(sample) / size)
-    floor = torch.maximum(relative_mean.abs(), CV_FLOOR * sample.rms)
-    signed = torch.where(relative_mean < 0, -floor, floor)
-    return sample.safe_span / size * _relative_std(sample) / signed
+    floor = torch.maximum(sample.mean.abs(), CV_FLOOR * sample.rms)
+    signed = torch.where(sample.mean < 0, -floor, floor)
+    return sample.safe_span * _unbiased_root(sample, sample.variance) / signed
 
 
 def iqr(sample: Sample) -> Tensor:
     """Interquartile range, quantiles at Hazen positions ``q n + 1/2``, ``[*]``."""
-    return _hazen_quantile(sample, 0.75) - _hazen_quantile(sample, 0.25)
+    low, high = (min(max(q * sample.num - 0.5, 0.0), sample.num - 1.0) for q in (0.25, 0.75))
+    base = sample.ordered[..., int(low)] * sample.stretch
+
+    def above_base(position: float) -> Tensor:
+        below, share = int(position), position % 1
+        values = (
+            sample.ordered[..., below : below + 2] * sample.stretch[..., None] - base[..., None]
+        )
+        return values[..., 0] * (1 - share) + values[..., -1] * share
+
+    return (above_base(high) - above_base(low)) / sample.stretch
 
 
 def skewness(sample: Sample) -> Tensor:
@@ -102,31 +132,29 @@ def kurtosis(sample: Sample) -> Tensor:
 
 
 def energy(sample: Sample) -> Tensor:
-    """Sum of squares, ``[*]``; saturates at the largest finite number of the dtype."""
-    return (sample.x * sample.x).sum(-1).clamp(max=torch.finfo(sample.x.dtype).max)
+    """Sum of squares, ``[*]``; Inf beyond the dtype, which ``describe`` saturates."""
+    return (sample.x * sample.x).sum(-1)
 
 
 def entropy(sample: Sample) -> Tensor:
     """Shannon entropy of the amplitude histogram in bits, ``[*]``; 0 for a constant.
 
-    Values are quantised to 256 levels between their extremes, exact halves rounded up (in float32
-    rounding decides them); the
+    Values are quantised to 256 levels between their extremes, exact halves rounded up: within 1e-9
+    of a level in float64, 2^-13 in float32, either above the rounding of 255 levels. The
     distinct levels serve as histogram *edges*, so the two highest occupied ones share one cell.
     Piecewise constant: its gradient is 0 wherever it exists, and none flows.
     """
-    ordered = sample.ordered.detach()
-    relative = (ordered - ordered[..., :1]) / sample.safe_span[..., None]
-    level = (relative * ENTROPY_LEVELS + (0.5 + 1e-9)).floor()
+    relative = (sample.ranked - sample.ranked[..., :1]) / sample.safe_span[..., None]
+    level = (relative * ENTROPY_LEVELS + (0.5 + HALF_SLACK.get(sample.x.dtype, 0.0))).floor()
     # the maximum always has the top level, so the second highest level joins it
     new_cell = (level[..., 1:] != level[..., :-1]) & (level[..., 1:] != ENTROPY_LEVELS)
     growth = _entropy_growth(sample.num).to(sample.x)
-    return torch.where(sample.is_flat, 0.0, growth[_rank_in_run(new_cell).long()].sum(-1))
+    return torch.where(sample.is_flat, 0.0, growth[rank_in_run(new_cell).long()].sum(-1))
 
 
 def peak_factor(sample: Sample) -> Tensor:
     """Signed maximum over the root mean square, ``[*]``; 0 for a zero sample."""
-    size = torch.where(sample.is_zero, 1.0, sample.magnitude)
-    return sample.x.amax(-1) / size / sample.rms
+    return sample.unit.amax(-1) / sample.rms
 
 
 def correlation(sample: Sample) -> Tensor:
@@ -155,7 +183,7 @@ def spectral_centroid(sample: Sample) -> Tensor:
 def spectral_spread(sample: Sample) -> Tensor:
     """Root of the weighted mean squared distance from the centroid, hertz, ``[*]``.
 
-    0 for a zero spectrum and for a single line.
+    0, without gradient, for a zero spectrum and for a single line.
 
     Raises:
         ValueError: if the sample has no frequency axis.
@@ -163,7 +191,7 @@ def spectral_spread(sample: Sample) -> Tensor:
     distance = _frequency_axis(sample) - spectral_centroid(sample)[..., None]
     square = (sample.weights * distance * distance).sum(-1)
     is_positive = square.detach() > 0
-    return torch.where(is_positive, torch.where(is_positive, square, 1.0).sqrt(), square)
+    return torch.where(is_positive, torch.where(is_positive, square, 1.0).sqrt(), 0.0)
 
 
 def band_energy_ratio(spectra: Tensor) -> Tensor:
@@ -173,11 +201,11 @@ def band_energy_ratio(spectra: Tensor) -> Tensor:
         - spectra: ``[*, branches, lines]``
         - output: ``[*, branches]``
     """
-    largest = spectra.detach().flatten(-2).abs().amax(-1)[..., None, None]
-    scaled = spectra / torch.where(largest == 0, 1.0, largest)
+    spectra = bounded_gradient(spectra)
+    scaled = spectra * stretch(spectra.detach().flatten(-2).abs().amax(-1))[..., None, None]
     energies = (scaled * scaled).sum(-1)
     total = energies.sum(-1, keepdim=True)
-    return energies / torch.where(total.detach() == 0, 1.0, total)
+    return energies / torch.where(total.detach() == 0, torch.inf, total)
 
 
 _DESCRIPTORS: dict[str, Callable[[Sample], Tensor]] = {
@@ -238,7 +266,10 @@ def describe(
         raise ValueError(f"a sample needs at least two values, got {x.shape[-1]}")
     sample = Sample(x, scale, None if reference is None else Sample(reference), frequency_hz)
     values = torch.stack([_DESCRIPTORS[name](sample) for name in names], dim=-1)
-    return torch.where(sample.span.detach().isfinite()[..., None], values, torch.nan)
+    largest = torch.finfo(x.dtype).max
+    return torch.where(
+        sample.magnitude.isfinite()[..., None], values.clamp(-largest, largest), torch.nan
+    )
 
 
 def _frequency_axis(sample: Sample) -> Tensor:
@@ -247,44 +278,10 @@ def _frequency_axis(sample: Sample) -> Tensor:
     return sample.frequency_hz.to(sample.x)
 
 
-def _relative_std(sample: Sample) -> Tensor:
-    """Standard deviation over the span, 0 for a constant, ``[*]``."""
-    unbiased = (sample.variance * (sample.num / (sample.num - 1))).sqrt()
-    return torch.where(sample.is_flat, 0.0, unbiased)
-
-
-def _hazen_quantile(sample: Sample, q: float) -> Tensor:
-    """Quantile above the minimum: linear at the one-based position ``q n + 1/2``, ``[*]``."""
-    position = min(max(q * sample.num - 0.5, 0.0), sample.num - 1.0)
-    below = int(position)
-    above = min(below + 1, sample.num - 1)
-    share = position - below
-    least = sample.ordered[..., 0]
-    low, high = sample.ordered[..., below] - least, sample.ordered[..., above] - least
-    return low * (1 - share) + high * share
-
-
-def _rank_in_run(is_boundary: Tensor) -> Tensor:
-    """Position of each sorted value within its run, from 0.
-
-    Shape:
-        - is_boundary: ``[*, n - 1]``, bool: a new run starts behind this value
-        - output: ``[*, n]``, int32
-    """
-    num = is_boundary.shape[-1] + 1
-    position = torch.arange(num, dtype=torch.int32, device=is_boundary.device)
-    start = torch.where(is_boundary, position[1:], 0)
-    start = torch.cat([torch.zeros_like(start[..., :1]), start], dim=-1)
-    return position - _running_max(start)
-
-
-def _running_max(x: Tensor) -> Tensor:
-    """``cummax`` of non-negative values by doubling: log2(n) plain maxima, which export to ONNX."""
-    reach = 1
-    while reach < x.shape[-1]:
-        x = torch.cat([x[..., :reach], torch.maximum(x[..., reach:], x[..., :-reach])], dim=-1)
-        reach *= 2
-    return x
+def _unbiased_root(sample: Sample, variance: Tensor) -> Tensor:
+    """Standard deviation with ``n - 1`` from a variance with ``n``, 0 for a constant, ``[*]``."""
+    root = (variance * (sample.num / (sample.num - 1))).sqrt()
+    return torch.where(sample.is_flat, 0.0, root)
 
 
 def _entropy_growth(num: int) -> Tensor:

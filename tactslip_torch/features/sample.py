@@ -3,12 +3,14 @@
 The rules for extremes are ours (REFERENCE.md section 4): a sample whose span is below
 ``16 * eps * scale``, rounding noise beside the raw bin it comes from, is replaced by its mean.
 Moments are two-pass, on values shifted by a sample and scaled by the span, so that large offsets,
-denormals and 1e30 neither cancel nor overflow.
+denormals and 1e30 neither cancel nor overflow. Magnitudes whose squares leave the dtype are first
+multiplied by a power of two (``stretch``), which costs no digit; all others by 1.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 from functools import cached_property
 
 import numpy as np
@@ -24,11 +26,13 @@ def is_constant(x: Tensor, scale: Tensor) -> Tensor:
         - x: ``[*, n]``; scale: ``[*]``; output: ``[*]``, bool
     """
     span = x.detach().amax(-1) - x.detach().amin(-1)
-    return span < 16 * torch.finfo(x.dtype).eps * scale
+    return span * (1 / (16 * torch.finfo(x.dtype).eps)) < scale  # on this side nothing underflows
 
 
 def settle(x: Tensor, scale: Tensor) -> Tensor:
     """Replace what ``is_constant`` by its mean, value by value; gradients there are 0.
+
+    The mean is right to ``eps (n span / 2 + |mean|)``, and lies within the span.
 
     Shape:
         - x, output: ``[*, n]``; scale: ``[*]``
@@ -36,6 +40,70 @@ def settle(x: Tensor, scale: Tensor) -> Tensor:
     first = x[..., :1].detach()
     mean = first + (x.detach() - first).mean(-1, keepdim=True)
     return torch.where(is_constant(x, scale)[..., None], mean, x)
+
+
+def stretch(magnitude: Tensor) -> Tensor:
+    """The power of two by which values of this magnitude are multiplied before they are squared.
+
+    1 from 2^-320 to 2^448 (float32: 2^-40 to 2^56), so ordinary values keep every bit; 2^768 (2^96)
+    below and its inverse above. Then no square overflows, and no square of a difference underflows
+    by more than rounding.
+
+    Shape:
+        - magnitude, output: ``[*]``
+    """
+    exponent = math.frexp(torch.finfo(magnitude.dtype).max)[1]
+    low, high = 2.0 ** (-5 * exponent // 16), 2.0 ** (7 * exponent // 16)
+    factor = 2.0 ** (3 * exponent // 4)
+    shrunk = torch.where(magnitude > high, 1 / factor, torch.ones_like(magnitude))
+    return torch.where(magnitude < low, factor, shrunk)
+
+
+def bounded_gradient(x: Tensor) -> Tensor:
+    """``x``, whose gradient saturates at the largest finite number of the dtype.
+
+    The derivative of a shape is of order 1/span, which for denormals no float can hold. Backward
+    only: derivatives taken forwards become Inf there.
+
+    Shape:
+        - x, output: ``[*]``
+    """
+    if not (x.requires_grad and torch.is_grad_enabled()) or torch.compiler.is_compiling():
+        return x
+    x = x.view_as(x)
+    x.register_hook(_saturate)
+    return x
+
+
+def _saturate(gradient: Tensor | None) -> Tensor | None:
+    """Autograd hands on None for a gradient that is undefined."""
+    if gradient is None:
+        return None
+    largest = torch.finfo(gradient.dtype).max
+    return gradient.clamp(-largest, largest)
+
+
+def rank_in_run(is_boundary: Tensor) -> Tensor:
+    """Position of each sorted value within its run, from 0.
+
+    Shape:
+        - is_boundary: ``[*, n - 1]``, bool: a new run starts behind this value
+        - output: ``[*, n]``, int32
+    """
+    num = is_boundary.shape[-1] + 1
+    position = torch.arange(num, dtype=torch.int32, device=is_boundary.device)
+    start = torch.where(is_boundary, position[1:], 0)
+    start = torch.cat([torch.zeros_like(start[..., :1]), start], dim=-1)
+    return position - _running_max(start)
+
+
+def _running_max(x: Tensor) -> Tensor:
+    """``cummax`` of non-negative values by doubling: log2(n) plain maxima, which export to ONNX."""
+    reach = 1
+    while reach < x.shape[-1]:
+        x = torch.cat([x[..., :reach], torch.maximum(x[..., reach:], x[..., :-reach])], dim=-1)
+        reach *= 2
+    return x
 
 
 class Sample:
@@ -56,7 +124,7 @@ class Sample:
         reference: Sample | None = None,
         frequency_hz: Tensor | None = None,
     ) -> None:
-        self.x = x
+        self.x = bounded_gradient(x)
         self.num = x.shape[-1]
         self._scale = scale
         self.reference = reference
@@ -74,19 +142,19 @@ class Sample:
         return torch.sort(x, dim=-1).values
 
     @cached_property
-    def span(self) -> Tensor:
-        """Largest minus smallest value, ``[*]``; NaN or Inf where a value is."""
-        return self.x.amax(-1) - self.x.amin(-1)
+    def largest(self) -> Tensor:
+        """Largest value, ``[*]``."""
+        return self.x.amax(-1)
 
     @cached_property
-    def is_flat(self) -> Tensor:
-        """All values equal, ``[*]``."""
-        return self.span.detach() == 0
+    def smallest(self) -> Tensor:
+        """Smallest value, ``[*]``."""
+        return self.x.amin(-1)
 
     @cached_property
     def magnitude(self) -> Tensor:
-        """Largest absolute value, ``[*]``, without gradient."""
-        return self.x.detach().abs().amax(-1)
+        """Largest absolute value, ``[*]``, without gradient; NaN or Inf where a value is."""
+        return torch.maximum(self.largest.detach(), -self.smallest.detach())
 
     @cached_property
     def scale(self) -> Tensor:
@@ -94,24 +162,71 @@ class Sample:
         return self.magnitude if self._scale is None else self._scale
 
     @cached_property
+    def stretch(self) -> Tensor:
+        """Power of two that keeps squares in range, 1 for ordinary values, ``[*]``."""
+        return stretch(self.magnitude)
+
+    # What follows is in the stretched unit: x times stretch.
+
+    @cached_property
+    def unit(self) -> Tensor:
+        """Values, ``[*, n]``."""
+        return self.x * self.stretch[..., None]
+
+    @cached_property
+    def ranked(self) -> Tensor:
+        """Sorted values without gradient, ``[*, n]``."""
+        return self.ordered.detach() * self.stretch[..., None]
+
+    @cached_property
+    def span(self) -> Tensor:
+        """Largest minus smallest value, ``[*]``."""
+        return self.largest * self.stretch - self.smallest * self.stretch
+
+    @cached_property
+    def is_flat(self) -> Tensor:
+        """All values equal, ``[*]``."""
+        return self.span.detach() == 0
+
+    @cached_property
+    def is_zero(self) -> Tensor:
+        """All values zero, ``[*]``."""
+        return self.magnitude == 0
+
+    @cached_property
     def safe_span(self) -> Tensor:
         """The span without gradient, 1 where it is 0, ``[*]``."""
         return torch.where(self.is_flat, 1.0, self.span.detach())
 
     @cached_property
-    def shifted(self) -> Tensor:
-        """Values minus the first, over the span: of order one whatever the unit, ``[*, n]``."""
-        return (self.x - self.x[..., :1].detach()) / self.safe_span[..., None]
+    def mean(self) -> Tensor:
+        """Arithmetic mean, ``[*]``; exact where the sum of differences from the first value is."""
+        return self.unit[..., 0].detach() + self._mean_shift.squeeze(-1)
 
     @cached_property
-    def shifted_mean(self) -> Tensor:
-        """Mean of ``shifted``, ``[*, 1]``."""
-        return self.shifted.mean(-1, keepdim=True)
+    def rms(self) -> Tensor:
+        """Root mean square, ``[*]``; Inf for a zero sample, over which value and gradient are 0."""
+        return torch.where(self.is_zero, torch.inf, (self.unit * self.unit).mean(-1)).sqrt()
+
+    @cached_property
+    def _shifted(self) -> Tensor:
+        return self.unit - self.unit[..., :1].detach()
+
+    @cached_property
+    def _mean_shift(self) -> Tensor:
+        return self._shifted.mean(-1, keepdim=True)
+
+    @cached_property
+    def centred(self) -> Tensor:
+        """Values minus their mean, ``[*, n]``."""
+        return self._shifted - self._mean_shift
+
+    # What follows has no unit.
 
     @cached_property
     def deviation(self) -> Tensor:
-        """Values minus their mean, over the span, ``[*, n]``."""
-        return self.shifted - self.shifted_mean
+        """Values minus their mean, over the span: of order one, ``[*, n]``."""
+        return self.centred / self.safe_span[..., None]
 
     @cached_property
     def squares(self) -> Tensor:
@@ -124,23 +239,7 @@ class Sample:
         return torch.where(self.is_flat, 1.0, self.squares.mean(-1))
 
     @cached_property
-    def is_zero(self) -> Tensor:
-        """All values zero, ``[*]``."""
-        return self.magnitude == 0
-
-    @cached_property
-    def by_magnitude(self) -> Tensor:
-        """Values over the largest magnitude (zeros stay zeros), ``[*, n]``."""
-        return self.x / torch.where(self.is_zero, 1.0, self.magnitude)[..., None]
-
-    @cached_property
-    def rms(self) -> Tensor:
-        """Root mean square over the largest magnitude, 1 for a zero sample, ``[*]``."""
-        mean_square = (self.by_magnitude * self.by_magnitude).mean(-1)
-        return torch.where(self.is_zero, 1.0, mean_square).sqrt()
-
-    @cached_property
     def weights(self) -> Tensor:
         """A spectrum's lines as shares of their sum, 0 for a zero spectrum, ``[*, n]``."""
-        total = self.by_magnitude.sum(-1, keepdim=True)
-        return self.by_magnitude / torch.where(self.is_zero[..., None], 1.0, total)
+        total = self.unit.sum(-1, keepdim=True)
+        return self.unit / torch.where(total.detach() == 0, torch.inf, total)
