@@ -11,10 +11,11 @@ size that computes in the dtype. TF32 and bfloat16 products are not of it.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tactslip_torch.model.quadratic import QuadraticForm
 
@@ -173,3 +174,51 @@ def _varied(points: Tensor, generator: torch.Generator) -> Tensor:
     drawn = (2 * draw[0] - 1).to(points.dtype)
     many = torch.where(draw[1] < 0.04, -many, many)
     return torch.where(draw[2] < 0.02, drawn, many)
+
+
+def head_facts(head: nn.Module, also: Tensor | None = None, seed: int = 0) -> dict[str, Any]:
+    """Bound and worst error seen of a head in float32, as plain values.
+
+    Args:
+        head: any; only a quadratic form has a bound.
+        also: as ``worst_error``.
+        seed: of the search.
+
+    Returns:
+        ``kind``, ``bound`` and ``overflows``, ``worst_seen`` and its ``ratio`` to the bound, the
+        ``reference_bound`` of float64, which the search compares with, and a ``note``. ``None``
+        for what there is not.
+    """
+    facts: dict[str, Any] = {"kind": type(head).__name__}
+    if not isinstance(head, QuadraticForm):
+        note = "no bound for this head: only what was measured on bins"
+        absent = ("bound", "worst_seen", "ratio", "reference_bound")
+        return facts | dict.fromkeys(absent) | {"overflows": False, "note": note}
+    bound, seen = rounding_bound(head), worst_error(head, seed=seed, also=also)
+    return facts | {
+        "bound": bound.error,
+        "worst_seen": seen,
+        "ratio": bound.error / seen if seen else None,
+        "reference_bound": rounding_bound(head, torch.float64).error,
+        "overflows": bound.overflows,
+        "note": "a coefficient or a sum may pass the largest float32" if bound.overflows else "",
+    }
+
+
+def gradient_norms(function: Callable[[Tensor], Tensor], points: Tensor, chunk: int = 16) -> Tensor:
+    """Euclidean norm of the gradient at each point: by how much a small error there is magnified.
+
+    Shape:
+        - function: ``[M, *] -> [M]``, one value for each point alone
+        - points: ``[N, *]``; output: ``[N]``
+
+    Example:
+        >>> gradient_norms(lambda z: z[:, 0] * 3 + z[:, 1] * 4, torch.zeros(2, 2))
+        tensor([5., 5.])
+    """
+    norms = []
+    for part in points.split(chunk):
+        given = part.detach().clone().requires_grad_()
+        (slope,) = torch.autograd.grad(function(given).sum(), given)
+        norms.append(torch.linalg.vector_norm(slope.flatten(1), dim=-1))
+    return torch.cat(norms)

@@ -1,0 +1,53 @@
+"""A detector of four channels that nobody trained, and bins for it: quick to certify."""
+
+import numpy as np
+import torch
+
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.kernel_sum import KernelSum
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.signals.filtering import ChannelFilter
+
+HAND = HandLayout.from_rows(
+    {"name": f"{kind}{i}", "kind": kind, "finger": finger, "segment": "distal"}
+    for kind in ("SG", "PVDF")
+    for i, finger in enumerate(("index", "thumb"), 1)
+)
+NUM_FEATURES = 12
+
+
+def raw_bins(num_bins: int, seed: int = 0, offset: float = 1.0) -> torch.Tensor:
+    """Noise of several sizes in volts, the gauges on an offset."""
+    rng = np.random.default_rng(seed)
+    size = 10 ** rng.uniform(-2, 0, (num_bins, 1, 1))
+    away = np.where(np.arange(4) < 2, offset, 0.0)[:, None]
+    return torch.from_numpy(size * rng.standard_normal((num_bins, 4, 150)) + away)
+
+
+def small_detector(
+    seed: int = 0, *, head: str = "quadratic", arithmetic: str = "double", gain: float = 1.0
+) -> SlipDetector:
+    rng = np.random.default_rng(seed)
+    pool = FeaturePool(HAND, arithmetic=arithmetic)  # type: ignore[arg-type]
+    channel_filter = ChannelFilter([51, 51, 11, 11])
+    of_gauges = rng.choice(26, 4, replace=False)
+    of_films = 26 + rng.choice(len(pool.names) - 26, NUM_FEATURES - 4, replace=False)
+    selected = [int(i) for i in (*of_gauges, *of_films)]
+    features = pool(channel_filter.valid(raw_bins(64, seed=99)))[:, selected]
+    scaler = FeatureScaler.fit(features)
+    if head == "sum":
+        support = torch.from_numpy(rng.uniform(-1, 1, (30, NUM_FEATURES)))
+        weights = torch.from_numpy(rng.standard_normal(30))
+        machine: QuadraticForm | KernelSum = KernelSum(support, weights, Polynomial(3, 0.5))
+    else:
+        bend = gain * torch.from_numpy(rng.standard_normal((NUM_FEATURES, NUM_FEATURES)))
+        linear = gain * torch.from_numpy(rng.standard_normal(NUM_FEATURES))
+        centre = scaler(features)
+        machine = QuadraticForm(bend + bend.T, linear, torch.tensor(0.0, dtype=torch.float64))
+        middle = -machine(centre).median()  # so that both decisions occur
+        machine = QuadraticForm(bend + bend.T, linear, middle)
+    return SlipDetector(pool, channel_filter, selected, scaler, machine, {"simulated": True})

@@ -1,0 +1,315 @@
+"""``certify`` as a command: the files, the page, the exit status, and which bins it draws."""
+
+import hashlib
+import json
+import re
+import sys
+from html.parser import HTMLParser
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from small_detector import raw_bins, small_detector
+from test_commands import TinyRecordings
+
+from tactslip_torch.certificate import certify as measure
+from tactslip_torch.certify import _plain, certify, draw_bins, main
+from tactslip_torch.config import conf_dir
+from tactslip_torch.data.labels import LabelRule, label_bins
+from tactslip_torch.data.splits import Split
+from tactslip_torch.features.cache import cache_key
+from tactslip_torch.report.certificate import number, verdict
+from tactslip_torch.report.certificate_page import MARK, certificate_page
+from tactslip_torch.simulation.extremes import EXTREMES
+
+TINY = (
+    "data._target_=test_commands.TinyRecordings",
+    "data.materials=[A,B,C]",
+    "data.cycles=4",
+    "split.seen=[A,B]",
+    "split.unseen=[C]",
+    "split.train_share=0.5",
+    "bins=60",
+    "judged_bins=40",
+    "extremes=3",
+)
+
+
+def composed(*overrides):
+    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+        return compose("certify", [*TINY, *overrides])
+
+
+def source():
+    return TinyRecordings(seed=0, cycles=4, materials=["A", "B", "C"])
+
+
+def saved(folder, **options):
+    path = folder / "detector.pt"
+    detector = small_detector(**options)
+    recordings = [r for r in source().ids if str(r) in ("A/0", "B/1", "C/2")]
+    known = {str(r): cache_key(source().key(r)) for r in recordings}
+    detector.info["train_recordings"] = known
+    detector.save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = saved(tmp_path_factory.mktemp("certified"))
+    returned, folder = certify(composed(f"model={path}"))
+    content = json.loads((folder / "certificate.json").read_text())
+    assert returned == content
+    return folder, content
+
+
+class Reader(HTMLParser):
+    """What a page loads, and its text."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.loads, self.tags, self.text = [], [], ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.loads += [value for key, value in attrs if key in ("src", "href", "srcset", "data")]
+
+    def handle_data(self, data):
+        self.text += data
+
+
+# What it leaves ----------------------------------------------------------------------------------
+
+
+def test_the_files_stand_beside_the_detector(written):
+    folder, content = written
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "certificate.html",
+        "certificate.json",
+        "detector.pt",
+    ]
+    assert content["format"] == "tactslip_torch certificate 1"
+    assert content["holds"] is True
+    assert content["simulated"] is False
+    digest = hashlib.sha256((folder / "detector.pt").read_bytes()).hexdigest()
+    assert content["detector"]["sha256"] == digest
+    assert list(content["sets"]) == ["calibration", "test", "unseen"]
+    assert [row["bins"] for row in content["sets"].values()] == [60, 40, 40]
+    assert list(content["extremes"]) == list(EXTREMES)
+    assert {row["bins"] for row in content["extremes"].values()} == {3}
+    drawn = content["data"]["drawn"]
+    assert drawn["calibration"]["role"] == "train"
+    assert drawn["calibration"]["materials"] == ["A", "B"]
+    assert drawn["unseen"] == {
+        "role": "unseen",
+        "recordings": 1,
+        "recordings_of_training": drawn["unseen"]["recordings_of_training"],
+        "materials": ["C"],
+    }
+
+
+def test_a_second_run_replaces_the_first_and_finds_the_same(tmp_path):
+    path = saved(tmp_path)
+    _, folder = certify(composed(f"model={path}", f"out={tmp_path / 'out'}"))
+    before = (folder / "certificate.json").read_text()
+    certify(composed(f"model={path}", f"out={tmp_path / 'out'}"))
+    assert (folder / "certificate.json").read_text() == before
+    assert sorted(p.name for p in folder.iterdir()) == ["certificate.html", "certificate.json"]
+
+
+@pytest.mark.parametrize("name", ["certificate.json", "certificate.html"])
+def test_a_foreign_file_is_left_alone(name, tmp_path):
+    path = saved(tmp_path)
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(ValueError, match=f"{name} is no certificate of ours; move it, or give"):
+        certify(composed(f"model={path}"))
+    assert (tmp_path / name).read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+# The page ----------------------------------------------------------------------------------------
+
+
+def test_the_page_needs_nothing_else(written):
+    folder, content = written
+    page = (folder / "certificate.html").read_text(encoding="utf-8")
+    reader = Reader(page)
+    assert MARK in page
+    assert "script" not in reader.tags
+    assert "link" not in reader.tags
+    assert [load[:22] for load in reader.loads] == ["data:image/png;base64,"]
+    assert not re.search(r"https?://|url\(|@import", page)
+    assert verdict(content) in reader.text
+    for row in content["conditions"]:
+        assert row["name"] in reader.text
+    for kind in EXTREMES:
+        assert kind in reader.text
+    assert content["detector"]["sha256"] in reader.text
+
+
+def test_simulated_numbers_say_so(written):
+    _, content = written
+    found = measure(
+        small_detector(),
+        raw_bins(30),
+        {"test": raw_bins(9), "unseen": raw_bins(9)},
+        simulated=True,
+        extremes=2,
+    )
+    for simulated, word in ((True, "simulated data"), (False, "recorded data")):
+        content = content | {"simulated": simulated}
+        assert ("(simulated data)" in verdict(content)) is simulated
+        text = Reader(certificate_page(content, points_of(found))).text
+        assert word in text
+
+
+def points_of(found):
+    return {
+        name: (c.exact.abs().tolist(), c.error.tolist(), c.flips.tolist())
+        for name, c in found.sets.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "Holds: float32 decides as float64 does where |score| exceeds"),
+        ({"head": "sum"}, "as measured: this head has no bound"),
+        ({"gain": 1e39}, "Does not hold: error of the head, worst seen is -"),
+    ],
+)
+def test_every_outcome_has_a_verdict_and_a_page(options, words, written):
+    detector = small_detector(**options)
+    found = measure(detector, raw_bins(30), simulated=True, extremes=2)
+    rest = {k: v for k, v in written[1].items() if k in ("detector", "data", "versions")}
+    content = _plain(found.facts() | rest)
+    assert words in verdict(content)
+    assert verdict(content) in Reader(certificate_page(content, points_of(found))).text
+    json.dumps(content, allow_nan=False)
+
+
+def test_numbers_are_short():
+    shown = [number(v) for v in (1.23456e-7, 0.0, 0.25, 12345.6, 7, None, "words")]
+    assert shown == ["1.2e-07", "0", "0.25", "1.2e+04", "7", "-", "words"]
+
+
+# The command -------------------------------------------------------------------------------------
+
+
+def run(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["certify", *TINY, *arguments])
+    status = 0
+    try:
+        main()
+    except SystemExit as stop:
+        status = stop.code
+    done = capsys.readouterr()
+    lines = [x for x in done.err.splitlines() if x.startswith(("error", "Does not hold"))]
+    return status, done.out, lines
+
+
+def test_the_exit_status_is_0_if_it_holds_and_1_if_not(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    model = f"model={saved(tmp_path)}"
+    status, out, lines = run(monkeypatch, capsys, model)
+    assert (status, lines) == (0, [])
+    assert out.startswith("Holds: ")
+    assert str(tmp_path / "certificate.html") in out
+    (tmp_path / "b").mkdir()
+    model = f"model={saved(tmp_path / 'b', gain=1e39)}"
+    status, out, lines = run(monkeypatch, capsys, model)
+    assert status == 1
+    assert out == ""
+    (line,) = lines
+    assert line.startswith("Does not hold: error of the head")
+    assert line.endswith("certificate.html")
+    assert json.loads((tmp_path / "b" / "certificate.json").read_text())["holds"] is False
+    assert (tmp_path / "b" / "certificate.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("model=missing.pt", "no detector at missing.pt"),
+        ("calibrate=all", "calibrate and judge must be different roles of train, test, unseen"),
+        ("judge=[train]", "got calibrate=train judge=[train]"),
+        ("bins=0", "bins must be at least 1, got 0"),
+        ("extremes=0", "extremes must be at least 1, got 0"),
+        ("fold=other", "fold must be one of unseen4, got other"),
+        ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3"),
+        ("+data.scene.broken=A/0", "repair or leave out A/0"),
+    ],
+)
+def test_bad_input_is_one_line(override, line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    more = ["bins=200"] if "broken" in override else []
+    arguments = [f"model={saved(tmp_path)}", *more, override]
+    status, out, lines = run(monkeypatch, capsys, *arguments)
+    assert (status, out) == (2, "")
+    assert len(lines) == 1
+    assert line in lines[0]
+    assert not list(tmp_path.glob("certificate*"))
+
+
+def test_one_judged_role_may_be_named_alone(tmp_path):
+    path = saved(tmp_path)
+    _, folder = certify(composed(f"model={path}", "judge=unseen"))
+    content = json.loads((folder / "certificate.json").read_text())
+    assert list(content["sets"]) == ["calibration", "unseen"]
+
+
+# Which bins --------------------------------------------------------------------------------------
+
+
+def drawn(number, role="train", seed=0, fold=None, rule=None):
+    fold = fold or instantiate(composed("model=x").split, _convert_="all")(source().ids)[0]
+    detector = small_detector()
+    known = fold.having("train")[:1]
+    detector.info["train_recordings"] = {str(r): cache_key(source().key(r)) for r in known}
+    return draw_bins(source(), rule or LabelRule(), detector, fold, role, number, seed), fold
+
+
+@pytest.mark.parametrize(("number", "recordings"), [(5, 1), (81, 3), (160, 4), (250, 4)])
+def test_drawn_bins_are_those_of_the_role_with_their_context(number, recordings):
+    (bins, facts), fold = drawn(number)
+    assert len(bins) == number
+    assert facts["recordings"] == recordings
+    known, rule = {}, LabelRule()
+    for recording in fold.having("train"):
+        times = source().timeline(recording)
+        own = label_bins(rule, times.onsets_s, times.sliding_s, times.duration_s, 2000.0)
+        samples = source().load(recording).samples
+        for start in own.starts.tolist():
+            known[samples[:, start - 25 : start + 125].numpy().tobytes()] = recording
+    met = [known[one.contiguous().numpy().tobytes()] for one in bins]
+    assert len(set(met)) == recordings
+    assert len({one.numpy().tobytes() for one in bins}) == number  # none twice
+    if recordings > 1:
+        assert {recording.material for recording in met} == {"A", "B"}
+
+
+def test_the_draw_repeats_itself_by_seed():
+    first, again, other = (drawn(50, seed=seed)[0][0] for seed in (3, 3, 4))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_recordings_of_the_training_are_counted():
+    assert drawn(200)[0][1]["recordings_of_training"] == 1
+    assert drawn(200, "unseen")[0][1]["recordings_of_training"] == 0
+
+
+def test_bins_of_one_recording_may_have_two_roles():
+    recordings = source().ids[:2]
+    fold = Split("random_bins", dict.fromkeys(recordings, "train"), test_share_of_bins=0.5)
+    train, test = (drawn(20, role, fold=fold)[0][0] for role in ("train", "test"))
+    own, other = ({one.numpy().tobytes() for one in bins} for bins in (train, test))
+    assert not own & other
+
+
+def test_a_role_that_nobody_has_is_refused():
+    fold = Split("odd", {source().ids[0]: "train"})
+    with pytest.raises(ValueError, match="no recording has the role 'unseen' in odd; choose"):
+        drawn(5, "unseen", fold=fold)
