@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.arithmetic import ARITHMETIC
 from benchmarks.clocks import Way, on_threads, say, shuffled_rounds
 from benchmarks.features.guards_off import guards_off, textbook
 from benchmarks.features.sizes import Sizes
@@ -26,11 +27,6 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.source import SimulatedRecordings
 
-ARITHMETIC = {
-    "float64": (torch.float64, "double"),
-    "float32, computed in float64": (torch.float32, "double"),
-    "float32 throughout": (torch.float32, "native"),
-}
 NUM_FEATURES = 120  # of the detector that is timed
 
 
@@ -41,7 +37,7 @@ def extract(sizes: Sizes) -> dict[str, Any]:
         say(f"extract on {threads} threads")
         ways: dict[str, Way] = {}
         for name, (dtype, arithmetic) in ARITHMETIC.items():
-            pool = FeaturePool(HandLayout.paper24(), arithmetic=arithmetic)  # type: ignore[arg-type]
+            pool = FeaturePool(HandLayout.paper24(), arithmetic=arithmetic)
             call = partial(pool.extract, simulated_bins(sizes.bins).to(dtype))
             ways |= {
                 f"{name} guards": Way(call),

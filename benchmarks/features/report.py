@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
+from benchmarks.arithmetic import NATIVE, WIDE
 from benchmarks.clocks import paired_ratio
 from tactslip_torch.report.tables import aligned
 
 SIMULATED_LINE = "SIMULATED bins: what features and scores cost, nothing about a real hand"
 QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
 MOST_OVER_OFF = 1.10  # what the guards may cost, as the project has set itself
-WIDE, NATIVE = "float32, computed in float64", "float32 throughout"
 _TITLES = {"extract": "features", "score": "scores with validity"}
 _KINDS = ("off", "textbook")  # what seconds with guards are compared with
 
