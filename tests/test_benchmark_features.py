@@ -22,7 +22,7 @@ from benchmarks.features.sizes import Sizes
 from tactslip_torch import FeaturePool, HandLayout
 from tactslip_torch.simulation.extremes import extreme_bins
 
-TINY = Sizes(bins=3, scored=(2,), threads=(1,), rounds=4)
+TINY = Sizes(bins=3, scored=(2,), solved=(12,), threads=(1,), rounds=4)
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +106,16 @@ def resolve(name: str) -> Any:
             found = getattr(found, part)
         return found
     raise LookupError(name)
+
+
+def test_both_solves_are_of_the_same_system(rng: np.random.Generator) -> None:
+    z = torch.from_numpy(rng.uniform(-1, 1, (9, 4)))
+    gram, targets = (z @ z.mT + 0.5) ** 2, torch.from_numpy(rng.standard_normal(9))
+    wanted = np.linalg.solve(gram.numpy() + np.eye(9) / measure.PENALTY, targets.numpy())
+    for way in (measure._reported, measure._bare):
+        before = gram.clone()
+        np.testing.assert_allclose(way(gram, targets), wanted)
+        assert torch.equal(gram, before)
 
 
 # ------------------------------------------------------------------------------------- clocks

@@ -2,7 +2,7 @@
 
 Here: what the guards cost that keep extremes from becoming silent numbers. Features and scores of
 ordinary bins are timed with them and, in the same rounds, with plain formulas in their place
-(``guards_off``). Prints tables and the limit the project has set itself, and keeps the numbers in
+(``guards_off``); a solve with its report and as a bare factorisation. Prints tables and the limit the project has set itself, and keeps the numbers in
 ``benchmarks/results``.
 """
 

@@ -1,7 +1,7 @@
 """The measurements of ``benchmarks.features``: seconds of every round, no judgement.
 
-Bins are simulated: those of one recording, filtered as in training. What is compared is timed in
-one process, in an order of its own in every round.
+Bins are simulated: those of one recording, filtered as in training; a solve takes synthetic
+features. What is compared is timed in one process, in an order of its own in every round.
 """
 
 from __future__ import annotations
@@ -17,17 +17,21 @@ from benchmarks.arithmetic import ARITHMETIC
 from benchmarks.clocks import Way, on_threads, say, shuffled_rounds
 from benchmarks.features.guards_off import guards_off, textbook
 from benchmarks.features.sizes import Sizes
+from benchmarks.model.synthetic import SyntheticBins
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.cholesky import cholesky_, cholesky_solve
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.kernel_elm import solve_kernel_elm_
+from tactslip_torch.model.kernels import PAPER_KERNEL, lower_gram
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.source import SimulatedRecordings
 
-NUM_FEATURES = 120  # of the detector that is timed
+NUM_FEATURES, PENALTY = 120, 0.1  # of the machine that is timed
 
 
 def extract(sizes: Sizes) -> dict[str, Any]:
@@ -79,7 +83,32 @@ def score(sizes: Sizes) -> dict[str, Any]:
     return {"rows": rows}
 
 
-SECTIONS: dict[str, Callable[[Sizes], dict[str, Any]]] = {"extract": extract, "score": score}
+def solve(sizes: Sizes) -> dict[str, Any]:
+    """The solve with its report, condition and all, beside a bare factorisation; both copy."""
+    rows = []
+    for threads in sizes.threads:
+        for num_bins in sizes.solved:
+            say(f"solve of {num_bins} bins on {threads} threads")
+            z, is_slip = SyntheticBins(NUM_FEATURES).training(num_bins)
+            gram, targets = lower_gram(PAPER_KERNEL, z), torch.where(is_slip, 1.0, -1.0).double()
+            ways = {
+                "guards": Way(partial(_reported, gram, targets)),
+                "off": Way(partial(_bare, gram, targets)),
+            }
+            with torch.inference_mode(), on_threads(threads):
+                seconds = shuffled_rounds(ways, sizes.rounds, sizes.seed)
+            rows.append(
+                {"bins": num_bins, "arithmetic": "float64", "threads": threads}
+                | {f"{kind}_s": taken for kind, taken in seconds.items()}
+            )
+    return {"rows": rows}
+
+
+SECTIONS: dict[str, Callable[[Sizes], dict[str, Any]]] = {
+    "extract": extract,
+    "score": score,
+    "solve": solve,
+}
 
 
 # ---------------------------------------------------------------------------------------- parts
@@ -108,3 +137,14 @@ def untrained_detector() -> SlipDetector:
     weights = torch.randn(NUM_FEATURES + 1, NUM_FEATURES, generator=generator, dtype=torch.float64)
     head = QuadraticForm(weights[1:] + weights[1:].T, weights[0], weights[0, 0])
     return SlipDetector(pool, ChannelFilter([51] * 14 + [11] * 10), selected, scaler, head)
+
+
+def _reported(gram: Tensor, targets: Tensor) -> Tensor:
+    return solve_kernel_elm_(gram.clone(), targets, PENALTY).x
+
+
+def _bare(gram: Tensor, targets: Tensor) -> Tensor:
+    system = gram.clone()
+    system.diagonal().add_(1 / PENALTY)
+    cholesky_(system)
+    return cholesky_solve(system, targets)

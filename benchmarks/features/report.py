@@ -13,7 +13,7 @@ from tactslip_torch.report.tables import aligned
 SIMULATED_LINE = "SIMULATED bins: what features and scores cost, nothing about a real hand"
 QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
 MOST_OVER_OFF = 1.10  # what the guards may cost, as the project has set itself
-_TITLES = {"extract": "features", "score": "scores with validity"}
+_TITLES = {"extract": "features", "score": "scores with validity", "solve": "solve with report"}
 _KINDS = ("off", "textbook")  # what seconds with guards are compared with
 
 

@@ -114,7 +114,7 @@ def load_experiment(sizes: Sizes) -> Experiment:
         "num_features": len(plan.frame.selected),
         "penalty": plan.penalty,
         "kernel": plan.kernel.to_dict(),
-        "num_bins": {"train": len(train.is_slip)}
+        "num_bins": {"train": int(survey.moments.count.sum())}
         | {role: len(one.is_slip) for role, one in parts.items()},
     }
     return Experiment(pool, channel_filter, plan, weights, train, parts, facts)
