@@ -2,8 +2,8 @@
 
 Here: what the guards cost that keep extremes from becoming silent numbers. Features and scores of
 ordinary bins are timed with them and, in the same rounds, with plain formulas in their place
-(``guards_off``); a solve with its report and as a bare factorisation. Prints tables and the limit the project has set itself, and keeps the numbers in
-``benchmarks/results``.
+(``guards_off``); a solve with its report beside a bare factorisation. Prints tables and the limit
+the project has set itself, and keeps the numbers in ``benchmarks/results``.
 """
 
 from __future__ import annotations
