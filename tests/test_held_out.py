@@ -288,12 +288,6 @@ def test_groups_must_be_one_whole_number_a_bin(groups, message, rng):
         HeldOut(draw(rng, 20), groups)
 
 
-def test_single_precision_is_refused(rng):
-    bins = draw(rng, 20)
-    with pytest.raises(ValueError, match=r"features in float64, got torch.float32"):
-        HeldOut(TrainingBins(bins.features.float(), bins.is_slip), torch.arange(20) % 2)
-
-
 def test_a_primal_of_a_kernel_that_does_not_fold_is_refused(rng):
     with pytest.raises(ValueError, match=r"RadialBasis.* has no primal of fixed size"):
         HeldOut(draw(rng, 20), torch.arange(20) % 2, RADIAL, route="primal")

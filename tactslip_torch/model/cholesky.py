@@ -6,7 +6,7 @@ it works on row-major storage, reads the lower triangle alone and makes no copy 
 
 Reference:
     Golub and Van Loan, Matrix Computations, 4th ed., sections 4.2.6 (block Cholesky), 3.1.4
-    (block substitution) and 11.5 (preconditioned conjugate gradients).
+    (block substitution) and 3.5.3 (iterative refinement).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _FEW = 256  # right-hand sides; up to here the threads share every band of one s
 _BAND = 512  # rows of a factor that a solve reads at a time
 _STRIP = 128  # rows of a band that one thread reads at a time, for few right-hand sides
 _WIDTH = 1024  # columns of a band, likewise
-_MOST_STEPS = 40  # of conjugate gradients
-_CONVERGED = 1e-12  # error of their solution, relative
+_MOST_STEPS = 20  # of refinement
+_CONVERGED = 1e-10  # error of a solution that needs no more of it, relative
 
 
 def cholesky_(matrix: Tensor) -> None:
@@ -139,7 +139,9 @@ def symmetric_product(matrix: Tensor, diagonal: Tensor, vector: Tensor) -> Tenso
 
 
 def refine(matrix: Tensor, diagonal: Tensor, right: Tensor) -> tuple[Tensor, int, float]:
-    """Solve ``A x = right`` with the factor of a neighbour of ``A``, by conjugate gradients.
+    """Solve ``A x = right`` with the factor of a neighbour of ``A``, by iterative refinement.
+
+    Not by conjugate gradients: where ``A`` is singular they blow up what rounding left there.
 
     Args:
         matrix: below its diagonal and on it the factor; above it what ``A`` has there.
@@ -150,27 +152,18 @@ def refine(matrix: Tensor, diagonal: Tensor, right: Tensor) -> tuple[Tensor, int
         - matrix: ``[n, n]``; diagonal, right: ``[n]``
 
     Returns:
-        The solution, the number of steps, and the norm of its error in units of its own: both that
-        which ``A`` gives, as far as the factor tells.
+        The solution, the number of steps, and the error of the solution in units of its own size:
+        both in the norm that ``A`` gives, as far as the factor tells.
     """
-    x, rest = torch.zeros_like(right), right.clone()
-    direction = cholesky_solve(matrix, rest)
-    first = square = float((rest * direction).sum())
-    steps = 0
-    while steps < _MOST_STEPS and square > _CONVERGED**2 * first:
-        image = symmetric_product(matrix, diagonal, direction)
-        curve = float((direction * image).sum())
-        if not curve > 0:  # A is not positive definite in its dtype
-            break
-        x.add_(direction, alpha=square / curve)
-        rest.sub_(image, alpha=square / curve)
-        turned = cholesky_solve(matrix, rest)
-        before, square = square, float((rest * turned).sum())
-        direction.mul_(square / before).add_(turned)
-        steps += 1
-    rest = right - symmetric_product(matrix, diagonal, x)
-    left = float((rest * cholesky_solve(matrix, rest)).sum())
-    return x, steps, math.sqrt(left / first) if left > 0 else 0.0
+    x, rest, size, steps, before = torch.zeros_like(right), right, 0.0, 0, math.inf
+    while True:
+        step = cholesky_solve(matrix, rest)
+        square = max(float((rest * step).sum()), 0.0)
+        size = size or square
+        if square <= _CONVERGED**2 * size or not square < before / 4 or steps == _MOST_STEPS:
+            return x, steps, math.sqrt(square / size) if size > 0 else 0.0
+        x, before, steps = x + step, square, steps + 1
+        rest = right - symmetric_product(matrix, diagonal, x)
 
 
 def check_finite(matrix: Tensor, right: Tensor, name: str) -> None:

@@ -42,8 +42,8 @@ class SolveReport:
         condition_bound: what it cannot exceed, since no eigenvalue is below the ridge's; ``None``
             without a ridge.
         rank: components kept; all but for ``"eigen"``.
-        jitter: added to the diagonal of the preconditioner, relative to it.
-        refinements: steps of conjugate gradients.
+        jitter: least part by which the diagonal of the system whose factor refines is larger.
+        refinements: steps of it.
         residual: what they left, relative, in the norm of the system.
         error: relative error of first order of the solution: rounding of the matrix, or the error
             it came with, times the condition.
@@ -148,12 +148,13 @@ def inverse_norm(factor: Tensor, scale: Tensor) -> float:
 def inverse_growth(factor: Tensor, scale: Tensor, solution: Tensor) -> float:
     """A lower bound of the largest eigenvalue of ``(D^-1 L L' D^-1)^-1`` for half a solve.
 
-    One and a half steps of inverse iteration: the solution of a system is the first.
+    One and a half steps of inverse iteration: the solution of a system is the first. It tells
+    nothing of directions that the right-hand side does not have.
 
     Args:
         factor: ``L``, the Cholesky factor of ``A``.
         scale: the diagonal of ``D``.
-        solution: of a system in ``A``; not 0.
+        solution: of a system in ``A``; 0 tells nothing.
 
     Shape:
         - factor: ``[n, n]``; scale, solution: ``[n]``

@@ -60,7 +60,7 @@ class HeldOut:
     the small ones costs ``P^2 / 2`` multiply-adds.
 
     Args:
-        bins: scaled training bins in float64.
+        bins: scaled training bins; float32 is promoted exactly.
         groups: ``[N]``, whole numbers; bins of one group need not stand together.
         kernel: of the machine.
         route: ``"auto"``, or the one to take.
@@ -77,6 +77,7 @@ class HeldOut:
         kernel: Kernel = PAPER_KERNEL,
         route: Route = "auto",
     ) -> None:
+        bins = bins.double()
         _check_bins(bins, groups)
         names, member, counts = torch.unique(groups, return_inverse=True, return_counts=True)
         _check_groups(names, member, bins.is_slip)
@@ -96,12 +97,14 @@ class HeldOut:
     def at(self, penalty: float) -> HeldOutFit:
         """The machine and the held-out scores for one value of C, from one factorisation.
 
+        The scores are right to 100 eps times the condition of the system of all bins.
+
         Args:
             penalty: the paper's ``C``, positive and finite.
 
         Raises:
-            ValueError: if the penalty is not that, the system is not positive definite, or the
-                machine without a group (named) cannot be told in float64.
+            ValueError: if the penalty is not that, the condition is above ``MOST_CONDITION``, or
+                the machine without a group (named) cannot be told in float64.
         """
         if not 0 < penalty < math.inf:
             raise ValueError(
@@ -273,8 +276,6 @@ def _check_bins(bins: TrainingBins, groups: Tensor) -> None:
             f"expected a whole number for the group of each of {len(bins.is_slip)} bins, got "
             f"{tuple(groups.shape)} {groups.dtype}"
         )
-    if bins.features.dtype != torch.float64:
-        raise ValueError(f"held-out scores need features in float64, got {bins.features.dtype}")
 
 
 def _check_groups(names: Tensor, member: Tensor, is_slip: Tensor) -> None:

@@ -159,7 +159,9 @@ def solve_normal_equations_(
         ValueError: as ``solve_primal``.
     """
     _check_penalty(penalty)
-    return solve_symmetric_(normal, moment, penalty, name="X'WX", most_condition=most_condition)
+    return solve_symmetric_(
+        normal, moment, penalty, name="X'WX", in_span=True, most_condition=most_condition
+    )
 
 
 def _solve(system: Tensor, right: Tensor, penalty: float, weights: Tensor, name: str) -> Tensor:

@@ -181,8 +181,7 @@ class SufficientStats:
 
         Takes one float64 matrix of ``P`` by ``P`` monomials beside the sums (436 MB for 120
         features). The same bits on any number of threads. The grid leaves an error in that matrix;
-        where C makes so much of it that it would show (a thousandth), components up to its size
-        are left out, and a machine that needs components near it is refused.
+        a machine of which C makes a thousandth its doing is refused.
 
         Args:
             penalty: the paper's ``C``; ``inf`` for the pseudo-inverse, which takes several such
@@ -200,7 +199,9 @@ class SufficientStats:
             Zong, Huang and Chen (2013), Neurocomputing 101, 229-242 (weighted ELM).
         """
         normal, moment, noise = self._normal_equations(penalty, offset, num_features, balance)
-        weights, report = solve_symmetric_(normal, moment, penalty, name="X'WX", noise=noise)
+        weights, report = solve_symmetric_(
+            normal, moment, penalty, name="X'WX", noise=noise, in_span=True
+        )
         machine = from_primal(weights, num_features or self.num_features, offset)
         machine.solved = report
         return machine
