@@ -37,7 +37,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if num := generated.num_generated():
         terminalreporter.write_line(
             f"property tests: {num} generated bins, seed {generated.SEED} "
-            f"(TACTSLIP_SEED={generated.SEED} pytest ... repeats them)"
+            f"(TACTSLIP_SEED={generated.SEED} and the same tests make them again)"
         )
 
 
