@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -101,6 +101,11 @@ def solve_sums(plan: Plan, stats: SufficientStats) -> QuadraticForm:
         raise ValueError(f"sums need a polynomial kernel of degree 2, the plan has {plan.kernel}")
     balance: Literal["weights", "none"] = "weights" if plan.balance == "weights" else "none"
     return stats.solve(plan.penalty, plan.kernel.offset, balance=balance)
+
+
+def solve_facts(head: Head) -> dict[str, Any]:
+    """How a machine was solved for, JSON-able: method, condition, error (``SolveReport``)."""
+    return {} if head.solved is None else head.solved.facts()
 
 
 def _is_kept(recording: str, is_slip: Tensor, shares: Sequence[float]) -> Tensor:

@@ -23,7 +23,7 @@ from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.feature_maker import RecordingFeatures
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.fitting import TrainingPass
+from tactslip_torch.fitting import TrainingPass, solve_facts
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import FeatureThreshold
@@ -242,6 +242,7 @@ class SlipLearner(L.LightningModule):
             name: facts[name] for name in ("kernel", "penalty", "balance", "num_bins", "validation")
         }
         self.facts["head"] = head.cost._asdict()
+        self.facts["solve"] = solve_facts(head)
         self.seconds["solve"] = time.perf_counter() - started
         self.detector = SlipDetector(
             self.pool,

@@ -37,7 +37,7 @@ from tactslip_torch.features.cache import FeatureCache, cache_key
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.files import load_table, save_table, table_form
-from tactslip_torch.fitting import solve_sums, training_part
+from tactslip_torch.fitting import solve_facts, solve_sums, training_part
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.ledger import first_difference
 from tactslip_torch.model.detector import SlipDetector
@@ -138,21 +138,22 @@ def _solve(config: DictConfig) -> str:
     sums = _only(config.inputs, SufficientStats)
     _check_same(sums.about, of_plan | {"plan": cache_key(plan.facts())}, "the sums", config.plan)
     _check_complete(sums.about, sums.ledger.entries)
-    about = sums.about
+    about, head = sums.about, solve_sums(plan, sums)
     detector = SlipDetector(
         FeaturePool(HandLayout.from_rows(about["channels"]), **about["pool"]),
         ChannelFilter(about["window_lengths"], about["polyorder"]),
         plan.frame.selected,
         plan.frame.scaler,
-        solve_sums(plan, sums),
+        head,
         plan.facts()
+        | {"solve": solve_facts(head)}
         | {name: about[name] for name in ("simulated", "experiment", "seed", "split")}
         | {"features_dtype": about["features_dtype"], "train_recordings": about["recordings"]}
         | {"train_materials": about["materials"]},
         plan.typical,
     )
     detector.save(config.out)
-    return f"detector of {int(sums.count.sum())} bins"
+    return f"detector of {int(sums.count.sum())} bins, by {head.solved}"
 
 
 def _data(config: DictConfig, cache: FeatureCache) -> SlipDataModule:

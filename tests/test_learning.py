@@ -133,6 +133,16 @@ def test_the_detector_judges_filtered_bins_as_the_test_did():
     assert learner.metrics["splits"]["unseen"]["accuracy"] == pytest.approx(right / total)
 
 
+def test_the_solve_is_reported_with_its_condition():
+    source = SmallSet()
+    learned = learn(source, unseen_c(source))
+    solve = learned.detector.info["solve"]
+    assert solve == learned.facts["solve"]
+    assert solve["method"] == "cholesky"
+    assert 1 < solve["condition"] <= solve["condition_bound"]
+    assert solve["rank"] == solve["size"] <= learned.facts["num_bins"]
+
+
 def test_a_finished_pass_survives_a_checkpoint(tmp_path):
     source = SmallSet()
     split = unseen_c(source)

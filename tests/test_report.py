@@ -21,6 +21,7 @@ from tactslip_torch.report import (
     published,
     selected_features_figure,
     selected_table,
+    solve_line,
     split_metrics,
     splits_table,
     timing_table,
@@ -213,6 +214,12 @@ def test_timing_table_takes_a_given_total() -> None:
     rows = rows_of(timing_table({"total": 50.0, "features": 20.0}))
     assert rows[1:] == [["features", "20.00", "40.00"], ["total", "50.00", "100.00"]]
     assert rows_of(timing_table({}))[1:] == [["total", "0.00", "-"]]
+
+
+def test_solve_line_says_how_far_rounding_may_reach() -> None:
+    facts = {"method": "eigen", "rank": 7, "size": 9, "condition": "inf", "error": 2.2e-16}
+    line = "solved by eigen: 7 of 9 unknowns, condition inf, relative error of the weights about"
+    assert solve_line(facts) == f"{line} 2e-16"
 
 
 def test_selected_table_counts_every_key(selected: list[dict[str, str]]) -> None:

@@ -10,6 +10,7 @@ from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_me
 from tactslip_torch.report.tables import (
     materials_table,
     selected_table,
+    solve_line,
     splits_table,
     timing_table,
 )
@@ -23,6 +24,7 @@ __all__ = [
     "pipeline_figure",
     "selected_features_figure",
     "selected_table",
+    "solve_line",
     "split_metrics",
     "splits_table",
     "timing_table",

@@ -12,6 +12,7 @@ from tactslip_torch.report.figures import confusion_figure, selected_features_fi
 from tactslip_torch.report.tables import (
     materials_table,
     selected_table,
+    solve_line,
     splits_table,
     timing_table,
 )
@@ -45,6 +46,8 @@ def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, st
         parts.append(selected_table(selected))
     if metrics.get("validation"):
         parts.append(validation_table(metrics["validation"], simulated=metrics["simulated"]))
+    if metrics.get("solve"):
+        parts.append(solve_line(metrics["solve"]))
     if metrics.get("timing_s"):
         parts.append(timing_table(metrics["timing_s"]))
     print("\n" + "\n\n".join(parts))

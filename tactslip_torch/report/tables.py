@@ -145,3 +145,12 @@ def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], num_left: int 
         ]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def solve_line(solve: Mapping[str, Any]) -> str:
+    """How the machine was solved for, in a line: ``SolveReport.facts`` in words."""
+    return (
+        f"solved by {solve['method']}: {solve['rank']} of {solve['size']} unknowns, condition "
+        f"{float(solve['condition']):.1e}, relative error of the weights about "
+        f"{float(solve['error']):.0e}"
+    )
