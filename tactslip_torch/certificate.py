@@ -25,7 +25,7 @@ from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 FACTOR = 4
 WORST_SD = 1e-3  # largest score error allowed on recordings, in standard deviations of the score
 INSIDE_SHARE = 0.01  # fewer of the held-out bins may lie inside the margin
-RULE = f"bound of the head over the box, plus {FACTOR} x the worst error on calibration bins"
+RULE = f"{FACTOR} x the worst error on calibration bins, plus the bound of the head if it has one"
 VALIDITY = "every channel in use is finite, and its filtered span above 64 eps of its magnitude"
 _CHUNK_BINS, _GRADIENT_BINS = 16, 128
 
@@ -278,7 +278,7 @@ def _conditions(content: Mapping[str, Any]) -> list[dict[str, Any]]:
 
     head = content["head"]
     seen, bound = head["worst_seen"], head["bound"]
-    wanted = "a bound, which this head has not" if bound is None else f"<= {bound:.2e}, its bound"
+    wanted = "a bound: this head has none" if bound is None else f"<= {bound:.2e}, its bound"
     within = None
     if bound is not None:  # what it is compared with is rounded as well
         within = seen <= bound + head["reference_bound"] and not head["overflows"]

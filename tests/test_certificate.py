@@ -206,6 +206,14 @@ def test_held_out_bins_that_turn_refute():
     assert named(found, "test: flips outside the margin")["holds"] is False
     assert named(found, "test: worst error, sd")["holds"] is False
     assert named(found, "calibration: flips outside the margin")["holds"] is True
+    turned = [c.flips & c.is_valid & (c.exact.abs() > row_margin(found)) for c in kinds_of(found)]
+    of_extremes = named(found, "valid extremes: flips outside the margin")
+    assert of_extremes["found"] == int(torch.cat(turned).sum()) > 0
+    assert of_extremes["holds"] is False
+
+
+def kinds_of(found):
+    return [found.sets[kind] for kind in EXTREMES]
 
 
 def row_margin(found):
@@ -247,6 +255,9 @@ def test_a_head_that_overflows_does_not_hold():
     facts = found.facts()
     assert facts["head"]["overflows"]
     assert facts["margin"]["score"] == math.inf
+    silent = sum(int((~c.rounded.isfinite()).sum()) for c in kinds_of(found))
+    assert named(found, "extremes: scores that are not finite")["found"] == silent > 0
+    assert named(found, "extremes: scores that are not finite")["holds"] is False
     assert facts["conditions"][0]["holds"] is False
     assert not found.holds
 

@@ -177,7 +177,10 @@ def points_of(found):
     [
         ({}, "Holds: float32 decides as float64 does where |score| exceeds"),
         ({"head": "sum"}, "as measured: this head has no bound"),
-        ({"gain": 1e39}, "Does not hold: error of the head, worst seen is -"),
+        (
+            {"gain": 1e39},
+            "Does not hold: error of the head, worst seen is not finite, wanted <= inf, its bound",
+        ),
     ],
 )
 def test_every_outcome_has_a_verdict_and_a_page(options, words, written):

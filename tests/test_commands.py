@@ -522,6 +522,7 @@ FAILURES = {
     "unknown layout": (["train", "labels.layout=nope"], "labels.layout must be one of whole_slide"),
     "missing detector": (["evaluate", "model=missing.pt"], "no detector at missing.pt"),
     "nothing to export": (["export", "model=missing.pt"], "no detector at missing.pt"),
+    "nothing to certify": (["certify", "model=missing.pt"], "no detector at missing.pt"),
 }
 
 

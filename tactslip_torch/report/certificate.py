@@ -25,7 +25,7 @@ def verdict(content: Mapping[str, Any]) -> str:
     if failed:
         row = failed[0]
         others = f" and {len(failed) - 1} more" if len(failed) > 1 else ""
-        found = f"{row['name']} is {number(row['found'])}, wanted {row['wanted']}"
+        found = f"{row['name']} is {found_in(row)}, wanted {row['wanted']}"
         return f"Does not hold: {found}{others}{kind}"
     margin = content["margin"]
     measured = ", as measured: this head has no bound" if content["head"]["bound"] is None else ""
@@ -49,6 +49,13 @@ def number(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def found_in(condition: Mapping[str, Any]) -> str:
+    """What was found for a condition, in words where it is no number."""
+    if condition["found"] is None and condition["holds"] is False:
+        return "not finite"
+    return number(condition["found"])
+
+
 def certificate_figure(content: Mapping[str, Any], points: Points) -> Figure:
     """Error against ``|score|`` with margin and bound, and the errors of each kind of extremes.
 
@@ -62,7 +69,7 @@ def certificate_figure(content: Mapping[str, Any], points: Points) -> Figure:
     _bars(right, content["extremes"])
     kind = "simulated recordings" if content["simulated"] else "recordings"
     _titled(left, f"(a) every bin of {kind}", "both")
-    _titled(right, "(b) generated extremes; grey: flagged as not valid", "x")
+    _titled(right, "(b) generated extremes (grey: flagged)", "x")
     return figure
 
 
@@ -94,7 +101,9 @@ def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
     if margin:
         axes.axvspan(low, margin, color="#F3E3D3", zorder=0)
         axes.axvline(margin, color=_BAD, linewidth=1.2)
-        axes.text(margin, 3 * floor, "  margin: to its left\n  a decision may turn", color=_BAD)
+        side = "right" if margin * margin > low * high else "left"
+        words = "  margin: to its left  \n  a decision may turn  "
+        axes.text(margin, 3 * floor, words, color=_BAD, ha=side, multialignment=side)
     if bound:
         axes.axhline(bound, color=_INK, linewidth=1.0, linestyle="--")
         axes.text(high, bound / 1.15, "bound of the head ", color=_INK, ha="right", va="top")

@@ -8,7 +8,13 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from tactslip_torch.report.certificate import Points, certificate_figure, number, verdict
+from tactslip_torch.report.certificate import (
+    Points,
+    certificate_figure,
+    found_in,
+    number,
+    verdict,
+)
 
 MARK = '<meta name="generator" content="tactslip_torch.certify">'
 """In every page, so that only our own are replaced."""
@@ -98,7 +104,7 @@ def _tiles(content: Mapping[str, Any]) -> str:
 
 def _tables(content: Mapping[str, Any], kind: str) -> list[str]:
     conditions = [
-        [row["name"], row["found"], row["wanted"], _HOLDS[row["holds"]]]
+        [row["name"], found_in(row), row["wanted"], _HOLDS[row["holds"]]]
         for row in content["conditions"]
     ]
     sets, extremes = content["sets"].items(), content["extremes"].items()
