@@ -140,7 +140,7 @@ def assert_gradient_right(got: list[float], s: Exact, name: str) -> None:
     got = [CTX.mpf(g) for g in got]
     if name in ORDERED:
         got, gradient, allowed = (by_value(s, part) for part in (got, gradient, allowed))
-    floor = s.rules.smallest * s.n + (e**2 if name in WITH_UNIT else 0)
+    floor = s.rules.smallest * s.n + e**2 * max(name in WITH_UNIT, *map(abs, gradient))
     for g, value, off in zip(got, gradient, allowed, strict=True):
         miss = abs(g - s.rules.saturated(value))
         assert miss <= off + floor, f"{name}: {g}, exact {value}, bound {off}"

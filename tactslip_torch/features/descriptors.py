@@ -144,12 +144,15 @@ def entropy(sample: Sample) -> Tensor:
     distinct levels serve as histogram *edges*, so the two highest occupied ones share one cell.
     Piecewise constant: its gradient is 0 wherever it exists, and none flows.
     """
-    relative = (sample.ranked - sample.ranked[..., :1]) / sample.safe_span[..., None]
-    level = (relative * ENTROPY_LEVELS + (0.5 + HALF_SLACK.get(sample.x.dtype, 0.0))).floor()
+    levels = (ENTROPY_LEVELS / sample.safe_span)[..., None]
+    half = 0.5 + HALF_SLACK.get(sample.x.dtype, 0.0)
+    level = ((sample.ranked - sample.ranked[..., :1]) * levels + half).floor()
     # the maximum always has the top level, so the second highest level joins it
     new_cell = (level[..., 1:] != level[..., :-1]) & (level[..., 1:] != ENTROPY_LEVELS)
     growth = _entropy_growth(sample.num).to(sample.x)
-    return torch.where(sample.is_flat, 0.0, growth[rank_in_run(new_cell).long()].sum(-1))
+    rank = rank_in_run(new_cell)
+    grown = growth.index_select(0, rank.flatten()).reshape(rank.shape)
+    return torch.where(sample.is_flat, 0.0, grown.sum(-1))
 
 
 def peak_factor(sample: Sample) -> Tensor:

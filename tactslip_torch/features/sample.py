@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.nn.functional import pad
 
 
 def is_constant(x: Tensor, scale: Tensor) -> Tensor:
@@ -86,24 +87,22 @@ def _saturate(gradient: Tensor | None) -> Tensor | None:
 def rank_in_run(is_boundary: Tensor) -> Tensor:
     """Position of each sorted value within its run, from 0.
 
+    The running maximum of where runs start, by doubling: log2(n) plain maxima of windows, which
+    export to ONNX as ``cummax`` does not.
+
     Shape:
         - is_boundary: ``[*, n - 1]``, bool: a new run starts behind this value
         - output: ``[*, n]``, int32
     """
     num = is_boundary.shape[-1] + 1
     position = torch.arange(num, dtype=torch.int32, device=is_boundary.device)
-    start = torch.where(is_boundary, position[1:], 0)
-    start = torch.cat([torch.zeros_like(start[..., :1]), start], dim=-1)
-    return position - _running_max(start)
-
-
-def _running_max(x: Tensor) -> Tensor:
-    """``cummax`` of non-negative values by doubling: log2(n) plain maxima, which export to ONNX."""
-    reach = 1
-    while reach < x.shape[-1]:
-        x = torch.cat([x[..., :reach], torch.maximum(x[..., reach:], x[..., :-reach])], dim=-1)
-        reach *= 2
-    return x
+    start = pad(torch.where(is_boundary, position[1:], 0), (num, 0))  # the window before the first
+    left, width = num - 1, 1
+    while left:
+        step = min(width, left)
+        start = torch.maximum(start[..., step:], start[..., :-step])
+        left, width = left - step, 2 * width
+    return position - start
 
 
 class Sample:
@@ -201,7 +200,7 @@ class Sample:
     @cached_property
     def mean(self) -> Tensor:
         """Arithmetic mean, ``[*]``; exact where the sum of differences from the first value is."""
-        return self.unit[..., 0].detach() + self._mean_shift.squeeze(-1)
+        return self.unit[..., 0].detach() + self._shift_and_centred[0].squeeze(-1)
 
     @cached_property
     def rms(self) -> Tensor:
@@ -209,17 +208,16 @@ class Sample:
         return torch.where(self.is_zero, torch.inf, (self.unit * self.unit).mean(-1)).sqrt()
 
     @cached_property
-    def _shifted(self) -> Tensor:
-        return self.unit - self.unit[..., :1].detach()
-
-    @cached_property
-    def _mean_shift(self) -> Tensor:
-        return self._shifted.mean(-1, keepdim=True)
-
-    @cached_property
     def centred(self) -> Tensor:
         """Values minus their mean, ``[*, n]``."""
-        return self._shifted - self._mean_shift
+        return self._shift_and_centred[1]
+
+    @cached_property
+    def _shift_and_centred(self) -> tuple[Tensor, Tensor]:
+        """Mean of the values minus the first, ``[*, 1]``, and ``centred``; the first goes free."""
+        shifted = self.unit - self.unit[..., :1].detach()
+        shift = shifted.mean(-1, keepdim=True)
+        return shift, shifted - shift
 
     # What follows has no unit.
 
