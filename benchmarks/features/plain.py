@@ -146,11 +146,13 @@ def _iqr(sample: PlainSample) -> Tensor:
 
 def _entropy(sample: PlainSample) -> Tensor:
     ordered, top = sample.ordered.detach(), descriptors.ENTROPY_LEVELS
-    relative = (ordered - ordered[..., :1]) / sample.span.detach()[..., None]
-    level = (relative * top + (0.5 + descriptors.HALF_SLACK[sample.x.dtype])).floor()
+    levels = (top / sample.span.detach())[..., None]
+    half = 0.5 + descriptors.HALF_SLACK.get(sample.x.dtype, 0.0)
+    level = ((ordered - ordered[..., :1]) * levels + half).floor()
     new_cell = (level[..., 1:] != level[..., :-1]) & (level[..., 1:] != top)
     growth = descriptors._entropy_growth(sample.num).to(sample.x)
-    return growth[rank_in_run(new_cell).long()].sum(-1)
+    rank = rank_in_run(new_cell)
+    return growth.index_select(0, rank.flatten()).reshape(rank.shape).sum(-1)
 
 
 def _correlation(sample: PlainSample) -> Tensor:
