@@ -2,13 +2,11 @@
 
 import math
 
-import pytest
 import torch
 
 from tactslip_torch.model.scaling import signed_log
 
 
-@pytest.mark.xfail(reason="a denormal ratio has lost its digits before log1p sees it")
 def test_a_value_far_below_its_knee_is_itself():
     """Found by hypothesis: 3.8e-11 beside 1.3e29 is bent away from zero, by 3e-6 of itself."""
     value, knee = torch.tensor([math.exp(-24)]), torch.tensor([math.exp(67)])

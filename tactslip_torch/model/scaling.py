@@ -30,6 +30,8 @@ def signed_log(features: Tensor, knee: Tensor) -> Tensor:
     far = torch.where(is_far, size, 1.0).log() - knee.log()
     far = far.clamp(min=math.log(torch.finfo(far.dtype).max))  # no step back where near ends
     bent = knee * torch.where(is_far, far, near)
+    is_linear = ratio < torch.finfo(ratio.dtype).tiny  # a denormal ratio has lost its digits
+    bent = torch.where(is_linear, size, bent)
     return torch.where(is_negative, -bent, bent)
 
 
