@@ -48,3 +48,13 @@ def versions() -> dict[str, str]:
     }
     known = [f"{own[1]} in torch"] if own else []
     return found | {"BLAS": " and ".join([*known, *sorted(blas)])}
+
+
+def threads_text(number: int | str) -> str:
+    """How many threads, in words.
+
+    Example:
+        >>> threads_text(1)
+        '1 thread'
+    """
+    return f"{number} thread" + ("" if int(number) == 1 else "s")

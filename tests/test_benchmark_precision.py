@@ -131,7 +131,7 @@ def test_a_float32_matrix_is_refused_with_its_figure(
     plan, weights = replace(experiment.plan, penalty=1e8), torch.cat([experiment.weights] * 2)
     harsh = replace(experiment, train=twice, plan=plan, weights=weights)
     found = measure.measure_variants(harsh, TINY)
-    row = by_name(found["variants"])["float32 refitted, float32 solve"]
+    row = by_name(found["variants"])["refitted, float32 solve"]
     assert row["worst_error"] is row["flipped"] is None
     assert set(row["balanced_accuracy"].values()) == {None}
     assert "condition" in row["refused"]

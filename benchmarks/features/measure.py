@@ -17,6 +17,7 @@ from benchmarks.arithmetic import ARITHMETIC
 from benchmarks.clocks import Way, on_threads, say, shuffled_rounds
 from benchmarks.features.guards_off import guards_off, textbook
 from benchmarks.features.sizes import Sizes
+from benchmarks.machine import threads_text
 from benchmarks.model.synthetic import SyntheticBins
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.feature_maker import FeatureMaker
@@ -38,7 +39,7 @@ def extract(sizes: Sizes) -> dict[str, Any]:
     """Features of bins with guards, without, and by the textbook."""
     rows = []
     for threads in sizes.threads:
-        say(f"extract on {threads} threads")
+        say(f"extract on {threads_text(threads)}")
         ways: dict[str, Way] = {}
         for name, (dtype, arithmetic) in ARITHMETIC.items():
             pool = FeaturePool(HandLayout.paper24(), arithmetic=arithmetic)
@@ -63,7 +64,7 @@ def score(sizes: Sizes) -> dict[str, Any]:
     rows = []
     for threads in sizes.threads:
         for num_bins in sizes.scored:
-            say(f"scores of {num_bins} at a time on {threads} threads")
+            say(f"scores of {num_bins} at a time on {threads_text(threads)}")
             bins = simulated_bins(num_bins)
             ways: dict[str, Way] = {}
             for name, dtype in (("float64", torch.float64), ("float32", torch.float32)):
@@ -88,7 +89,7 @@ def solve(sizes: Sizes) -> dict[str, Any]:
     rows = []
     for threads in sizes.threads:
         for num_bins in sizes.solved:
-            say(f"solve of {num_bins} bins on {threads} threads")
+            say(f"solve of {num_bins} bins on {threads_text(threads)}")
             z, is_slip = SyntheticBins(NUM_FEATURES).training(num_bins)
             gram, targets = lower_gram(PAPER_KERNEL, z), torch.where(is_slip, 1.0, -1.0).double()
             ways = {

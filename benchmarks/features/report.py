@@ -8,6 +8,7 @@ from typing import Any
 
 from benchmarks.arithmetic import NATIVE, WIDE
 from benchmarks.clocks import paired_ratio
+from benchmarks.machine import threads_text
 from tactslip_torch.report.tables import aligned
 
 SIMULATED_LINE = "SIMULATED bins: what features and scores cost, nothing about a real hand"
@@ -113,16 +114,12 @@ def _table(name: str, numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
 
 
 def _wide_line(of: Mapping[str, Any]) -> str:
-    on = [f"{_spread(ratio)} on {_threads(threads)}" for threads, ratio in of.items()]
+    on = [f"{_spread(ratio)} on {threads_text(threads)}" for threads, ratio in of.items()]
     return f"{WIDE} / {NATIVE}: {', '.join(on)} (a choice, not a guard)" if on else ""
 
 
 def _about(row: Mapping[str, Any]) -> str:
-    return f"{row['arithmetic']}, {row['bins']} at once, {_threads(row['threads'])}"
-
-
-def _threads(number: int | str) -> str:
-    return f"{number} thread" + ("" if int(number) == 1 else "s")
+    return f"{row['arithmetic']}, {row['bins']} at once, {threads_text(row['threads'])}"
 
 
 def _spread(ratio: Mapping[str, float]) -> str:

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import offset_copy
 
 from benchmarks.arithmetic import WIDE
+from benchmarks.machine import threads_text
 from benchmarks.model.figure import GREY, OURS, PEER
 from tactslip_torch.files import whole_file
 
@@ -47,7 +48,7 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
     num = sum(of["num_bins"][role] for role in ("test", "unseen"))
     drawing.suptitle(
         f"Precision against time: {num} held-out bins of the simulated hand, "
-        f"{report['threads']} threads{quick}",
+        f"{threads_text(report['threads'])}{quick}",
         fontsize=11,
     )
     with whole_file(path) as temporary:
@@ -74,12 +75,14 @@ def _front(
         size=8,
         color=GREY,
     )
+    most = max([limit, *(microseconds(row) for row in rows)])
+    axes.set_xlim(0, 1.4 * most)  # room for the labels
     seen: list[tuple[float, float]] = []
     for row in sorted(rows, key=lambda row: row["median_error"]):
         at, error = microseconds(row), row["median_error"]
         place = sum(time == at for time, _ in seen)
         is_close = any(time == at and error <= _CLOSE * other for time, other in seen)
-        is_left = at < 0.9 * limit  # room for the label on that side
+        is_left = 0.5 * most < at < 0.9 * limit  # room for the label on that side
         seen.append((at, error))
         side = offset_copy(
             axes.transData, axes.get_figure(root=True), x=_DODGE_PT * place, units="points"
@@ -98,8 +101,6 @@ def _front(
             ha="right" if is_left else "left",
             va="center",
         )
-    times = [limit, *(microseconds(row) for row in rows)]
-    axes.set_xlim(0, max(times) * 1.4)  # room for the labels
     axes.set_xlabel("µs a bin")
     axes.grid(color="#dddddd")
     axes.set_axisbelow(True)

@@ -47,12 +47,12 @@ VARIANTS = {
     "float64": Variant(FLOAT64, torch.float64, FLOAT64),
     "float32": Variant(WIDE, torch.float32, FLOAT64),
     "float32 throughout": Variant(NATIVE, torch.float32, FLOAT64),
-    "float32 refitted, float64 solve": Variant(NATIVE, torch.float32, OF_FLOAT32),
-    "float32 refitted, float32 solve": Variant(NATIVE, torch.float32, IN_FLOAT32),
+    "refitted, float64 solve": Variant(NATIVE, torch.float32, OF_FLOAT32),
+    "refitted, float32 solve": Variant(NATIVE, torch.float32, IN_FLOAT32),
     "bfloat16 head": Variant(WIDE, torch.bfloat16, FLOAT64),
     "float16 head": Variant(WIDE, torch.float16, FLOAT64),
 }
-"""The first is what the others are compared with."""
+"""The first is what the others are compared with; refitted: to features in float32 throughout."""
 
 
 class Fitted(NamedTuple):

@@ -7,6 +7,7 @@ from statistics import median
 from typing import Any
 
 from benchmarks.clocks import paired_ratio
+from benchmarks.machine import threads_text
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
 
 QUICK_LINE = "QUICK: too few bins and rounds to mean anything, whatever stands under limits"
@@ -67,7 +68,7 @@ def _heading(report: Mapping[str, Any]) -> str:
     lines = [
         f"precision: {of['experiment']}, recipe {of['recipe']}, {of['num_features']} features, "
         f"C = {of['penalty']:g}; bins: {bins}",
-        f"machine   {', '.join(report['machine'].values())}, {report['threads']} threads",
+        f"machine   {', '.join(report['machine'].values())}, {threads_text(report['threads'])}",
         f"versions  {', '.join(f'{name} {of}' for name, of in report['versions'].items())}",
         SIMULATED_LINE,
     ]
