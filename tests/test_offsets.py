@@ -76,8 +76,12 @@ def test_gradients_of_float32_bins_are_finite(kind, pool):
     assert bool(bins.grad.isfinite().all())
 
 
-def test_validity_of_a_span_that_overflows(pool):
-    """Rail to rail at the end of float64: the span is infinite, the samples are not."""
-    bins = torch.full((24, 100), torch.finfo(torch.float64).max, dtype=torch.float64)
-    bins[:, ::2] *= -1
-    assert pool.validity(bins).all()
+def test_what_leaves_float64_on_its_way_counts_as_missing(pool):
+    """Rail to rail at its end: the samples are finite, their branches are not."""
+    bins = torch.full((2, 24, 100), torch.finfo(torch.float64).max, dtype=torch.float64)
+    bins[:, :, ::2] *= -1
+    bins[1] /= 64
+    assert pool.is_missing(bins).all(-1).tolist() == [True, False]
+    assert pool.validity(bins).all(-1).tolist() == [False, True]
+    assert pool(bins[1]).isfinite().all()
+    assert pool.validity(torch.full((24, 100), 3e38).cumsum(-1).clamp(max=3.4e38)).all()

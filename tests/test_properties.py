@@ -174,7 +174,6 @@ def test_float32_bins_give_what_they_give_in_float64_rounded_once(batch):
 OVERFLOWS = pytest.mark.xfail(
     reason="between film and branch a saturated gradient overflows, and Inf - Inf is NaN"
 )
-ROUNDED = pytest.mark.xfail(reason="64 eps times a denormal magnitude is itself rounded")
 
 
 def where_not_finite(bins):
@@ -221,7 +220,6 @@ def test_gradients_are_finite_at_both_ends_of_the_dtype(end, dtype):
     assert where_not_finite(end_of(dtype, end)) == []
 
 
-@ROUNDED
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_validity_where_64_eps_of_the_magnitude_is_denormal(dtype):
     """A span of 6 quanta is more than 5.5; the product of the rule must not be rounded to 6."""

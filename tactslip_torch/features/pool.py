@@ -25,6 +25,8 @@ from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, s
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names
 
 Arithmetic = Literal["double", "native"]
+LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
+"""Volts; what is larger counts as Inf, because its branches and spectra may leave float64."""
 
 
 class FeaturePool(nn.Module):
@@ -205,8 +207,8 @@ class FeaturePool(nn.Module):
     def validity(self, bins: Tensor) -> Tensor:
         """Which channels can be trusted.
 
-        False where a channel holds a NaN or Inf or its span is within 64 eps of its magnitude
-        (a dead sensor, or a vibration the dtype cannot resolve).
+        False where a channel holds a NaN or Inf (``is_missing``) or its span is within 64 eps of
+        its magnitude (a dead sensor, or a vibration the dtype cannot resolve).
 
         Shape:
             - bins: ``[*, C, n]``
@@ -218,8 +220,17 @@ class FeaturePool(nn.Module):
         self._check(bins)
         high, low = bins.amax(-1), bins.amin(-1)
         magnitude = torch.maximum(high, -low)
-        is_alive = high - low > 64 * torch.finfo(bins.dtype).eps * magnitude
-        return high.isfinite() & low.isfinite() & is_alive
+        span_in_eps = (high - low) * (1 / (64 * torch.finfo(bins.dtype).eps))  # never underflows
+        return (span_in_eps > magnitude) & (magnitude <= LARGEST_SAMPLE)
+
+    def is_missing(self, bins: Tensor) -> Tensor:
+        """Which channels hold a NaN or Inf, or a sample beyond ``LARGEST_SAMPLE``.
+
+        Shape:
+            - bins: ``[*, C, n]``
+            - output: ``[*, C]``, bool
+        """
+        return ~(bins.abs().amax(-1) <= LARGEST_SAMPLE)
 
     def _of_gauges(self, bins: Tensor) -> Tensor:
         gauges = bins[..., self._gauges, :]

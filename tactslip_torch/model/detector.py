@@ -196,7 +196,7 @@ class SlipDetector(nn.Module):
         return score
 
     def _judge(self, bins: Tensor, is_trusted: Tensor) -> Judgement:
-        is_missing = ~bins.isfinite().all(-1)
+        is_missing = self.pool.is_missing(bins)
         scaled = self._scale(self._features(torch.where(is_missing[..., None], 0.0, bins)))
         scaled = torch.where(is_missing[..., self._channel_of], self.typical, scaled)
         score = saturating(self.head(scaled), bins.dtype)
