@@ -5,7 +5,15 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from tactslip_torch.model.cholesky import cholesky_, cholesky_solve, forward_solve
+from tactslip_torch.model.cholesky import (
+    cholesky_,
+    cholesky_solve,
+    forward_solve,
+    from_above,
+    mirror_,
+    refine,
+    symmetric_product,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -191,3 +199,52 @@ def test_right_hand_sides_that_do_not_fit_are_refused(solve):
             solve(torch.eye(4), right)
     with pytest.raises(ValueError, match="factor must be"):
         solve(torch.zeros(4, 3), torch.zeros(4, 1))
+
+
+# The system above its factor -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num", [1, 2, 255, 256, 257, 600])
+def test_a_system_comes_back_from_above_its_factor(rng, num):
+    matrix = definite(rng, num)
+    half = torch.from_numpy(np.where(np.tri(num, dtype=bool), matrix, np.nan))
+    mirror_(half)
+    assert np.array_equal(half.numpy(), matrix)
+    vector = rng.standard_normal(num)
+    diagonal = half.diagonal().clone()
+    cholesky_(half)
+    product = symmetric_product(half, diagonal, torch.from_numpy(vector))
+    np.testing.assert_allclose(product.numpy(), matrix @ vector, rtol=1e-12, atol=1e-12)
+    from_above(half)
+    half.diagonal().copy_(diagonal)
+    assert np.array_equal(half.numpy(), matrix)
+
+
+@pytest.mark.parametrize("num", [5, 600])
+def test_refinement_solves_the_system_and_not_its_neighbour(rng, num):
+    matrix, right = definite(rng, num), rng.standard_normal(num)
+    system = torch.from_numpy(matrix.copy())
+    diagonal = system.diagonal().clone()
+    system.diagonal().mul_(1.01)
+    cholesky_(system)
+    far = cholesky_solve(system, torch.from_numpy(right)).numpy()
+    x, steps, error = refine(system, diagonal, torch.from_numpy(right))
+    expected = np.linalg.solve(matrix, right)
+    np.testing.assert_allclose(x.numpy(), expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    assert np.abs(far - expected).max() > 1e-4 * np.abs(expected).max()
+    assert 3 <= steps <= 10
+    assert error <= 1e-10
+    zero = refine(system, diagonal, torch.zeros(num, dtype=torch.float64))
+    assert (zero[0].abs().max(), zero[1:]) == (0, (0, 0.0))
+
+
+def test_refinement_stops_where_it_leads_nowhere(rng):
+    """A neighbour that is far from the system: the error is told."""
+    matrix, right = definite(rng, 20), torch.from_numpy(rng.standard_normal(20))
+    system = torch.from_numpy(matrix.copy())
+    diagonal = system.diagonal().clone()
+    system.diagonal().mul_(30)
+    cholesky_(system)
+    _, steps, error = refine(system, diagonal, right)
+    assert steps <= 20
+    assert error > 1e-2

@@ -64,6 +64,8 @@ def test_condition_is_numpys_within_a_factor(kind, num, decades, graded, seed):
     expected = np.linalg.cond(plain, 1)
     slack = 1 + 1e-14 * num * expected
     assert expected / 3 / slack <= estimate <= expected * slack
+    quick = scaled_norm(torch.from_numpy(matrix), turned) * inverse_norm(factor, turned, 1)
+    assert expected / 10 / slack <= quick <= expected * slack
 
 
 @pytest.mark.parametrize("num", [1, 2, 255, 256, 257, 512, 513, 900])

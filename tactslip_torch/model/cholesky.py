@@ -94,13 +94,17 @@ def cholesky_solve(factor: Tensor, right: Tensor) -> Tensor:
     return rows.mT
 
 
-def mirror_(matrix: Tensor, *, upper: bool = False) -> None:
-    """Copy the lower triangle of a matrix above its diagonal, where a factor leaves it alone.
+def mirror_(matrix: Tensor) -> None:
+    """Copy what stands below the diagonal above it, where a factor leaves it alone: ``[n, n]``."""
+    _copy_across(matrix, up=True)
 
-    Args:
-        matrix: ``[n, n]``, row-major; overwritten.
-        upper: copy the upper triangle below the diagonal instead.
-    """
+
+def from_above(matrix: Tensor) -> None:
+    """Copy what stands above the diagonal below it, where a factor was: ``[n, n]``."""
+    _copy_across(matrix, up=False)
+
+
+def _copy_across(matrix: Tensor, *, up: bool) -> None:
     _check_square(matrix, "matrix")
     num = len(matrix)
 
@@ -108,12 +112,10 @@ def mirror_(matrix: Tensor, *, upper: bool = False) -> None:
         rows = slice(row, min(row + _TILE, num))
         for column in range(0, row, _TILE):
             columns = slice(column, column + _TILE)
-            source, goal = matrix[rows, columns], matrix[columns, rows].mT
-            if upper:
-                source, goal = goal, source
-            goal.copy_(source)
+            below, above = matrix[rows, columns], matrix[columns, rows].mT
+            (above if up else below).copy_(below if up else above)
         corner = matrix[rows, rows]
-        half = corner.mT if upper else corner
+        half = corner if up else corner.mT
         corner.copy_(half.tril() + half.tril(-1).mT)
 
     for_each(copy, range(0, num, _TILE))

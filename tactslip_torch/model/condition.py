@@ -25,7 +25,9 @@ from tactslip_torch.threads import for_each
 
 _ROWS = 256  # that one thread sums at a time
 _WIDTH = 512  # columns at a time: what fits a cache
-_MOST_ROUNDS = 3  # of two solves each; two nearly always do
+
+
+Method = Literal["cholesky", "jittered", "eigen"]
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class SolveReport:
             it came with, times the condition.
     """
 
-    method: Literal["cholesky", "jittered", "eigen"]
+    method: Method
     dtype: str
     size: int
     penalty: float
@@ -111,14 +113,15 @@ def scaled_norm(matrix: Tensor, scale: Tensor) -> float:
     return float((sums.sum(0) * shares).max())
 
 
-def inverse_norm(factor: Tensor, scale: Tensor) -> float:
+def inverse_norm(factor: Tensor, scale: Tensor, rounds: int = 3) -> float:
     """An estimate of the 1-norm of ``(D^-1 L L' D^-1)^-1``: never above, rarely a third of it.
 
-    Hager's ascent with two vectors at a time, at most six solves; no random numbers.
+    Hager's ascent with two vectors at a time; no random numbers.
 
     Args:
         factor: ``L``, the Cholesky factor of ``A``; only its lower triangle is read.
         scale: the diagonal of ``D``, positive.
+        rounds: of two solves each, at most; two nearly always do, one is rarely off by ten.
 
     Shape:
         - factor: ``[n, n]``; scale: ``[n]``
@@ -128,7 +131,7 @@ def inverse_norm(factor: Tensor, scale: Tensor) -> float:
     ramp[1::2] *= -1  # what cancellation hides from ones
     tried = torch.stack([torch.full_like(ramp, 1 / num), ramp / ramp.abs().sum()], dim=-1)
     best, seen = 0.0, torch.zeros(num, dtype=torch.bool)
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(rounds):
         image = column * cholesky_solve(factor, column * tried)
         found = float(image.abs().sum(0).max())
         if not found > best:

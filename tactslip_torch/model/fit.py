@@ -11,6 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from tactslip_torch.model.cholesky import from_above
 from tactslip_torch.model.fourth_moments import ProductSums, add_products_, normal_matrix
 from tactslip_torch.model.kernel_elm import (
     solve_kernel_elm_,
@@ -156,7 +157,7 @@ def _solve_linear_primal(
         weighted = x if bins.weights is None else x * bins.weights[chunk, None]
         normal.addmm_(weighted.mT, x)
         moment.addmv_(weighted.mT, bins.targets[chunk])
-    solved, report = solve_normal_equations_(normal, moment, penalty)
+    solved, report = solve_normal_equations_(normal, moment, penalty, restore=from_above)
     flat = solved.new_zeros(num_features, num_features)
     machine = QuadraticForm(flat, solved[:-1], math.sqrt(offset) * solved[-1])
     machine.solved = report
@@ -176,7 +177,7 @@ def _solve_quadratic_primal(
     normal = normal_matrix(total, num_features, offset)
     moment = sum_of_quadratic_features(bins.features, pull, offset)
     del total
-    weights, report = solve_normal_equations_(normal, moment, penalty)
+    weights, report = solve_normal_equations_(normal, moment, penalty, restore=from_above)
     machine = from_primal(weights, num_features, offset)
     machine.solved = report
     return machine

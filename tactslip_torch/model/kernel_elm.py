@@ -148,9 +148,21 @@ def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Te
 
 
 def solve_normal_equations_(
-    normal: Tensor, moment: Tensor, penalty: float, *, most_condition: float | None = None
+    normal: Tensor,
+    moment: Tensor,
+    penalty: float,
+    *,
+    restore: Callable[[Tensor], object] | None = None,
+    most_condition: float | None = None,
 ) -> Solution:
     """``solve_normal_equations`` within the matrix it is given, as ``solve_kernel_elm_`` does.
+
+    Args:
+        normal: as in ``solve_normal_equations``.
+        moment: likewise.
+        penalty: likewise.
+        restore: as in ``solve_symmetric_``.
+        most_condition: likewise.
 
     Shape:
         - normal: ``[P, P]``, row-major, only its lower triangle is read; moment, output: ``[P]``
@@ -160,7 +172,13 @@ def solve_normal_equations_(
     """
     _check_penalty(penalty)
     return solve_symmetric_(
-        normal, moment, penalty, name="X'WX", in_span=True, most_condition=most_condition
+        normal,
+        moment,
+        penalty,
+        name="X'WX",
+        restore=restore,
+        in_span=True,
+        most_condition=most_condition,
     )
 
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from tactslip_torch.files import load_table, save_table
 from tactslip_torch.ledger import Ledger, content_digest, first_difference
+from tactslip_torch.model.cholesky import from_above
 from tactslip_torch.model.fourth_moments import (
     ProductSums,
     add_products_,
@@ -200,7 +201,13 @@ class SufficientStats:
         """
         normal, moment, noise = self._normal_equations(penalty, offset, num_features, balance)
         weights, report = solve_symmetric_(
-            normal, moment, penalty, name="X'WX", noise=noise, in_span=True
+            normal,
+            moment,
+            penalty,
+            name="X'WX",
+            restore=from_above,
+            noise=noise,
+            in_span=True,
         )
         machine = from_primal(weights, num_features or self.num_features, offset)
         machine.solved = report

@@ -25,13 +25,26 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.model.cholesky import check_finite, cholesky_, cholesky_solve, mirror_, refine
-from tactslip_torch.model.condition import SolveReport, inverse_growth, inverse_norm, scaled_norm
+from tactslip_torch.model.cholesky import (
+    check_finite,
+    cholesky_,
+    cholesky_solve,
+    from_above,
+    mirror_,
+    refine,
+)
+from tactslip_torch.model.condition import (
+    Method,
+    SolveReport,
+    inverse_growth,
+    inverse_norm,
+    scaled_norm,
+)
 from tactslip_torch.threads import for_each
 
 log = logging.getLogger(__name__)
@@ -83,11 +96,11 @@ def solve_symmetric_(
         penalty: the paper's ``C``, positive; ``inf`` for minimum-norm (weighted) least squares.
         weights: positive weight of each unknown; default 1.
         name: of the matrix, for errors.
-        restore: writes the lower triangle of the matrix again into its argument.
+        restore: writes what stands below the diagonal again into its argument.
         noise: size (2-norm) of the error that the matrix comes with beyond rounding; refused where
             a thousandth of the solution would be its.
         in_span: the right-hand side lies in the span of the matrix, so that the solution shows
-            nothing of what is null: the condition takes solves of its own even below 1e8.
+            nothing of what is null: the condition takes two solves even if surely below 1e8.
         most_condition: raise an error instead of leaving the first rung, or above this condition.
 
     Shape:
@@ -178,9 +191,11 @@ class _System:
         except ValueError as failure:
             return self.escalated(most, math.inf, str(failure))
         x = cholesky_solve(self.matrix, self.right)
-        cheap = bound <= _SURE and self.eps <= _EPS and not self.in_span
+        sure = bound <= _SURE and self.eps <= _EPS
+        cheap = sure and not self.in_span
         inverse = inverse_growth(self.matrix, self.scale, x) if cheap else 0.0
-        inverse = min(inverse or inverse_norm(self.matrix, self.scale), bound / self.norm)
+        inverse = inverse or inverse_norm(self.matrix, self.scale, 1 if sure else 3)
+        inverse = min(inverse, bound / self.norm)
         condition = self.norm * inverse
         drowned = self.noise * min(inverse / float(self.whole.min()), float(1 / self.ridge.min()))
         error = max(self.eps * condition, drowned)
@@ -215,12 +230,10 @@ class _System:
 
     def reset(self) -> None:
         """The system as it was given, without its ridge, in both triangles."""
-        if self.restore is None:
-            mirror_(self.matrix, upper=True)
-            self.matrix.diagonal().copy_(self.bare)
-        else:
-            self.restore(self.matrix)
+        (self.restore or from_above)(self.matrix)
+        if self.restore not in (None, from_above):
             mirror_(self.matrix)
+        self.matrix.diagonal().copy_(self.bare)
 
     def by_refinement(self, condition: float) -> Solution | None:
         """From the factor of a jittered system; none if that does not tell."""
@@ -280,21 +293,7 @@ class _System:
         least = float(values[len(values) - rank] + ridge) if rank else math.inf
         return roots * (vectors @ parts), (top + ridge) / least, rounding / least, rank
 
-    def report(
-        self,
-        method: Literal["cholesky", "jittered", "eigen"],
-        condition: float,
-        error: float,
-        rank: int,
-    ) -> SolveReport:
-        bound = self.bound()
-        return SolveReport(
-            method,
-            self.dtype,
-            len(self.right),
-            self.penalty,
-            condition,
-            bound if math.isfinite(bound) else None,
-            rank,
-            error,
-        )
+    def report(self, method: Method, condition: float, error: float, rank: int) -> SolveReport:
+        bound, size = self.bound(), len(self.right)
+        known = bound if math.isfinite(bound) else None
+        return SolveReport(method, self.dtype, size, self.penalty, condition, known, rank, error)
