@@ -25,7 +25,7 @@ from torch import Tensor
 import tactslip_torch
 from tactslip_torch.certificate import certify as measure
 from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
-from tactslip_torch.data.labels import LabelRule, label_bins, needed_windows
+from tactslip_torch.data.labels import LabelRule, needed_windows
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import ROLES, Split
 from tactslip_torch.feature_maker import FeatureMaker
@@ -65,15 +65,16 @@ def certify(config: DictConfig) -> tuple[dict[str, Any], Path]:
             raise ValueError(f"{name} must be at least 1, got {config[name]}")
     source: RecordingSource = instantiate(config.data, _convert_="all")
     rule: LabelRule = instantiate(config.labels)
-    FeatureMaker(source, detector.pool, detector.channel_filter, rule)  # refuses what does not fit
+    maker = FeatureMaker(source, detector.pool, detector.channel_filter, rule)
     fold = _fold(config, source)
     drawn: dict[str, Tensor] = {}
     facts: dict[str, Any] = {}
     for role, number in _roles(config).items():
         name = "calibration" if not drawn else role
-        drawn[name], facts[name] = draw_bins(
-            source, rule, detector, fold, role, number, config.seed
-        )
+        drawn[name], facts[name] = draw_bins(maker, fold, role, number, config.seed)
+        known = set(detector.info.get("train_recordings", {}).values())
+        keys = facts[name].pop("keys")
+        facts[name]["recordings_of_training"] = sum(key in known for key in keys)
     found = measure(
         detector,
         drawn.pop("calibration"),
@@ -96,13 +97,7 @@ def certify(config: DictConfig) -> tuple[dict[str, Any], Path]:
 
 
 def draw_bins(
-    source: RecordingSource,
-    rule: LabelRule,
-    detector: SlipDetector,
-    fold: Split,
-    role: str,
-    number: int,
-    seed: int,
+    maker: FeatureMaker, fold: Split, role: str, number: int, seed: int
 ) -> tuple[Tensor, dict[str, Any]]:
     """Raw bins of a role with the context that ``score_raw`` needs, drawn at random.
 
@@ -113,7 +108,7 @@ def draw_bins(
         - first output: ``[N, C, n + 2 * context]``, ``N`` at most ``number``
 
     Returns:
-        The bins, and where they come from.
+        The bins, and where they come from: ``keys`` are those of the recordings.
 
     Raises:
         ValueError: if no recording has the role, none has a bin, or a sample is not finite.
@@ -124,29 +119,27 @@ def draw_bins(
         raise ValueError(f"no recording has the role {role!r} in {fold.name}; choose another split")
     each = max(PER_RECORDING, math.ceil(number / len(recordings)))
     recordings = recordings[: math.ceil(number / each)]
+    source, context = maker.source, maker.channel_filter.context
     parts: list[Tensor] = []
     for recording in bar(recordings, f"{role}, recordings", "recording"):
         times = source.timeline(recording)
-        onsets = times.annotated_onsets_s if rule.onsets == "annotated" else times.onsets_s
-        rate_hz = source.sample_rate_hz
-        bins = label_bins(rule, onsets, times.sliding_s, times.duration_s, rate_hz)
-        windows = needed_windows(bins, detector.context, times.duration_s, rate_hz)
+        bins = maker.lay_bins(times)
+        windows = needed_windows(bins, context, times.duration_s, source.sample_rate_hz)
         samples = source.load(recording, windows).samples
-        first, last = bins.starts - detector.context, bins.starts + bins.bin_samples
+        first, last = bins.starts - context, bins.starts + bins.bin_samples
         may = fold.bin_roles(recording, len(first))[role] & (first >= 0)
-        first = first[may & (last + detector.context <= samples.shape[-1])]
+        first = first[may & (last + context <= samples.shape[-1])]
         chosen = torch.randperm(len(first), generator=generator)[:each].sort().values
-        length = bins.bin_samples + 2 * detector.context
+        length = bins.bin_samples + 2 * context
         parts.append(bins_at(samples, first[chosen], length))
         refuse_nonfinite(parts[-1], source.hand.names, f"repair or leave out {recording}")
     drawn = torch.cat(parts)[:number]
     if not len(drawn):
         raise ValueError(f"no bin of {role} lies far enough inside its recording; take longer ones")
-    known = set(detector.info.get("train_recordings", {}).values())
     return drawn, {
         "role": role,
         "recordings": len(recordings),
-        "recordings_of_training": sum(cache_key(source.key(r)) in known for r in recordings),
+        "keys": [cache_key(source.key(recording)) for recording in recordings],
         "materials": sorted({recording.material for recording in recordings}),
     }
 

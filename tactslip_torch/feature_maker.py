@@ -100,7 +100,7 @@ class FeatureMaker:
             ValueError: if bins leave the recording or a sample they need is not finite.
         """
         times = self.source.timeline(recording)
-        bins = self._lay_bins(times)
+        bins = self.lay_bins(times)
         seconds: dict[str, float] = {}
         features = self._features(recording, times, bins, seconds)
         is_slip = bins.is_slip
@@ -113,15 +113,16 @@ class FeatureMaker:
 
     def key(self, recording: RecordingId) -> str:
         """A digest of everything that determines the features of a recording."""
-        return self._key(recording, self._lay_bins(self.source.timeline(recording)))
+        return self._key(recording, self.lay_bins(self.source.timeline(recording)))
 
     def filtered_bins(self, recording: RecordingId) -> tuple[Tensor, LabelledBins]:
         """The filtered bins ``[N, C, n]`` that features are taken from, and their labels."""
         times = self.source.timeline(recording)
-        bins = self._lay_bins(times)
+        bins = self.lay_bins(times)
         return self._filter(recording, self._load(recording, times, bins), bins), bins
 
-    def _lay_bins(self, times: Timeline) -> LabelledBins:
+    def lay_bins(self, times: Timeline) -> LabelledBins:
+        """Where the bins of a recording lie, and what they are; no sample is needed for that."""
         onsets = times.annotated_onsets_s if self.rule.onsets == "annotated" else times.onsets_s
         return label_bins(
             self.rule, onsets, times.sliding_s, times.duration_s, self.source.sample_rate_hz

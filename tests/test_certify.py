@@ -18,6 +18,7 @@ from tactslip_torch.certify import _plain, certify, draw_bins, main
 from tactslip_torch.config import conf_dir
 from tactslip_torch.data.labels import LabelRule, label_bins
 from tactslip_torch.data.splits import Split
+from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.report.certificate import number, verdict
 from tactslip_torch.report.certificate_page import MARK, certificate_page
@@ -269,9 +270,8 @@ def test_one_judged_role_may_be_named_alone(tmp_path):
 def drawn(number, role="train", seed=0, fold=None, rule=None):
     fold = fold or instantiate(composed("model=x").split, _convert_="all")(source().ids)[0]
     detector = small_detector()
-    known = fold.having("train")[:1]
-    detector.info["train_recordings"] = {str(r): cache_key(source().key(r)) for r in known}
-    return draw_bins(source(), rule or LabelRule(), detector, fold, role, number, seed), fold
+    maker = FeatureMaker(source(), detector.pool, detector.channel_filter, rule or LabelRule())
+    return draw_bins(maker, fold, role, number, seed), fold
 
 
 @pytest.mark.parametrize(("number", "recordings"), [(5, 1), (81, 3), (160, 4), (250, 4)])
@@ -299,9 +299,9 @@ def test_the_draw_repeats_itself_by_seed():
     assert not torch.equal(first, other)
 
 
-def test_recordings_of_the_training_are_counted():
-    assert drawn(200)[0][1]["recordings_of_training"] == 1
-    assert drawn(200, "unseen")[0][1]["recordings_of_training"] == 0
+def test_drawn_recordings_are_known_by_their_keys():
+    (_, facts), fold = drawn(200)
+    assert sorted(facts["keys"]) == sorted(cache_key(source().key(r)) for r in fold.having("train"))
 
 
 def test_bins_of_one_recording_may_have_two_roles():
