@@ -29,29 +29,26 @@ class PlainSample(Sample):
         return self.largest - self.smallest
 
     @cached_property
-    def shift(self) -> Tensor:
-        """Values minus the first."""
-        return self.x - self.x[..., :1].detach()
-
-    @cached_property
-    def mean_shift(self) -> Tensor:
-        """Mean of ``shift``."""
-        return self.shift.mean(-1, keepdim=True)
+    def shift_and_centred(self) -> tuple[Tensor, Tensor]:
+        """Mean of the values minus the first, and values minus their mean."""
+        shifted = self.x - self.x[..., :1].detach()
+        shift = shifted.mean(-1, keepdim=True)
+        return shift, shifted - shift
 
     @cached_property
     def mean(self) -> Tensor:
         """Arithmetic mean."""
-        return self.x[..., 0].detach() + self.mean_shift.squeeze(-1)
+        return self.x[..., 0].detach() + self.shift_and_centred[0].squeeze(-1)
 
     @cached_property
-    def unit(self) -> Tensor:
-        """What deviations are divided by."""
-        return self.span.detach()
+    def centred(self) -> Tensor:
+        """Values minus their mean."""
+        return self.shift_and_centred[1]
 
     @cached_property
     def deviation(self) -> Tensor:
-        """Values minus their mean, over the unit."""
-        return (self.shift - self.mean_shift) / self.unit[..., None]
+        """Values minus their mean, over the span."""
+        return self.centred / self.span.detach()[..., None]
 
     @cached_property
     def squares(self) -> Tensor:
@@ -66,7 +63,8 @@ class PlainSample(Sample):
     @cached_property
     def std(self) -> Tensor:
         """Standard deviation."""
-        return self.unit * (self.variance * (self.num / (self.num - 1))).sqrt()
+        square = (self.centred * self.centred).mean(-1)
+        return (square * (self.num / (self.num - 1))).sqrt()
 
     @cached_property
     def rms(self) -> Tensor:
@@ -99,14 +97,14 @@ class TextbookSample(PlainSample):
         return self.x.mean(-1)
 
     @cached_property
-    def deviation(self) -> Tensor:
+    def centred(self) -> Tensor:
         """Values minus their mean."""
         return self.x - self.mean[..., None]
 
     @cached_property
-    def unit(self) -> Tensor:
-        """One."""
-        return torch.ones((), dtype=self.x.dtype)
+    def deviation(self) -> Tensor:
+        """Likewise."""
+        return self.centred
 
 
 def describer(kind: type[PlainSample]) -> Callable[..., Tensor]:
@@ -172,7 +170,7 @@ _FORMULAS: dict[str, Callable[[Any], Tensor]] = {
     "median": lambda s: s.ordered[..., (s.num - 1) // 2 : s.num // 2 + 1].mean(-1),
     "mode": _mode,
     "range": lambda sample: sample.span,
-    "mean_deviation": lambda sample: sample.unit * sample.deviation.abs().mean(-1),
+    "mean_deviation": lambda sample: sample.centred.abs().mean(-1),
     "std": lambda sample: sample.std,
     "cv": lambda sample: sample.std / sample.mean,
     "iqr": _iqr,
