@@ -72,8 +72,7 @@ def mode(sample: Sample) -> Tensor:
     longest run changes; elsewhere the gradient is that of the value returned.
     """
     tolerance = RUN_TOLERANCE.get(sample.x.dtype, 2.0**-8) * (sample.scale * sample.stretch)
-    apart = sample.ranked[..., 1:] - sample.ranked[..., :-1] > tolerance[..., None]
-    rank = rank_in_run(apart)
+    rank = rank_in_run(sample.gaps > tolerance[..., None])
     last = rank.argmax(-1, keepdim=True)  # the first maximum: the end of the first longest run
     return sample.ordered.gather(-1, last - rank.gather(-1, last).long()).squeeze(-1)
 
@@ -144,9 +143,10 @@ def entropy(sample: Sample) -> Tensor:
     distinct levels serve as histogram *edges*, so the two highest occupied ones share one cell.
     Piecewise constant: its gradient is 0 wherever it exists, and none flows.
     """
+    least = (sample.smallest.detach() * sample.stretch)[..., None]
     levels = (ENTROPY_LEVELS / sample.safe_span)[..., None]
     half = 0.5 + HALF_SLACK.get(sample.x.dtype, 0.0)
-    level = ((sample.ranked - sample.ranked[..., :1]) * levels + half).floor()
+    level = ((sample.ranked - least) * levels + half).floor()
     # the maximum always has the top level, so the second highest level joins it
     new_cell = (level[..., 1:] != level[..., :-1]) & (level[..., 1:] != ENTROPY_LEVELS)
     growth = _entropy_growth(sample.num).to(sample.x)

@@ -172,10 +172,16 @@ class Sample:
         """Values, ``[*, n]``."""
         return self.x * self.stretch[..., None]
 
-    @cached_property
+    @property
     def ranked(self) -> Tensor:
-        """Sorted values without gradient, ``[*, n]``."""
+        """Sorted values without gradient, ``[*, n]``; not kept, as memory costs more than time."""
         return self.ordered.detach() * self.stretch[..., None]
+
+    @property
+    def gaps(self) -> Tensor:
+        """Differences of neighbours in ``ranked``, ``[*, n - 1]``."""
+        ranked = self.ranked
+        return ranked[..., 1:] - ranked[..., :-1]
 
     @cached_property
     def span(self) -> Tensor:
