@@ -236,7 +236,7 @@ def test_sums_give_the_scores_or_refuse(kind, penalty):
             stats.solve(penalty, balance="none")
         return
     assert kind.startswith(("plain", "weights")) or penalty <= 1e6
-    grid = 64 * 2.0**-stats.grid_bits / c.weights.min()  # of the sums themselves
+    grid = 64 * 2.0**-26 / c.weights.min() if "weights" in kind else 0.0  # light bins drown
     scores = machine(torch.from_numpy(np.r_[c.z, c.new]))
     assert machine.solved.error <= 1e-3
     assert_right(scores, kind, penalty, 16 * machine.solved.error + grid)

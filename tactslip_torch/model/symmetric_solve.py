@@ -97,8 +97,8 @@ def solve_symmetric_(
         weights: positive weight of each unknown; default 1.
         name: of the matrix, for errors.
         restore: writes what stands below the diagonal again into its argument.
-        noise: size (2-norm) of the error that the matrix comes with beyond rounding; refused where
-            a thousandth of the solution would be its.
+        noise: size (2-norm) of the error that matrix and right-hand side come with beyond rounding;
+            refused where that of the matrix would be a thousandth of the solution.
         in_span: the right-hand side lies in the span of the matrix, so that the solution shows
             nothing of what is null: the condition takes two solves even if surely below 1e8.
         most_condition: raise an error instead of leaving the first rung, or above this condition.
@@ -198,7 +198,8 @@ class _System:
         inverse = min(inverse, bound / self.norm)
         condition = self.norm * inverse
         drowned = self.noise * min(inverse / float(self.whole.min()), float(1 / self.ridge.min()))
-        error = max(self.eps * condition, drowned)
+        given = float(self.noise / self.bare.max()) if self.noise > 0 else 0.0
+        error = max(self.eps * condition, drowned, given)
         limit = min(largest_condition(len(x), self.eps), math.inf if most is None else most)
         if condition > limit or drowned > _LARGEST_ERROR:
             return self.escalated(most, condition, "")
