@@ -67,7 +67,8 @@ class TrainingPass:
         """The machine.
 
         Raises:
-            ValueError: if a class is absent or the system is not positive definite.
+            ValueError: if a class is absent, a number is not finite, or the sums are too coarse
+            for this penalty.
         """
         plan = self.plan
         if self.stats is not None:
@@ -94,8 +95,8 @@ def solve_sums(plan: Plan, stats: SufficientStats) -> QuadraticForm:
     """The machine of sums.
 
     Raises:
-        ValueError: if the plan's kernel is not of degree 2, a class is absent or the system is not
-            positive definite.
+        ValueError: if the plan's kernel is not of degree 2, a class is absent, a number is
+            not finite, or the sums are too coarse for this penalty.
     """
     if not isinstance(plan.kernel, Polynomial) or plan.kernel.degree != 2:
         raise ValueError(f"sums need a polynomial kernel of degree 2, the plan has {plan.kernel}")

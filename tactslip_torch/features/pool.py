@@ -221,7 +221,7 @@ class FeaturePool(nn.Module):
         high, low = bins.amax(-1), bins.amin(-1)
         magnitude = torch.maximum(high, -low)
         span_in_eps = (high - low) * (1 / (64 * torch.finfo(bins.dtype).eps))  # never underflows
-        return (span_in_eps > magnitude) & (magnitude <= LARGEST_SAMPLE)
+        return (span_in_eps > magnitude) & ~self.is_missing(bins)
 
     def is_missing(self, bins: Tensor) -> Tensor:
         """Which channels hold a NaN or Inf, or a sample beyond ``LARGEST_SAMPLE``.
@@ -230,7 +230,8 @@ class FeaturePool(nn.Module):
             - bins: ``[*, C, n]``
             - output: ``[*, C]``, bool
         """
-        return ~(bins.abs().amax(-1) <= LARGEST_SAMPLE)
+        # sample by sample: onnxruntime's maxima pass over NaN
+        return (~(bins.abs() <= LARGEST_SAMPLE)).any(-1)
 
     def _of_gauges(self, bins: Tensor) -> Tensor:
         gauges = bins[..., self._gauges, :]
