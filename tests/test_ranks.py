@@ -1,8 +1,8 @@
 """Several processes under Lightning: the detector of one, bit for bit."""
 
 import json
-import re
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
