@@ -51,15 +51,17 @@ CV_FLOOR = 1e-6
 
 def mean(sample: Sample) -> Tensor:
     """Arithmetic mean, ``[*]``."""
-    return sample.mean / sample.stretch
+    return sample.out_of_unit(sample.mean)
 
 
 def median(sample: Sample) -> Tensor:
     """Middle value, or the mean of the two middle values for even ``n``, ``[*]``."""
     if sample.num % 2:
         return sample.ordered[..., sample.num // 2]
-    early = sample.stretch.clamp(0.5, 1.0)  # huge values are halved before they are added
     middle = sample.ordered[..., sample.num // 2 - 1 : sample.num // 2 + 1]
+    if sample.is_ordinary:
+        return middle.sum(-1) * 0.5
+    early = sample.stretch.clamp(0.5, 1.0)  # huge values are halved before they are added
     return (middle * early[..., None]).sum(-1) * (0.5 / early)
 
 
@@ -71,7 +73,7 @@ def mode(sample: Sample) -> Tensor:
     rounding. The result is the first value of the longest run. Not differentiable where the
     longest run changes; elsewhere the gradient is that of the value returned.
     """
-    tolerance = RUN_TOLERANCE.get(sample.x.dtype, 2.0**-8) * (sample.scale * sample.stretch)
+    tolerance = RUN_TOLERANCE.get(sample.x.dtype, 2.0**-8) * sample.in_unit(sample.scale)
     rank = rank_in_run(sample.gaps > tolerance[..., None])
     last = rank.argmax(-1, keepdim=True)  # the first maximum: the end of the first longest run
     return sample.ordered.gather(-1, last - rank.gather(-1, last).long()).squeeze(-1)
@@ -79,19 +81,19 @@ def mode(sample: Sample) -> Tensor:
 
 def range_(sample: Sample) -> Tensor:
     """Largest minus smallest value, ``[*]``."""
-    return sample.span / sample.stretch
+    return sample.out_of_unit(sample.span)
 
 
 def mean_deviation(sample: Sample) -> Tensor:
     """Mean absolute deviation from the mean, ``[*]``."""
-    return sample.centred.abs().mean(-1) / sample.stretch
+    return sample.out_of_unit(sample.centred.abs().mean(-1))
 
 
 def std(sample: Sample) -> Tensor:
     """Standard deviation with ``n - 1`` in the denominator, ``[*]``."""
     # not by the span, which as a factor would make denormals of the gradient on its way back
     square = (sample.centred * sample.centred).mean(-1)
-    return _unbiased_root(sample, torch.where(sample.is_flat, 1.0, square)) / sample.stretch
+    return sample.out_of_unit(_unbiased_root(sample, sample.unless_flat(square, 1.0)))
 
 
 def cv(sample: Sample) -> Tensor:
@@ -107,16 +109,17 @@ def cv(sample: Sample) -> Tensor:
 def iqr(sample: Sample) -> Tensor:
     """Interquartile range, quantiles at Hazen positions ``q n + 1/2``, ``[*]``."""
     low, high = (min(max(q * sample.num - 0.5, 0.0), sample.num - 1.0) for q in (0.25, 0.75))
-    base = sample.ordered[..., int(low)] * sample.stretch
+    base = sample.in_unit(sample.ordered[..., int(low)])
 
     def above_base(position: float) -> Tensor:
         below, share = int(position), position % 1
-        values = (
-            sample.ordered[..., below : below + 2] * sample.stretch[..., None] - base[..., None]
+        near, far = (
+            sample.in_unit(sample.ordered[..., place]) - base
+            for place in (below, min(below + 1, sample.num - 1))
         )
-        return values[..., 0] * (1 - share) + values[..., -1] * share
+        return near * (1 - share) + far * share
 
-    return (above_base(high) - above_base(low)) / sample.stretch
+    return sample.out_of_unit(above_base(high) - above_base(low))
 
 
 def skewness(sample: Sample) -> Tensor:
@@ -126,8 +129,8 @@ def skewness(sample: Sample) -> Tensor:
 
 def kurtosis(sample: Sample) -> Tensor:
     """Fourth central moment over the squared second, not excess, ``[*]``; 3 for a constant."""
-    plain = (sample.squares * sample.squares).mean(-1) / sample.variance**2
-    return torch.where(sample.is_flat, 3.0, plain)
+    fourth = (sample.squares * sample.squares).mean(-1)
+    return sample.unless_flat(fourth / sample.variance**2, 3.0)
 
 
 def energy(sample: Sample) -> Tensor:
@@ -143,7 +146,7 @@ def entropy(sample: Sample) -> Tensor:
     distinct levels serve as histogram *edges*, so the two highest occupied ones share one cell.
     Piecewise constant: its gradient is 0 wherever it exists, and none flows.
     """
-    least = (sample.smallest.detach() * sample.stretch)[..., None]
+    least = sample.in_unit(sample.smallest.detach())[..., None]
     levels = (ENTROPY_LEVELS / sample.safe_span)[..., None]
     half = 0.5 + HALF_SLACK.get(sample.x.dtype, 0.0)
     level = ((sample.ranked - least) * levels + half).floor()
@@ -152,12 +155,12 @@ def entropy(sample: Sample) -> Tensor:
     growth = _entropy_growth(sample.num).to(sample.x)
     rank = rank_in_run(new_cell)
     grown = growth.index_select(0, rank.flatten()).reshape(rank.shape)
-    return torch.where(sample.is_flat, 0.0, grown.sum(-1))
+    return sample.unless_flat(grown.sum(-1), 0.0)
 
 
 def peak_factor(sample: Sample) -> Tensor:
     """Signed maximum over the root mean square, ``[*]``; 0 for a zero sample."""
-    return sample.unit.amax(-1) / sample.rms
+    return (sample.largest if sample.is_ordinary else sample.unit.amax(-1)) / sample.rms
 
 
 def correlation(sample: Sample) -> Tensor:
@@ -171,7 +174,7 @@ def correlation(sample: Sample) -> Tensor:
     other = sample.reference
     covariance = (sample.deviation * other.deviation).mean(-1)
     plain = covariance / (sample.variance.sqrt() * other.variance.sqrt())
-    return torch.where(sample.is_flat | other.is_flat, 0.0, plain)
+    return sample.unless_flat(other.unless_flat(plain, 0.0), 0.0)
 
 
 def spectral_centroid(sample: Sample) -> Tensor:
@@ -269,6 +272,8 @@ def describe(
         raise ValueError(f"a sample needs at least two values, got {x.shape[-1]}")
     sample = Sample(x, scale, None if reference is None else Sample(reference), frequency_hz)
     values = torch.stack([_DESCRIPTORS[name](sample) for name in names], dim=-1)
+    if sample.is_ordinary:
+        return values
     largest = torch.finfo(x.dtype).max
     return torch.where(
         sample.magnitude.isfinite()[..., None], values.clamp(-largest, largest), torch.nan
@@ -284,7 +289,7 @@ def _frequency_axis(sample: Sample) -> Tensor:
 def _unbiased_root(sample: Sample, variance: Tensor) -> Tensor:
     """Standard deviation with ``n - 1`` from a variance with ``n``, 0 for a constant, ``[*]``."""
     root = (variance * (sample.num / (sample.num - 1))).sqrt()
-    return torch.where(sample.is_flat, 0.0, root)
+    return sample.unless_flat(root, 0.0)
 
 
 def _entropy_growth(num: int) -> Tensor:

@@ -19,7 +19,7 @@ from tactslip_torch.features.descriptors import (
     describe,
 )
 from tactslip_torch.features.names import pool_names
-from tactslip_torch.features.sample import is_constant, settle
+from tactslip_torch.features.sample import is_constant, is_nowhere, settle
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names
@@ -173,8 +173,11 @@ class FeaturePool(nn.Module):
         shifted = shifted.unflatten(-1, matrix.shape[:2])
         branches = shifted + torch.where(is_approximation, first, 0.0)
         scale = films.detach().abs().amax(-1)[..., None].expand(branches.shape[:-1])
+        settled = settle(branches, scale)
+        if settled is branches:
+            return branches
         constant = is_constant(branches, scale)[..., None]
-        return torch.where(constant & ~is_approximation, 0.0, settle(branches, scale))
+        return torch.where(constant & ~is_approximation, 0.0, settled)
 
     def amplitudes(self, branches: Tensor) -> Tensor:
         """Amplitude spectrum of each branch; the gradient of a line that is zero is 0.
@@ -184,12 +187,16 @@ class FeaturePool(nn.Module):
             - output: ``[*, lines]``
         """
         size = branches.detach().abs().amax(-1, keepdim=True)
-        size = torch.where(size == 0, 1.0, size)  # squares of 1e30 or 1e-30 stay in range
-        scaled = branches / size
+        is_zero = size == 0
+        if not is_nowhere(is_zero):
+            size = torch.where(is_zero, 1.0, size)
+        scaled = branches / size  # squares of 1e30 or 1e-30 stay in range
         real = scaled @ self._constant("cosine", branches).T
         imaginary = scaled @ self._constant("sine", branches).T
         square = real * real + imaginary * imaginary
         is_zero = square.detach() == 0
+        if is_nowhere(is_zero):
+            return size * square.sqrt()
         return size * torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
 
     def extract(self, bins: Tensor, chunk_bins: int = 16) -> Tensor:

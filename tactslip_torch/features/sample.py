@@ -38,9 +38,30 @@ def settle(x: Tensor, scale: Tensor) -> Tensor:
     Shape:
         - x, output: ``[*, n]``; scale: ``[*]``
     """
+    constant = is_constant(x, scale)
+    if is_nowhere(constant):
+        return x
     first = x[..., :1].detach()
     mean = first + (x.detach() - first).mean(-1, keepdim=True)
-    return torch.where(is_constant(x, scale)[..., None], mean, x)
+    return torch.where(constant[..., None], mean, x)
+
+
+def is_nowhere(mask: Tensor) -> bool:
+    """Whether a mask is known to hold nowhere, so that what depends on it can be passed over."""
+    with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
+        return may_look(mask) and not bool(mask.any())
+    return False
+
+
+def may_look(x: Tensor) -> bool:
+    """Whether a decision may be taken on values: in eager mode, on a CPU, on at least one."""
+    return x.device.type == "cpu" and x.numel() > 0 and not torch.compiler.is_compiling()
+
+
+def ordinary_sizes(dtype: torch.dtype) -> tuple[float, float]:
+    """Between which magnitudes squares stay well within a dtype: 2^-320 and 2^448 in float64."""
+    exponent = math.frexp(torch.finfo(dtype).max)[1]
+    return 2.0 ** (-5 * exponent // 16), 2.0 ** (7 * exponent // 16)
 
 
 def stretch(magnitude: Tensor) -> Tensor:
@@ -53,9 +74,8 @@ def stretch(magnitude: Tensor) -> Tensor:
     Shape:
         - magnitude, output: ``[*]``
     """
-    exponent = math.frexp(torch.finfo(magnitude.dtype).max)[1]
-    low, high = 2.0 ** (-5 * exponent // 16), 2.0 ** (7 * exponent // 16)
-    factor = 2.0 ** (3 * exponent // 4)
+    low, high = ordinary_sizes(magnitude.dtype)
+    factor = 2.0 ** (3 * math.frexp(torch.finfo(magnitude.dtype).max)[1] // 4)
     shrunk = torch.where(magnitude > high, 1 / factor, torch.ones_like(magnitude))
     return torch.where(magnitude < low, factor, shrunk)
 
@@ -165,17 +185,47 @@ class Sample:
         """Power of two that keeps squares in range, 1 for ordinary values, ``[*]``."""
         return stretch(self.magnitude)
 
-    # What follows is in the stretched unit: x times stretch.
+    @cached_property
+    def is_ordinary(self) -> bool:
+        """Whether no value needs a guard, which then costs nothing and would change no bit.
+
+        That is: finite sizes in the range of ``stretch``, no flat sample, no negative amplitude.
+        Unknown, so False, where values may not be looked at (compiling, vmap) or looking is dear.
+        """
+        if not may_look(self.x):
+            return False
+        low, high = ordinary_sizes(self.x.dtype)
+        with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
+            least, most = self.magnitude.aminmax()
+            is_amplitude = self.frequency_hz is None or bool(self.smallest.detach().amin() >= 0)
+            narrowest = (self.largest.detach() - self.smallest.detach()).amin()
+            return is_amplitude and bool((least >= low) & (most <= high) & (narrowest > 0))
+        return False
+
+    def in_unit(self, x: Tensor) -> Tensor:
+        """``x``, one number a sample, in the stretched unit, which is ``stretch`` times smaller."""
+        return x if self.is_ordinary else x * self.stretch
+
+    def out_of_unit(self, x: Tensor) -> Tensor:
+        """The way back."""
+        return x if self.is_ordinary else x / self.stretch
+
+    def unless_flat(self, x: Tensor, otherwise: float) -> Tensor:
+        """``x``, one number a sample, and ``otherwise`` where all values are equal."""
+        return x if self.is_ordinary else torch.where(self.is_flat, otherwise, x)
+
+    # What follows is in the stretched unit.
 
     @cached_property
     def unit(self) -> Tensor:
         """Values, ``[*, n]``."""
-        return self.x * self.stretch[..., None]
+        return self.x if self.is_ordinary else self.x * self.stretch[..., None]
 
     @property
     def ranked(self) -> Tensor:
         """Sorted values without gradient, ``[*, n]``; not kept, as memory costs more than time."""
-        return self.ordered.detach() * self.stretch[..., None]
+        ordered = self.ordered.detach()
+        return ordered if self.is_ordinary else ordered * self.stretch[..., None]
 
     @property
     def gaps(self) -> Tensor:
@@ -186,7 +236,7 @@ class Sample:
     @cached_property
     def span(self) -> Tensor:
         """Largest minus smallest value, ``[*]``."""
-        return self.largest * self.stretch - self.smallest * self.stretch
+        return self.in_unit(self.largest) - self.in_unit(self.smallest)
 
     @cached_property
     def is_flat(self) -> Tensor:
@@ -194,14 +244,9 @@ class Sample:
         return self.span.detach() == 0
 
     @cached_property
-    def is_zero(self) -> Tensor:
-        """All values zero, ``[*]``."""
-        return self.magnitude == 0
-
-    @cached_property
     def safe_span(self) -> Tensor:
         """The span without gradient, 1 where it is 0, ``[*]``."""
-        return torch.where(self.is_flat, 1.0, self.span.detach())
+        return self.unless_flat(self.span.detach(), 1.0)
 
     @cached_property
     def mean(self) -> Tensor:
@@ -211,7 +256,10 @@ class Sample:
     @cached_property
     def rms(self) -> Tensor:
         """Root mean square, ``[*]``; Inf for a zero sample, over which value and gradient are 0."""
-        return torch.where(self.is_zero, torch.inf, (self.unit * self.unit).mean(-1)).sqrt()
+        mean_square = (self.unit * self.unit).mean(-1)
+        if not self.is_ordinary:
+            mean_square = torch.where(self.magnitude == 0, torch.inf, mean_square)
+        return mean_square.sqrt()
 
     @cached_property
     def centred(self) -> Tensor:
@@ -240,10 +288,12 @@ class Sample:
     @cached_property
     def variance(self) -> Tensor:
         """Mean of ``squares``, 1 where the sample is flat, ``[*]``."""
-        return torch.where(self.is_flat, 1.0, self.squares.mean(-1))
+        return self.unless_flat(self.squares.mean(-1), 1.0)
 
     @cached_property
     def weights(self) -> Tensor:
         """A spectrum's lines as shares of their sum, 0 for a zero spectrum, ``[*, n]``."""
         total = self.unit.sum(-1, keepdim=True)
-        return self.unit / torch.where(total.detach() == 0, torch.inf, total)
+        if not self.is_ordinary:
+            total = torch.where(total.detach() == 0, torch.inf, total)
+        return self.unit / total
