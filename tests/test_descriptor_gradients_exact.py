@@ -20,7 +20,7 @@ from test_descriptors_exact import (
     third,
 )
 
-from tactslip_torch.features.sample import is_constant
+from tactslip_torch.features.guards import is_constant
 
 ORDERED = ("median", "mode", "range", "iqr")
 CENTRAL = ("mean_deviation", "std", "cv", "skewness", "kurtosis", "correlation")

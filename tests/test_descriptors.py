@@ -16,7 +16,7 @@ from tactslip_torch.features.descriptors import (
     band_energy_ratio,
     describe,
 )
-from tactslip_torch.features.sample import settle
+from tactslip_torch.features.guards import settle
 
 EVERY = (*TIME_DESCRIPTORS, "spectral_centroid", "spectral_spread")
 UNSMOOTH = ("mode", "entropy")

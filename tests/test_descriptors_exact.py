@@ -11,7 +11,7 @@ from tactslip_torch.features.descriptors import (
     band_energy_ratio,
     describe,
 )
-from tactslip_torch.features.sample import is_constant, settle
+from tactslip_torch.features.guards import is_constant, settle
 
 RULES = {torch.float64: FLOAT64, torch.float32: FLOAT32}
 DTYPES = list(RULES)

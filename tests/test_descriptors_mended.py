@@ -8,7 +8,7 @@ from test_descriptors import EVERY, measure
 
 from tactslip_torch.features import descriptors, sample
 from tactslip_torch.features.descriptors import band_energy_ratio, describe
-from tactslip_torch.features.sample import is_constant
+from tactslip_torch.features.guards import is_constant
 
 DTYPES = [torch.float64, torch.float32]
 SECOND = ["std", "cv", "skewness", "kurtosis", "peak_factor", "correlation", "spectral_spread"]

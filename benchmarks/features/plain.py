@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features import descriptors
-from tactslip_torch.features.sample import Sample, rank_in_run
+from tactslip_torch.features.runs import entropy_growth, rank_in_run
+from tactslip_torch.features.sample import Sample
 
 
 class PlainSample(Sample):
@@ -148,7 +149,7 @@ def _entropy(sample: PlainSample) -> Tensor:
     half = 0.5 + descriptors.HALF_SLACK.get(sample.x.dtype, 0.0)
     level = ((ordered - ordered[..., :1]) * levels + half).floor()
     new_cell = (level[..., 1:] != level[..., :-1]) & (level[..., 1:] != top)
-    growth = descriptors._entropy_growth(sample.num).to(sample.x)
+    growth = entropy_growth(sample.num).to(sample.x)
     rank = rank_in_run(new_cell)
     return growth.index_select(0, rank.flatten()).reshape(rank.shape).sum(-1)
 

@@ -40,9 +40,10 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.sample import Sample, bounded_gradient, rank_in_run, stretch
+from tactslip_torch.features.guards import are_ordinary, bounded_gradient, stretch
+from tactslip_torch.features.runs import entropy_growth, rank_in_run
+from tactslip_torch.features.sample import Sample
 
-EPS64 = torch.finfo(torch.float64).eps
 ENTROPY_LEVELS = 255
 RUN_TOLERANCE = {torch.float64: 1e-12, torch.float32: 2.0**-20}
 HALF_SLACK = {torch.float64: 1e-9, torch.float32: 2.0**-13}
@@ -152,7 +153,7 @@ def entropy(sample: Sample) -> Tensor:
     level = ((sample.ranked - least) * levels + half).floor()
     # the maximum always has the top level, so the second highest level joins it
     new_cell = (level[..., 1:] != level[..., :-1]) & (level[..., 1:] != ENTROPY_LEVELS)
-    growth = _entropy_growth(sample.num).to(sample.x)
+    growth = entropy_growth(sample.num).to(sample.x)
     rank = rank_in_run(new_cell)
     grown = growth.index_select(0, rank.flatten()).reshape(rank.shape)
     return sample.unless_flat(grown.sum(-1), 0.0)
@@ -208,10 +209,14 @@ def band_energy_ratio(spectra: Tensor) -> Tensor:
         - output: ``[*, branches]``
     """
     spectra = bounded_gradient(spectra)
-    scaled = spectra * stretch(spectra.detach().flatten(-2).abs().amax(-1))[..., None, None]
+    magnitude = spectra.detach().flatten(-2).abs().amax(-1)
+    is_ordinary = are_ordinary(magnitude)
+    scaled = spectra if is_ordinary else spectra * stretch(magnitude)[..., None, None]
     energies = (scaled * scaled).sum(-1)
     total = energies.sum(-1, keepdim=True)
-    return energies / torch.where(total.detach() == 0, torch.inf, total)
+    if not is_ordinary:
+        total = torch.where(total.detach() == 0, torch.inf, total)
+    return energies / total
 
 
 _DESCRIPTORS: dict[str, Callable[[Sample], Tensor]] = {
@@ -290,9 +295,3 @@ def _unbiased_root(sample: Sample, variance: Tensor) -> Tensor:
     """Standard deviation with ``n - 1`` from a variance with ``n``, 0 for a constant, ``[*]``."""
     root = (variance * (sample.num / (sample.num - 1))).sqrt()
     return sample.unless_flat(root, 0.0)
-
-
-def _entropy_growth(num: int) -> Tensor:
-    """What the value of rank ``r`` in its cell adds to the entropy of ``num`` values, ``[num]``."""
-    share = torch.arange(num + 1, dtype=torch.float64) / num
-    return (-share * (share + EPS64).log2()).diff()

@@ -18,8 +18,8 @@ from tactslip_torch.features.descriptors import (
     band_energy_ratio,
     describe,
 )
+from tactslip_torch.features.guards import is_constant, is_nowhere, settle
 from tactslip_torch.features.names import pool_names
-from tactslip_torch.features.sample import is_constant, is_nowhere, settle
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names

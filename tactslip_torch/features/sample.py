@@ -1,128 +1,22 @@
-"""Values to be described, with what several descriptors share; and when values count as constant.
+"""Values to be described, with what several descriptors share.
 
-The rules for extremes are ours (REFERENCE.md section 4): a sample whose span is below
-``16 * eps * scale``, rounding noise beside the raw bin it comes from, is replaced by its mean.
 Moments are two-pass, on values shifted by a sample and scaled by the span, so that large offsets,
 denormals and 1e30 neither cancel nor overflow. Magnitudes whose squares leave the dtype are first
-multiplied by a power of two (``stretch``), which costs no digit; all others by 1.
+multiplied by a power of two (``guards.stretch``), which costs no digit; all others by 1. Where no
+value of a batch is extreme, which one look tells, guards are passed over: they would change no bit.
 """
 
 from __future__ import annotations
 
 import contextlib
-import math
 from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.nn.functional import pad
 
-
-def is_constant(x: Tensor, scale: Tensor) -> Tensor:
-    """Whether the span of ``x`` is rounding noise beside ``scale``, the size of the raw bin.
-
-    Shape:
-        - x: ``[*, n]``; scale: ``[*]``; output: ``[*]``, bool
-    """
-    span = x.detach().amax(-1) - x.detach().amin(-1)
-    return span * (1 / (16 * torch.finfo(x.dtype).eps)) < scale  # on this side nothing underflows
-
-
-def settle(x: Tensor, scale: Tensor) -> Tensor:
-    """Replace what ``is_constant`` by its mean, value by value; gradients there are 0.
-
-    The mean is right to ``eps (n span / 2 + |mean|)``, and lies within the span.
-
-    Shape:
-        - x, output: ``[*, n]``; scale: ``[*]``
-    """
-    constant = is_constant(x, scale)
-    if is_nowhere(constant):
-        return x
-    first = x[..., :1].detach()
-    mean = first + (x.detach() - first).mean(-1, keepdim=True)
-    return torch.where(constant[..., None], mean, x)
-
-
-def is_nowhere(mask: Tensor) -> bool:
-    """Whether a mask is known to hold nowhere, so that what depends on it can be passed over."""
-    with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
-        return may_look(mask) and not bool(mask.any())
-    return False
-
-
-def may_look(x: Tensor) -> bool:
-    """Whether a decision may be taken on values: in eager mode, on a CPU, on at least one."""
-    return x.device.type == "cpu" and x.numel() > 0 and not torch.compiler.is_compiling()
-
-
-def ordinary_sizes(dtype: torch.dtype) -> tuple[float, float]:
-    """Between which magnitudes squares stay well within a dtype: 2^-320 and 2^448 in float64."""
-    exponent = math.frexp(torch.finfo(dtype).max)[1]
-    return 2.0 ** (-5 * exponent // 16), 2.0 ** (7 * exponent // 16)
-
-
-def stretch(magnitude: Tensor) -> Tensor:
-    """The power of two by which values of this magnitude are multiplied before they are squared.
-
-    1 from 2^-320 to 2^448 (float32: 2^-40 to 2^56), so ordinary values keep every bit; 2^768 (2^96)
-    below and its inverse above. Then no square overflows, and no square of a difference underflows
-    by more than rounding.
-
-    Shape:
-        - magnitude, output: ``[*]``
-    """
-    low, high = ordinary_sizes(magnitude.dtype)
-    factor = 2.0 ** (3 * math.frexp(torch.finfo(magnitude.dtype).max)[1] // 4)
-    shrunk = torch.where(magnitude > high, 1 / factor, torch.ones_like(magnitude))
-    return torch.where(magnitude < low, factor, shrunk)
-
-
-def bounded_gradient(x: Tensor) -> Tensor:
-    """``x``, whose gradient saturates at the largest finite number of the dtype.
-
-    The derivative of a shape is of order 1/span, which for denormals no float can hold. Backward
-    only: derivatives taken forwards become Inf there.
-
-    Shape:
-        - x, output: ``[*]``
-    """
-    if not (x.requires_grad and torch.is_grad_enabled()) or torch.compiler.is_compiling():
-        return x
-    x = x.view_as(x)
-    x.register_hook(_saturate)
-    return x
-
-
-def _saturate(gradient: Tensor | None) -> Tensor | None:
-    """Autograd hands on None for a gradient that is undefined."""
-    if gradient is None:
-        return None
-    largest = torch.finfo(gradient.dtype).max
-    return gradient.clamp(-largest, largest)
-
-
-def rank_in_run(is_boundary: Tensor) -> Tensor:
-    """Position of each sorted value within its run, from 0.
-
-    The running maximum of where runs start, by doubling: log2(n) plain maxima of windows, which
-    export to ONNX as ``cummax`` does not.
-
-    Shape:
-        - is_boundary: ``[*, n - 1]``, bool: a new run starts behind this value
-        - output: ``[*, n]``, int32
-    """
-    num = is_boundary.shape[-1] + 1
-    position = torch.arange(num, dtype=torch.int32, device=is_boundary.device)
-    start = pad(torch.where(is_boundary, position[1:], 0), (num, 0))  # the window before the first
-    left, width = num - 1, 1
-    while left:
-        step = min(width, left)
-        start = torch.maximum(start[..., step:], start[..., :-step])
-        left, width = left - step, 2 * width
-    return position - start
+from tactslip_torch.features.guards import are_ordinary, bounded_gradient, stretch
 
 
 class Sample:
@@ -192,15 +86,12 @@ class Sample:
         That is: finite sizes in the range of ``stretch``, no flat sample, no negative amplitude.
         Unknown, so False, where values may not be looked at (compiling, vmap) or looking is dear.
         """
-        if not may_look(self.x):
+        if not are_ordinary(self.magnitude):
             return False
-        low, high = ordinary_sizes(self.x.dtype)
-        with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
-            least, most = self.magnitude.aminmax()
-            is_amplitude = self.frequency_hz is None or bool(self.smallest.detach().amin() >= 0)
-            narrowest = (self.largest.detach() - self.smallest.detach()).amin()
-            return is_amplitude and bool((least >= low) & (most <= high) & (narrowest > 0))
-        return False
+        smallest = self.smallest.detach()
+        if self.frequency_hz is not None and float(smallest.amin()) < 0:
+            return False
+        return float((self.largest.detach() - smallest).amin()) > 0
 
     def in_unit(self, x: Tensor) -> Tensor:
         """``x``, one number a sample, in the stretched unit, which is ``stretch`` times smaller."""

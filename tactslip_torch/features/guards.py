@@ -1,0 +1,108 @@
+"""What keeps extremes from becoming silent numbers; on ordinary values none of it changes a bit.
+
+The rules are ours (REFERENCE.md section 4): a sample whose span is below ``16 * eps * scale``,
+rounding noise beside the raw bin it comes from, is replaced by its mean.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+
+import torch
+from torch import Tensor
+
+
+def is_constant(x: Tensor, scale: Tensor) -> Tensor:
+    """Whether the span of ``x`` is rounding noise beside ``scale``, the size of the raw bin.
+
+    Shape:
+        - x: ``[*, n]``; scale: ``[*]``; output: ``[*]``, bool
+    """
+    x = x.detach()
+    span = x.amax(-1) - x.amin(-1)
+    return span * (1 / (16 * torch.finfo(x.dtype).eps)) < scale  # on this side nothing underflows
+
+
+def settle(x: Tensor, scale: Tensor) -> Tensor:
+    """Replace what ``is_constant`` by its mean, value by value; gradients there are 0.
+
+    The mean is right to ``eps (n span / 2 + |mean|)``, and lies within the span.
+
+    Shape:
+        - x, output: ``[*, n]``; scale: ``[*]``
+    """
+    constant = is_constant(x, scale)
+    if is_nowhere(constant):
+        return x
+    first = x[..., :1].detach()
+    mean = first + (x.detach() - first).mean(-1, keepdim=True)
+    return torch.where(constant[..., None], mean, x)
+
+
+def is_nowhere(mask: Tensor) -> bool:
+    """Whether a mask is known to hold nowhere, so that what depends on it can be passed over."""
+    with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
+        return may_look(mask) and not bool(mask.any())
+    return False
+
+
+def may_look(x: Tensor) -> bool:
+    """Whether a decision may be taken on values: in eager mode, on a CPU, on at least one."""
+    return x.device.type == "cpu" and x.numel() > 0 and not torch.compiler.is_compiling()
+
+
+def ordinary_sizes(dtype: torch.dtype) -> tuple[float, float]:
+    """Between which magnitudes squares stay well within a dtype: 2^-320 and 2^448 in float64."""
+    exponent = math.frexp(torch.finfo(dtype).max)[1]
+    return 2.0 ** (-5 * exponent // 16), 2.0 ** (7 * exponent // 16)
+
+
+def are_ordinary(magnitude: Tensor) -> bool:
+    """Whether magnitudes are known to need no ``stretch``; false for NaN and 0."""
+    if not may_look(magnitude):
+        return False
+    low, high = ordinary_sizes(magnitude.dtype)
+    with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
+        return low <= float(magnitude.amin()) and float(magnitude.amax()) <= high
+    return False
+
+
+def stretch(magnitude: Tensor) -> Tensor:
+    """The power of two by which values of this magnitude are multiplied before they are squared.
+
+    1 from 2^-320 to 2^448 (float32: 2^-40 to 2^56), so ordinary values keep every bit; 2^768 (2^96)
+    below and its inverse above. Then no square overflows, and no square of a difference underflows
+    by more than rounding.
+
+    Shape:
+        - magnitude, output: ``[*]``
+    """
+    low, high = ordinary_sizes(magnitude.dtype)
+    factor = 2.0 ** (3 * math.frexp(torch.finfo(magnitude.dtype).max)[1] // 4)
+    shrunk = torch.where(magnitude > high, 1 / factor, torch.ones_like(magnitude))
+    return torch.where(magnitude < low, factor, shrunk)
+
+
+def bounded_gradient(x: Tensor) -> Tensor:
+    """``x``, whose gradient saturates at the largest finite number of the dtype.
+
+    The derivative of a shape is of order 1/span, which for denormals no float can hold. Backward
+    only: derivatives taken forwards become Inf there.
+
+    Shape:
+        - x, output: ``[*]``
+    """
+    if not (x.requires_grad and torch.is_grad_enabled()) or torch.compiler.is_compiling():
+        return x
+    x = x.view_as(x)
+    x.register_hook(_saturate)
+    return x
+
+
+def _saturate(gradient: Tensor | None) -> Tensor | None:
+    """Autograd hands on None for a gradient that is undefined."""
+    if gradient is None:
+        return None
+    largest = torch.finfo(gradient.dtype).max
+    return gradient.clamp(-largest, largest)
