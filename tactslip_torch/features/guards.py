@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -42,14 +44,16 @@ def settle(x: Tensor, scale: Tensor) -> Tensor:
 
 def is_nowhere(mask: Tensor) -> bool:
     """Whether a mask is known to hold nowhere, so that what depends on it can be passed over."""
-    with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
-        return may_look(mask) and not bool(mask.any())
-    return False
+    values = looked_at(mask)
+    return values is not None and not values.any()
 
 
-def may_look(x: Tensor) -> bool:
-    """Whether a decision may be taken on values: in eager mode, on a CPU, on at least one."""
-    return x.device.type == "cpu" and x.numel() > 0 and not torch.compiler.is_compiling()
+def looked_at(x: Tensor) -> np.ndarray[Any, Any] | None:
+    """The values, if a decision may be taken on them: in eager mode, on a CPU, at least one."""
+    if x.device.type == "cpu" and x.numel() and not torch.compiler.is_compiling():
+        with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
+            return x.detach().numpy()
+    return None
 
 
 def ordinary_sizes(dtype: torch.dtype) -> tuple[float, float]:
@@ -60,12 +64,9 @@ def ordinary_sizes(dtype: torch.dtype) -> tuple[float, float]:
 
 def are_ordinary(magnitude: Tensor) -> bool:
     """Whether magnitudes are known to need no ``stretch``; false for NaN and 0."""
-    if not may_look(magnitude):
-        return False
+    values = looked_at(magnitude)
     low, high = ordinary_sizes(magnitude.dtype)
-    with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
-        return low <= float(magnitude.amin()) and float(magnitude.amax()) <= high
-    return False
+    return values is not None and bool(low <= values.min() and values.max() <= high)
 
 
 def stretch(magnitude: Tensor) -> Tensor:

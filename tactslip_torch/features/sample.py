@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from tactslip_torch.features.guards import are_ordinary, bounded_gradient, stretch
+from tactslip_torch.features.guards import bounded_gradient, looked_at, ordinary_sizes, stretch
 
 
 class Sample:
@@ -86,12 +86,14 @@ class Sample:
         That is: finite sizes in the range of ``stretch``, no flat sample, no negative amplitude.
         Unknown, so False, where values may not be looked at (compiling, vmap) or looking is dear.
         """
-        if not are_ordinary(self.magnitude):
+        smallest, largest = looked_at(self.smallest), looked_at(self.largest)
+        if smallest is None or largest is None:
             return False
-        smallest = self.smallest.detach()
-        if self.frequency_hz is not None and float(smallest.amin()) < 0:
-            return False
-        return float((self.largest.detach() - smallest).amin()) > 0
+        low, high = ordinary_sizes(self.x.dtype)
+        size = np.maximum(largest, -smallest)
+        is_amplitude = self.frequency_hz is None or smallest.min() >= 0
+        in_range = low <= size.min() and size.max() <= high
+        return bool(is_amplitude and in_range and (largest > smallest).all())
 
     def in_unit(self, x: Tensor) -> Tensor:
         """``x``, one number a sample, in the stretched unit, which is ``stretch`` times smaller."""
