@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from tactslip_torch.features.guards import is_nowhere
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool, saturating
 from tactslip_torch.files import load_table, save_table, table_form
@@ -58,6 +59,9 @@ class SlipDetector(nn.Module):
     """
 
     typical: Tensor
+    _selected_index: Tensor
+    _channel_index: Tensor
+    _needed_index: Tensor
 
     def __init__(
         self,
@@ -99,7 +103,10 @@ class SlipDetector(nn.Module):
         self.selected = tuple(int(i) for i in selected)
         self.info = dict(info or {})
         self.register_buffer("typical", typical.to(next(head.buffers()), copy=True))
-        self._channel_of = [pool.hand.names.index(name.channel) for name in self.selected_names]
+        channels = [pool.hand.names.index(name.channel) for name in self.selected_names]
+        indices = {"selected": self.selected, "channel": channels, "needed": sorted(set(channels))}
+        for name, index in indices.items():
+            self.register_buffer(f"_{name}_index", torch.tensor(index), persistent=False)
 
     @property
     def selected_names(self) -> tuple[FeatureName, ...]:
@@ -154,7 +161,7 @@ class SlipDetector(nn.Module):
                 a NaN or Inf, naming bin, channel and sample.
         """
         check_nonfinite(nonfinite, bins, self.pool.hand.names)
-        return self._judge(bins, self.pool.validity(bins))
+        return self._judge(bins, bins)
 
     def judge_raw(self, samples: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
         """``judge`` for raw bins that come with ``context`` samples on each side.
@@ -169,9 +176,7 @@ class SlipDetector(nn.Module):
         """
         check_nonfinite(nonfinite, samples, self.pool.hand.names)
         bins = self._filter(samples)
-        rounded = bins.to(samples.dtype)  # sensors resolve no more than their samples do
-        judged = self._judge(bins, self.pool.validity(rounded))
-        return judged._replace(score=saturating(judged.score, samples.dtype))
+        return self._judge(bins, bins.to(samples.dtype))  # sensors resolve no more than they give
 
     def validity(self, bins: Tensor) -> Tensor:
         """Whether every channel the score depends on can be trusted (``FeaturePool.validity``).
@@ -195,21 +200,25 @@ class SlipDetector(nn.Module):
         score: Tensor = self.head(self._scale(features))
         return score
 
-    def _judge(self, bins: Tensor, is_trusted: Tensor) -> Judgement:
+    def _judge(self, bins: Tensor, given: Tensor) -> Judgement:
+        """Scores of filtered bins, valid by the dtype they were given in, which is the score's."""
         is_missing = self.pool.is_missing(bins)
-        scaled = self._scale(self._features(torch.where(is_missing[..., None], 0.0, bins)))
-        scaled = torch.where(is_missing[..., self._channel_of], self.typical, scaled)
-        score = saturating(self.head(scaled), bins.dtype)
-        return Judgement(score, self._needed(is_trusted), is_missing)
+        is_whole = is_nowhere(is_missing)
+        if not is_whole:
+            bins = torch.where(is_missing[..., None], 0.0, bins)
+        scaled = self._scale(self._features(bins))
+        if not is_whole:
+            is_typical = is_missing.index_select(-1, self._channel_index)
+            scaled = torch.where(is_typical, self.typical, scaled)
+        score = saturating(self.head(scaled), given.dtype)
+        return Judgement(score, self._needed(self.pool.validity(given)), is_missing)
 
     def _filter(self, samples: Tensor) -> Tensor:
-        filtered: Tensor = self.channel_filter.valid(self.pool.widen(samples))
-        return filtered
+        return self.channel_filter.valid(self.pool.widen(samples))
 
     def _features(self, bins: Tensor) -> Tensor:
-        index = torch.tensor(self.selected, device=bins.device)
-        selected: Tensor = self.pool(self.pool.widen(bins)).index_select(-1, index)
-        return selected
+        features: Tensor = self.pool(self.pool.widen(bins))
+        return features.index_select(-1, self._selected_index)
 
     def _scale(self, features: Tensor) -> Tensor:
         scaled: Tensor = self.scaler(saturating(features, self.scaler.minimum.dtype))
@@ -225,7 +234,7 @@ class SlipDetector(nn.Module):
 
     def _needed(self, is_trusted: Tensor) -> Tensor:
         """Whether all channels in use are trusted, ``[*, C] -> [*]``."""
-        return is_trusted[..., sorted(set(self._channel_of))].all(-1)
+        return is_trusted.index_select(-1, self._needed_index).all(-1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the detector to one file, whole or not at all."""
