@@ -85,11 +85,16 @@ def stretch(magnitude: Tensor) -> Tensor:
     return torch.where(magnitude < low, factor, shrunk)
 
 
-def bounded_gradient(x: Tensor) -> Tensor:
+def bounded_gradient(x: Tensor, headroom: float = 1.0) -> Tensor:
     """``x``, whose gradient saturates at the largest finite number of the dtype.
 
     The derivative of a shape is of order 1/span, which for denormals no float can hold. Backward
     only: derivatives taken forwards become Inf there.
+
+    Args:
+        x: any values.
+        headroom: the gradient saturates at this part below the largest number, so that a linear
+            map on the way back, of no larger gain, does not overflow.
 
     Shape:
         - x, output: ``[*]``
@@ -97,13 +102,7 @@ def bounded_gradient(x: Tensor) -> Tensor:
     if not (x.requires_grad and torch.is_grad_enabled()) or torch.compiler.is_compiling():
         return x
     x = x.view_as(x)
-    x.register_hook(_saturate)
+    largest = torch.finfo(x.dtype).max / headroom
+    # autograd hands on None for a gradient that is undefined
+    x.register_hook(lambda g: None if g is None else g.clamp(-largest, largest))
     return x
-
-
-def _saturate(gradient: Tensor | None) -> Tensor | None:
-    """Autograd hands on None for a gradient that is undefined."""
-    if gradient is None:
-        return None
-    largest = torch.finfo(gradient.dtype).max
-    return gradient.clamp(-largest, largest)

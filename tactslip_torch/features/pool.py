@@ -18,13 +18,15 @@ from tactslip_torch.features.descriptors import (
     band_energy_ratio,
     describe,
 )
-from tactslip_torch.features.guards import is_constant, is_nowhere, settle
+from tactslip_torch.features.guards import bounded_gradient, is_constant, is_nowhere, settle
 from tactslip_torch.features.names import pool_names
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names
 
 Arithmetic = Literal["double", "native"]
+GAIN = 2.0**20
+"""More than wavelet branches and spectra multiply a gradient by on its way back."""
 LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
 """Volts; what is larger counts as Inf, because its branches and spectra may leave float64."""
 
@@ -34,7 +36,7 @@ class FeaturePool(nn.Module):
 
     Holds two constant matrices, the wavelet branches and the spectrum, evaluated on an identity
     in float64 through ptwt and torch.fft. Follows the dtype and the device of its input. Gradients
-    flow wherever the descriptor is differentiable.
+    flow wherever the descriptor is differentiable; they are finite up to 1e300 V.
 
     float32 bins are computed in float64 and rounded once at the end, unless ``arithmetic`` is
     ``"native"``. In float32 throughout, entropy and mode step in other places than in float64, and
@@ -136,8 +138,9 @@ class FeaturePool(nn.Module):
     def _describe(self, bins: Tensor) -> Tensor:
         films = bins[..., self._films, :]
         scale = films.detach().abs().amax(-1)  # [*, films]
-        branches = self.branches(films)  # [*, films, branches, n]
-        spectra = self.amplitudes(branches)  # [*, films, branches, lines]
+        films = bounded_gradient(films)
+        branches = bounded_gradient(self.branches(films), GAIN)  # [*, films, branches, n]
+        spectra = bounded_gradient(self.amplitudes(branches), GAIN)  # [*, films, branches, lines]
         branch_scale = scale[..., None].expand(branches.shape[:-1])
         in_time = describe(
             branches,
