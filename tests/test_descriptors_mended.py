@@ -8,7 +8,7 @@ from test_descriptors import EVERY, measure
 
 from tactslip_torch.features import descriptors, sample
 from tactslip_torch.features.descriptors import band_energy_ratio, describe
-from tactslip_torch.features.guards import is_constant
+from tactslip_torch.features.guards import is_constant, stretch
 
 DTYPES = [torch.float64, torch.float32]
 SECOND = ["std", "cv", "skewness", "kurtosis", "peak_factor", "correlation", "spectral_spread"]
@@ -180,9 +180,33 @@ def test_ordinary_values_are_the_plain_formulas_to_the_bit(rng):
         assert torch.equal(got[:, column], values), name
 
 
-@pytest.mark.parametrize("exponent", [-320, -319, 0, 447, 449])
-def test_the_stretch_is_one_between_its_ends(exponent):
-    size = torch.tensor(2.0**exponent, dtype=torch.float64)
-    expected = -768 if exponent > 448 else 0
-    assert math.log2(sample.stretch(size)) == expected
-    assert math.log2(sample.stretch(size * 2.0**-200)) == (768 if exponent < -120 else 0)
+@pytest.mark.parametrize(("dtype", "unit"), [(torch.float64, 64), (torch.float32, 8)])
+def test_the_stretch_is_one_between_its_ends_and_leads_back_beyond(dtype, unit):
+    """A power of two everywhere, after which sizes lie between 2^-320 and 2^448 again."""
+    lowest, highest = -1074 // 64 * unit, 16 * unit - 1
+    exponent = torch.arange(lowest, highest)
+    size = torch.ldexp(torch.ones(len(exponent), dtype=dtype), exponent)
+    factor = stretch(size)
+    power = factor.log2()
+    assert torch.equal(power, power.round())
+    is_ordinary = (exponent >= -5 * unit) & (exponent <= 7 * unit)
+    assert torch.equal(power == 0, is_ordinary)
+    after = exponent + power
+    assert bool(((after >= -5 * unit) & (after <= 7 * unit)).all())
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("name", ["mean", "std", "mean_deviation", "iqr", "range"])
+def test_gradients_of_what_has_the_unit_of_x_are_the_same_at_every_size(name, dtype):
+    """Once NaN for std from 2^448 on (1e17 in float32), and 0 below 2^-320: a root of squares."""
+    x = torch.randn(40, dtype=dtype, generator=torch.Generator().manual_seed(2))
+    top = math.frexp(torch.finfo(dtype).max)[1]
+
+    def gradient(exponent):
+        scaled = torch.ldexp(x, torch.tensor(exponent)).requires_grad_()
+        describe(scaled, [name]).sum().backward()
+        return scaled.grad
+
+    expected = gradient(0)
+    for exponent in range(-top + 8, top - 8, max(1, top // 100)):
+        torch.testing.assert_close(gradient(exponent), expected, rtol=1e-5, atol=1e-7)

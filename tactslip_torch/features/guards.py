@@ -72,17 +72,23 @@ def are_ordinary(magnitude: Tensor) -> bool:
 def stretch(magnitude: Tensor) -> Tensor:
     """The power of two by which values of this magnitude are multiplied before they are squared.
 
-    1 from 2^-320 to 2^448 (float32: 2^-40 to 2^56), so ordinary values keep every bit; 2^768 (2^96)
-    below and its inverse above. Then no square overflows, and no square of a difference underflows
-    by more than rounding.
+    1 from 2^-320 to 2^448 (float32: 2^-40 to 2^56), so ordinary values keep every bit; beyond, what
+    brings them near 1. Then no square overflows, no square of a difference underflows by more than
+    rounding, and neither do the derivatives of roots of squares on their way back.
 
     Shape:
         - magnitude, output: ``[*]``
     """
+    exponent = math.frexp(torch.finfo(magnitude.dtype).max)[1]
+
+    def power(sixteenths: int) -> float:
+        return 2.0 ** (sixteenths * exponent // 16)
+
     low, high = ordinary_sizes(magnitude.dtype)
-    factor = 2.0 ** (3 * math.frexp(torch.finfo(magnitude.dtype).max)[1] // 4)
-    shrunk = torch.where(magnitude > high, 1 / factor, torch.ones_like(magnitude))
-    return torch.where(magnitude < low, factor, shrunk)
+    factor = torch.where(magnitude > high, power(-9), torch.ones_like(magnitude))
+    factor = torch.where(magnitude > power(11), power(-12), factor)
+    factor = torch.where(magnitude < low, power(8), factor)
+    return torch.where(magnitude < power(-11), power(12), factor)
 
 
 def bounded_gradient(x: Tensor, headroom: float = 1.0) -> Tensor:

@@ -36,7 +36,7 @@ class FeaturePool(nn.Module):
 
     Holds two constant matrices, the wavelet branches and the spectrum, evaluated on an identity
     in float64 through ptwt and torch.fft. Follows the dtype and the device of its input. Gradients
-    flow wherever the descriptor is differentiable; they are finite up to 1e300 V.
+    flow wherever the descriptor is differentiable; they are finite up to 1e288 V.
 
     float32 bins are computed in float64 and rounded once at the end, unless ``arithmetic`` is
     ``"native"``. In float32 throughout, entropy and mode step in other places than in float64, and
