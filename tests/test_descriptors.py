@@ -516,11 +516,17 @@ def test_band_energy_ratio_of_nan_is_nan(rng):
 # Errors --------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("dtype", [torch.int64, torch.bfloat16, torch.float16])
+def test_another_dtype_is_refused(dtype):
+    with pytest.raises(ValueError, match=f"expected float32 or float64 and a name, got {dtype}"):
+        describe(torch.ones(3, 4, dtype=dtype), ["mean"])
+
+
 def test_errors_name_what_was_passed():
     x = torch.zeros(3, 10)
     with pytest.raises(ValueError, match=r"wobble.*mean"):
         describe(x, ["mean", "wobble"])
-    with pytest.raises(ValueError, match="at least two values, got 1"):
+    with pytest.raises(ValueError, match=r"at least two values, got shape \(3, 1\)"):
         describe(x[:, :1], ["mean"])
     with pytest.raises(ValueError, match=r"correlation needs reference="):
         describe(x, ["correlation"])

@@ -1,6 +1,7 @@
 """Scores with their validity, and what becomes of NaN and Inf."""
 
 import copy
+import warnings
 
 import pytest
 import torch
@@ -202,3 +203,63 @@ def test_widening_happens_once_and_before_the_filter(detector):
 def test_an_unknown_arithmetic_is_refused(detector):
     with pytest.raises(ValueError, match="arithmetic must be one of double, native, got 'half'"):
         FeaturePool(detector.pool.hand, arithmetic="half")
+
+
+# Found by review --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arithmetic", ["double", "native"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("bad", BAD[:3])
+def test_filtered_bins_with_a_broken_channel(bad, dtype, arithmetic):
+    """Once NaN and not missing, for Inf in float32: the limit itself was rounded to Inf."""
+    detector = random_detector()
+    detector.pool.arithmetic = arithmetic
+    bins = detector.channel_filter.valid(noise(3)).to(dtype)
+    bins[0, used_channel(detector)] = bad
+    bins[1, used_channel(detector), 5] = bad
+    judged = detector.judge(bins)
+    assert judged.score.isfinite().all()
+    assert judged.is_missing[:, used_channel(detector)].tolist() == [True, True, False]
+    assert judged.is_valid.tolist() == [False, False, True]
+
+
+def test_a_head_that_overflows_is_not_valid():
+    detector = random_detector()
+    detector.head.quadratic *= 1e40
+    judged = detector.float().judge_raw(noise(4).float())
+    assert not judged.is_valid[~judged.score.isfinite()].any()
+    assert not judged.score.isfinite().all()
+
+
+@pytest.mark.parametrize("policy", ["mask", "raise"])
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        (torch.zeros(2, 24, 150, dtype=torch.int64), "float32 or float64 .*, got torch.int64"),
+        (torch.full((2, 25, 150), torch.nan), r"24, .*got \(2, 25, 150\)"),
+        (torch.full((150,), torch.nan), r"24, .*got \(150,\)"),
+    ],
+)
+def test_what_are_no_samples_of_this_hand_is_refused_in_words(samples, message, policy, detector):
+    with pytest.raises(ValueError, match=message):
+        detector.judge_raw(samples, nonfinite=policy)
+    with pytest.raises(ValueError, match=message.replace("150", "100")):
+        detector.judge(samples[..., :100], nonfinite=policy)
+
+
+def test_gradients_of_denormal_samples_are_finite(detector):
+    samples = noise(2) * 1e-311
+    samples.requires_grad_()
+    detector.score_raw(samples).sum().backward()
+    assert samples.grad.isfinite().all()
+
+
+def test_a_trace_holds_for_other_bins(detector):
+    """Once the sorted values and the look at extremes of the traced bins went into the graph."""
+    pool, bins = detector.pool, detector.channel_filter.valid(noise(2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # tracing is deprecated, and says so
+        traced = torch.jit.trace(pool, bins, check_trace=False)
+        for other in (detector.channel_filter.valid(noise(2, seed=5)), torch.zeros_like(bins)):
+            torch.testing.assert_close(traced(other), pool(other), rtol=1e-6, atol=1e-6)

@@ -74,7 +74,7 @@ def mode(sample: Sample) -> Tensor:
     rounding. The result is the first value of the longest run. Not differentiable where the
     longest run changes; elsewhere the gradient is that of the value returned.
     """
-    tolerance = RUN_TOLERANCE.get(sample.x.dtype, 2.0**-8) * sample.in_unit(sample.scale)
+    tolerance = RUN_TOLERANCE[sample.x.dtype] * sample.in_unit(sample.scale)
     rank = rank_in_run(sample.gaps > tolerance[..., None])
     last = rank.argmax(-1, keepdim=True)  # the first maximum: the end of the first longest run
     return sample.ordered.gather(-1, last - rank.gather(-1, last).long()).squeeze(-1)
@@ -149,7 +149,7 @@ def entropy(sample: Sample) -> Tensor:
     """
     least = sample.in_unit(sample.smallest.detach())[..., None]
     levels = (ENTROPY_LEVELS / sample.safe_span)[..., None]
-    half = 0.5 + HALF_SLACK.get(sample.x.dtype, 0.0)
+    half = 0.5 + HALF_SLACK[sample.x.dtype]
     level = ((sample.ranked - least) * levels + half).floor()
     # the maximum always has the top level, so the second highest level joins it
     new_cell = (level[..., 1:] != level[..., :-1]) & (level[..., 1:] != ENTROPY_LEVELS)
@@ -264,7 +264,8 @@ def describe(
         - output: ``[*, len(names)]``
 
     Raises:
-        ValueError: for an unknown name, fewer than two values, or a missing argument.
+        ValueError: for an unknown name or none, fewer than two values, another dtype than float32
+            and float64, or a missing argument.
 
     Example:
         >>> describe(torch.tensor([1.0, 2.0, 2.0, 5.0]), ["mean", "mode", "range"])
@@ -273,8 +274,10 @@ def describe(
     unknown = [name for name in names if name not in _DESCRIPTORS]
     if unknown:
         raise ValueError(f"unknown descriptors {unknown}; known are {', '.join(_DESCRIPTORS)}")
-    if x.shape[-1] < 2:
-        raise ValueError(f"a sample needs at least two values, got {x.shape[-1]}")
+    if not names or x.dtype not in RUN_TOLERANCE:
+        raise ValueError(f"expected float32 or float64 and a name, got {x.dtype} and {names}")
+    if not x.ndim or x.shape[-1] < 2:
+        raise ValueError(f"a sample needs at least two values, got shape {tuple(x.shape)}")
     sample = Sample(x, scale, None if reference is None else Sample(reference), frequency_hz)
     values = torch.stack([_DESCRIPTORS[name](sample) for name in names], dim=-1)
     if sample.is_ordinary:

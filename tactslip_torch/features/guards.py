@@ -48,9 +48,15 @@ def is_nowhere(mask: Tensor) -> bool:
     return values is not None and not values.any()
 
 
+def is_recorded() -> bool:
+    """Whether what runs is being written down as a graph, in which no value may be looked at."""
+    is_traced = torch.jit.is_tracing()  # type: ignore[attr-defined,no-untyped-call]
+    return bool(is_traced or torch.compiler.is_compiling())
+
+
 def looked_at(x: Tensor) -> np.ndarray[Any, Any] | None:
     """The values, if a decision may be taken on them: in eager mode, on a CPU, at least one."""
-    if x.device.type == "cpu" and x.numel() and not torch.compiler.is_compiling():
+    if x.device.type == "cpu" and x.numel() and not is_recorded():
         with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
             return x.detach().numpy()
     return None
@@ -105,7 +111,7 @@ def bounded_gradient(x: Tensor, headroom: float = 1.0) -> Tensor:
     Shape:
         - x, output: ``[*]``
     """
-    if not (x.requires_grad and torch.is_grad_enabled()) or torch.compiler.is_compiling():
+    if not (x.requires_grad and torch.is_grad_enabled()) or is_recorded():
         return x
     x = x.view_as(x)
     largest = torch.finfo(x.dtype).max / headroom

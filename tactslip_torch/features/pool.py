@@ -27,6 +27,8 @@ from tactslip_torch.signals.wavelet import branch_matrix, branch_names
 Arithmetic = Literal["double", "native"]
 GAIN = 2.0**20
 """More than wavelet branches and spectra multiply a gradient by on its way back."""
+NATIVE_SPAN = 2.0**-10
+"""Part of a film's magnitude; in float32 throughout, less may be lost in a branch."""
 LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
 """Volts; what is larger counts as Inf, because its branches and spectra may leave float64."""
 
@@ -122,18 +124,19 @@ class FeaturePool(nn.Module):
             ValueError: if the number of channels or samples is another, or bins are neither float32
                 nor float64.
         """
-        self._check(bins)
+        self.check(bins)
         return saturating(self._describe(self.widen(bins)), bins.dtype)
 
     def widen(self, x: Tensor) -> Tensor:
-        """Samples in the dtype that features are computed in; filter after it, not before."""
-        if self.arithmetic == "native" or x.dtype == torch.float64:
-            return x
-        wide = x.double()
-        if wide.requires_grad:  # what flows back is rounded to the dtype of the samples
-            most = torch.finfo(x.dtype).max
-            wide.register_hook(lambda gradient: gradient.clamp(-most, most))
-        return wide
+        """Samples in the dtype that features are computed in; filter after it, not before.
+
+        Raises:
+            ValueError: if they are neither float32 nor float64.
+        """
+        if x.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"expected float32 or float64 samples in volts, got {x.dtype}")
+        x = bounded_gradient(x)
+        return x if self.arithmetic == "native" else x.double()
 
     def _describe(self, bins: Tensor) -> Tensor:
         films = bins[..., self._films, :]
@@ -209,7 +212,7 @@ class FeaturePool(nn.Module):
             - bins: ``[N, C, n]``
             - output: ``[N, F]``
         """
-        self._check(bins)
+        self.check(bins)
         if not len(bins):
             return bins.new_empty(0, len(self.names))
         return torch.cat([self(chunk) for chunk in bins.split(chunk_bins)])
@@ -218,7 +221,8 @@ class FeaturePool(nn.Module):
         """Which channels can be trusted.
 
         False where a channel holds a NaN or Inf (``is_missing``) or its span is within 64 eps of
-        its magnitude (a dead sensor, or a vibration the dtype cannot resolve).
+        its magnitude (a dead sensor, or a vibration the dtype cannot resolve). In native float32 a
+        film's span must be a thousandth of it, for its branches to survive.
 
         Shape:
             - bins: ``[*, C, n]``
@@ -227,11 +231,16 @@ class FeaturePool(nn.Module):
         Raises:
             ValueError: as ``forward``.
         """
-        self._check(bins)
+        self.check(bins)
         high, low = bins.amax(-1), bins.amin(-1)
         magnitude = torch.maximum(high, -low)
-        span_in_eps = (high - low) * (1 / (64 * torch.finfo(bins.dtype).eps))  # never underflows
-        return (span_in_eps > magnitude) & ~self.is_missing(bins)
+        least = [64 * torch.finfo(bins.dtype).eps] * len(self.hand)
+        if self.arithmetic == "native" and bins.dtype == torch.float32:
+            for film in self._films:
+                least[film] = NATIVE_SPAN
+        inverse = 1 / torch.tensor(least, dtype=bins.dtype, device=bins.device)
+        is_alive = (high - low) * inverse > magnitude  # so that nothing underflows
+        return is_alive & ~self.is_missing(bins)
 
     def is_missing(self, bins: Tensor) -> Tensor:
         """Which channels hold a NaN or Inf, or a sample beyond ``LARGEST_SAMPLE``.
@@ -241,7 +250,8 @@ class FeaturePool(nn.Module):
             - output: ``[*, C]``, bool
         """
         # sample by sample: onnxruntime's maxima pass over NaN
-        return (~(bins.abs() <= LARGEST_SAMPLE)).any(-1)
+        largest = min(LARGEST_SAMPLE, torch.finfo(bins.dtype).max)
+        return (~(bins.abs() <= largest)).any(-1)
 
     def _of_gauges(self, bins: Tensor) -> Tensor:
         gauges = bins[..., self._gauges, :]
@@ -254,7 +264,12 @@ class FeaturePool(nn.Module):
             return constant.to(like.device)
         return constant.to(like)
 
-    def _check(self, bins: Tensor) -> None:
+    def check(self, bins: Tensor) -> None:
+        """Refuse what are no bins of this hand.
+
+        Raises:
+            ValueError: as ``forward``.
+        """
         if bins.ndim < 2 or bins.shape[-2:] != (len(self.hand), self.bin_samples):
             raise ValueError(
                 f"expected bins [*, {len(self.hand)}, {self.bin_samples}] (channels, samples), "

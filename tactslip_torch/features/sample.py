@@ -16,7 +16,13 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from tactslip_torch.features.guards import bounded_gradient, looked_at, ordinary_sizes, stretch
+from tactslip_torch.features.guards import (
+    bounded_gradient,
+    is_recorded,
+    looked_at,
+    ordinary_sizes,
+    stretch,
+)
 
 
 class Sample:
@@ -47,7 +53,7 @@ class Sample:
     def ordered(self) -> Tensor:
         """Sorted values, ``[*, n]``; NumPy's vectorised sort where no derivative is asked for."""
         x = self.x
-        if x.device.type == "cpu" and not (x.requires_grad or torch.compiler.is_compiling()):
+        if x.device.type == "cpu" and not (x.requires_grad or is_recorded()):
             has_tangent = forward_ad.unpack_dual(x).tangent is not None
             with contextlib.suppress(RuntimeError):  # under vmap there is no memory to look at
                 if not has_tangent:

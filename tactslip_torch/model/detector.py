@@ -34,9 +34,8 @@ EARLIER_FORMAT = "tactslip_torch detector 1"
 class SlipDetector(nn.Module):
     """The fitted pipeline from filtered or raw samples to a score.
 
-    Of float32 bins too, features are computed and scaled in float64 (``FeaturePool.arithmetic``):
-    offsets cancel there. The head works in the dtype of the detector, float64 as fitted;
-    ``detector.float()`` for float32.
+    Features are computed and scaled in float64, of float32 bins too (``FeaturePool.arithmetic``);
+    the head works in the dtype of the detector, float64 as fitted.
 
     Args:
         pool: what features there are, F of C channels.
@@ -45,8 +44,7 @@ class SlipDetector(nn.Module):
         scaler: of the selected features.
         head: the machine on scaled features.
         info: JSON-able facts about the training, kept in the file.
-        typical: scaled features that stand in for those of a missing channel, such as the mean of
-            the training bins; default 0, the middle of their range.
+        typical: scaled features that stand in for those of a missing channel; default 0.
 
     Shape:
         - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
@@ -60,8 +58,8 @@ class SlipDetector(nn.Module):
 
     typical: Tensor
     _selected_index: Tensor
-    _channel_index: Tensor
-    _needed_index: Tensor
+    _channel_index: Tensor  # of each selected feature
+    _needed_index: Tensor  # of the channels in use
 
     def __init__(
         self,
@@ -160,13 +158,15 @@ class SlipDetector(nn.Module):
             ValueError: if the number of channels or samples is another, or under ``"raise"`` for
                 a NaN or Inf, naming bin, channel and sample.
         """
+        self.pool.check(bins)
         check_nonfinite(nonfinite, bins, self.pool.hand.names)
         return self._judge(bins, bins)
 
     def judge_raw(self, samples: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
         """``judge`` for raw bins that come with ``context`` samples on each side.
 
-        A NaN or Inf in the context of a bin makes the channel missing as well.
+        A NaN or Inf in the context of a bin makes the channel missing as well, if the frame of its
+        filter reaches that far; under ``"raise"`` any is refused.
 
         Shape:
             - samples: ``[*, C, n + 2 * context]``, volts
@@ -174,19 +174,16 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: as ``judge``.
         """
-        check_nonfinite(nonfinite, samples, self.pool.hand.names)
         bins = self._filter(samples)
+        check_nonfinite(nonfinite, samples, self.pool.hand.names)
         return self._judge(bins, bins.to(samples.dtype))  # sensors resolve no more than they give
 
     def validity(self, bins: Tensor) -> Tensor:
-        """Whether every channel the score depends on can be trusted (``FeaturePool.validity``).
+        """Whether every channel in use can be trusted (``FeaturePool.validity``), as ``judge``.
 
         Shape:
             - bins: ``[*, C, n]``, filtered
             - output: ``[*]``, bool
-
-        Raises:
-            ValueError: as ``forward``.
         """
         return self._needed(self.pool.validity(bins))
 
@@ -202,6 +199,7 @@ class SlipDetector(nn.Module):
 
     def _judge(self, bins: Tensor, given: Tensor) -> Judgement:
         """Scores of filtered bins, valid by the dtype they were given in, which is the score's."""
+        bins = self.pool.widen(bins)
         is_missing = self.pool.is_missing(bins)
         is_whole = is_nowhere(is_missing)
         if not is_whole:
@@ -211,7 +209,8 @@ class SlipDetector(nn.Module):
             is_typical = is_missing.index_select(-1, self._channel_index)
             scaled = torch.where(is_typical, self.typical, scaled)
         score = saturating(self.head(scaled), given.dtype)
-        return Judgement(score, self._needed(self.pool.validity(given)), is_missing)
+        is_valid = self._needed(self.pool.validity(given)) & score.isfinite()
+        return Judgement(score, is_valid, is_missing)
 
     def _filter(self, samples: Tensor) -> Tensor:
         return self.channel_filter.valid(self.pool.widen(samples))
@@ -225,7 +224,7 @@ class SlipDetector(nn.Module):
         return scaled.to(self.typical.dtype)
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SlipDetector:
-        """What ``float()`` and ``to()`` do to every tensor; ranges of features stay as they are."""
+        """``float()`` and ``to()``: ranges of features stay float64, as offsets cancel there."""
         exact = dict(self.scaler.named_buffers())
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch has no annotations
         for name, value in exact.items():

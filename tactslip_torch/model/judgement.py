@@ -16,8 +16,9 @@ class Judgement(NamedTuple):
     """Scores, and whether they can be relied on.
 
     Attributes:
-        score: ``[*]``, finite; at least 0 means slip.
-        is_valid: ``[*]``, bool: every channel that the score depends on can be trusted.
+        score: ``[*]``, at least 0 means slip; finite, unless the head overflows its dtype.
+        is_valid: ``[*]``, bool: every channel that the score depends on can be trusted, and the
+            score is finite.
         is_missing: ``[*, C]``, bool: the channel holds a NaN or Inf and was left out.
     """
 
