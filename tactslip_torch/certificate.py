@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.rounding import gradient_norms, head_facts
+from tactslip_torch.model.rounding import error_facts, gradient_facts, head_facts
 from tactslip_torch.signals.coverage import Coverage, KnownInputs, coverage
 from tactslip_torch.signals.finite import refuse_nonfinite
 from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
@@ -25,6 +25,7 @@ from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 FACTOR = 4
 WORST_SD = 1e-3  # largest score error allowed on recordings, in standard deviations of the score
 INSIDE_SHARE = 0.01  # fewer of the held-out bins may lie inside the margin
+LARGEST_RATIO = 1e4  # a bound further above the worst error seen says too little
 RULE = f"{FACTOR} x the worst error on calibration bins, plus the bound of the head if it has one"
 VALIDITY = "every channel in use is finite, and its filtered span above 64 eps of its magnitude"
 _CHUNK_BINS, _GRADIENT_BINS = 16, 128
@@ -174,23 +175,21 @@ def certify(
         - calibration, held_out: ``[N, C, n + 2 * context]``, volts, finite
 
     Raises:
-        ValueError: if a set is empty or not finite, or all calibration bins score the same.
+        ValueError: if a set is empty or not finite, has a name that the certificate uses itself, or
+            calibration scores are not finite or all the same.
     """
-    sets = {
-        name: compare(detector, bins, name, watch)
-        for name, bins in {"calibration": calibration, **(held_out or {})}.items()
-    }
+    given = {"calibration": calibration} | dict(held_out or {})
+    if taken := sorted({"calibration", *EXTREMES} & {*(held_out or {})}):
+        raise ValueError(f"a held-out set may not be named {taken[0]!r}, a name of our own; rename")
+    sets = {name: compare(detector, bins, name, watch) for name, bins in given.items()}
+    base = sets["calibration"]
+    sd = _score_sd(base.exact)
     generator = torch.Generator().manual_seed(seed)
     size = (extremes, *calibration.shape[1:])
     kinds = {
         kind: compare(detector, extreme_bins(kind, size, generator, torch.float32), kind)
         for kind in watch(EXTREMES, "extremes", "kinds")
     }
-    base = sets["calibration"]
-    sd = float(base.exact.std()) if len(base.exact) > 1 else 0.0
-    if not 0 < sd < math.inf:
-        found = f"{len(base.exact)} calibration bins have scores of standard deviation {sd:g}"
-        raise ValueError(f"{found}; give more bins, of both classes")
     head = head_facts(detector.head, base.scaled, seed)
     worst = float(base.error.max())
     margin = (head["bound"] or 0.0) + FACTOR * worst
@@ -198,10 +197,6 @@ def certify(
     known = KnownInputs(base.covers, kinds_of, {n.channel for n in detector.selected_names})
     double = copy.deepcopy(detector).double()
     thinned = calibration[:: -(-len(calibration) // _GRADIENT_BINS)].double()
-    slopes = {
-        "per_scaled_feature": gradient_norms(double.head, base.scaled),
-        "per_volt": gradient_norms(double.score_raw, thinned),
-    }
     content: dict[str, Any] = {
         "simulated": simulated,
         "seed": seed,
@@ -220,8 +215,8 @@ def certify(
         "condition_numbers": {
             "solve": detector.info.get("solve", "not recorded"),
             "score": {
-                name: {"largest": float(x.max()), "median": float(x.median()), "bins": len(x)}
-                for name, x in slopes.items()
+                "per_scaled_feature": gradient_facts(double.head, base.scaled),
+                "per_volt": gradient_facts(double.score_raw, thinned),
             },
         },
         "range": known.facts() | {"validity": VALIDITY},
@@ -229,6 +224,19 @@ def certify(
     content["conditions"] = _conditions(content)
     content["holds"] = all(row["holds"] is not False for row in content["conditions"])
     return Certificate(content, sets | kinds)
+
+
+def _score_sd(scores: Tensor) -> float:
+    """Standard deviation of the calibration scores, or what is wrong with them."""
+    num, sd = len(scores), float(scores.std()) if len(scores) > 1 else 0.0
+    if num_bad := int((~scores.isfinite()).sum()):
+        bad = f"scores of {num_bad} of {num} calibration bins are not finite in float64"
+        raise ValueError(f"{bad}; the head is broken, fit it again")
+    if not 0 < sd < math.inf:
+        found = f"{num} calibration bins have scores of standard deviation {sd:g}"
+        cure = "give more bins, of both classes" if sd == 0 else "scale the head down, or fit again"
+        raise ValueError(f"{found}; {cure}")
+    return sd
 
 
 def _set_facts(
@@ -243,9 +251,9 @@ def _set_facts(
         "invalid": int((~compared.is_valid).sum()),
         "outside_range": int((~known.cover(compared.covers)).sum()),
         "not_finite": int((~compared.rounded.isfinite()).sum()),
-        "error": _error_facts(compared.error, sd),
-        "error_of_valid": _error_facts(compared.error[compared.is_valid], sd),
-        "stages": {name: _error_facts(x.abs(), sd) for name, x in compared.stages.items()},
+        "error": error_facts(compared.error, sd),
+        "error_of_valid": error_facts(compared.error[compared.is_valid], sd),
+        "stages": {name: error_facts(x.abs(), sd) for name, x in compared.stages.items()},
         "worst_feature": {
             "name": str(detector.selected_names[int(worst)]),
             "scaled_error": float(by_feature[worst]),
@@ -257,16 +265,6 @@ def _set_facts(
             "outside_margin_valid": int((outside & compared.is_valid).sum()),
         },
     }
-
-
-def _error_facts(error: Tensor, sd: float) -> dict[str, float | None]:
-    """Worst, 99th percentile and median, in units of the score and of its standard deviation."""
-    if not len(error):
-        return dict.fromkeys(("worst", "p99", "median", "worst_sd", "p99_sd", "median_sd"))
-    shares = torch.tensor([1.0, 0.99, 0.5], dtype=error.dtype)
-    worst, p99, median = error.quantile(shares, interpolation="higher").tolist()
-    found = {"worst": worst, "p99": p99, "median": median}
-    return found | {f"{name}_sd": value / sd for name, value in found.items()}
 
 
 def _conditions(content: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -283,6 +281,8 @@ def _conditions(content: Mapping[str, Any]) -> list[dict[str, Any]]:
     if bound is not None:  # what it is compared with is rounded as well
         within = seen <= bound + head["reference_bound"] and not head["overflows"]
     check("error of the head, worst seen", seen, wanted, within)
+    tight = None if head["ratio"] is None else head["ratio"] <= LARGEST_RATIO
+    check("bound of the head / worst seen", head["ratio"], f"<= {LARGEST_RATIO:g}", tight)
     for name, facts in content["sets"].items():
         worst = facts["error"]["worst_sd"]
         check(f"{name}: worst error, sd", worst, f"<= {WORST_SD:g}", worst <= WORST_SD)

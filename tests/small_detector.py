@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from tactslip_torch.certificate import certify
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
@@ -51,3 +52,27 @@ def small_detector(
         middle = -machine(centre).median()  # so that both decisions occur
         machine = QuadraticForm(bend + bend.T, linear, middle)
     return SlipDetector(pool, channel_filter, selected, scaler, machine, {"simulated": True})
+
+
+class Lying(QuadraticForm):
+    """Its float32 score has the other sign where the first feature is above ``threshold``."""
+
+    threshold = 0.0
+
+    def forward(self, z):
+        score = super().forward(z)
+        lies = (z[..., 0] > self.threshold) & (z.dtype == torch.float32)
+        return torch.where(lies, -score, score)
+
+
+def lying_detector(threshold):
+    detector = small_detector()
+    head = detector.head
+    detector.head = Lying(head.quadratic, head.linear, head.constant)
+    detector.head.threshold = threshold
+    return detector
+
+
+def certified(detector, num_bins=48, held_out=None, **options):
+    options = {"simulated": True, "extremes": 6} | options
+    return certify(detector, raw_bins(num_bins), held_out, **options)

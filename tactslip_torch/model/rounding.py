@@ -219,6 +219,34 @@ def gradient_norms(function: Callable[[Tensor], Tensor], points: Tensor, chunk: 
     norms = []
     for part in points.split(chunk):
         given = part.detach().clone().requires_grad_()
-        (slope,) = torch.autograd.grad(function(given).sum(), given)
+        with torch.enable_grad():  # the caller may have turned it off
+            value = function(given).sum()
+        (slope,) = torch.autograd.grad(value, given)
         norms.append(torch.linalg.vector_norm(slope.flatten(1), dim=-1))
     return torch.cat(norms)
+
+
+def gradient_facts(function: Callable[[Tensor], Tensor], points: Tensor) -> dict[str, float | int]:
+    """Largest and median of ``gradient_norms``, and over how many bins."""
+    norms = gradient_norms(function, points)
+    return {"largest": float(norms.max()), "median": float(norms.median()), "bins": len(norms)}
+
+
+def error_facts(error: Tensor, sd: float) -> dict[str, float | None]:
+    """Worst, 99th percentile and median, in units of the score and of its standard deviation.
+
+    ``None`` for each if there is no error to tell of.
+
+    Args:
+        error: sizes of score errors, infinite where a score is not finite.
+        sd: standard deviation of the score.
+
+    Shape:
+        - error: ``[N]``
+    """
+    if not len(error):
+        return dict.fromkeys(("worst", "p99", "median", "worst_sd", "p99_sd", "median_sd"))
+    shares = torch.tensor([1.0, 0.99, 0.5], dtype=error.dtype)
+    worst, p99, median = error.quantile(shares, interpolation="higher").tolist()
+    found = {"worst": worst, "p99": p99, "median": median}
+    return found | {f"{name}_sd": value / sd for name, value in found.items()}
