@@ -42,6 +42,7 @@ FORMAT = "tactslip_torch certificate 1"
 EXIT_DOES_NOT_HOLD = 1
 PER_RECORDING = 40
 """Bins drawn from a recording, more where there are too few recordings."""
+_PAST_LARGEST = 2**63
 
 
 def certify(config: DictConfig) -> tuple[dict[str, Any], Path]:
@@ -57,12 +58,14 @@ def certify(config: DictConfig) -> tuple[dict[str, Any], Path]:
         ValueError: for bad input, in one line.
         FileNotFoundError: if there is no such detector.
     """
+    for name, least in (("bins", 1), ("judged_bins", 1), ("extremes", 1), ("seed", 0)):
+        if type(config[name]) is not int or not least <= config[name] < _PAST_LARGEST:
+            wanted = f"a whole number from {least} on, below 2^63"
+            raise ValueError(f"{name} must be {wanted}, got {config[name]!r}")
     detector = SlipDetector.load(config.model)
     folder = Path(config.out) if config.out else Path(config.model).parent
+    _refuse_unwritable(folder)
     _refuse_foreign(folder)
-    for name in ("bins", "judged_bins", "extremes"):
-        if not config[name] >= 1:
-            raise ValueError(f"{name} must be at least 1, got {config[name]}")
     source: RecordingSource = instantiate(config.data, _convert_="all")
     rule: LabelRule = instantiate(config.labels)
     maker = FeatureMaker(source, detector.pool, detector.channel_filter, rule)
@@ -202,6 +205,13 @@ def _origin(
             "code": source_digest(Path(tactslip_torch.__file__).parent),
         },
     }
+
+
+def _refuse_unwritable(folder: Path) -> None:
+    """Raise if there is a file where the folder, or one around it, would be."""
+    path = next(path for path in (folder, *folder.parents) if path.exists())
+    if not path.is_dir():
+        raise ValueError(f"{path} is a file, out= must be a folder; give another")
 
 
 def _refuse_foreign(folder: Path) -> None:

@@ -29,9 +29,10 @@ def verdict(content: Mapping[str, Any]) -> str:
         return f"Does not hold: {found}{others}{kind}"
     margin = content["margin"]
     measured = ", as measured: this head has no bound" if content["head"]["bound"] is None else ""
+    judged = "" if len(content["sets"]) > 1 else "; no held-out bins were judged"
     return (
         f"Holds: float32 decides as float64 does where |score| exceeds {margin['score']:.1e}, "
-        f"{100 * margin['sd']:.2g} % of its standard deviation{measured}{kind}"
+        f"{100 * margin['sd']:.2g} % of its standard deviation{measured}{judged}{kind}"
     )
 
 
