@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 import torch
 
+from tactslip_torch.model import fit
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.held_out import MOST_CONDITION, HeldOut
+from tactslip_torch.model.kernel_elm import solve_primal
 from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, RadialBasis
 from tactslip_torch.model.sufficient import SufficientStats
 
@@ -167,6 +169,33 @@ def test_from_one_feature_to_all_of_them(num_features, penalty):
     actual = machine(torch.from_numpy(np.r_[z, new])).numpy()
     tolerance = 16 * machine.solved.error * np.abs(expected).max()
     np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_bin_that_weighs_1e14_does_not_drown_the_others(degree, rng, monkeypatch):
+    """X'WX holds bins of weight 1 to 2 % beside it, behind any jitter; the dual holds all."""
+    z, targets = rng.uniform(-1, 1, (40, 3)), rng.choice([-1.0, 1.0], 40)
+    weights = np.ones(40)
+    weights[3] = 1e14
+    tensors = torch.from_numpy(z), torch.from_numpy(targets > 0), torch.from_numpy(weights)
+    bins, paper = TrainingBins(*tensors), Polynomial(degree, 0.5)
+    with mpmath.workdps(80):
+        half, rows = mpmath.mpf(0.5), [exactly(row) for row in z]
+        gram = [[(mpmath.fdot(u, v) + half) ** degree for v in rows] for u in rows]
+        expected = scores_of(gram, gram, targets, weights, 1.0)
+    actual = fit_machine(bins, 1.0, paper)(tensors[0]).numpy()
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9)
+    refused = r"weights from 1\.0e\+00 to 1\.0e\+14 .* loses [2-9]e-02 of the lightest bin"
+    with pytest.raises(ValueError, match=refused):
+        fit_machine(bins, 1.0, paper, route="primal")
+    with pytest.raises(ValueError, match=refused):
+        solve_primal(tensors[0], torch.from_numpy(targets), 1.0, tensors[2])
+    with pytest.raises(ValueError, match="condition"):
+        HeldOut(bins, torch.arange(40) // 4, paper, route="primal").at(1.0)
+    monkeypatch.setattr(fit, "_MOST_DUAL", 39)
+    with pytest.raises(ValueError, match=refused):
+        fit_machine(bins, 1.0, paper)
+    assert fit_machine(bins, 1e-13, paper, route="primal").solved.method == "cholesky"
 
 
 @pytest.mark.parametrize("kernel", [Polynomial(3), RadialBasis(0.5), Polynomial(1, 0.5)], ids=str)

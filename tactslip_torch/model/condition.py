@@ -23,6 +23,8 @@ from torch import Tensor
 from tactslip_torch.model.cholesky import cholesky_solve, forward_solve
 from tactslip_torch.threads import for_each
 
+LARGEST_ERROR_FROM_FLOAT32 = 1e-2  # of a solution whose matrix came in float32
+_EPS = torch.finfo(torch.float64).eps
 _ROWS = 256  # that one thread sums at a time
 _WIDTH = 512  # columns at a time: what fits a cache
 
@@ -168,3 +170,47 @@ def inverse_growth(factor: Tensor, scale: Tensor, solution: Tensor) -> float:
         return 0.0
     half = forward_solve(factor, (scale * (turned / size))[:, None])
     return float(torch.linalg.vector_norm(half)) ** 2
+
+
+def condition_of(matrix: Tensor, factor: Tensor) -> float:
+    """Estimate for a positive definite matrix scaled to a diagonal of ones, from its factor.
+
+    Shape:
+        - matrix, factor: ``[n, n]``, row-major; only their lower triangles are read
+    """
+    scale = matrix.diagonal().sqrt()
+    return scaled_norm(matrix, scale) * inverse_norm(factor, scale)
+
+
+def conditions_of(system: Tensor, factor: Tensor, info: Tensor) -> list[float]:
+    """Of each matrix of a batch; infinite where its factorisation failed."""
+    num = system.shape[-1]
+    return [
+        math.inf if failed else condition_of(matrix, lower.contiguous())
+        for matrix, lower, failed in zip(
+            system.reshape(-1, num, num).cpu(),
+            factor.reshape(-1, num, num).cpu(),
+            info.reshape(-1).tolist(),
+            strict=True,
+        )
+    ]
+
+
+def check_spectrum(values: Tensor, noise: float, eps: float, name: str) -> None:
+    """That a matrix is positive semi-definite and, in float32, tells what is kept of it."""
+    top, low = values.amax(-1, keepdim=True), values.amin(-1, keepdim=True)
+    wrong = (low < -10 * noise * top.clamp(min=0)).flatten()
+    if bool(wrong.any()):
+        place = int(wrong.nonzero()[0])
+        raise ValueError(
+            f"{name} is not positive semi-definite: it has the eigenvalue "
+            f"{float(low.flatten()[place]):.3g} beside {float(top.flatten()[place]):.3g}; it must "
+            "be a sum of squares"
+        )
+    least = torch.where(values > noise * top, values, top).amin(-1, keepdim=True)
+    if eps > _EPS and bool((eps * top > LARGEST_ERROR_FROM_FLOAT32 * least).any()):
+        condition = float((top / least).max())
+        raise ValueError(
+            f"{name} at penalty=inf has condition {condition:.1e}, too much for a matrix in "
+            "float32; make it in float64, or lower the penalty"
+        )

@@ -14,6 +14,9 @@ from torch import Tensor
 from tactslip_torch.model.cholesky import from_above
 from tactslip_torch.model.fourth_moments import ProductSums, add_products_, normal_matrix
 from tactslip_torch.model.kernel_elm import (
+    LARGEST_LOSS,
+    check_spread,
+    lost_in_sums,
     solve_kernel_elm_,
     solve_normal_equations_,
 )
@@ -34,6 +37,7 @@ Progress = Callable[[Iterable[int], str], Iterable[int]]
 """Wraps a range so that its progress shows; gets the range and what is being done."""
 
 CHUNK_BINS = 2048
+_MOST_DUAL = 16_384  # bins whose Gram matrix (2 GiB) is worth keeping the light ones
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,8 @@ def fit_machine(
     Through the primal or the dual, whichever ``takes_dual`` finds cheaper; both give the same
     machine. The primal takes one matrix of monomials by monomials (7381 for 120 features) whatever
     the number of bins; the dual takes one of bins by bins. In float64, and however close to
-    singular (``symmetric_solve``); ``solved`` of the machine says how it went.
+    singular (``symmetric_solve``); ``solved`` of the machine says how it went. Weights so far apart
+    that sums of the primal would lose the lightest bin take the dual up to 16384 bins.
 
     Args:
         bins: scaled training bins; float32 is promoted exactly.
@@ -98,17 +103,14 @@ def fit_machine(
         route: ``"auto"``, or the one to take.
 
     Raises:
-        ValueError: if a number is not finite, or the primal is asked of a kernel that does not
-            fold.
+        ValueError: if a number is not finite, the primal is asked of a kernel that does not fold,
+            or it would lose the lightest bin to rounding.
     """
     if route not in ("auto", "primal", "dual"):
         raise ValueError(f"route must be 'auto', 'primal' or 'dual', got {route!r}")
     bins = bins.double()
-    num_bins, num_features = bins.features.shape
     if isinstance(kernel, Polynomial) and kernel.collapses:
-        if route == "primal" or (
-            route == "auto" and not takes_dual(kernel, num_bins, num_features)
-        ):
+        if not _goes_dual(bins, penalty, kernel, route):
             solve = _solve_linear_primal if kernel.degree == 1 else _solve_quadratic_primal
             return solve(bins, penalty, kernel.offset, progress)
     elif route == "primal":
@@ -142,6 +144,21 @@ def takes_dual(kernel: Kernel, num_bins: int, num_features: int) -> bool:
         return num_bins <= num_features + 1
     sums = math.comb(num_features + 4, 4) * num_bins
     return num_bins**3 <= num_quadratic_features(num_features) ** 3 + 6 * sums
+
+
+def _goes_dual(bins: TrainingBins, penalty: float, kernel: Polynomial, route: Route) -> bool:
+    """Whether the dual is asked for, cheaper, or needed: sums would lose the lightest bin."""
+    num_bins, num_features = bins.features.shape
+    if route == "dual" or (route == "auto" and takes_dual(kernel, num_bins, num_features)):
+        return True
+    if bins.weights is None or not penalty > 0:
+        return False
+    longest = float(bins.features.square().sum(-1).max())
+    spread = bins.weights, penalty, (longest + kernel.offset) ** kernel.degree
+    if route == "auto" and num_bins <= _MOST_DUAL and lost_in_sums(*spread) > LARGEST_LOSS:
+        return True
+    check_spread(*spread)
+    return False
 
 
 def _solve_linear_primal(

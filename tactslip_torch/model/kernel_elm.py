@@ -16,13 +16,14 @@ from torch import Tensor
 
 from tactslip_torch.model.cholesky import check_finite
 from tactslip_torch.model.symmetric_solve import (
-    LARGEST_ERROR_FROM_FLOAT32,
     Solution,
-    condition_of,
+    check_spectrum,
+    conditions_of,
     largest_condition,
     solve_symmetric_,
 )
 
+LARGEST_LOSS = 1e-3  # of what the lightest bin says, in a sum with the heaviest
 _EPS = torch.finfo(torch.float64).eps
 
 
@@ -128,9 +129,37 @@ def solve_primal(
         )
     _check_weights(weights, targets)
     x = features.double()  # exact, so that only the result is rounded
+    if weights is not None and x.numel():
+        check_spread(weights, penalty, float(x.detach().square().sum(-1).max()))
     weighted = x if weights is None else x * weights[:, None]
     moment = weighted.mT @ targets.double()
     return solve_normal_equations(x.mT @ weighted, moment, penalty).to(features.dtype)
+
+
+def lost_in_sums(weights: Tensor, penalty: float, square: float) -> float:
+    """How much of what the lightest bin says ``X'WX`` loses to rounding; the dual loses none.
+
+    Args:
+        weights: of the bins.
+        penalty: the paper's ``C``.
+        square: of the longest row of ``X``.
+    """
+    return _EPS * float(weights.max()) * square / (float(weights.min()) * square + 1 / penalty)
+
+
+def check_spread(weights: Tensor, penalty: float, square: float) -> None:
+    """Refuse weights too far apart for ``X'WX``; arguments of ``lost_in_sums``.
+
+    Raises:
+        ValueError: if more than ``LARGEST_LOSS`` is lost.
+    """
+    lost = lost_in_sums(weights, penalty, square)
+    if lost > LARGEST_LOSS:
+        raise ValueError(
+            f"weights from {float(weights.min()):.1e} to {float(weights.max()):.1e} are too far "
+            f"apart for X'WX: it loses {lost:.0e} of the lightest bin to rounding, wanted up to "
+            f"{LARGEST_LOSS:.0e}; take the dual, or lower the penalty"
+        )
 
 
 def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Tensor:
@@ -191,7 +220,7 @@ def _solve(system: Tensor, right: Tensor, penalty: float, weights: Tensor, name:
         return _pseudo_solve(system, right, penalty, weights, eps, name).to(given)
     ridged = system + torch.diag_embed(1 / (penalty * weights))
     factor, info = torch.linalg.cholesky_ex(ridged)
-    conditions = _conditions(ridged.detach(), factor.detach(), info)
+    conditions = conditions_of(ridged.detach(), factor.detach(), info)
     most = largest_condition(right.shape[-1], eps)
     singular = torch.tensor([not condition <= most for condition in conditions])
     singular = singular.view(info.shape).to(info.device)
@@ -219,47 +248,13 @@ def _pseudo_solve(
     roots = weights.sqrt()
     weighted = roots[..., :, None] * system * roots[..., None, :]
     noise = right.shape[-1] * eps
-    _check_spectrum(torch.linalg.eigvalsh(weighted.detach()), noise, eps, name)
+    check_spectrum(torch.linalg.eigvalsh(weighted.detach()), noise, eps, name)
     inverse: Tensor = torch.linalg.pinv(weighted, rtol=noise, hermitian=True)
     solved = inverse @ (roots * right)[..., None]
     if not math.isinf(penalty):
         ridged = inverse / penalty + torch.eye(right.shape[-1]).to(inverse)
         solved = torch.cholesky_solve(solved, torch.linalg.cholesky(ridged))
     return roots * solved.squeeze(-1)
-
-
-def _conditions(system: Tensor, factor: Tensor, info: Tensor) -> list[float]:
-    """Of each matrix of a batch; infinite where its factorisation failed."""
-    num = system.shape[-1]
-    return [
-        math.inf if failed else condition_of(matrix, lower.contiguous())
-        for matrix, lower, failed in zip(
-            system.reshape(-1, num, num).cpu(),
-            factor.reshape(-1, num, num).cpu(),
-            info.reshape(-1).tolist(),
-            strict=True,
-        )
-    ]
-
-
-def _check_spectrum(values: Tensor, noise: float, eps: float, name: str) -> None:
-    """That a matrix is positive semi-definite and, in float32, tells what is kept of it."""
-    top, low = values.amax(-1, keepdim=True), values.amin(-1, keepdim=True)
-    wrong = (low < -10 * noise * top.clamp(min=0)).flatten()
-    if bool(wrong.any()):
-        place = int(wrong.nonzero()[0])
-        raise ValueError(
-            f"{name} is not positive semi-definite: it has the eigenvalue "
-            f"{float(low.flatten()[place]):.3g} beside {float(top.flatten()[place]):.3g}; it must "
-            "be a sum of squares"
-        )
-    least = torch.where(values > noise * top, values, top).amin(-1, keepdim=True)
-    if eps > _EPS and bool((eps * top > LARGEST_ERROR_FROM_FLOAT32 * least).any()):
-        condition = float((top / least).max())
-        raise ValueError(
-            f"{name} at penalty=inf has condition {condition:.1e}, too much for a matrix in "
-            "float32; make it in float64, or lower the penalty"
-        )
 
 
 def _check_system(gram: Tensor, targets: Tensor, weights: Tensor | None, penalty: float) -> None:

@@ -39,17 +39,27 @@ from tactslip_torch.model.cholesky import (
     refine,
 )
 from tactslip_torch.model.condition import (
+    LARGEST_ERROR_FROM_FLOAT32,
     Method,
     SolveReport,
+    check_spectrum,
+    conditions_of,
     inverse_growth,
     inverse_norm,
     scaled_norm,
 )
 from tactslip_torch.threads import for_each
 
+__all__ = [
+    "Solution",
+    "check_spectrum",
+    "conditions_of",
+    "largest_condition",
+    "solve_symmetric_",
+]
+
 log = logging.getLogger(__name__)
 
-LARGEST_ERROR_FROM_FLOAT32 = 1e-2  # of a solution whose matrix came in float32
 _EPS = torch.finfo(torch.float64).eps
 _MOST_CONDITION = 1e12  # of what a plain Cholesky may solve
 _SURE = 1e8  # a condition that the ridge keeps below this needs no better estimate
@@ -137,16 +147,6 @@ def largest_condition(size: int, eps: float = _EPS) -> float:
     """Up to which a plain Cholesky solves a system that came with this relative error."""
     most = min(_MOST_CONDITION, 1 / (size * _EPS))
     return most if eps <= _EPS else min(most, LARGEST_ERROR_FROM_FLOAT32 / eps)
-
-
-def condition_of(matrix: Tensor, factor: Tensor) -> float:
-    """Estimate for a positive definite matrix scaled to a diagonal of ones, from its factor.
-
-    Shape:
-        - matrix, factor: ``[n, n]``, row-major; only their lower triangles are read
-    """
-    scale = matrix.diagonal().sqrt()
-    return scaled_norm(matrix, scale) * inverse_norm(factor, scale)
 
 
 @dataclass
