@@ -171,6 +171,18 @@ def test_extremes_are_judged_by_kind_and_flagged_as_the_pipeline_flags_them():
     assert not flagged & {"plain", "rails", "integers"}
 
 
+def test_a_spike_is_flagged_where_the_filter_leaves_none_of_it():
+    """As the note of the page has it."""
+    detector = small_detector()
+    spikes = extreme_bins("spike", (60, 4, 150), torch.Generator().manual_seed(0), torch.float32)
+    filtered = detector.channel_filter.valid(spikes.double()).numpy()
+    used = {name.channel for name in detector.selected_names}
+    places = [i for i, name in enumerate(detector.pool.hand.names) if name in used]
+    is_gone = (filtered[:, places] == 0).all(-1).any(-1)
+    assert 0 < is_gone.sum() < 60
+    assert (~compare(detector, spikes).is_valid.numpy() == is_gone).all()
+
+
 def test_condition_numbers_are_those_of_finite_differences():
     detector, samples = small_detector(), raw_bins(7)
     detector.info["solve"] = {"condition": 12.5, "method": "Cholesky"}

@@ -119,14 +119,17 @@ def _tables(content: Mapping[str, Any], kind: str) -> list[str]:
     sorts += ["flips", "outside range"]
     spans = ["channels", "least", "greatest", "smallest span, filtered", "over its magnitude"]
     valid = f"And a valid bin: {content['range']['validity']}."
+    flagged = (
+        "Flagged: not valid, as a dead sensor is (rule below); what is said of the score holds for "
+        "the others. A spike is flagged where the filter leaves none of it in the bin."
+    )
     stages = "Features, scaler and head: the worst that arises in each."
     return [
         _table("What was checked", ["", "found", "wanted", "holds"], conditions),
         _table(f"Bins of {kind} recordings, errors in sd of the score", heads,
                [_set_row(*pair) for pair in sets], stages),
         _table("Generated extremes, errors in sd of the score", sorts,
-               [_extreme_row(*pair) for pair in extremes],
-               "Flagged: not valid; what is said of the score holds for the others."),
+               [_extreme_row(*pair) for pair in extremes], flagged),
         _table("The scaled feature that is off most, of a range of 2",
                ["set", "feature", "error"], features),
         _table("Margin, in units of the score", ["", "score", ""], _margin_rows(content)),
