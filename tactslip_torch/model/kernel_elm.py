@@ -130,7 +130,7 @@ def solve_primal(
     _check_weights(weights, targets)
     x = features.double()  # exact, so that only the result is rounded
     if weights is not None and x.numel():
-        check_spread(weights, penalty, float(x.detach().square().sum(-1).max()))
+        check_spread(weights.detach(), penalty, float(x.detach().square().sum(-1).max()))
     weighted = x if weights is None else x * weights[:, None]
     moment = weighted.mT @ targets.double()
     return solve_normal_equations(x.mT @ weighted, moment, penalty).to(features.dtype)
