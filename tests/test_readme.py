@@ -19,7 +19,7 @@ def test_the_programs_run(tmp_path, monkeypatch, capsys):
     exec(compile(first, "README.md", "exec"), {})
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("torch.Size([8, 2582])")
-    assert re.fullmatch(r"tensor\(\[-?\d+\.\d+\]\)", lines[1])
+    assert re.fullmatch(r"tensor\(\[-?\d+\.\d+\]\) tensor\(\[True\]\)", lines[1])
     exec(compile(second, "README.md", "exec"), {})
     (line,) = capsys.readouterr().out.splitlines()
     scores, counts = re.fullmatch(r"tensor\((.*), dtype=.*\) tensor\((.*)\)", line).groups()
