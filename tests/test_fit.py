@@ -58,8 +58,13 @@ def test_targets_are_plus_one_for_slip():
     [
         (torch.ones(4, dtype=torch.bool), None, r"one N, got \(5, 2\), \(4,\)$"),
         (torch.ones(5, dtype=torch.bool), torch.ones(4), r"got \(5, 2\), \(5,\), \(4,\)$"),
-        (torch.ones(5, dtype=torch.bool), torch.arange(5.0), "weights must be positive, got 0"),
-        (torch.ones(5, dtype=torch.bool), torch.full((5,), torch.nan), "positive, got nan"),
+        (torch.ones(5, dtype=torch.bool), torch.arange(5.0), "positive and finite, got 0"),
+        (
+            torch.ones(5, dtype=torch.bool),
+            torch.full((5,), torch.nan),
+            "positive and finite, got nan",
+        ),
+        (torch.ones(5, dtype=torch.bool), torch.full((5,), torch.inf), "and finite, got inf"),
     ],
 )
 def test_bins_that_do_not_fit_together_are_refused(is_slip, weights, message):
@@ -203,6 +208,13 @@ def test_twice_the_weight_is_twice_the_bin(rng):
 def test_a_penalty_that_is_not_positive_is_refused(num_bins, penalty, rng):
     with pytest.raises(ValueError, match=r"penalty .* must be positive"):
         fit_machine(draw(rng, num_bins), penalty)
+
+
+@pytest.mark.parametrize("route", ["auto", "primal", "dual"])
+def test_no_bins_are_no_machine(route):
+    none = TrainingBins(torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"^a machine needs training bins, got none; add"):
+        fit_machine(none, 1.0, route=route)
 
 
 # Validation ----------------------------------------------------------------------------------

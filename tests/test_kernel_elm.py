@@ -245,6 +245,62 @@ def test_errors_in_place_are_those_of_the_others():
         solve_kernel_elm_(torch.eye(2), torch.ones(2), 1.0, torch.tensor([1.0, 0.0]))
 
 
+def dual(*arguments):
+    return solve_kernel_elm_(*arguments).x
+
+
+BOTH = pytest.mark.parametrize("solve", [solve_kernel_elm, dual], ids=["kept", "in place"])
+
+
+@BOTH
+def test_a_light_bin_is_no_noise(solve):
+    """Of weight 1e-20, beside one it has nothing to do with; in a singular system it is refused."""
+    eye, targets = torch.eye(2).double(), torch.tensor([1.0, -1.0]).double()
+    weights = torch.tensor([1e-20, 1.0]).double()
+    assert solve(eye.clone(), targets, np.inf, weights).tolist() == [1.0, -1.0]
+    twice = torch.block_diag(eye[:1, :1], torch.ones(2, 2).double())
+    weights = torch.tensor([1e-20, 1.0, 1.0]).double()
+    with pytest.raises(ValueError, match=r"weights from 1\.0e-20 to 1\.0e\+00 too far apart"):
+        solve(twice, torch.tensor([1.0, -1.0, 1.0]).double(), np.inf, weights)
+
+
+@BOTH
+def test_a_solution_that_leaves_its_dtype_is_refused(solve):
+    targets = torch.tensor([1e5, -1e5])
+    with pytest.raises(ValueError, match=r"solution for gram leaves float32: an entry is 1e\+44;"):
+        solve(1e-39 * torch.eye(2), targets, np.inf)
+    with pytest.raises(ValueError, match="solution for gram leaves float64"):
+        solve(1e-310 * torch.eye(2).double(), targets.double(), np.inf)
+    with pytest.raises(ValueError, match=r"1 / \(C w\) is finite, got 1e-310"):
+        solve(torch.eye(2).double(), targets.double(), 1e-310)
+
+
+@BOTH
+def test_the_dtype_is_that_of_the_matrix(solve):
+    for penalty in (1.0, 1e14, np.inf):
+        beta = solve(torch.ones(2, 2).double(), torch.tensor([1, 1]), penalty)
+        assert beta.dtype == torch.float64
+        share = 1 / (2 + 1 / penalty)
+        close(beta, np.array([share, share]), 1e-7)  # jittered
+        single = solve(torch.eye(2), torch.ones(2).double(), penalty)
+        assert single.dtype == torch.float32
+    with pytest.raises(ValueError, match=r"gram must .* floating, got 2 of torch.int64"):
+        solve(torch.ones(2, 2).long(), torch.ones(2), 1.0)
+    with pytest.raises(ValueError, match=r"gram must have bins .* got 0"):
+        solve(torch.ones(0, 0), torch.ones(0), 1.0)
+    with pytest.raises(ValueError, match="too much for a matrix in float16"):
+        solve(torch.ones(2, 2).half(), torch.ones(2).half(), 1e4)
+
+
+def test_a_singular_matrix_does_not_spoil_its_batch():
+    """The first is positive definite with its ridge, and no sum of squares without it."""
+    first = torch.diag(torch.tensor([1.0, -1e-9]).double())
+    batch = torch.stack([first, torch.full((2, 2), 1e16).double()])
+    both = solve_kernel_elm(batch, torch.ones(2, 2).double(), 1e6)
+    close(both[0], np.array([1 / (1 + 1e-6), 1 / (1e-6 - 1e-9)]), 1e-10)
+    close(both[1], np.array([0.5e-16, 0.5e-16]), 1e-7)
+
+
 # Errors and extremes -------------------------------------------------------------------------
 
 
@@ -331,7 +387,7 @@ def test_shapes_must_agree():
         solve_primal(torch.zeros(3, 2), torch.ones(3), 1.0, torch.ones(1))
 
 
-@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan")])
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
 def test_weights_must_be_positive(bad):
     weights = torch.tensor([1.0, bad, 1.0])
     with pytest.raises(ValueError, match="weights must be positive"):

@@ -15,7 +15,6 @@ import torch
 from tactslip_torch.model import fit
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.held_out import MOST_CONDITION, HeldOut
-from tactslip_torch.model.kernel_elm import solve_primal
 from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, RadialBasis
 from tactslip_torch.model.sufficient import SufficientStats
 
@@ -23,6 +22,8 @@ EPS = 2.0**-52
 KINDS = (
     "plain",
     "duplicate features",
+    "nearly duplicate features, 1e-7",
+    "nearly duplicate features, float32",
     "duplicate bins",
     "duplicate bins that agree",
     "constant column",
@@ -34,6 +35,12 @@ KINDS = (
     "weights over 12 decades, more features than bins",
 )
 PENALTIES = (1e-12, 1e-6, 1.0, 1e3, 1e6, 1e9, 1e12, np.inf)
+CAPS = {  # of the error where the condition is up to 1e10; 1e-8 for others
+    "nearly duplicate features, 1e-7": 1e-5,
+    "nearly duplicate features, float32": 5e-3,
+    "weights over 12 decades": 1e-5,
+    "weights over 12 decades, more features than bins": 1e-5,
+}
 LIMIT = 1e90  # an infinite penalty, as far as 80 digits tell beside 12 decades of weights
 
 
@@ -60,6 +67,10 @@ def case(kind: str) -> Case:
     weights, new = np.ones(16), rng.uniform(-1, 1, (4, num_features))
     if kind == "duplicate features":
         z[:, 2] = z[:, 1]
+    elif kind.endswith("1e-7"):
+        z[:, 2] = z[:, 1] + 1e-7 * z[:, 2]
+    elif kind.endswith("float32"):
+        z[:, 2] = z[:, 1].astype(np.float32)
     elif kind.startswith("duplicate bins"):
         z[8:] = z[:8]
         targets[8:] = targets[:8]
@@ -110,11 +121,15 @@ def truth(kind: str, penalty: float) -> tuple[np.ndarray, float]:
     return scores, float(np.abs(size).max())
 
 
-def assert_right(actual: torch.Tensor, kind: str, penalty: float, tolerance: float) -> None:
+def assert_right(
+    actual: torch.Tensor, kind: str, penalty: float, tolerance: float, *, trained: bool = False
+) -> None:
     (expected, size), num = truth(kind, penalty), len(case(kind).z)
     assert bool(actual.isfinite().all())
     wrong = np.abs(actual.numpy() - expected)
     assert wrong[:num].max() <= tolerance * size
+    if trained:
+        return
     assert wrong[num:].max() <= tolerance * max(size, np.abs(expected[num:]).max())
 
 
@@ -124,17 +139,31 @@ def assert_right(actual: torch.Tensor, kind: str, penalty: float, tolerance: flo
 @pytest.mark.parametrize("penalty", PENALTIES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_scores_are_those_of_eighty_digits(kind, penalty, caplog):
-    """To 16 times the relative error that the report states, which is eps times the condition."""
-    c = case(kind)
+    """To 16 times the relative error that the report states, which is eps times the condition.
+
+    A report may not buy its ease: up to a condition of 1e10 the error has a cap of its own. What is
+    left out is stated for training bins: new ones tell features apart that were nearly duplicate.
+    """
+    c, nearly = case(kind), kind.startswith("nearly")
     for route in ("dual", "primal"):
         if route == "primal" and c.z.shape[1] > 3:
             continue
         caplog.clear()
+        if kind.endswith("1e-7") and penalty >= 1e12:
+            with pytest.raises(
+                ValueError, match=r"nearly singular: .* add \de-0[12] to scores, but"
+            ):
+                fit_machine(c.bins, penalty, route=route)
+            continue
         machine = fit_machine(c.bins, penalty, route=route)
         report = machine.solved
         scores = machine(torch.from_numpy(np.r_[c.z, c.new]))
-        assert report.error <= 1e-3
-        assert_right(scores, kind, penalty, 16 * report.error)
+        left_out = report.left_out or 0.0
+        assert left_out <= report.error <= max(1e-3, left_out)
+        trained = nearly and report.method == "eigen"
+        assert_right(scores, kind, penalty, 16 * report.error, trained=trained)
+        if report.condition <= 1e10 and not (nearly and penalty > 1e12):
+            assert_right(scores, kind, penalty, CAPS.get(kind, 1e-8), trained=trained)
         if report.method == "cholesky":
             assert report.error == pytest.approx(EPS * report.condition)
             assert report.condition <= 1e12
@@ -167,7 +196,7 @@ def test_from_one_feature_to_all_of_them(num_features, penalty):
         gram, across = kernel(z, z), kernel(new, z)
         expected = scores_of(gram, gram + across, targets, np.ones(8), penalty)
     actual = machine(torch.from_numpy(np.r_[z, new])).numpy()
-    tolerance = 16 * machine.solved.error * np.abs(expected).max()
+    tolerance = min(16 * machine.solved.error, 1e-10) * np.abs(expected).max()
     np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance)
 
 
@@ -188,8 +217,6 @@ def test_a_bin_that_weighs_1e14_does_not_drown_the_others(degree, rng, monkeypat
     refused = r"weights from 1\.0e\+00 to 1\.0e\+14 .* loses [2-9]e-02 of the lightest bin"
     with pytest.raises(ValueError, match=refused):
         fit_machine(bins, 1.0, paper, route="primal")
-    with pytest.raises(ValueError, match=refused):
-        solve_primal(tensors[0], torch.from_numpy(targets), 1.0, tensors[2])
     with pytest.raises(ValueError, match="condition"):
         HeldOut(bins, torch.arange(40) // 4, paper, route="primal").at(1.0)
     monkeypatch.setattr(fit, "_MOST_DUAL", 39)

@@ -141,6 +141,25 @@ def test_the_ridge_stays_where_components_are_left_out(rng):
     assert abs(shares[6] - 1) > 0.01
 
 
+def test_a_penalty_near_the_largest_number_is_as_good_as_infinite(rng):
+    """More of the ridge overflowed, and a machine of zeros reported no error."""
+    matrix, right = singular(rng, 12, 4)
+    x, report = solve_symmetric_(lower(matrix), torch.from_numpy(right), 1e308)
+    assert (report.method, report.rank) == ("eigen", 4)
+    close(x, np.linalg.pinv(matrix, rcond=1e-12, hermitian=True) @ right, 1e-9)
+
+
+def test_what_is_left_out_is_stated(rng):
+    """An eigenvalue a of rounding's size adds a C / (1 + a C) of its share; null ones say so."""
+    values = np.r_[2e-16, np.geomspace(0.1, 1, 7)]
+    matrix, right = with_spectrum(rng, values), rng.choice([-1.0, 1.0], 8)
+    report = solve_symmetric_(lower(matrix), torch.from_numpy(right), 2e13).report
+    share = np.linalg.eigh(matrix)[1][:, 0] @ right
+    assert abs(share) * 4e-3 / 1.004 / np.sqrt(8) <= report.left_out <= 0.1
+    assert report.error == report.left_out
+    assert str(report).endswith("unless what is left out is null")
+
+
 @pytest.mark.parametrize("num", [40, 600])
 @pytest.mark.parametrize("rung", ["cholesky", "jittered", "eigen"])
 def test_bits_do_not_depend_on_the_number_of_threads(rung, num, rng):

@@ -186,6 +186,17 @@ def check_finite(matrix: Tensor, right: Tensor, name: str) -> None:
             )
 
 
+def in_dtype(x: Tensor, given: torch.dtype, name: str) -> Tensor:
+    """A solution as it is handed out: refused where the dtype has no room for it."""
+    cast = x.to(given)
+    if not bool(cast.isfinite().all()):
+        raise ValueError(
+            f"the solution for {name} leaves {str(given)[6:]}: an entry is "
+            f"{float(x.detach()[~cast.isfinite()][0]):.3g}; scale the features or the penalty"
+        )
+    return cast
+
+
 def _factorise_panel(matrix: Tensor, start: int, end: int) -> None:
     """Columns ``start`` to ``end`` of the factor, all columns before them being final."""
     left = matrix[start:end, :start]

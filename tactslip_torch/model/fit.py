@@ -14,9 +14,7 @@ from torch import Tensor
 from tactslip_torch.model.cholesky import from_above
 from tactslip_torch.model.fourth_moments import ProductSums, add_products_, normal_matrix
 from tactslip_torch.model.kernel_elm import (
-    LARGEST_LOSS,
-    check_spread,
-    lost_in_sums,
+    check_weights,
     solve_kernel_elm_,
     solve_normal_equations_,
 )
@@ -37,6 +35,7 @@ Progress = Callable[[Iterable[int], str], Iterable[int]]
 """Wraps a range so that its progress shows; gets the range and what is being done."""
 
 CHUNK_BINS = 2048
+_LARGEST_LOSS = 1e-3  # of what the lightest bin says, in a sum with the heaviest
 _MOST_DUAL = 16_384  # bins whose Gram matrix (2 GiB) is worth keeping the light ones
 
 
@@ -50,7 +49,7 @@ class TrainingBins:
         weights: ``[N]``, positive, or ``None`` for 1 each.
 
     Raises:
-        ValueError: if shapes disagree or a weight is not positive.
+        ValueError: if shapes disagree or a weight is not positive and finite.
     """
 
     features: Tensor
@@ -66,8 +65,8 @@ class TrainingBins:
                 "expected features [N, K], is_slip [N] and weights [N] with one N, got "
                 f"{', '.join(map(str, shapes))}"
             )
-        if self.weights is not None and not bool((self.weights > 0).all()):
-            raise ValueError(f"weights must be positive, got {float(self.weights.min()):g}")
+        if self.weights is not None:
+            check_weights(self.weights)
 
     @property
     def targets(self) -> Tensor:
@@ -108,6 +107,8 @@ def fit_machine(
     """
     if route not in ("auto", "primal", "dual"):
         raise ValueError(f"route must be 'auto', 'primal' or 'dual', got {route!r}")
+    if len(bins.features) == 0:
+        raise ValueError("a machine needs training bins, got none; add bins of both classes")
     bins = bins.double()
     if isinstance(kernel, Polynomial) and kernel.collapses:
         if not _goes_dual(bins, penalty, kernel, route):
@@ -155,10 +156,31 @@ def _goes_dual(bins: TrainingBins, penalty: float, kernel: Polynomial, route: Ro
         return False
     longest = float(bins.features.square().sum(-1).max())
     spread = bins.weights, penalty, (longest + kernel.offset) ** kernel.degree
-    if route == "auto" and num_bins <= _MOST_DUAL and lost_in_sums(*spread) > LARGEST_LOSS:
+    if route == "auto" and num_bins <= _MOST_DUAL and _lost_in_sums(*spread) > _LARGEST_LOSS:
         return True
-    check_spread(*spread)
+    _check_spread(*spread)
     return False
+
+
+def _lost_in_sums(weights: Tensor, penalty: float, square: float) -> float:
+    """How much of the lightest bin ``X'WX`` loses; ``square`` is of the longest row of ``X``."""
+    return (
+        torch.finfo(torch.float64).eps
+        * float(weights.max())
+        * square
+        / (float(weights.min()) * square + 1 / penalty)
+    )
+
+
+def _check_spread(weights: Tensor, penalty: float, square: float) -> None:
+    """Refuse weights of which more than ``_LARGEST_LOSS`` is lost."""
+    lost = _lost_in_sums(weights, penalty, square)
+    if lost > _LARGEST_LOSS:
+        raise ValueError(
+            f"weights from {float(weights.min()):.1e} to {float(weights.max()):.1e} are too far "
+            f"apart for X'WX: it loses {lost:.0e} of the lightest bin to rounding, wanted up to "
+            f"{_LARGEST_LOSS:.0e}; take the dual, or lower the penalty"
+        )
 
 
 def _solve_linear_primal(

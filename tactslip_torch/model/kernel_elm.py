@@ -14,16 +14,18 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from tactslip_torch.model.cholesky import check_finite
+from tactslip_torch.model.cholesky import check_finite, in_dtype
 from tactslip_torch.model.symmetric_solve import (
     Solution,
-    check_spectrum,
+    check_light,
     conditions_of,
     largest_condition,
+    light_bins,
+    ridge_of,
     solve_symmetric_,
+    truncated,
 )
 
-LARGEST_LOSS = 1e-3  # of what the lightest bin says, in a sum with the heaviest
 _EPS = torch.finfo(torch.float64).eps
 
 
@@ -34,12 +36,13 @@ def solve_kernel_elm(
 
     One Cholesky factorisation, no inverse. Differentiable in ``gram`` and ``targets``. Where the
     system is too close to singular for that (``symmetric_solve`` has the rule), components of the
-    weighted Gram matrix that are rounding noise are left out: they add nothing to any score, and
+    weighted Gram matrix that are rounding noise are left out: null ones add nothing to a score, and
     derivatives are those at constant rank. With ``penalty=inf`` that is the minimum-norm (weighted)
     least-squares solution through the Moore-Penrose pseudo-inverse, the paper's wording.
 
-    Solved in float64. A float32 ``gram`` carries its rounding times the condition into the
-    solution: it is refused where that exceeds 1e-2.
+    Solved in float64, and handed out in the dtype of ``gram``, whatever that of the targets. A
+    float32 ``gram`` carries its rounding times the condition into the solution: it is refused
+    where that exceeds 1e-2.
 
     Args:
         gram: kernel matrix of the training bins, symmetric, positive semi-definite; only its
@@ -65,7 +68,7 @@ def solve_kernel_elm(
     """
     _check_system(gram, targets, weights, penalty)
     weights = torch.ones_like(targets) if weights is None else weights
-    return _solve(gram, targets, penalty, weights, "gram")
+    return _solve(gram, targets, penalty, weights, in_span=False, name="gram")
 
 
 def solve_kernel_elm_(
@@ -129,37 +132,9 @@ def solve_primal(
         )
     _check_weights(weights, targets)
     x = features.double()  # exact, so that only the result is rounded
-    if weights is not None and x.numel():
-        check_spread(weights.detach(), penalty, float(x.detach().square().sum(-1).max()))
     weighted = x if weights is None else x * weights[:, None]
     moment = weighted.mT @ targets.double()
     return solve_normal_equations(x.mT @ weighted, moment, penalty).to(features.dtype)
-
-
-def lost_in_sums(weights: Tensor, penalty: float, square: float) -> float:
-    """How much of what the lightest bin says ``X'WX`` loses to rounding; the dual loses none.
-
-    Args:
-        weights: of the bins.
-        penalty: the paper's ``C``.
-        square: of the longest row of ``X``.
-    """
-    return _EPS * float(weights.max()) * square / (float(weights.min()) * square + 1 / penalty)
-
-
-def check_spread(weights: Tensor, penalty: float, square: float) -> None:
-    """Refuse weights too far apart for ``X'WX``; arguments of ``lost_in_sums``.
-
-    Raises:
-        ValueError: if more than ``LARGEST_LOSS`` is lost.
-    """
-    lost = lost_in_sums(weights, penalty, square)
-    if lost > LARGEST_LOSS:
-        raise ValueError(
-            f"weights from {float(weights.min()):.1e} to {float(weights.max()):.1e} are too far "
-            f"apart for X'WX: it loses {lost:.0e} of the lightest bin to rounding, wanted up to "
-            f"{LARGEST_LOSS:.0e}; take the dual, or lower the penalty"
-        )
 
 
 def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Tensor:
@@ -173,7 +148,8 @@ def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Te
         ValueError: as ``solve_primal``.
     """
     _check_penalty(penalty)
-    return _solve(normal, moment, penalty, torch.ones_like(moment), "X'WX")
+    weights = torch.ones_like(moment)
+    return _solve(normal, moment, penalty, weights, in_span=True, name="X'WX")
 
 
 def solve_normal_equations_(
@@ -211,44 +187,66 @@ def solve_normal_equations_(
     )
 
 
-def _solve(system: Tensor, right: Tensor, penalty: float, weights: Tensor, name: str) -> Tensor:
+def _solve(
+    system: Tensor, right: Tensor, penalty: float, weights: Tensor, *, in_span: bool, name: str
+) -> Tensor:
     """``(system + diag(1 / (penalty weights)))^-1 right``, differentiable; batched, in float64."""
-    given, eps = right.dtype, torch.finfo(system.dtype).eps
+    given = system.dtype
     system, right, weights = system.double(), right.double(), weights.double()
     check_finite(system, right, name)
-    if math.isinf(penalty):
-        return _pseudo_solve(system, right, penalty, weights, eps, name).to(given)
-    ridged = system + torch.diag_embed(1 / (penalty * weights))
-    factor, info = torch.linalg.cholesky_ex(ridged)
-    conditions = conditions_of(ridged.detach(), factor.detach(), info)
-    most = largest_condition(right.shape[-1], eps)
-    singular = torch.tensor([not condition <= most for condition in conditions])
-    singular = singular.view(info.shape).to(info.device)
-    if eps > _EPS and bool(singular.any()):
+    ridged = system + torch.diag_embed(ridge_of(penalty, weights))
+    system, right = system.expand(ridged.shape), right.expand(ridged.shape[:-1])
+    eps = torch.finfo(given).eps
+    plain = torch.ones(right.shape[:-1], dtype=torch.bool, device=right.device)
+    if math.isinf(penalty):  # no Cholesky first, but for bins that a cut would lose
+        plain = light_bins(system.detach().diagonal(dim1=-2, dim2=-1), weights, eps).any(-1)
+    singular = ~plain
+    if bool(plain.any()):
+        factor, info = torch.linalg.cholesky_ex(ridged)
+        conditions = torch.tensor(conditions_of(ridged.detach(), factor.detach(), info))
+        singular |= ~(conditions <= largest_condition(right.shape[-1], eps)).view(info.shape)
+    if not bool(singular.any()):
+        solved = torch.cholesky_solve(right[..., None], factor).squeeze(-1)
+        return in_dtype(solved, given, name)
+    if eps > _EPS and bool((plain & singular).any()):
         raise ValueError(
-            f"{name} + I/C at penalty={penalty:g} has condition {max(conditions):.1e}, too much "
-            "for a matrix in float32; make it in float64, or lower the penalty"
+            f"{name} + I/C at penalty={penalty:g} has condition {float(conditions.max()):.1e}, too "
+            f"much for a matrix in {str(given)[6:]}; make it in float64, or lower the penalty"
         )
-    if bool(singular.any()):
-        safe = torch.where(singular[..., None, None], torch.eye(right.shape[-1]).to(right), ridged)
-        solved = torch.cholesky_solve(right[..., None], torch.linalg.cholesky(safe)).squeeze(-1)
-        escalated = _pseudo_solve(system, right, penalty, weights, eps, name)
-        return torch.where(singular[..., None], escalated, solved)
-    return torch.cholesky_solve(right[..., None], factor).squeeze(-1).to(given)
+    terms = right[singular], penalty, weights.expand(right.shape)[singular].sqrt()
+    escalated = _pseudo_solve(system[singular], *terms, given, in_span=in_span, name=name)
+    solved = torch.zeros_like(right)
+    if not bool(singular.all()):
+        solved[~singular] = torch.cholesky_solve(
+            right[~singular][..., None], torch.linalg.cholesky(ridged[~singular])
+        ).squeeze(-1)
+    solved[singular] = escalated
+    return in_dtype(solved, given, name)
 
 
 def _pseudo_solve(
-    system: Tensor, right: Tensor, penalty: float, weights: Tensor, eps: float, name: str
+    system: Tensor,
+    right: Tensor,
+    penalty: float,
+    roots: Tensor,
+    given: torch.dtype,
+    *,
+    in_span: bool,
+    name: str,
 ) -> Tensor:
     """Likewise, without the components of ``sqrt(w) system sqrt(w)`` that are rounding noise.
 
     ``(M + I/C)^-1`` on the span of ``M`` is ``(I + M^+/C)^-1 M^+``: of these one is well-posed and
     the other has derivatives.
+
+    Shape:
+        - system: ``[B, N, N]``; right, roots, output: ``[B, N]``
     """
-    roots = weights.sqrt()
     weighted = roots[..., :, None] * system * roots[..., None, :]
-    noise = right.shape[-1] * eps
-    check_spectrum(torch.linalg.eigvalsh(weighted.detach()), noise, eps, name)
+    for matrix, own, root in zip(weighted.detach(), right.detach(), roots.detach(), strict=True):
+        check_light(matrix.diagonal() / root**2, root**2, penalty, given, name)
+        truncated(matrix, own, root, penalty, given, in_span=in_span, name=name)
+    noise = right.shape[-1] * torch.finfo(given).eps
     inverse: Tensor = torch.linalg.pinv(weighted, rtol=noise, hermitian=True)
     solved = inverse @ (roots * right)[..., None]
     if not math.isinf(penalty):
@@ -264,6 +262,8 @@ def _check_system(gram: Tensor, targets: Tensor, weights: Tensor | None, penalty
             f"expected gram [*, N, N] and targets [*, N] with one N, got {tuple(gram.shape)} "
             f"and {tuple(targets.shape)}"
         )
+    if num_bins == 0 or not gram.is_floating_point():
+        raise ValueError(f"gram must have bins and be floating, got {num_bins} of {gram.dtype}")
     _check_weights(weights, targets)
     _check_penalty(penalty)
 
@@ -276,8 +276,14 @@ def _check_weights(weights: Tensor | None, targets: Tensor) -> None:
             f"weights must have one entry per bin, {tuple(targets.shape)}, "
             f"got {tuple(weights.shape)}"
         )
-    if not bool((weights > 0).all()):
-        raise ValueError(f"weights must be positive, got {float(weights.min()):g}")
+    check_weights(weights)
+
+
+def check_weights(weights: Tensor) -> None:
+    """That they are positive and finite."""
+    wrong = weights[~((weights > 0) & weights.isfinite())]
+    if len(wrong):
+        raise ValueError(f"weights must be positive and finite, got {float(wrong[0]):g}")
 
 
 def _check_penalty(penalty: float) -> None:

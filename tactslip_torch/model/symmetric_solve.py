@@ -10,9 +10,12 @@ Three rungs, and a report of the one that was taken:
   refined against the system itself, so that the answer is that of the system asked for. Taken if
   that converges, to a solution small enough that its rounding does not show.
 - *Eigen*: ``sqrt(w) A sqrt(w)`` without its ridge is decomposed, and what is rounding noise is
-  dropped: eigenvalues up to ``n eps`` of the largest. Such components add nothing to any score of
-  a training bin, but with a large C they would fill x with rounding. An infinite C comes here
-  at once: the minimum-norm least-squares solution.
+  dropped: eigenvalues up to ``n eps`` of the largest. With a large C they would fill x with
+  rounding. If they are null, as those of duplicates are, they add nothing to any score of a
+  training bin; what they could add, as far as float64 tells, is in the error of the report. One
+  above rounding, of features that are nearly duplicate, is refused where it would add 1e-2. An
+  infinite C comes here at once, unless weights are so far apart that the cut would lose a bin:
+  the minimum-norm least-squares solution.
 
 Reference:
     Higham (2002), Accuracy and Stability of Numerical Algorithms, 2nd ed., sections 10.1 and 12
@@ -25,6 +28,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -35,28 +39,26 @@ from tactslip_torch.model.cholesky import (
     cholesky_,
     cholesky_solve,
     from_above,
+    in_dtype,
     mirror_,
     refine,
 )
 from tactslip_torch.model.condition import (
+    LARGEST_ERROR,
     LARGEST_ERROR_FROM_FLOAT32,
     Method,
     SolveReport,
-    check_spectrum,
+    check_light,
     conditions_of,
     inverse_growth,
     inverse_norm,
+    light_bins,
     scaled_norm,
+    truncated,
 )
 from tactslip_torch.threads import for_each
 
-__all__ = [
-    "Solution",
-    "check_spectrum",
-    "conditions_of",
-    "largest_condition",
-    "solve_symmetric_",
-]
+__all__ = ["Solution", "check_light", "conditions_of", "light_bins", "truncated"]
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +67,6 @@ _MOST_CONDITION = 1e12  # of what a plain Cholesky may solve
 _SURE = 1e8  # a condition that the ridge keeps below this needs no better estimate
 _JITTERS = (1e-8, 1e-6)  # of the diagonal: so much that what is null does not fill with rounding
 _ENOUGH = 1e-8  # relative error that refinement may leave
-_LARGEST_ERROR = 1e-3  # of a solution that is handed out
 
 
 class Solution(NamedTuple):
@@ -136,11 +137,21 @@ def solve_symmetric_(
         restore if given == torch.float64 else None,
         noise,
         in_span,
-        str(given).removeprefix("torch."),
-        torch.finfo(given).eps,
+        given,
     )
     x, report = system.solve(most_condition)
-    return Solution(x.to(given), report)
+    return Solution(in_dtype(x, given, name), report)
+
+
+def ridge_of(penalty: float, weights: Tensor) -> Tensor:
+    """``1 / (C w)``, which must be finite."""
+    ridge = 1 / (penalty * weights)
+    if not (penalty > 0 and bool(ridge.isfinite().all())):
+        raise ValueError(
+            f"penalty (the paper's C) must be positive, and so large that 1 / (C w) is finite, "
+            f"got {penalty}"
+        )
+    return ridge
 
 
 def largest_condition(size: int, eps: float = _EPS) -> float:
@@ -161,16 +172,11 @@ class _System:
     restore: Callable[[Tensor], object] | None
     noise: float
     in_span: bool
-    dtype: str
-    eps: float  # of what the matrix came in
+    given: torch.dtype  # what the matrix came in
 
     def __post_init__(self) -> None:
-        self.ridge = 1 / (self.penalty * self.weights)
-        if not (self.penalty > 0 and bool(self.ridge.isfinite().all())):
-            raise ValueError(
-                f"penalty (the paper's C) must be positive, and so large that 1 / (C w) is finite, "
-                f"got {self.penalty}"
-            )
+        self.dtype, self.eps = str(self.given).removeprefix("torch."), torch.finfo(self.given).eps
+        self.ridge = ridge_of(self.penalty, self.weights)
         self.bare = self.matrix.diagonal().clone()
         self.whole = self.bare + self.ridge
         self.scale = torch.where(self.whole > 0, self.whole, 1.0).sqrt()
@@ -181,7 +187,8 @@ class _System:
             raise ValueError(f"{self.name} overflows float64; scale the features")
 
     def solve(self, most: float | None) -> Solution:
-        if math.isinf(self.penalty):
+        light = bool(light_bins(self.bare, self.weights, self.eps).any())
+        if math.isinf(self.penalty) and not light:
             return self.by_eigen()
         if most is None and self.restore is None:
             mirror_(self.matrix)
@@ -201,7 +208,7 @@ class _System:
         given = float(self.noise / self.bare.max()) if self.noise > 0 else 0.0
         error = max(self.eps * condition, drowned, given)
         limit = min(largest_condition(len(x), self.eps), math.inf if most is None else most)
-        if condition > limit or drowned > _LARGEST_ERROR:
+        if condition > limit or drowned > LARGEST_ERROR:
             return self.escalated(most, condition, "")
         return Solution(x, self.report("cholesky", condition, error, len(x)))
 
@@ -241,6 +248,8 @@ class _System:
         for jitter in _JITTERS:
             self.reset()
             more = jitter * float((self.whole / self.ridge).max())  # more ridge, so of its shape
+            if not math.isfinite(more):
+                return None
             self.matrix.diagonal().copy_(self.whole + more * self.ridge)
             try:
                 cholesky_(self.matrix)
@@ -259,40 +268,21 @@ class _System:
 
     def by_eigen(self) -> Solution:
         """Without the components that are rounding noise."""
+        check_light(self.bare, self.weights, self.penalty, self.given, self.name)
         if not math.isinf(self.penalty):
             self.reset()
         roots = self.weights.sqrt()
         self.matrix.mul_(roots).mul_(roots[:, None])
-        found: list[tuple[Tensor, float, float, int]] = []
-        for_each(lambda matrix: found.append(self.truncated(matrix, roots)), [self.matrix])
-        x, condition, error, rank = found[0]
-        hidden = self.noise > 0 and rank < len(x)
-        if hidden or error > (_LARGEST_ERROR if self.eps <= _EPS else LARGEST_ERROR_FROM_FLOAT32):
-            raise ValueError(
-                f"{self.name} at penalty={self.penalty:g} has rank {rank} of {len(x)} and a "
-                f"condition of {condition:.1e}, too much for the error it came with ({error:.0e}, "
-                f"from {self.dtype}); lower the penalty, or make it exactly"
-            )
-        return Solution(x, self.report("eigen", condition, error, rank))
-
-    def truncated(self, matrix: Tensor, roots: Tensor) -> tuple[Tensor, float, float, int]:
-        """Solution, condition, error and rank; on one thread, for the bits."""
-        values, vectors = torch.linalg.eigh(matrix)
-        top, low = float(values[-1]), float(values[0])
-        rounding = max(self.eps * max(top, -low), self.noise)
-        cutoff = max(len(values) * self.eps * top, self.noise)
-        if low < -max(10 * cutoff, 0.0):
-            raise ValueError(
-                f"{self.name} is not positive semi-definite: it has the eigenvalue {low:.3g} "
-                f"beside {top:.3g}; it must be a sum of squares"
-            )
-        kept = values > cutoff
-        rank = int(kept.sum())
-        ridge = 1 / self.penalty
-        parts = vectors.mT @ (roots * self.right)
-        parts = torch.where(kept, parts / torch.where(kept, values + ridge, 1.0), 0.0)
-        least = float(values[len(values) - rank] + ridge) if rank else math.inf
-        return roots * (vectors @ parts), (top + ridge) / least, rounding / least, rank
+        terms = self.right, roots, self.penalty, self.given
+        more = partial(truncated, noise=self.noise, in_span=self.in_span, name=self.name)
+        found: list[tuple[Tensor, float, float, float, int]] = []
+        for_each(lambda matrix: found.append(more(matrix, *terms)), [self.matrix])  # for the bits
+        x, condition, error, left_out, rank = found[0]
+        report = self.report("eigen", condition, max(error, left_out), rank)
+        report = replace(report, left_out=left_out)
+        if math.isinf(self.penalty) and left_out > LARGEST_ERROR:
+            log.warning("%s: solved by %s", self.name, report)
+        return Solution(x, report)
 
     def report(self, method: Method, condition: float, error: float, rank: int) -> SolveReport:
         bound, size = self.bound(), len(self.right)
