@@ -15,6 +15,7 @@ import torch
 from tactslip_torch.model import fit
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.held_out import MOST_CONDITION, HeldOut
+from tactslip_torch.model.kernel_elm import solve_primal
 from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, RadialBasis
 from tactslip_torch.model.sufficient import SufficientStats
 
@@ -219,6 +220,10 @@ def test_a_bin_that_weighs_1e14_does_not_drown_the_others(degree, rng, monkeypat
         fit_machine(bins, 1.0, paper, route="primal")
     with pytest.raises(ValueError, match="condition"):
         HeldOut(bins, torch.arange(40) // 4, paper, route="primal").at(1.0)
+    for heavy in (1e14, 1e16):
+        far = torch.where(bins.weights > 1, heavy, 1.0).double()
+        with pytest.raises(ValueError, match="too far apart for X'WX, by 1e"):
+            solve_primal(bins.features, bins.targets, 1.0, far)
     monkeypatch.setattr(fit, "_MOST_DUAL", 39)
     with pytest.raises(ValueError, match=refused):
         fit_machine(bins, 1.0, paper)

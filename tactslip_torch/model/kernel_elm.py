@@ -132,6 +132,14 @@ def solve_primal(
         )
     _check_weights(weights, targets)
     x = features.double()  # exact, so that only the result is rounded
+    if weights is not None and len(x):
+        square = float(x.detach().square().sum(-1).max())
+        light, heavy = (float(bound) * square for bound in weights.detach().aminmax())
+        if _EPS * heavy > 1e-3 * (light + 1 / penalty):  # what fit_machine allows, too
+            raise ValueError(
+                f"weights are too far apart for X'WX, by {heavy / light:.0e}; take the dual, or "
+                "lower the penalty"
+            )
     weighted = x if weights is None else x * weights[:, None]
     moment = weighted.mT @ targets.double()
     return solve_normal_equations(x.mT @ weighted, moment, penalty).to(features.dtype)

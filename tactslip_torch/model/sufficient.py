@@ -262,7 +262,7 @@ class SufficientStats:
         if not bool(fine.all()):
             number = int((~fine).nonzero()[0])
             raise ValueError(
-                f"batch {batch_id!r}: weights must be positive and finite, got "
+                f"batch {batch_id!r}: weights must be finite and positive, got "
                 f"{float(weights[number]):g} at bin {number}"
             )
         try:
