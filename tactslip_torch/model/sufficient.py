@@ -258,12 +258,11 @@ class SufficientStats:
                 f"batch {batch_id!r}: z must be within [-1, 1], got {float(z[number, feature]):g} "
                 f"at bin {number}, feature {feature}; scale it and clip"
             )
-        fine = (weights > 0) & weights.isfinite()
-        if not bool(fine.all()):
-            number = int((~fine).nonzero()[0])
+        if not bool((weights > 0).all()):
+            number = int((~(weights > 0)).nonzero()[0])
             raise ValueError(
-                f"batch {batch_id!r}: weights must be finite and positive, got "
-                f"{float(weights[number]):g} at bin {number}"
+                f"batch {batch_id!r}: weights must be positive, got {float(weights[number]):g} "
+                f"at bin {number}"
             )
         try:
             for of in (~is_slip, is_slip):
