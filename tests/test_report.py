@@ -220,6 +220,8 @@ def test_solve_line_says_how_far_rounding_may_reach() -> None:
     facts = {"method": "eigen", "rank": 7, "size": 9, "condition": "inf", "error": 2.2e-16}
     line = "solved by eigen: 7 of 9 unknowns, condition inf, relative error of the weights about"
     assert solve_line(facts) == f"{line} 2e-16"
+    facts |= {"left_out": 0.01, "error": 0.01}
+    assert solve_line(facts) == f"{line} 1e-02, unless what is left out is null"
 
 
 def test_selected_table_counts_every_key(selected: list[dict[str, str]]) -> None:

@@ -149,8 +149,9 @@ def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], num_left: int 
 
 def solve_line(solve: Mapping[str, Any]) -> str:
     """How the machine was solved for, in a line: ``SolveReport.facts`` in words."""
-    return (
+    line = (
         f"solved by {solve['method']}: {solve['rank']} of {solve['size']} unknowns, condition "
         f"{float(solve['condition']):.1e}, relative error of the weights about "
         f"{float(solve['error']):.0e}"
     )
+    return f"{line}, unless what is left out is null" if solve.get("left_out") else line
