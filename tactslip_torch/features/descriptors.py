@@ -40,7 +40,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.guards import are_ordinary, bounded_gradient, stretch
+from tactslip_torch.features.guards import are_ordinary, are_positive, bounded_gradient, stretch
 from tactslip_torch.features.runs import entropy_growth, rank_in_run
 from tactslip_torch.features.sample import Sample
 
@@ -92,9 +92,7 @@ def mean_deviation(sample: Sample) -> Tensor:
 
 def std(sample: Sample) -> Tensor:
     """Standard deviation with ``n - 1`` in the denominator, ``[*]``."""
-    # not by the span, which as a factor would make denormals of the gradient on its way back
-    square = (sample.centred * sample.centred).mean(-1)
-    return sample.out_of_unit(_unbiased_root(sample, sample.unless_flat(square, 1.0)))
+    return sample.out_of_unit(sample.std)
 
 
 def cv(sample: Sample) -> Tensor:
@@ -104,7 +102,7 @@ def cv(sample: Sample) -> Tensor:
     """
     floor = torch.maximum(sample.mean.abs(), CV_FLOOR * sample.rms)
     signed = torch.where(sample.mean < 0, -floor, floor)
-    return sample.safe_span * _unbiased_root(sample, sample.variance) / signed
+    return sample.std / signed
 
 
 def iqr(sample: Sample) -> Tensor:
@@ -197,6 +195,8 @@ def spectral_spread(sample: Sample) -> Tensor:
     """
     distance = _frequency_axis(sample) - spectral_centroid(sample)[..., None]
     square = (sample.weights * distance * distance).sum(-1)
+    if are_positive(square):
+        return square.sqrt()
     is_positive = square.detach() > 0
     return torch.where(is_positive, torch.where(is_positive, square, 1.0).sqrt(), 0.0)
 
@@ -292,9 +292,3 @@ def _frequency_axis(sample: Sample) -> Tensor:
     if sample.frequency_hz is None:
         raise ValueError("spectral_centroid and spectral_spread need frequency_hz=")
     return sample.frequency_hz.to(sample.x)
-
-
-def _unbiased_root(sample: Sample, variance: Tensor) -> Tensor:
-    """Standard deviation with ``n - 1`` from a variance with ``n``, 0 for a constant, ``[*]``."""
-    root = (variance * (sample.num / (sample.num - 1))).sqrt()
-    return sample.unless_flat(root, 0.0)

@@ -48,6 +48,12 @@ def is_nowhere(mask: Tensor) -> bool:
     return values is not None and not values.any()
 
 
+def are_positive(x: Tensor) -> bool:
+    """Whether values are all known to be above 0."""
+    values = looked_at(x)
+    return values is not None and bool(values.min() > 0)
+
+
 def is_recorded() -> bool:
     """Whether what runs is being written down as a graph, in which no value may be looked at."""
     is_traced = torch.jit.is_tracing()  # type: ignore[attr-defined,no-untyped-call]

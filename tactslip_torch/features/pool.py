@@ -18,7 +18,7 @@ from tactslip_torch.features.descriptors import (
     band_energy_ratio,
     describe,
 )
-from tactslip_torch.features.guards import bounded_gradient, is_constant, is_nowhere, settle
+from tactslip_torch.features.guards import are_positive, bounded_gradient, is_constant, settle
 from tactslip_torch.features.names import pool_names
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
@@ -193,16 +193,15 @@ class FeaturePool(nn.Module):
             - output: ``[*, lines]``
         """
         size = branches.detach().abs().amax(-1, keepdim=True)
-        is_zero = size == 0
-        if not is_nowhere(is_zero):
-            size = torch.where(is_zero, 1.0, size)
+        if not are_positive(size):
+            size = torch.where(size == 0, 1.0, size)
         scaled = branches / size  # squares of 1e30 or 1e-30 stay in range
         real = scaled @ self._constant("cosine", branches).T
         imaginary = scaled @ self._constant("sine", branches).T
         square = real * real + imaginary * imaginary
-        is_zero = square.detach() == 0
-        if is_nowhere(is_zero):
+        if are_positive(square):
             return size * square.sqrt()
+        is_zero = square.detach() == 0
         return size * torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
 
     def extract(self, bins: Tensor, chunk_bins: int = 16) -> Tensor:

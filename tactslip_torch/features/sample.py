@@ -166,6 +166,13 @@ class Sample:
         return self._shift_and_centred[1]
 
     @cached_property
+    def std(self) -> Tensor:
+        """Standard deviation with ``n - 1``, 0 for a constant, ``[*]``."""
+        # not by the span, which as a factor would make denormals of the gradient on its way back
+        square = (self.centred * self.centred).mean(-1) * (self.num / (self.num - 1))
+        return self.unless_flat(self.unless_flat(square, 1.0).sqrt(), 0.0)
+
+    @cached_property
     def _shift_and_centred(self) -> tuple[Tensor, Tensor]:
         """Mean of the values minus the first, ``[*, 1]``, and ``centred``; the first goes free."""
         shifted = self.unit - self.unit[..., :1].detach()
