@@ -54,11 +54,23 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "model.kernels": (),
     "model.cholesky": ("threads",),
     "model.condition": ("model.cholesky", "threads"),
-    "model.symmetric_solve": ("model.cholesky", "model.condition", "threads"),
+    "model.truncation": (),
+    "model.symmetric_solve": (
+        "model.cholesky",
+        "model.condition",
+        "model.truncation",
+        "threads",
+    ),
     "model.rounding": ("model.quadratic",),
     "model.quadratic": ("model.kernels",),
     "model.kernel_sum": ("model.kernels",),
-    "model.kernel_elm": ("model.kernels", "model.cholesky", "model.symmetric_solve"),
+    "model.kernel_elm": (
+        "model.kernels",
+        "model.cholesky",
+        "model.condition",
+        "model.symmetric_solve",
+        "model.truncation",
+    ),
     "model.fourth_moments": ("model.quadratic", "threads"),
     "model.sufficient": (
         "model.fourth_moments",
@@ -76,6 +88,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "model.fourth_moments",
         "model.cholesky",
         "model.symmetric_solve",
+        "model.truncation",
     ),
     "model.downdate": (
         "model.kernels",
@@ -138,28 +151,13 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "config": ("*",),
 }
 
+# What knows the configuration.
+ENTRY = ("experiment", "train", "evaluate", "export", "stats", "crossval", "certify", "config")
+
 # Packages of others that only these modules may import.
 ONLY_IN: dict[str, tuple[str, ...]] = {
-    "hydra": (
-        "experiment",
-        "train",
-        "evaluate",
-        "export",
-        "stats",
-        "crossval",
-        "certify",
-        "config",
-    ),
-    "omegaconf": (
-        "experiment",
-        "train",
-        "evaluate",
-        "export",
-        "stats",
-        "crossval",
-        "certify",
-        "config",
-    ),
+    "hydra": ENTRY,
+    "omegaconf": ENTRY,
     "lightning": ("datamodule", "learning", "experiment", "train", "progress"),
     "pytorch_lightning": (),
     "ptwt": ("signals.wavelet",),
@@ -180,6 +178,7 @@ TORCH_ALONE = (
     "model.kernels",
     "model.cholesky",
     "model.condition",
+    "model.truncation",
     "model.symmetric_solve",
     "model.rounding",
     "model.quadratic",

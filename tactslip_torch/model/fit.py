@@ -27,6 +27,7 @@ from tactslip_torch.model.quadratic import (
     num_quadratic_features,
     sum_of_quadratic_features,
 )
+from tactslip_torch.model.truncation import LARGEST_LOSS, lost_in_sums
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +36,6 @@ Progress = Callable[[Iterable[int], str], Iterable[int]]
 """Wraps a range so that its progress shows; gets the range and what is being done."""
 
 CHUNK_BINS = 2048
-_LARGEST_LOSS = 1e-3  # of what the lightest bin says, in a sum with the heaviest
 _MOST_DUAL = 16_384  # bins whose Gram matrix (2 GiB) is worth keeping the light ones
 
 
@@ -156,30 +156,20 @@ def _goes_dual(bins: TrainingBins, penalty: float, kernel: Polynomial, route: Ro
         return False
     longest = float(bins.features.square().sum(-1).max())
     spread = bins.weights, penalty, (longest + kernel.offset) ** kernel.degree
-    if route == "auto" and num_bins <= _MOST_DUAL and _lost_in_sums(*spread) > _LARGEST_LOSS:
+    if route == "auto" and num_bins <= _MOST_DUAL and lost_in_sums(*spread) > LARGEST_LOSS:
         return True
     _check_spread(*spread)
     return False
 
 
-def _lost_in_sums(weights: Tensor, penalty: float, square: float) -> float:
-    """How much of the lightest bin ``X'WX`` loses; ``square`` is of the longest row of ``X``."""
-    return (
-        torch.finfo(torch.float64).eps
-        * float(weights.max())
-        * square
-        / (float(weights.min()) * square + 1 / penalty)
-    )
-
-
 def _check_spread(weights: Tensor, penalty: float, square: float) -> None:
-    """Refuse weights of which more than ``_LARGEST_LOSS`` is lost."""
-    lost = _lost_in_sums(weights, penalty, square)
-    if lost > _LARGEST_LOSS:
+    """Refuse weights of which more than ``LARGEST_LOSS`` is lost."""
+    lost = lost_in_sums(weights, penalty, square)
+    if lost > LARGEST_LOSS:
         raise ValueError(
             f"weights from {float(weights.min()):.1e} to {float(weights.max()):.1e} are too far "
             f"apart for X'WX: it loses {lost:.0e} of the lightest bin to rounding, wanted up to "
-            f"{_LARGEST_LOSS:.0e}; take the dual, or lower the penalty"
+            f"{LARGEST_LOSS:.0e}; take the dual, or lower the penalty"
         )
 
 

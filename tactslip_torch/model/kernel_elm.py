@@ -15,14 +15,18 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model.cholesky import check_finite, in_dtype
+from tactslip_torch.model.condition import conditions_of
 from tactslip_torch.model.symmetric_solve import (
     Solution,
-    check_light,
-    conditions_of,
     largest_condition,
-    light_bins,
     ridge_of,
     solve_symmetric_,
+)
+from tactslip_torch.model.truncation import (
+    LARGEST_LOSS,
+    check_light,
+    light_bins,
+    lost_in_sums,
     truncated,
 )
 
@@ -134,11 +138,10 @@ def solve_primal(
     x = features.double()  # exact, so that only the result is rounded
     if weights is not None and len(x):
         square = float(x.detach().square().sum(-1).max())
-        light, heavy = (float(bound) * square for bound in weights.detach().aminmax())
-        if _EPS * heavy > 1e-3 * (light + 1 / penalty):  # what fit_machine allows, too
+        if lost_in_sums(weights.detach(), penalty, square) > LARGEST_LOSS:
             raise ValueError(
-                f"weights are too far apart for X'WX, by {heavy / light:.0e}; take the dual, or "
-                "lower the penalty"
+                f"weights are too far apart for X'WX, by {float(weights.max() / weights.min()):.0e}"
+                "; take the dual, or lower the penalty"
             )
     weighted = x if weights is None else x * weights[:, None]
     moment = weighted.mT @ targets.double()
@@ -156,8 +159,7 @@ def solve_normal_equations(normal: Tensor, moment: Tensor, penalty: float) -> Te
         ValueError: as ``solve_primal``.
     """
     _check_penalty(penalty)
-    weights = torch.ones_like(moment)
-    return _solve(normal, moment, penalty, weights, in_span=True, name="X'WX")
+    return _solve(normal, moment, penalty, torch.ones_like(moment), in_span=True, name="X'WX")
 
 
 def solve_normal_equations_(
@@ -199,12 +201,11 @@ def _solve(
     system: Tensor, right: Tensor, penalty: float, weights: Tensor, *, in_span: bool, name: str
 ) -> Tensor:
     """``(system + diag(1 / (penalty weights)))^-1 right``, differentiable; batched, in float64."""
-    given = system.dtype
+    given, eps = system.dtype, torch.finfo(system.dtype).eps
     system, right, weights = system.double(), right.double(), weights.double()
     check_finite(system, right, name)
     ridged = system + torch.diag_embed(ridge_of(penalty, weights))
     system, right = system.expand(ridged.shape), right.expand(ridged.shape[:-1])
-    eps = torch.finfo(given).eps
     plain = torch.ones(right.shape[:-1], dtype=torch.bool, device=right.device)
     if math.isinf(penalty):  # no Cholesky first, but for bins that a cut would lose
         plain = light_bins(system.detach().diagonal(dim1=-2, dim2=-1), weights, eps).any(-1)

@@ -44,21 +44,20 @@ from tactslip_torch.model.cholesky import (
     refine,
 )
 from tactslip_torch.model.condition import (
-    LARGEST_ERROR,
-    LARGEST_ERROR_FROM_FLOAT32,
     Method,
     SolveReport,
-    check_light,
-    conditions_of,
     inverse_growth,
     inverse_norm,
-    light_bins,
     scaled_norm,
+)
+from tactslip_torch.model.truncation import (
+    LARGEST_ERROR,
+    LARGEST_ERROR_FROM_FLOAT32,
+    check_light,
+    light_bins,
     truncated,
 )
 from tactslip_torch.threads import for_each
-
-__all__ = ["Solution", "check_light", "conditions_of", "light_bins", "truncated"]
 
 log = logging.getLogger(__name__)
 
