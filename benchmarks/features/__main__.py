@@ -9,7 +9,6 @@ the project has set itself, and keeps the numbers in ``benchmarks/results``.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -20,10 +19,7 @@ from benchmarks.features.measure import SECTIONS
 from benchmarks.features.report import limit_rows, ratios, report_text
 from benchmarks.features.sizes import QUICK, Sizes
 from benchmarks.machine import machine_facts, versions
-from tactslip_torch.files import whole_file
-
-RESULTS = Path(__file__).parents[1] / "results"
-EXIT_INTERRUPTED = 130
+from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, keep_numbers, refuse_folders
 
 
 def measure(sizes: Sizes, names: Sequence[str], quick: bool) -> dict[str, Any]:
@@ -62,8 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     text = "where the numbers go (benchmarks/results, if all is measured in full)"
     parser.add_argument("--json", type=Path, metavar="FILE", help=text)
     parsed = parser.parse_args(arguments)
-    if parsed.json and parsed.json.is_dir():
-        parser.error(f"--json needs a file, {parsed.json} is a folder")
+    refuse_folders(parser, parsed, "json")
     if not (parsed.quick or parsed.only):
         parsed.json = parsed.json or RESULTS / "features.json"
     names = [name for name in SECTIONS if parsed.only is None or name in parsed.only]
@@ -72,10 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     print(report_text(report))
-    if parsed.json:
-        with whole_file(parsed.json) as temporary:
-            temporary.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
-        print(f"\nnumbers in {parsed.json}")
+    keep_numbers(report, parsed.json)
     return 0
 
 

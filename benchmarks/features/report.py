@@ -9,6 +9,7 @@ from typing import Any
 from benchmarks.arithmetic import NATIVE, WIDE
 from benchmarks.clocks import paired_ratio
 from benchmarks.machine import threads_text
+from benchmarks.outcome import limits_table
 from tactslip_torch.report.tables import aligned
 
 SIMULATED_LINE = "SIMULATED bins: what features and scores cost, nothing about a real hand"
@@ -81,11 +82,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     parts = [_heading(report)]
     parts += [_table(name, of, report["ratios"]) for name, of in report["sections"].items()]
     parts += [_wide_line(report["ratios"]["wide_over_native"])]
-    rows = [
-        [row["what"], row["measured"], row["limit"], "met" if row["ok"] else "MISSED"]
-        for row in report["limits"]
-    ]
-    parts.append(aligned(["limits", "median, quartiles", "limit", ""], rows))
+    parts.append(limits_table(report["limits"], "median, quartiles"))
     parts.append("guards off replaces " + ", ".join(report["replaced"]))
     return "\n\n".join([*filter(None, parts), *([QUICK_LINE] if report["quick"] else [])])
 

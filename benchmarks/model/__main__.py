@@ -11,7 +11,6 @@ The one run at a million bins: ``python -m benchmarks.model --only any_size --bi
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -27,10 +26,9 @@ from benchmarks.model.measure import SECTIONS
 from benchmarks.model.report import limit_rows, ratios, report_text
 from benchmarks.model.sizes import QUICK, Sizes
 from benchmarks.model.worker import WorkerFailedError
-from tactslip_torch.files import whole_file
+from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, keep_numbers, refuse_folders
 
-RESULTS = Path(__file__).parents[1] / "results"
-EXIT_FAILED, EXIT_INTERRUPTED = 1, 130
+EXIT_FAILED = 1
 
 
 def measure(sizes: Sizes, names: Sequence[str], threads: int, quick: bool) -> dict[str, Any]:
@@ -79,10 +77,7 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         value = getattr(parsed, name)
         if value is not None and value < 1:
             parser.error(f"--{name} must be at least 1, got {value}")
-    for name in ("json", "figure"):
-        path = getattr(parsed, name)
-        if path and path.is_dir():
-            parser.error(f"--{name} needs a file, {path} is a folder")
+    refuse_folders(parser, parsed, "json", "figure")
     if parsed.figure and parsed.only and not set(parsed.only) & set(PANELS):
         parser.error(f"--figure shows {', '.join(PANELS)}; measure one of them")
     if not (parsed.quick or parsed.only):
@@ -108,10 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     print(report_text(report))
-    if parsed.json:
-        with whole_file(parsed.json) as temporary:
-            temporary.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
-        print(f"\nnumbers in {parsed.json}")
+    keep_numbers(report, parsed.json)
     if parsed.figure:
         figure(report, parsed.figure)
         print(f"\nfigure in {parsed.figure}")

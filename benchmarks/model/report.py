@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from statistics import median
 from typing import Any
 
+from benchmarks.outcome import limits_table
 from tactslip_torch.report.tables import aligned
 
 SYNTHETIC_LINE = "SYNTHETIC features: what the machine costs, nothing about a hand"
@@ -142,11 +143,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     sections, of = report["sections"], report["ratios"]
     parts = [_heading(report)]
     parts += [_TABLES[name](numbers, of) for name, numbers in sections.items()]
-    rows = [
-        [row["what"], row["measured"], row["limit"], "met" if row["ok"] else "MISSED"]
-        for row in report["limits"]
-    ]
-    parts.append(aligned(["limits", "measured", "limit", ""], rows))
+    parts.append(limits_table(report["limits"]))
     return "\n\n".join(parts + ([QUICK_LINE] if report["quick"] else []))
 
 

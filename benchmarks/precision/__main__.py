@@ -9,7 +9,6 @@ flip, balanced accuracy. Prints tables and keeps numbers and figure in ``benchma
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,15 +18,12 @@ import torch
 
 from benchmarks.clocks import on_threads
 from benchmarks.machine import machine_facts, versions
+from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, keep_numbers, refuse_folders
 from benchmarks.precision.data import load_experiment
 from benchmarks.precision.figure import figure
 from benchmarks.precision.measure import measure_variants
 from benchmarks.precision.report import limit_rows, ratios, report_text
 from benchmarks.precision.sizes import QUICK, Sizes
-from tactslip_torch.files import whole_file
-
-RESULTS = Path(__file__).parents[1] / "results"
-EXIT_INTERRUPTED = 130
 
 
 def measure(sizes: Sizes, threads: int, quick: bool) -> dict[str, Any]:
@@ -70,10 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = parser.parse_args(arguments)
     if parsed.threads < 1:
         parser.error(f"--threads must be at least 1, got {parsed.threads}")
-    for name in ("json", "figure"):
-        path = getattr(parsed, name)
-        if path and path.is_dir():
-            parser.error(f"--{name} needs a file, {path} is a folder")
+    refuse_folders(parser, parsed, "json", "figure")
     if not parsed.quick:
         parsed.json = parsed.json or RESULTS / "precision.json"
         parsed.figure = parsed.figure or RESULTS / "precision.png"
@@ -82,10 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     print(report_text(report))
-    if parsed.json:
-        with whole_file(parsed.json) as temporary:
-            temporary.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
-        print(f"\nnumbers in {parsed.json}")
+    keep_numbers(report, parsed.json)
     if parsed.figure:
         figure(report, parsed.figure)
         print(f"\nfigure in {parsed.figure}")

@@ -8,6 +8,7 @@ from typing import Any
 
 from benchmarks.clocks import paired_ratio
 from benchmarks.machine import threads_text
+from benchmarks.outcome import limits_table
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
 
 QUICK_LINE = "QUICK: too few bins and rounds to mean anything, whatever stands under limits"
@@ -54,11 +55,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     parts += [
         f"{name} bins: the pool refuses, {of!r}" for name, of in report["pool_refuses"].items()
     ]
-    rows = [
-        [row["what"], row["measured"], row["limit"], "met" if row["ok"] else "MISSED"]
-        for row in report["limits"]
-    ]
-    parts.append(aligned(["limits", "measured", "limit", ""], rows))
+    parts.append(limits_table(report["limits"]))
     return "\n\n".join(parts + ([QUICK_LINE] if report["quick"] else []))
 
 
