@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.pool import VALIDITY
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.rounding import error_facts, gradient_facts, head_facts
 from tactslip_torch.signals.coverage import Coverage, KnownInputs, coverage
@@ -27,7 +28,6 @@ WORST_SD = 1e-3  # largest score error allowed on recordings, in standard deviat
 INSIDE_SHARE = 0.01  # fewer of the held-out bins may lie inside the margin
 LARGEST_RATIO = 1e4  # a bound further above the worst error seen says too little
 RULE = f"{FACTOR} x the worst error on calibration bins, plus the bound of the head if it has one"
-VALIDITY = "every channel in use is finite, and its filtered span above 64 eps of its magnitude"
 _CHUNK_BINS, _GRADIENT_BINS = 16, 128
 
 Watch = Callable[[Iterable[Any], str, str], Iterable[Any]]

@@ -29,6 +29,11 @@ GAIN = 2.0**20
 """More than wavelet branches and spectra multiply a gradient by on its way back."""
 NATIVE_SPAN = 2.0**-10
 """Part of a film's magnitude; in float32 throughout, less may be lost in a branch."""
+VALIDITY = (
+    "every channel in use is finite, and its filtered span above 64 eps of its magnitude; in "
+    "native float32 that of a film above 2^-10 of it"
+)
+"""``FeaturePool.validity`` of the channels in use, in words for people."""
 LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
 """Volts; what is larger counts as Inf, because its branches and spectra may leave float64."""
 
