@@ -48,6 +48,37 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "features.guards",
         "hand",
     ),
+    "features.plan": ("features.names", "features.descriptors", "signals.*", "hand"),
+    "features.linear_maps": ("features.pool", "features.guards", "signals.*"),
+    "features.eager*": (
+        "features.eager*",
+        "features.plan",
+        "features.linear_maps",
+        "features.pool",
+        "features.descriptors",
+        "features.guards",
+        "features.runs",
+    ),
+    "features.compiled*": (
+        "features.compiled*",
+        "features.plan",
+        "features.linear_maps",
+        "features.pool",
+        "features.descriptors",
+        "features.guards",
+        "features.runs",
+    ),
+    "features.extractor": (
+        "features.eager",
+        "features.compiled",
+        "features.plan",
+        "features.linear_maps",
+        "features.pool",
+        "features.names",
+        "features.guards",
+        "threads",
+    ),
+    "features.ranking": ("features.selection", "features.names", "features.plan"),
     "features.cache": ("files",),
     "features.invariance": ("features.descriptors",),
     "model.scaling": (),
@@ -148,11 +179,26 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "model.*",
     ),
     "certify": ("*",),
+    "latency": ("features.*", "signals.*", "model.*", "hand"),
+    "cost": ("latency", "features.*", "signals.*", "model.*", "hand"),
+    "front": (
+        "latency",
+        "cost",
+        "recipe",
+        "planning",
+        "fitting",
+        "features.*",
+        "model.*",
+        "data.*",
+        "progress",
+        "threads",
+    ),
+    "pareto": ("*",),
     "config": ("*",),
 }
 
 # What knows the configuration.
-ENTRY = ("experiment", "train", "evaluate", "export", "stats", "crossval", "certify", "config")
+ENTRY = ("experiment", "train", "evaluate", "export", "stats", "crossval", "certify", "pareto", "config")
 
 # Packages of others that only these modules may import.
 ONLY_IN: dict[str, tuple[str, ...]] = {
@@ -162,7 +208,8 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "pytorch_lightning": (),
     "ptwt": ("signals.wavelet",),
     "pywt": ("signals.wavelet",),
-    "matplotlib": ("report.figures", "report.crossval", "report.validation", "report.certificate"),
+    "matplotlib": ("report.figures", "report.crossval", "report.validation", "report.certificate", "report.pareto"),
+    "numba": ("features.compiled*",),
 }
 
 # These need torch and the standard library alone.
