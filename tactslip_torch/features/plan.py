@@ -95,9 +95,8 @@ def make_plan(hand: HandLayout, level: int, names: Sequence[FeatureName | str]) 
         ValueError: if there is no name, or one is none of the pool.
 
     Example:
-        >>> plan = make_plan(HandLayout.paper24(), 4, ["PVDF3 A2 freq kurtosis", "SG1 raw time std"])
-        >>> plan.channels, len(plan.rows)
-        ((0, 16), 2)
+        >>> make_plan(HandLayout.paper24(), 4, ["PVDF3 A2 freq kurtosis"]).rows
+        (Row(kind='freq', channel=16, branch=2),)
     """
     known = {str(name): name for name in pool_names(hand, level)}
     if not names:
