@@ -142,6 +142,16 @@ ARROWS: dict[str, tuple[str, ...]] = {
     ),
     "model.threshold": (),
     "model.judgement": ("signals.finite",),
+    "model.detector_file": (
+        "features.pool",
+        "signals.filtering",
+        "model.kernels",
+        "model.kernel_sum",
+        "model.quadratic",
+        "model.scaling",
+        "hand",
+        "files",
+    ),
     "model.detector": ("features.*", "signals.*", "model.*", "hand", "files"),
     "report.*": ("report.*", "files"),
     "feature_maker": ("data.*", "simulation.*", "signals.*", "features.*", "hand"),
@@ -198,7 +208,17 @@ ARROWS: dict[str, tuple[str, ...]] = {
 }
 
 # What knows the configuration.
-ENTRY = ("experiment", "train", "evaluate", "export", "stats", "crossval", "certify", "pareto", "config")
+ENTRY = (
+    "experiment",
+    "train",
+    "evaluate",
+    "export",
+    "stats",
+    "crossval",
+    "certify",
+    "pareto",
+    "config",
+)
 
 # Packages of others that only these modules may import.
 ONLY_IN: dict[str, tuple[str, ...]] = {
@@ -208,7 +228,13 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "pytorch_lightning": (),
     "ptwt": ("signals.wavelet",),
     "pywt": ("signals.wavelet",),
-    "matplotlib": ("report.figures", "report.crossval", "report.validation", "report.certificate", "report.pareto"),
+    "matplotlib": (
+        "report.figures",
+        "report.crossval",
+        "report.validation",
+        "report.certificate",
+        "report.pareto",
+    ),
     "numba": ("features.compiled*",),
 }
 

@@ -108,13 +108,13 @@ def make_plan(hand: HandLayout, level: int, names: Sequence[FeatureName | str]) 
             f"unknown feature {unknown[0]!r}, expected one of the pool's {len(known)} names, such "
             f"as {example!r}; pool.names lists them"
         )
-    branches = branch_names(level)
+    branches = {name: index for index, name in enumerate(branch_names(level))} | {"raw": -1}
+    channel_of = {name: index for index, name in enumerate(hand.names)}
     found: list[tuple[Row, str]] = []
     for name in (known[str(name)] for name in names):
-        channel = hand.names.index(name.channel)
-        branch = -1 if name.component == "raw" else branches.index(name.component)
+        branch = branches[name.component]
         kind: RowKind = "gauge" if branch < 0 else "time" if name.domain == "time" else "freq"
-        found.append((Row(kind, channel, branch), name.descriptor))
+        found.append((Row(kind, channel_of[name.channel], branch), name.descriptor))
     is_share = [descriptor == "band_energy_ratio" for _, descriptor in found]
     rows = sorted(
         {row for (row, _), shared in zip(found, is_share, strict=True) if not shared},
