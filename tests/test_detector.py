@@ -9,7 +9,7 @@ import torch
 
 from tactslip_torch import FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.files import load_table, save_table
-from tactslip_torch.model.detector import FORMAT
+from tactslip_torch.model.detector_file import FORMAT
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import Polynomial, RadialBasis
 from tactslip_torch.model.quadratic import QuadraticForm

@@ -12,23 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from tactslip_torch.features.extractor import EngineName, FeatureExtractor, resolved
 from tactslip_torch.features.guards import is_nowhere
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool, saturating
-from tactslip_torch.files import load_table, save_table, table_form
-from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.detector_file import Head, damaged, read_detector, write_detector
 from tactslip_torch.model.judgement import Judgement, Nonfinite, check_nonfinite
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.kernels import kernel_from_dict
-from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
-
-Head = QuadraticForm | KernelSum
-"""A quadratic form of fixed size, or the sum over training bins of a kernel that does not fold."""
-
-FORMAT = "tactslip_torch detector 2"
-EARLIER_FORMAT = "tactslip_torch detector 1"
 
 
 class SlipDetector(nn.Module):
@@ -45,6 +36,7 @@ class SlipDetector(nn.Module):
         head: the machine on scaled features.
         info: JSON-able facts about the training, kept in the file.
         typical: scaled features that stand in for those of a missing channel; default 0.
+        engine: what features are made by where no gradient is asked for (``FeatureExtractor``).
 
     Shape:
         - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
@@ -57,7 +49,6 @@ class SlipDetector(nn.Module):
     """
 
     typical: Tensor
-    _selected_index: Tensor
     _channel_index: Tensor  # of each selected feature
     _needed_index: Tensor  # of the channels in use
 
@@ -70,6 +61,8 @@ class SlipDetector(nn.Module):
         head: Head,
         info: Mapping[str, Any] | None = None,
         typical: Tensor | Sequence[float] | None = None,
+        *,
+        engine: EngineName = "reference",
     ) -> None:
         super().__init__()
         if not len(selected) == len(scaler.minimum) == head.num_features:
@@ -77,12 +70,7 @@ class SlipDetector(nn.Module):
                 f"{len(selected)} selected features, a scaler of {len(scaler.minimum)} and a head "
                 f"of {head.num_features}: the three must agree"
             )
-        outside = [int(i) for i in selected if not 0 <= i < len(pool.names)]
-        if outside:
-            raise ValueError(
-                f"selected features must lie in 0..{len(pool.names) - 1}, the pool's "
-                f"{len(pool.names)}, got {outside[0]}"
-            )
+        extractor = FeatureExtractor(pool, selected, engine)
         if len(channel_filter.window_lengths) != len(pool.hand):
             raise ValueError(
                 f"a filter of {len(channel_filter.window_lengths)} channels does not fit a hand "
@@ -95,21 +83,22 @@ class SlipDetector(nn.Module):
                 f"{tuple(typical.shape)} of at most {float(typical.abs().max()):g}"
             )
         self.pool = pool
+        self.extractor = extractor
         self.channel_filter = channel_filter
         self.scaler = scaler
         self.head = head
-        self.selected = tuple(int(i) for i in selected)
+        self.selected = extractor.selected
         self.info = dict(info or {})
         self.register_buffer("typical", typical.to(next(head.buffers()), copy=True))
         channels = [pool.hand.names.index(name.channel) for name in self.selected_names]
-        indices = {"selected": self.selected, "channel": channels, "needed": sorted(set(channels))}
+        indices = {"channel": channels, "needed": sorted(set(channels))}
         for name, index in indices.items():
             self.register_buffer(f"_{name}_index", torch.tensor(index), persistent=False)
 
     @property
     def selected_names(self) -> tuple[FeatureName, ...]:
         """Names of the features in use, best first."""
-        return tuple(self.pool.names[i] for i in self.selected)
+        return self.extractor.names
 
     @property
     def context(self) -> int:
@@ -216,8 +205,7 @@ class SlipDetector(nn.Module):
         return self.channel_filter.valid(self.pool.widen(samples))
 
     def _features(self, bins: Tensor) -> Tensor:
-        features: Tensor = self.pool(self.pool.widen(bins))
-        return features.index_select(-1, self._selected_index)
+        return self.extractor(bins, self.scaler.minimum.dtype)
 
     def _scale(self, features: Tensor) -> Tensor:
         scaled: Tensor = self.scaler(saturating(features, self.scaler.minimum.dtype))
@@ -237,63 +225,20 @@ class SlipDetector(nn.Module):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the detector to one file, whole or not at all."""
-        pool, head = self.pool, self.head
-        facts = {
-            "channels": pool.hand.to_rows(),
-            "pool": pool.facts(),
-            "window_lengths": list(self.channel_filter.window_lengths),
-            "polyorder": self.channel_filter.polyorder,
-            "selected": list(self.selected),
-            "kernel": head.kernel.to_dict() if isinstance(head, KernelSum) else None,
-            "info": self.info,
-        }
-        state = {name: value.cpu() for name, value in self.state_dict().items()}
-        save_table(path, FORMAT, facts, state)
+        parts = (self.pool, self.channel_filter, self.selected, self.head, self.info)
+        write_detector(path, *parts, self.state_dict())
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> SlipDetector:
+    def load(cls, path: str | os.PathLike[str], engine: EngineName = "reference") -> SlipDetector:
         """Read a detector; nothing in the file is executed.
 
         Raises:
             FileNotFoundError: if there is no such file.
             ValueError: if it is not a detector file, a damaged one, or of an earlier version.
         """
-        name = os.fspath(path)
+        resolved(engine)
+        parts = read_detector(path)
         try:
-            if table_form(path) == EARLIER_FORMAT:
-                raise ValueError(
-                    f"{name} was made by an earlier version; train again, or evaluate it with "
-                    "that version"
-                )
-            facts, state = load_table(path, FORMAT)
-        except FileNotFoundError:
-            raise FileNotFoundError(f"no detector at {name}") from None
-        try:
-            return cls._from_facts(facts, state)
+            return cls(*parts, engine=engine)
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"{name} is a damaged detector: {reason}") from error
-
-    @classmethod
-    def _from_facts(cls, facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> SlipDetector:
-        def part(prefix: str) -> dict[str, Any]:
-            return {
-                name.removeprefix(prefix): value
-                for name, value in state.items()
-                if name.startswith(prefix)
-            }
-
-        head: Head
-        if facts["kernel"] is None:
-            head = QuadraticForm(**part("head."))
-        else:
-            head = KernelSum(**part("head."), kernel=kernel_from_dict(facts["kernel"]))
-        return cls(
-            FeaturePool(HandLayout.from_rows(facts["channels"]), **facts["pool"]),
-            ChannelFilter(facts["window_lengths"], facts["polyorder"]),
-            facts["selected"],
-            FeatureScaler(**part("scaler.")),
-            head,
-            facts["info"],
-            state.get("typical"),
-        )
+            raise damaged(path, error) from error

@@ -1,0 +1,226 @@
+"""The front door to features: a pool or a part of it, by the fastest engine that may be used.
+
+``"reference"`` is ``FeaturePool`` itself: differentiable, on any device, the truth in tests.
+``"eager"`` and ``"compiled"`` carry out a plan of the least work, forwards only and on the CPU:
+PyTorch and NumPy, or kernels compiled by numba. All give the same values to rounding. Where a
+derivative is asked for, a graph is recorded or bins lie on another device, the reference takes
+over; so it does for single bins that hold a NaN, an Inf or magnitudes beyond ``ordinary_sizes``.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.util import find_spec
+from typing import Any, Literal, Protocol, get_args
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from tactslip_torch.features.guards import is_recorded, ordinary_sizes
+from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.plan import make_plan
+from tactslip_torch.features.pool import FeaturePool, saturating
+from tactslip_torch.threads import for_each
+
+EngineName = Literal["auto", "compiled", "eager", "reference"]
+_FEW_BINS = 4  # so few are done here: another thread would take longer to start
+
+
+class Engine(Protocol):
+    """Carries out a plan on ordinary bins; called from several threads at once.
+
+    Attributes:
+        chunk_bins: how many bins at once it is fastest with, and the most it takes.
+    """
+
+    chunk_bins: int
+
+    def __call__(self, x: Tensor, scale: Tensor, out: Tensor) -> None:
+        """Write the features of some bins.
+
+        Shape:
+            - x: ``[M, C', n]``, float64, contiguous: filtered bins of the plan's channels
+            - scale: ``[M, C']``, float64, largest magnitude of each: 0 or ordinary
+            - out: ``[M, K]``, float32 or float64, written
+        """
+
+
+class FeatureExtractor:
+    """Features of filtered bins, the whole pool or those selected, as fast as can be.
+
+    float32 bins are computed in float64 and rounded once; for a pool whose arithmetic is
+    ``"native"`` the fast engines keep linear maps in float64 and take statistics in float32 of
+    rows scaled to order one, which is nearer to float64 than the reference in float32 throughout.
+
+    Args:
+        pool: what features there are.
+        selected: pool indices of the features wanted, in the order of the output; default: all.
+        engine: ``"auto"`` takes the compiled one where numba is installed, else the eager one.
+
+    Attributes:
+        plan: the least work for these features.
+        engine: the engine in use, never ``"auto"``.
+
+    Raises:
+        ValueError: for no feature, an index outside the pool, an unknown engine, or
+            ``"compiled"`` without numba.
+
+    Example:
+        >>> from tactslip_torch import HandLayout
+        >>> extractor = FeatureExtractor(FeaturePool(HandLayout.paper24()), selected=[200, 7])
+        >>> extractor(torch.randn(5, 24, 100)).shape
+        torch.Size([5, 2])
+    """
+
+    def __init__(
+        self,
+        pool: FeaturePool,
+        selected: Sequence[int] | None = None,
+        engine: EngineName = "auto",
+    ) -> None:
+        num = len(pool.names)
+        outside = [int(i) for i in selected or () if not 0 <= i < num]
+        if outside:
+            raise ValueError(
+                f"selected features must lie in 0..{num - 1}, the pool's {num}, got {outside[0]}"
+            )
+        self.pool = pool
+        self.selected = tuple(range(num)) if selected is None else tuple(int(i) for i in selected)
+        self.engine = resolved(engine)
+        self.plan = make_plan(pool.hand, pool.level, self.names)
+        self._index = None if selected is None else torch.tensor(self.selected)
+        self._start()
+
+    @property
+    def names(self) -> tuple[FeatureName, ...]:
+        """Names of the features, in the order of the output."""
+        return tuple(self.pool.names[i] for i in self.selected)
+
+    def __call__(self, bins: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+        """Features of filtered bins.
+
+        Shape:
+            - bins: ``[*, C, n]``, float32 or float64, volts
+            - output: ``[*, K]`` in ``dtype``, by default that of ``bins``; NaN for features of a
+              channel that holds a NaN or Inf; what is beyond the dtype saturates
+
+        Raises:
+            ValueError: as ``FeaturePool``.
+        """
+        self.pool.check(bins)
+        dtype = dtype or bins.dtype
+        if self.engine == "reference" or not _is_plain(bins):
+            return self._reference(bins, dtype)
+        is_native = self.pool.arithmetic == "native"
+        engine = self._engine(bins.dtype if is_native else torch.float64)
+        flat = bins.detach().flatten(0, -3) if bins.ndim > 2 else bins.detach()[None]
+        out = torch.empty(len(flat), len(self.selected), dtype=dtype)
+
+        def work(start: int) -> None:
+            stop = start + engine.chunk_bins
+            self._chunk(engine, flat[start:stop], out[start:stop])
+
+        starts = range(0, len(flat), engine.chunk_bins)
+        if len(flat) <= _FEW_BINS:
+            for start in starts:
+                work(start)
+        else:
+            for_each(work, starts)
+        return out.reshape(*bins.shape[:-2], len(self.selected))
+
+    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
+        """Features of one batch of bins after the other; no more than one is held.
+
+        Shape:
+            - of each batch: ``[*, C, n]``; of what is handed on for it: ``[*, K]``
+        """
+        for bins in batches:
+            yield self(bins)
+
+    def _chunk(self, engine: Engine, bins: Tensor, out: Tensor) -> None:
+        x = bins
+        if len(self.plan.channels) < bins.shape[1]:
+            x = x.index_select(1, self._channels)
+        x = x.double().contiguous()
+        low, high = x.aminmax(dim=-1)
+        scale = torch.maximum(high, -low)
+        size = scale.numpy()
+        is_ordinary = ((size >= self._sizes[0]) & (size <= self._sizes[1])) | (size == 0)
+        if is_ordinary.all():
+            engine(x, scale, out)
+            return
+        whole = torch.from_numpy(is_ordinary.all(axis=1))
+        if bool(whole.any()):
+            part = out.new_empty(int(whole.sum()), out.shape[1])
+            engine(x[whole], scale[whole], part)
+            out[whole] = part
+        out[~whole] = self._reference(bins[~whole], out.dtype)
+
+    def _reference(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
+        features: Tensor = self.pool(self.pool.widen(bins))
+        if self._index is not None:
+            features = features.index_select(-1, self._index.to(features.device))
+        return saturating(features, dtype)
+
+    def _engine(self, dtype: torch.dtype) -> Engine:
+        with self._making:
+            if dtype not in self._engines:
+                self._engines[dtype] = self._made(dtype)
+            return self._engines[dtype]
+
+    def _made(self, dtype: torch.dtype) -> Engine:
+        if self.engine == "eager":
+            from tactslip_torch.features.eager import EagerEngine
+
+            return EagerEngine(self.pool, self.plan, dtype)
+        from tactslip_torch.features.compiled import CompiledEngine  # numba takes a second
+
+        return CompiledEngine(self.pool, self.plan, dtype)
+
+    def _start(self) -> None:
+        self._engines: dict[torch.dtype, Engine] = {}
+        self._making = threading.Lock()
+        self._channels = torch.tensor(self.plan.channels)
+        self._sizes = ordinary_sizes(torch.float64)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without engines, which hold workspaces of threads."""
+        return {k: v for k, v in self.__dict__.items() if k not in ("_engines", "_making")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._start()
+
+
+def resolved(engine: EngineName) -> EngineName:
+    """The engine that a name means on this machine.
+
+    Raises:
+        ValueError: for an unknown name, or ``"compiled"`` without numba.
+    """
+    if engine not in get_args(EngineName):
+        raise ValueError(f"engine must be one of {', '.join(get_args(EngineName))}, got {engine!r}")
+    has_numba = find_spec("numba") is not None
+    if engine == "compiled" and not has_numba:
+        raise ValueError(
+            'engine "compiled" needs numba, which is not installed; pip install '
+            '"tactslip_torch[fast]", or use engine "eager"'
+        )
+    if engine == "auto":
+        return "compiled" if has_numba else "eager"
+    return engine
+
+
+def _is_plain(bins: Tensor) -> bool:
+    """Whether only values are asked for, and lie in memory that can be looked at."""
+    if bins.device.type != "cpu" or is_recorded():
+        return False
+    if torch.is_grad_enabled() and bins.requires_grad:
+        return False
+    try:
+        bins.detach().numpy()  # under vmap and other transforms there is no memory to look at
+        return forward_ad.unpack_dual(bins).tangent is None
+    except RuntimeError:
+        return False

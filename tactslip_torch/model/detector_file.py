@@ -1,0 +1,111 @@
+"""A fitted detector in one file: a plain table of tensors and JSON text that executes nothing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.files import load_table, save_table, table_form
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.kernel_sum import KernelSum
+from tactslip_torch.model.kernels import kernel_from_dict
+from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.signals.filtering import ChannelFilter
+
+FORMAT = "tactslip_torch detector 2"
+EARLIER_FORMAT = "tactslip_torch detector 1"
+
+Head = QuadraticForm | KernelSum
+"""A quadratic form of fixed size, or the sum over training bins of a kernel that does not fold."""
+
+
+class DetectorParts(NamedTuple):
+    """What ``SlipDetector`` is made of, in the order of its arguments."""
+
+    pool: FeaturePool
+    channel_filter: ChannelFilter
+    selected: Sequence[int]
+    scaler: FeatureScaler
+    head: Head
+    info: Mapping[str, Any]
+    typical: Tensor | None
+
+
+def write_detector(
+    path: str | os.PathLike[str],
+    pool: FeaturePool,
+    channel_filter: ChannelFilter,
+    selected: Sequence[int],
+    head: Head,
+    info: Mapping[str, Any],
+    state: Mapping[str, Tensor],
+) -> None:
+    """Write a detector with the tensors of its ``state_dict``, whole or not at all."""
+    facts = {
+        "channels": pool.hand.to_rows(),
+        "pool": pool.facts(),
+        "window_lengths": list(channel_filter.window_lengths),
+        "polyorder": channel_filter.polyorder,
+        "selected": list(selected),
+        "kernel": head.kernel.to_dict() if isinstance(head, KernelSum) else None,
+        "info": dict(info),
+    }
+    save_table(path, FORMAT, facts, {name: value.cpu() for name, value in state.items()})
+
+
+def read_detector(path: str | os.PathLike[str]) -> DetectorParts:
+    """The parts of a saved detector.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a detector file, a damaged one, or of an earlier version.
+    """
+    name = os.fspath(path)
+    try:
+        if table_form(path) == EARLIER_FORMAT:
+            raise ValueError(
+                f"{name} was made by an earlier version; train again, or evaluate it with "
+                "that version"
+            )
+        facts, state = load_table(path, FORMAT)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"no detector at {name}") from None
+    try:
+        return _parts(facts, state)
+    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise damaged(path, error) from error
+
+
+def damaged(path: str | os.PathLike[str], error: Exception) -> ValueError:
+    """What to raise for a file whose parts do not fit together."""
+    reason = str(error).splitlines()[0]
+    return ValueError(f"{os.fspath(path)} is a damaged detector: {reason}")
+
+
+def _parts(facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> DetectorParts:
+    def part(prefix: str) -> dict[str, Any]:
+        return {
+            name.removeprefix(prefix): value
+            for name, value in state.items()
+            if name.startswith(prefix)
+        }
+
+    head: Head
+    if facts["kernel"] is None:
+        head = QuadraticForm(**part("head."))
+    else:
+        head = KernelSum(**part("head."), kernel=kernel_from_dict(facts["kernel"]))
+    return DetectorParts(
+        FeaturePool(HandLayout.from_rows(facts["channels"]), **facts["pool"]),
+        ChannelFilter(facts["window_lengths"], facts["polyorder"]),
+        facts["selected"],
+        FeatureScaler(**part("scaler.")),
+        head,
+        facts["info"],
+        state.get("typical"),
+    )
