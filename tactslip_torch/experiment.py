@@ -26,7 +26,7 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.files import whole_file
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.progress import RecordingProgressBar
-from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.spectrum import SpectrumMethod
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -42,6 +42,7 @@ def feature_parts(
     level: int,
     spectrum: SpectrumMethod,
     dtype: str,
+    align: Align = "centred",
 ) -> tuple[FeaturePool, ChannelFilter, torch.dtype]:
     """Pool, filter and dtype from the ``features`` section.
 
@@ -63,7 +64,7 @@ def feature_parts(
         arithmetic="native" if dtype == "float32" else "double",
     )
     lengths = [frames[channel.kind] for channel in source.hand.channels]
-    return pool, ChannelFilter(lengths, polyorder), DTYPES[dtype]
+    return pool, ChannelFilter(lengths, polyorder, align), DTYPES[dtype]
 
 
 @contextmanager

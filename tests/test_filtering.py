@@ -4,8 +4,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import signal
 
-from tactslip_torch.signals.filtering import ChannelFilter, savgol_filter
+from tactslip_torch.signals.filtering import ChannelFilter, reach, savgol_filter
 
 WINDOWS = [(1, 0), (3, 1), (5, 2), (11, 1), (51, 1), (51, 3), (11, 0), (7, 6)]
 WINDOW_OF_CHANNEL = [51, 11, 51, 5]
@@ -18,6 +19,53 @@ def test_equals_scipy(window, order, num_samples, make, rng):
     x = make(rng, 40, num_samples)
     actual = savgol_filter(torch.from_numpy(x), window, order)
     oracles.assert_columns_close(actual, oracles.savgol(x, window, order))
+
+
+def causal(x, window, order=1):
+    """The trailing frame's polynomial at its last sample; the first frame's before it is full."""
+    taps = signal.savgol_coeffs(window, order, pos=window - 1, use="dot")
+    rest = np.lib.stride_tricks.sliding_window_view(x, window, axis=-1) @ taps
+    position = np.arange(window)
+    fits = [np.polynomial.Polynomial.fit(position, row, order) for row in x[:, :window]]
+    head = np.stack([fit(position[:-1]) for fit in fits])
+    return np.concatenate([head, rest], axis=-1)
+
+
+@pytest.mark.parametrize(("window", "order"), WINDOWS)
+@pytest.mark.parametrize("num_samples", [51, 52, 200])
+def test_causal_equals_scipys_coefficients(window, order, num_samples, rng):
+    x = oracles.random_bins(rng, 20, num_samples)
+    actual = savgol_filter(torch.from_numpy(x), window, order, "causal")
+    oracles.assert_columns_close(actual, causal(x, window, order), 1e-9)
+
+
+@pytest.mark.parametrize("window", [11, 51])
+def test_causal_uses_nothing_behind_a_sample(window, rng):
+    x = torch.from_numpy(oracles.random_bins(rng, 300))
+    changed = x.clone()
+    changed[200:] += 100
+    before, after = (savgol_filter(y, window, align="causal") for y in (x, changed))
+    assert torch.equal(after[:200], before[:200])
+    assert (after[200] - before[200]).abs() > 1
+    changed = x.clone()
+    changed[200] += 100
+    last = savgol_filter(changed, window, align="causal") - savgol_filter(x, window, align="causal")
+    assert (last[:200] == 0).all()
+    assert last[200 + window - 1].abs() > 1e-3  # the frame reaches so far back
+    assert (last[200 + window :] == 0).all()
+
+
+@pytest.mark.parametrize(("window", "gain", "corner_hz"), [(11, 3.5, 200.0), (51, 3.885, 44.0)])
+def test_what_causal_lets_through_is_as_stated(window, gain, corner_hz):
+    impulse = torch.zeros(8 * window, dtype=torch.float64)
+    impulse[2 * window] = 1
+    taps = savgol_filter(impulse, window, align="causal")
+    assert float(taps.square().sum() * window) == pytest.approx(gain, abs=1e-3)
+    t = torch.arange(4000, dtype=torch.float64) / 2000.0
+    tone = torch.sin(2 * torch.pi * corner_hz * t)
+    inside = slice(200, -200)
+    passed = savgol_filter(tone, window, align="causal")[inside].std() / tone[inside].std()
+    assert 20 * torch.log10(passed) == pytest.approx(-3, abs=0.2)
 
 
 def test_default_order_is_one(rng):
@@ -134,13 +182,46 @@ def test_valid_is_the_centre_of_the_filtered_whole(num_samples, rng):
     torch.testing.assert_close(actual, torch.from_numpy(expected), rtol=1e-12, atol=1e-12)
 
 
-def test_channel_filter_manners(rng, device):
+@pytest.mark.parametrize("num_samples", [1, 100, 101])
+@pytest.mark.parametrize("order", [1, 2])
+def test_valid_of_a_causal_filter_is_the_end_of_the_filtered_whole(num_samples, order, rng):
+    layer = ChannelFilter(WINDOW_OF_CHANNEL, order, "causal")
+    assert (layer.context_before, layer.context_after, layer.context) == (50, 0, 25)
+    assert layer.reaches == ((50, 0), (10, 0), (50, 0), (4, 0))
+    x = oracles.random_bins(rng, 3, 4, 20 + 50 + num_samples)  # 20 samples that nobody needs
+    expected = np.stack(
+        [causal(x[:, c], w, order)[:, 70:] for c, w in enumerate(WINDOW_OF_CHANNEL)], axis=1
+    )
+    actual = layer.valid(torch.from_numpy(x[..., 20:].copy()))
+    np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-9)
+    whole = layer(torch.from_numpy(x))
+    np.testing.assert_allclose(whole[..., 70:], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_valid_keeps_its_matrices_to_itself(rng):
+    layer = ChannelFilter(WINDOW_OF_CHANNEL)
+    x = torch.from_numpy(oracles.random_bins(rng, 4, 150))
+    with torch.inference_mode():
+        first = layer.valid(x)
+    wanting = x.clone().requires_grad_()
+    again = layer.valid(wanting)
+    again.sum().backward()
+    assert torch.equal(first, again)
+    assert layer.valid(x.float()).dtype == torch.float32
+    assert layer.valid(x[:, :149]).shape == (4, 99)
+    assert torch.equal(layer.valid(x), first)
+    assert layer.state_dict() == {}
+
+
+@pytest.mark.parametrize("align", ["centred", "causal"])
+def test_channel_filter_manners(align, rng, device):
     x = torch.from_numpy(oracles.random_bins(rng, 2, 4, 160)).to(device)
-    layer = ChannelFilter(WINDOW_OF_CHANNEL).to(device)
+    layer = ChannelFilter(WINDOW_OF_CHANNEL, align=align).to(device)
     oracles.assert_manners(layer, x, num_axes=2)
     oracles.assert_manners(layer.valid, x, num_axes=2)
     assert torch.autograd.gradcheck(
-        ChannelFilter([3, 5]), torch.randn(2, 9, dtype=torch.float64, requires_grad=True)
+        ChannelFilter([3, 5], align=align),
+        torch.randn(2, 9, dtype=torch.float64, requires_grad=True),
     )
 
 
@@ -150,8 +231,14 @@ def test_channel_filter_errors():
         layer(torch.zeros(3, 100))
     with pytest.raises(ValueError, match=r"4.*\(3, 100\)"):
         layer.valid(torch.zeros(3, 100))
-    with pytest.raises(ValueError, match=r"25 samples of context.*50"):
+    with pytest.raises(ValueError, match=r"25 samples of context before and 25 behind.* 50"):
         layer.valid(torch.zeros(4, 50))
+    with pytest.raises(ValueError, match=r"50 samples of context before and 0 behind.* 50"):
+        ChannelFilter(WINDOW_OF_CHANNEL, align="causal").valid(torch.zeros(4, 50))
+    with pytest.raises(ValueError, match=r"align must be one of centred, causal, got 'left'"):
+        ChannelFilter([11], align="left")
+    with pytest.raises(ValueError, match=r"align must be one of centred, causal, got 'left'"):
+        reach(11, "left")
     with pytest.raises(ValueError, match=r"50 samples.*51"):
         layer(torch.zeros(4, 50))
     with pytest.raises(ValueError, match=r"odd.*10"):

@@ -2,14 +2,22 @@
 
 Order 1 is a moving average: -3 dB at 81 Hz for the 11-sample frame of the films and at 17 Hz for
 the 51-sample frame of the gauges. Centred, so it looks half a frame ahead: 2.5 ms and 12.5 ms.
+Causal (ours), the polynomial of the frame behind a sample is evaluated at that sample, the frame's
+last: no look-ahead, but at order 1 nearly four times the variance of white noise comes through,
+some tones below the corner are raised by a third, and the corners move to 200 Hz and 44 Hz.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
+
+Align = Literal["centred", "causal"]
+"""Where in its frame a sample lies: ``"centred"`` in the middle, ``"causal"`` at the end."""
+_MOST_MATRICES = 16
 
 
 def fit_matrix(window_length: int, polyorder: int) -> Tensor:
@@ -36,38 +44,62 @@ def fit_matrix(window_length: int, polyorder: int) -> Tensor:
     return basis @ basis.T
 
 
-def savgol_filter(x: Tensor, window_length: int, polyorder: int = 1) -> Tensor:
+def savgol_filter(
+    x: Tensor, window_length: int, polyorder: int = 1, align: Align = "centred"
+) -> Tensor:
     """Savitzky-Golay filter along the last axis, ``scipy.signal.savgol_filter(mode="interp")``.
 
-    The first and last half frame take the polynomial fitted to the first and last frame.
-    Linear, so gradients flow everywhere; a NaN reaches half a frame to each side and no further.
+    Samples whose frame would leave the signal take the polynomial fitted to the first or last
+    frame: half a frame at either end, or all but one sample of the first frame if causal.
+    Linear, so gradients flow everywhere; a NaN reaches as far as a frame does and no further.
 
     Args:
         x: signal in any unit.
         window_length: frame in samples, odd; 11 for PVDF and 51 for SG in the paper.
         polyorder: order of the fitted polynomial, 1 in the paper.
+        align: ``"centred"``, or ``"causal"``: the frame ends with the sample, as
+            ``scipy.signal.savgol_coeffs(pos=window_length - 1)``.
 
     Shape:
         - x, output: ``[*, T]`` with ``T >= window_length``
 
     Raises:
-        ValueError: if the frame is even, not above the order, or longer than the signal.
+        ValueError: if the frame is even, not above the order, or longer than the signal, or the
+            alignment is unknown.
 
     Example:
         >>> savgol_filter(torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0]), 3)
         tensor([-0.5000,  1.0000,  1.0000,  1.0000, -0.5000])
+        >>> savgol_filter(torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0]), 3, align="causal")
+        tensor([-0.5000,  1.0000,  2.5000,  1.0000, -0.5000])
     """
     fit = fit_matrix(window_length, polyorder).to(x)
+    before, after = reach(window_length, align)
     if x.shape[-1] < window_length:
         raise ValueError(
             f"a signal of {x.shape[-1]} samples is shorter than window_length {window_length}"
         )
-    half = window_length // 2
-    if half == 0:
+    if window_length == 1:
         return x.clone()
-    head = x[..., :window_length] @ fit[:half].T
-    tail = x[..., -window_length:] @ fit[-half:].T
-    return torch.cat([head, _convolve_valid(x, fit[half]), tail], dim=-1)
+    head = x[..., :window_length] @ fit[:before].T
+    tail = x[..., -window_length:] @ fit[window_length - after :].T
+    return torch.cat([head, _convolve_valid(x, fit[before]), tail], dim=-1)
+
+
+def reach(window_length: int, align: Align) -> tuple[int, int]:
+    """Samples before and after its own that a filtered sample is made of.
+
+    Raises:
+        ValueError: if the alignment is unknown.
+
+    Example:
+        >>> reach(51, "centred"), reach(51, "causal")
+        ((25, 25), (50, 0))
+    """
+    if align not in get_args(Align):
+        raise ValueError(f"align must be one of {', '.join(get_args(Align))}, got {align!r}")
+    half = window_length // 2
+    return (half, half) if align == "centred" else (2 * half, 0)
 
 
 def _convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
@@ -92,27 +124,62 @@ def _overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
 class ChannelFilter(nn.Module):
     """``savgol_filter`` with a frame of its own for every channel.
 
+    A bin is filtered exactly with ``context_before`` samples before it and ``context_after``
+    behind: as many on each side if centred, all of them before if causal, ``2 * context`` in all.
+
     Args:
         window_lengths: one odd frame per channel, in samples.
         polyorder: order of the fitted polynomial.
+        align: where in its frame a sample lies.
 
     Raises:
-        ValueError: if a frame is even or does not exceed the order.
+        ValueError: if a frame is even or does not exceed the order, or the alignment is unknown.
+
+    Example:
+        >>> causal = ChannelFilter([51, 11], align="causal")
+        >>> causal.context_before, causal.context_after, causal.reaches
+        (50, 0, ((50, 0), (10, 0)))
     """
 
-    def __init__(self, window_lengths: Sequence[int], polyorder: int = 1) -> None:
+    def __init__(
+        self, window_lengths: Sequence[int], polyorder: int = 1, align: Align = "centred"
+    ) -> None:
         super().__init__()
         self.window_lengths = tuple(int(length) for length in window_lengths)
         self.polyorder = polyorder
+        self.align: Align = align
         # float64 and outside the state: cast on use, so they never lose digits
         self._kernels = {
-            length: fit_matrix(length, polyorder)[length // 2] for length in self.window_lengths
+            length: fit_matrix(length, polyorder)[reach(length, align)[0]]
+            for length in self.window_lengths
         }
+        self._matrices: dict[tuple[int, int, torch.dtype, torch.device], Tensor] = {}
+        self._groups = [  # frames and their channels, the frame of the first channel first
+            (length, [i for i, own in enumerate(self.window_lengths) if own == length])
+            for length in dict.fromkeys(self.window_lengths)
+        ]
+        order = [i for _, chosen in self._groups for i in chosen]
+        self._inverse = sorted(range(len(order)), key=order.__getitem__)
+
+    @property
+    def reaches(self) -> tuple[tuple[int, int], ...]:
+        """Samples before and after its own that each channel's frame takes in."""
+        return tuple(reach(length, self.align) for length in self.window_lengths)
 
     @property
     def context(self) -> int:
-        """Samples needed on each side of a bin to filter it exactly: half the longest frame."""
+        """Half the longest frame; a bin comes with twice as many samples around it."""
         return max(self.window_lengths) // 2
+
+    @property
+    def context_before(self) -> int:
+        """Samples needed before a bin to filter it exactly."""
+        return reach(max(self.window_lengths), self.align)[0]
+
+    @property
+    def context_after(self) -> int:
+        """Samples needed behind a bin to filter it exactly; 0 if causal."""
+        return reach(max(self.window_lengths), self.align)[1]
 
     def forward(self, samples: Tensor) -> Tensor:
         """Filter whole recordings.
@@ -125,10 +192,10 @@ class ChannelFilter(nn.Module):
         """
         self._check(samples)
         parts = [
-            savgol_filter(samples[..., chosen, :], length, self.polyorder)
-            for length, chosen in self._groups()
+            savgol_filter(_channels(samples, chosen), length, self.polyorder, self.align)
+            for length, chosen in self._groups
         ]
-        return torch.cat(parts, dim=-2)[..., self._inverse(), :]
+        return self._in_order(parts)
 
     def valid(self, samples: Tensor) -> Tensor:
         """Filter bins that come with their context, keeping only the bins.
@@ -136,7 +203,7 @@ class ChannelFilter(nn.Module):
         One matrix product, so a NaN anywhere in a bin's frame makes the channel's whole bin NaN.
 
         Shape:
-            - samples: ``[*, C, n + 2 * context]``
+            - samples: ``[*, C, n + 2 * context]``, the bin behind ``context_before`` of them
             - output: ``[*, C, n]``, equal to the filter over the whole recording
 
         Raises:
@@ -146,16 +213,15 @@ class ChannelFilter(nn.Module):
         num_samples = samples.shape[-1] - 2 * self.context
         if num_samples < 1:
             raise ValueError(
-                f"expected bins with {self.context} samples of context on each side, "
-                f"got {samples.shape[-1]} samples in all"
+                f"expected bins with {self.context_before} samples of context before and "
+                f"{self.context_after} behind, got {samples.shape[-1]} samples in all"
             )
-        parts = []
-        for length, chosen in self._groups():
-            spare = self.context - length // 2
-            kept = samples[..., chosen, spare : samples.shape[-1] - spare]
-            num_kept = samples.shape[-1] - 2 * self.context
-            parts.append(kept @ _overlap_matrix(self._kernels[length].to(samples), num_kept))
-        return torch.cat(parts, dim=-2)[..., self._inverse(), :]
+        parts, before = [], self.context_before
+        for length, chosen in self._groups:
+            start = before - reach(length, self.align)[0]
+            kept = _channels(samples, chosen).narrow(-1, start, num_samples + length - 1)
+            parts.append(kept @ self._matrix(length, num_samples, samples))
+        return self._in_order(parts)
 
     def _check(self, samples: Tensor) -> None:
         if samples.ndim < 2 or samples.shape[-2] != len(self.window_lengths):
@@ -164,12 +230,33 @@ class ChannelFilter(nn.Module):
                 f"got {tuple(samples.shape)}"
             )
 
-    def _groups(self) -> list[tuple[int, list[int]]]:
-        return [
-            (length, [i for i, own in enumerate(self.window_lengths) if own == length])
-            for length in sorted(set(self.window_lengths))
-        ]
+    def _matrix(self, length: int, num_kept: int, like: Tensor) -> Tensor:
+        """The filter of short signals as a matrix; kept, as making it takes longer than using it.
 
-    def _inverse(self) -> list[int]:
-        order = [i for _, chosen in self._groups() for i in chosen]
-        return sorted(range(len(order)), key=order.__getitem__)
+        A trace makes its own: what is made in one must not outlive it.
+        """
+        if torch.compiler.is_compiling():
+            return _overlap_matrix(self._kernels[length].to(like), num_kept)
+        key = (length, num_kept, like.dtype, like.device)
+        matrix = self._matrices.get(key)
+        if matrix is None:
+            if len(self._matrices) >= _MOST_MATRICES:
+                self._matrices.clear()
+            with torch.inference_mode(False):  # it may be needed for a gradient later
+                matrix = _overlap_matrix(self._kernels[length].to(like), num_kept)
+            self._matrices[key] = matrix
+        return matrix
+
+    def _in_order(self, parts: Sequence[Tensor]) -> Tensor:
+        """Channels of the parts, one for each group, in the order of the hand."""
+        filtered = torch.cat(list(parts), dim=-2)
+        if self._inverse == sorted(self._inverse):
+            return filtered
+        return filtered[..., self._inverse, :]
+
+
+def _channels(samples: Tensor, chosen: Sequence[int]) -> Tensor:
+    """The chosen channels of ``[*, C, T]``; neighbours without a copy."""
+    if chosen[-1] - chosen[0] + 1 == len(chosen):
+        return samples.narrow(-2, chosen[0], len(chosen))
+    return samples[..., list(chosen), :]
