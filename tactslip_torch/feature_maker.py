@@ -20,6 +20,7 @@ from tactslip_torch.data.labels import (
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource, Timeline
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.cache import FeatureCache, cache_key, source_digest
+from tactslip_torch.features.extractor import EngineName, FeatureExtractor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -53,9 +54,11 @@ class FeatureMaker:
         rule: where the bins lie and what they are.
         cache: where features are kept, if they are.
         dtype: in which features are computed; they are handed on in float32.
+        engine: what computes them.
 
     Raises:
-        ValueError: if rate, channels or bin length of the parts disagree.
+        ValueError: if rate, channels or bin length of the parts disagree, or the engine is none
+            that can be used.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class FeatureMaker:
         rule: LabelRule,
         cache: FeatureCache | None = None,
         dtype: torch.dtype = torch.float64,
+        engine: EngineName = "reference",
     ) -> None:
         if pool.hand != source.hand:
             raise ValueError(
@@ -86,6 +90,7 @@ class FeatureMaker:
             )
         self.source = source
         self.pool = pool
+        self.extractor = FeatureExtractor(pool, engine=engine)
         self.channel_filter = channel_filter
         self.rule = rule
         self.cache = cache
@@ -146,7 +151,7 @@ class FeatureMaker:
         filtered = self._filter(recording, loaded, bins)
         seconds["filter"] = _lap(started, seconds)
         with torch.no_grad():
-            features = self.pool.extract(filtered).float()
+            features = self.extractor(filtered).float()
         seconds["features"] = _lap(started, seconds)
         if self.cache is not None:
             self.cache.store(key, features)
@@ -154,9 +159,8 @@ class FeatureMaker:
         return features
 
     def _load(self, recording: RecordingId, times: Timeline, bins: LabelledBins) -> Recording:
-        windows = needed_windows(
-            bins, self.channel_filter.context, times.duration_s, self.source.sample_rate_hz
-        )
+        context = self.channel_filter.context_before  # never fewer than behind
+        windows = needed_windows(bins, context, times.duration_s, self.source.sample_rate_hz)
         return self.source.load(recording, windows)
 
     def _filter(self, recording: RecordingId, loaded: Recording, bins: LabelledBins) -> Tensor:
@@ -170,9 +174,9 @@ class FeatureMaker:
 
     def _broken(self, recording: RecordingId, loaded: Recording, start: int, channel: int) -> str:
         """What to say of a channel whose filtered bin from sample ``start`` on is not finite."""
-        reach = self.channel_filter.window_lengths[channel] // 2
-        begin = max(start - reach, 0)
-        near = loaded.samples[channel, begin : start + self.pool.bin_samples + reach]
+        before, after = self.channel_filter.reaches[channel]
+        begin = max(start - before, 0)
+        near = loaded.samples[channel, begin : start + self.pool.bin_samples + after]
         place = int((~near.isfinite()).nonzero()[0])
         return (
             f"{recording}: channel {self.pool.hand.names[channel]}, sample {begin + place} "
@@ -188,8 +192,13 @@ class FeatureMaker:
             "bin_samples": bins.bin_samples,
             "wavelet": [pool.wavelet, pool.level],
             "spectrum": [pool.spectrum, pool.arithmetic],
-            "filter": [self.channel_filter.window_lengths, self.channel_filter.polyorder],
+            "filter": [
+                self.channel_filter.window_lengths,
+                self.channel_filter.polyorder,
+                self.channel_filter.align,
+            ],
             "dtype": str(self.dtype),
+            "engine": self.extractor.engine,
             "code": self._code,
             "libraries": self._libraries,
         }

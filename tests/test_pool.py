@@ -318,15 +318,6 @@ def test_manners(device, rng):
     oracles.assert_manners(lambda bins: pool(bins) / normal.to(bins), bins, num_axes=2)
 
 
-@pytest.mark.parametrize("num_bins", [0, 1, 5, 64, 65, 130])
-def test_chunks_change_nothing(num_bins, rng):
-    pool = FeaturePool(SMALL_HAND)
-    bins = torch.from_numpy(rng.standard_normal((num_bins, 3, 100)))
-    whole = pool(bins) if num_bins else torch.zeros(0, len(pool.names), dtype=torch.float64)
-    torch.testing.assert_close(pool.extract(bins), whole, rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(pool.extract(bins, chunk_bins=3), whole, rtol=1e-9, atol=1e-12)
-
-
 def test_native_float32_is_close_to_float64(pool, rng):
     """But for mode and entropy, which jump."""
     native = FeaturePool(HandLayout.paper24(), arithmetic="native")

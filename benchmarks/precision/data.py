@@ -24,6 +24,7 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
 from tactslip_torch.experiment import feature_parts
 from tactslip_torch.feature_maker import FeatureMaker
+from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.planning import Plan, plan_detector
@@ -122,7 +123,7 @@ def load_experiment(sizes: Sizes) -> Experiment:
 
 def described(pool: FeaturePool, bins: Tensor) -> Tensor:
     """Features ``[N, F]`` as ``SlipDetector`` takes them: not rounded to the dtype of the bins."""
-    return pool.extract(pool.widen(bins))
+    return FeatureExtractor(pool, engine="reference")(pool.widen(bins))
 
 
 def pool_in(pool: FeaturePool, name: str) -> FeaturePool:

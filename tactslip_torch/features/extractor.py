@@ -26,6 +26,7 @@ from tactslip_torch.threads import for_each
 
 EngineName = Literal["auto", "compiled", "eager", "reference"]
 _FEW_BINS = 4  # so few are done here: another thread would take longer to start
+_REFERENCE_CHUNK = 16  # what fits the cache of a processor
 
 
 class Engine(Protocol):
@@ -111,18 +112,21 @@ class FeatureExtractor:
         """
         self.pool.check(bins)
         dtype = dtype or bins.dtype
-        if self.engine == "reference" or not _is_plain(bins):
+        if not _is_plain(bins):
             return self._reference(bins, dtype)
-        is_native = self.pool.arithmetic == "native"
-        engine = self._engine(bins.dtype if is_native else torch.float64)
         flat = bins.detach().flatten(0, -3) if bins.ndim > 2 else bins.detach()[None]
         out = torch.empty(len(flat), len(self.selected), dtype=dtype)
+        engine = None if self.engine == "reference" else self._engine_for(bins.dtype)
+        chunk_bins = _REFERENCE_CHUNK if engine is None else engine.chunk_bins
 
         def work(start: int) -> None:
-            stop = start + engine.chunk_bins
-            self._chunk(engine, flat[start:stop], out[start:stop])
+            part = slice(start, start + chunk_bins)
+            if engine is None:
+                out[part] = self._reference(flat[part], dtype)
+            else:
+                self._carry_out(engine, flat[part], out[part])
 
-        starts = range(0, len(flat), engine.chunk_bins)
+        starts = range(0, len(flat), chunk_bins)
         if len(flat) <= _FEW_BINS:
             for start in starts:
                 work(start)
@@ -139,7 +143,8 @@ class FeatureExtractor:
         for bins in batches:
             yield self(bins)
 
-    def _chunk(self, engine: Engine, bins: Tensor, out: Tensor) -> None:
+    def _carry_out(self, engine: Engine, bins: Tensor, out: Tensor) -> None:
+        """The plan by an engine, and the reference for bins that are not ordinary."""
         x = bins
         if len(self.plan.channels) < bins.shape[1]:
             x = x.index_select(1, self._channels)
@@ -164,7 +169,8 @@ class FeatureExtractor:
             features = features.index_select(-1, self._index.to(features.device))
         return saturating(features, dtype)
 
-    def _engine(self, dtype: torch.dtype) -> Engine:
+    def _engine_for(self, bins: torch.dtype) -> Engine:
+        dtype = bins if self.pool.arithmetic == "native" else torch.float64
         with self._making:
             if dtype not in self._engines:
                 self._engines[dtype] = self._made(dtype)

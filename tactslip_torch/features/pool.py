@@ -95,6 +95,7 @@ class FeaturePool(nn.Module):
         self.arithmetic: Arithmetic = arithmetic
         self._gauges = list(hand.indices("SG"))
         self._films = list(hand.indices("PVDF"))
+        self._inverses: dict[torch.dtype, Tensor] = {}
         self.names = pool_names(hand, level)
         lines = spectrum_matrix(bin_samples, spectrum)
         self._constants = {  # float64; cast to the bins' dtype on use, so they never lose digits
@@ -209,18 +210,6 @@ class FeaturePool(nn.Module):
         is_zero = square.detach() == 0
         return size * torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
 
-    def extract(self, bins: Tensor, chunk_bins: int = 16) -> Tensor:
-        """``forward`` in chunks that fit the processor's cache: bounded memory, equal to rounding.
-
-        Shape:
-            - bins: ``[N, C, n]``
-            - output: ``[N, F]``
-        """
-        self.check(bins)
-        if not len(bins):
-            return bins.new_empty(0, len(self.names))
-        return torch.cat([self(chunk) for chunk in bins.split(chunk_bins)])
-
     def validity(self, bins: Tensor) -> Tensor:
         """Which channels can be trusted.
 
@@ -236,15 +225,28 @@ class FeaturePool(nn.Module):
             ValueError: as ``forward``.
         """
         self.check(bins)
+        return self.is_alive(bins) & ~self.is_missing(bins)
+
+    def is_alive(self, bins: Tensor) -> Tensor:
+        """Which channels have a span the dtype can resolve: ``validity`` but for its limit.
+
+        Shape:
+            - bins: ``[*, C, n]``
+            - output: ``[*, C]``, bool
+        """
         high, low = bins.amax(-1), bins.amin(-1)
-        magnitude = torch.maximum(high, -low)
-        least = [64 * torch.finfo(bins.dtype).eps] * len(self.hand)
-        if self.arithmetic == "native" and bins.dtype == torch.float32:
-            for film in self._films:
-                least[film] = NATIVE_SPAN
-        inverse = 1 / torch.tensor(least, dtype=bins.dtype, device=bins.device)
-        is_alive = (high - low) * inverse > magnitude  # so that nothing underflows
-        return is_alive & ~self.is_missing(bins)
+        span = (high - low) * self._inverse_span(bins)  # so that nothing underflows
+        return span > torch.maximum(high, -low)
+
+    def _inverse_span(self, like: Tensor) -> Tensor:
+        """One over the least span that resolves, as a part of the magnitude, ``[C]``."""
+        if like.dtype not in self._inverses:
+            least = [64 * torch.finfo(like.dtype).eps] * len(self.hand)
+            if self.arithmetic == "native" and like.dtype == torch.float32:
+                for film in self._films:
+                    least[film] = NATIVE_SPAN
+            self._inverses[like.dtype] = 1 / torch.tensor(least, dtype=like.dtype)
+        return self._inverses[like.dtype].to(like.device)
 
     def is_missing(self, bins: Tensor) -> Tensor:
         """Which channels hold a NaN or Inf, or a sample beyond ``LARGEST_SAMPLE``.

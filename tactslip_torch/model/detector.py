@@ -198,7 +198,8 @@ class SlipDetector(nn.Module):
             is_typical = is_missing.index_select(-1, self._channel_index)
             scaled = torch.where(is_typical, self.typical, scaled)
         score = saturating(self.head(scaled), given.dtype)
-        is_valid = self._needed(self.pool.validity(given)) & score.isfinite()
+        is_trusted = self.pool.is_alive(given) & ~is_missing
+        is_valid = self._needed(is_trusted) & score.isfinite()
         return Judgement(score, is_valid, is_missing)
 
     def _filter(self, samples: Tensor) -> Tensor:

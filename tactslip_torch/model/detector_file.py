@@ -51,6 +51,7 @@ def write_detector(
         "pool": pool.facts(),
         "window_lengths": list(channel_filter.window_lengths),
         "polyorder": channel_filter.polyorder,
+        "align": channel_filter.align,
         "selected": list(selected),
         "kernel": head.kernel.to_dict() if isinstance(head, KernelSum) else None,
         "info": dict(info),
@@ -102,7 +103,11 @@ def _parts(facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> DetectorPar
         head = KernelSum(**part("head."), kernel=kernel_from_dict(facts["kernel"]))
     return DetectorParts(
         FeaturePool(HandLayout.from_rows(facts["channels"]), **facts["pool"]),
-        ChannelFilter(facts["window_lengths"], facts["polyorder"]),
+        ChannelFilter(
+            facts["window_lengths"],
+            facts["polyorder"],
+            facts.get("align", "centred"),  # as all were before it was a choice
+        ),
         facts["selected"],
         FeatureScaler(**part("scaler.")),
         head,
