@@ -122,18 +122,19 @@ def draw_bins(
         raise ValueError(f"no recording has the role {role!r} in {fold.name}; choose another split")
     each = max(PER_RECORDING, math.ceil(number / len(recordings)))
     recordings = recordings[: math.ceil(number / each)]
-    source, context = maker.source, maker.channel_filter.context
+    source = maker.source
+    before, after = maker.channel_filter.context_before, maker.channel_filter.context_after
     parts: list[Tensor] = []
     for recording in bar(recordings, f"{role}, recordings", "recording"):
         times = source.timeline(recording)
         bins = maker.lay_bins(times)
-        windows = needed_windows(bins, context, times.duration_s, source.sample_rate_hz)
+        windows = needed_windows(bins, before, times.duration_s, source.sample_rate_hz)
         samples = source.load(recording, windows).samples
-        first, last = bins.starts - context, bins.starts + bins.bin_samples
+        first, last = bins.starts - before, bins.starts + bins.bin_samples
         may = fold.bin_roles(recording, len(first))[role] & (first >= 0)
-        first = first[may & (last + context <= samples.shape[-1])]
+        first = first[may & (last + after <= samples.shape[-1])]
         chosen = torch.randperm(len(first), generator=generator)[:each].sort().values
-        length = bins.bin_samples + 2 * context
+        length = before + bins.bin_samples + after
         parts.append(bins_at(samples, first[chosen], length))
         refuse_nonfinite(parts[-1], source.hand.names, f"repair or leave out {recording}")
     drawn = torch.cat(parts)[:number]

@@ -52,6 +52,7 @@ class SlipDataModule(L.LightningDataModule):
             "pool": pool.facts(),
             "window_lengths": list(self.maker.channel_filter.window_lengths),
             "polyorder": self.maker.channel_filter.polyorder,
+            "align": self.maker.channel_filter.align,
             "features_dtype": str(self.maker.dtype).removeprefix("torch."),
             "training_bins": self.fingerprint(),
         }

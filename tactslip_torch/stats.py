@@ -141,7 +141,7 @@ def _solve(config: DictConfig) -> str:
     about, head = sums.about, solve_sums(plan, sums)
     detector = SlipDetector(
         FeaturePool(HandLayout.from_rows(about["channels"]), **about["pool"]),
-        ChannelFilter(about["window_lengths"], about["polyorder"]),
+        ChannelFilter(about["window_lengths"], about["polyorder"], about["align"]),
         plan.frame.selected,
         plan.frame.scaler,
         head,
