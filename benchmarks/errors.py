@@ -1,0 +1,69 @@
+"""How far features and scores are from the reference, in units in which they matter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+HUGE_CV, FLOOR_CV = 1e4, 9e5
+ELSEWHERE = 1e-4
+
+
+def feature_errors(found: Tensor, reference: Tensor, names: Sequence[object]) -> dict[str, Any]:
+    """The largest error over all bins and features, JSON-able.
+
+    An error is counted over max(magnitude of the reference, standard deviation of its column).
+    Entropy, which steps, is in bits; a mode counts as elsewhere beyond 1e-4 of that size. A cv
+    beyond 1e4 is the rounding of a mean near 0: its inverse is compared as part of 1, and beyond
+    9e5, where the floor under the mean stands, without its sign.
+
+    Args:
+        found: features to be judged.
+        reference: by ``FeaturePool`` in float64.
+        names: of the columns; the last word of each is the descriptor.
+
+    Returns:
+        ``worst`` of all but entropy and mode, its descriptor ``at``, ``entropy_bits``,
+        ``mode_elsewhere`` as a share of all modes, and ``not_finite``, how many values are left
+        out because they are NaN or Inf.
+
+    Shape:
+        - found, reference: ``[N, K]``
+    """
+    found, reference = found.double(), reference.double()
+    kinds = [str(name).split()[-1] for name in names]
+    size = torch.maximum(reference.abs(), reference.std(0, correction=0))
+    is_finite = found.isfinite()
+    distance = torch.where(is_finite, (found - reference).abs(), 0.0)
+    relative = torch.where(distance == 0, 0.0, distance / size)
+    is_cv = torch.tensor([kind == "cv" for kind in kinds])
+    is_huge = is_cv & is_finite & (reference.abs() > HUGE_CV)
+    inverse = (1 / found - 1 / reference).abs()
+    unsigned = (found.abs() - reference.abs()).abs() / size
+    inverse = torch.where(
+        reference.abs() > FLOOR_CV, torch.minimum(inverse, unsigned.nan_to_num(torch.inf)), inverse
+    )
+    relative = torch.where(is_huge, inverse, relative)
+    worst: dict[str, float] = {}
+    for kind in dict.fromkeys(kinds):
+        mine = torch.tensor([other == kind for other in kinds])
+        worst[kind] = float((distance if kind == "entropy" else relative)[:, mine].max())
+    modes = relative[:, torch.tensor([kind == "mode" for kind in kinds])]
+    usual = {kind: value for kind, value in worst.items() if kind not in ("entropy", "mode")}
+    at = max(usual, key=usual.__getitem__, default="")
+    return {
+        "worst": usual.get(at, 0.0),
+        "at": at,
+        "entropy_bits": worst.get("entropy", 0.0),
+        "mode_elsewhere": float((modes > ELSEWHERE).double().mean()) if modes.numel() else 0.0,
+        "not_finite": int((~is_finite).sum()),
+    }
+
+
+def score_error(found: Tensor, reference: Tensor) -> float:
+    """Largest difference of scores, in standard deviations of the reference."""
+    distance = (found.double() - reference.double()).abs().max()
+    return float(distance / reference.double().std(correction=0))
