@@ -276,11 +276,11 @@ def test_correlations_are_close_and_exact_in_any_order_of_summation(rng):
     features, is_slip = families(rng, 4000, 50)
     expected = within_class_correlation(features, is_slip)
     features, is_slip = torch.from_numpy(features), torch.from_numpy(is_slip)
-    units = selection._unit_deviations(features, is_slip)
+    units = selection.unit_deviations(features, is_slip)
     correlation = selection._correlation(units, units)
     np.testing.assert_allclose(correlation, expected, atol=1e-7)
     order = torch.from_numpy(rng.permutation(4000))
-    shuffled = selection._unit_deviations(features[order], is_slip[order])
+    shuffled = selection.unit_deviations(features[order], is_slip[order])
     assert torch.equal(shuffled, units[:, order])
     assert torch.equal(selection._correlation(shuffled, shuffled), correlation)
 

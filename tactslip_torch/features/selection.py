@@ -226,7 +226,7 @@ def rank_distinct(
     chosen: list[int] = []
     skipped: list[int] = []
     for block in rank_features(scores, len(scores)).split(_BLOCK):
-        units = _unit_deviations(features[:, block], is_slip)
+        units = unit_deviations(features[:, block], is_slip)
         repeats = (_correlation(units, taken[: len(chosen)]) > most_correlation).any(-1)
         is_near = _correlation(units, units) > most_correlation
         for row, index in enumerate(block.tolist()):
@@ -241,7 +241,7 @@ def rank_distinct(
     return torch.tensor(chosen + skipped[: num - len(chosen)])
 
 
-def _unit_deviations(features: Tensor, is_slip: Tensor) -> Tensor:
+def unit_deviations(features: Tensor, is_slip: Tensor) -> Tensor:
     """Deviations from class means, about of norm ``_GRID`` and integer, ``[F, n]``, float64."""
     moments = ClassMoments(features.shape[1])
     moments.update(features, is_slip)
