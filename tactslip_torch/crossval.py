@@ -181,12 +181,12 @@ def _read(config: DictConfig, source: RecordingSource, names: Sequence[str]) -> 
     by_cycle: Split = seen6(
         source.ids, seen=names, train_share=config.train_share, seed=config.seed
     )[0]
-    pool, channel_filter, dtype = feature_parts(source, rule.bin_ms, **config.features)
+    pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
     materials = Materials(len(pool.names), config.train_bins, config.judged_bins)
     num_threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the processors belong to those who make features
     with feature_cache(config.cache) as cache:
-        maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype)
+        maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, engine)
         data = SlipDataModule(maker, by_cycle, config.num_workers)
         for batch in bar(data.loader(["train", "test"]), "features of all materials", "recording"):
             materials.update(batch, by_cycle.roles[batch.recording])

@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 import tactslip_torch
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.features.cache import FeatureCache, default_cache_folder, source_digest
+from tactslip_torch.features.extractor import EngineName, resolved
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.files import whole_file
@@ -42,9 +43,10 @@ def feature_parts(
     level: int,
     spectrum: SpectrumMethod,
     dtype: str,
+    engine: EngineName,
     align: Align = "centred",
-) -> tuple[FeaturePool, ChannelFilter, torch.dtype]:
-    """Pool, filter and dtype from the ``features`` section.
+) -> tuple[FeaturePool, ChannelFilter, torch.dtype, EngineName]:
+    """Pool, filter, dtype and engine from the ``features`` section.
 
     Raises:
         ValueError: if a kind of channel has no frame, or a value is none that exists.
@@ -64,7 +66,7 @@ def feature_parts(
         arithmetic="native" if dtype == "float32" else "double",
     )
     lengths = [frames[channel.kind] for channel in source.hand.channels]
-    return pool, ChannelFilter(lengths, polyorder, align), DTYPES[dtype]
+    return pool, ChannelFilter(lengths, polyorder, align), DTYPES[dtype], resolved(engine)
 
 
 @contextmanager

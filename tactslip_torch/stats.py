@@ -164,8 +164,8 @@ def _data(config: DictConfig, cache: FeatureCache) -> SlipDataModule:
     if config.fold not in ((None, *names) if len(folds) == 1 else names):
         raise ValueError(f"fold must be one of {', '.join(names)}, got {config.fold}")
     fold = folds[names.index(config.fold) if config.fold else 0]
-    pool, channel_filter, dtype = feature_parts(source, rule.bin_ms, **config.features)
-    maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype)
+    pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
+    maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, engine)
     return SlipDataModule(maker, fold, config.num_workers)
 
 

@@ -58,7 +58,7 @@ def test_an_experiment_composes_and_everything_it_names_exists(name):
     assert isinstance(source, SimulatedRecordings)
     assert isinstance(rule, LabelRule)
     assert isinstance(instantiate(config.recipe, _convert_="all"), Recipe)
-    pool, channel_filter, _ = feature_parts(source, rule.bin_ms, **config.features)
+    pool, channel_filter, *_ = feature_parts(source, rule.bin_ms, **config.features)
     assert isinstance(pool, FeaturePool)
     assert len(channel_filter.window_lengths) == len(source.hand)
     assert folds

@@ -84,8 +84,8 @@ def load_experiment(sizes: Sizes) -> Experiment:
     rule = instantiate(config.labels)
     recipe: Recipe = instantiate(config.recipe, _convert_="all")
     split: Split = instantiate(config.split, _convert_="all")(source.ids)[0]
-    pool, channel_filter, dtype = feature_parts(source, rule.bin_ms, **config.features)
-    maker = FeatureMaker(source, pool, channel_filter, rule, None, dtype)
+    pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
+    maker = FeatureMaker(source, pool, channel_filter, rule, None, dtype, engine)
     pools = {name: pool_in(pool, name) for name in ARITHMETIC}
 
     survey = Survey(len(pool.names), recipe.sample_bins)
