@@ -105,8 +105,12 @@ class Plan:
         )
 
 
-def plan_detector(recipe: Recipe, survey: Survey, progress: Progress) -> Plan:
+def plan_detector(
+    recipe: Recipe, survey: Survey, progress: Progress, frame: Frame | None = None
+) -> Plan:
     """Rank, scale, and choose K, c and C by closed-form validation on held-out groups.
+
+    Features that were ranked and scaled elsewhere come as a ``frame``.
 
     A held-out score is that of the machine refitted without the bin's group, from one
     factorisation per choice (``model.held_out``), with ranking and scaling held. So it chooses,
@@ -115,7 +119,7 @@ def plan_detector(recipe: Recipe, survey: Survey, progress: Progress) -> Plan:
     Raises:
         ValueError: if a class is absent or a solve fails.
     """
-    frame = choose_frame(recipe, survey)
+    frame = frame or choose_frame(recipe, survey)
     sample = survey.sample.bins()
     counts = survey.moments.count.tolist()
     weights = stand_for(sample, recipe, counts)
@@ -128,7 +132,7 @@ def plan_detector(recipe: Recipe, survey: Survey, progress: Progress) -> Plan:
     rows: list[dict[str, Any]] = []
     if len(choices) > 1 and len(sample.group_names) > 1:
         bins = TrainingBins(frame(sample.features), sample.is_slip, weights)
-        rows = _validate(bins, sample.group, sample.group_names, choices, progress)
+        rows = validate(bins, sample.group, sample.group_names, choices, progress)
         best = max(row["mean"] for row in rows)
         place = next(i for i, row in enumerate(rows) if row["mean"] == best)
     else:
@@ -172,13 +176,28 @@ def _typical(scaled: Tensor, is_slip: Tensor, weights: Tensor) -> tuple[float, .
     return tuple(((means[0] + means[1]) / 2).tolist())
 
 
-def _validate(
+def validate(
     bins: TrainingBins,
     groups: Tensor,
     names: Sequence[str],
     choices: Sequence[tuple[int, Kernel, float]],
     progress: Progress,
 ) -> list[dict[str, Any]]:
+    """Balanced accuracy of each held-out group for each choice of K, kernel and C, in order.
+
+    Args:
+        bins: training bins, as many features as the largest K, best first.
+        groups: ``[N]``, which group each bin is of, an index into ``names``.
+        names: of the groups.
+        choices: in any order; those of one K and kernel that stand together cost least.
+        progress: wraps what is gone through.
+
+    Returns:
+        One row per choice; ``mean`` is over the groups that have bins of both classes.
+
+    Raises:
+        ValueError: if no group has, or held-out scores cannot be told (``HeldOut``).
+    """
     rows = []
     machine: HeldOut | None = None
     made_of: Any = None

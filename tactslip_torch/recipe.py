@@ -196,14 +196,19 @@ def choose_frame(recipe: Recipe, survey: Survey) -> Frame:
         )
     else:
         order = rank_features(scores, most)
-    selected = tuple(int(index) for index in order)
+    return fit_frame(recipe, survey, order.tolist())
+
+
+def fit_frame(recipe: Recipe, survey: Survey, selected: Sequence[int]) -> Frame:
+    """Scale these features on what the first pass learned of the training bins."""
+    sample = survey.sample.bins()
     if recipe.compress or recipe.tail > 0:
         chosen = sample.features[:, list(selected)].double()
         scaler = FeatureScaler.fit(chosen, compress=recipe.compress, tail=recipe.tail)
     else:  # the exact range of every training bin
         index = list(selected)
         scaler = FeatureScaler(survey.minimum[index].double(), survey.maximum[index].double())
-    return Frame(selected, scaler)
+    return Frame(tuple(selected), scaler)
 
 
 def bin_weights(recipe: Recipe, counts: Sequence[float], is_slip: Tensor) -> Tensor:

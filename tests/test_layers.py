@@ -190,7 +190,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
     ),
     "certify": ("*",),
     "latency": ("features.*", "signals.*", "model.*", "hand"),
-    "cost": ("latency", "features.*", "signals.*", "model.*", "hand"),
+    "timing": ("features.pool", "model.detector"),
+    "cost": ("timing", "features.*", "signals.*", "model.*"),
     "front": (
         "latency",
         "cost",

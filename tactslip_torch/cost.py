@@ -1,0 +1,230 @@
+"""What features cost on this machine, group by group of work, shared parts counted once.
+
+A feature needs parts: a film that is read, a branch that is formed, its spectrum, a sort, a
+column. What a selection costs is the sum over the parts it needs, each counted once, and over the
+groups of parts it needs at all: a group has a price of its own, for calls that happen once however
+many rows there are. Prices are fitted to timings of ``FeatureExtractor`` with one bin and one
+thread. The model prunes a search; what is promised is timed as a whole (``timing``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.features.extractor import FeatureExtractor
+from tactslip_torch.features.plan import ORDERED, Plan, make_plan
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.timing import one_thread, single_bins, time_calls, time_detector
+
+GROUPS: Mapping[str, str] = {
+    "gauges": "a gauge read and described",
+    "films": "a film read",
+    "branches": "a wavelet branch formed",
+    "spectra": "a spectrum of a branch formed",
+    "energies": "energies of all branches of a film",
+    "moments": "mean, spread, shape and extremes of a row",
+    "sorts": "a row sorted, for median, mode and iqr",
+    "histograms": "entropy of a row",
+    "correlations": "correlation of a branch with its film",
+    "lines": "centroid and spread of a spectrum",
+    "columns": "a column written",
+}
+"""Groups of work, and what one part of each is."""
+_OF_ROW = {"gauge": "gauges", "time": "branches", "freq": "spectra"}
+_OF_DESCRIPTOR = dict.fromkeys(ORDERED, "sorts") | {
+    "entropy": "histograms",
+    "correlation": "correlations",
+    "spectral_centroid": "lines",
+    "spectral_spread": "lines",
+}
+_SWEEPS = 3000
+
+Part = tuple[str, tuple[object, ...]]  # a group, and which of it; none of it: the group as such
+
+
+@dataclass(frozen=True)
+class CostModel:
+    """What a call with one bin costs, by what it needs.
+
+    Args:
+        base_us: of a call that does nothing.
+        group_us: by group, once if any of its parts is needed.
+        part_us: by group, of each of its parts.
+        rest_us: by number of features, what filter, scaling, head and checks add.
+        tail: p99 over p50, usually.
+        error: median relative error on the timings it was fitted to.
+    """
+
+    base_us: float
+    group_us: Mapping[str, float]
+    part_us: Mapping[str, float]
+    rest_us: Mapping[int, float]
+    tail: float
+    error: float
+
+    def features_us(self, parts: set[Part]) -> float:
+        """Median time of the features that need these parts."""
+        return self.base_us + sum(self._price(part) for part in parts)
+
+    def compute_us(self, parts: set[Part], num_features: int) -> float:
+        """p99 of a whole call, from raw samples to the decision."""
+        return self.tail * (self.features_us(parts) + self.rest_us[num_features])
+
+    def bill(self, needed: Sequence[set[Part]]) -> tuple[Tensor, Tensor]:
+        """What ``rank_per_cost`` takes: which parts each feature needs, and their prices.
+
+        Shape:
+            - first output: ``[F, P]``, bool
+            - second output: ``[P]``, whole nanoseconds
+        """
+        parts = sorted(set().union(*needed), key=repr)
+        place = {part: index for index, part in enumerate(parts)}
+        needs = torch.zeros(len(needed), len(parts), dtype=torch.bool)
+        for row, own in enumerate(needed):
+            needs[row, [place[part] for part in own]] = True
+        return needs, torch.tensor([round(1000 * self._price(part)) for part in parts])
+
+    def facts(self) -> dict[str, Any]:
+        """All prices, JSON-able."""
+        return {
+            "base_us": self.base_us,
+            "groups": {
+                name: {"group_us": self.group_us[name], "part_us": self.part_us[name], "part": what}
+                for name, what in GROUPS.items()
+            },
+            "rest_us": {str(size): value for size, value in self.rest_us.items()},
+            "p99_over_p50": self.tail,
+            "median_relative_error": self.error,
+        }
+
+    def _price(self, part: Part) -> float:
+        group, which = part
+        return self.part_us[group] if which else self.group_us[group]
+
+
+def parts_of(plan: Plan) -> list[set[Part]]:
+    """The parts that each column of a plan needs; those of several features are the union."""
+    needed: list[set[Part]] = [{("columns", (place,))} for place in range(plan.num_features)]
+    for wanted in plan.wanted:
+        row = plan.rows[wanted.row]
+        own = needed[wanted.place]
+        own.add((_OF_ROW[row.kind], (row.channel, row.branch)))
+        if row.kind != "gauge":
+            own.add(("films", (row.channel,)))
+        own.add((_OF_DESCRIPTOR.get(wanted.descriptor, "moments"), tuple(row)))
+    for share in plan.shares:
+        needed[share.place] |= {("films", (share.channel,)), ("energies", (share.channel,))}
+    return [own | {(group, ()) for group, _ in own} for own in needed]
+
+
+def measure_costs(
+    pool: FeaturePool,
+    channel_filter: ChannelFilter,
+    sizes: Sequence[int],
+    *,
+    calls: int = 100,
+    watch: Callable[[Sequence[Any], str], Any] = lambda items, what: items,
+) -> CostModel:
+    """Fit the model to timings on this machine.
+
+    Args:
+        pool: what features there are.
+        channel_filter: of the hand.
+        sizes: numbers of features for which the rest is timed.
+        calls: of each selection, in each of three runs.
+        watch: shows progress.
+    """
+    needed = parts_of(make_plan(pool.hand, pool.level, pool.names))
+    bins = single_bins(pool, pool.bin_samples)
+    timings = []
+    designs = list(_designs(needed, sizes))
+    with one_thread():
+        for selected in watch(designs, "cost of feature groups"):
+            extractor = FeatureExtractor(pool, selected)
+            timings.append(time_calls(extractor, bins, calls))
+        rest = {}
+        for size in sizes:
+            some = _spread(range(len(pool.names)), size)
+            of_features = time_calls(FeatureExtractor(pool, some), bins, calls)
+            detector = stand_in(pool, channel_filter, some)
+            whole = time_detector(detector, calls)
+            rest[size] = max(whole.p50_us - of_features.p50_us, 0.0)
+    taken = torch.tensor([timing.p50_us for timing in timings], dtype=torch.float64)
+    counts = torch.stack([_counted(set().union(*(needed[i] for i in s))) for s in designs])
+    prices = _nonnegative(counts / taken[:, None])
+    names = list(GROUPS)
+    return CostModel(
+        base_us=float(prices[0]),
+        group_us=dict(zip(names, prices[1 : 1 + len(names)].tolist(), strict=True)),
+        part_us=dict(zip(names, prices[1 + len(names) :].tolist(), strict=True)),
+        rest_us=rest,
+        tail=median(timing.p99_us / timing.p50_us for timing in timings),
+        error=float(((counts @ prices) / taken - 1).abs().median()),
+    )
+
+
+def stand_in(
+    pool: FeaturePool, channel_filter: ChannelFilter, selected: Sequence[int]
+) -> SlipDetector:
+    """A detector that nobody trained, which takes as long as one that somebody did."""
+    num = len(selected)
+    generator = torch.Generator().manual_seed(num)
+    bend = torch.randn(num, num, generator=generator, dtype=torch.float64)
+    ends = torch.ones(num, dtype=torch.float64)
+    head = QuadraticForm(bend + bend.T, bend[0].clone(), torch.tensor(0.5, dtype=torch.float64))
+    scaler = FeatureScaler(-ends, ends, ends)
+    return SlipDetector(pool, channel_filter, selected, scaler, head)
+
+
+def _designs(needed: Sequence[set[Part]], sizes: Sequence[int]) -> Iterator[list[int]]:
+    """Selections that tell the groups apart: each group with one, some and all of its parts."""
+    for group in GROUPS:
+        first: dict[Part, int] = {}  # of each part of the group, the feature that needs fewest
+        for index, own in enumerate(needed):
+            for part in own:
+                if part[0] == group and part[1]:
+                    known = first.setdefault(part, index)
+                    first[part] = min(known, index, key=lambda i: len(needed[i]))
+        places = sorted(set(first.values()))
+        for number in sorted({1, 4, 16, min(len(places), 80)}):
+            if 0 < number <= len(places):
+                yield _spread(places, number)
+    generator = torch.Generator().manual_seed(0)
+    for size in sizes:
+        for _ in range(3):
+            order = torch.randperm(len(needed), generator=generator)
+            yield order[:size].sort().values.tolist()
+
+
+def _spread(places: Sequence[int], number: int) -> list[int]:
+    """So many of the places, evenly."""
+    return [places[index * len(places) // number] for index in range(min(number, len(places)))]
+
+
+def _counted(parts: set[Part]) -> Tensor:
+    """How many of each group there are, behind a 1 for the call and 0 or 1 for each group."""
+    counts = [1.0]
+    counts += [float((group, ()) in parts) for group in GROUPS]
+    counts += [float(sum(p[0] == group and p[1] != () for p in parts)) for group in GROUPS]
+    return torch.tensor(counts, dtype=torch.float64)
+
+
+def _nonnegative(rows: Tensor) -> Tensor:
+    """The x, none negative, with ``rows @ x`` closest to 1: least squares by coordinates."""
+    gram, pull = rows.T @ rows, rows.sum(0)
+    x = torch.zeros_like(pull)
+    for _ in range(_SWEEPS):
+        for i in range(len(x)):
+            if gram[i, i] > 0:
+                x[i] = (x[i] + (pull[i] - gram[i] @ x) / gram[i, i]).clamp(min=0)
+    return x

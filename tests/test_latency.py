@@ -1,0 +1,88 @@
+"""The arithmetic of latency against a robot that is played sample by sample."""
+
+import pytest
+
+from tactslip_torch.latency import (
+    Latency,
+    least_latency_ms,
+    longest_hop,
+    look_ahead_samples,
+    shortest_hop,
+)
+from tactslip_torch.signals.filtering import ChannelFilter
+
+RATE_HZ = 2000
+
+
+def decided_after_ms(onset, num_samples, hop, look_ahead, compute_us):
+    """Samples come one by one; the first bin that begins at or behind the onset decides."""
+    for newest in range(10**6):
+        start = newest - look_ahead - num_samples + 1
+        if start >= onset and start % hop == 0:
+            return (newest + 1 - onset) * 1000 / RATE_HZ + compute_us / 1000
+    raise AssertionError("never decided")
+
+
+@pytest.mark.parametrize("look_ahead", [0, 5, 25])
+@pytest.mark.parametrize("hop", [10, 37, 100])
+def test_no_onset_waits_longer_and_one_waits_so_long(look_ahead, hop):
+    played = [decided_after_ms(400 + i, 100, hop, look_ahead, 700.0) for i in range(hop)]
+    stated = Latency(look_ahead / 2, 50.0, hop / 2, 700.0)
+    sample_ms = 1000 / RATE_HZ
+    assert max(played) <= stated.worst_ms + 1e-9
+    # an onset just behind the first sample of a bin is the worst: it misses that bin by nothing
+    assert max(played) == pytest.approx(stated.worst_ms - sample_ms)
+    assert stated.facts()["worst_ms"] == pytest.approx(
+        sum(stated.facts()[part] for part in ("look_ahead_ms", "bin_ms", "hop_ms")) + 0.7
+    )
+
+
+def test_look_ahead_is_of_the_channels_in_use():
+    centred = ChannelFilter([51, 51, 11, 11])
+    assert look_ahead_samples(centred, [0, 2]) == 25
+    assert look_ahead_samples(centred, [3, 2]) == 5
+    assert look_ahead_samples(ChannelFilter([51, 51, 11, 11], align="causal"), range(4)) == 0
+    with pytest.raises(ValueError, match="no channel is in use"):
+        look_ahead_samples(centred, [])
+
+
+def test_what_is_missed_is_named():
+    latency = Latency(2.5, 50.0, 5.0, 400.0)
+    assert latency.misses(57.9, 400) == []
+    assert latency.misses(57.8, 399) == [
+        "latency 57.90 ms above deadline_ms=57.8",
+        "compute 400 us above compute_us=399",
+    ]
+    assert Latency(0.0, 50.0, 5.0, 5000.0).misses(100, 9999) == [
+        "compute 5000 us not below the hop 5 ms"
+    ]
+    assert Latency(0.0, 50.0, 5.0, 1000.0).load == pytest.approx(0.2)
+
+
+def test_hops():
+    hops = [50.0, 5.0, 10.0, 25.0]
+    parts = Latency(12.5, 50.0, 5.0, 300.0)
+    assert longest_hop(parts, hops, 200, 500).hop_ms == 50
+    assert longest_hop(parts, hops, 72.8, 500).hop_ms == 10
+    assert longest_hop(parts, hops, 72.7, 500).hop_ms == 5
+    assert longest_hop(parts, hops, 60, 500).hop_ms == 5  # none: the shortest
+    assert longest_hop(parts, hops, 200, 200).hop_ms == 5  # too slow at any
+    slow = Latency(0.0, 50.0, 5.0, 12_000.0)
+    assert shortest_hop(slow, hops).hop_ms == 25
+    assert shortest_hop(Latency(0.0, 50.0, 5.0, 60_000.0), hops).hop_ms == 50
+    assert shortest_hop(Latency(0.0, 50.0, 5.0, 5_000.0), hops).hop_ms == 10  # below, not at
+    assert least_latency_ms(50.0, hops, 2.5) == 57.5
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ((-1.0, 50.0, 5.0, 1.0), "look_ahead_ms must not be negative, got -1"),
+        ((0.0, 0.0, 5.0, 1.0), "bin_ms must be positive, got 0"),
+        ((0.0, 50.0, 0.0, 1.0), "hop_ms must be positive, got 0"),
+        ((0.0, 50.0, 5.0, float("nan")), "compute_us must not be negative, got nan"),
+    ],
+)
+def test_parts_that_are_none_are_refused(parts, message):
+    with pytest.raises(ValueError, match=message):
+        Latency(*parts)
