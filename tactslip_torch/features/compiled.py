@@ -1,0 +1,122 @@
+"""The compiled engine: products by BLAS, sorts by NumPy, everything else in kernels by numba."""
+
+from __future__ import annotations
+
+import threading
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tactslip_torch.features.compiled_bins import describe_bins
+from tactslip_torch.features.compiled_jit import Array
+from tactslip_torch.features.compiled_products import Products, ProductSpace
+from tactslip_torch.features.compiled_ranked import describe_sorted
+from tactslip_torch.features.compiled_rows import Desk, desk_of
+from tactslip_torch.features.compiled_steps import (
+    formings,
+    sorted_rows,
+    sorts_of,
+    steps_of,
+)
+from tactslip_torch.features.linear_maps import LinearMaps
+from tactslip_torch.features.plan import Plan
+from tactslip_torch.features.pool import FeaturePool
+
+
+class _Workspace(NamedTuple):
+    """Memory of one thread, for a whole chunk."""
+
+    products: ProductSpace
+    samples: Array
+    sample_facts: Array
+    lines: Array
+    line_facts: Array
+    values: Tensor
+    desk: Desk
+
+
+class CompiledEngine:
+    """Carries out a plan on ordinary bins, on the CPU and forwards only.
+
+    Linear maps are products in float64. Kernels walk over the bins, describe each branch and
+    spectrum while it lies in cache, and leave deviations to be sorted, all at once.
+
+    Args:
+        pool: what features there are.
+        plan: which of them are wanted.
+        dtype: of the statistics; ``torch.float32`` for rows scaled to order one.
+
+    Attributes:
+        chunk_bins: the most bins a call, and how many it is fastest with.
+    """
+
+    chunk_bins = 8
+
+    def __init__(self, pool: FeaturePool, plan: Plan, dtype: torch.dtype) -> None:
+        maps = LinearMaps.of(pool)
+        made, chains = formings(plan, maps, self.chunk_bins)
+        self._dtype = dtype
+        self._num_features = plan.num_features
+        self._steps = steps_of(plan, maps, made, chains)
+        self._sorts = sorts_of(plan)
+        self._num_sorted = tuple(len(rows) for rows in sorted_rows(plan))
+        self._products = Products(maps, made, len(self._steps.film_channel), self.chunk_bins)
+        self._local = threading.local()
+
+    def __call__(self, x: Tensor, scale: Tensor, out: Tensor) -> None:
+        """Write the features of some bins.
+
+        Shape:
+            - x: ``[M, C', n]``, float64, contiguous: filtered bins of the plan's channels
+            - scale: ``[M, C']``, float64, largest magnitude of each: 0 or ordinary
+            - out: ``[M, K]``, float32 or float64, written
+        """
+        space = self._workspace()
+        num = len(x)
+        bins, values = x.numpy(), space.values[:num]
+        steps, limit = self._steps, torch.finfo(out.dtype).max
+        self._products(bins, steps.film_channel, space.products)
+        samples, lines = space.samples[:num], space.lines[:num]
+        describe_bins(
+            bins,
+            space.products.shifted.numpy(),
+            scale.numpy(),
+            space.products.formed.numpy(),
+            steps,
+            space.desk,
+            samples,
+            space.sample_facts,
+            lines,
+            space.line_facts,
+            values.numpy(),
+            limit,
+        )
+        facts = (space.sample_facts, space.line_facts)
+        for rows, fact, sorts in zip((samples, lines), facts, self._sorts, strict=True):
+            if rows.shape[1]:
+                rows.sort(axis=-1)
+                describe_sorted(rows, fact, sorts, values.numpy(), limit)
+        out.copy_(values)
+
+    def _workspace(self) -> _Workspace:
+        space: _Workspace | None = getattr(self._local, "space", None)
+        if space is None:
+            space = self._local.space = self._new_workspace()
+        return space
+
+    def _new_workspace(self) -> _Workspace:
+        num, n = self.chunk_bins, self._steps.dense.shape[-1]
+        num_lines = len(self._steps.frequency_hz)
+        number = np.float32 if self._dtype == torch.float32 else np.float64
+        in_time, in_frequency = self._num_sorted
+        return _Workspace(
+            products=self._products.new_space(),
+            samples=np.empty((num, in_time, n), number),
+            sample_facts=np.empty((num, in_time, 3)),
+            lines=np.empty((num, in_frequency, num_lines), number),
+            line_facts=np.empty((num, in_frequency, 3)),
+            values=torch.empty(num, self._num_features, dtype=torch.float64),
+            desk=desk_of(n, num_lines, len(self._steps.dense), number),
+        )

@@ -1,0 +1,52 @@
+"""How kernels are compiled: once for each kind of number, and kept on disk until a source changes.
+
+numba looks at the file of a cached function alone, and would not notice a change in another file
+that it calls into; so the folder of the cache carries a digest of all of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_FAST = frozenset({"reassoc", "contract", "nsz", "arcp", "nnan"})
+"""Sums in any order; values are finite and no quotient is 0/0, so there is no NaN."""
+
+
+def inner(function: Function) -> Function:
+    """``function`` compiled to be called by other kernels."""
+    return _compiled(function, cache=False)
+
+
+def kernel(function: Function) -> Function:
+    """``function`` compiled to be called from Python, without the interpreter lock, and kept."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(_folder(before))
+    try:
+        return _compiled(function, cache=True)
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def _compiled(function: Function, cache: bool) -> Function:
+    compiled = numba.njit(
+        nogil=True, cache=cache, fastmath=set(_FAST), error_model="numpy", _nrt=False
+    )
+    return cast(Function, compiled(function))
+
+
+def _folder(chosen: str) -> Path:
+    """Where compiled code is kept: beneath ``NUMBA_CACHE_DIR`` if set, else beside the sources."""
+    here = Path(__file__).parent
+    digest = hashlib.sha256()
+    for source in sorted(here.glob("compiled*.py")):
+        digest.update(source.read_bytes())
+    return (Path(chosen) if chosen else here / "__pycache__") / digest.hexdigest()[:16]
