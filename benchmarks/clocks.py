@@ -39,6 +39,38 @@ def in_turns(
     return {name: (seconds[name], results[name]) for name in calls}
 
 
+class Turns(NamedTuple):
+    """What is known of a call that was made in every round.
+
+    Attributes:
+        seconds: of every round.
+        core_s: processor seconds of all threads, of every round.
+        result: of the last.
+    """
+
+    seconds: list[float]
+    core_s: list[float]
+    result: Any
+
+
+def shuffled_turns(
+    calls: Mapping[str, Callable[[], object]], rounds: int, seed: int, what: str
+) -> dict[str, Turns]:
+    """Long calls, each once a round in an order of its own, after one that is not timed."""
+    shuffle = random.Random(seed)
+    turns = {name: Turns([], [], call()) for name, call in calls.items()}
+    for place in range(rounds):
+        say(f"{what}, round {place + 1} of {rounds}")
+        for name in shuffle.sample(list(calls), len(calls)):
+            turns[name] = turns[name]._replace(result=None)
+            busy = time.process_time()
+            taken, result = timed(calls[name])
+            turns[name].seconds.append(taken)
+            turns[name].core_s.append(time.process_time() - busy)
+            turns[name] = turns[name]._replace(result=result)
+    return turns
+
+
 class Way(NamedTuple):
     """A short call, and what it runs under: entered and left while the clock stands."""
 

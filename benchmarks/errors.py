@@ -22,7 +22,8 @@ def feature_errors(found: Tensor, reference: Tensor, names: Sequence[object]) ->
 
     Args:
         found: features to be judged.
-        reference: by ``FeaturePool`` in float64.
+        reference: by ``FeaturePool`` in float64, of the same bins and perhaps more, which tell
+            what is usual in a column.
         names: of the columns; the last word of each is the descriptor.
 
     Returns:
@@ -31,11 +32,12 @@ def feature_errors(found: Tensor, reference: Tensor, names: Sequence[object]) ->
         out because they are NaN or Inf.
 
     Shape:
-        - found, reference: ``[N, K]``
+        - found: ``[N, K]``; reference: ``[M, K]``, N first rows of the same bins
     """
-    found, reference = found.double(), reference.double()
+    found, usual = found.double(), reference.double().std(0, correction=0)
+    reference = reference[: len(found)].double()
     kinds = [str(name).split()[-1] for name in names]
-    size = torch.maximum(reference.abs(), reference.std(0, correction=0))
+    size = torch.maximum(reference.abs(), usual)
     is_finite = found.isfinite()
     distance = torch.where(is_finite, (found - reference).abs(), 0.0)
     relative = torch.where(distance == 0, 0.0, distance / size)
@@ -52,10 +54,10 @@ def feature_errors(found: Tensor, reference: Tensor, names: Sequence[object]) ->
         mine = torch.tensor([other == kind for other in kinds])
         worst[kind] = float((distance if kind == "entropy" else relative)[:, mine].max())
     modes = relative[:, torch.tensor([kind == "mode" for kind in kinds])]
-    usual = {kind: value for kind, value in worst.items() if kind not in ("entropy", "mode")}
-    at = max(usual, key=usual.__getitem__, default="")
+    smooth = {kind: value for kind, value in worst.items() if kind not in ("entropy", "mode")}
+    at = max(smooth, key=smooth.__getitem__, default="")
     return {
-        "worst": usual.get(at, 0.0),
+        "worst": smooth.get(at, 0.0),
         "at": at,
         "entropy_bits": worst.get("entropy", 0.0),
         "mode_elsewhere": float((modes > ELSEWHERE).double().mean()) if modes.numel() else 0.0,

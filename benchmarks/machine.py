@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -34,11 +35,15 @@ def processor_name() -> str:
     return platform.processor() or platform.machine()
 
 
-def versions() -> dict[str, str]:
-    """Of the libraries that do the work, and of the BLAS in them."""
+PEERS = ("numba", "PyWavelets", "ptwt", "onnxruntime", "tsfel", "aeon")
+"""Libraries that ``benchmarks.features`` and those after it use besides."""
+
+
+def versions(more: Sequence[str] = ()) -> dict[str, str]:
+    """Of the libraries that do the work, of more of them, and of the BLAS in them."""
     from threadpoolctl import threadpool_info  # type: ignore[import-untyped]  # comes with [bench]
 
-    names = ("torch", "numpy", "scipy", "scikit-learn", "tactslip_torch")
+    names = ("torch", "numpy", "scipy", "scikit-learn", "tactslip_torch", *more)
     found = {"python": platform.python_version()} | {name: metadata.version(name) for name in names}
     own = re.search(r"BLAS_INFO=(\w+)", torch.__config__.show())
     blas = {

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.tables import limits
 from tactslip_torch.files import whole_file
-from tactslip_torch.report.tables import aligned
 
+SIMULATED_LINE = "SIMULATED bins: what things cost, nothing about a real hand"
+QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
 RESULTS = Path(__file__).parent / "results"
 EXIT_INTERRUPTED = 130
 
@@ -32,11 +34,25 @@ def limits_table(rows: Sequence[Mapping[str, Any]], measured: str = "measured") 
         rows: with ``what``, ``measured``, ``limit`` and ``ok``.
         measured: heads the second column.
     """
-    cells = [
-        [row["what"], row["measured"], row["limit"], "met" if row["ok"] else "MISSED"]
-        for row in rows
+    return limits(rows, measured).text()
+
+
+def heading(report: Mapping[str, Any], about: str, parts: Sequence[str]) -> str:
+    """A report as text: what it ran on, its parts, and whether it means anything.
+
+    Args:
+        report: with ``quick``, ``machine``, ``versions`` and perhaps ``threads``.
+        about: what was measured.
+        parts: what is shown.
+    """
+    lines = [
+        about,
+        f"machine   {', '.join(report['machine'].values())}",
+        f"versions  {', '.join(f'{name} {of}' for name, of in report['versions'].items())}",
+        SIMULATED_LINE,
     ]
-    return aligned(["limits", measured, "limit", ""], cells)
+    quick = [QUICK_LINE] if report["quick"] else []
+    return "\n\n".join(["\n".join(lines + quick), *parts, *quick])
 
 
 def keep_numbers(report: Mapping[str, Any], path: Path | None) -> None:
@@ -46,3 +62,13 @@ def keep_numbers(report: Mapping[str, Any], path: Path | None) -> None:
     with whole_file(path) as temporary:
         temporary.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
     print(f"\nnumbers in {path}")
+
+
+def keep_figure(
+    draw: Callable[[Mapping[str, Any], Path], None], report: Mapping[str, Any], path: Path | None
+) -> None:
+    """Draw a report and say where; nothing without a path."""
+    if path is None:
+        return
+    draw(report, path)
+    print(f"figure in {path}")

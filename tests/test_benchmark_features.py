@@ -16,13 +16,22 @@ from benchmarks import clocks
 from benchmarks.arithmetic import NATIVE, WIDE
 from benchmarks.clocks import Way, paired_ratio
 from benchmarks.features import __main__ as bench
-from benchmarks.features import measure, report
-from benchmarks.features.guards_off import guards_off, replaced, textbook
-from benchmarks.features.sizes import Sizes
+from benchmarks.features.guards import measure, report
+from benchmarks.features.guards.off import guards_off, replaced, textbook
+from benchmarks.features.report import report_text
+from benchmarks.features.sizes import PoolSizes, Sizes
+from benchmarks.outcome import QUICK_LINE, SIMULATED_LINE
 from tactslip_torch import FeaturePool, HandLayout
 from tactslip_torch.simulation.extremes import extreme_bins
 
-TINY = Sizes(bins=3, scored=(2,), solved=(12,), threads=(1,), rounds=4)
+TINY = Sizes(
+    PoolSizes(5, 3, 2, 3, judged=6, threads=1, rounds=2, ceiling_rounds=2, matrix=8, streamed_mb=1),
+    bins=3,
+    scored=(2,),
+    solved=(12,),
+    threads=(1,),
+    rounds=4,
+)
 
 
 @pytest.fixture(scope="module")
@@ -184,23 +193,23 @@ def test_tables_say_what_is_missed() -> None:
         "ratios": report.ratios(sections),
         "limits": report.limit_rows(sections),
     }
-    text = report.report_text(made)
+    text = report_text(made)
     (line,) = [line for line in text.splitlines() if line.startswith("float64")]
     assert line.split()[1:] == ["1", "2", "2", "1", "0", "1.500", "3.000"]
     assert [line.split()[-1] for line in text.splitlines() if "<= 1.10" in line] == ["MISSED"]
-    assert report.SIMULATED_LINE in text
-    assert text.count(report.QUICK_LINE) == 2
+    assert SIMULATED_LINE in text
+    assert text.count(QUICK_LINE) == 2
     assert "pool.settle" in text
 
 
 # --------------------------------------------------------------------------------------- main
-def test_quick_run_measures_everything(
+def test_quick_run_measures_every_guard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(bench, "QUICK", TINY)
     path = tmp_path / "numbers.json"
     before = torch.get_num_threads()
-    assert bench.main(["--quick", "--json", str(path)]) == 0
+    assert bench.main(["--quick", "--only", *measure.SECTIONS, "--json", str(path)]) == 0
     assert torch.get_num_threads() == before
     made = json.loads(path.read_text())
     assert made["quick"] is made["simulated"] is True
@@ -214,7 +223,7 @@ def test_quick_run_measures_everything(
             assert len(found["guards_s"]) == TINY.rounds
             assert ratio["over_off"]["median"] == pytest.approx(wanted)
     assert len(made["limits"]) == sum(len(of["rows"]) for of in made["sections"].values())
-    assert report.QUICK_LINE in capsys.readouterr().out
+    assert QUICK_LINE in capsys.readouterr().out
 
 
 def test_runs_in_part_or_in_brief_leave_the_results_alone(
@@ -224,11 +233,13 @@ def test_runs_in_part_or_in_brief_leave_the_results_alone(
     monkeypatch.setattr(bench, "QUICK", TINY)
     monkeypatch.setattr(bench, "Sizes", lambda: TINY)
     monkeypatch.setattr(bench, "SECTIONS", {"extract": measure.extract})
+    monkeypatch.setattr(bench, "figure", lambda report, path: path.touch())
     bench.main(["--quick"])
     bench.main(["--only", "extract"])
     assert list(tmp_path.iterdir()) == []
     bench.main([])
     assert json.loads((tmp_path / "features.json").read_text())["quick"] is False
+    assert (tmp_path / "features.png").exists()
 
 
 def test_a_folder_is_no_file(capsys: pytest.CaptureFixture[str]) -> None:
@@ -236,3 +247,10 @@ def test_a_folder_is_no_file(capsys: pytest.CaptureFixture[str]) -> None:
         bench.main(["--json", "."])
     assert error.value.code == 2
     assert "--json needs a file, . is a folder" in capsys.readouterr().err
+
+
+def test_a_figure_shows_the_pool(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as error:
+        bench.main(["--only", "solve", "--figure", "nowhere.png"])
+    assert error.value.code == 2
+    assert "--figure shows the section pool" in capsys.readouterr().err

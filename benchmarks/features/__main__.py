@@ -1,25 +1,42 @@
 """What features and scores cost: ``python -m benchmarks.features [--quick] [--json FILE]``.
 
-Here: what the guards cost that keep extremes from becoming silent numbers. Features and scores of
-ordinary bins are timed with them and, in the same rounds, with plain formulas in their place
-(``guards_off``); a solve with its report beside a bare factorisation. Prints tables and the limit
-the project has set itself, and keeps the numbers in ``benchmarks/results``.
+``pool``: the whole pool by every engine beside SciPy, NumPy, TSFEL and MiniRocket, with errors.
+``roofline``: the ceilings of the machine, and how near the engines come. ``extract``, ``score`` and
+``solve``: what the guards cost that keep extremes from becoming silent numbers; ordinary bins are
+timed with them and, in the same rounds, with plain formulas in their place (``guards``). Prints
+tables and the limits the project has set itself, and keeps numbers and figure in
+``benchmarks/results``.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.features.guards_off import replaced
-from benchmarks.features.measure import SECTIONS
-from benchmarks.features.report import limit_rows, ratios, report_text
+from benchmarks.features.figure import figure
+from benchmarks.features.guards import measure as guards
+from benchmarks.features.guards.off import replaced
+from benchmarks.features.pool import full_pool
+from benchmarks.features.report import following, report_text
+from benchmarks.features.roofline import roofline
 from benchmarks.features.sizes import QUICK, Sizes
-from benchmarks.machine import machine_facts, versions
-from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, keep_numbers, refuse_folders
+from benchmarks.machine import PEERS, machine_facts, versions
+from benchmarks.outcome import (
+    EXIT_INTERRUPTED,
+    RESULTS,
+    keep_figure,
+    keep_numbers,
+    refuse_folders,
+)
+
+SECTIONS: dict[str, Callable[[Sizes], dict[str, Any]]] = {
+    "pool": full_pool,
+    "roofline": roofline,
+    **guards.SECTIONS,
+}
 
 
 def measure(sizes: Sizes, names: Sequence[str], quick: bool) -> dict[str, Any]:
@@ -36,12 +53,11 @@ def measure(sizes: Sizes, names: Sequence[str], quick: bool) -> dict[str, Any]:
         "simulated": True,
         "quick": quick,
         "machine": machine,
-        "versions": versions(),
+        "versions": versions(PEERS),
         "settings": asdict(sizes),
         "replaced": replaced(),
         "sections": sections,
-        "ratios": ratios(sections),
-        "limits": limit_rows(sections),
+        **following(sections),
     }
 
 
@@ -49,18 +65,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; the exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.features",
-        description="Time features and scores of simulated bins, with guards and without.",
+        description="Time features of simulated bins beside other tools, and what guards cost.",
     )
     parser.add_argument("--quick", action="store_true", help="a few rounds, to see that it runs")
     parser.add_argument(
         "--only", nargs="+", choices=SECTIONS, metavar="SECTION", help="of %(choices)s"
     )
-    text = "where the numbers go (benchmarks/results, if all is measured in full)"
-    parser.add_argument("--json", type=Path, metavar="FILE", help=text)
+    for name, what in (("json", "numbers"), ("figure", "figure")):
+        text = f"where the {what} go (benchmarks/results, if all is measured in full)"
+        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
     parsed = parser.parse_args(arguments)
-    refuse_folders(parser, parsed, "json")
+    refuse_folders(parser, parsed, "json", "figure")
+    if parsed.figure and parsed.only and "pool" not in parsed.only:
+        parser.error("--figure shows the section pool; measure it, with roofline if you like")
     if not (parsed.quick or parsed.only):
         parsed.json = parsed.json or RESULTS / "features.json"
+        parsed.figure = parsed.figure or RESULTS / "features.png"
     names = [name for name in SECTIONS if parsed.only is None or name in parsed.only]
     try:
         report = measure(QUICK if parsed.quick else Sizes(), names, parsed.quick)
@@ -68,6 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
     print(report_text(report))
     keep_numbers(report, parsed.json)
+    keep_figure(figure, report, parsed.figure)
     return 0
 
 

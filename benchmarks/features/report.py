@@ -1,127 +1,55 @@
-"""What follows from the measurements of ``benchmarks.features``: ratios, limits, tables."""
+"""What ``benchmarks.features`` prints: heading, tables of all sections, limits."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from statistics import median
+from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.arithmetic import NATIVE, WIDE
-from benchmarks.clocks import paired_ratio
-from benchmarks.machine import threads_text
-from benchmarks.outcome import limits_table
-from tactslip_torch.report.tables import aligned
+from benchmarks.features.guards import report as guards
+from benchmarks.features.guards.measure import SECTIONS as GUARDED
+from benchmarks.features.pool_report import fractions, limit_rows, pool_tables, roofline_tables
+from benchmarks.outcome import heading
+from benchmarks.tables import Table, limits
 
-SIMULATED_LINE = "SIMULATED bins: what features and scores cost, nothing about a real hand"
-QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
-MOST_OVER_OFF = 1.10  # what the guards may cost, as the project has set itself
-_TITLES = {"extract": "features", "score": "scores with validity", "solve": "solve with report"}
-_KINDS = ("off", "textbook")  # what seconds with guards are compared with
+ABOUT = "features and scores"
 
 
-# ------------------------------------------------------------------------------------- numbers
-def ratios(sections: Mapping[str, Any]) -> dict[str, Any]:
-    """Seconds with guards over seconds without, of calls timed in the same rounds.
+def following(sections: Mapping[str, Any]) -> dict[str, Any]:
+    """What follows from the sections that were measured: ratios, fractions, limits."""
+    guarded = {name: of for name, of in sections.items() if name in GUARDED}
+    found: dict[str, Any] = {"ratios": guards.ratios(guarded)}
+    if "roofline" in sections:
+        found["fractions"] = fractions(sections["roofline"], sections.get("pool"))
+    pool = limit_rows(sections["pool"]) if "pool" in sections else []
+    return found | {"limits": pool + guards.limit_rows(guarded)}
+
+
+def tables(report: Mapping[str, Any]) -> dict[str, list[Table]]:
+    """Tables by title, the limits first.
 
     Args:
-        sections: name to numbers; any of ``SECTIONS``.
-
-    Returns:
-        By section one row per measured row, with ``over_off`` and ``over_textbook``: medians and
-        quartiles of the ratios within rounds. Under ``"wide_over_native"``, by threads, what it
-        costs to compute float32 bins in float64.
+        report: as ``--json`` keeps it.
     """
-    found: dict[str, Any] = {
-        name: [_over(row) for row in of["rows"]] for name, of in sections.items()
-    }
-    rows = sections.get("extract", {}).get("rows", ())
-    seconds = {(row["arithmetic"], row["threads"]): row["guards_s"] for row in rows}
-    found["wide_over_native"] = {
-        str(threads): paired_ratio(taken, seconds[NATIVE, threads])._asdict()
-        for (name, threads), taken in seconds.items()
-        if name == WIDE and (NATIVE, threads) in seconds
-    }
+    sections = report["sections"]
+    guarded = {name: of for name, of in sections.items() if name in GUARDED}
+    found = {"Limits": [limits(report["limits"], "median, quartiles")]}
+    if "pool" in sections:
+        found["The whole pool"] = pool_tables(sections["pool"])
+    if "roofline" in sections:
+        found["Roofline"] = roofline_tables(sections["roofline"], report["fractions"])
+    if guarded:
+        found["What guards cost"] = guards.tables(guarded, report["ratios"])
     return found
 
 
-def _over(row: Mapping[str, Any]) -> dict[str, Any]:
-    facts = {name: row[name] for name in ("arithmetic", "threads", "bins")}
-    return facts | {
-        f"over_{kind}": paired_ratio(row["guards_s"], row[f"{kind}_s"])._asdict()
-        for kind in _KINDS
-        if f"{kind}_s" in row
-    }
-
-
-def limit_rows(sections: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Every limit beside what was measured, and whether it holds.
-
-    Args:
-        sections: name to numbers; limits of absent ones are left out.
-    """
-    of = ratios(sections)
-    return [
-        {
-            "what": f"{_TITLES[name]}, guards / off, {_about(row)}",
-            "measured": _spread(row["over_off"]),
-            "limit": f"<= {MOST_OVER_OFF:.2f}",
-            "ok": row["over_off"]["median"] <= MOST_OVER_OFF,
-        }
-        for name in sections
-        for row in of[name]
-    ]
-
-
-# -------------------------------------------------------------------------------------- tables
 def report_text(report: Mapping[str, Any]) -> str:
     """What is printed.
 
     Args:
-        report: settings, facts and sections, as ``--json`` keeps them.
+        report: as ``--json`` keeps it.
     """
-    parts = [_heading(report)]
-    parts += [_table(name, of, report["ratios"]) for name, of in report["sections"].items()]
-    parts += [_wide_line(report["ratios"]["wide_over_native"])]
-    parts.append(limits_table(report["limits"], "median, quartiles"))
-    parts.append("guards off replaces " + ", ".join(report["replaced"]))
-    return "\n\n".join([*filter(None, parts), *([QUICK_LINE] if report["quick"] else [])])
-
-
-def _heading(report: Mapping[str, Any]) -> str:
-    lines = [
-        f"features and scores, {report['settings']['rounds']} rounds of each call",
-        f"machine   {', '.join(report['machine'].values())}",
-        f"versions  {', '.join(f'{name} {of}' for name, of in report['versions'].items())}",
-        SIMULATED_LINE,
-    ]
-    return "\n".join(lines + ([QUICK_LINE] if report["quick"] else []))
-
-
-def _table(name: str, numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
-    kinds = [kind for kind in _KINDS if f"{kind}_s" in numbers["rows"][0]]
-    header = [_TITLES[name], "threads", "bins at once", "guards, us/bin"]
-    header += [f"{kind}, us/bin" for kind in kinds] + [f"guards / {kind}" for kind in kinds]
-    rows = []
-    for row, ratio in zip(numbers["rows"], of[name], strict=True):
-        cells = [row["arithmetic"], str(row["threads"]), str(row["bins"])]
-        cells += [_per_bin(row[f"{kind}_s"], row["bins"]) for kind in ("guards", *kinds)]
-        rows.append(cells + [f"{ratio[f'over_{kind}']['median']:.3f}" for kind in kinds])
-    note = "\ntextbook: neither guards nor shifted and scaled sums" if "textbook" in kinds else ""
-    return aligned(header, rows) + note
-
-
-def _wide_line(of: Mapping[str, Any]) -> str:
-    on = [f"{_spread(ratio)} on {threads_text(threads)}" for threads, ratio in of.items()]
-    return f"{WIDE} / {NATIVE}: {', '.join(on)} (a choice, not a guard)" if on else ""
-
-
-def _about(row: Mapping[str, Any]) -> str:
-    return f"{row['arithmetic']}, {row['bins']} at once, {threads_text(row['threads'])}"
-
-
-def _spread(ratio: Mapping[str, float]) -> str:
-    return f"{ratio['median']:.3f} ({ratio['low']:.3f} to {ratio['high']:.3f})"
-
-
-def _per_bin(seconds: Sequence[float], bins: int) -> str:
-    return f"{1e6 * median(seconds) / bins:.0f}"
+    by_title = tables(report)
+    last = by_title.pop("Limits")
+    parts = [table.text() for of in by_title.values() for table in of]
+    replaced = "guards off replaces " + ", ".join(report["replaced"])
+    return heading(report, ABOUT, [*parts, *(table.text() for table in last), replaced])

@@ -16,8 +16,8 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-from benchmarks.features.plain import PlainSample, TextbookSample, describer
-from tactslip_torch.features import pool
+from benchmarks.features.guards.plain import PlainSample, TextbookSample, describer
+from tactslip_torch.features import extractor, pool
 from tactslip_torch.model import detector
 
 
@@ -81,6 +81,7 @@ _OFF: tuple[_Place, ...] = (
     (pool, "saturating", Tensor.to),
     (pool.FeaturePool, "branches", _branches),
     (pool.FeaturePool, "amplitudes", _amplitudes),
+    (extractor, "saturating", Tensor.to),
     (detector, "saturating", Tensor.to),
 )
 _TEXTBOOK: tuple[_Place, ...] = (

@@ -1,4 +1,4 @@
-"""The measurements of ``benchmarks.features``: seconds of every round, no judgement.
+"""What guards cost: seconds of every round, no judgement.
 
 Bins are simulated: those of one recording, filtered as in training; a solve takes synthetic
 features. What is compared is timed in one process, in an order of its own in every round.
@@ -7,20 +7,20 @@ features. What is compared is timed in one process, in an order of its own in ev
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from benchmarks.arithmetic import ARITHMETIC
+from benchmarks.bins import WINDOW_LENGTHS, simulated_bins
 from benchmarks.clocks import Way, on_threads, say, shuffled_rounds
-from benchmarks.features.guards_off import guards_off, textbook
+from benchmarks.features.guards.off import guards_off, textbook
 from benchmarks.features.sizes import Sizes
 from benchmarks.machine import threads_text
 from benchmarks.model.synthetic import SyntheticBins
-from tactslip_torch.data.labels import LabelRule
-from tactslip_torch.feature_maker import FeatureMaker
+from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.cholesky import cholesky_, cholesky_solve
@@ -30,7 +30,6 @@ from tactslip_torch.model.kernels import PAPER_KERNEL, lower_gram
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.simulation.source import SimulatedRecordings
 
 NUM_FEATURES, PENALTY = 120, 0.1  # of the machine that is timed
 
@@ -43,7 +42,7 @@ def extract(sizes: Sizes) -> dict[str, Any]:
         ways: dict[str, Way] = {}
         for name, (dtype, arithmetic) in ARITHMETIC.items():
             pool = FeaturePool(HandLayout.paper24(), arithmetic=arithmetic)
-            call = partial(pool.extract, simulated_bins(sizes.bins).to(dtype))
+            call = partial(_reference(pool), simulated_bins(sizes.bins).to(dtype))
             ways |= {
                 f"{name} guards": Way(call),
                 f"{name} off": Way(call, guards_off),
@@ -113,19 +112,8 @@ SECTIONS: dict[str, Callable[[Sizes], dict[str, Any]]] = {
 
 
 # ---------------------------------------------------------------------------------------- parts
-@cache
-def _recording() -> Tensor:
-    source = SimulatedRecordings(cycles=1, materials=["M1"])
-    maker = FeatureMaker(
-        source, FeaturePool(source.hand), ChannelFilter([51] * 14 + [11] * 10), LabelRule()
-    )
-    return maker.filtered_bins(source.ids[0])[0]
-
-
-def simulated_bins(num: int) -> Tensor:
-    """Filtered bins ``[num, 24, 100]`` of a simulated recording, over and over; float64."""
-    bins = _recording()
-    return bins[torch.arange(num) % len(bins)].clone()
+def _reference(pool: FeaturePool) -> FeatureExtractor:
+    return FeatureExtractor(pool, engine="reference")  # guards are its
 
 
 @torch.no_grad()
@@ -133,11 +121,11 @@ def untrained_detector() -> SlipDetector:
     """A detector of the usual size that nobody trained: its time is that of any."""
     pool = FeaturePool(HandLayout.paper24())
     selected = list(range(0, len(pool.names), len(pool.names) // NUM_FEATURES))[:NUM_FEATURES]
-    scaler = FeatureScaler.fit(pool.extract(simulated_bins(64))[:, selected], compress=True)
+    scaler = FeatureScaler.fit(_reference(pool)(simulated_bins(64))[:, selected], compress=True)
     generator = torch.Generator().manual_seed(0)
     weights = torch.randn(NUM_FEATURES + 1, NUM_FEATURES, generator=generator, dtype=torch.float64)
     head = QuadraticForm(weights[1:] + weights[1:].T, weights[0], weights[0, 0])
-    return SlipDetector(pool, ChannelFilter([51] * 14 + [11] * 10), selected, scaler, head)
+    return SlipDetector(pool, ChannelFilter(WINDOW_LENGTHS), selected, scaler, head)
 
 
 def _reported(gram: Tensor, targets: Tensor) -> Tensor:

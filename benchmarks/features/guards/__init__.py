@@ -1,0 +1,1 @@
+"""What guards cost: features and scores with them and with plain formulas in their place."""
