@@ -1,0 +1,268 @@
+"""The search for detectors that trade accuracy for time.
+
+For each alignment of the filter, over groups of channels and of components, features are ranked in
+several ways; heads of several sizes and degrees are scored by closed-form validation, a material
+left out at a time, on a bounded sample of training bins. These scores choose, so that of the one
+chosen is a little too good. What a candidate costs is modelled (``cost``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.cost import CostModel, parts_of
+from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.features.groups import Channels, Components, allowed, of_fingers
+from tactslip_torch.features.plan import make_plan
+from tactslip_torch.features.pool import Arithmetic, FeaturePool
+from tactslip_torch.features.ranking import rank_per_cost, rank_weighted
+from tactslip_torch.features.selection import rank_distinct, rank_features, t_scores
+from tactslip_torch.features.survey import Survey
+from tactslip_torch.front import Candidate
+from tactslip_torch.latency import Latency, look_ahead_samples, shortest_hop
+from tactslip_torch.model.fit import TrainingBins
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.planning import validate
+from tactslip_torch.recipe import Frame, Recipe, fit_frame, stand_for
+from tactslip_torch.signals.filtering import Align, ChannelFilter
+from tactslip_torch.threads import for_each
+
+Ranking = Literal["t", "ccweighting", "per_cost"]
+Watch = Callable[[Iterable[Any], str], Iterable[Any]]
+_NAMES = {
+    "channels": Channels,
+    "components": Components,
+    "rankings": Ranking,
+    "aligns": Align,
+    "arithmetics": Arithmetic,
+}
+
+
+@dataclass(frozen=True)
+class Search:
+    """What is searched, as in ``conf/search``.
+
+    Args:
+        sizes: numbers of features.
+        channels: groups: ``"all"``, ``"films"``, ``"gauges"``.
+        drop_fingers: leave out one finger after the other, from the best candidate on.
+        components: groups: ``"all"``; ``"unsorted"``, without median, mode, iqr and entropy;
+            ``"deep_spectra"``, spectra of levels 3 and on only; ``"time"``, no spectra.
+        rankings: ``"t"``, as the recipe ranks; ``"ccweighting"``; ``"per_cost"``.
+        degrees: of the head: 1 is linear, 2 quadratic.
+        aligns: of the filter.
+        arithmetics: of the pool: ``"double"``, or ``"native"``, statistics in float32.
+        hops_ms: between bins.
+        penalties: values of C.
+        bins: of each material and class that are searched on.
+        alpha: of ``rank_weighted``.
+        cost_power: of ``rank_per_cost``.
+        most_timed: candidates at most that are timed.
+        calls: of each timing, in each of its runs.
+
+    Raises:
+        ValueError: for a name that is none, an empty list, or a number out of range.
+    """
+
+    sizes: Sequence[int]
+    channels: Sequence[Channels]
+    drop_fingers: bool
+    components: Sequence[Components]
+    rankings: Sequence[Ranking]
+    degrees: Sequence[int]
+    aligns: Sequence[Align]
+    arithmetics: Sequence[Arithmetic]
+    hops_ms: Sequence[float]
+    penalties: Sequence[float]
+    bins: int = 100
+    alpha: float = 0.7
+    cost_power: float = 0.5
+    most_timed: int = 24
+    calls: int = 400
+
+    def __post_init__(self) -> None:
+        for name in (*_NAMES, "sizes", "degrees", "hops_ms", "penalties"):
+            given = list(getattr(self, name))
+            if not given:
+                raise ValueError(f"search.{name} is empty, expected at least one value")
+            known = get_args(_NAMES[name]) if name in _NAMES else given
+            unknown = [value for value in given if value not in known]
+            if unknown:
+                raise ValueError(
+                    f"search.{name}: unknown {unknown[0]!r}, expected some of {', '.join(known)}"
+                )
+        for name in ("sizes", "hops_ms", "penalties", "bins", "most_timed", "calls"):
+            value = getattr(self, name)
+            least = min(value) if isinstance(value, Sequence) else value
+            if not least > 0:
+                raise ValueError(f"search.{name} must be positive, got {least}")
+        if set(self.degrees) - {1, 2}:
+            raise ValueError(f"search.degrees must be of 1 and 2, got {list(self.degrees)}")
+
+
+class Searcher:
+    """Scores candidates on surveys of the training recordings.
+
+    Args:
+        search: what is searched.
+        recipe: how features are scaled, classes balanced, and ``"t"`` ranks.
+        pool: what features there are.
+        costs: of features on this machine.
+        surveys: of the training recordings, by alignment of the filter.
+        filters: by alignment.
+    """
+
+    def __init__(
+        self,
+        search: Search,
+        recipe: Recipe,
+        pool: FeaturePool,
+        costs: CostModel,
+        surveys: Mapping[Align, Survey],
+        filters: Mapping[Align, ChannelFilter],
+    ) -> None:
+        self.search, self.recipe, self.pool, self.costs = search, recipe, pool, costs
+        self.surveys, self.filters = surveys, filters
+        self._samples = {align: survey.sample.bins() for align, survey in surveys.items()}
+        self._needed = parts_of(make_plan(pool.hand, pool.level, pool.names))
+        self._needs, self._prices = costs.bill(self._needed)
+        self._channel_of = [pool.hand.names.index(name.channel) for name in pool.names]
+
+    def candidates(self, watch: Watch) -> list[Candidate]:
+        """All candidates, in an order that does not depend on the number of threads.
+
+        Raises:
+            ValueError: if no group has a feature, or training bins do not allow validation.
+        """
+        jobs = [
+            (align, channels, components, mask, ranking)
+            for align in self.search.aligns
+            for channels, components, mask in self._groups()
+            for ranking in self.search.rankings
+        ]
+        found = [each for job in watch(jobs, "search, rankings") for each in self._scored(*job)]
+        if not found:
+            raise ValueError(
+                f"an empty selection: no feature of this hand is in search.channels="
+                f"{list(self.search.channels)} with search.components="
+                f"{list(self.search.components)}; add a group, or a smaller one to search.sizes"
+            )
+        return found
+
+    def without_fingers(self, best: Candidate, watch: Watch) -> list[Candidate]:
+        """Candidates like the best with one finger after the other left out, greedily."""
+        hand, found = self.pool.hand, []
+        used = {self._channel_of[index] for index in best.selected}
+        fingers = sorted({hand.channels[channel].finger for channel in used})
+        kept = allowed(hand, self.pool.names, best.channels, best.components)
+        dropped: list[str] = []
+        for _ in watch(range(len(fingers) - 1), "search, fingers"):
+            trials = []
+            for finger in sorted(set(fingers) - set(dropped)):
+                mask = kept & ~of_fingers(hand, self.pool.names, [*dropped, finger])
+                label = f"{best.channels} without {' and '.join([*dropped, finger])}"
+                scored = self._scored(best.align, label, best.components, mask, best.ranking)
+                if scored:
+                    trials.append((max(each.balanced_accuracy for each in scored), finger, scored))
+            if not trials:
+                break
+            _, finger, _ = max(trials, key=lambda trial: trial[0])
+            dropped.append(finger)
+            found += [each for _, _, scored in trials for each in scored]
+        return found
+
+    def frame(self, candidate: Candidate) -> Frame:
+        """The candidate's features and their scaling."""
+        return fit_frame(self.recipe, self.surveys[candidate.align], candidate.selected)
+
+    def _groups(self) -> Iterator[tuple[str, str, Tensor]]:
+        """Groups of channels and components that differ and are not empty."""
+        seen: list[Tensor] = []
+        for channels in self.search.channels:
+            for components in self.search.components:
+                mask = allowed(self.pool.hand, self.pool.names, channels, components)
+                if bool(mask.any()) and not any(torch.equal(mask, other) for other in seen):
+                    seen.append(mask)
+                    yield channels, components, mask
+
+    def _scored(
+        self, align: Align, channels: str, components: str, mask: Tensor, ranking: str
+    ) -> list[Candidate]:
+        """The candidates of one ranking: of each degree and size the best C."""
+        places = mask.nonzero().flatten()
+        sizes = [size for size in sorted(self.search.sizes) if size <= len(places)]
+        if not sizes:
+            return []
+        sample, survey = self._samples[align], self.surveys[align]
+        order = places[self._ranked(ranking, survey, sample, places, sizes[-1])].tolist()
+        weights = stand_for(sample, self.recipe, survey.moments.count.tolist())
+        scaled = fit_frame(self.recipe, survey, order)(sample.features)
+        bins = TrainingBins(scaled, sample.is_slip, weights)
+        jobs = [(degree, size) for degree in self.search.degrees for size in sizes]
+        best: dict[tuple[int, int], dict[str, Any]] = {}
+
+        def score(job: tuple[int, int]) -> None:
+            degree, size = job
+            kernel = Polynomial(degree, offset_of(self.recipe))
+            choices = [(size, kernel, penalty) for penalty in self.search.penalties]
+            rows = validate(bins, sample.group, sample.group_names, choices, _quietly)
+            best[job] = max(rows, key=lambda row: row["mean"])
+
+        for_each(score, jobs)
+        return [
+            Candidate(
+                align,
+                channels,
+                components,
+                ranking,
+                degree,
+                best[degree, size]["penalty"],
+                tuple(order[:size]),
+                best[degree, size]["mean"],
+                best[degree, size]["balanced_accuracy"],
+                self._latency(align, order[:size]),
+            )
+            for degree, size in jobs
+        ]
+
+    def _ranked(
+        self, ranking: str, survey: Survey, sample: SampledBins, places: Tensor, num: int
+    ) -> Tensor:
+        """The best of these features, as places among them."""
+        scores = t_scores(survey.moments, self.recipe.score_variance)[places]
+        if ranking == "per_cost":
+            return rank_per_cost(
+                scores, self._needs[places], self._prices, num, self.search.cost_power
+            )
+        features = sample.features[:, places]
+        if ranking == "ccweighting":
+            return rank_weighted(scores, features, num, self.search.alpha)
+        if self.recipe.most_correlation < 1:
+            most = self.recipe.most_correlation
+            return rank_distinct(scores, features, sample.is_slip, num, most)
+        return rank_features(scores, num)
+
+    def _latency(self, align: Align, selected: Sequence[int]) -> Latency:
+        parts = set().union(*(self._needed[index] for index in selected))
+        compute_us = self.costs.compute_us(parts, len(selected))
+        used = {self._channel_of[index] for index in selected}
+        ahead = look_ahead_samples(self.filters[align], used)
+        rate = self.pool.sample_rate_hz / 1000
+        hops = self.search.hops_ms
+        parts_ms = Latency(ahead / rate, self.pool.bin_samples / rate, hops[0], compute_us)
+        return shortest_hop(parts_ms, hops)
+
+
+def offset_of(recipe: Recipe) -> float:
+    """The polynomial's c: the first of the recipe's."""
+    offsets = recipe.offsets
+    return float(offsets[0] if isinstance(offsets, Sequence) else offsets)
+
+
+def _quietly(items: Iterable[Any], what: str) -> Iterable[Any]:
+    return items
