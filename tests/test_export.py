@@ -273,7 +273,7 @@ def test_a_failed_check_leaves_no_file(detector, tmp_path, monkeypatch, worst):
 def test_a_graph_with_other_flags_is_not_written(detector, tmp_path, monkeypatch):
     """The detector trusts what the file does not."""
     trusting = copy.deepcopy(detector)
-    monkeypatch.setattr(FeaturePool, "validity", lambda pool, bins: bins.isfinite().all(-1))
+    monkeypatch.setattr(FeaturePool, "is_alive", lambda pool, bins: bins.isfinite().all(-1))
     with pytest.raises(ValueError, match=r"disagree on which bins are valid \(kinds .*'constant'"):
         export_onnx(trusting, tmp_path / "model.onnx")
     assert not list(tmp_path.iterdir())
@@ -318,5 +318,7 @@ def test_what_single_precision_costs_is_measured(detector):
     stepping = SlipDetector(detector.pool, detector.channel_filter, mode, scaler, detector.head)
     in_double = float32_error(stepping)["float32_p95"]
     assert in_double < 1e-4
-    stepping.pool = FeaturePool(detector.pool.hand, arithmetic="native")
+    native = FeaturePool(detector.pool.hand, arithmetic="native")
+    parts = (detector.channel_filter, mode, scaler, detector.head)
+    stepping = SlipDetector(native, *parts, engine="reference")
     assert float32_error(stepping)["float32_p95"] > 10 * in_double

@@ -243,3 +243,19 @@ def test_channel_filter_errors():
         layer(torch.zeros(4, 50))
     with pytest.raises(ValueError, match=r"odd.*10"):
         ChannelFilter([11, 10])
+
+
+@pytest.mark.parametrize("align", ["centred", "causal"])
+def test_only_the_channels_wanted_are_filtered(align, rng):
+    """The others come back as their largest magnitude, which shows what is not finite."""
+    smooth = ChannelFilter([51, 51, 11, 11], align=align)
+    samples = torch.from_numpy(rng.standard_normal((3, 4, 150)))
+    samples[1, 0, 60] = torch.nan
+    samples[2, 3, 80] = -torch.inf
+    whole, part = smooth.valid(samples), smooth.valid(samples, {1, 2})
+    assert torch.equal(part[:, 1:3], whole[:, 1:3])
+    start = smooth.context_before - smooth.reaches[3][0]
+    in_frame = samples[0, 3, start : start + 110].abs().max()
+    assert (part[0, 3] == in_frame).all()
+    assert part[1, 0].isnan().all()
+    assert (part[2, 3] == torch.inf).all()

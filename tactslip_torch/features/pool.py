@@ -18,7 +18,13 @@ from tactslip_torch.features.descriptors import (
     band_energy_ratio,
     describe,
 )
-from tactslip_torch.features.guards import are_positive, bounded_gradient, is_constant, settle
+from tactslip_torch.features.guards import (
+    are_positive,
+    bounded_gradient,
+    is_constant,
+    is_recorded,
+    settle,
+)
 from tactslip_torch.features.names import pool_names
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
@@ -255,9 +261,10 @@ class FeaturePool(nn.Module):
             - bins: ``[*, C, n]``
             - output: ``[*, C]``, bool
         """
-        # sample by sample: onnxruntime's maxima pass over NaN
         largest = min(LARGEST_SAMPLE, torch.finfo(bins.dtype).max)
-        return (~(bins.abs() <= largest)).any(-1)
+        if is_recorded():  # onnxruntime's maxima pass over NaN
+            return (~(bins.abs() <= largest)).any(-1)
+        return ~(torch.maximum(bins.amax(-1), -bins.amin(-1)) <= largest)
 
     def _of_gauges(self, bins: Tensor) -> Tensor:
         gauges = bins[..., self._gauges, :]

@@ -203,7 +203,7 @@ class SlipDetector(nn.Module):
         return Judgement(score, is_valid, is_missing)
 
     def _filter(self, samples: Tensor) -> Tensor:
-        return self.channel_filter.valid(self.pool.widen(samples))
+        return self.channel_filter.valid(self.pool.widen(samples), self.extractor.plan.channels)
 
     def _features(self, bins: Tensor) -> Tensor:
         return self.extractor(bins, self.scaler.minimum.dtype)

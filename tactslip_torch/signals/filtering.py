@@ -9,7 +9,7 @@ some tones below the corner are raised by a third, and the corners move to 200 H
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Literal, get_args
 
 import torch
@@ -158,8 +158,6 @@ class ChannelFilter(nn.Module):
             (length, [i for i, own in enumerate(self.window_lengths) if own == length])
             for length in dict.fromkeys(self.window_lengths)
         ]
-        order = [i for _, chosen in self._groups for i in chosen]
-        self._inverse = sorted(range(len(order)), key=order.__getitem__)
 
     @property
     def reaches(self) -> tuple[tuple[int, int], ...]:
@@ -195,12 +193,17 @@ class ChannelFilter(nn.Module):
             savgol_filter(_channels(samples, chosen), length, self.polyorder, self.align)
             for length, chosen in self._groups
         ]
-        return self._in_order(parts)
+        return _in_order(parts, [i for _, chosen in self._groups for i in chosen])
 
-    def valid(self, samples: Tensor) -> Tensor:
+    def valid(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:
         """Filter bins that come with their context, keeping only the bins.
 
         One matrix product, so a NaN anywhere in a bin's frame makes the channel's whole bin NaN.
+
+        Args:
+            samples: raw bins.
+            channels: which are wanted, by default all; the others are not filtered but come back
+                as a constant, the largest magnitude in their frame, which shows a NaN or Inf.
 
         Shape:
             - samples: ``[*, C, n + 2 * context]``, the bin behind ``context_before`` of them
@@ -216,12 +219,21 @@ class ChannelFilter(nn.Module):
                 f"expected bins with {self.context_before} samples of context before and "
                 f"{self.context_after} behind, got {samples.shape[-1]} samples in all"
             )
-        parts, before = [], self.context_before
-        for length, chosen in self._groups:
+        wanted = frozenset(range(len(self.window_lengths)) if channels is None else channels)
+        parts, before, order = [], self.context_before, list[int]()
+        for length, own in self._groups:
             start = before - reach(length, self.align)[0]
-            kept = _channels(samples, chosen).narrow(-1, start, num_samples + length - 1)
-            parts.append(kept @ self._matrix(length, num_samples, samples))
-        return self._in_order(parts)
+            for chosen in ([c for c in own if c in wanted], [c for c in own if c not in wanted]):
+                if not chosen:
+                    continue
+                order += chosen
+                kept = _channels(samples, chosen).narrow(-1, start, num_samples + length - 1)
+                if chosen[0] in wanted:
+                    parts.append(kept @ self._matrix(length, num_samples, samples))
+                else:
+                    largest = torch.maximum(kept.amax(-1), -kept.amin(-1))[..., None]
+                    parts.append(largest.expand(*kept.shape[:-1], num_samples))
+        return _in_order(parts, order)
 
     def _check(self, samples: Tensor) -> None:
         if samples.ndim < 2 or samples.shape[-2] != len(self.window_lengths):
@@ -247,12 +259,13 @@ class ChannelFilter(nn.Module):
             self._matrices[key] = matrix
         return matrix
 
-    def _in_order(self, parts: Sequence[Tensor]) -> Tensor:
-        """Channels of the parts, one for each group, in the order of the hand."""
-        filtered = torch.cat(list(parts), dim=-2)
-        if self._inverse == sorted(self._inverse):
-            return filtered
-        return filtered[..., self._inverse, :]
+
+def _in_order(parts: Sequence[Tensor], order: Sequence[int]) -> Tensor:
+    """The parts' channels, which are those of ``order``, in the order of the hand."""
+    filtered = torch.cat(list(parts), dim=-2)
+    if list(order) == sorted(order):
+        return filtered
+    return filtered[..., sorted(range(len(order)), key=order.__getitem__), :]
 
 
 def _channels(samples: Tensor, chosen: Sequence[int]) -> Tensor:
