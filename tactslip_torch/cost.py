@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.extractor import FeatureExtractor
+from tactslip_torch.features.extractor import EngineName, FeatureExtractor
 from tactslip_torch.features.plan import ORDERED, Plan, make_plan
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
@@ -83,6 +83,8 @@ class CostModel:
     def bill(self, needed: Sequence[set[Part]]) -> tuple[Tensor, Tensor]:
         """What ``rank_per_cost`` takes: which parts each feature needs, and their prices.
 
+        A column's price holds its share of the rest, and is never nothing.
+
         Shape:
             - first output: ``[F, P]``, bool
             - second output: ``[P]``, whole nanoseconds
@@ -92,7 +94,11 @@ class CostModel:
         needs = torch.zeros(len(needed), len(parts), dtype=torch.bool)
         for row, own in enumerate(needed):
             needs[row, [place[part] for part in own]] = True
-        return needs, torch.tensor([round(1000 * self._price(part)) for part in parts])
+        prices = [round(1000 * self._price(part)) for part in parts]
+        for index, (group, which) in enumerate(parts):
+            if group == "columns" and which:
+                prices[index] += max(round(1000 * self._rest_of_one), 1)
+        return needs, torch.tensor(prices)
 
     def facts(self) -> dict[str, Any]:
         """All prices, JSON-able."""
@@ -106,6 +112,12 @@ class CostModel:
             "p99_over_p50": self.tail,
             "median_relative_error": self.error,
         }
+
+    @property
+    def _rest_of_one(self) -> float:
+        """What one more feature adds to the rest."""
+        least, most = min(self.rest_us), max(self.rest_us)
+        return (self.rest_us[most] - self.rest_us[least]) / max(most - least, 1)
 
     def _price(self, part: Part) -> float:
         group, which = part
@@ -131,6 +143,7 @@ def measure_costs(
     pool: FeaturePool,
     channel_filter: ChannelFilter,
     sizes: Sequence[int],
+    engine: EngineName = "auto",
     *,
     calls: int = 100,
     watch: Callable[[Sequence[Any], str], Any] = lambda items, what: items,
@@ -141,6 +154,7 @@ def measure_costs(
         pool: what features there are.
         channel_filter: of the hand.
         sizes: numbers of features for which the rest is timed.
+        engine: what computes features.
         calls: of each selection, in each of three runs.
         watch: shows progress.
     """
@@ -150,13 +164,13 @@ def measure_costs(
     designs = list(_designs(needed, sizes))
     with one_thread():
         for selected in watch(designs, "cost of feature groups"):
-            extractor = FeatureExtractor(pool, selected)
+            extractor = FeatureExtractor(pool, selected, engine)
             timings.append(time_calls(extractor, bins, calls))
         rest = {}
         for size in sizes:
             some = _spread(range(len(pool.names)), size)
-            of_features = time_calls(FeatureExtractor(pool, some), bins, calls)
-            detector = stand_in(pool, channel_filter, some)
+            of_features = time_calls(FeatureExtractor(pool, some, engine), bins, calls)
+            detector = stand_in(pool, channel_filter, some, engine)
             whole = time_detector(detector, calls)
             rest[size] = max(whole.p50_us - of_features.p50_us, 0.0)
     taken = torch.tensor([timing.p50_us for timing in timings], dtype=torch.float64)
@@ -174,7 +188,10 @@ def measure_costs(
 
 
 def stand_in(
-    pool: FeaturePool, channel_filter: ChannelFilter, selected: Sequence[int]
+    pool: FeaturePool,
+    channel_filter: ChannelFilter,
+    selected: Sequence[int],
+    engine: EngineName = "auto",
 ) -> SlipDetector:
     """A detector that nobody trained, which takes as long as one that somebody did."""
     num = len(selected)
@@ -183,7 +200,7 @@ def stand_in(
     ends = torch.ones(num, dtype=torch.float64)
     head = QuadraticForm(bend + bend.T, bend[0].clone(), torch.tensor(0.5, dtype=torch.float64))
     scaler = FeatureScaler(-ends, ends, ends)
-    return SlipDetector(pool, channel_filter, selected, scaler, head)
+    return SlipDetector(pool, channel_filter, selected, scaler, head, engine=engine)
 
 
 def _designs(needed: Sequence[set[Part]], sizes: Sequence[int]) -> Iterator[list[int]]:

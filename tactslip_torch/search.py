@@ -28,7 +28,7 @@ from tactslip_torch.latency import Latency, look_ahead_samples, shortest_hop
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.planning import validate
-from tactslip_torch.recipe import Frame, Recipe, fit_frame, stand_for
+from tactslip_torch.recipe import Recipe, fit_frame, stand_for
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.threads import for_each
 
@@ -175,10 +175,6 @@ class Searcher:
             dropped.append(finger)
             found += [each for _, _, scored in trials for each in scored]
         return found
-
-    def frame(self, candidate: Candidate) -> Frame:
-        """The candidate's features and their scaling."""
-        return fit_frame(self.recipe, self.surveys[candidate.align], candidate.selected)
 
     def _groups(self) -> Iterator[tuple[str, str, Tensor]]:
         """Groups of channels and components that differ and are not empty."""

@@ -1,8 +1,9 @@
-"""How long a decision takes here: ``python -m tactslip_torch.timing detector.pt [calls]``.
+"""How long a decision takes here: ``python -m tactslip_torch.timing detector.pt``.
 
 One bin at a time and one thread, as a live loop calls it, from raw samples to the decision. Prints
 a line of JSON: p50 and p99 in microseconds. The bins are ordinary ones: one with a NaN goes another
-way, which takes longer.
+way, which takes longer. The number of calls in each of five runs (1000) and the engine (``auto``)
+may follow the name of the file.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
 
@@ -64,13 +66,16 @@ def time_detector(detector: SlipDetector, calls: int, runs: int = 3) -> Timing:
         return time_calls(detector.judge_raw, inputs, calls, runs)
 
 
-def time_in_fresh_process(path: str | os.PathLike[str], calls: int) -> Timing:
+def time_in_fresh_process(
+    path: str | os.PathLike[str], calls: int, engine: EngineName = "auto"
+) -> Timing:
     """``time_detector`` of a saved detector in a process that has done nothing else.
 
     Raises:
         ValueError: if that process fails; its last line is named.
     """
     command = [sys.executable, "-m", "tactslip_torch.timing", os.fspath(path), str(calls)]
+    command.append(engine)
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         said = (done.stderr.strip() or f"exit status {done.returncode}").splitlines()[-1]
@@ -98,11 +103,12 @@ def single_bins(pool: FeaturePool, num_samples: int) -> list[Tensor]:
 
 def main(arguments: Sequence[str]) -> None:
     """Print the timing of a saved detector as a line of JSON."""
-    if not 1 <= len(arguments) <= 2:
-        raise SystemExit("usage: python -m tactslip_torch.timing detector.pt [calls]")
-    calls = int(arguments[1]) if len(arguments) > 1 else 1000
+    if not 1 <= len(arguments) <= 3:
+        raise SystemExit("usage: python -m tactslip_torch.timing detector.pt [calls [engine]]")
+    path, calls, engine = [*arguments, *("1000", "auto")[len(arguments) - 1 :]]
     with one_thread():
-        timing = time_detector(SlipDetector.load(Path(arguments[0])), calls, runs=5)
+        detector = SlipDetector.load(Path(path), cast(EngineName, engine))
+        timing = time_detector(detector, int(calls), runs=5)
     print(json.dumps(timing._asdict()))
 
 

@@ -1,0 +1,158 @@
+"""What ``pareto`` found: the front of latency, compute and accuracy, and the detector chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tactslip_torch.files import whole_file
+from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+
+_ALIGN_COLOURS = {"centred": "#0072B2", "causal": "#D55E00"}
+_CHOSEN = "#009E73"
+
+
+def pareto_table(found: Mapping[str, Any]) -> str:
+    """The front by latency, the chosen detector with its parts, and what was promised.
+
+    Args:
+        found: the content of ``pareto.json``.
+    """
+    head = [SIMULATED_LINE] if found["simulated"] else []
+    limits = found["limits"]
+    head.append(
+        f"front of {found['searched']} candidates, {found['timed']} timed (engine "
+        f"{found['engine']}, one bin, one thread); limits: deadline "
+        f"{limits['deadline_ms']:g} ms, compute {limits['compute_us']:g} us"
+    )
+    head.append(found["definition"])
+    header = ["latency ms", "look-ahead", "bin", "hop", "compute us", "p50 us"]
+    header += ["valid. %", "K", "deg.", "numbers", "filter", "channels", "components", "ranking"]
+    rows = [
+        _cells(row) for row in sorted(found["front"], key=lambda row: row["latency"]["worst_ms"])
+    ]
+    table = aligned(header, rows, num_left=0)
+    return "\n".join([*head, "", table, "", *_verdict(found)])
+
+
+def none_meets(found: Mapping[str, Any]) -> str:
+    """One line on what no detector meets, and what the closest misses."""
+    limits = found["limits"]
+    line = (
+        f"no detector meets deadline_ms={limits['deadline_ms']:g} and "
+        f"compute_us={limits['compute_us']:g} with head-room {found['headroom']:g}"
+    )
+    if found["tries"]:
+        tried = found["tries"][-1]
+        return (
+            f"{line}: of {len(found['tries'])} tried again the last misses by {tried['misses'][0]}"
+        )
+    quickest = min(found["front"], key=lambda row: row["p99_us"])
+    soonest = min(found["front"], key=lambda row: row["latency"]["worst_ms"])
+    return (
+        f"{line}: the quickest takes {quickest['p99_us']:.0f} us at p99, the least latency is "
+        f"{soonest['latency']['worst_ms']:.2f} ms"
+    )
+
+
+def pareto_figure(found: Mapping[str, Any], path: str | Path) -> None:
+    """Write accuracy against latency and against compute as a PNG, the chosen detector marked.
+
+    Args:
+        found: the content of ``pareto.json``.
+        path: the PNG to write, replaced as a whole if it exists.
+    """
+    figure = Figure(figsize=(11, 4.8), layout="constrained")
+    kind = "SIMULATED hand" if found["simulated"] else "recorded"
+    figure.suptitle(
+        f"What latency and compute buy ({kind}), {found['searched']} candidates", fontsize=13
+    )
+    left, right = figure.subplots(1, 2, sharey=True)
+    limits = found["limits"]
+    _panel(left, found, lambda row: row["latency"]["worst_ms"], 0)
+    left.axvline(limits["deadline_ms"], color="black", linestyle=":", linewidth=1)
+    left.set_xlabel("worst-case latency, onset to decision, ms")
+    left.set_ylabel("balanced accuracy, a material left out, %")
+    left.set_title("shortest hop; dotted: the deadline", fontsize=10)
+    _panel(right, found, lambda row: row["p99_us"], 1)
+    right.axvline(limits["compute_us"], color="black", linestyle=":", linewidth=1)
+    right.set_xscale("log")
+    right.set_xlabel("compute, raw samples to decision, p99, us")
+    right.set_title("one bin, one thread; dotted: the limit", fontsize=10)
+    right.legend(frameon=False, loc="lower right", fontsize=9)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=150)
+
+
+def _panel(axes: Axes, found: Mapping[str, Any], x: Callable[[Any], float], place: int) -> None:
+    """Modelled candidates in grey, the front by alignment, steps along what nothing beats."""
+    modelled = found["modelled"]
+    axes.plot(
+        [point[place] for point in modelled],
+        [100 * point[2] for point in modelled],
+        ".",
+        color="#CCCCCC",
+        markersize=3,
+        label="searched (compute modelled)",
+    )
+    for align, colour in _ALIGN_COLOURS.items():
+        rows = [row for row in found["front"] if row["align"] == align]
+        if rows:
+            ys = [100 * row["validation"] for row in rows]
+            axes.plot([x(row) for row in rows], ys, "o", color=colour, label=f"front, {align}")
+    best = -1.0
+    steps: list[tuple[float, float]] = []
+    for row in sorted(found["front"], key=lambda row: (x(row), -row["validation"])):
+        if row["validation"] > best:
+            best = row["validation"]
+            steps.append((x(row), 100 * best))
+    axes.step(*zip(*steps, strict=True), where="post", color="#555555", linewidth=1)
+    chosen = found["chosen"]
+    if chosen:
+        axes.plot(
+            x(chosen),
+            100 * chosen["validation"],
+            "*",
+            color=_CHOSEN,
+            markersize=17,
+            markeredgecolor="black",
+            label="chosen",
+        )
+    axes.grid(color="#DDDDDD")
+
+
+def _verdict(found: Mapping[str, Any]) -> list[str]:
+    chosen = found["chosen"]
+    if chosen is None:
+        return [none_meets(found)]
+    latency = chosen["latency"]
+    return [
+        f"chosen: {latency['worst_ms']:.2f} ms = look-ahead {latency['look_ahead_ms']:g} + bin "
+        f"{latency['bin_ms']:g} + hop {latency['hop_ms']:g} + compute "
+        f"{latency['compute_us'] / 1000:.3f} (p99 in a fresh process; p50 {chosen['p50_us']:.0f} "
+        f"us, {100 * latency['load']:.1f} % of a core)",
+        f"  {chosen['num_features']} features of {len(chosen['channels_read'])} channels, degree "
+        f"{chosen['degree']}, {chosen['align']}, {chosen['arithmetic']}; fitted to "
+        f"{chosen['fitted_to']}",
+        f"  balanced accuracy {_percent(chosen['validation'])} % in validation, which chose it and "
+        f"is a little too good; {_percent(chosen['test']['balanced_accuracy'])} % on "
+        f"{chosen['test']['num_bins']} bins of the test cycles of seen materials",
+    ]
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    latency = row["latency"]
+    cells = [f"{latency['worst_ms']:.2f}"]
+    cells += [f"{latency[part]:g}" for part in ("look_ahead_ms", "bin_ms", "hop_ms")]
+    cells += [f"{row['p99_us']:.0f}", f"{row['p50_us']:.0f}", _percent(row["validation"])]
+    cells += [str(row["num_features"]), str(row["degree"])]
+    names = ("arithmetic", "align", "channels", "components", "ranking")
+    return cells + [str(row[name]) for name in names]
+
+
+def _percent(fraction: float | None) -> str:
+    return "-" if fraction is None else f"{100 * fraction:.2f}"
