@@ -1,0 +1,142 @@
+"""What the eager engine reads off sorted rows: median, interquartile range, mode and entropy.
+
+Rows are deviations from their mean over their span, so of order one, sorted. Runs of equal values
+are counted in one byte a value, on all rows as one flat array: the first value of a row never
+continues a run, so no run crosses from row to row.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from tactslip_torch.features.descriptors import ENTROPY_LEVELS, HALF_SLACK, RUN_TOLERANCE
+from tactslip_torch.features.eager_scratch import Scratch
+from tactslip_torch.features.runs import entropy_growth
+
+Array = np.ndarray[Any, Any]
+MIXED_TOLERANCE = 2.0**-22
+"""Part of the span by which equal values may differ in float32: the rounding of deviations."""
+
+
+def quantile_weights(num: int) -> tuple[Array, Array]:
+    """Which sorted values make the median and the interquartile range, and with which weights.
+
+    Shape:
+        - output: ``[k]`` places, and ``[2, k]`` weights, float64: of the median, of the range
+    """
+    weights = np.zeros((2, num))
+    for part in (0.25, 0.75):  # Hazen: q n + 1/2, counted from 1
+        position = min(max(part * num - 0.5, 0.0), num - 1.0)
+        below, share = int(position), position % 1
+        sign = 1.0 if part > 0.5 else -1.0
+        weights[1, below] += sign * (1 - share)
+        weights[1, min(below + 1, num - 1)] += sign * share
+    weights[0, (num - 1) // 2] += 0.5
+    weights[0, num // 2] += 0.5
+    places = np.flatnonzero(weights.any(0))
+    return places, weights[:, places]
+
+
+def rank_in_run(continues: Array, spare: Array, other: Array) -> Array:
+    """Position of each value within its run, from 0, by doubling; stops with the longest run.
+
+    Shape:
+        - continues: ``[m]`` flat, unsigned integers: 1 where a value is of the run of the one
+          before it, else 0. Becomes the result.
+        - spare, other: ``[m]``, same dtype, overwritten
+        - output: ``[m]``
+    """
+    rank = continues
+    whole = np.negative(rank, out=spare)  # all bits set: the last ``width`` values all continue
+    width = 1
+    while width < len(rank) and whole.any():
+        grown = np.bitwise_and(whole[width:], rank[:-width], out=other[width:])
+        np.add(rank[width:], grown, out=rank[width:])
+        np.bitwise_and(whole[width:], whole[:-width], out=other[width:])
+        other[:width] = 0
+        whole, other = other, whole
+        width *= 2
+    return rank
+
+
+class Ordered:
+    """Views of memory for sorted rows, and what is read off them.
+
+    Args:
+        scratch: the memory.
+        num_rows: rows; each has as many bins as the scratch.
+        num: values of each.
+        num_quantised: how many of the rows, the first ones, want their entropy.
+
+    Attributes:
+        sorted: ``[num_rows * M, num]``.
+    """
+
+    def __init__(self, scratch: Scratch, num_rows: int, num: int, num_quantised: int) -> None:
+        rows, self._quantised = num_rows * scratch.num_bins, num_quantised * scratch.num_bins
+        self._rows, self._work = scratch.ordered(rows, num), scratch.work(rows, num)
+        self.sorted: Array = self._rows.numpy()
+        self._gaps: Array = self._work.numpy()
+        self._ranks = scratch.counts(rows * num)
+        self._flags = scratch.flags(self._quantised * num)
+        self._growth: Array = entropy_growth(num).to(scratch.dtype).numpy()
+        self._half = 0.5 + HALF_SLACK[scratch.dtype]
+        self._floor = MIXED_TOLERANCE if scratch.dtype == torch.float32 else 0.0
+        places, weights = quantile_weights(num)
+        self._places = places
+        self._weights = np.ascontiguousarray(weights.T, dtype=self.sorted.dtype)
+
+    def quantiles(self) -> Array:
+        """Median and interquartile range, ``[num_rows, 2]``."""
+        found: Array = self.sorted.take(self._places, axis=1) @ self._weights
+        return found
+
+    def modes(self, scale: Array, span: Array) -> tuple[Array, Array]:
+        """Modes that are not the smallest value: in which rows, and the first of the longest run.
+
+        Only rows whose smallest gap is within the tolerance are looked at closer.
+
+        Shape:
+            - scale: ``[num_rows]``, size of the raw bin; span: ``[num_rows]``, of the row, not 0
+            - output: ``[k]`` rows, ``[k]`` values
+        """
+        flat, gaps = self.sorted.ravel(), self._gaps
+        np.subtract(flat[1:], flat[:-1], out=gaps.ravel()[:-1])
+        gaps[:, -1] = np.inf
+        tolerance = (RUN_TOLERANCE[torch.float64] * scale / span + self._floor).astype(gaps.dtype)
+        rows = np.flatnonzero(torch.amin(self._work, 1).numpy() <= tolerance)
+        if not len(rows):
+            return rows, self.sorted[rows, 0]
+        num = gaps.shape[1]
+        continues, spare, other = (each[: len(rows) * num] for each in self._ranks)
+        grid = continues.reshape(-1, num)
+        grid[:, 0] = 0
+        near = gaps if len(rows) == len(gaps) else gaps[rows]
+        np.less_equal(near[:, :-1], tolerance[rows, None], out=grid[:, 1:], casting="unsafe")
+        rank = rank_in_run(continues, spare, other).reshape(-1, num)
+        last = rank.argmax(1)  # the first maximum: the end of the first longest run
+        first = last - rank[np.arange(len(rows)), last]
+        rows, first = rows[first > 0], first[first > 0]
+        return rows, self.sorted[rows, first]
+
+    def entropy(self) -> Array:
+        """Shannon entropy of the histogram of those rows that want it, in bits."""
+        work, ordered = self._work[: self._quantised], self._rows[: self._quantised]
+        shift = self._half - ENTROPY_LEVELS * ordered[:, :1]
+        values: Array = torch.add(shift, ordered, alpha=ENTROPY_LEVELS, out=work).numpy()
+        level, is_same, is_top = self._flags
+        continues, spare, other = (each[: values.size] for each in self._ranks)
+        np.copyto(level, values.reshape(-1), casting="unsafe")
+        np.equal(level[1:], level[:-1], out=is_same[1:])
+        # the maximum always has the top level, so the second highest level joins it
+        np.equal(level, ENTROPY_LEVELS, out=is_top)
+        np.logical_or(is_same, is_top, out=is_same)
+        is_same.reshape(values.shape)[:, 0] = False
+        np.copyto(continues, is_same)
+        rank = rank_in_run(continues, spare, other)
+        np.take(self._growth, rank, out=values.reshape(-1), mode="clip")
+        found: Array = torch.sum(work, 1).numpy()
+        return found
