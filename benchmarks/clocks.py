@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from statistics import median, quantiles
 from typing import Any, NamedTuple
 
@@ -69,6 +70,46 @@ def shuffled_turns(
             turns[name].core_s.append(time.process_time() - busy)
             turns[name] = turns[name]._replace(result=result)
     return turns
+
+
+def shuffled_singles(
+    calls: Mapping[str, Callable[[int], object]],
+    rounds: int,
+    seed: int,
+    block_s: float,
+    most_calls: int,
+) -> dict[str, list[list[float]]]:
+    """Seconds of every single call, by round.
+
+    Every round makes some calls of each, about ``block_s`` worth, in an order of its own and after
+    one that is not timed.
+
+    Args:
+        calls: each takes a number that counts its calls.
+        rounds: how many.
+        seed: of the order.
+        block_s: for so long a call is repeated within a round.
+        most_calls: in a round.
+    """
+    shuffle = random.Random(seed)
+    repeats: dict[str, int] = {}
+    for name, call in calls.items():
+        call(0)
+        least = min(timed(partial(call, 0))[0] for _ in range(2))
+        repeats[name] = max(1, min(most_calls, round(block_s / least)))
+    seconds: dict[str, list[list[float]]] = {name: [] for name in calls}
+    count = dict.fromkeys(calls, 0)
+    for _ in range(rounds):
+        for name in shuffle.sample(list(calls), len(calls)):
+            calls[name](count[name])
+            taken = []
+            for _ in range(repeats[name]):
+                count[name] += 1
+                started = time.perf_counter()
+                calls[name](count[name])
+                taken.append(time.perf_counter() - started)
+            seconds[name].append(taken)
+    return seconds
 
 
 class Way(NamedTuple):

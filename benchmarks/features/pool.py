@@ -46,11 +46,9 @@ class Call(NamedTuple):
 def full_pool(sizes: Sizes) -> dict[str, Any]:
     """All features of bins of every kind by everything there is."""
     rows: list[dict[str, Any]] = []
-    with torch.inference_mode(), on_threads(sizes.pool.threads):
-        rocket = others.mini_rocket(
-            bins_of(KINDS[0], min(64, sizes.pool.windows)).numpy(), sizes.pool.threads
-        )
-        tsfel = others.tsfel_features()
+    windows = bins_of(KINDS[0], min(64, sizes.pool.windows)).numpy()
+    rocket, tsfel = others.mini_rocket(windows, sizes.pool.threads), others.tsfel_features()
+    with torch.inference_mode(), on_threads(sizes.pool.threads):  # of all that is loaded by now
         for kind in KINDS:
             calls = _ours(kind, sizes) | _peers(kind, sizes, rocket, tsfel)
             runs = {name: call.run for name, call in calls.items()}

@@ -8,6 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,9 @@ def mini_rocket(windows: Array, threads: int, num_kernels: int = 10_000) -> Any:
         num_kernels: about as many features.
     """
     with quiet():
-        from importlib import import_module
+        import numba
 
+        numba.config.THREADING_LAYER = "workqueue"  # that by OpenMP sets the threads of torch too
         transform = import_module(_MINI_ROCKET).MiniRocket(
             n_kernels=num_kernels, n_jobs=threads, random_state=0
         )

@@ -1,0 +1,1 @@
+"""What one bin costs: ``python -m benchmarks.latency``."""

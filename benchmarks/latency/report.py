@@ -1,0 +1,110 @@
+"""What follows from the measurements of ``benchmarks.latency``: ratios, limits, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from benchmarks.clocks import Ratio, paired_ratio
+from benchmarks.engines import FLOAT32, FLOAT64
+from benchmarks.latency.measure import row_of
+from benchmarks.latency.ways import LOOP
+from benchmarks.outcome import heading
+from benchmarks.selection import source_text
+from benchmarks.tables import Spread, Table, limits, number
+
+TIMES_THE_LOOP = 200.0  # p50 of the eager engine and the quadratic head
+MOST_ERROR = {FLOAT32: 1e-2, FLOAT64: 1e-6}
+"""Standard deviations of the score; a step of an entropy counts."""
+Rows = Sequence[Mapping[str, Any]]
+
+
+def loop_over(rows: Rows) -> dict[str, Ratio]:
+    """How many times as long the loop takes as every other whole way, median of the rounds."""
+    looped = row_of(rows, LOOP)
+    if looped is None:
+        return {}
+    taken = looped["round_medians_s"]
+    return {
+        row["way"]: paired_ratio(taken, row["round_medians_s"]) for row in rows if row["is_whole"]
+    }
+
+
+def limit_rows(rows: Rows) -> list[dict[str, Any]]:
+    """Limits beside what was measured, and whether they hold."""
+    over, found = loop_over(rows), []
+    way = f"eager, {FLOAT32}"
+    if way in over:
+        found.append(
+            {
+                "what": f"p50, {LOOP} / {way}, quadratic head",
+                "measured": Spread(*over[way]).text(),
+                "limit": f">= {TIMES_THE_LOOP:g}",
+                "ok": over[way].median >= TIMES_THE_LOOP,
+            }
+        )
+    return found
+
+
+def tables(report: Mapping[str, Any]) -> dict[str, list[Table]]:
+    """Tables by title, the limits first.
+
+    Args:
+        report: as ``--json`` keeps it.
+    """
+    rows = report["sections"]["latency"]["rows"]
+    return {
+        "Limits": [limits(report["limits"], "median, quartiles")],
+        "One bin, from samples to a score": [_whole(rows, report)],
+        "Parts": [_parts(rows)],
+    }
+
+
+def report_text(report: Mapping[str, Any]) -> str:
+    """What is printed.
+
+    Args:
+        report: as ``--json`` keeps it.
+    """
+    by_title = tables(report)
+    last = by_title.pop("Limits")
+    parts = [table.text() for of in by_title.values() for table in of]
+    return heading(report, about(report), [*parts, *(table.text() for table in last)])
+
+
+def about(report: Mapping[str, Any]) -> str:
+    """What was measured, in a line."""
+    return f"latency of one bin on 1 thread; {source_text(report['selection'])}"
+
+
+def _whole(rows: Rows, report: Mapping[str, Any]) -> Table:
+    over = loop_over(rows)
+    header = ["raw bin to score, 1 thread", "features", "p50, us", "quartiles", "p99, us"]
+    header += ["calls", "loop / this", "score error, sd"]
+    cells = [
+        [
+            row["way"],
+            str(row["features"]),
+            *_times(row),
+            number(over[row["way"]].median),
+            "-" if row["error"] is None else number(row["error"]),
+        ]
+        for row in sorted(rows, key=lambda row: float(row["p50_s"]))
+        if row["is_whole"]
+    ]
+    note = (
+        f"Filter, features, scaling, head. Heads are fitted to {report['training_bins']} simulated "
+        "bins; errors are against the float64 reference, - for another machine. Quadratic head "
+        "unless another is named."
+    )
+    return Table(header, cells, note)
+
+
+def _parts(rows: Rows) -> Table:
+    header = ["part, 1 bin, 1 thread", "p50, us", "quartiles", "p99, us", "calls"]
+    return Table(header, [[row["way"], *_times(row)] for row in rows if not row["is_whole"]])
+
+
+def _times(row: Mapping[str, Any]) -> list[str]:
+    p25, p50, p75, p99 = (number(1e6 * row[name]) for name in ("p25_s", "p50_s", "p75_s", "p99_s"))
+    return [p50, f"{p25} to {p75}", p99, str(row["calls"])]

@@ -1,0 +1,1 @@
+"""What many bins cost: ``python -m benchmarks.throughput``."""
