@@ -52,7 +52,7 @@ class CompiledEngine:
         chunk_bins: the most bins a call, and how many it is fastest with.
     """
 
-    chunk_bins = 8
+    chunk_bins = 16
 
     def __init__(self, pool: FeaturePool, plan: Plan, dtype: torch.dtype) -> None:
         maps = LinearMaps.of(pool)
@@ -62,7 +62,7 @@ class CompiledEngine:
         self._steps = steps_of(plan, maps, made, chains)
         self._sorts = sorts_of(plan)
         self._num_sorted = tuple(len(rows) for rows in sorted_rows(plan))
-        self._products = Products(maps, made, len(self._steps.film_channel), self.chunk_bins)
+        self._products = Products(maps, made, len(self._steps.film_channel), self.chunk_bins, dtype)
         self._local = threading.local()
 
     def __call__(self, x: Tensor, scale: Tensor, out: Tensor) -> None:
@@ -77,13 +77,15 @@ class CompiledEngine:
         num = len(x)
         bins, values = x.numpy(), space.values[:num]
         steps, limit = self._steps, torch.finfo(out.dtype).max
-        self._products(bins, steps.film_channel, space.products)
+        self._products(bins, scale.numpy(), steps.film_channel, space.products)
         samples, lines = space.samples[:num], space.lines[:num]
         describe_bins(
             bins,
             space.products.shifted.numpy(),
             scale.numpy(),
-            space.products.formed.numpy(),
+            space.products.unit,
+            space.products.formed[0].numpy(),
+            space.products.formed[1].numpy(),
             steps,
             space.desk,
             samples,
@@ -118,5 +120,5 @@ class CompiledEngine:
             lines=np.empty((num, in_frequency, num_lines), number),
             line_facts=np.empty((num, in_frequency, 3)),
             values=torch.empty(num, self._num_features, dtype=torch.float64),
-            desk=desk_of(n, num_lines, len(self._steps.dense), number),
+            desk=desk_of(self._steps, number),
         )

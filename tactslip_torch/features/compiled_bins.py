@@ -12,7 +12,9 @@ def describe_bins(
     x: Array,
     y: Array,
     scale: Array,
-    formed: Array,
+    unit: Array,
+    branches: Array,
+    spectra: Array,
     steps: Steps,
     desk: Desk,
     samples: Array,
@@ -28,7 +30,9 @@ def describe_bins(
         x: bins of the plan's channels.
         y: those of films, less their first sample.
         scale: largest magnitudes.
-        formed: branches and lines that were formed by products.
+        unit: one over the magnitudes of films.
+        branches: those formed by products.
+        spectra: lines formed by products, in the unit of their film.
         steps: what is to be done.
         desk: where to work.
         samples: deviations of rows of samples, written.
@@ -39,9 +43,9 @@ def describe_bins(
         limit: largest magnitude written.
 
     Shape:
-        - x: ``[M, C, n]``; y: ``[M, F, n]``; scale: ``[M, C]``; samples: ``[M, S, n]``;
-          sample_facts: ``[M, S, 3]``; lines: ``[M, S', L]``; line_facts: ``[M, S', 3]``;
-          out: ``[M, K]``
+        - x: ``[M, C, n]``; y: ``[M, F, n]``; scale: ``[M, C]``; unit: ``[M, F]``;
+          samples: ``[M, S, n]``; sample_facts: ``[M, S, 3]``;
+          lines: ``[M, S', L]``; line_facts: ``[M, S', 3]``; out: ``[M, K]``
     """
     n = x.shape[2]
     is_constant, centre, energies = desk.is_constant, desk.centre, desk.energies
@@ -78,7 +82,7 @@ def describe_bins(
                 x[m, channel, 0],
                 scale[m, channel],
                 y[m, f],
-                formed,
+                branches,
                 steps,
                 desk,
                 is_constant,
@@ -93,8 +97,9 @@ def describe_bins(
                 f,
                 x[m, channel, 0],
                 scale[m, channel],
+                unit[m, f],
                 y[m, f],
-                formed,
+                spectra,
                 steps,
                 desk,
                 is_constant,
@@ -137,7 +142,7 @@ def _in_time(
     span = high - low
     if span * (1 / NOISE) < scale:
         span = 0.0
-    scaled(y, mean, span, desk.raw)
+    scaled(y, low, mean, span, desk.raw)
     square = 0.0
     for i in range(n):
         square += desk.raw[i] * desk.raw[i]
@@ -184,6 +189,7 @@ def _in_frequency(
     f: int,
     first: float,
     scale: float,
+    unit: float,
     y: Array,
     formed: Array,
     steps: Steps,
@@ -221,12 +227,12 @@ def _in_frequency(
             spectrum = formed[at : at + width] if kind else total
             if is_constant[b] < 0:
                 is_constant[b] = False
-                if not _is_alive(spectrum, scale, steps):
+                if not _is_alive(spectrum, steps):
                     flat, value = _constant(y, steps.dense[b], scale, desk.shifted)
                     is_constant[b], centre[b] = flat, value + first if kind == 0 else 0.0
-            gain, offset = 1.0, first if kind == 0 else 0.0
+            gain, offset = 1.0, first * unit if kind == 0 else 0.0
             if is_constant[b]:
-                gain, offset = 0.0, centre[b]
+                gain, offset = 0.0, centre[b] * unit
             energies[b] = lines_row(
                 spectrum, gain, offset, scale, row, steps, desk, ordered, facts, out, limit
             )
@@ -247,15 +253,15 @@ def _shares(f: int, energies: Array, steps: Steps, out: Array) -> None:
 
 
 @inner
-def _is_alive(lines: Array, scale: float, steps: Steps) -> bool:
-    """Whether the span of a branch is beyond doubt, by its spectrum: no sample is looked at."""
+def _is_alive(lines: Array, steps: Steps) -> bool:
+    """Whether the span of a branch is beyond doubt, by its spectrum in the unit of its film."""
     n = lines.size // 2
     level = lines[0] / steps.ones[0]
     away = 0.0
     for i in range(2 * n):
         v = lines[i] - level * steps.ones[i]
         away += v * v
-    least = 4 * NOISE * scale * steps.reach
+    least = 4 * NOISE * steps.reach
     return bool(away > n * least * least)
 
 

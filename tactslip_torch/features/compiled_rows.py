@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tactslip_torch.features.compiled_jit import Array, inner
+from tactslip_torch.features.compiled_jit import Array, inner, larger, smaller
 from tactslip_torch.features.compiled_steps import (
     CENTROID,
     CORRELATION,
     CV,
+    DESCRIPTORS,
     ENERGY,
     ENTROPY,
     KURTOSIS,
@@ -43,6 +44,7 @@ class Desk(NamedTuple):
     raw: Array
     sums: Array
     square: Array
+    frequency_hz: Array
     d: Array
     level: Array
     cells: Array
@@ -52,20 +54,24 @@ class Desk(NamedTuple):
     energies: Array
 
 
-def desk_of(n: int, num_lines: int, num_branches: int, number: type[np.floating[Any]]) -> Desk:
-    """Room for bins of ``n`` samples, statistics in that kind of number."""
+def desk_of(steps: Steps, number: type[np.floating[Any]]) -> Desk:
+    """Room for bins of these steps, statistics in that kind of number."""
+    num_branches, n, _ = steps.dense.shape
+    num_lines = len(steps.frequency_hz)
+    most = max(n, num_lines)
     return Desk(
-        np.empty(n),
-        np.empty(n, number),
-        np.empty(2 * num_lines),
-        np.empty(num_lines),
-        np.empty(max(n, num_lines), number),
-        np.empty(max(n, num_lines), np.int32),
-        np.empty(256, np.uint32),
-        np.empty(16),
-        np.empty(num_branches, np.int8),
-        np.empty(num_branches),
-        np.empty(num_branches),
+        shifted=np.empty(n),
+        raw=np.empty(n, number),
+        sums=np.empty(2 * num_lines, number),
+        square=np.empty(num_lines),
+        frequency_hz=steps.frequency_hz.astype(number),
+        d=np.empty(most, number),
+        level=np.empty(most, np.int32),
+        cells=np.empty(256, np.uint32),
+        values=np.empty(len(DESCRIPTORS)),
+        is_constant=np.empty(num_branches, np.int8),
+        centre=np.empty(num_branches),
+        energies=np.empty(num_branches),
     )
 
 
@@ -76,25 +82,27 @@ def extent(row: Array) -> tuple[float, float, float]:
     total = 0.0
     for i in range(row.size):
         v = row[i]
-        low = v if v < low else low
-        high = v if v > high else high
+        low, high = smaller(low, v), larger(high, v)
         total += v
     return low, high, total / row.size
 
 
 @inner
-def scaled(row: Array, mean: float, span: float, d: Array) -> None:
-    """``d = (row - mean) / span``; 0 for no span."""
-    factor = 1.0 / span if span > 0 else 0.0
+def scaled(row: Array, low: float, mean: float, span: float, d: Array) -> float:
+    """``d = (row - mean) / span``, 0 for no span; the least of them."""
+    factor = row.dtype.type(1) / span if span > 0 else row.dtype.type(0)
     for i in range(row.size):
         d[i] = (row[i] - mean) * factor
+    least: float = d.dtype.type((low - mean) * factor)
+    return least
 
 
 @inner
-def _entropy(d: Array, growth: Array, grown: Array, level: Array, cells: Array) -> float:
-    """Entropy of values whose span is 1, in bits."""
+def _entropy(
+    d: Array, low: float, growth: Array, grown: Array, level: Array, cells: Array
+) -> float:
+    """Entropy in bits of values whose span is 1, the least of them given."""
     t = d.dtype.type
-    low, _, _ = extent(d)
     half = t(0.5 + (2.0**-13 if d.itemsize == 4 else 1e-9))
     second = np.int32(0)
     for i in range(d.size):
@@ -193,7 +201,7 @@ def time_row(
         return is_constant, centre
     slot = steps.slot[row]
     d = ordered[slot] if slot >= 0 else desk.d[:n]
-    scaled(branch, mean, span, d)
+    least = scaled(branch, low, mean, span, d)
     top = centre if span == 0 else high + offset
     values = desk.values
     _describe(d, desk.raw, centre, span, top, -1.0, values)
@@ -205,7 +213,7 @@ def time_row(
         values[CORRELATION] = 0.0
     values[ENTROPY] = 0.0
     if span > 0 and steps.flags[row] & WANTS_ENTROPY:
-        values[ENTROPY] = _entropy(d, steps.growth, steps.grown, desk.level, desk.cells)
+        values[ENTROPY] = _entropy(d, least, steps.growth, steps.grown, desk.level, desk.cells)
     if slot >= 0:
         _note(facts[slot], centre, span, scale, d.itemsize)
     _put(row, values, steps, out, limit)
@@ -233,7 +241,7 @@ def lines_row(
     out: Array,
     limit: float,
 ) -> float:
-    """Describe the spectrum ``abs(gain * lines + offset * ones)``; its energy."""
+    """Describe ``scale * abs(gain * lines + offset * ones)``; its energy over ``scale**2``."""
     n = lines.size // 2
     square = desk.square[:n]
     real, imaginary, one, other = lines[:n], lines[n:], steps.ones[:n], steps.ones[n:]
@@ -244,30 +252,29 @@ def lines_row(
         v = a * a + b * b
         square[i] = v
         energy += v
-        most = v if v > most else most
+        most = larger(most, v)
     if row < 0:
         return energy
     slot = steps.slot[row]
     d = ordered[slot] if slot >= 0 else desk.d[:n]
     t = d.dtype.type
     factor = 1 / most if most > 0 else 0.0
-    low, total = t(1), t(0)
+    low, high, total = t(1), t(0), t(0)
     for i in range(n):
         v = np.sqrt(t(square[i] * factor))
         d[i] = v
         total += v
-        low = v if v < low else low
-    size = np.sqrt(most)
+        low, high = smaller(low, v), larger(high, v)
+    size = scale * np.sqrt(most)
     values = desk.values
     if steps.flags[row] & WANTS_CENTROID:
-        values[CENTROID], values[SPREAD] = _centroid(d, steps.frequency_hz, total)
-    mean = np.float64(total) / n
-    share = 1.0 - low if most > 0 else 0.0
-    scaled(d, t(mean), t(share), d)
-    _describe(d, d, size * mean, size * share, size, energy, values)
+        values[CENTROID], values[SPREAD] = _centroid(d, desk.frequency_hz, total)
+    mean, share = np.float64(total) / n, high - low
+    least = scaled(d, low, t(mean), share, d)
+    _describe(d, d, size * mean, size * share, size, scale * scale * energy, values)
     values[ENTROPY] = 0.0
     if share > 0 and steps.flags[row] & WANTS_ENTROPY:
-        values[ENTROPY] = _entropy(d, steps.growth, steps.grown, desk.level, desk.cells)
+        values[ENTROPY] = _entropy(d, least, steps.growth, steps.grown, desk.level, desk.cells)
     if slot >= 0:
         _note(facts[slot], size * mean, size * share, scale, d.itemsize)
     _put(row, values, steps, out, limit)

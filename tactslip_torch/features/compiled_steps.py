@@ -112,7 +112,7 @@ class Forming(NamedTuple):
         kind: ``TIME`` or ``LINES``.
         branch: which.
         films: for which films, ascending.
-        base: where its values begin in the memory for all formed values.
+        base: where its values begin in the memory for all formed of its kind.
     """
 
     kind: int
@@ -135,10 +135,10 @@ def formings(
             chains[kind, film], branches = chain_of(wanted, ranks)
             for branch in branches:
                 formed.setdefault((kind, branch), []).append(film)
-    found, base = [], 0
+    found, base = [], [0, 0]
     for (kind, branch), of in sorted(formed.items()):
-        found.append(Forming(kind, branch, tuple(of), base))
-        base += capacity * len(of) * width_of(maps, kind)
+        found.append(Forming(kind, branch, tuple(of), base[kind]))
+        base[kind] += capacity * len(of) * width_of(maps, kind)
     return found, chains
 
 
