@@ -36,6 +36,10 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
         axes.set(xscale="log", yscale="log")
         plain_decades(axes.xaxis)
         plain_decades(axes.yaxis)
+        if name != "batch":
+            key = {"length": "bin_ms", "channels": "channels"}.get(name, "bins")
+            values = sorted({row[key] for row in report["sections"][name]["rows"]})
+            axes.set_xticks(values, [f"{value:,}" for value in values])
         axes.grid(color=LIGHT)
         axes.legend(frameon=False, fontsize=8)
     for axes in list(drawing.axes)[len(shown) :]:
