@@ -18,7 +18,7 @@ from torch import Tensor
 
 from tactslip_torch.features.pool import VALIDITY
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.rounding import error_facts, gradient_facts, head_facts
+from tactslip_torch.model.rounding import error_facts, gradient_facts, head_facts, score_sd
 from tactslip_torch.signals.coverage import Coverage, KnownInputs, coverage
 from tactslip_torch.signals.finite import refuse_nonfinite
 from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
@@ -183,7 +183,7 @@ def certify(
         raise ValueError(f"a held-out set may not be named {taken[0]!r}, a name of our own; rename")
     sets = {name: compare(detector, bins, name, watch) for name, bins in given.items()}
     base = sets["calibration"]
-    sd = _score_sd(base.exact)
+    sd = score_sd(base.exact)
     generator = torch.Generator().manual_seed(seed)
     size = (extremes, *calibration.shape[1:])
     kinds = {
@@ -224,19 +224,6 @@ def certify(
     content["conditions"] = _conditions(content)
     content["holds"] = all(row["holds"] is not False for row in content["conditions"])
     return Certificate(content, sets | kinds)
-
-
-def _score_sd(scores: Tensor) -> float:
-    """Standard deviation of the calibration scores, or what is wrong with them."""
-    num, sd = len(scores), float(scores.std()) if len(scores) > 1 else 0.0
-    if num_bad := int((~scores.isfinite()).sum()):
-        bad = f"scores of {num_bad} of {num} calibration bins are not finite in float64"
-        raise ValueError(f"{bad}; the head is broken, fit it again")
-    if not 0 < sd < math.inf:
-        found = f"{num} calibration bins have scores of standard deviation {sd:g}"
-        cure = "give more bins, of both classes" if sd == 0 else "scale the head down, or fit again"
-        raise ValueError(f"{found}; {cure}")
-    return sd
 
 
 def _set_facts(

@@ -69,7 +69,7 @@ class FeatureMaker:
         rule: LabelRule,
         cache: FeatureCache | None = None,
         dtype: torch.dtype = torch.float64,
-        engine: EngineName = "reference",
+        engine: EngineName = "auto",
     ) -> None:
         if pool.hand != source.hand:
             raise ValueError(

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from tactslip_torch.certificate import certify
+from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
@@ -30,7 +31,12 @@ def raw_bins(num_bins: int, seed: int = 0, offset: float = 1.0) -> torch.Tensor:
 
 
 def small_detector(
-    seed: int = 0, *, head: str = "quadratic", arithmetic: str = "double", gain: float = 1.0
+    seed: int = 0,
+    *,
+    head: str = "quadratic",
+    arithmetic: str = "double",
+    gain: float = 1.0,
+    engine: EngineName = "auto",
 ) -> SlipDetector:
     rng = np.random.default_rng(seed)
     pool = FeaturePool(HAND, arithmetic=arithmetic)  # type: ignore[arg-type]
@@ -51,7 +57,8 @@ def small_detector(
         machine = QuadraticForm(bend + bend.T, linear, torch.tensor(0.0, dtype=torch.float64))
         middle = -machine(centre).median()  # so that both decisions occur
         machine = QuadraticForm(bend + bend.T, linear, middle)
-    return SlipDetector(pool, channel_filter, selected, scaler, machine, {"simulated": True})
+    facts = {"simulated": True}
+    return SlipDetector(pool, channel_filter, selected, scaler, machine, facts, engine=engine)
 
 
 class Lying(QuadraticForm):

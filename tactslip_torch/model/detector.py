@@ -62,7 +62,7 @@ class SlipDetector(nn.Module):
         info: Mapping[str, Any] | None = None,
         typical: Tensor | Sequence[float] | None = None,
         *,
-        engine: EngineName = "reference",
+        engine: EngineName = "auto",
     ) -> None:
         super().__init__()
         if not len(selected) == len(scaler.minimum) == head.num_features:
@@ -230,7 +230,7 @@ class SlipDetector(nn.Module):
         write_detector(path, *parts, self.state_dict())
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], engine: EngineName = "reference") -> SlipDetector:
+    def load(cls, path: str | os.PathLike[str], engine: EngineName = "auto") -> SlipDetector:
         """Read a detector; nothing in the file is executed.
 
         Raises:

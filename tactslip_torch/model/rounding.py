@@ -250,3 +250,25 @@ def error_facts(error: Tensor, sd: float) -> dict[str, float | None]:
     worst, p99, median = error.quantile(shares, interpolation="higher").tolist()
     found = {"worst": worst, "p99": p99, "median": median}
     return found | {f"{name}_sd": value / sd for name, value in found.items()}
+
+
+def score_sd(scores: Tensor) -> float:
+    """Standard deviation of the scores of calibration bins, by which errors are judged.
+
+    Shape:
+        - scores: ``[N]``
+
+    Raises:
+        ValueError: if scores are not finite, or differ by no more than rounding.
+    """
+    num, sd = len(scores), float(scores.std()) if len(scores) > 1 else 0.0
+    if num_bad := int((~scores.isfinite()).sum()):
+        bad = f"scores of {num_bad} of {num} calibration bins are not finite in float64"
+        raise ValueError(f"{bad}; the head is broken, fit it again")
+    if sd <= 64 * torch.finfo(scores.dtype).eps * float(scores.abs().amax()):
+        sd = 0.0  # equal bins
+    if not 0 < sd < math.inf:
+        found = f"{num} calibration bins have scores of standard deviation {sd:g}"
+        cure = "give more bins, of both classes" if sd == 0 else "scale the head down, or fit again"
+        raise ValueError(f"{found}; {cure}")
+    return sd
