@@ -8,6 +8,8 @@ chosen is a little too good. What a candidate costs is modelled (``cost``).
 
 from __future__ import annotations
 
+import itertools
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -33,6 +35,7 @@ from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.threads import for_each
 
 Ranking = Literal["t", "ccweighting", "per_cost"]
+_Job = tuple[Align, str, str, Tensor, str]  # alignment, channels, components, mask, ranking
 Watch = Callable[[Iterable[Any], str], Iterable[Any]]
 _NAMES = {
     "channels": Channels,
@@ -139,13 +142,13 @@ class Searcher:
         Raises:
             ValueError: if no group has a feature, or training bins do not allow validation.
         """
-        jobs = [
+        jobs: list[_Job] = [
             (align, channels, components, mask, ranking)
             for align in self.search.aligns
             for channels, components, mask in self._groups()
             for ranking in self.search.rankings
         ]
-        found = [each for job in watch(jobs, "search, rankings") for each in self._scored(*job)]
+        found = [each for scored in self._all(jobs, watch) for each in scored]
         if not found:
             raise ValueError(
                 f"an empty selection: no feature of this hand is in search.channels="
@@ -161,19 +164,35 @@ class Searcher:
         fingers = sorted({hand.channels[channel].finger for channel in used})
         kept = allowed(hand, self.pool.names, best.channels, best.components)
         dropped: list[str] = []
-        for _ in watch(range(len(fingers) - 1), "search, fingers"):
-            trials = []
-            for finger in sorted(set(fingers) - set(dropped)):
+        while len(dropped) < len(fingers) - 1:
+            others = sorted(set(fingers) - set(dropped))
+            jobs: list[_Job] = []
+            for finger in others:
                 mask = kept & ~of_fingers(hand, self.pool.names, [*dropped, finger])
                 label = f"{best.channels} without {' and '.join([*dropped, finger])}"
-                scored = self._scored(best.align, label, best.components, mask, best.ranking)
-                if scored:
-                    trials.append((max(each.balanced_accuracy for each in scored), finger, scored))
-            if not trials:
+                jobs.append((best.align, label, best.components, mask, best.ranking))
+            trials = self._all(jobs, watch)
+            tops = [max((each.balanced_accuracy for each in own), default=-1.0) for own in trials]
+            if max(tops) < 0:  # too few features are left for any size
                 break
-            _, finger, _ = max(trials, key=lambda trial: trial[0])
-            dropped.append(finger)
-            found += [each for _, _, scored in trials for each in scored]
+            dropped.append(others[tops.index(max(tops))])
+            found += [each for own in trials for each in own]
+        return found
+
+    def _all(self, jobs: Sequence[_Job], watch: Watch) -> list[list[Candidate]]:
+        """What each job finds, in their order; every job is done by one thread."""
+        found: list[list[Candidate]] = [[] for _ in jobs]
+        ticks = iter(watch(range(len(jobs)), "search, rankings"))
+        ticking = threading.Lock()
+
+        def work(number: int) -> None:
+            found[number] = self._scored(*jobs[number])
+            with ticking:
+                next(ticks)
+
+        for_each(work, range(len(jobs)))
+        for _ in ticks:  # closes what is shown
+            pass
         return found
 
     def _groups(self) -> Iterator[tuple[str, str, Tensor]]:
@@ -199,32 +218,27 @@ class Searcher:
         weights = stand_for(sample, self.recipe, survey.moments.count.tolist())
         scaled = fit_frame(self.recipe, survey, order)(sample.features)
         bins = TrainingBins(scaled, sample.is_slip, weights)
-        jobs = [(degree, size) for degree in self.search.degrees for size in sizes]
-        best: dict[tuple[int, int], dict[str, Any]] = {}
-
-        def score(job: tuple[int, int]) -> None:
-            degree, size = job
+        found = []
+        for degree, size in itertools.product(self.search.degrees, sizes):
             kernel = Polynomial(degree, offset_of(self.recipe))
             choices = [(size, kernel, penalty) for penalty in self.search.penalties]
             rows = validate(bins, sample.group, sample.group_names, choices, _quietly)
-            best[job] = max(rows, key=lambda row: row["mean"])
-
-        for_each(score, jobs)
-        return [
-            Candidate(
-                align,
-                channels,
-                components,
-                ranking,
-                degree,
-                best[degree, size]["penalty"],
-                tuple(order[:size]),
-                best[degree, size]["mean"],
-                best[degree, size]["balanced_accuracy"],
-                self._latency(align, order[:size]),
+            best = max(rows, key=lambda row: float(row["mean"]))
+            found.append(
+                Candidate(
+                    align,
+                    channels,
+                    components,
+                    ranking,
+                    degree,
+                    best["penalty"],
+                    tuple(order[:size]),
+                    best["mean"],
+                    best["balanced_accuracy"],
+                    self._latency(align, order[:size]),
+                )
             )
-            for degree, size in jobs
-        ]
+        return found
 
     def _ranked(
         self, ranking: str, survey: Survey, sample: SampledBins, places: Tensor, num: int

@@ -146,7 +146,8 @@ def test_quick_is_small_and_has_every_role():
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_composes(group, option):
-    section = composed(f"{group}={option}")[group]
+    name = "pareto" if group == "search" else "train"
+    section = composed(f"{group}={option}", name=name)[group]
     assert section
     if group != "features":  # plain values, for ``feature_parts``
         assert callable(get_object(section._target_))

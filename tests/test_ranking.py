@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tactslip_torch.features import ranking
 from tactslip_torch.features.ranking import rank_per_cost, rank_weighted
 from tactslip_torch.features.selection import rank_features
 
@@ -50,7 +51,7 @@ def test_weighted_leaves_the_twin_of_the_first_for_later(rng):
     assert found.index(9) > 1
 
 
-def test_weighted_does_not_depend_on_threads_or_units(rng):
+def test_weighted_does_not_depend_on_threads_or_units(rng, monkeypatch):
     features = torch.from_numpy(related(rng, 500, 60))
     scores = torch.from_numpy(rng.uniform(0, 9, 60))
     one = rank_weighted(scores, features, 60)
@@ -61,6 +62,8 @@ def test_weighted_does_not_depend_on_threads_or_units(rng):
         torch.set_num_threads(1)
     assert torch.equal(rank_weighted(scores, 2.0**20 * features, 60), one)
     assert torch.equal(rank_weighted(scores, features.flip(0), 60), one)
+    monkeypatch.setattr(ranking, "_MOST_AT_ONCE", 59)
+    assert torch.equal(rank_weighted(scores, features, 60), one)
 
 
 def test_extreme_scores_have_their_place(rng):

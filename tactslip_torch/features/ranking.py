@@ -15,6 +15,7 @@ from tactslip_torch.features.selection import rank_features, unit_deviations
 
 LARGEST_PRICE = 2**50
 """So that sums of prices, and of their products with 0 and 1, are exact in float64."""
+_MOST_AT_ONCE = 4096  # features whose products fit into memory; of more, those with one at a time
 
 
 def rank_weighted(scores: Tensor, features: Tensor, num: int, alpha: float = 0.7) -> Tensor:
@@ -49,6 +50,7 @@ def rank_weighted(scores: Tensor, features: Tensor, num: int, alpha: float = 0.7
     rank_features(scores, num)  # refuses a num out of range
     units = unit_deviations(features, torch.zeros(len(features), dtype=torch.bool))
     size = units.square().sum(-1).sqrt()
+    gram = units @ units.T if len(units) <= _MOST_AT_ONCE else None
     comparable = torch.where(scores.isnan(), -1.0, scores).double().cpu()
     repeated = torch.zeros_like(comparable)  # sum of correlations with those taken
     is_free = torch.ones_like(comparable, dtype=torch.bool)
@@ -60,7 +62,8 @@ def rank_weighted(scores: Tensor, features: Tensor, num: int, alpha: float = 0.7
         chosen.append(best)
         is_free[best] = False
         both = size * size[best]
-        rho = (units @ units[best]).abs() / torch.where(both == 0, 1.0, both)
+        product = units @ units[best] if gram is None else gram[best]
+        rho = product.abs() / torch.where(both == 0, 1.0, both)
         repeated += torch.where(both == 0, 0.0, rho).clamp(max=1)
     return torch.tensor(chosen)
 

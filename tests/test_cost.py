@@ -1,0 +1,216 @@
+"""The bill of a selection by hand, the fit against known prices, and the clock."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import nnls
+from small_detector import HAND, small_detector
+
+from tactslip_torch.cost import (
+    GROUPS,
+    CostModel,
+    _counted,
+    _designs,
+    _nonnegative,
+    measure_costs,
+    parts_of,
+    stand_in,
+)
+from tactslip_torch.features.plan import make_plan
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.ranking import rank_per_cost
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.timing import main, one_thread, time_calls, time_in_fresh_process
+
+POOL = FeaturePool(HAND)
+
+
+def parts(*names):
+    return parts_of(make_plan(HAND, 4, names))
+
+
+def model(**prices):
+    """Every part of a group costs its prime, the group itself a thousand times that."""
+    primes = dict(zip(GROUPS, (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31), strict=True))
+    part_us = {name: float(prime) for name, prime in primes.items()}
+    group_us = {name: 1000.0 * prime for name, prime in primes.items()}
+    return CostModel(0.5, group_us, part_us, {1: 100.0, 11: 105.0}, 2.0, 0.0, **prices)
+
+
+def priced(*groups):
+    """The bill by hand: each group once, and so many of its parts."""
+    price = model()
+    return 0.5 + sum(price.group_us[name] + num * price.part_us[name] for name, num in groups)
+
+
+@pytest.mark.parametrize(
+    ("names", "bill"),
+    [
+        (["SG1 raw time mean"], [("gauges", 1), ("moments", 1), ("columns", 1)]),
+        (["SG1 raw time mode"], [("gauges", 1), ("sorts", 1), ("columns", 1)]),
+        (
+            ["PVDF1 A2 time std", "PVDF1 A2 time median", "PVDF1 A2 time iqr"],
+            [("films", 1), ("branches", 1), ("moments", 1), ("sorts", 1), ("columns", 3)],
+        ),
+        (
+            ["PVDF1 A2 time correlation", "PVDF2 A2 time entropy"],
+            [("films", 2), ("branches", 2), ("correlations", 1), ("histograms", 1), ("columns", 2)],
+        ),
+        (
+            ["PVDF1 D4 freq spectral_centroid", "PVDF1 D4 freq spectral_spread"],
+            [("films", 1), ("spectra", 1), ("lines", 1), ("columns", 2)],
+        ),
+        (
+            ["PVDF1 A1 freq band_energy_ratio", "PVDF1 D3 freq band_energy_ratio"],
+            [("films", 1), ("energies", 1), ("columns", 2)],
+        ),
+    ],
+)
+def test_shared_work_is_on_the_bill_once(names, bill):
+    needed = parts(*names)
+    assert len(needed) == len(names)
+    assert model().features_us(set().union(*needed)) == pytest.approx(priced(*bill))
+
+
+def test_compute_is_of_the_whole_call_at_its_tail():
+    (needed,) = parts("SG1 raw time mean")
+    found = model().compute_us(needed, 1)
+    assert found == pytest.approx(2.0 * (model().features_us(needed) + 100.0))
+
+
+def test_the_bill_for_a_ranking_adds_up_and_no_column_is_free():
+    names = ["SG1 raw time mean", "PVDF1 A2 time median", "PVDF1 A2 time std"]
+    needed = parts(*names)
+    needs, prices = model().bill(needed)
+    own = needs.long() @ prices
+    of_column = 500  # ns: 5 us more of the rest for 10 more features
+    for row, place in zip(needed, own.tolist(), strict=True):
+        alone = model().features_us(row) - model().base_us
+        assert place == round(1000 * alone) + of_column
+    together = int(prices[needs.any(0)].sum())
+    whole = model().features_us(set().union(*needed)) - model().base_us
+    assert together == round(1000 * whole) + 3 * of_column
+    free = CostModel(0.0, dict.fromkeys(GROUPS, 0.0), dict.fromkeys(GROUPS, 0.0), {1: 9.0}, 1, 0)
+    needs, prices = free.bill(needed)
+    assert (needs.long() @ prices == 1).all()
+    # of equal price the higher score wins: nothing is taken just because it is free
+    assert rank_per_cost(torch.tensor([1.0, 3.0, 2.0]), needs, prices, 3).tolist() == [1, 2, 0]
+
+
+def test_designs_tell_all_groups_apart():
+    needed = parts_of(make_plan(HAND, 4, POOL.names))
+    designs = list(_designs(needed, [8, 30]))
+    rows = np.stack([_counted(set().union(*(needed[i] for i in own))).numpy() for own in designs])
+    met = rows[:, 1:] > 0
+    assert met.any(0).all()  # every group, and parts of every group
+    # the call and the columns are in all of them; every other group is absent somewhere
+    groups = [name for name in GROUPS if name != "columns"]
+    assert not met[:, [list(GROUPS).index(name) for name in groups]].all(0).any()
+    # prices that made the timings are found again from the timings, up to what is in all of them
+    price = model()
+    truth = np.array([0.5, *price.group_us.values(), *price.part_us.values()])
+    timings = rows @ truth
+    scaled = torch.from_numpy(rows / timings[:, None])
+    found = _nonnegative(scaled).numpy()
+    expected, _ = nnls(scaled.numpy(), np.ones(len(rows)), maxiter=10_000)
+    error = np.abs(rows @ found / timings - 1).max()
+    assert error <= np.abs(rows @ expected / timings - 1).max() + 1e-3
+    assert (found >= 0).all()
+
+
+def test_fit_equals_scipys_nonnegative_least_squares(rng):
+    rows = rng.uniform(0, 1, (40, 6))
+    rows[:, 2] *= -1  # best left at 0
+    found = _nonnegative(torch.from_numpy(rows)).numpy()
+    expected, _ = nnls(rows, np.ones(40))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert found[2] == 0
+
+
+def test_measured_prices_are_of_this_machine():
+    costs = measure_costs(POOL, ChannelFilter([51, 51, 11, 11]), [4, 8], "eager", calls=5)
+    assert costs.facts()["groups"].keys() == GROUPS.keys()
+    assert set(costs.rest_us) == {4, 8}
+    assert min(costs.rest_us.values()) >= 0
+    few, many = (set().union(*parts(*names)) for names in (POOL.names[:1], POOL.names))
+    assert 0 < costs.features_us(few) <= costs.features_us(many)
+    assert costs.tail >= 1
+    json.dumps(costs.facts(), allow_nan=False)
+
+
+def test_a_stand_in_gives_finite_scores():
+    detector = stand_in(POOL, ChannelFilter([51, 51, 11, 11]), [0, 30, 100], "eager")
+    score = detector.judge_raw(torch.randn(7, 4, 150)).score
+    assert score.isfinite().all()
+
+
+# The clock -----------------------------------------------------------------------------------
+
+
+def test_p50_and_p99_are_of_single_calls(monkeypatch):
+    """A clock that is played: 100 calls of 1..100 us, three runs, one of them ten times slower."""
+    now, step = [0], [0]
+
+    def clock():
+        return now[0]
+
+    def call(given):
+        if given is not None:
+            return
+        run, number = divmod(step[0], 100)
+        step[0] += 1
+        now[0] += 1000 * (number + 1) * (10 if run == 1 else 1)
+
+    monkeypatch.setattr("tactslip_torch.timing.time.perf_counter_ns", clock)
+    warm = [torch.zeros(1)]
+    call(warm[0])
+    given = [None]
+    step[0] = -1  # the call that warms up is not timed
+    now[0] = 0
+    timing = time_calls(call, given, 100, runs=3)
+    assert timing.calls == 100
+    assert timing.p50_us == pytest.approx(51, abs=1)
+    assert timing.p99_us == pytest.approx(99, abs=1)
+
+
+def test_a_saved_detector_is_timed_in_a_process_of_its_own(tmp_path, capsys):
+    path = tmp_path / "detector.pt"
+    small_detector().save(path)
+    timing = time_in_fresh_process(path, 20, "eager")
+    assert timing.calls == 20
+    assert 0 < timing.p50_us <= timing.p99_us
+    before = torch.get_num_threads()
+    main([str(path), "10", "eager"])
+    assert torch.get_num_threads() == before
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["calls"] == 10
+    with pytest.raises(ValueError, match=r"timing .*gone.pt in a fresh process failed: .*gone.pt"):
+        time_in_fresh_process(tmp_path / "gone.pt", 20)
+    with pytest.raises(SystemExit, match=r"usage: python -m tactslip_torch.timing detector.pt"):
+        main([])
+
+
+def test_threads_are_given_back():
+    def fails():
+        with one_thread():
+            assert torch.get_num_threads() == 1
+            raise KeyError
+
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(KeyError):
+            fails()
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
+
+
+def test_the_module_runs_as_a_command():
+    command = [sys.executable, "-m", "tactslip_torch.timing"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "usage: python -m tactslip_torch.timing detector.pt" in done.stderr
