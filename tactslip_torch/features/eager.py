@@ -126,5 +126,5 @@ class Run:
         table.write(out)
 
     def _known(self, constant: Array | None, scale: Array) -> Known:
-        mean = self._table.grid(self._table.mean)
+        mean = self._table.grid(self._table.least)
         return self._constants.known(self._forming, constant, mean, scale)

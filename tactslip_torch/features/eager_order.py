@@ -1,8 +1,8 @@
 """What the eager engine reads off sorted rows: median, interquartile range, mode and entropy.
 
-Rows are deviations from their mean over their span, so of order one, sorted. Runs of equal values
-are counted in one byte a value, on all rows as one flat array: the first value of a row never
-continues a run, so no run crosses from row to row.
+Rows are heights over their least value as parts of their span, so from 0 to 1, sorted. Runs of
+equal values are counted in one byte a value, on all rows as one flat array: the first value of a
+row never continues a run, so no run crosses from row to row.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tactslip_torch.features.runs import entropy_growth
 
 Array = np.ndarray[Any, Any]
 MIXED_TOLERANCE = 2.0**-22
-"""Part of the span by which equal values may differ in float32: the rounding of deviations."""
+"""Part of a value by which equal ones may differ in float32: the rounding of heights."""
 
 
 def quantile_weights(num: int) -> tuple[Array, Array]:
@@ -83,8 +83,9 @@ class Ordered:
         self._ranks = scratch.counts(rows * num)
         self._flags = scratch.flags(self._quantised * num)
         self._growth: Array = entropy_growth(num).to(scratch.dtype).numpy()
-        self._half = 0.5 + HALF_SLACK[scratch.dtype]
-        self._floor = MIXED_TOLERANCE if scratch.dtype == torch.float32 else 0.0
+        half = 0.5 + HALF_SLACK[scratch.dtype]
+        self._half = torch.tensor(half, dtype=scratch.dtype)
+        self._rounding = MIXED_TOLERANCE if scratch.dtype == torch.float32 else 0.0
         places, weights = quantile_weights(num)
         self._places = places
         self._weights = np.ascontiguousarray(weights.T, dtype=self.sorted.dtype)
@@ -94,28 +95,34 @@ class Ordered:
         found: Array = self.sorted.take(self._places, axis=1) @ self._weights
         return found
 
-    def modes(self, scale: Array, span: Array) -> tuple[Array, Array]:
+    def modes(self, scale: Array, span: Array, floor: Array) -> tuple[Array, Array]:
         """Modes that are not the smallest value: in which rows, and the first of the longest run.
 
         Only rows whose smallest gap is within the tolerance are looked at closer.
 
         Shape:
             - scale: ``[num_rows]``, size of the raw bin; span: ``[num_rows]``, of the row, not 0
+            - floor: ``[num_rows]``, what was subtracted after rounding, as part of the span
             - output: ``[k]`` rows, ``[k]`` values
         """
         flat, gaps = self.sorted.ravel(), self._gaps
         np.subtract(flat[1:], flat[:-1], out=gaps.ravel()[:-1])
         gaps[:, -1] = np.inf
-        tolerance = (RUN_TOLERANCE[torch.float64] * scale / span + self._floor).astype(gaps.dtype)
-        rows = np.flatnonzero(torch.amin(self._work, 1).numpy() <= tolerance)
+        tolerance = (RUN_TOLERANCE[torch.float64] * scale / span + self._rounding * floor).astype(
+            gaps.dtype
+        )
+        least = torch.amin(self._work, 1).numpy()
+        rows = np.flatnonzero(least <= tolerance + gaps.dtype.type(self._rounding))
         if not len(rows):
             return rows, self.sorted[rows, 0]
         num = gaps.shape[1]
         continues, spare, other = (each[: len(rows) * num] for each in self._ranks)
         grid = continues.reshape(-1, num)
         grid[:, 0] = 0
-        near = gaps if len(rows) == len(gaps) else gaps[rows]
-        np.less_equal(near[:, :-1], tolerance[rows, None], out=grid[:, 1:], casting="unsafe")
+        near = gaps[rows, :-1]
+        if self._rounding:
+            near -= self._rounding * self.sorted[rows, 1:]
+        np.less_equal(near, tolerance[rows, None], out=grid[:, 1:], casting="unsafe")
         rank = rank_in_run(continues, spare, other).reshape(-1, num)
         last = rank.argmax(1)  # the first maximum: the end of the first longest run
         first = last - rank[np.arange(len(rows)), last]
@@ -125,8 +132,7 @@ class Ordered:
     def entropy(self) -> Array:
         """Shannon entropy of the histogram of those rows that want it, in bits."""
         work, ordered = self._work[: self._quantised], self._rows[: self._quantised]
-        shift = self._half - ENTROPY_LEVELS * ordered[:, :1]
-        values: Array = torch.add(shift, ordered, alpha=ENTROPY_LEVELS, out=work).numpy()
+        values: Array = torch.add(self._half, ordered, alpha=ENTROPY_LEVELS, out=work).numpy()
         level, is_same, is_top = self._flags
         continues, spare, other = (each[: values.size] for each in self._ranks)
         np.copyto(level, values.reshape(-1), casting="unsafe")

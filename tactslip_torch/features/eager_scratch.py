@@ -45,7 +45,7 @@ class Scratch:
         """``[rows, num]``, float64."""
         return self._wide[: rows * num].view(rows, num)
 
-    def deviations(self, rows: int, num: int) -> Tensor:
+    def heights(self, rows: int, num: int) -> Tensor:
         """``[rows, num]``."""
         return self._some[0][: rows * num].view(rows, num)
 

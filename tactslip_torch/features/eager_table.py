@@ -1,7 +1,7 @@
 """All numbers of a plan's rows in some bins: from sums over deviations to features.
 
-Parts leave here what they found of their rows, in the unit of deviations (values minus their mean,
-over their span). ``finish`` makes descriptors of it, which is the same for all rows at once.
+Parts leave here what they found of their rows, in parts of the row's span. ``finish`` makes
+descriptors of it, which is the same for all rows at once.
 """
 
 from __future__ import annotations
@@ -29,11 +29,14 @@ class Table:
     Attributes:
         values: ``[lines, M]``, float64.
         planes: lines of one descriptor, ``[rows * M]`` in the order of rows.
-        sums: of deviations, by the descriptor they are for: median, range between quartiles, sums
-            of magnitudes (mean deviation), of cubes (skewness), of fourth powers (kurtosis), of
-            products with those of the film (correlation). All other planes are written as they
-            will be. What nobody wants stays 0.
-        mean, span, largest: of rows, ``[rows * M]``; the span is 0 for a flat row.
+        sums: by the descriptor they are for, in parts of the span: median and range between
+            quartiles of heights; of deviations from the mean the sums of magnitudes (mean
+            deviation), of cubes (skewness), of fourth powers (kurtosis), and of products with
+            those of the film (correlation). All other planes are written as they will be. What
+            nobody wants stays 0.
+        span, least, largest: of rows, ``[rows * M]``; the span is 0 for a flat row.
+        floor: ``least / span`` of spectra, for the mode; 0 of others.
+        center: means of heights, ``[rows * M]``.
         squares: sums of squared deviations, ``[rows * M]``.
         scale: size of the raw bin, ``[rows, M]``.
     """
@@ -46,8 +49,11 @@ class Table:
             name: self.values[place * num : (place + 1) * num].reshape(-1)
             for place, name in enumerate(layout.planes)
         }
-        self.mean, self.span = self.planes["mean"], self.planes["range"]
+        self.span = self.planes["range"]
         self.largest: Array = np.zeros(num * num_bins)
+        self.least: Array = np.zeros(num * num_bins)
+        self.floor: Array = np.zeros(num * num_bins)
+        self.center: Array = np.zeros(num * num_bins)
         self.squares: Array = np.ones(num * num_bins)
         self.sums: dict[str, Array] = {
             name: np.zeros(num * num_bins) for name in layout.planes if name in SUMS
@@ -92,7 +98,7 @@ class Table:
                 factor = span
             np.multiply(found, factor, out=planes[name])
         if "median" in wanted:
-            planes["median"] += self.mean
+            planes["median"] += self.least
         root *= span
         if "std" in wanted:
             np.divide(root, self._root_less, out=planes["std"])
@@ -107,7 +113,8 @@ class Table:
     def _by_mean_square(self, root: Array) -> None:
         """Of the root of the sum of squared differences from the mean."""
         planes, wanted = self.planes, self._wanted
-        size = np.abs(self.mean)
+        mean = planes["mean"]
+        size = np.abs(mean)
         around = root / self._root_num
         square = around * around + size * size
         if "energy" in wanted:
@@ -121,7 +128,7 @@ class Table:
             np.divide(self.largest, rms, out=planes["peak_factor"])
         if "cv" in wanted:
             floor = np.maximum(size, rms * CV_FLOOR)
-            np.divide(root / self._root_less, np.copysign(floor, self.mean + 0.0), out=planes["cv"])
+            np.divide(root / self._root_less, np.copysign(floor, mean + 0.0), out=planes["cv"])
 
     def share(self, energies: Array) -> None:
         """Band energy ratios: each branch's part of the energy of all spectra of a film.
