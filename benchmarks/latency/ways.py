@@ -135,17 +135,17 @@ def _looped(timed: Timed, samples: Any, wanted: Any) -> Callable[[int], float]:
     used = [place[index] for index in timed.selected]
     machine = timed.kernel_sum()
     support, beta = (np.asarray(of) for of in (machine.support, machine.beta))
-    knee, low, high = (
-        np.asarray(of) for of in (timed.scaler.knee, timed.scaler.minimum, timed.scaler.maximum)
-    )
+    low, high = (np.asarray(of) for of in (timed.scaler.minimum, timed.scaler.maximum))
+    knee = None if timed.scaler.knee is None else np.asarray(timed.scaler.knee)
 
     def score(number: int) -> float:
         raw = samples[number % len(samples)].astype(np.float64)
         filtered = loop.savgol(raw, WINDOW_LENGTHS, 1, channel_filter.context)
         with others.quiet():
             x = loop.features(filtered, names, pool.hand.names)[used]
-        bent = np.sign(x) * knee * np.log1p(np.abs(x) / knee)
-        z = np.clip(2 * (bent - low) / (high - low) - 1, -1, 1)
+        if knee is not None:
+            x = np.sign(x) * knee * np.log1p(np.abs(x) / knee)
+        z = np.clip(2 * (x - low) / (high - low) - 1, -1, 1)
         return loop.kernel_score(z, support, beta, timed.kernel.offset, timed.kernel.degree)
 
     return score
