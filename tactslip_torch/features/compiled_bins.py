@@ -24,7 +24,7 @@ def describe_bins(
     out: Array,
     limit: float,
 ) -> None:
-    """Everything but what needs sorted values, for which it leaves deviations and facts.
+    """Everything but what needs sorted values, for which it leaves rows and facts.
 
     Args:
         x: bins of the plan's channels.
@@ -36,9 +36,9 @@ def describe_bins(
         steps: what is to be done.
         desk: where to work.
         samples: deviations of rows of samples, written.
-        sample_facts: mean, span and tolerance of those, written.
-        lines: deviations of spectra, written.
-        line_facts: of those, written.
+        sample_facts: what turns those into values, and how near two count as one, written.
+        lines: spectra over their largest line, written.
+        line_facts: the same of those, written.
         out: written.
         limit: largest magnitude written.
 
@@ -142,7 +142,7 @@ def _in_time(
     span = high - low
     if span * (1 / NOISE) < scale:
         span = 0.0
-    scaled(y, low, mean, span, desk.raw)
+    scaled(y, mean, span, desk.raw)
     square = 0.0
     for i in range(n):
         square += desk.raw[i] * desk.raw[i]

@@ -8,24 +8,24 @@ from tactslip_torch.features.compiled_steps import MEDIAN, MODE, Sorts
 
 @kernel
 def describe_sorted(d: Array, facts: Array, sorts: Sorts, out: Array, limit: float) -> None:
-    """Order statistics of rows ``mean + span * d``, clamped to the limit.
+    """Order statistics of rows ``base + unit * d``, clamped to the limit.
 
     Shape:
-        - d: ``[M, S, n]``, each row sorted; facts: ``[M, S, 3]``, mean, span and how near two
+        - d: ``[M, S, n]``, each row sorted; facts: ``[M, S, 3]``, base, unit and how near two
           neighbours in ``d`` count as equal; out: ``[M, K]``, written
     """
     for m in range(d.shape[0]):
         for s in range(d.shape[1]):
             row = d[m, s]
-            mean, span, tolerance = facts[m, s]
+            base, unit, tolerance = facts[m, s]
             for k in range(sorts.start[s], sorts.start[s + 1]):
                 what = sorts.what[k]
                 if what == MEDIAN:
-                    value = mean + span * _median(row)
+                    value = base + unit * _median(row)
                 elif what == MODE:
-                    value = mean + span * _mode(row, row.dtype.type(tolerance))
+                    value = base + unit * _mode(row, row.dtype.type(tolerance))
                 else:
-                    value = span * _iqr(row)
+                    value = unit * _iqr(row)
                 out[m, sorts.place[k]] = min(max(value, -limit), limit)
 
 

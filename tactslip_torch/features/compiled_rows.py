@@ -19,6 +19,7 @@ from tactslip_torch.features.compiled_steps import (
     ENERGY,
     ENTROPY,
     KURTOSIS,
+    LINES,
     MEAN,
     MEAN_DEVIATION,
     PEAK_FACTOR,
@@ -26,6 +27,7 @@ from tactslip_torch.features.compiled_steps import (
     SKEWNESS,
     SPREAD,
     STD,
+    TIME,
     WANTS_CENTROID,
     WANTS_ENTROPY,
     Steps,
@@ -44,6 +46,7 @@ class Desk(NamedTuple):
     raw: Array
     sums: Array
     square: Array
+    amplitude: Array
     frequency_hz: Array
     d: Array
     level: Array
@@ -64,6 +67,7 @@ def desk_of(steps: Steps, number: type[np.floating[Any]]) -> Desk:
         raw=np.empty(n, number),
         sums=np.empty(2 * num_lines, number),
         square=np.empty(num_lines),
+        amplitude=np.empty(num_lines, number),
         frequency_hz=steps.frequency_hz.astype(number),
         d=np.empty(most, number),
         level=np.empty(most, np.int32),
@@ -88,32 +92,29 @@ def extent(row: Array) -> tuple[float, float, float]:
 
 
 @inner
-def scaled(row: Array, low: float, mean: float, span: float, d: Array) -> float:
-    """``d = (row - mean) / span``, 0 for no span; the least of them."""
+def scaled(row: Array, mean: float, span: float, d: Array) -> None:
+    """``d = (row - mean) / span``, 0 for no span."""
     factor = row.dtype.type(1) / span if span > 0 else row.dtype.type(0)
     for i in range(row.size):
         d[i] = (row[i] - mean) * factor
-    least: float = d.dtype.type((low - mean) * factor)
-    return least
 
 
 @inner
-def _entropy(
-    d: Array, low: float, growth: Array, grown: Array, level: Array, cells: Array
-) -> float:
-    """Entropy in bits of values whose span is 1, the least of them given."""
-    t = d.dtype.type
-    half = t(0.5 + (2.0**-13 if d.itemsize == 4 else 1e-9))
+def _entropy(row: Array, low: float, span: float, steps: Steps, kind: int, desk: Desk) -> float:
+    """Entropy in bits of values of that least value and span."""
+    growth, grown, level, cells = steps.growth[kind], steps.grown[kind], desk.level, desk.cells
+    t = row.dtype.type
+    levels, half = t(_TOP / span), t(0.5 + (2.0**-13 if row.itemsize == 4 else 1e-9))
     second = np.int32(0)
-    for i in range(d.size):
-        place = np.int32((d[i] - low) * t(_TOP) + half)
+    for i in range(row.size):
+        place = np.int32((row[i] - low) * levels + half)
         level[i] = place
         below = place if place < _TOP else np.int32(0)
         second = below if below > second else second
     for i in range(cells.size):
         cells[i] = 0
     total = 0.0
-    for i in range(d.size):
+    for i in range(row.size):
         cell = np.uint32(level[i])
         rank = cells[cell]
         total += growth[rank]
@@ -201,7 +202,7 @@ def time_row(
         return is_constant, centre
     slot = steps.slot[row]
     d = ordered[slot] if slot >= 0 else desk.d[:n]
-    least = scaled(branch, low, mean, span, d)
+    scaled(branch, mean, span, d)
     top = centre if span == 0 else high + offset
     values = desk.values
     _describe(d, desk.raw, centre, span, top, -1.0, values)
@@ -213,7 +214,7 @@ def time_row(
         values[CORRELATION] = 0.0
     values[ENTROPY] = 0.0
     if span > 0 and steps.flags[row] & WANTS_ENTROPY:
-        values[ENTROPY] = _entropy(d, least, steps.growth, steps.grown, desk.level, desk.cells)
+        values[ENTROPY] = _entropy(branch, low, span, steps, TIME, desk)
     if slot >= 0:
         _note(facts[slot], centre, span, scale, d.itemsize)
     _put(row, values, steps, out, limit)
@@ -222,7 +223,7 @@ def time_row(
 
 @inner
 def _note(fact: Array, centre: float, span: float, scale: float, itemsize: int) -> None:
-    """What turns sorted deviations into values, and how near two of them cells as one."""
+    """What turns sorted deviations into values, and how near two of them count as one."""
     fact[0], fact[1] = centre, span
     fact[2] = 1e-12 * scale / span + (2.0**-22 if itemsize == 4 else 0.0) if span > 0 else 1.0
 
@@ -256,27 +257,28 @@ def lines_row(
     if row < 0:
         return energy
     slot = steps.slot[row]
-    d = ordered[slot] if slot >= 0 else desk.d[:n]
+    amplitude = ordered[slot] if slot >= 0 else desk.amplitude
+    d = desk.d[:n]
     t = d.dtype.type
     factor = 1 / most if most > 0 else 0.0
     low, high, total = t(1), t(0), t(0)
     for i in range(n):
         v = np.sqrt(t(square[i] * factor))
-        d[i] = v
+        amplitude[i] = v
         total += v
         low, high = smaller(low, v), larger(high, v)
     size = scale * np.sqrt(most)
     values = desk.values
     if steps.flags[row] & WANTS_CENTROID:
-        values[CENTROID], values[SPREAD] = _centroid(d, desk.frequency_hz, total)
+        values[CENTROID], values[SPREAD] = _centroid(amplitude, desk.frequency_hz, total)
     mean, share = np.float64(total) / n, high - low
-    least = scaled(d, low, t(mean), share, d)
+    scaled(amplitude, t(mean), share, d)
     _describe(d, d, size * mean, size * share, size, scale * scale * energy, values)
     values[ENTROPY] = 0.0
     if share > 0 and steps.flags[row] & WANTS_ENTROPY:
-        values[ENTROPY] = _entropy(d, least, steps.growth, steps.grown, desk.level, desk.cells)
+        values[ENTROPY] = _entropy(amplitude, low, share, steps, LINES, desk)
     if slot >= 0:
-        _note(facts[slot], size * mean, size * share, scale, d.itemsize)
+        _note(facts[slot], 0.0, size, scale, d.itemsize)
     _put(row, values, steps, out, limit)
     return energy
 

@@ -63,8 +63,8 @@ class Steps(NamedTuple):
         dense: ``[B, n, n]``, each branch as one matrix.
         ones: ``[2 L]``, spectrum of the constant 1, cosines before sines.
         frequency_hz: ``[L]``.
-        growth: what a value adds to the entropy, by its rank in its cell.
-        grown: what a cell of so many values adds.
+        growth: ``[2, n or L]``, what a value adds to the entropy, by its rank in its cell.
+        grown: ``[2, n + 1]``, what a cell of so many values adds.
         reach: the most that a line can grow by where the span is 1.
     """
 
@@ -195,7 +195,9 @@ def steps_of(
     share_start, share_branch, share_place = _by_row(
         range(len(films)), [(films.index(s.channel), s.branch, s.place) for s in plan.shares]
     )
-    growth = entropy_growth(max(maps.num_samples, maps.num_lines)).numpy()
+    growth = np.zeros((2, max(maps.num_samples, maps.num_lines)))
+    for kind, num in enumerate((maps.num_samples, maps.num_lines)):
+        growth[kind, :num] = entropy_growth(num)
     return Steps(
         gauge_channel=np.array([channel for channel, _ in gauges], np.int64),
         gauge_row=np.array([index for _, index in gauges], np.int64),
@@ -216,7 +218,7 @@ def steps_of(
         ones=maps.ones_lines.numpy(),
         frequency_hz=maps.frequency_hz.numpy(),
         growth=growth,
-        grown=np.concatenate([[0.0], np.cumsum(growth)]),
+        grown=np.pad(np.cumsum(growth, axis=1), ((0, 0), (1, 0))),
         reach=float(maps.dense_lines.unflatten(0, (2, -1)).norm(dim=0).sum(-1).max()),
     )
 
