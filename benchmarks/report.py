@@ -50,6 +50,7 @@ class Section(NamedTuple):
         text: what it prints.
         draw: draws its figure; ``None`` where the benchmark itself leaves one.
         about: a line on what was measured.
+        needs: sections without which there is no figure.
     """
 
     title: str
@@ -57,10 +58,17 @@ class Section(NamedTuple):
     text: Callable[[Report], str]
     draw: Callable[[Report, Path], None] | None = None
     about: Callable[[Report], str] | None = None
+    needs: tuple[str, ...] = ()
 
 
 SECTIONS = {
-    "features": Section("Features", features.tables, features.report_text, features_figure.figure),
+    "features": Section(
+        "Features",
+        features.tables,
+        features.report_text,
+        features_figure.figure,
+        needs=("pool",),
+    ),
     "latency": Section(
         "Latency", latency.tables, latency.report_text, latency_figure.figure, latency.about
     ),
@@ -70,6 +78,7 @@ SECTIONS = {
         throughput.report_text,
         throughput_figure.figure,
         throughput.about,
+        needs=("batch",),
     ),
     "train": Section("Training", None, train.report_text),
     "model": Section("Kernel machine at any size", None, model.report_text),
@@ -83,7 +92,7 @@ def load_reports(folder: Path) -> dict[str, dict[str, Any]]:
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if one is not JSON.
+        ValueError: if one is not JSON, or was measured in part.
     """
     found = {}
     for name in SECTIONS:
@@ -94,6 +103,11 @@ def load_reports(folder: Path) -> dict[str, dict[str, Any]]:
             found[name] = json.loads(path.read_text(encoding="utf-8"))
         except json.JSONDecodeError as error:
             raise ValueError(f"{path} is not JSON ({error}); measure it again") from None
+        missing = [of for of in SECTIONS[name].needs if of not in found[name]["sections"]]
+        if missing:
+            raise ValueError(
+                f"{path} has no section {missing[0]}; python -m benchmarks.{name} measures all"
+            )
     if not found:
         names = ", ".join(f"{name}.json" for name in SECTIONS)
         raise FileNotFoundError(f"no numbers in {folder}, expected any of {names}; measure first")

@@ -67,12 +67,12 @@ def test_quick_numbers_are_named_so() -> None:
     assert "QUICK" not in report.markdown({"latency": latency_report()}, "results")
 
 
-@pytest.mark.parametrize("content", [None, "{"])
+@pytest.mark.parametrize("content", [None, "{", '{"sections": {"solve": {}}}'])
 def test_without_numbers_one_line_says_so(
     content: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if content:
-        (tmp_path / "latency.json").write_text(content)
+        (tmp_path / "features.json").write_text(content)
     assert report.main(["--results", str(tmp_path), "--out", str(tmp_path / "B.md")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "B.md").exists()

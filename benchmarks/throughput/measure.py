@@ -65,7 +65,8 @@ def _bulk_calls(timed: Timed, sizes: Sizes, threads: int) -> tuple[Calls, dict[s
                 calls[name], counts[name] = call, num
     if sizes.has_onnx:
         name = f"{ORT}: {RAW}"
-        calls[name], counts[name] = _exported(timed, samples, threads), len(samples)
+        few = samples[: sizes.reference_bins]
+        calls[name], counts[name] = _exported(timed, few, threads), len(few)
     return calls, counts
 
 

@@ -12,7 +12,7 @@ class Sizes:
     Args:
         recordings: simulated, to whose bins the head is fitted.
         bulk_bins: of a call that is to be as fast as can be.
-        reference_bins: of a call of the reference.
+        reference_bins: of a call of the reference, and of the exported file.
         batches: bins at once, of the curve over batches.
         many: batches from here on are timed call by call, smaller ones in blocks.
         bins_ms: lengths of bins, of the curve over lengths.
@@ -32,7 +32,7 @@ class Sizes:
 
     recordings: int = 8
     bulk_bins: int = 4096
-    reference_bins: int = 256
+    reference_bins: int = 64
     batches: tuple[int, ...] = (1, 4, 16, 64, 256, 1024, 4096, 16_384, 65_536)
     many: int = 1024
     bins_ms: tuple[int, ...] = (10, 20, 50, 100, 200, 400)
@@ -44,7 +44,7 @@ class Sizes:
     streamed: int = 1_000_000
     streamed_pool: int = 100_000
     chunk: int = 4096
-    rounds: int = 7
+    rounds: int = 5
     few_rounds: int = 3
     has_onnx: bool = True
     seed: int = 0
