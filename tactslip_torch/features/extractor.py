@@ -4,7 +4,8 @@
 ``"eager"`` and ``"compiled"`` carry out a plan of the least work, forwards only and on the CPU:
 PyTorch and NumPy, or kernels compiled by numba. All give the same values to rounding. Where a
 derivative is asked for, a graph is recorded or bins lie on another device, the reference takes
-over; so it does for single bins that hold a NaN, an Inf or magnitudes beyond ``ordinary_sizes``.
+over; so it does for each bin that holds a NaN, an Inf or magnitudes beyond ``ordinary_sizes``.
+The bits of a bin do not depend on the bins beside it.
 """
 
 from __future__ import annotations
@@ -156,12 +157,12 @@ class FeatureExtractor:
         if is_ordinary.all():
             engine(x, scale, out)
             return
-        whole = torch.from_numpy(is_ordinary.all(axis=1))
-        if bool(whole.any()):
-            part = out.new_empty(int(whole.sum()), out.shape[1])
-            engine(x[whole], scale[whole], part)
-            out[whole] = part
-        out[~whole] = self._reference(bins[~whole], out.dtype)
+        strange = torch.from_numpy(~is_ordinary.all(axis=1))
+        # the engine sees zeros there: so the bits of a bin do not depend on its neighbours
+        x = torch.where(strange[:, None, None], 0.0, x)
+        engine(x, torch.where(strange[:, None], 0.0, scale), out)
+        for index in strange.nonzero().flatten().tolist():
+            out[index] = self._reference(bins[index], out.dtype)
 
     def _reference(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
         features: Tensor = self.pool(self.pool.widen(bins))
