@@ -14,10 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.eager_constant import Constants, Known
+from tactslip_torch.features.eager_constant import ROUNDING, Constants
 from tactslip_torch.features.eager_forming import Forming
 from tactslip_torch.features.eager_layout import Layout
 from tactslip_torch.features.eager_rows import PartRows
+from tactslip_torch.features.eager_scaling import InTime, Spectra
 from tactslip_torch.features.eager_scratch import Scratch
 from tactslip_torch.features.eager_table import Table
 from tactslip_torch.features.linear_maps import LinearMaps
@@ -26,9 +27,7 @@ from tactslip_torch.features.pool import FeaturePool
 
 Array = np.ndarray[Any, Any]
 CHUNK_ROWS = 2800
-"""Rows in a chunk; fewer spend their time on starting calls."""
-PART_ROWS = 700
-"""Rows that are described together; more do not fit the cache."""
+"""Rows in a chunk: fewer spend their time on starting calls, more on fetching from far memory."""
 _KEPT = 2  # workspaces of a thread: of whole chunks, and of the rest or of single bins
 
 
@@ -87,44 +86,35 @@ class Run:
         self, layout: Layout, constants: Constants, num_bins: int, dtype: torch.dtype
     ) -> None:
         self._layout, self._constants = layout, constants
-        self._forming = Forming(layout.linear, layout.maps, num_bins, layout.has_raw)
-        self._table = Table(layout, num_bins)
-        parts = list(layout.parts(num_bins, PART_ROWS))
+        forming = Forming(layout.linear, layout.maps, num_bins, layout.has_raw)
+        table, parts = Table(layout, num_bins), layout.parts()
         scratch = Scratch(parts, layout, num_bins, dtype)
-        self._parts = [PartRows(p, layout, self._forming, self._table, scratch) for p in parts]
-        self._constant: Array = np.zeros((layout.num_in_time, num_bins), bool)
-        self._has_spectra = layout.num_in_time < len(layout.rows)
+        self._forming, self._table = forming, table
+        first, last = parts[0], parts[-1]
+        self._in_time: InTime | None = None
+        self._spectra: Spectra | None = None
+        if first.first < first.split:
+            self._in_time = InTime(first, layout, forming, table, scratch)
+        if last.split < last.stop:
+            self._spectra = Spectra(last, layout, forming, table, scratch)
+        self._rows = [PartRows(part, layout, table, scratch) for part in parts]
 
     def __call__(self, x: Array, scale: Array, out: Array) -> None:
         """As the engine."""
         layout, forming, table = self._layout, self._forming, self._table
-        by_channel = scale.T
+        finest = scale.T * ROUNDING
         forming.begin(x)
-        np.take(by_channel, layout.channel_of, axis=0, out=table.scale, mode="clip")
-        constant: Array | None = None
-        known: Known | None = None
-        for rows in self._parts:
-            part = rows.part
-            if part.first < part.split:
-                found = rows.form_rows()
-                if found is not None:
-                    if constant is None:
-                        constant = self._constant
-                        constant[...] = False
-                    constant[part.first : part.split] = found.reshape(-1, len(x))
-            if part.split < part.stop:
-                known = known or self._known(constant, by_channel)
-                rows.form_spectra(self._constants, known)
-            rows.describe()
+        np.take(finest, layout.channel_of, axis=0, out=table.finest, mode="clip")
+        constant = None if self._in_time is None else self._in_time()
+        if len(self._rows) > 1:  # heights of spectra take the same place
+            self._rows[0]()
+        known = self._constants.known(forming, constant, table.least, finest)
+        if self._spectra is not None:
+            self._spectra(self._constants, known)
+        self._rows[-1]()
         table.finish()
         if layout.num_shared:
-            if layout.linear.energy_branches:
-                known = known or self._known(constant, by_channel)
-                if not known.is_plain:
-                    self._constants.mend_energies(forming, known)
+            if not known.is_plain:
+                self._constants.mend_energies(forming, known)
             table.share(forming.energies)
         table.write(out)
-
-    def _known(self, constant: Array | None, scale: Array) -> Known:
-        mean = self._table.grid(self._table.least)
-        return self._constants.known(self._forming, constant, mean, scale)

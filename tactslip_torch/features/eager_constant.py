@@ -8,7 +8,6 @@ that it is not constant, and the few others are looked at exactly.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,27 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.eager_forming import Forming
+from tactslip_torch.features.eager_forming import Forming, index_of
 from tactslip_torch.features.eager_layout import Layout
 
 Array = np.ndarray[Any, Any]
-INVERSE = 1 / (16 * torch.finfo(torch.float64).eps)
-"""A span times this below the size of the raw bin is rounding."""
-WATCH = INVERSE / 64
-"""The same for a watching sum, well above its own rounding."""
-
-
-def is_rounding(span: Array, scale: Array) -> Array | None:
-    """Which spans count as 0; none if no one does.
-
-    Shape:
-        - span, scale, output: ``[*]``
-    """
-    enlarged = span * INVERSE
-    if not (enlarged <= scale).any():
-        return None
-    found: Array = (enlarged < scale) | (span == 0)
-    return found
+ROUNDING = 16 * torch.finfo(torch.float64).eps
+"""Part of a raw bin's size below which a span is rounding."""
+WATCH = 64.0
+"""A watching sum so many times that, well above its own rounding, tells that the span is not."""
 
 
 @dataclass
@@ -46,13 +32,13 @@ class Known:
     Args:
         constant: ``[rows, M]``, which rows in time are constant; none if no one is.
         mean: ``[rows, M]``, of rows in time with their offset.
-        scale: ``[films, M]``, sizes of the raw bins.
+        finest: ``[films, M]``, ``ROUNDING`` of the sizes of raw bins.
         suspicious: ``[films, M, watched]``; none if nothing is.
     """
 
     constant: Array | None
     mean: Array
-    scale: Array
+    finest: Array
     suspicious: Array | None
 
     @property
@@ -70,7 +56,7 @@ class Constants:
 
     def __init__(self, layout: Layout) -> None:
         self._linear, self._maps = layout.linear, layout.maps
-        self._channels = list(layout.linear.films)
+        self._channels = index_of(layout.linear.films)
         self._watches = bool(layout.linear.watched)
         self._ones: Array = layout.maps.ones_lines.numpy()
         self._row_of = np.full((len(layout.maps.branches), len(layout.linear.films)), -1)
@@ -83,25 +69,23 @@ class Constants:
             matrix[0] = 0.0  # where the first sample stands instead of a difference
             self._dense[branch] = matrix
 
-    def known(self, forming: Forming, constant: Array | None, mean: Array, scale: Array) -> Known:
+    def known(self, forming: Forming, constant: Array | None, mean: Array, finest: Array) -> Known:
         """What there is to go by, once rows in time are taken in.
 
         Shape:
-            - constant, mean: as ``Known``; scale: ``[C', M]``
+            - constant, mean: as ``Known``; finest: ``[C', M]``
         """
-        sizes, suspicious = scale, None
+        finest = finest[self._channels]
+        suspicious: Array | None = None
         if self._watches:
-            sizes = scale[self._channels]
-            suspicious = np.abs(forming.watch) * WATCH < sizes[..., None]
+            suspicious = np.abs(forming.watch) < (finest * WATCH)[..., None]
             if not suspicious.any():
                 suspicious = None
-        elif constant is not None:
-            sizes = scale[self._channels]
-        return Known(constant, mean, sizes, suspicious)
+        return Known(constant, mean, finest, suspicious)
 
-    def mend_spectra(self, forming: Forming, known: Known, blocks: Iterable[int]) -> None:
-        """Replace lines of branches that are constant in some blocks of spectra."""
-        for block in (self._linear.freq[index] for index in blocks):
+    def mend_spectra(self, forming: Forming, known: Known) -> None:
+        """Replace lines of branches that are constant."""
+        for block in self._linear.freq:
             which, value = self._found(forming, known, block.branch, list(block.films))
             if which.any():
                 lines: Array = forming.lines[block.first : block.stop].numpy()
@@ -119,7 +103,7 @@ class Constants:
     ) -> tuple[Array, Array]:
         """Whether a branch is constant, and the constant that stands for it, ``[films, M]``."""
         rows = self._row_of[branch, films]
-        is_constant = np.zeros((len(films), known.scale.shape[1]), bool)
+        is_constant = np.zeros((len(films), known.finest.shape[1]), bool)
         value = np.zeros(is_constant.shape)
         formed = rows >= 0
         if known.constant is not None and formed.any():
@@ -133,8 +117,7 @@ class Constants:
                 samples = forming.bins[place, bins]
                 row = (torch.from_numpy(samples) @ self._dense[branch]).numpy()
                 span = row.max(-1) - row.min(-1)
-                is_constant[some, bins] = span * INVERSE < known.scale[place, bins]
-                is_constant[some, bins] |= span == 0
+                is_constant[some, bins] = (span < known.finest[place, bins]) | (span == 0)
                 value[some, bins] = row.mean(-1) + samples[:, 0]
         if not self._maps.is_approximation[branch]:
             value[...] = 0.0

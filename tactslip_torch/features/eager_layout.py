@@ -7,9 +7,7 @@ is no row, a band energy ratio. Columns of the output are some of the lines.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,27 +16,22 @@ from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import Plan, Row
 
 Array = np.ndarray[Any, Any]
-PLANES = ("mean", "range")
-"""Descriptors that all rows have, wanted or not."""
+PLANES = ("largest", "least", "mean", "range")
+"""What all rows have, wanted or not."""
 
 
-@dataclass(frozen=True)
-class Part:
-    """Rows that are formed and described together, while they lie in cache.
+class Part(NamedTuple):
+    """Rows of one length, which are described together.
 
     Args:
         first: the first row.
         split: the first spectrum among them; ``stop`` if there is none.
         stop: behind the last row.
-        time: which blocks of branches are formed.
-        freq: which blocks of spectra.
     """
 
     first: int
     split: int
     stop: int
-    time: range
-    freq: range
 
 
 class Layout:
@@ -54,7 +47,7 @@ class Layout:
         num_in_time: how many are no spectra.
         wanted: descriptor to the rows that want it, ascending; ``energy`` also where a band
             energy ratio needs it, of no row.
-        planes: descriptors that have a line for every row.
+        planes: descriptors and extremes that have a line for every row.
         raw_of: the row of the film itself, by row.
         is_detail: ``[num_in_time]``, which rows have no offset.
         first_of: ``[num_in_time]``, the channel whose first sample is the row's offset.
@@ -137,33 +130,10 @@ class Layout:
         for share in plan.shares:
             self.columns[share.place] = begin + shared.index(share.channel) * num + share.branch
 
-    def parts(self, num_bins: int, most: int) -> Iterator[Part]:
-        """Rows cut into parts: one or two of everything if that is little, else by blocks.
-
-        Args:
-            num_bins: M.
-            most: rows times bins up to which blocks are put together.
-        """
-        time, freq = self.linear.time, self.linear.freq
-        num_time, num, split = len(time), len(self.rows), self.num_in_time
-        if num * num_bins <= most and self.maps.num_lines == self.maps.num_samples:
-            yield Part(0, split, num, range(num_time), range(len(freq)))
-            return
-        sizes = [self.num_before, *(len(block.films) for block in time)]
-        for begin, stop in _together(sizes, most // num_bins):
-            first, last = sum(sizes[:begin]), sum(sizes[:stop])
-            if first < last:
-                yield Part(first, last, last, range(max(begin - 1, 0), stop - 1), range(0))
-        sizes = [len(block.films) for block in freq]
-        for begin, stop in _together(sizes, most // num_bins):
-            first, last = split + sum(sizes[:begin]), split + sum(sizes[:stop])
-            yield Part(first, first, last, range(0), range(begin, stop))
-
-
-def _together(sizes: Sequence[int], most: int) -> Iterator[tuple[int, int]]:
-    """Neighbours put together as long as their sizes sum to no more than ``most``."""
-    begin = 0
-    for stop in range(1, len(sizes) + 1):
-        if stop == len(sizes) or sum(sizes[begin : stop + 1]) > most:
-            yield begin, stop
-            begin = stop
+    def parts(self) -> list[Part]:
+        """All rows at once if they are of one length, else those in time, then spectra."""
+        num, split = len(self.rows), self.num_in_time
+        if self.maps.num_lines == self.maps.num_samples:
+            return [Part(0, split, num)]
+        found = [Part(0, split, split), Part(split, split, num)]
+        return [part for part in found if part.first < part.stop]

@@ -17,8 +17,12 @@ from tactslip_torch.features.eager_scratch import Scratch
 from tactslip_torch.features.runs import entropy_growth
 
 Array = np.ndarray[Any, Any]
+TOLERANCE = RUN_TOLERANCE[torch.float64] / (16 * torch.finfo(torch.float64).eps)
+"""Of equal values, in parts of 16 eps of the size of the raw bin."""
 MIXED_TOLERANCE = 2.0**-22
 """Part of a value by which equal ones may differ in float32: the rounding of heights."""
+FEW = 4096
+"""Values in which runs are found one by one, which takes fewer calls."""
 
 
 def quantile_weights(num: int) -> tuple[Array, Array]:
@@ -82,7 +86,9 @@ class Ordered:
         self._gaps: Array = self._work.numpy()
         self._ranks = scratch.counts(rows * num)
         self._flags = scratch.flags(self._quantised * num)
-        self._growth: Array = entropy_growth(num).to(scratch.dtype).numpy()
+        growth = entropy_growth(num)
+        self._growth: Array = growth.to(scratch.dtype).numpy()
+        self._parts: Array = np.concatenate([[0.0], growth.cumsum(0).numpy()])
         half = 0.5 + HALF_SLACK[scratch.dtype]
         self._half = torch.tensor(half, dtype=scratch.dtype)
         self._rounding = MIXED_TOLERANCE if scratch.dtype == torch.float32 else 0.0
@@ -95,22 +101,24 @@ class Ordered:
         found: Array = self.sorted.take(self._places, axis=1) @ self._weights
         return found
 
-    def modes(self, scale: Array, span: Array, floor: Array) -> tuple[Array, Array]:
+    def modes(self, finest: Array, span: Array, floor: Array) -> tuple[Array, Array]:
         """Modes that are not the smallest value: in which rows, and the first of the longest run.
 
         Only rows whose smallest gap is within the tolerance are looked at closer.
 
         Shape:
-            - scale: ``[num_rows]``, size of the raw bin; span: ``[num_rows]``, of the row, not 0
+            - finest: ``[num_rows]``, 16 eps of the size of the raw bin
+            - span: ``[num_rows]``, of the row
             - floor: ``[num_rows]``, what was subtracted after rounding, as part of the span
             - output: ``[k]`` rows, ``[k]`` values
         """
-        flat, gaps = self.sorted.ravel(), self._gaps
-        np.subtract(flat[1:], flat[:-1], out=gaps.ravel()[:-1])
+        flat, gaps = self.sorted.reshape(-1), self._gaps
+        np.subtract(flat[1:], flat[:-1], out=gaps.reshape(-1)[:-1])
         gaps[:, -1] = np.inf
-        tolerance = (RUN_TOLERANCE[torch.float64] * scale / span + self._rounding * floor).astype(
-            gaps.dtype
-        )
+        wide = np.full_like(span, -1.0)  # the mode of a flat row is its smallest value
+        np.divide(finest * TOLERANCE, span, out=wide, where=span > 0)
+        wide += self._rounding * floor
+        tolerance = wide.astype(gaps.dtype)
         least = torch.amin(self._work, 1).numpy()
         rows = np.flatnonzero(least <= tolerance + gaps.dtype.type(self._rounding))
         if not len(rows):
@@ -142,7 +150,18 @@ class Ordered:
         np.logical_or(is_same, is_top, out=is_same)
         is_same.reshape(values.shape)[:, 0] = False
         np.copyto(continues, is_same)
+        if len(level) <= FEW:
+            return self._from_starts(np.flatnonzero(continues == 0), len(values))
         rank = rank_in_run(continues, spare, other)
         np.take(self._growth, rank, out=values.reshape(-1), mode="clip")
         found: Array = torch.sum(work, 1).numpy()
+        return found
+
+    def _from_starts(self, starts: Array, num_rows: int) -> Array:
+        """Entropies from where runs start on the flat array; dear for many runs, quick for few."""
+        counts = np.empty_like(starts)
+        np.subtract(starts[1:], starts[:-1], out=counts[:-1])
+        num = self.sorted.shape[1]
+        counts[-1] = num_rows * num - starts[-1]
+        found: Array = np.bincount(starts // num, weights=self._parts[counts], minlength=num_rows)
         return found

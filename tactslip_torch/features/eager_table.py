@@ -34,11 +34,12 @@ class Table:
             deviation), of cubes (skewness), of fourth powers (kurtosis), and of products with
             those of the film (correlation). All other planes are written as they will be. What
             nobody wants stays 0.
-        span, least, largest: of rows, ``[rows * M]``; the span is 0 for a flat row.
-        floor: ``least / span`` of spectra, for the mode; 0 of others.
-        center: means of heights, ``[rows * M]``.
+        extremes: largest, least and mean of rows, ``[3, rows * M]``.
+        least: of rows, ``[rows, M]``.
+        span: largest minus least, ``[rows * M]``; 0 for a flat row.
+        floor: least over span of spectra, for the mode; 0 of others.
         squares: sums of squared deviations, ``[rows * M]``.
-        scale: size of the raw bin, ``[rows, M]``.
+        finest: 16 eps of the size of the raw bin, ``[rows, M]``; a span below it is rounding.
     """
 
     def __init__(self, layout: Layout, num_bins: int) -> None:
@@ -49,16 +50,15 @@ class Table:
             name: self.values[place * num : (place + 1) * num].reshape(-1)
             for place, name in enumerate(layout.planes)
         }
+        self.extremes: Array = self.values[: 3 * num].reshape(3, -1)
+        self.least = self.values[num : 2 * num]
         self.span = self.planes["range"]
-        self.largest: Array = np.zeros(num * num_bins)
-        self.least: Array = np.zeros(num * num_bins)
         self.floor: Array = np.zeros(num * num_bins)
-        self.center: Array = np.zeros(num * num_bins)
         self.squares: Array = np.ones(num * num_bins)
         self.sums: dict[str, Array] = {
             name: np.zeros(num * num_bins) for name in layout.planes if name in SUMS
         }
-        self.scale: Array = np.empty((num, num_bins))
+        self.finest: Array = np.empty((num, num_bins))
         self._found: Array = np.empty((len(layout.columns), num_bins))
         self._wanted = frozenset(layout.wanted)
         self._raw = layout.raw_of
@@ -76,7 +76,7 @@ class Table:
 
     def grid(self, values: Array) -> Array:
         """``[rows * M]`` as ``[rows, M]``."""
-        return values.reshape(-1, self.scale.shape[1])
+        return values.reshape(-1, self.finest.shape[1])
 
     def finish(self) -> None:
         """Descriptors of all rows."""
@@ -98,7 +98,7 @@ class Table:
                 factor = span
             np.multiply(found, factor, out=planes[name])
         if "median" in wanted:
-            planes["median"] += self.least
+            planes["median"] += planes["least"]
         root *= span
         if "std" in wanted:
             np.divide(root, self._root_less, out=planes["std"])
@@ -125,7 +125,7 @@ class Table:
         if not rms.all():
             rms[rms == 0] = np.inf  # so that cv and peak factor of a zero row are 0
         if "peak_factor" in wanted:
-            np.divide(self.largest, rms, out=planes["peak_factor"])
+            np.divide(planes["largest"], rms, out=planes["peak_factor"])
         if "cv" in wanted:
             floor = np.maximum(size, rms * CV_FLOOR)
             np.divide(root / self._root_less, np.copysign(floor, mean + 0.0), out=planes["cv"])
