@@ -13,6 +13,7 @@ from tactslip_torch.features.compiled_bins import describe_bins
 from tactslip_torch.features.compiled_jit import Array
 from tactslip_torch.features.compiled_products import Products, ProductSpace
 from tactslip_torch.features.compiled_ranked import describe_sorted
+from tactslip_torch.features.compiled_read import read_bins
 from tactslip_torch.features.compiled_rows import Desk, desk_of
 from tactslip_torch.features.compiled_steps import (
     formings,
@@ -20,9 +21,15 @@ from tactslip_torch.features.compiled_steps import (
     sorts_of,
     steps_of,
 )
+from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import Plan
 from tactslip_torch.features.pool import FeaturePool
+
+_MANY_ROWS = 100
+_FEW, _MANY = 16, 64
+"""Bins a chunk for many rows, whose memory should fit the cache, and for few."""
+_SIZES = ordinary_sizes(torch.float64)
 
 
 class _Workspace(NamedTuple):
@@ -34,6 +41,9 @@ class _Workspace(NamedTuple):
     lines: Array
     line_facts: Array
     values: Tensor
+    bins: Tensor
+    scale: Tensor
+    is_ordinary: Array
     desk: Desk
 
 
@@ -52,18 +62,33 @@ class CompiledEngine:
         chunk_bins: the most bins a call, and how many it is fastest with.
     """
 
-    chunk_bins = 16
-
     def __init__(self, pool: FeaturePool, plan: Plan, dtype: torch.dtype) -> None:
         maps = LinearMaps.of(pool)
+        self.chunk_bins = _FEW if len(plan.rows) > _MANY_ROWS else _MANY
         made, chains = formings(plan, maps, self.chunk_bins)
         self._dtype = dtype
-        self._num_features = plan.num_features
+        self.num_features = plan.num_features
+        self._channels = np.array(plan.channels, np.int64)
         self._steps = steps_of(plan, maps, made, chains)
         self._sorts = sorts_of(plan)
         self._num_sorted = tuple(len(rows) for rows in sorted_rows(plan))
         self._products = Products(maps, made, len(self._steps.film_channel), self.chunk_bins, dtype)
         self._local = threading.local()
+
+    def read(self, bins: Tensor) -> tuple[Tensor, Tensor, Array]:
+        """What ``__call__`` takes, from bins of all channels, in memory of this thread.
+
+        Shape:
+            - bins: ``[M, C, n]``, float32 or float64
+            - output: x ``[M, C', n]``, scale ``[M, C']``, and ``[M]``, whether a bin is ordinary:
+              without NaN and Inf, each channel's magnitude 0 or ordinary
+        """
+        space, num = self._workspace(), len(bins)
+        x, scale = space.bins[:num], space.scale[:num]
+        is_ordinary = space.is_ordinary[:num]
+        source = bins.contiguous().numpy()
+        read_bins(source, self._channels, *_SIZES, x.numpy(), scale.numpy(), is_ordinary)
+        return x, scale, is_ordinary
 
     def __call__(self, x: Tensor, scale: Tensor, out: Tensor) -> None:
         """Write the features of some bins.
@@ -119,6 +144,9 @@ class CompiledEngine:
             sample_facts=np.empty((num, in_time, 3)),
             lines=np.empty((num, in_frequency, num_lines), number),
             line_facts=np.empty((num, in_frequency, 3)),
-            values=torch.empty(num, self._num_features, dtype=torch.float64),
+            values=torch.empty(num, self.num_features, dtype=torch.float64),
+            bins=torch.empty(num, len(self._channels), n, dtype=torch.float64),
+            scale=torch.empty(num, len(self._channels), dtype=torch.float64),
+            is_ordinary=np.empty(num, np.bool_),
             desk=desk_of(self._steps, number),
         )

@@ -24,24 +24,32 @@ _FAST = frozenset({"reassoc", "contract", "nsz", "arcp", "nnan"})
 
 
 def inner(function: Function) -> Function:
-    """``function`` compiled to be called by other kernels."""
-    return _compiled(function, cache=False, forceinline=True)
+    """``function`` compiled into the kernels that call it."""
+    return _compiled(function, fastmath=set(_FAST), forceinline=True)
 
 
 def kernel(function: Function) -> Function:
     """``function`` compiled to be called from Python, without the interpreter lock, and kept."""
+    return _kept(function, fastmath=set(_FAST))
+
+
+def careful_kernel(function: Function) -> Function:
+    """A ``kernel`` that may meet NaN and Inf."""
+    return _kept(function, fastmath=False)
+
+
+def _kept(function: Function, **options: Any) -> Function:
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(_folder(before))
     try:
-        return _compiled(function, cache=True)
+        return _compiled(function, cache=True, **options)
     finally:
         numba.config.CACHE_DIR = before
 
 
-def _compiled(function: Function, **options: bool) -> Function:
-    compiled = numba.njit(
-        nogil=True, **options, fastmath=set(_FAST), error_model="numpy", _nrt=False
-    )
+def _compiled(function: Function, **options: Any) -> Function:
+    # counting who uses which array would take as long as the work on a row
+    compiled = numba.njit(nogil=True, error_model="numpy", _nrt=False, **options)
     return cast(Function, compiled(function))
 
 

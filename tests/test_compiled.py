@@ -1,0 +1,266 @@
+"""The compiled engine equals the reference, on bins of every kind and for any part of the pool."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from engine_bins import (
+    KINDS,
+    assert_equals_reference,
+    assert_modes_are_fair,
+    bins_of,
+    some_hand,
+)
+
+from tactslip_torch import FeaturePool, HandLayout
+from tactslip_torch.features.guards import ordinary_sizes
+from tactslip_torch.features.plan import make_plan
+
+numba = pytest.importorskip("numba")
+from tactslip_torch.features.compiled import CompiledEngine  # noqa: E402
+from tactslip_torch.features.compiled_jit import _folder  # noqa: E402
+from tactslip_torch.features.compiled_steps import ADD, OWN, chain_of  # noqa: E402
+
+STATISTICS = {"double": torch.float64, "mixed": torch.float32}
+HAND = some_hand("GFF")
+DESCRIPTORS = sorted({name.descriptor for name in FeaturePool(HAND).names})
+RANKS = (51, 51, 27, 27, 15, 15, 10, 9)  # of A1, D1, A2, .. of 100 samples
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def engine_of(pool, names, statistics):
+    return CompiledEngine(pool, make_plan(pool.hand, pool.level, names), STATISTICS[statistics])
+
+
+def run(engine, bins, dtype=torch.float64):
+    """Features of any number of bins, chunk by chunk."""
+    parts = []
+    for chunk in bins.split(engine.chunk_bins):
+        x, scale, is_ordinary = engine.read(chunk)
+        assert is_ordinary.all()
+        out = torch.full((len(chunk), engine.num_features), torch.nan, dtype=dtype)
+        engine(x, scale, out)
+        parts.append(out)
+    return torch.cat(parts)
+
+
+def reference(pool, bins, names):
+    columns = [pool.names.index(name) for name in names]
+    return pool(bins)[:, columns]
+
+
+# Equal to the reference ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("statistics", STATISTICS)
+@pytest.mark.parametrize("spectrum", ["reference", "clean"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_whole_pool_on_bins_of_every_kind(kind, spectrum, statistics):
+    pool = FeaturePool(HAND, spectrum=spectrum)
+    bins = bins_of(kind, 30, HAND, 100, generator())
+    found = run(engine_of(pool, pool.names, statistics), bins)
+    assert_equals_reference(found, pool(bins), pool.names, statistics == "mixed")
+    if statistics == "mixed":
+        assert_modes_are_fair(found[:6], bins[:6], pool, pool.names)
+
+
+@pytest.mark.parametrize("statistics", STATISTICS)
+@pytest.mark.parametrize(("num", "level"), [(50, 3), (64, 3), (101, 4), (20, 1)])
+@pytest.mark.parametrize("spectrum", ["reference", "clean"])
+def test_other_lengths_and_levels(num, level, spectrum, statistics):
+    hand = some_hand("FG")
+    pool = FeaturePool(hand, bin_samples=num, level=level, spectrum=spectrum)
+    engine = engine_of(pool, pool.names, statistics)
+    for kind in ("random", "tied", "impulses"):
+        bins = bins_of(kind, 20, hand, num, generator())
+        assert_equals_reference(run(engine, bins), pool(bins), pool.names, statistics == "mixed")
+
+
+@pytest.mark.parametrize("kinds", ["F", "G", "GG", "FF", "FGFGF"])
+def test_other_hands(kinds):
+    pool = FeaturePool(some_hand(kinds))
+    bins = bins_of("random", 20, pool.hand, 100, generator())
+    found = run(engine_of(pool, pool.names, "double"), bins)
+    assert_equals_reference(found, pool(bins), pool.names, mixed=False)
+
+
+def test_the_papers_hand():
+    pool = FeaturePool(HandLayout.paper24())
+    bins = bins_of("tied", 40, pool.hand, 100, generator())
+    found = run(engine_of(pool, pool.names, "double"), bins)
+    assert_equals_reference(found, pool(bins), pool.names, mixed=False)
+
+
+@pytest.mark.parametrize("statistics", STATISTICS)
+@pytest.mark.parametrize("descriptor", DESCRIPTORS)
+def test_each_descriptor_alone(descriptor, statistics):
+    pool = FeaturePool(HAND)
+    names = [name for name in pool.names if name.descriptor == descriptor]
+    engine = engine_of(pool, names, statistics)
+    for kind in ("random", "near_constant", "zeros", "constants"):
+        bins = bins_of(kind, 20, HAND, 100, generator())
+        assert_equals_reference(
+            run(engine, bins), reference(pool, bins, names), names, statistics == "mixed"
+        )
+
+
+@pytest.mark.parametrize("channel", HAND.names)
+def test_one_channel(channel):
+    pool = FeaturePool(HAND)
+    names = [name for name in pool.names if name.channel == channel]
+    bins = bins_of("random", 20, HAND, 100, generator())
+    found = run(engine_of(pool, names, "double"), bins)
+    assert_equals_reference(found, reference(pool, bins, names), names, mixed=False)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 20, 100])
+@pytest.mark.parametrize("seed", range(4))
+def test_random_parts_in_any_order(size, seed, rng):
+    pool = FeaturePool(some_hand("GFFF"))
+    names = [pool.names[i] for i in rng.integers(len(pool.names), size=size)]  # repeats too
+    engine = engine_of(pool, names, "double")
+    for kind in ("random", "dead_channel"):
+        bins = bins_of(kind, 20, pool.hand, 100, generator(seed))
+        assert_equals_reference(run(engine, bins), reference(pool, bins, names), names, mixed=False)
+
+
+def test_spectra_alone_know_which_branches_are_rounding():
+    pool = FeaturePool(some_hand("FFF"))
+    in_frequency = [name for name in pool.names if name.domain == "freq"]
+    noise = bins_of("random", 30, pool.hand, 100, generator())
+    size = 10.0 ** -torch.arange(30)[:, None, None]  # of vibration; branches go one by one
+    bins = 1 + size * noise
+    alone = run(engine_of(pool, in_frequency, "double"), bins)
+    among = run(engine_of(pool, pool.names, "double"), bins)
+    columns = [pool.names.index(name) for name in in_frequency]
+    torch.testing.assert_close(alone, among[:, columns], rtol=1e-9, atol=1e-9)
+
+
+# Manners -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("statistics", STATISTICS)
+@pytest.mark.parametrize("num", [1, 7, 70])
+def test_any_number_of_bins(num, statistics):
+    pool = FeaturePool(HAND)
+    engine = engine_of(pool, pool.names, statistics)
+    bins = bins_of("random", 70, HAND, 100, generator())
+    found = run(engine, bins[:num])
+    torch.testing.assert_close(found, run(engine, bins)[:num], rtol=1e-4, atol=1e-6)
+    assert_equals_reference(run(engine, bins), pool(bins), pool.names, statistics == "mixed")
+
+
+def test_same_bin_in_the_same_place_has_the_same_bits():
+    pool = FeaturePool(HAND)
+    engine = engine_of(pool, pool.names, "double")
+    bins = bins_of("tied", engine.chunk_bins, HAND, 100, generator())
+    first = run(engine, bins)
+    run(engine, bins_of("constants", engine.chunk_bins, HAND, 100, generator()))
+    assert torch.equal(run(engine, bins), first)
+
+
+def test_float32_out_is_rounded_once_and_saturates():
+    pool = FeaturePool(HAND)
+    engine = engine_of(pool, pool.names, "double")
+    bins = bins_of("random", 8, HAND, 100, generator())
+    assert torch.equal(run(engine, bins, torch.float32), run(engine, bins).float())
+    huge = run(engine, 1e30 * bins, torch.float32)
+    of_energy = torch.tensor([name.descriptor == "energy" for name in pool.names])
+    assert (huge[:, of_energy] == torch.finfo(torch.float32).max).all()
+    assert huge.isfinite().all()
+
+
+@pytest.mark.parametrize("exponent", [-300, 400])
+def test_ordinary_sizes_need_no_guard(exponent):
+    pool = FeaturePool(HAND)
+    bins = bins_of("random", 20, HAND, 100, generator()) * 2.0**exponent
+    for statistics in STATISTICS:
+        found = run(engine_of(pool, pool.names, statistics), bins)
+        assert_equals_reference(found, pool(bins), pool.names, statistics == "mixed")
+
+
+def test_two_threads_at_once():
+    pool = FeaturePool(HAND)
+    engine = engine_of(pool, pool.names, "double")
+    batches = [bins_of("random", 64, HAND, 100, generator(seed)) for seed in range(8)]
+    expected = [run(engine, bins) for bins in batches]
+    with ThreadPoolExecutor(2) as threads:
+        found = list(threads.map(lambda bins: run(engine, bins), batches * 3))
+    for one, other in zip(found, expected * 3, strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_read_takes_channels_and_finds_what_is_not_ordinary(dtype):
+    pool = FeaturePool(some_hand("GFFG"))
+    names = [name for name in pool.names if name.channel in ("SG1", "PVDF2")]
+    engine = engine_of(pool, names, "double")
+    bins = bins_of("random", 8, pool.hand, 100, generator()).to(dtype)
+    bins[1, 0, 99], bins[2, 2, 50], bins[3, 0, 0] = torch.nan, torch.inf, -torch.inf
+    bins[4, 2] = 0.0
+    bins[5, 1, 3] = torch.nan  # a channel that is not read
+    low, high = ordinary_sizes(torch.float64)
+    expected = [True, False, False, False, True, True, True, True]
+    if dtype == torch.float64:
+        bins[6, 0] *= low / 100
+        bins[7, 2, 17] = -2 * high
+        expected[6:] = [False, False]
+    x, scale, is_ordinary = engine.read(bins.transpose(0, 1).contiguous().transpose(0, 1))
+    assert is_ordinary.tolist() == expected
+    assert x.dtype == scale.dtype == torch.float64
+    good = torch.tensor(expected)
+    assert torch.equal(x[good], bins[good][:, [0, 2]].double())
+    assert torch.equal(scale[good], bins[good][:, [0, 2]].double().abs().amax(-1))
+
+
+# What the work is ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_chains_form_what_is_wanted(seed):
+    chosen = np.random.default_rng(seed).random(8) < 0.4
+    wanted = {int(b) for b in chosen.nonzero()[0]}
+    chain, formed = chain_of(wanted, RANKS)
+    assert {b for b in wanted if b % 2} <= formed
+    parts = {3: {"A4"}, 2: {"A4", "D4"}, 1: {"A4", "D4", "D3"}, 0: {"A4", "D4", "D3", "D2"}}
+    total, had = set(), {}
+    for level in (3, 2, 1, 0):
+        if chain[level] == OWN:
+            assert 2 * level in formed
+            total = set(parts[level])
+        elif chain[level] == ADD:
+            assert 2 * level + 3 in formed
+            total = total | {f"D{level + 2}"}
+        had[level] = total
+    for branch in wanted:
+        if branch % 2 == 0:
+            assert had[branch // 2] == parts[branch // 2]
+    alone = wanted  # each by its own product
+    assert sum(RANKS[b] for b in formed) <= sum(RANKS[b] for b in alone)
+
+
+def test_compiled_code_is_kept_apart_for_each_state_of_the_sources(tmp_path, monkeypatch):
+    before = _folder("")
+    assert before.parent.name == "__pycache__"
+    assert _folder(str(tmp_path)) == tmp_path / before.name
+    source = tmp_path / "compiled_other.py"
+    monkeypatch.setattr("tactslip_torch.features.compiled_jit.__file__", str(source))
+    source.write_text("a = 1")
+    one = _folder("")
+    source.write_text("a = 2")
+    assert one.name != _folder("").name
+
+
+def test_the_package_works_without_numba():
+    source = (
+        "import sys; sys.modules['numba'] = None\n"
+        "import tactslip_torch\n"
+        "import tactslip_torch.features.extractor"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", source], check=True)
