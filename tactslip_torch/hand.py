@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 ChannelKind = Literal["SG", "PVDF"]
@@ -72,7 +73,7 @@ class HandLayout:
     def __len__(self) -> int:
         return len(self.channels)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Channel names in file order."""
         return tuple(channel.name for channel in self.channels)

@@ -17,12 +17,12 @@ from typing import Any, Literal, Protocol, get_args
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from tactslip_torch.features.guards import is_recorded, ordinary_sizes
+from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool, saturating
+from tactslip_torch.plain import is_plain
 from tactslip_torch.threads import for_each
 
 EngineName = Literal["auto", "compiled", "eager", "reference"]
@@ -113,7 +113,7 @@ class FeatureExtractor:
         """
         self.pool.check(bins)
         dtype = dtype or bins.dtype
-        if not _is_plain(bins):
+        if not is_plain(bins):
             return self._reference(bins, dtype)
         flat = bins.detach().flatten(0, -3) if bins.ndim > 2 else bins.detach()[None]
         out = torch.empty(len(flat), len(self.selected), dtype=dtype)
@@ -153,6 +153,9 @@ class FeatureExtractor:
         low, high = x.aminmax(dim=-1)
         scale = torch.maximum(high, -low)
         size = scale.numpy()
+        if size.min() >= self._sizes[0] and size.max() <= self._sizes[1]:
+            engine(x, scale, out)
+            return
         is_ordinary = ((size >= self._sizes[0]) & (size <= self._sizes[1])) | (size == 0)
         if is_ordinary.all():
             engine(x, scale, out)
@@ -218,16 +221,3 @@ def resolved(engine: EngineName) -> EngineName:
     if engine == "auto":
         return "compiled" if has_numba else "eager"
     return engine
-
-
-def _is_plain(bins: Tensor) -> bool:
-    """Whether only values are asked for, and lie in memory that can be looked at."""
-    if bins.device.type != "cpu" or is_recorded():
-        return False
-    if torch.is_grad_enabled() and bins.requires_grad:
-        return False
-    try:
-        bins.detach().numpy()  # under vmap and other transforms there is no memory to look at
-        return forward_ad.unpack_dual(bins).tangent is None
-    except RuntimeError:
-        return False

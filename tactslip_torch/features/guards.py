@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tactslip_torch.plain import is_recorded
+
 
 def is_constant(x: Tensor, scale: Tensor) -> Tensor:
     """Whether the span of ``x`` is rounding noise beside ``scale``, the size of the raw bin.
@@ -52,12 +54,6 @@ def are_positive(x: Tensor) -> bool:
     """Whether values are all known to be above 0."""
     values = looked_at(x)
     return values is not None and bool(values.min() > 0)
-
-
-def is_recorded() -> bool:
-    """Whether what runs is being written down as a graph, in which no value may be looked at."""
-    is_traced = torch.jit.is_tracing()  # type: ignore[attr-defined,no-untyped-call]
-    return bool(is_traced or torch.compiler.is_compiling())
 
 
 def looked_at(x: Tensor) -> np.ndarray[Any, Any] | None:

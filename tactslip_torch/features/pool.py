@@ -22,11 +22,11 @@ from tactslip_torch.features.guards import (
     are_positive,
     bounded_gradient,
     is_constant,
-    is_recorded,
     settle,
 )
 from tactslip_torch.features.names import pool_names
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.plain import is_recorded
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names
 

@@ -18,11 +18,11 @@ from torch.autograd import forward_ad
 
 from tactslip_torch.features.guards import (
     bounded_gradient,
-    is_recorded,
     looked_at,
     ordinary_sizes,
     stretch,
 )
+from tactslip_torch.plain import is_recorded
 
 
 class Sample:

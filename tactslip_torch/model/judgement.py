@@ -10,6 +10,7 @@ from torch import Tensor
 from tactslip_torch.signals.finite import refuse_nonfinite
 
 Nonfinite = Literal["mask", "raise"]
+_POLICIES = get_args(Nonfinite)
 
 
 class Judgement(NamedTuple):
@@ -33,7 +34,7 @@ def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
     Raises:
         ValueError: for an unknown policy, or under ``"raise"`` for a NaN or Inf.
     """
-    if policy not in get_args(Nonfinite):
+    if policy not in _POLICIES:
         raise ValueError(f"nonfinite must be 'mask' or 'raise', got {policy!r}")
     if policy == "raise":
         refuse_nonfinite(samples, names, "repair the samples, or take nonfinite='mask'")
