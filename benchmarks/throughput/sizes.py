@@ -37,7 +37,7 @@ class Sizes:
     many: int = 1024
     bins_ms: tuple[int, ...] = (10, 20, 50, 100, 200, 400)
     channels: tuple[int, ...] = (1, 4, 24, 64, 256)
-    curve_samples: int = 600_000
+    curve_samples: int = 240_000
     threads: tuple[int, ...] = (1, 2)
     held: tuple[int, ...] = (1024, 16_384, 65_536)
     pieced: int = 1024
