@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.clocks import Ratio, paired_ratio
-from benchmarks.engines import FLOAT32, FLOAT64
+from benchmarks.engines import FLOAT32
 from benchmarks.latency.measure import row_of
 from benchmarks.latency.ways import LOOP
 from benchmarks.outcome import heading
@@ -14,8 +14,6 @@ from benchmarks.selection import source_text
 from benchmarks.tables import Spread, Table, limits, number
 
 TIMES_THE_LOOP = 200.0  # p50 of the eager engine and the quadratic head
-MOST_ERROR = {FLOAT32: 1e-2, FLOAT64: 1e-6}
-"""Standard deviations of the score; a step of an entropy counts."""
 Rows = Sequence[Mapping[str, Any]]
 
 
