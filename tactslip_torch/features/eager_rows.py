@@ -11,7 +11,7 @@ from tactslip_torch.features.eager_forming import index_of
 from tactslip_torch.features.eager_layout import Layout, Part
 from tactslip_torch.features.eager_order import Ordered
 from tactslip_torch.features.eager_scratch import Scratch
-from tactslip_torch.features.eager_table import Table
+from tactslip_torch.features.eager_table import TINIEST, Table
 from tactslip_torch.features.plan import ORDERED
 
 Array = np.ndarray[Any, Any]
@@ -178,6 +178,3 @@ class PartRows:
 
     def _put(self, name: str, rows: slice | list[int], found: Array) -> None:
         self._here[name].reshape(-1, self._shape[1])[rows] = found.reshape(-1, self._shape[1])
-
-
-TINIEST = float(np.finfo(np.float64).tiny)

@@ -16,10 +16,9 @@ from tactslip_torch.features.eager_constant import Constants, Known
 from tactslip_torch.features.eager_forming import Forming
 from tactslip_torch.features.eager_layout import Layout, Part
 from tactslip_torch.features.eager_scratch import Scratch
-from tactslip_torch.features.eager_table import Table
+from tactslip_torch.features.eager_table import TINIEST, Table
 
 Array = np.ndarray[Any, Any]
-TINIEST = float(np.finfo(np.float64).tiny)
 
 
 class InTime:

@@ -16,6 +16,8 @@ from tactslip_torch.features.eager_layout import Layout
 Array = np.ndarray[Any, Any]
 SUMS = frozenset({"mean_deviation", "median", "iqr", "skewness", "kurtosis", "correlation"})
 """Descriptors that are made of something in the unit of deviations."""
+TINIEST = float(np.finfo(np.float64).tiny)
+"""Instead of a divisor that is 0, below which there are only zeros."""
 MOST = float(np.finfo(np.float32).max)
 
 
@@ -122,8 +124,7 @@ class Table:
         if wanted.isdisjoint(("peak_factor", "cv")):
             return
         rms = np.sqrt(square)
-        if not rms.all():
-            rms[rms == 0] = np.inf  # so that cv and peak factor of a zero row are 0
+        np.maximum(rms, TINIEST, out=rms)  # cv and peak factor of a zero row are 0
         if "peak_factor" in wanted:
             np.divide(planes["largest"], rms, out=planes["peak_factor"])
         if "cv" in wanted:
@@ -140,8 +141,7 @@ class Table:
             self._lonely[...] = energies.transpose(2, 0, 1)
         found = self.values.take(self._layout.energy_lines, axis=0).reshape(self._ratios.shape)
         total = found.sum(1, keepdims=True)
-        if not total.all():
-            total[total == 0] = np.inf
+        np.maximum(total, TINIEST, out=total)  # ratios of a zero film are 0
         np.divide(found, total, out=self._ratios)
 
     def write(self, out: Array) -> None:
