@@ -21,7 +21,7 @@ from tactslip_torch.features.plan import make_plan
 
 numba = pytest.importorskip("numba")
 from tactslip_torch.features.compiled import CompiledEngine  # noqa: E402
-from tactslip_torch.features.compiled_jit import _folder  # noqa: E402
+from tactslip_torch.features.compiled_jit import _folder, kernel  # noqa: E402
 from tactslip_torch.features.compiled_steps import ADD, OWN, chain_of  # noqa: E402
 
 STATISTICS = {"double": torch.float64, "mixed": torch.float32}
@@ -255,6 +255,14 @@ def test_compiled_code_is_kept_apart_for_each_state_of_the_sources(tmp_path, mon
     one = _folder("")
     source.write_text("a = 2")
     assert one.name != _folder("").name
+
+
+def test_kernels_work_where_they_cannot_be_kept():
+    scope = {}
+    exec("def more(x):\n    return x + 1", scope)  # numba keeps nothing without a file
+    with pytest.raises(RuntimeError, match="cannot cache"):
+        numba.njit(scope["more"], cache=True)
+    assert kernel(scope["more"])(2) == 3
 
 
 def test_the_package_works_without_numba():

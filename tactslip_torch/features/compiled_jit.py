@@ -43,6 +43,8 @@ def _kept(function: Function, **options: Any) -> Function:
     numba.config.CACHE_DIR = str(_folder(before))
     try:
         return _compiled(function, cache=True, **options)
+    except RuntimeError:  # no folder may be written to
+        return _compiled(function, **options)
     finally:
         numba.config.CACHE_DIR = before
 

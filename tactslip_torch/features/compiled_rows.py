@@ -115,7 +115,7 @@ def _entropy(row: Array, low: float, span: float, steps: Steps, kind: int, desk:
         cells[i] = 0
     total = 0.0
     for i in range(row.size):
-        cell = np.uint32(level[i])
+        cell = np.uint32(level[i] & _TOP)
         rank = cells[cell]
         total += growth[rank]
         cells[cell] = rank + np.uint32(1)
