@@ -17,7 +17,7 @@ from tactslip_torch.signals.filtering import ChannelFilter
 DEFINITION = (
     "worst case, from the onset of slip to the decision of the first bin that lies wholly in slip: "
     "look-ahead of the filter for the channels in use + bin + hop (the onset falls just behind a "
-    "bin's start) + compute (p99 of a call with one bin, one thread)"
+    "bin's start) + compute (p99 of a call with one bin, one thread, on a processor of its own)"
 )
 
 

@@ -155,6 +155,7 @@ def _prepared(config: DictConfig, cache: FeatureCache) -> tuple[Limits, Workshop
         features = {**config.features, "align": align}
         pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **features)
         makers[align] = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, engine)
+    search.groups(pool)  # refuses an empty selection before any work
     _check_physics(limits, rule.bin_ms, makers)
     shop = Workshop(makers, folds[0], search, recipe, config.most_summed, config.num_workers)
     return limits, shop
@@ -236,6 +237,7 @@ def row_of(shop: Workshop, timed: Timed, latency: Latency, timing: Timing) -> di
         "latency": latency.facts(),
         "p50_us": timing.p50_us,
         "p99_us": timing.p99_us,
+        "interrupted": timing.interrupted,
         "modelled_us": candidate.latency.compute_us,
         "validation": candidate.balanced_accuracy,
         "validation_by_group": dict(candidate.by_group),

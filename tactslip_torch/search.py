@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -35,7 +35,7 @@ from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.threads import for_each
 
 Ranking = Literal["t", "ccweighting", "per_cost"]
-_Job = tuple[Align, str, str, Tensor, str]  # alignment, channels, components, mask, ranking
+_Job = tuple[Align, str, str, Tensor, str, Sequence[int]]  # Searcher._scored takes it
 Watch = Callable[[Iterable[Any], str], Iterable[Any]]
 _NAMES = {
     "channels": Channels,
@@ -107,6 +107,26 @@ class Search:
         if set(self.degrees) - {1, 2}:
             raise ValueError(f"search.degrees must be of 1 and 2, got {list(self.degrees)}")
 
+    def groups(self, pool: FeaturePool) -> list[tuple[str, str, Tensor]]:
+        """Groups of channels and components that differ and are large enough, with their masks.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        found: list[tuple[str, str, Tensor]] = []
+        for channels, components in itertools.product(self.channels, self.components):
+            mask = allowed(pool.hand, pool.names, channels, components)
+            is_new = not any(torch.equal(mask, other) for _, _, other in found)
+            if is_new and int(mask.sum()) >= min(self.sizes):
+                found.append((channels, components, mask))
+        if not found:
+            raise ValueError(
+                "an empty selection: no group of this hand, search.channels="
+                f"{list(self.channels)} by search.components={list(self.components)}, has "
+                f"{min(self.sizes)} features, the least of search.sizes; add a group or a size"
+            )
+        return found
+
 
 class Searcher:
     """Scores candidates on surveys of the training recordings.
@@ -140,22 +160,15 @@ class Searcher:
         """All candidates, in an order that does not depend on the number of threads.
 
         Raises:
-            ValueError: if no group has a feature, or training bins do not allow validation.
+            ValueError: if training bins do not allow validation.
         """
         jobs: list[_Job] = [
-            (align, channels, components, mask, ranking)
+            (align, channels, components, mask, ranking, self.search.degrees)
             for align in self.search.aligns
-            for channels, components, mask in self._groups()
+            for channels, components, mask in self.search.groups(self.pool)
             for ranking in self.search.rankings
         ]
-        found = [each for scored in self._all(jobs, watch) for each in scored]
-        if not found:
-            raise ValueError(
-                f"an empty selection: no feature of this hand is in search.channels="
-                f"{list(self.search.channels)} with search.components="
-                f"{list(self.search.components)}; add a group, or a smaller one to search.sizes"
-            )
-        return found
+        return [each for scored in self._all(jobs, watch) for each in scored]
 
     def without_fingers(self, best: Candidate, watch: Watch) -> list[Candidate]:
         """Candidates like the best with one finger after the other left out, greedily."""
@@ -170,7 +183,8 @@ class Searcher:
             for finger in others:
                 mask = kept & ~of_fingers(hand, self.pool.names, [*dropped, finger])
                 label = f"{best.channels} without {' and '.join([*dropped, finger])}"
-                jobs.append((best.align, label, best.components, mask, best.ranking))
+                as_best = (best.components, mask, best.ranking, [best.degree])
+                jobs.append((best.align, label, *as_best))
             trials = self._all(jobs, watch)
             tops = [max((each.balanced_accuracy for each in own), default=-1.0) for own in trials]
             if max(tops) < 0:  # too few features are left for any size
@@ -195,18 +209,14 @@ class Searcher:
             pass
         return found
 
-    def _groups(self) -> Iterator[tuple[str, str, Tensor]]:
-        """Groups of channels and components that differ and are not empty."""
-        seen: list[Tensor] = []
-        for channels in self.search.channels:
-            for components in self.search.components:
-                mask = allowed(self.pool.hand, self.pool.names, channels, components)
-                if bool(mask.any()) and not any(torch.equal(mask, other) for other in seen):
-                    seen.append(mask)
-                    yield channels, components, mask
-
     def _scored(
-        self, align: Align, channels: str, components: str, mask: Tensor, ranking: str
+        self,
+        align: Align,
+        channels: str,
+        components: str,
+        mask: Tensor,
+        ranking: str,
+        degrees: Sequence[int],
     ) -> list[Candidate]:
         """The candidates of one ranking: of each degree and size the best C."""
         places = mask.nonzero().flatten()
@@ -219,7 +229,7 @@ class Searcher:
         scaled = fit_frame(self.recipe, survey, order)(sample.features)
         bins = TrainingBins(scaled, sample.is_slip, weights)
         found = []
-        for degree, size in itertools.product(self.search.degrees, sizes):
+        for degree, size in itertools.product(degrees, sizes):
             kernel = Polynomial(degree, offset_of(self.recipe))
             choices = [(size, kernel, penalty) for penalty in self.search.penalties]
             rows = validate(bins, sample.group, sample.group_names, choices, _quietly)

@@ -24,7 +24,13 @@ from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.ranking import rank_per_cost
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.timing import main, one_thread, time_calls, time_in_fresh_process
+from tactslip_torch.timing import (
+    Timing,
+    main,
+    one_thread,
+    time_calls,
+    time_in_fresh_process,
+)
 
 POOL = FeaturePool(HAND)
 
@@ -151,30 +157,34 @@ def test_a_stand_in_gives_finite_scores():
 # The clock -----------------------------------------------------------------------------------
 
 
+class Played:
+    """A clock and calls that are played: microseconds as given, interrupted if negative."""
+
+    def __init__(self, monkeypatch, *runs):
+        self.now, self.switches = 0, 0
+        self.left = iter([1, *(us for run in runs for us in run)])  # the first is not timed
+        monkeypatch.setattr("tactslip_torch.timing.time.perf_counter_ns", lambda: self.now)
+        monkeypatch.setattr("tactslip_torch.timing._interruptions", lambda: self.switches)
+
+    def __call__(self, given):
+        us = next(self.left)
+        self.now += 1000 * abs(us)
+        self.switches += us < 0
+
+
 def test_p50_and_p99_are_of_single_calls(monkeypatch):
-    """A clock that is played: 100 calls of 1..100 us, three runs, one of them ten times slower."""
-    now, step = [0], [0]
+    run = list(range(1, 101))
+    played = Played(monkeypatch, run[::-1], [10 * us for us in run], run)
+    # one run that a neighbour slows down does not decide
+    assert time_calls(played, [None], 100, runs=3) == Timing(51.0, 99.0, 100, 0.0)
 
-    def clock():
-        return now[0]
 
-    def call(given):
-        if given is not None:
-            return
-        run, number = divmod(step[0], 100)
-        step[0] += 1
-        now[0] += 1000 * (number + 1) * (10 if run == 1 else 1)
-
-    monkeypatch.setattr("tactslip_torch.timing.time.perf_counter_ns", clock)
-    warm = [torch.zeros(1)]
-    call(warm[0])
-    given = [None]
-    step[0] = -1  # the call that warms up is not timed
-    now[0] = 0
-    timing = time_calls(call, given, 100, runs=3)
-    assert timing.calls == 100
-    assert timing.p50_us == pytest.approx(51, abs=1)
-    assert timing.p99_us == pytest.approx(99, abs=1)
+def test_interrupted_calls_are_told_but_not_counted(monkeypatch):
+    run = list(range(1, 101))
+    played = Played(monkeypatch, [*run[:50], *[-5000] * 25, *run[50:]])
+    assert time_calls(played, [None], 100, runs=1) == Timing(51.0, 99.0, 100, 0.2)
+    played = Played(monkeypatch, [7, *[-5000] * 100])
+    assert time_calls(played, [None], 100, runs=1).p50_us == 5000  # hardly one was left alone
 
 
 def test_a_saved_detector_is_timed_in_a_process_of_its_own(tmp_path, capsys):

@@ -30,6 +30,11 @@ def pareto_table(found: Mapping[str, Any]) -> str:
         f"{limits['deadline_ms']:g} ms, compute {limits['compute_us']:g} us"
     )
     head.append(found["definition"])
+    interrupted = max(row["interrupted"] for row in found["front"])
+    head.append(
+        f"calls that the system interrupted do not count: at most {100 * interrupted:.1f} % of a "
+        "detector's"
+    )
     header = ["latency ms", "look-ahead", "bin", "hop", "compute us", "p50 us"]
     header += ["valid. %", "K", "deg.", "numbers", "filter", "channels", "components", "ranking"]
     rows = [

@@ -1,0 +1,265 @@
+"""Groups, the search and the front, each against its definition."""
+
+import itertools
+from dataclasses import replace
+
+import pytest
+import torch
+from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
+
+from tactslip_torch.cost import GROUPS, CostModel
+from tactslip_torch.data.splits import seen6
+from tactslip_torch.datamodule import SlipDataModule
+from tactslip_torch.features.groups import allowed, of_fingers
+from tactslip_torch.features.names import FeatureName, pool_names
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.selection import rank_features, t_scores
+from tactslip_torch.features.survey import Survey
+from tactslip_torch.front import Candidate, nondominated, worth_timing
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.latency import Latency
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.recipe import fit_frame, recalls_mean, stand_for
+from tactslip_torch.search import Search, Searcher
+from tactslip_torch.signals.filtering import ChannelFilter
+
+SMALL = {
+    "sizes": [3, 6],
+    "channels": ["all", "films", "gauges"],
+    "drop_fingers": True,
+    "components": ["all", "time"],
+    "rankings": ["t", "ccweighting", "per_cost"],
+    "degrees": [1, 2],
+    "aligns": ["centred"],
+    "arithmetics": ["double"],
+    "hops_ms": [5.0, 10.0],
+    "penalties": [0.1, 1.0],
+    "bins": 40,
+}
+RECIPE = small_recipe(balance="weights", compress=True, tail=0.01)
+HAND = HandLayout.paper24()
+
+
+def quietly(items, what):
+    return items
+
+
+def searcher(source=None, recipe=RECIPE, **changes):
+    source = source or SmallSet()
+    search = Search(**(SMALL | changes))
+    maker = small_maker(source)
+    fold = seen6(source.ids, seen=["a", "b", "c"])[0]
+    survey = Survey(len(maker.pool.names), search.bins)
+    for batch in SlipDataModule(maker, fold, 0).loader(["train"]):
+        name, material = str(batch.recording), batch.recording.material
+        survey.update(name, material, batch.features, batch.is_slip)
+    prices = dict.fromkeys(GROUPS, 1.0)
+    costs = CostModel(10.0, prices, prices, dict.fromkeys(search.sizes, 50.0), 2.0, 0.0)
+    filters = {"centred": maker.channel_filter}
+    return Searcher(search, recipe, maker.pool, costs, {"centred": survey}, filters)
+
+
+@pytest.fixture(scope="module")
+def searched():
+    made = searcher()
+    return made, made.candidates(quietly)
+
+
+# Groups ----------------------------------------------------------------------------------------
+
+
+def names_of(channels, components):
+    names = pool_names(HAND, 4)
+    mask = allowed(HAND, names, channels, components)
+    return {name for name, inside in zip(names, mask.tolist(), strict=True) if inside}
+
+
+def test_groups_hold_what_their_names_say():
+    everything = names_of("all", "all")
+    assert len(everything) == 2582
+    assert {name.channel[:2] for name in names_of("gauges", "all")} == {"SG"}
+    assert names_of("films", "all") == everything - names_of("gauges", "all")
+    costly = {"median", "mode", "iqr", "entropy"}
+    assert names_of("all", "unsorted") == {n for n in everything if n.descriptor not in costly}
+    assert {name.domain for name in names_of("all", "time")} == {"time"}
+    left = everything - names_of("all", "deep_spectra")
+    assert {name.component for name in left} == {"A1", "D1", "A2", "D2"}
+    assert {name.domain for name in left} == {"freq"}
+    with pytest.raises(ValueError, match=r"unknown group 'toes' or 'all', expected one of all"):
+        names_of("toes", "all")
+    with pytest.raises(ValueError, match=r"unknown group 'all' or 'cheap'"):
+        names_of("all", "cheap")
+
+
+def test_fingers_are_those_of_the_channels():
+    names = (FeatureName("SG1", "raw", "time", "mean"), FeatureName("PVDF10", "A1", "time", "std"))
+    assert of_fingers(HAND, names, ["little"]).tolist() == [True, False]
+    assert of_fingers(HAND, names, ["thumb", "index"]).tolist() == [False, True]
+
+
+# What is searched ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"channels": ["toes"]}, r"search.channels: unknown 'toes', expected some of all, films"),
+        ({"components": ["cheap"]}, r"search.components: unknown 'cheap', expected .* time"),
+        ({"rankings": ["best"]}, r"search.rankings: unknown 'best', expected some of t, cc"),
+        ({"aligns": ["left"]}, r"search.aligns: unknown 'left', expected some of centred"),
+        ({"arithmetics": ["half"]}, r"search.arithmetics: unknown 'half'"),
+        ({"sizes": []}, r"search.sizes is empty, expected at least one value"),
+        ({"rankings": []}, r"search.rankings is empty"),
+        ({"sizes": [0, 3]}, r"search.sizes must be positive, got 0"),
+        ({"hops_ms": [5.0, -1.0]}, r"search.hops_ms must be positive, got -1"),
+        ({"bins": 0}, r"search.bins must be positive, got 0"),
+        ({"degrees": [3]}, r"search.degrees must be of 1 and 2, got \[3\]"),
+    ],
+)
+def test_what_cannot_be_searched_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Search(**(SMALL | changes))
+
+
+def test_an_empty_selection_is_named():
+    made = searcher(sizes=[500], channels=["gauges"])
+    with pytest.raises(ValueError, match=r"an empty selection: no group .*=\['gauges'\]"):
+        made.candidates(quietly)
+
+
+# What is found ---------------------------------------------------------------------------------
+
+
+def test_every_group_ranking_head_and_size_is_there_once(searched):
+    _, candidates = searched
+    groups = {("all", "all"), ("all", "time"), ("films", "all"), ("films", "time")}
+    groups.add(("gauges", "all"))  # a gauge has no spectra: gauges in time are the same again
+    met = [(c.channels, c.components, c.ranking, c.degree, len(c.selected)) for c in candidates]
+    expected = itertools.product(groups, SMALL["rankings"], (1, 2), (3, 6))
+    assert sorted(met) == sorted((*group, *rest) for group, *rest in expected)
+    names = FeaturePool(SMALL_HAND).names
+    for each in candidates:
+        chosen = [names[index] for index in each.selected]
+        if each.channels == "films":
+            assert {name.channel for name in chosen} == {"PVDF1"}
+        if each.components == "time":
+            assert {name.domain for name in chosen} == {"time"}
+        # frames of 51 and 11 samples, half of them behind a sample
+        with_gauge = any(name.channel == "SG1" for name in chosen)
+        assert each.latency.look_ahead_ms == (12.5 if with_gauge else 2.5)
+        assert (each.latency.bin_ms, each.latency.hop_ms) == (50.0, 5.0)
+
+
+def test_t_ranks_as_the_t_test(searched):
+    made, candidates = searched
+    scores = t_scores(made.surveys["centred"].moments)
+    expected = tuple(rank_features(scores, 6).tolist())
+    found = [c for c in candidates if (c.ranking, c.channels, c.components) == ("t", "all", "all")]
+    assert {c.selected for c in found} == {expected, expected[:3]}
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_score_is_that_of_machines_that_never_met_the_material(searched, degree):
+    made, candidates = searched
+    (found,) = [
+        c
+        for c in candidates
+        if (c.channels, c.components, c.ranking, c.degree) == ("films", "all", "t", degree)
+        and len(c.selected) == 6
+    ]
+    survey = made.surveys["centred"]
+    sample = survey.sample.bins()
+    z = fit_frame(RECIPE, survey, found.selected)(sample.features)
+    weights = stand_for(sample, RECIPE, survey.moments.count.tolist())
+    by_penalty = {}
+    for penalty in SMALL["penalties"]:
+        scores = []
+        for index in range(len(sample.group_names)):
+            out = sample.group == index
+            training = TrainingBins(z[~out], sample.is_slip[~out], weights[~out])
+            head = fit_machine(training, penalty, Polynomial(degree, 0.5))
+            scores.append(recalls_mean(head(z[out]) >= 0, sample.is_slip[out]))
+        by_penalty[penalty] = scores
+    best = max(by_penalty, key=lambda penalty: sum(by_penalty[penalty]))
+    assert found.balanced_accuracy == pytest.approx(sum(by_penalty[best]) / 3)
+    assert list(found.by_group.values()) == pytest.approx(by_penalty[found.penalty])
+
+
+def test_the_number_of_threads_changes_nothing(searched):
+    made, candidates = searched
+    torch.set_num_threads(2)
+    try:
+        assert made.candidates(quietly) == candidates
+    finally:
+        torch.set_num_threads(1)
+
+
+def test_test_cycles_teach_nothing():
+    fold = seen6(SmallSet().ids, seen=["a", "b", "c"])[0]
+    loud = SmallSet(gains=dict.fromkeys(fold.having("test"), 9.0))
+    few = {"rankings": ["t"], "channels": ["all"], "components": ["all"], "degrees": [2]}
+    quiet = searcher(**few).candidates(quietly)
+    assert searcher(loud, **few).candidates(quietly) == quiet
+    loud = SmallSet(gains=dict.fromkeys(fold.having("train")[:3], 9.0))
+    assert searcher(loud, **few).candidates(quietly) != quiet
+
+
+def test_fingers_are_dropped_from_the_best_on():
+    made = searcher(rankings=["t"], components=["all"])
+    gauge, film = SMALL_HAND.channels
+    made.pool = FeaturePool(HandLayout((gauge, replace(film, finger="thumb"))))
+    candidates = made.candidates(quietly)
+    best = next(c for c in candidates if c.channels == "all" and c.degree == 2)
+    best = best._replace(selected=(0, 100))
+    found = made.without_fingers(best, quietly)
+    assert {c.channels for c in found} == {"all without index", "all without thumb"}
+    of_film = next(c for c in candidates if c.channels == "films" and len(c.selected) == 6)
+    without = [c for c in found if c.channels == "all without index" and len(c.selected) == 6]
+    assert without[0].selected == of_film.selected
+    alone = best._replace(selected=(0,))
+    assert made.without_fingers(alone, quietly) == []
+
+
+# The front -------------------------------------------------------------------------------------
+
+
+def test_the_front_is_what_nothing_beats(rng):
+    points = rng.integers(0, 6, (80, 3)).tolist()
+    kept = nondominated(points)
+
+    def beats(a, b):
+        return all(x <= y for x, y in zip(a, b, strict=True)) and a != b
+
+    expected = [
+        i
+        for i, own in enumerate(points)
+        if not any(beats(other, own) for other in points) and own not in points[:i]
+    ]
+    assert kept == expected
+    assert nondominated([]) == []
+
+
+def candidate(worst_ms, compute_us, accuracy):
+    latency = Latency(worst_ms - 55 - compute_us / 1000, 50.0, 5.0, compute_us)
+    return Candidate("centred", "all", "all", "t", 2, 0.1, (1,), accuracy, {}, latency)
+
+
+def test_worth_timing_puts_those_that_meet_the_limits_first():
+    line = [candidate(60.0 + i, 100.0 * (i + 1), 0.5 + 0.04 * i) for i in range(10)]
+    beaten = candidate(75.0, 990.0, 0.4)
+    everything = worth_timing([*line, beaten], 80.0, 500.0, 30)
+    assert sorted(everything, key=lambda c: c.point) == line
+    assert everything[0] == line[4]  # the most accurate within 500 us
+    few = worth_timing([beaten, *line], 80.0, 500.0, 4)
+    assert few[:2] == [line[4], line[3]]
+    assert few[2:] == [line[0], line[9]]
+    assert worth_timing(line, 80.0, 500.0, 1) == [line[4]]
+    assert worth_timing(line, 10.0, 500.0, 1) == [line[9]]
+    assert len(worth_timing(line, 80.0, 500.0, 3)) == 3
+
+
+def test_look_ahead_is_that_of_the_filter():
+    made = searcher(channels=["gauges"], rankings=["t"], degrees=[1], sizes=[3])
+    made.filters = {"centred": ChannelFilter([51, 11], align="causal")}
+    assert {c.latency.look_ahead_ms for c in made.candidates(quietly)} == {0.0}

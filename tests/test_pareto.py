@@ -1,0 +1,356 @@
+"""``pareto`` as a command: what it writes, what it promises, and what it says when it cannot."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+from scipy import signal
+from test_commands import TinyRecordings, composed
+
+import tactslip_torch.pareto as command
+from tactslip_torch import SlipDetector
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.splits import unseen4
+from tactslip_torch.feature_maker import FeatureMaker
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.front import Candidate
+from tactslip_torch.latency import Latency
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.report.pareto import none_meets, pareto_table
+from tactslip_torch.search import Search
+from tactslip_torch.signals.binning import bins_at
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.timing import Timing
+from tactslip_torch.workshop import Workshop
+
+TINY = (
+    "data._target_=test_commands.TinyRecordings",
+    "data.materials=[A,B,C]",
+    "data.cycles=4",
+    "split.seen=[A,B]",
+    "split.unseen=[C]",
+    "split.train_share=0.5",
+    "search=quick",
+    "search.sizes=[4,8]",
+    "search.rankings=[t]",
+    "search.arithmetics=[double]",
+    "search.calls=10",
+    "search.most_timed=3",
+    "features.engine=eager",
+    "retime_calls=20",
+    "num_workers=0",
+)
+EASY = ("deadline_ms=500", "compute_us=400000")  # a busy machine keeps these too
+
+
+def run(folder, *overrides):
+    return command.pareto(composed(*TINY, *overrides, name="pareto"), folder)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pareto")
+    return folder, run(folder, *EASY)
+
+
+# What it leaves ----------------------------------------------------------------------------------
+
+
+def test_the_files_and_the_parts_of_the_promise(written):
+    folder, found = written
+    assert json.loads((folder / "pareto.json").read_text()) == found
+    names = {"pareto.json", "pareto.png", "detector.pt", "config.yaml"}
+    assert {path.name for path in folder.iterdir()} == names
+    assert (folder / "pareto.png").read_bytes().startswith(b"\x89PNG")
+    assert found["simulated"] is False
+    for row in [found["chosen"], *found["front"]]:
+        latency = row["latency"]
+        parts = [latency[name] for name in ("look_ahead_ms", "bin_ms", "hop_ms")]
+        assert latency["worst_ms"] == pytest.approx(sum(parts) + latency["compute_us"] / 1000)
+        assert latency["bin_ms"] == 50
+        assert latency["compute_us"] == row["p99_us"]
+        gauges = any(name.startswith("SG") for name in row["channels_read"])
+        waits = 0.0 if row["align"] == "causal" else 12.5 if gauges else 2.5
+        assert latency["look_ahead_ms"] == waits
+        assert len(row["selected"]) == row["num_features"]
+    chosen = found["chosen"]
+    assert chosen["latency"]["worst_ms"] <= 500
+    assert chosen["latency"]["hop_ms"] == 50  # the longest that keeps the deadline
+    assert chosen["validation"] == max(row["validation"] for row in found["front"])
+    assert chosen["fitted_to"] == "all training bins"
+
+
+def test_nothing_on_the_front_beats_another(written):
+    _, found = written
+    points = [(r["latency"]["worst_ms"], r["p99_us"], -r["validation"]) for r in found["front"]]
+    for own in points:
+        for other in points:
+            assert own == other or any(a > b for a, b in zip(other, own, strict=True))
+    assert found["searched"] == len(found["modelled"]) >= found["timed"] >= len(points)
+
+
+def test_the_detector_is_the_one_described_and_its_test_score_its_own(written):
+    folder, found = written
+    chosen, detector = found["chosen"], SlipDetector.load(folder / "detector.pt")
+    assert [str(name) for name in detector.selected_names] == chosen["selected"]
+    assert detector.channel_filter.align == chosen["align"]
+    assert detector.info["train_materials"] == ["A", "B"]
+    source = TinyRecordings(seed=0, cycles=4, materials=["A", "B", "C"])
+    fold = unseen4(source.ids, seen=["A", "B"], unseen=["C"], train_share=0.5)[0]
+    maker = FeatureMaker(source, detector.pool, detector.channel_filter, LabelRule())
+    truth, says = [], []
+    for recording in fold.having("test"):
+        bins = maker.lay_bins(source.timeline(recording))
+        filtered = detector.channel_filter(source.load(recording).samples.double())
+        score = detector.judge(bins_at(filtered, bins.starts, 100).float()).score
+        truth += bins.is_slip.tolist()
+        says += (score >= 0).tolist()
+    truth, says = np.array(truth), np.array(says)
+    recalls = [np.mean(says[truth == label] == label) for label in (False, True)]
+    assert chosen["test"]["num_bins"] == len(truth)
+    assert chosen["test"]["balanced_accuracy"] == pytest.approx(np.mean(recalls), abs=0.01)
+
+
+def test_the_table_says_what_the_files_do(written, capsys):
+    _, found = written
+    table = pareto_table(found)
+    rows = [line.split() for line in table.splitlines()]
+    for row in found["front"]:
+        cells = f"{row['latency']['worst_ms']:.2f}"
+        assert any(cells in line for line in rows)
+    assert "SIMULATED" not in table
+    assert found["definition"] in table
+    assert "look-ahead" in table
+    assert f"{100 * found['chosen']['test']['balanced_accuracy']:.2f} %" in table
+    assert "SIMULATED" in pareto_table(found | {"simulated": True})
+
+
+# Limits ------------------------------------------------------------------------------------------
+
+
+def fails(monkeypatch, capsys, tmp_path, *arguments):
+    """Exit status and the last line that the command leaves on standard error."""
+    monkeypatch.setattr(sys, "argv", ["pareto", *TINY, f"hydra.run.dir={tmp_path}", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        command.main()
+    return stopped.value.code, capsys.readouterr().err.strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["deadline_ms=55"], "deadline_ms=55 cannot be met: bin 50 ms, shortest hop 5 ms"),
+        (
+            ["search.aligns=[centred]", "deadline_ms=57.5"],
+            "least look-ahead 2.5 ms are 57.5 ms before any compute; give more, or a shorter",
+        ),
+        (["compute_us=0"], "compute_us must be a positive number, got 0"),
+        (["compute_us=-3"], "compute_us must be a positive number, got -3"),
+        (["deadline_ms=soon"], "deadline_ms must be a positive number, got 'soon'"),
+        (["search.channels=[toes]"], "search.channels: unknown 'toes', expected some of all"),
+        (["search.components=[cheap]"], "search.components: unknown 'cheap'"),
+        (["search.sizes=[]"], "search.sizes is empty, expected at least one value"),
+        (["split=leave_one_material_out"], "split has 10 folds"),
+        (["headroom=0.5"], "headroom must be at least 1, got 0.5"),
+        (["search.sizes=[5000]"], "an empty selection: no group of this hand"),
+    ],
+)
+def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, arguments, message):
+    if "split=leave_one_material_out" in arguments:
+        monkeypatch.setattr("test_pareto.TINY", tuple(o for o in TINY if "split." not in o))
+        materials = "M1,M2,M3,M4,M5,M6,iron,cloth,copper,wood"
+        arguments = [arguments[0], f"data.materials=[{materials}]"]
+    status, line = fails(monkeypatch, capsys, tmp_path, *arguments)
+    assert status == 2
+    assert line.startswith("error: ")
+    assert message in line
+    assert not (tmp_path / "pareto.json").exists()
+
+
+def test_none_that_meets_the_limits_is_said_plainly(monkeypatch, capsys, tmp_path):
+    status, line = fails(monkeypatch, capsys, tmp_path, "compute_us=1", "search.sizes=[4]")
+    assert status == 1
+    assert "no detector meets deadline_ms=80 and compute_us=1 with head-room 1.25" in line
+    assert "the quickest takes" in line
+    found = json.loads((tmp_path / "pareto.json").read_text())
+    assert found["chosen"] is None
+    assert found["front"]
+    assert (tmp_path / "pareto.png").exists()
+    assert not (tmp_path / "detector.pt").exists()
+    assert not (tmp_path / "trial.pt").exists()
+
+
+def test_one_that_fails_in_the_fresh_process_gives_way_to_the_next(monkeypatch, tmp_path):
+    given = iter([900_000.0, 100.0, 100.0])
+
+    def played(path, calls, engine):
+        assert path.exists()
+        return Timing(50.0, next(given), calls)
+
+    monkeypatch.setattr(command, "time_in_fresh_process", played)
+    found = run(tmp_path, *EASY)
+    first, second, third = found["tries"]
+    assert first["misses"][1] == "compute 900000 us above compute_us=400000"
+    assert second["selected"] == third["selected"] == found["chosen"]["selected"]
+    assert (second["misses"], third["misses"]) == ([], [])
+    assert first["validation"] >= found["chosen"]["validation"]
+    assert first["selected"] != second["selected"]
+    assert found["chosen"]["p99_us"] == 100
+    assert "sample" not in third["fitted_to"]
+
+
+def test_all_that_fail_there_leave_none(monkeypatch, tmp_path):
+    slow = Timing(50.0, 900_000.0, 20)
+    monkeypatch.setattr(command, "time_in_fresh_process", lambda *a: slow)
+    found = run(tmp_path, *EASY, "tries=2")
+    assert found["chosen"] is None
+    assert len(found["tries"]) == 2
+    assert "of 2 tried again the last misses by latency" in none_meets(found)
+    assert not (tmp_path / "detector.pt").exists()
+
+
+def test_unseen_materials_are_never_read(monkeypatch, tmp_path):
+    read = []
+    load = TinyRecordings.load
+
+    def watched(self, recording, windows=None):
+        read.append(str(recording))
+        return load(self, recording, windows)
+
+    monkeypatch.setattr(TinyRecordings, "load", watched)
+    monkeypatch.setattr(command, "time_in_fresh_process", lambda *a: Timing(50.0, 100.0, 20))
+    run(tmp_path, *EASY, "cache=off", "search.sizes=[4]")
+    assert {name[0] for name in read} == {"A", "B"}
+    # the test cycles once and at the end, by the detector that was chosen by then
+    source = TinyRecordings(seed=0, cycles=4, materials=["A", "B", "C"])
+    fold = unseen4(source.ids, seen=["A", "B"], unseen=["C"], train_share=0.5)[0]
+    test = [str(recording) for recording in fold.having("test")]
+    assert read[-len(test) :] == test
+    assert not set(test) & set(read[: -len(test)])
+
+
+# The workshop ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def shop():
+    source = TinyRecordings(seed=0, cycles=4, materials=["A", "B"])
+    fold = unseen4(source.ids, seen=["A"], unseen=["B"], train_share=0.5)[0]
+    config = composed(*TINY, name="pareto").search
+    search = Search(**{k: v for k, v in config.items() if k != "_target_"})
+    lengths = [51, 51, 11, 11]
+    makers = {
+        align: FeatureMaker(
+            source, FeaturePool(source.hand), ChannelFilter(lengths, align=align), LabelRule()
+        )
+        for align in ("centred", "causal")
+    }
+    recipe = composed(*TINY, name="pareto").recipe
+    from hydra.utils import instantiate
+
+    made = Workshop(makers, fold, search, instantiate(recipe, _convert_="all"), num_workers=0)
+    made.look()
+    return made
+
+
+def candidate(**changes):
+    parts = {
+        "align": "causal",
+        "channels": "all",
+        "components": "all",
+        "ranking": "t",
+        "degree": 1,
+        "penalty": 0.01,
+        "selected": (3, 40, 300, 17),
+        "balanced_accuracy": 0.9,
+        "by_group": {},
+        "latency": Latency(0.0, 50.0, 5.0, 100.0),
+    }
+    return Candidate(**(parts | changes))
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_machine_of_all_bins_is_that_of_all_bins(shop, degree):
+    chosen = candidate(degree=degree)
+    detector = shop.make(chosen, "double", from_all=True)
+    assert detector.info["fitted_to"] == "all training bins"
+    maker = shop.makers["causal"]
+    features, labels = [], []
+    for recording in shop.fold.having("train"):
+        batch = maker(recording, shop.fold)
+        features.append(batch.features[:, list(chosen.selected)].double())
+        labels.append(batch.is_slip)
+    z, is_slip = detector.scaler(torch.cat(features)), torch.cat(labels)
+    counts = torch.bincount(is_slip.long()).double()
+    weights = (len(z) / (2 * counts))[is_slip.long()]
+    training = TrainingBins(z, is_slip, weights)
+    head = fit_machine(training, 0.01, Polynomial(degree, 0.5), route="dual")
+    torch.testing.assert_close(detector.head(z), head(z), rtol=1e-6, atol=1e-6)
+
+
+def test_a_large_quadratic_head_keeps_to_the_sample(shop):
+    shop.most_summed = 3
+    try:
+        quadratic = shop.make(candidate(degree=2), "double", from_all=True)
+        linear = shop.make(candidate(degree=1), "double", from_all=True)
+    finally:
+        shop.most_summed = 120
+    assert quadratic.info["fitted_to"] == "30 training bins of each material and class"
+    assert linear.info["fitted_to"] == "all training bins"
+
+
+def test_arithmetic_is_the_pools(shop):
+    assert shop.make(candidate(), "native").pool.arithmetic == "native"
+    assert shop.make(candidate(), "double").pool.arithmetic == "double"
+
+
+# The causal filter in the experiment --------------------------------------------------------------
+
+
+def test_causal_features_are_of_causally_filtered_bins(shop):
+    centred, causal = (shop.makers[align] for align in ("centred", "causal"))
+    recording = shop.fold.having("train")[0]
+    assert centred.key(recording) != causal.key(recording)
+    samples = causal.source.load(recording).samples.double().numpy()
+    filtered = np.empty_like(samples)
+    for channel, window in enumerate((51, 51, 11, 11)):
+        taps = signal.savgol_coeffs(window, 1, pos=window - 1, use="dot")
+        frames = np.lib.stride_tricks.sliding_window_view(samples[channel], window)
+        filtered[channel, window - 1 :] = frames @ taps
+    bins = causal.lay_bins(causal.source.timeline(recording))
+    cut = bins_at(torch.from_numpy(filtered), bins.starts, 100)
+    expected = causal.pool(cut).float()
+    found = causal(recording, shop.fold).features
+    std = expected.std(0)
+    torch.testing.assert_close(found / std, expected / std, rtol=1e-4, atol=1e-4, equal_nan=True)
+
+
+def test_a_broken_sample_before_a_causal_bin_is_named():
+    source = TinyRecordings(seed=0, cycles=1, materials=["A"], scene={"broken": "A/0"})
+    maker = FeatureMaker(
+        source,
+        FeaturePool(source.hand),
+        ChannelFilter([51, 51, 11, 11], align="causal"),
+        LabelRule(),
+    )
+    fold = unseen4(
+        [*source.ids, *TinyRecordings(0, 2, ["B"]).ids], seen=["B"], unseen=["A"], train_share=0.5
+    )[0]
+    with pytest.raises(ValueError, match=r"A/0: channel SG1, sample 2000 \(1.0000 s\) is nan"):
+        maker(source.ids[0], fold)
+
+
+def test_a_saved_causal_detector_loads_as_causal(shop, tmp_path):
+    detector = shop.make(candidate(), "double")
+    detector.save(tmp_path / "a.pt")
+    loaded = SlipDetector.load(tmp_path / "a.pt")
+    assert loaded.channel_filter.align == "causal"
+    raw = torch.randn(5, 4, 150)
+    assert torch.equal(loaded.judge_raw(raw).score, detector.judge_raw(raw).score)
+    changed = raw.clone()
+    changed[..., :50] += 1  # all context lies before the bin
+    moved = loaded.judge_raw(changed).score - loaded.judge_raw(raw).score
+    assert (moved != 0).any()
