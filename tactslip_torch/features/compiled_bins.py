@@ -206,6 +206,7 @@ def _in_frequency(
     width = desk.sums.size
     has_shares = steps.share_start[f + 1] > steps.share_start[f]
     total = desk.sums
+    low, high, _ = extent(y)
     for level in range(steps.chain.shape[2] - 1, -1, -1):
         how = steps.chain[LINES, f, level]
         if how == OWN:
@@ -228,7 +229,10 @@ def _in_frequency(
             if is_constant[b] < 0:
                 is_constant[b] = False
                 if not _is_alive(spectrum, steps):
-                    flat, value = _constant(y, steps.dense[b], scale, desk.shifted)
+                    flat = high - low < NOISE * scale / steps.gain[b]
+                    value = spectrum[0] / steps.ones[0] * scale
+                    if not flat:
+                        flat, value = _constant(y, steps.dense[b], scale, desk.shifted)
                     is_constant[b], centre[b] = flat, value + first if kind == 0 else 0.0
             gain, offset = 1.0, first * unit if kind == 0 else 0.0
             if is_constant[b]:

@@ -61,6 +61,7 @@ class Steps(NamedTuple):
         share_branch: band energy ratios.
         share_place: their columns.
         dense: ``[B, n, n]``, each branch as one matrix.
+        gain: ``[B]``, the most that a branch can span where the bin spans 1.
         ones: ``[2 L]``, spectrum of the constant 1, cosines before sines.
         frequency_hz: ``[L]``.
         growth: ``[2, n or L]``, what a value adds to the entropy, by its rank in its cell.
@@ -84,6 +85,7 @@ class Steps(NamedTuple):
     share_branch: Array
     share_place: Array
     dense: Array
+    gain: Array
     ones: Array
     frequency_hz: Array
     growth: Array
@@ -195,6 +197,7 @@ def steps_of(
     share_start, share_branch, share_place = _by_row(
         range(len(films)), [(films.index(s.channel), s.branch, s.place) for s in plan.shares]
     )
+    dense = np.stack([matrix.numpy() for matrix in maps.dense])
     growth = np.zeros((2, max(maps.num_samples, maps.num_lines)))
     for kind, num in enumerate((maps.num_samples, maps.num_lines)):
         growth[kind, :num] = entropy_growth(num)
@@ -214,7 +217,8 @@ def steps_of(
         share_start=share_start,
         share_branch=share_branch,
         share_place=share_place,
-        dense=np.stack([matrix.numpy() for matrix in maps.dense]),
+        dense=dense,
+        gain=2 * np.abs(dense).sum(-1).max(-1),
         ones=maps.ones_lines.numpy(),
         frequency_hz=maps.frequency_hz.numpy(),
         growth=growth,
