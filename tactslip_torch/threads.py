@@ -10,13 +10,14 @@ from __future__ import annotations
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import TypeVar
 
 import torch
 
 Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _POOLS: dict[tuple[int, int], ThreadPoolExecutor] = {}  # by process and number of threads
 _MAKING = threading.Lock()
@@ -73,6 +74,22 @@ def for_each(function: Callable[[Item], object], items: Iterable[Item]) -> None:
         wait(futures)
     for future in futures:
         future.result()
+
+
+def in_parts(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """What ``function`` returns for every item, in their order, made by ``for_each``.
+
+    Example:
+        >>> in_parts(torch.sum, torch.arange(6).split(4))
+        [tensor(6), tensor(9)]
+    """
+    results: dict[int, Result] = {}
+
+    def call(index: int) -> None:
+        results[index] = function(items[index])
+
+    for_each(call, range(len(items)))
+    return [results[index] for index in range(len(items))]
 
 
 def _pool(number: int) -> ThreadPoolExecutor:

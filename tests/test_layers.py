@@ -156,7 +156,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "hand",
         "files",
     ),
-    "model.detector": ("features.*", "signals.*", "model.*", "hand", "files"),
+    "model.detector": ("features.*", "signals.*", "model.*", "plain", "threads"),
     "report.*": ("report.*", "files"),
     "feature_maker": ("data.*", "simulation.*", "signals.*", "features.*", "hand"),
     "datamodule": ("feature_maker", "data.*", "features.*"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.threads import for_each
+from tactslip_torch.threads import for_each, in_parts
 
 
 @pytest.fixture(autouse=True)
@@ -144,3 +144,12 @@ def test_a_forked_child_makes_its_own_threads():
         os.kill(child, 9)
         os.waitpid(child, 0)
     assert ended == (child, 0)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_parts_come_back_in_their_order(number):
+    torch.set_num_threads(number)
+    starts = range(0, 30, 4)
+    expected = [sum(range(start, min(start + 4, 30))) for start in starts]
+    assert in_parts(lambda part: int(part.sum()), torch.arange(30).split(4)) == expected
+    assert in_parts(len, []) == []

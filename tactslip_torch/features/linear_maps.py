@@ -9,12 +9,13 @@ ptwt and torch.fft evaluated on an identity.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
+from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names
 
 RANK_TOLERANCE = 1e-12
@@ -50,24 +51,9 @@ class LinearMaps:
 
     @classmethod
     def of(cls, pool: FeaturePool) -> LinearMaps:
-        """The maps behind a pool's features."""
-        num = pool.bin_samples
-        spectrum = spectrum_matrix(num, pool.spectrum)
-        dense_lines = torch.cat([spectrum.real, spectrum.imag]).contiguous()
-        dense = branch_matrix(num, pool.wavelet, pool.level)
-        factors = [_low_rank(matrix) for matrix in dense]
-        names = branch_names(pool.level)
-        return cls(
-            branches=names,
-            is_approximation=tuple(name[0] == "A" for name in names),
-            dense=tuple(dense),
-            into=tuple(into for into, _ in factors),
-            out=tuple(out for _, out in factors),
-            lines=tuple((dense_lines @ out).contiguous() for _, out in factors),
-            dense_lines=dense_lines,
-            ones_lines=dense_lines.sum(-1),
-            frequency_hz=frequency_axis_hz(num, pool.sample_rate_hz, pool.spectrum),
-        )
+        """The maps behind a pool's features; made once, so do not write into them."""
+        facts = (pool.bin_samples, pool.sample_rate_hz, pool.wavelet, pool.level, pool.spectrum)
+        return _made(*facts)
 
     @property
     def num_samples(self) -> int:
@@ -78,6 +64,28 @@ class LinearMaps:
     def num_lines(self) -> int:
         """Lines of a spectrum."""
         return len(self.frequency_hz)
+
+
+@lru_cache(maxsize=16)
+def _made(
+    num: int, sample_rate_hz: float, wavelet: str, level: int, method: SpectrumMethod
+) -> LinearMaps:
+    spectrum = spectrum_matrix(num, method)
+    dense_lines = torch.cat([spectrum.real, spectrum.imag]).contiguous()
+    dense = branch_matrix(num, wavelet, level)
+    factors = [_low_rank(matrix) for matrix in dense]
+    names = branch_names(level)
+    return LinearMaps(
+        branches=names,
+        is_approximation=tuple(name[0] == "A" for name in names),
+        dense=tuple(dense),
+        into=tuple(into for into, _ in factors),
+        out=tuple(out for _, out in factors),
+        lines=tuple((dense_lines @ out).contiguous() for _, out in factors),
+        dense_lines=dense_lines,
+        ones_lines=dense_lines.sum(-1),
+        frequency_hz=frequency_axis_hz(num, sample_rate_hz, method),
+    )
 
 
 def _low_rank(matrix: Tensor) -> tuple[Tensor, Tensor]:

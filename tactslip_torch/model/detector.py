@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +19,12 @@ from tactslip_torch.features.pool import FeaturePool, saturating
 from tactslip_torch.model.detector_file import Head, damaged, read_detector, write_detector
 from tactslip_torch.model.judgement import Judgement, Nonfinite, check_nonfinite
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.plain import is_plain
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.threads import in_parts
+
+Said = TypeVar("Said", Tensor, Judgement)
+_PART_BINS = 64
 
 
 class SlipDetector(nn.Module):
@@ -117,7 +122,7 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: if the number of channels or samples is another.
         """
-        return saturating(self.score_features(self._features(bins)), bins.dtype)
+        return _in_parts(self._score, bins)
 
     def score_raw(self, samples: Tensor) -> Tensor:
         """Filter and score raw bins that come with ``context`` samples on each side.
@@ -129,7 +134,7 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: if the number of channels or samples is another.
         """
-        return saturating(self(self._filter(samples)), samples.dtype)
+        return _in_parts(self._score_raw, samples)
 
     def judge(self, bins: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
         """Score filtered bins of a hand whose sensors may fail: a finite score, and its validity.
@@ -149,7 +154,7 @@ class SlipDetector(nn.Module):
         """
         self.pool.check(bins)
         check_nonfinite(nonfinite, bins, self.pool.hand.names)
-        return self._judge(bins, bins)
+        return _in_parts(self._judge, bins)
 
     def judge_raw(self, samples: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
         """``judge`` for raw bins that come with ``context`` samples on each side.
@@ -163,9 +168,9 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: as ``judge``.
         """
-        bins = self._filter(samples)
+        self.channel_filter.check(samples)
         check_nonfinite(nonfinite, samples, self.pool.hand.names)
-        return self._judge(bins, bins.to(samples.dtype))  # sensors resolve no more than they give
+        return _in_parts(self._judge_raw, samples)
 
     def validity(self, bins: Tensor) -> Tensor:
         """Whether every channel in use can be trusted (``FeaturePool.validity``), as ``judge``.
@@ -186,8 +191,19 @@ class SlipDetector(nn.Module):
         score: Tensor = self.head(self._scale(features))
         return score
 
-    def _judge(self, bins: Tensor, given: Tensor) -> Judgement:
+    def _score(self, bins: Tensor) -> Tensor:
+        return saturating(self.score_features(self._features(bins)), bins.dtype)
+
+    def _score_raw(self, samples: Tensor) -> Tensor:
+        return saturating(self._score(self._filter(samples)), samples.dtype)
+
+    def _judge_raw(self, samples: Tensor) -> Judgement:
+        bins = self._filter(samples)
+        return self._judge(bins, bins.to(samples.dtype))  # sensors resolve no more than they give
+
+    def _judge(self, bins: Tensor, given: Tensor | None = None) -> Judgement:
         """Scores of filtered bins, valid by the dtype they were given in, which is the score's."""
+        given = bins if given is None else given
         bins = self.pool.widen(bins)
         is_missing = self.pool.is_missing(bins)
         is_whole = is_nowhere(is_missing)
@@ -243,3 +259,18 @@ class SlipDetector(nn.Module):
             return cls(*parts, engine=engine)
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise damaged(path, error) from error
+
+
+def _in_parts(judge: Callable[[Tensor], Said], x: Tensor) -> Said:
+    """What ``judge`` says of bins ``[*, C, n]``, of many in parts that stay in a cache."""
+    if not is_plain(x) or x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS:
+        return judge(x)
+
+    def joined(parts: Sequence[Tensor]) -> Tensor:
+        whole: Tensor = torch.cat(list(parts)).unflatten(0, x.shape[:-2])
+        return whole
+
+    found = in_parts(judge, x.flatten(0, -3).split(_PART_BINS))
+    if isinstance(found[0], Judgement):
+        return Judgement(*map(joined, zip(*found, strict=True)))
+    return joined(found)

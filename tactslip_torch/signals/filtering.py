@@ -188,7 +188,7 @@ class ChannelFilter(nn.Module):
         Raises:
             ValueError: if the number of channels is another, or ``T`` is shorter than a frame.
         """
-        self._check(samples)
+        self.check(samples)
         parts = [
             savgol_filter(_channels(samples, chosen), length, self.polyorder, self.align)
             for length, chosen in self._groups
@@ -212,7 +212,7 @@ class ChannelFilter(nn.Module):
         Raises:
             ValueError: if the number of channels is another, or nothing is left.
         """
-        self._check(samples)
+        self.check(samples)
         num_samples = samples.shape[-1] - 2 * self.context
         if num_samples < 1:
             raise ValueError(
@@ -235,7 +235,12 @@ class ChannelFilter(nn.Module):
                     parts.append(largest.expand(*kept.shape[:-1], num_samples))
         return _in_order(parts, order)
 
-    def _check(self, samples: Tensor) -> None:
+    def check(self, samples: Tensor) -> None:
+        """Refuse what are no samples of this hand.
+
+        Raises:
+            ValueError: if there are no axes of channels and time, or other channels.
+        """
         if samples.ndim < 2 or samples.shape[-2] != len(self.window_lengths):
             raise ValueError(
                 f"expected samples [*, {len(self.window_lengths)}, T] (channels, time), "

@@ -42,8 +42,8 @@ class ArmStroke:
     def travel_mm(self, time_s: Array) -> Array:
         """Distance from the stroke's origin, clamped before and after the stroke."""
         t = np.clip(time_s - self.start_s, 0.0, self.stop_s - self.start_s)
-        up = np.minimum(t, self.ramp_s)
-        down = np.maximum(t - (self.stop_s - self.start_s - self.ramp_s), 0.0)
+        up: Array = np.minimum(t, self.ramp_s)
+        down: Array = np.maximum(t - (self.stop_s - self.start_s - self.ramp_s), 0.0)
         half = 0.5 * self.acceleration_mm_s2
         return half * up * up + self.peak_mm_s * (t - up) - half * down * down
 
