@@ -17,6 +17,7 @@ from torch import Tensor
 from tactslip_torch.features.eager_constant import ROUNDING, Constants
 from tactslip_torch.features.eager_forming import Forming
 from tactslip_torch.features.eager_layout import Layout
+from tactslip_torch.features.eager_read import read_bins
 from tactslip_torch.features.eager_rows import PartRows
 from tactslip_torch.features.eager_scaling import InTime, Spectra
 from tactslip_torch.features.eager_scratch import Scratch
@@ -50,10 +51,15 @@ class EagerEngine:
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype of statistics must be float32 or float64, got {dtype}")
         self.dtype = dtype
+        self._channels = torch.tensor(plan.channels)
         self._layout = Layout(plan, LinearMaps.of(pool))
         self._constants = Constants(self._layout)
         self.chunk_bins = max(1, min(256, CHUNK_ROWS // max(1, len(self._layout.rows))))
         self._local = threading.local()
+
+    def read(self, bins: Tensor) -> tuple[Tensor, Tensor, Array]:
+        """What ``__call__`` takes, from bins of all channels (``read_bins``)."""
+        return read_bins(bins, self._channels)
 
     def __call__(self, x: Tensor, scale: Tensor, out: Tensor) -> None:
         """Write the features of some bins.

@@ -88,7 +88,7 @@ class Constants:
         for block in self._linear.freq:
             which, value = self._found(forming, known, block.branch, list(block.films))
             if which.any():
-                lines: Array = forming.lines[block.first : block.stop].numpy()
+                lines = forming.lines[block.first : block.stop]
                 lines[which] = value[which][:, None] * self._ones
 
     def mend_energies(self, forming: Forming, known: Known) -> None:

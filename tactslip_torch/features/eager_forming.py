@@ -1,26 +1,22 @@
 """Branch rows and lines of spectra of a number of bins: the products of ``Linear``, in memory.
 
 Rows come by kind (gauges, raw films, branches; spectra), then bins. Views of memory and the steps
-that fill it are made once for a number of bins, so that one bin costs few calls.
+that fill it are made once for a number of bins.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from tactslip_torch.features.eager_calls import Step, add, memory, multiply, product, run
 from tactslip_torch.features.eager_linear import Block, Linear
 from tactslip_torch.features.linear_maps import LinearMaps
 
 Array = np.ndarray[Any, Any]
-Step = Callable[[], object]
-FEW = 2**17
-"""Multiplications up to which NumPy's product is quicker to start, and uses one thread."""
 
 
 class Forming:
@@ -39,8 +35,8 @@ class Forming:
         bins: ``[films, M, n]``: films relative to the first sample, which stands in its place.
         watch: ``[films, M, branches]``: of watched branches, a sum no larger than the span.
         energies: ``[films, M, branches]``: of spectra that are no rows, for band energy ratios.
-        time: what fills each block of branches, once ``begin`` is done.
-        freq: what fills each block of spectra, after the blocks before it.
+        time: what fills branches, once ``begin`` is done.
+        freq: what fills spectra.
     """
 
     def __init__(self, linear: Linear, maps: LinearMaps, num_bins: int, has_raw: bool) -> None:
@@ -48,31 +44,30 @@ class Forming:
         gauges, films = len(linear.gauges), len(linear.films)
         before = gauges + (films if has_raw else 0)
         self.first: Array = np.zeros((gauges + films + 1, num_bins))
-        self.rows = _empty(before + _height(linear.time), num_bins, num)
-        self.lines = _empty(_height(linear.freq), num_bins, width)
-        films_there = _empty(films, num_bins, num)
-        self.bins: Array = films_there.numpy()
-        self._gauge_rows: Array = self.rows[:gauges].numpy()
-        self._raw_rows: Array = self.rows[gauges:before].numpy()
+        self.rows = memory(before + _height(linear.time), num_bins, num)
+        self.lines = memory(_height(linear.freq), num_bins, width)
+        self.bins = memory(films, num_bins, num)
+        self._gauge_rows, self._raw_rows = self.rows[:gauges], self.rows[gauges:before]
         self._gauges, self._films = index_of(linear.gauges), index_of(linear.films)
-        small = _empty(films, num_bins, linear.into.shape[1])
-        self.watch: Array = small.numpy()[..., linear.into.shape[1] - len(linear.watched) :]
+        into = linear.into.numpy()
+        small = memory(films, num_bins, into.shape[1])
+        self.watch = small[..., into.shape[1] - len(linear.watched) :]
         self._first_steps: list[Step] = []
-        if linear.into.shape[1]:
-            self._first_steps.append(_product(films_there, linear.into, small))
+        if into.size and films:
+            self._first_steps.append(product(_flat(self.bins), into, _flat(small)))
         shape = (len(linear.energy_films), num_bins)
         self.energies: Array = np.empty((*shape, len(linear.energy_branches)))
         if linear.energy_branches:
-            roots = _empty(*shape, linear.energy.shape[1])
-            some = _of_films(films_there, linear.energy_films, self._first_steps)
-            squares, starts = roots.numpy(), list(linear.energy_starts)
+            energy, starts = linear.energy.numpy(), list(linear.energy_starts)
+            roots = memory(*shape, energy.shape[1])
+            some = _of_films(self.bins, linear.energy_films, self._first_steps)
             self._first_steps += [
-                _product(some, linear.energy, roots),
-                partial(np.multiply, squares, squares, squares),
-                partial(np.add.reduceat, squares, starts, -1, None, self.energies),
+                product(_flat(some), energy, _flat(roots)),
+                multiply(roots, roots, roots),
+                partial(np.add.reduceat, roots, starts, -1, None, self.energies),
             ]
-        self.time = _steps(linear.time, films_there, small, self.rows[before:])
-        self.freq = _steps(linear.freq, films_there, small, self.lines)
+        self.time = _steps(linear.time, self.bins, small, self.rows[before:])
+        self.freq = _steps(linear.freq, self.bins, small, self.lines)
 
     def begin(self, x: Array) -> None:
         """Take in bins, form gauges, films and what all blocks start from.
@@ -92,8 +87,7 @@ class Forming:
             if len(self._raw_rows):
                 np.copyto(self._raw_rows, self.bins)
             self.bins[..., 0] = first[take]
-        for step in self._first_steps:
-            step()
+        run(self._first_steps)
 
 
 def index_of(places: Sequence[int]) -> slice | list[int]:
@@ -105,44 +99,37 @@ def index_of(places: Sequence[int]) -> slice | list[int]:
     return list(places)
 
 
-def _steps(
-    blocks: Sequence[Block], films: Tensor, small: Tensor, target: Tensor
-) -> list[list[Step]]:
-    """What fills each block's rows of ``target``, from films or from their small numbers."""
-    found: list[list[Step]] = []
+def _steps(blocks: Sequence[Block], films: Array, small: Array, target: Array) -> list[Step]:
+    """What fills ``target`` block by block, from films or from their small numbers."""
+    steps: list[Step] = []
     for block in blocks:
         out = target[block.first : block.stop]
-        steps: list[Step] = []
         if block.parts is not None:
             low, high = (target[blocks[part].first : blocks[part].stop] for part in block.parts)
-            steps.append(partial(torch.add, low, high, out=out))
+            steps.append(add(low, high, out))
         elif block.matrix is not None:
             source = films if block.columns is None else small[..., block.columns]
             some = _of_films(source, block.films, steps)
-            steps.append(_product(some, block.matrix, out))
-        found.append(steps)
-    return found
+            steps.append(product(_flat(some), block.matrix.numpy(), _flat(out)))
+    return steps
 
 
-def _of_films(source: Tensor, films: tuple[int, ...], steps: list[Step]) -> Tensor:
+def _of_films(source: Array, films: tuple[int, ...], steps: list[Step]) -> Array:
     """The part of ``[films, M, k]``, where it lies or copied together by a further step."""
     take = index_of(films)
     if isinstance(take, slice):
         return source[take]
-    found = _empty(len(films), *source.shape[1:])
-    steps.append(partial(torch.index_select, source, 0, torch.tensor(take), out=found))
+    found = memory(len(films), *source.shape[1:])
+    steps.append(partial(np.take, source, take, 0, found, "clip"))
     return found
 
 
-def _product(left: Tensor, right: Tensor, out: Tensor) -> Step:
-    left, out = left.flatten(0, 1), out.flatten(0, 1)
-    if left.shape[0] * left.shape[1] * right.shape[1] <= FEW:
-        return partial(np.matmul, left.numpy(), right.numpy(), out.numpy())
-    return partial(torch.mm, left, right, out=out)
-
-
-def _empty(*shape: int) -> Tensor:
-    return torch.empty(shape, dtype=torch.float64)
+def _flat(values: Array) -> Array:
+    """``[films, M, k]`` as ``[films * M, k]``, a view."""
+    num, bins, width = values.shape
+    step = values.strides[1]
+    shape, strides = (num * bins, width), (step, values.strides[2])
+    return np.lib.stride_tricks.as_strided(values, shape, strides)
 
 
 def _height(blocks: Sequence[Block]) -> int:

@@ -7,12 +7,14 @@ row never continues a run, so no run crosses from row to row.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 
 from tactslip_torch.features.descriptors import ENTROPY_LEVELS, HALF_SLACK, RUN_TOLERANCE
+from tactslip_torch.features.eager_calls import FEW, Step, least, memory, run, total
 from tactslip_torch.features.eager_scratch import Scratch
 from tactslip_torch.features.runs import entropy_growth
 
@@ -21,8 +23,6 @@ TOLERANCE = RUN_TOLERANCE[torch.float64] / (16 * torch.finfo(torch.float64).eps)
 """Of equal values, in parts of 16 eps of the size of the raw bin."""
 MIXED_TOLERANCE = 2.0**-22
 """Part of a value by which equal ones may differ in float32: the rounding of heights."""
-FEW = 4096
-"""Values in which runs are found one by one, which takes fewer calls."""
 
 
 def quantile_weights(num: int) -> tuple[Array, Array]:
@@ -80,21 +80,39 @@ class Ordered:
     """
 
     def __init__(self, scratch: Scratch, num_rows: int, num: int, num_quantised: int) -> None:
-        rows, self._quantised = num_rows * scratch.num_bins, num_quantised * scratch.num_bins
-        self._rows, self._work = scratch.ordered(rows, num), scratch.work(rows, num)
-        self.sorted: Array = self._rows.numpy()
-        self._gaps: Array = self._work.numpy()
+        rows, quantised = num_rows * scratch.num_bins, num_quantised * scratch.num_bins
+        self.sorted, self._gaps = scratch.ordered(rows, num), scratch.work(rows, num)
         self._ranks = scratch.counts(rows * num)
-        self._flags = scratch.flags(self._quantised * num)
-        growth = entropy_growth(num)
-        self._growth: Array = growth.to(scratch.dtype).numpy()
-        self._parts: Array = np.concatenate([[0.0], growth.cumsum(0).numpy()])
-        half = 0.5 + HALF_SLACK[scratch.dtype]
-        self._half = torch.tensor(half, dtype=scratch.dtype)
         self._rounding = MIXED_TOLERANCE if scratch.dtype == torch.float32 else 0.0
         places, weights = quantile_weights(num)
         self._places = places
         self._weights = np.ascontiguousarray(weights.T, dtype=self.sorted.dtype)
+        flat, gaps = self.sorted.reshape(-1), self._gaps
+        self._smallest = memory(rows, dtype=scratch.dtype)
+        self._finding_gaps: list[Step] = [
+            partial(np.subtract, flat[1:], flat[:-1], gaps.reshape(-1)[:-1]),
+            partial(np.copyto, gaps[:, -1], np.inf),
+            least(gaps, self._smallest),
+        ]
+        growth = entropy_growth(num)
+        self._growth: Array = growth.to(scratch.dtype).numpy()
+        self._parts: Array = np.concatenate([[0.0], growth.cumsum(0).numpy()])
+        self._sums = memory(quantised, dtype=scratch.dtype)
+        self._counted = scratch.work(quantised, num)
+        half = np.array(0.5 + HALF_SLACK[scratch.dtype], self.sorted.dtype)
+        levels = np.array(ENTROPY_LEVELS, self.sorted.dtype)
+        level, self._is_same, is_top = scratch.flags(quantised * num)
+        self._quantising: list[Step] = [
+            partial(np.multiply, self.sorted[:quantised], levels, self._counted),
+            partial(np.add, self._counted, half, self._counted),
+            partial(np.copyto, level, self._counted.reshape(-1), "unsafe"),
+            partial(np.equal, level[1:], level[:-1], self._is_same[1:]),
+            # the maximum always has the top level, so the second highest level joins it
+            partial(np.equal, level, np.uint8(ENTROPY_LEVELS), is_top),
+            partial(np.logical_or, self._is_same, is_top, self._is_same),
+            partial(np.copyto, self._is_same.reshape(quantised, num)[:, 0], False),
+        ]
+        self._adding_up = total(self._counted, self._sums)
 
     def quantiles(self) -> Array:
         """Median and interquartile range, ``[num_rows, 2]``."""
@@ -112,15 +130,13 @@ class Ordered:
             - floor: ``[num_rows]``, what was subtracted after rounding, as part of the span
             - output: ``[k]`` rows, ``[k]`` values
         """
-        flat, gaps = self.sorted.reshape(-1), self._gaps
-        np.subtract(flat[1:], flat[:-1], out=gaps.reshape(-1)[:-1])
-        gaps[:, -1] = np.inf
+        run(self._finding_gaps)
+        gaps, smallest = self._gaps, self._smallest
         wide = np.full_like(span, -1.0)  # the mode of a flat row is its smallest value
         np.divide(finest * TOLERANCE, span, out=wide, where=span > 0)
         wide += self._rounding * floor
         tolerance = wide.astype(gaps.dtype)
-        least = torch.amin(self._work, 1).numpy()
-        rows = np.flatnonzero(least <= tolerance + gaps.dtype.type(self._rounding))
+        rows = np.flatnonzero(smallest <= tolerance + gaps.dtype.type(self._rounding))
         if not len(rows):
             return rows, self.sorted[rows, 0]
         num = gaps.shape[1]
@@ -139,23 +155,16 @@ class Ordered:
 
     def entropy(self) -> Array:
         """Shannon entropy of the histogram of those rows that want it, in bits."""
-        work, ordered = self._work[: self._quantised], self._rows[: self._quantised]
-        values: Array = torch.add(self._half, ordered, alpha=ENTROPY_LEVELS, out=work).numpy()
-        level, is_same, is_top = self._flags
+        run(self._quantising)
+        values, is_same = self._counted, self._is_same
+        if values.size <= FEW:
+            return self._from_starts(np.flatnonzero(np.logical_not(is_same)), len(values))
         continues, spare, other = (each[: values.size] for each in self._ranks)
-        np.copyto(level, values.reshape(-1), casting="unsafe")
-        np.equal(level[1:], level[:-1], out=is_same[1:])
-        # the maximum always has the top level, so the second highest level joins it
-        np.equal(level, ENTROPY_LEVELS, out=is_top)
-        np.logical_or(is_same, is_top, out=is_same)
-        is_same.reshape(values.shape)[:, 0] = False
         np.copyto(continues, is_same)
-        if len(level) <= FEW:
-            return self._from_starts(np.flatnonzero(continues == 0), len(values))
         rank = rank_in_run(continues, spare, other)
         np.take(self._growth, rank, out=values.reshape(-1), mode="clip")
-        found: Array = torch.sum(work, 1).numpy()
-        return found
+        self._adding_up()
+        return self._sums
 
     def _from_starts(self, starts: Array, num_rows: int) -> Array:
         """Entropies from where runs start on the flat array; dear for many runs, quick for few."""
@@ -163,5 +172,7 @@ class Ordered:
         np.subtract(starts[1:], starts[:-1], out=counts[:-1])
         num = self.sorted.shape[1]
         counts[-1] = num_rows * num - starts[-1]
-        found: Array = np.bincount(starts // num, weights=self._parts[counts], minlength=num_rows)
+        found: Array = np.bincount(
+            starts // num, weights=self._parts.take(counts), minlength=num_rows
+        )
         return found

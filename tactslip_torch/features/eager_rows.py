@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 
+from tactslip_torch.features.eager_calls import Step, memory, multiply, run, subtract
 from tactslip_torch.features.eager_forming import index_of
 from tactslip_torch.features.eager_layout import Layout, Part
 from tactslip_torch.features.eager_order import Ordered
@@ -39,13 +39,11 @@ class PartRows:
         size = self._shape[0] * num_bins
         before = (part.split - part.first) * num_bins
         whole = slice(part.first * num_bins, part.stop * num_bins)
-        self._heights, self._work = scratch.heights(size, num), scratch.work(size, num)
-        self._values: Array = self._heights.numpy()
-        self._products: Array = self._work.numpy()
+        self._values, self._work = scratch.heights(size, num), scratch.work(size, num)
         kind = self._values.dtype
         self._ones: Array = np.ones(num, kind)
-        self._center: Array = np.empty(size, kind)
-        self._centers = torch.from_numpy(self._center)[:, None]
+        self._mean_height = memory(size, dtype=scratch.dtype)
+        self._centring = subtract(self._values, self._mean_height[:, None], self._values)
         self._here = {name: plane[whole] for name, plane in table.planes.items()}
         self._here |= {name: found[whole] for name, found in table.sums.items()}
         self._here |= {
@@ -58,7 +56,8 @@ class PartRows:
         spectra = {name: self._here[name][before:] for name in ("mean", "range", "least")}
         self._mean, self._span, self._least = spectra.values()
         hertz = maps.frequency_hz
-        self._hertz, self._axis = hertz.to(scratch.dtype), hertz.numpy().astype(kind)
+        self._hertz = (hertz * num**-0.5).numpy().astype(kind)  # so squares need no division
+        self._axis = (hertz / num).numpy().astype(kind)
         self._mean_hertz = float(hertz.mean())
         self._variance_hertz = float(hertz.var(correction=0))
         self._raw = scratch.raw
@@ -80,6 +79,12 @@ class PartRows:
         if axis and (part.stop - part.split) * scratch.num_bins <= FEW:
             axis = list(range(part.split - part.first, part.stop - part.first))
         self._weighed = index_of(axis) if axis else None
+        self._center = memory(len(axis) * scratch.num_bins, dtype=scratch.dtype)
+        self._distance = self._work[: len(self._center)]
+        self._measuring: list[Step] = [
+            subtract(self._hertz, self._center[:, None], self._distance),
+            multiply(self._distance, self._distance, self._distance),
+        ]
         entropy = here.get("entropy", [])
         ordered = {row for name in ORDERED for row in here.get(name, ())}
         self._sorted = index_of([*entropy, *sorted(ordered - {*entropy})])
@@ -94,19 +99,19 @@ class PartRows:
         """Leave what descriptors are made of in the table; heights are used up."""
         if self._order is not None:
             self._in_order(self._order)
-        center = np.vecdot(self._values, self._ones, out=self._center)
+        center = np.vecdot(self._values, self._ones, out=self._mean_height)
         center *= 1.0 / self._shape[2]
         np.multiply(center[self._spectra], self._span, out=self._mean)
         self._mean += self._least
         if self._weighed is not None:
             self._weigh(self._weighed)
         if self._has_moments:
-            self._heights.sub_(self._centers)
+            self._centring()
             self._moments()
 
     def _moments(self) -> None:
         """Sums over deviations from the mean."""
-        here, names, deviations, work = self._here, self._names, self._values, self._products
+        here, names, deviations, work = self._here, self._names, self._values, self._work
         if self._has_squares:
             np.vecdot(deviations, deviations, out=here["squares"])
         if "mean_deviation" in names:
@@ -129,24 +134,21 @@ class PartRows:
         """Centroid and spread, of a spectrum that is its least line and heights over it."""
         num_bins, num = self._shape[1:]
         weights = self._values.reshape(-1, num_bins, num)[rows].reshape(-1, num)
-        span, least = self._pick("range", rows), self._pick("least", rows)
-        inverse = self._pick("mean", rows) * num
-        inverse = 1.0 / np.maximum(inverse, TINIEST, out=inverse)  # of a zero spectrum both are 0
-        span, least = span * inverse, least * inverse * num
-        centroid = np.vecdot(weights, self._axis) * span
-        centroid += least * self._mean_hertz
+        mean = np.maximum(self._pick("mean", rows), TINIEST)  # of a zero spectrum both are 0
+        of_heights, of_least = self._pick("range", rows) / mean, self._pick("least", rows) / mean
+        centroid = np.vecdot(weights, self._axis)
+        centroid = centroid * of_heights
+        centroid += of_least * self._mean_hertz
         if "spectral_centroid" in self._names:
             self._put("spectral_centroid", rows, centroid)
         if "spectral_spread" in self._names:
-            center = torch.from_numpy(centroid.astype(weights.dtype))[:, None]
-            work = self._work[: len(weights)]
-            distance: Array = torch.sub(self._hertz, center, out=work).numpy()
-            np.multiply(distance, distance, out=distance)
+            np.multiply(centroid, num**-0.5, out=self._center, casting="same_kind")
+            run(self._measuring)
             around = centroid - self._mean_hertz
             around *= around
             around += self._variance_hertz
-            around *= least
-            around += np.vecdot(distance, weights) * span
+            around *= of_least
+            around += np.vecdot(self._distance, weights) * of_heights
             self._put("spectral_spread", rows, np.sqrt(around, out=around))
 
     def _in_order(self, order: Ordered) -> None:

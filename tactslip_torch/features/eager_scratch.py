@@ -1,4 +1,4 @@
-"""Memory that the parts of the eager engine use one after the other, so that it stays in cache."""
+"""Memory that the steps of the eager engine use one after the other."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
+from tactslip_torch.features.eager_calls import memory
 from tactslip_torch.features.eager_layout import Layout, Part
 
 Array = np.ndarray[Any, Any]
@@ -32,37 +32,35 @@ class Scratch:
     ) -> None:
         self.dtype, self.num_bins = dtype, num_bins
         num = max(layout.maps.num_samples, layout.maps.num_lines)
-        size = max((part.stop - part.first for part in parts), default=0) * num_bins * num
-        self._wide = torch.empty(size, dtype=torch.float64)
-        self._some = [torch.empty(size, dtype=dtype) for _ in range(3)]
-        counter = torch.uint8 if num <= 256 else torch.int16
-        self._counts = [torch.empty(size, dtype=counter) for _ in range(3)]
-        self._bytes = [torch.empty(size, dtype=torch.uint8) for _ in range(3)]
+        size = max(part.stop - part.first for part in parts) * num_bins * num
+        self._wide = memory(size)
+        self._some = [memory(size, dtype=dtype) for _ in range(3)]
+        self._counts = [np.empty(size, np.uint8 if num <= 256 else np.uint16) for _ in range(3)]
+        self._bytes = [np.empty(size, np.uint8) for _ in range(3)]
         raw = layout.num_before if layout.has_raw else 0
-        self.raw: Array = torch.empty(raw, num_bins, layout.maps.num_samples, dtype=dtype).numpy()
+        self.raw = memory(raw, num_bins, layout.maps.num_samples, dtype=dtype)
 
-    def wide(self, rows: int, num: int) -> Tensor:
+    def wide(self, rows: int, num: int) -> Array:
         """``[rows, num]``, float64."""
-        return self._wide[: rows * num].view(rows, num)
+        return self._wide[: rows * num].reshape(rows, num)
 
-    def heights(self, rows: int, num: int) -> Tensor:
+    def heights(self, rows: int, num: int) -> Array:
         """``[rows, num]``."""
-        return self._some[0][: rows * num].view(rows, num)
+        return self._some[0][: rows * num].reshape(rows, num)
 
-    def work(self, rows: int, num: int) -> Tensor:
+    def work(self, rows: int, num: int) -> Array:
         """``[rows, num]``, in which nothing stays from one descriptor to the next."""
-        return self._some[1][: rows * num].view(rows, num)
+        return self._some[1][: rows * num].reshape(rows, num)
 
-    def ordered(self, rows: int, num: int) -> Tensor:
+    def ordered(self, rows: int, num: int) -> Array:
         """``[rows, num]``, sorted values."""
-        return self._some[2][: rows * num].view(rows, num)
+        return self._some[2][: rows * num].reshape(rows, num)
 
     def counts(self, size: int) -> list[Array]:
         """Three times ``[size]``, unsigned integers that can count a row."""
-        found = [each[:size].numpy() for each in self._counts]
-        return [each.view(np.dtype(f"u{each.itemsize}")) for each in found]
+        return [each[:size] for each in self._counts]
 
     def flags(self, size: int) -> tuple[Array, Array, Array]:
         """``[size]`` bytes, and twice ``[size]`` bool."""
-        level, one, other = (each[:size].numpy() for each in self._bytes)
+        level, one, other = (each[:size] for each in self._bytes)
         return level, one.view(bool), other.view(bool)
