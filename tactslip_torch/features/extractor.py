@@ -15,10 +15,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from typing import Any, Literal, Protocol, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool, saturating
@@ -38,6 +38,15 @@ class Engine(Protocol):
     """
 
     chunk_bins: int
+
+    def read(self, bins: Tensor) -> tuple[Tensor, Tensor, np.ndarray[Any, Any]]:
+        """What ``__call__`` takes, in memory that is this thread's until its next call.
+
+        Shape:
+            - bins: ``[M, C, n]``, float32 or float64
+            - output: x and scale as below; ``[M]``, bool, whether a bin is ordinary: no NaN, no
+              Inf, and each magnitude 0 or within ``ordinary_sizes`` of float64
+        """
 
     def __call__(self, x: Tensor, scale: Tensor, out: Tensor) -> None:
         """Write the features of some bins.
@@ -146,25 +155,15 @@ class FeatureExtractor:
 
     def _carry_out(self, engine: Engine, bins: Tensor, out: Tensor) -> None:
         """The plan by an engine, and the reference for bins that are not ordinary."""
-        x = bins
-        if len(self.plan.channels) < bins.shape[1]:
-            x = x.index_select(1, self._channels)
-        x = x.double().contiguous()
-        low, high = x.aminmax(dim=-1)
-        scale = torch.maximum(high, -low)
-        size = scale.numpy()
-        if size.min() >= self._sizes[0] and size.max() <= self._sizes[1]:
-            engine(x, scale, out)
-            return
-        is_ordinary = ((size >= self._sizes[0]) & (size <= self._sizes[1])) | (size == 0)
+        x, scale, is_ordinary = engine.read(bins)
         if is_ordinary.all():
             engine(x, scale, out)
             return
-        strange = torch.from_numpy(~is_ordinary.all(axis=1))
-        # the engine sees zeros there: so the bits of a bin do not depend on its neighbours
-        x = torch.where(strange[:, None, None], 0.0, x)
-        engine(x, torch.where(strange[:, None], 0.0, scale), out)
-        for index in strange.nonzero().flatten().tolist():
+        # the engine sees zeros in their place: so the bits of a bin do not depend on its neighbours
+        strange = (~is_ordinary).nonzero()[0].tolist()
+        x[strange], scale[strange] = 0.0, 0.0
+        engine(x, scale, out)
+        for index in strange:
             out[index] = self._reference(bins[index], out.dtype)
 
     def _reference(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
@@ -192,8 +191,6 @@ class FeatureExtractor:
     def _start(self) -> None:
         self._engines: dict[torch.dtype, Engine] = {}
         self._making = threading.Lock()
-        self._channels = torch.tensor(self.plan.channels)
-        self._sizes = ordinary_sizes(torch.float64)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without engines, which hold workspaces of threads."""
