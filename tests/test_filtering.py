@@ -253,7 +253,7 @@ def test_only_the_channels_wanted_are_filtered(align, rng):
     samples[1, 0, 60] = torch.nan
     samples[2, 3, 80] = -torch.inf
     whole, part = smooth.valid(samples), smooth.valid(samples, {1, 2})
-    assert torch.equal(part[:, 1:3], whole[:, 1:3])
+    torch.testing.assert_close(part[:, 1:3], whole[:, 1:3], rtol=1e-13, atol=1e-14)
     start = smooth.context_before - smooth.reaches[3][0]
     in_frame = samples[0, 3, start : start + 110].abs().max()
     assert (part[0, 3] == in_frame).all()

@@ -137,7 +137,7 @@ class FeatureScaler(nn.Module):
             features = signed_log(features, self.knee)
         width = self.maximum - self.minimum
         if is_plain(width) and width.numel() and width.numpy().min() > 0:
-            return torch.sub(2 * ((features - self.minimum) / width), 1).clamp(-1, 1)
+            return (2 * ((features - self.minimum) / width) - 1).clamp(-1, 1)
         is_constant = width == 0
         relative = (features - self.minimum) / torch.where(is_constant, 1.0, width)
         scaled = (2 * relative - 1).clamp(-1, 1)

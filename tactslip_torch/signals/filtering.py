@@ -154,6 +154,7 @@ class ChannelFilter(nn.Module):
             for length in self.window_lengths
         }
         self._matrices: dict[tuple[int, int, torch.dtype, torch.device], Tensor] = {}
+        self._wanted: dict[tuple[int, ...] | None, list[tuple[int, list[int], bool]]] = {}
         self._groups = [  # frames and their channels, the frame of the first channel first
             (length, [i for i, own in enumerate(self.window_lengths) if own == length])
             for length in dict.fromkeys(self.window_lengths)
@@ -219,21 +220,30 @@ class ChannelFilter(nn.Module):
                 f"expected bins with {self.context_before} samples of context before and "
                 f"{self.context_after} behind, got {samples.shape[-1]} samples in all"
             )
-        wanted = frozenset(range(len(self.window_lengths)) if channels is None else channels)
-        parts, before, order = [], self.context_before, list[int]()
-        for length, own in self._groups:
-            start = before - reach(length, self.align)[0]
-            for chosen in ([c for c in own if c in wanted], [c for c in own if c not in wanted]):
-                if not chosen:
-                    continue
-                order += chosen
-                kept = _channels(samples, chosen).narrow(-1, start, num_samples + length - 1)
-                if chosen[0] in wanted:
-                    parts.append(kept @ self._matrix(length, num_samples, samples))
-                else:
-                    largest = torch.maximum(kept.amax(-1), -kept.amin(-1))[..., None]
-                    parts.append(largest.expand(*kept.shape[:-1], num_samples))
+        parts, order = [], list[int]()
+        for length, chosen, is_wanted in self._groups_for(channels):
+            order += chosen
+            start = self.context_before - reach(length, self.align)[0]
+            kept = _channels(samples, chosen).narrow(-1, start, num_samples + length - 1)
+            if is_wanted:
+                parts.append(kept.contiguous() @ self._matrix(length, num_samples, samples))
+            else:
+                largest = torch.maximum(kept.amax(-1), -kept.amin(-1))[..., None]
+                parts.append(largest.expand(*kept.shape[:-1], num_samples))
         return _in_order(parts, order)
+
+    def _groups_for(self, channels: Collection[int] | None) -> list[tuple[int, list[int], bool]]:
+        """Frames, channels of theirs, and whether these are wanted."""
+        key = None if channels is None else tuple(channels)
+        if key not in self._wanted:
+            wanted = range(len(self.window_lengths)) if key is None else frozenset(key)
+            groups = [
+                (length, [c for c in own if (c in wanted) == is_wanted], is_wanted)
+                for length, own in self._groups
+                for is_wanted in (True, False)
+            ]
+            self._wanted = {key: [group for group in groups if group[1]]}  # the last one asked for
+        return self._wanted[key]
 
     def check(self, samples: Tensor) -> None:
         """Refuse what are no samples of this hand.
