@@ -27,7 +27,7 @@ from tactslip_torch.features.plan import Plan
 from tactslip_torch.features.pool import FeaturePool
 
 Array = np.ndarray[Any, Any]
-CHUNK_ROWS = 2800
+CHUNK_ROWS = 2200
 """Rows in a chunk: fewer spend their time on starting calls, more on fetching from far memory."""
 _KEPT = 2  # workspaces of a thread: of whole chunks, and of the rest or of single bins
 

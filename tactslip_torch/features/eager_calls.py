@@ -15,7 +15,7 @@ import torch
 
 Array = np.ndarray[Any, Any]
 Step = Callable[[], object]
-FEW = 2**13
+FEW = 2**15
 """Values for which NumPy is the quicker one."""
 FEW_PRODUCTS = 2**17
 """Multiplications for which NumPy's product is, and uses one thread."""

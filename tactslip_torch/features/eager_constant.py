@@ -30,7 +30,8 @@ class Known:
     """What is known of branches in some bins.
 
     Args:
-        constant: ``[rows, M]``, which rows in time are constant; none if no one is.
+        constant: ``[rows, M]``, which rows in time are constant, though their film is not; none
+            if no one is.
         mean: ``[rows, M]``, of rows in time with their offset.
         finest: ``[films, M]``, ``ROUNDING`` of the sizes of raw bins.
         suspicious: ``[films, M, watched]``; none if nothing is.
@@ -60,9 +61,11 @@ class Constants:
         self._watches = bool(layout.linear.watched)
         self._ones: Array = layout.maps.ones_lines.numpy()
         self._row_of = np.full((len(layout.maps.branches), len(layout.linear.films)), -1)
+        self._film_of = np.zeros(layout.num_in_time, np.intp)
         for block in layout.linear.time:
             rows = range(layout.num_before + block.first, layout.num_before + block.stop)
             self._row_of[block.branch, list(block.films)] = rows
+            self._film_of[rows] = block.films
         self._dense: dict[int, Tensor] = {}
         for branch in layout.linear.watched:
             matrix = layout.maps.dense[branch].T.clone()
@@ -81,6 +84,11 @@ class Constants:
             suspicious = np.abs(forming.watch) < (finest * WATCH)[..., None]
             if not suspicious.any():
                 suspicious = None
+        if len(finest) and (constant is not None or suspicious is not None):
+            # of a film that stands still all is right
+            moves: Array = np.any(forming.bins[..., 1:], -1)
+            constant = _somewhere(constant, moves[self._film_of])
+            suspicious = _somewhere(suspicious, moves[..., None])
         return Known(constant, mean, finest, suspicious)
 
     def mend_spectra(self, forming: Forming, known: Known) -> None:
@@ -122,3 +130,11 @@ class Constants:
         if not self._maps.is_approximation[branch]:
             value[...] = 0.0
         return is_constant, value
+
+
+def _somewhere(mask: Array | None, other: Array) -> Array | None:
+    """Where both hold; none if nowhere."""
+    if mask is None:
+        return None
+    found: Array = mask & other
+    return found if found.any() else None

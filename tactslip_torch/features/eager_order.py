@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from tactslip_torch.features.descriptors import ENTROPY_LEVELS, HALF_SLACK, RUN_TOLERANCE
-from tactslip_torch.features.eager_calls import FEW, Step, least, memory, run, total
+from tactslip_torch.features.eager_calls import Step, least, memory, run, total
 from tactslip_torch.features.eager_scratch import Scratch
 from tactslip_torch.features.runs import entropy_growth
 
@@ -23,6 +23,8 @@ TOLERANCE = RUN_TOLERANCE[torch.float64] / (16 * torch.finfo(torch.float64).eps)
 """Of equal values, in parts of 16 eps of the size of the raw bin."""
 MIXED_TOLERANCE = 2.0**-22
 """Part of a value by which equal ones may differ in float32: the rounding of heights."""
+FEW_RUNS = 2**12
+"""Values in which runs are found one by one, which takes fewer calls."""
 
 
 def quantile_weights(num: int) -> tuple[Array, Array]:
@@ -157,7 +159,7 @@ class Ordered:
         """Shannon entropy of the histogram of those rows that want it, in bits."""
         run(self._quantising)
         values, is_same = self._counted, self._is_same
-        if values.size <= FEW:
+        if values.size <= FEW_RUNS:
             return self._from_starts(np.flatnonzero(np.logical_not(is_same)), len(values))
         continues, spare, other = (each[: values.size] for each in self._ranks)
         np.copyto(continues, is_same)
