@@ -20,9 +20,9 @@ from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.plan import make_plan
 
 numba = pytest.importorskip("numba")
-from tactslip_torch.features.compiled import CompiledEngine  # noqa: E402
-from tactslip_torch.features.compiled_jit import _folder, kernel  # noqa: E402
-from tactslip_torch.features.compiled_steps import ADD, OWN, chain_of  # noqa: E402
+from tactslip_torch.features.compiled.engine import CompiledEngine  # noqa: E402
+from tactslip_torch.features.compiled.jit import _folder, kernel  # noqa: E402
+from tactslip_torch.features.compiled.steps import ADD, OWN, chain_of  # noqa: E402
 
 STATISTICS = {"double": torch.float64, "mixed": torch.float32}
 HAND = some_hand("GFF")
@@ -250,7 +250,7 @@ def test_compiled_code_is_kept_apart_for_each_state_of_the_sources(tmp_path, mon
     assert before.parent.name == "__pycache__"
     assert _folder(str(tmp_path)) == tmp_path / before.name
     source = tmp_path / "compiled_other.py"
-    monkeypatch.setattr("tactslip_torch.features.compiled_jit.__file__", str(source))
+    monkeypatch.setattr("tactslip_torch.features.compiled.jit.__file__", str(source))
     source.write_text("a = 1")
     one = _folder("")
     source.write_text("a = 2")

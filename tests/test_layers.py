@@ -61,8 +61,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "features.guards",
         "features.runs",
     ),
-    "features.compiled*": (
-        "features.compiled*",
+    "features.compiled.*": (
+        "features.compiled.*",
         "features.plan",
         "features.linear_maps",
         "features.pool",
@@ -72,7 +72,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     ),
     "features.extractor": (
         "features.eager",
-        "features.compiled",
+        "features.compiled.engine",
         "features.plan",
         "features.linear_maps",
         "features.pool",
@@ -257,7 +257,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
         "report.certificate",
         "report.pareto",
     ),
-    "numba": ("features.compiled*",),
+    "numba": ("features.compiled.*",),
 }
 
 # These need torch and the standard library alone.

@@ -184,7 +184,7 @@ class FeatureExtractor:
             from tactslip_torch.features.eager import EagerEngine
 
             return EagerEngine(self.pool, self.plan, dtype)
-        from tactslip_torch.features.compiled import CompiledEngine  # numba takes a second
+        from tactslip_torch.features.compiled.engine import CompiledEngine  # numba takes a second
 
         return CompiledEngine(self.pool, self.plan, dtype)
 

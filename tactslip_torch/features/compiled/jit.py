@@ -81,6 +81,6 @@ def _folder(chosen: str) -> Path:
     """Where compiled code is kept: beneath ``NUMBA_CACHE_DIR`` if set, else beside the sources."""
     here = Path(__file__).parent
     digest = hashlib.sha256()
-    for source in sorted(here.glob("compiled*.py")):
+    for source in sorted(here.glob("*.py")):
         digest.update(source.read_bytes())
     return (Path(chosen) if chosen else here / "__pycache__") / digest.hexdigest()[:16]

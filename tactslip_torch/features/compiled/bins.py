@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from tactslip_torch.features.compiled_jit import Array, inner, kernel
-from tactslip_torch.features.compiled_rows import NOISE, Desk, extent, lines_row, scaled, time_row
-from tactslip_torch.features.compiled_steps import ADD, LINES, OWN, TIME, Steps
+from tactslip_torch.features.compiled.jit import Array, inner, kernel
+from tactslip_torch.features.compiled.rows import NOISE, Desk, extent, lines_row, scaled, time_row
+from tactslip_torch.features.compiled.steps import ADD, LINES, OWN, TIME, Steps
 
 
 @kernel

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tactslip_torch.features.compiled_jit import Array, inner, larger, smaller
-from tactslip_torch.features.compiled_steps import (
+from tactslip_torch.features.compiled.jit import Array, inner, larger, smaller
+from tactslip_torch.features.compiled.steps import (
     CENTROID,
     CORRELATION,
     CV,

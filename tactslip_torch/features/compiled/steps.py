@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactslip_torch.features.compiled_jit import Array
+from tactslip_torch.features.compiled.jit import Array
 from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
 from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import ORDERED, Plan

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from tactslip_torch.features.compiled_jit import Array, inner, kernel
-from tactslip_torch.features.compiled_steps import MEDIAN, MODE, Sorts
+from tactslip_torch.features.compiled.jit import Array, inner, kernel
+from tactslip_torch.features.compiled.steps import MEDIAN, MODE, Sorts
 
 
 @kernel

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tactslip_torch.features.compiled_jit import Array, careful_kernel, larger
+from tactslip_torch.features.compiled.jit import Array, careful_kernel, larger
 
 
 @careful_kernel

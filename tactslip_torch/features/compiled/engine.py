@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.compiled_bins import describe_bins
-from tactslip_torch.features.compiled_jit import Array
-from tactslip_torch.features.compiled_products import Products, ProductSpace
-from tactslip_torch.features.compiled_ranked import describe_sorted
-from tactslip_torch.features.compiled_read import read_bins
-from tactslip_torch.features.compiled_rows import Desk, desk_of
-from tactslip_torch.features.compiled_steps import (
+from tactslip_torch.features.compiled.bins import describe_bins
+from tactslip_torch.features.compiled.jit import Array
+from tactslip_torch.features.compiled.products import Products, ProductSpace
+from tactslip_torch.features.compiled.ranked import describe_sorted
+from tactslip_torch.features.compiled.read import read_bins
+from tactslip_torch.features.compiled.rows import Desk, desk_of
+from tactslip_torch.features.compiled.steps import (
     formings,
     sorted_rows,
     sorts_of,

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.compiled_jit import Array, kernel
-from tactslip_torch.features.compiled_steps import LINES, TIME, Forming, width_of
+from tactslip_torch.features.compiled.jit import Array, kernel
+from tactslip_torch.features.compiled.steps import LINES, TIME, Forming, width_of
 from tactslip_torch.features.linear_maps import LinearMaps
 
 

@@ -1,0 +1,1 @@
+"""The compiled engine: a plan of features carried out by kernels that numba compiles."""
