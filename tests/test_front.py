@@ -221,6 +221,30 @@ def test_fingers_are_dropped_from_the_best_on():
     assert made.without_fingers(alone, quietly) == []
 
 
+def test_each_finger_goes_that_is_missed_least(monkeypatch):
+    made = searcher(rankings=["t"], components=["all"])
+    made.pool = FeaturePool(HAND)
+    made._channel_of = [HAND.names.index(name.channel) for name in made.pool.names]
+    worth = {"little": 0.01, "ring": 0.3, "middle": 0.02, "index": 0.2, "thumb": 0.1}
+
+    def played(align, channels, components, mask, ranking, degrees):
+        gone = channels.split(" without ")[1].split(" and ")
+        inside = {
+            HAND.channel(n.channel).finger for n, m in zip(made.pool.names, mask, strict=True) if m
+        }
+        assert inside == set(worth) - set(gone)
+        assert degrees == [2]
+        return [candidate(60.0, 100.0, 0.9 - sum(worth[finger] for finger in gone))]
+
+    monkeypatch.setattr(made, "_scored", played)
+    one_of_each = [made._channel_of.index(channel) for channel in (0, 3, 6, 9, 12)]
+    best = candidate(60.0, 100.0, 0.9)._replace(selected=tuple(one_of_each))
+    found = made.without_fingers(best, quietly)
+    assert len(found) == 5 + 4 + 3 + 2
+    kept = [max(c.balanced_accuracy for c in part) for part in (found[:5], found[5:9], found[9:12])]
+    assert kept == pytest.approx([0.89, 0.87, 0.77])  # little, then middle, then the thumb
+
+
 # The front -------------------------------------------------------------------------------------
 
 

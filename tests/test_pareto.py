@@ -12,7 +12,7 @@ from test_commands import TinyRecordings, composed
 import tactslip_torch.pareto as command
 from tactslip_torch import SlipDetector
 from tactslip_torch.data.labels import LabelRule
-from tactslip_torch.data.splits import unseen4
+from tactslip_torch.data.splits import seen6, unseen4
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.front import Candidate
@@ -302,6 +302,22 @@ def test_a_large_quadratic_head_keeps_to_the_sample(shop):
     assert linear.info["fitted_to"] == "all training bins"
 
 
+@pytest.mark.parametrize(("align", "before", "after"), [("centred", 25, 25), ("causal", 50, 0)])
+def test_test_bins_come_with_the_context_of_their_filter(shop, monkeypatch, align, before, after):
+    detector = shop.make(candidate(align=align), "double")
+    given, judge_raw = [], detector.judge_raw
+    monkeypatch.setattr(detector, "judge_raw", lambda raw: given.append(raw) or judge_raw(raw))
+    found = shop.judged(detector)
+    expected = []
+    for recording in shop.fold.having("test"):
+        maker = shop.makers[align]
+        starts = maker.lay_bins(maker.source.timeline(recording)).starts.tolist()
+        samples = maker.source.load(recording).samples
+        expected += [samples[:, start - before : start + 100 + after] for start in starts]
+    assert torch.equal(torch.cat(given), torch.stack(expected))
+    assert found["num_bins"] == len(expected)
+
+
 def test_arithmetic_is_the_pools(shop):
     assert shop.make(candidate(), "native").pool.arithmetic == "native"
     assert shop.make(candidate(), "double").pool.arithmetic == "double"
@@ -328,18 +344,22 @@ def test_causal_features_are_of_causally_filtered_bins(shop):
     torch.testing.assert_close(found / std, expected / std, rtol=1e-4, atol=1e-4, equal_nan=True)
 
 
+class BrokenBefore(TinyRecordings):
+    """One sample is missing 30 before the first bin."""
+
+    def load(self, recording, windows=None):
+        loaded = super().load(recording, windows)
+        loaded.samples[0, 150] = torch.nan
+        return loaded
+
+
 def test_a_broken_sample_before_a_causal_bin_is_named():
-    source = TinyRecordings(seed=0, cycles=1, materials=["A"], scene={"broken": "A/0"})
-    maker = FeatureMaker(
-        source,
-        FeaturePool(source.hand),
-        ChannelFilter([51, 51, 11, 11], align="causal"),
-        LabelRule(),
-    )
-    fold = unseen4(
-        [*source.ids, *TinyRecordings(0, 2, ["B"]).ids], seen=["B"], unseen=["A"], train_share=0.5
-    )[0]
-    with pytest.raises(ValueError, match=r"A/0: channel SG1, sample 2000 \(1.0000 s\) is nan"):
+    source = BrokenBefore(seed=0, cycles=2, materials=["A"])
+    causal = ChannelFilter([51, 51, 11, 11], align="causal")
+    maker = FeatureMaker(source, FeaturePool(source.hand), causal, LabelRule())
+    assert int(maker.lay_bins(source.timeline(source.ids[0])).starts[0]) == 180
+    fold = seen6(source.ids, seen=["A"])[0]
+    with pytest.raises(ValueError, match=r"A/0: channel SG1, sample 150 \(0.0750 s\) is nan"):
         maker(source.ids[0], fold)
 
 
