@@ -14,9 +14,9 @@ from engine_bins import (
 )
 
 from tactslip_torch import FeaturePool, HandLayout
-from tactslip_torch.features.eager import EagerEngine
-from tactslip_torch.features.eager_linear import linear_of
-from tactslip_torch.features.eager_order import quantile_weights, rank_in_run
+from tactslip_torch.features.eager.engine import EagerEngine
+from tactslip_torch.features.eager.linear import linear_of
+from tactslip_torch.features.eager.order import quantile_weights, rank_in_run
 from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.signals.spectrum import amplitude_spectrum

@@ -52,8 +52,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
     ),
     "features.plan": ("features.names", "features.descriptors", "signals.*", "hand"),
     "features.linear_maps": ("features.pool", "features.guards", "signals.*"),
-    "features.eager*": (
-        "features.eager*",
+    "features.eager.*": (
+        "features.eager.*",
         "features.plan",
         "features.linear_maps",
         "features.pool",
@@ -71,7 +71,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "features.runs",
     ),
     "features.extractor": (
-        "features.eager",
+        "features.eager.engine",
         "features.compiled.engine",
         "features.plan",
         "features.linear_maps",

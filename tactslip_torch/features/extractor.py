@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.eager.engine import EagerEngine
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool, saturating
@@ -181,8 +182,6 @@ class FeatureExtractor:
 
     def _made(self, dtype: torch.dtype) -> Engine:
         if self.engine == "eager":
-            from tactslip_torch.features.eager import EagerEngine
-
             return EagerEngine(self.pool, self.plan, dtype)
         from tactslip_torch.features.compiled.engine import CompiledEngine  # numba takes a second
 

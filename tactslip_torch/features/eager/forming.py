@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from tactslip_torch.features.eager_calls import Step, add, memory, multiply, product, run
-from tactslip_torch.features.eager_linear import Block, Linear
+from tactslip_torch.features.eager.calls import Step, add, memory, multiply, product, run
+from tactslip_torch.features.eager.linear import Block, Linear
 from tactslip_torch.features.linear_maps import LinearMaps
 
 Array = np.ndarray[Any, Any]

@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.eager_constant import ROUNDING, Constants
-from tactslip_torch.features.eager_forming import Forming
-from tactslip_torch.features.eager_layout import Layout
-from tactslip_torch.features.eager_read import read_bins
-from tactslip_torch.features.eager_rows import PartRows
-from tactslip_torch.features.eager_scaling import InTime, Spectra
-from tactslip_torch.features.eager_scratch import Scratch
-from tactslip_torch.features.eager_table import Table
+from tactslip_torch.features.eager.constant import ROUNDING, Constants
+from tactslip_torch.features.eager.forming import Forming
+from tactslip_torch.features.eager.layout import Layout
+from tactslip_torch.features.eager.read import read_bins
+from tactslip_torch.features.eager.rows import PartRows
+from tactslip_torch.features.eager.scaling import InTime, Spectra
+from tactslip_torch.features.eager.scratch import Scratch
+from tactslip_torch.features.eager.table import Table
 from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import Plan
 from tactslip_torch.features.pool import FeaturePool

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from tactslip_torch.features.eager_calls import memory
-from tactslip_torch.features.eager_layout import Layout, Part
+from tactslip_torch.features.eager.calls import memory
+from tactslip_torch.features.eager.layout import Layout, Part
 
 Array = np.ndarray[Any, Any]
 

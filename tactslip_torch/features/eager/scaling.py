@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tactslip_torch.features.eager_calls import (
+from tactslip_torch.features.eager.calls import (
     Step,
     add,
     largest,
@@ -22,11 +22,11 @@ from tactslip_torch.features.eager_calls import (
     subtract,
     total,
 )
-from tactslip_torch.features.eager_constant import Constants, Known
-from tactslip_torch.features.eager_forming import Forming
-from tactslip_torch.features.eager_layout import Layout, Part
-from tactslip_torch.features.eager_scratch import Scratch
-from tactslip_torch.features.eager_table import TINIEST, Table
+from tactslip_torch.features.eager.constant import Constants, Known
+from tactslip_torch.features.eager.forming import Forming
+from tactslip_torch.features.eager.layout import Layout, Part
+from tactslip_torch.features.eager.scratch import Scratch
+from tactslip_torch.features.eager.table import TINIEST, Table
 
 Array = np.ndarray[Any, Any]
 FLATTEST = 1e-30

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tactslip_torch.features.descriptors import CV_FLOOR
-from tactslip_torch.features.eager_layout import Layout
+from tactslip_torch.features.eager.layout import Layout
 
 Array = np.ndarray[Any, Any]
 SUMS = frozenset({"mean_deviation", "median", "iqr", "skewness", "kurtosis", "correlation"})

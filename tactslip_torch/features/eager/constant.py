@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.eager_forming import Forming, index_of
-from tactslip_torch.features.eager_layout import Layout
+from tactslip_torch.features.eager.forming import Forming, index_of
+from tactslip_torch.features.eager.layout import Layout
 
 Array = np.ndarray[Any, Any]
 ROUNDING = 16 * torch.finfo(torch.float64).eps

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from tactslip_torch.features.eager_calls import Step, memory, multiply, run, subtract
-from tactslip_torch.features.eager_forming import index_of
-from tactslip_torch.features.eager_layout import Layout, Part
-from tactslip_torch.features.eager_order import Ordered
-from tactslip_torch.features.eager_scratch import Scratch
-from tactslip_torch.features.eager_table import TINIEST, Table
+from tactslip_torch.features.eager.calls import Step, memory, multiply, run, subtract
+from tactslip_torch.features.eager.forming import index_of
+from tactslip_torch.features.eager.layout import Layout, Part
+from tactslip_torch.features.eager.order import Ordered
+from tactslip_torch.features.eager.scratch import Scratch
+from tactslip_torch.features.eager.table import TINIEST, Table
 from tactslip_torch.features.plan import ORDERED
 
 Array = np.ndarray[Any, Any]

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from tactslip_torch.features.descriptors import ENTROPY_LEVELS, HALF_SLACK, RUN_TOLERANCE
-from tactslip_torch.features.eager_calls import Step, least, memory, run, total
-from tactslip_torch.features.eager_scratch import Scratch
+from tactslip_torch.features.eager.calls import Step, least, memory, run, total
+from tactslip_torch.features.eager.scratch import Scratch
 from tactslip_torch.features.runs import entropy_growth
 
 Array = np.ndarray[Any, Any]

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tactslip_torch.features.eager_linear import linear_of
+from tactslip_torch.features.eager.linear import linear_of
 from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import Plan, Row
 

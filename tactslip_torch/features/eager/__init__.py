@@ -1,0 +1,1 @@
+"""The eager engine: a plan of features carried out by calls of PyTorch and NumPy."""
