@@ -166,12 +166,13 @@ def measure_costs(
         for selected in watch(designs, "cost of feature groups"):
             extractor = FeatureExtractor(pool, selected, engine)
             timings.append(time_calls(extractor, bins, calls))
-        rest = {}
+        rest, tails = {}, []
         for size in sizes:
             some = _spread(range(len(pool.names)), size)
             of_features = time_calls(FeatureExtractor(pool, some, engine), bins, calls)
             detector = stand_in(pool, channel_filter, some, engine)
             whole = time_detector(detector, calls)
+            tails.append(whole.p99_us / whole.p50_us)
             rest[size] = max(whole.p50_us - of_features.p50_us, 0.0)
     taken = torch.tensor([timing.p50_us for timing in timings], dtype=torch.float64)
     counts = torch.stack([_counted(set().union(*(needed[i] for i in s))) for s in designs])
@@ -182,7 +183,7 @@ def measure_costs(
         group_us=dict(zip(names, prices[1 : 1 + len(names)].tolist(), strict=True)),
         part_us=dict(zip(names, prices[1 + len(names) :].tolist(), strict=True)),
         rest_us=rest,
-        tail=median(timing.p99_us / timing.p50_us for timing in timings),
+        tail=median(tails),
         error=float(((counts @ prices) / taken - 1).abs().median()),
     )
 

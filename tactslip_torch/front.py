@@ -58,20 +58,21 @@ def nondominated(points: Sequence[Sequence[float]]) -> list[int]:
     return sorted(kept)
 
 
-def worth_timing(
-    candidates: Sequence[Candidate], deadline_ms: float, compute_us: float, most: int
-) -> list[Candidate]:
-    """The candidates on the modelled front; of too many those that meet the limits come first.
+def worth_timing(candidates: Sequence[Candidate], most: int) -> list[Candidate]:
+    """The candidates on the modelled front, then those that would be without them, and so on.
 
-    Half of the places go to those that meet the limits, most accurate first; the others are spread
-    over the rest by compute, so that the front is known beyond the limits too.
+    A model errs, so what is close to the front is timed as well. Of a layer that is too large
+    those are taken that are spread over it by compute, from the cheapest to the dearest.
     """
-    front = [candidates[index] for index in nondominated([each.point for each in candidates])]
-    meeting = [each for each in front if not each.latency.misses(deadline_ms, compute_us)]
-    meeting.sort(key=lambda each: -each.balanced_accuracy)
-    first = meeting[: -(-most // 2)]
-    rest = sorted((each for each in front if each not in first), key=lambda each: each.point[1])
-    places = min(most - len(first), len(rest))
-    if places == 1:
-        return [*first, rest[-1]]
-    return first + [rest[i * (len(rest) - 1) // (places - 1)] for i in range(places)]
+    chosen: list[Candidate] = []
+    left = list(candidates)
+    while left and len(chosen) < most:
+        places = nondominated([each.point for each in left])
+        layer = sorted((left[place] for place in places), key=lambda each: each.point[1])
+        room = most - len(chosen)
+        if len(layer) > room:
+            steps = max(room - 1, 1)
+            layer = [layer[number * (len(layer) - 1) // steps] for number in range(room)]
+        chosen += layer
+        left = [each for place, each in enumerate(left) if place not in set(places)]
+    return chosen

@@ -18,6 +18,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import hydra
@@ -33,8 +34,8 @@ from tactslip_torch.experiment import common_facts, feature_cache, feature_parts
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.files import whole_file
-from tactslip_torch.front import nondominated, worth_timing
-from tactslip_torch.latency import DEFINITION, Latency, least_latency_ms, longest_hop
+from tactslip_torch.front import Candidate, nondominated, worth_timing
+from tactslip_torch.latency import DEFINITION, Latency, least_latency_ms, longest_hop, shortest_hop
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.report.pareto import none_meets, pareto_figure, pareto_table
@@ -105,11 +106,9 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
             keeping = [each for each in candidates if not limits.misses(each.latency)]
             best = max(keeping or candidates, key=lambda each: each.balanced_accuracy)
             candidates += searcher.without_fingers(best, bar)
-        worth = worth_timing(
-            candidates, limits.deadline_ms, limits.compute_us, shop.search.most_timed
-        )
-        timed = shop.timed(worth)
+        timed = shop.timed(worth_timing(candidates, shop.search.most_timed))
         front = [timed[place] for place in nondominated([each.point for each in timed])]
+        scale = median(each.timing.p99_us / each.candidate.latency.compute_us for each in timed)
         chosen, tries = _chosen(config, limits, shop, timed, folder)
     source = next(iter(shop.makers.values())).source
     found = common_facts(source, shop.pool, config) | {
@@ -123,10 +122,8 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
         "front": [row_of(shop, each, each.latency, each.timing) for each in front],
         "timed": len(timed),
         "searched": len(candidates),
-        "modelled": [
-            [each.latency.worst_ms, each.latency.compute_us, each.balanced_accuracy]
-            for each in candidates
-        ],
+        "measured_over_modelled": scale,
+        "modelled": [_modelled(each, scale, limits) for each in candidates],
         "costs": costs.facts(),
         "seconds": time.perf_counter() - started,
     }
@@ -210,6 +207,13 @@ def _chosen(
     finally:
         trial.unlink(missing_ok=True)
     return None, tries
+
+
+def _modelled(candidate: Candidate, scale: float, limits: Limits) -> list[float]:
+    """Latency, compute and accuracy as modelled, brought to what was measured."""
+    latency = replace(candidate.latency, compute_us=scale * candidate.latency.compute_us)
+    latency = shortest_hop(latency, limits.hops_ms)
+    return [latency.worst_ms, latency.compute_us, candidate.balanced_accuracy]
 
 
 def _preferred(timed: Timed) -> tuple[float, bool, float]:

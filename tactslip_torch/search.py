@@ -85,7 +85,7 @@ class Search:
     bins: int = 100
     alpha: float = 0.7
     cost_power: float = 0.5
-    most_timed: int = 24
+    most_timed: int = 16
     calls: int = 400
 
     def __post_init__(self) -> None:

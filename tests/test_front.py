@@ -269,18 +269,16 @@ def candidate(worst_ms, compute_us, accuracy):
     return Candidate("centred", "all", "all", "t", 2, 0.1, (1,), accuracy, {}, latency)
 
 
-def test_worth_timing_puts_those_that_meet_the_limits_first():
+def test_worth_timing_goes_by_layers():
     line = [candidate(60.0 + i, 100.0 * (i + 1), 0.5 + 0.04 * i) for i in range(10)]
-    beaten = candidate(75.0, 990.0, 0.4)
-    everything = worth_timing([*line, beaten], 80.0, 500.0, 30)
-    assert sorted(everything, key=lambda c: c.point) == line
-    assert everything[0] == line[4]  # the most accurate within 500 us
-    few = worth_timing([beaten, *line], 80.0, 500.0, 4)
-    assert few[:2] == [line[4], line[3]]
-    assert few[2:] == [line[0], line[9]]
-    assert worth_timing(line, 80.0, 500.0, 1) == [line[4]]
-    assert worth_timing(line, 10.0, 500.0, 1) == [line[9]]
-    assert len(worth_timing(line, 80.0, 500.0, 3)) == 3
+    behind = [candidate(60.5 + i, 110.0 * (i + 1), 0.45 + 0.04 * i) for i in range(10)]
+    assert worth_timing([*behind, *line], 10) == line
+    more = worth_timing([*behind, *line], 13)
+    assert more[:10] == line
+    assert more[10:] == [behind[0], behind[4], behind[9]]
+    assert worth_timing([*behind, *line], 3) == [line[0], line[4], line[9]]
+    assert worth_timing(line, 1) == [line[0]]
+    assert worth_timing(line[:2] * 2, 30) == line[:2] * 2
 
 
 def test_look_ahead_is_that_of_the_filter():
