@@ -176,15 +176,17 @@ def _chosen(
 ) -> tuple[dict[str, Any] | None, list[dict[str, Any]]]:
     """The most accurate detector that meets the limits in a fresh process, or none; and the tries.
 
-    Those are tried that meet them with head-room: first as fitted to the sample, which takes as
-    long as what is then fitted to all bins and timed again. Only that one is kept.
+    Those that meet them with head-room are tried first, then those that just meet them; each as
+    fitted to the sample, which takes as long as what is then fitted to all bins and timed again.
+    Only that one is kept.
     """
     able: list[tuple[Timed, Latency]] = []
-    for each in timed:
-        latency = limits.latency(each.latency, config.headroom * each.timing.p99_us)
-        if not limits.misses(latency):
-            able.append((each, latency))
-    able.sort(key=lambda pair: _preferred(pair[0]))
+    for headroom in (config.headroom, 1.0):
+        tried = [each for each, _ in able]
+        for each in sorted((each for each in timed if each not in tried), key=_preferred):
+            latency = limits.latency(each.latency, headroom * each.timing.p99_us)
+            if not limits.misses(latency):
+                able.append((each, latency))
     tries: list[dict[str, Any]] = []
     trial = folder / "trial.pt"
     try:

@@ -173,8 +173,7 @@ def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, arguments, message
 def test_none_that_meets_the_limits_is_said_plainly(monkeypatch, capsys, tmp_path):
     status, line = fails(monkeypatch, capsys, tmp_path, "compute_us=1", "search.sizes=[4]")
     assert status == 1
-    assert "no detector meets deadline_ms=80 and compute_us=1 with head-room 1.25" in line
-    assert "the quickest takes" in line
+    assert "no detector meets deadline_ms=80 and compute_us=1: the quickest takes" in line
     found = json.loads((tmp_path / "pareto.json").read_text())
     assert found["chosen"] is None
     assert found["front"]
@@ -210,6 +209,22 @@ def test_all_that_fail_there_leave_none(monkeypatch, tmp_path):
     assert len(found["tries"]) == 2
     assert "of 2 tried again the last misses by latency" in none_meets(found)
     assert not (tmp_path / "detector.pt").exists()
+
+
+def test_those_without_head_room_come_last(monkeypatch, tmp_path):
+    met = []
+
+    def played(detector, calls):
+        met.append([str(name) for name in detector.selected_names])
+        return Timing(100.0, 100.0 * (len(met) + 2), calls)
+
+    monkeypatch.setattr("tactslip_torch.workshop.time_detector", played)
+    slow = Timing(50.0, 900_000.0, 20)
+    monkeypatch.setattr(command, "time_in_fresh_process", lambda *a: slow)
+    found = run(tmp_path, "deadline_ms=500", "compute_us=400", "headroom=1.3", "tries=9")
+    # 300, 400 and 500 us: the first has head-room, the second just meets the limit
+    assert len(met) == 3
+    assert [row["selected"] for row in found["tries"]] == met[:2]
 
 
 def test_unseen_materials_are_never_read(monkeypatch, tmp_path):

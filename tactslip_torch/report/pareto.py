@@ -49,7 +49,7 @@ def none_meets(found: Mapping[str, Any]) -> str:
     limits = found["limits"]
     line = (
         f"no detector meets deadline_ms={limits['deadline_ms']:g} and "
-        f"compute_us={limits['compute_us']:g} with head-room {found['headroom']:g}"
+        f"compute_us={limits['compute_us']:g}"
     )
     if found["tries"]:
         tried = found["tries"][-1]
@@ -139,7 +139,8 @@ def _verdict(found: Mapping[str, Any]) -> list[str]:
         f"chosen: {latency['worst_ms']:.2f} ms = look-ahead {latency['look_ahead_ms']:g} + bin "
         f"{latency['bin_ms']:g} + hop {latency['hop_ms']:g} + compute "
         f"{latency['compute_us'] / 1000:.3f} (p99 in a fresh process; p50 {chosen['p50_us']:.0f} "
-        f"us, {100 * latency['load']:.1f} % of a core)",
+        f"us, {100 * latency['load']:.1f} % of a core, "
+        f"{found['limits']['compute_us'] / latency['compute_us']:.2f} times faster than asked)",
         f"  {chosen['num_features']} features of {len(chosen['channels_read'])} channels, degree "
         f"{chosen['degree']}, {chosen['align']}, {chosen['arithmetic']}; fitted to "
         f"{chosen['fitted_to']}",
