@@ -206,11 +206,29 @@ def test_valid_keeps_its_matrices_to_itself(rng):
     wanting = x.clone().requires_grad_()
     again = layer.valid(wanting)
     again.sum().backward()
-    assert torch.equal(first, again)
+    torch.testing.assert_close(first, again, rtol=1e-13, atol=1e-13)
     assert layer.valid(x.float()).dtype == torch.float32
     assert layer.valid(x[:, :149]).shape == (4, 99)
     assert torch.equal(layer.valid(x), first)
     assert layer.state_dict() == {}
+
+
+@pytest.mark.parametrize("channels", [None, (1, 2), (3,), (0, 1, 2, 3)])
+@pytest.mark.parametrize("align", ["centred", "causal"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_few_bins_are_filtered_as_many_are(channels, align, dtype, rng):
+    x = torch.from_numpy(oracles.random_bins(rng, 9, 4, 150)).to(dtype)
+    x[0, 1, 40] = torch.nan
+    x[1, 0, 149 if align == "causal" else 0] = torch.inf
+    x[2, 3, 75] = -torch.inf
+    layer = ChannelFilter(WINDOW_OF_CHANNEL, align=align)
+    many = layer.valid(x, channels)
+    for few in (x[:1], x[:4], x[2], x.flip(-1)[:4].flip(-1)):
+        found = layer.valid(few, channels)
+        wanted = many[2] if few.ndim == 2 else many[: len(few)]
+        assert found.dtype == dtype
+        close = 1e-5 if dtype == torch.float32 else 1e-13
+        torch.testing.assert_close(found, wanted, rtol=close, atol=close, equal_nan=True)
 
 
 @pytest.mark.parametrize("align", ["centred", "causal"])

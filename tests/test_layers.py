@@ -26,7 +26,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "data.labels": ("data.recording",),
     "data.splits": ("data.recording",),
     "simulation.*": ("hand", "data.recording", "simulation.*"),
-    "signals.*": (),
+    "signals.*": ("plain",),
     "features.guards": ("plain",),
     "features.runs": (),
     "features.sample": ("features.guards", "plain"),

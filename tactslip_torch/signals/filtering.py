@@ -12,12 +12,17 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from typing import Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+
+from tactslip_torch.plain import is_plain
 
 Align = Literal["centred", "causal"]
 """Where in its frame a sample lies: ``"centred"`` in the middle, ``"causal"`` at the end."""
 _MOST_MATRICES = 16
+_FEW_BINS = 4
+_Group = tuple[int, int, list[int], bool]
 
 
 def fit_matrix(window_length: int, polyorder: int) -> Tensor:
@@ -132,13 +137,13 @@ class ChannelFilter(nn.Module):
         polyorder: order of the fitted polynomial.
         align: where in its frame a sample lies.
 
+    Attributes:
+        context: half the longest frame; a bin comes with twice as many samples around it.
+        context_before: samples needed before a bin to filter it exactly.
+        context_after: and behind it; 0 if causal.
+
     Raises:
         ValueError: if a frame is even or does not exceed the order, or the alignment is unknown.
-
-    Example:
-        >>> causal = ChannelFilter([51, 11], align="causal")
-        >>> causal.context_before, causal.context_after, causal.reaches
-        (50, 0, ((50, 0), (10, 0)))
     """
 
     def __init__(
@@ -153,8 +158,10 @@ class ChannelFilter(nn.Module):
             length: fit_matrix(length, polyorder)[reach(length, align)[0]]
             for length in self.window_lengths
         }
+        self.context = max(self.window_lengths) // 2
+        self.context_before, self.context_after = reach(max(self.window_lengths), align)
         self._matrices: dict[tuple[int, int, torch.dtype, torch.device], Tensor] = {}
-        self._wanted: dict[tuple[int, ...] | None, list[tuple[int, list[int], bool]]] = {}
+        self._wanted: dict[tuple[int, ...] | None, list[_Group]] = {}
         self._groups = [  # frames and their channels, the frame of the first channel first
             (length, [i for i, own in enumerate(self.window_lengths) if own == length])
             for length in dict.fromkeys(self.window_lengths)
@@ -164,21 +171,6 @@ class ChannelFilter(nn.Module):
     def reaches(self) -> tuple[tuple[int, int], ...]:
         """Samples before and after its own that each channel's frame takes in."""
         return tuple(reach(length, self.align) for length in self.window_lengths)
-
-    @property
-    def context(self) -> int:
-        """Half the longest frame; a bin comes with twice as many samples around it."""
-        return max(self.window_lengths) // 2
-
-    @property
-    def context_before(self) -> int:
-        """Samples needed before a bin to filter it exactly."""
-        return reach(max(self.window_lengths), self.align)[0]
-
-    @property
-    def context_after(self) -> int:
-        """Samples needed behind a bin to filter it exactly; 0 if causal."""
-        return reach(max(self.window_lengths), self.align)[1]
 
     def forward(self, samples: Tensor) -> Tensor:
         """Filter whole recordings.
@@ -220,10 +212,11 @@ class ChannelFilter(nn.Module):
                 f"expected bins with {self.context_before} samples of context before and "
                 f"{self.context_after} behind, got {samples.shape[-1]} samples in all"
             )
+        if is_plain(samples) and samples.shape[:-2].numel() <= _FEW_BINS:
+            return self._valid_of_few(samples, num_samples, channels)
         parts, order = [], list[int]()
-        for length, chosen, is_wanted in self._groups_for(channels):
+        for length, start, chosen, is_wanted in self._groups_for(channels):
             order += chosen
-            start = self.context_before - reach(length, self.align)[0]
             kept = _channels(samples, chosen).narrow(-1, start, num_samples + length - 1)
             if is_wanted:
                 parts.append(kept.contiguous() @ self._matrix(length, num_samples, samples))
@@ -232,17 +225,33 @@ class ChannelFilter(nn.Module):
                 parts.append(largest.expand(*kept.shape[:-1], num_samples))
         return _in_order(parts, order)
 
-    def _groups_for(self, channels: Collection[int] | None) -> list[tuple[int, list[int], bool]]:
-        """Frames, channels of theirs, and whether these are wanted."""
+    def _valid_of_few(
+        self, samples: Tensor, num_samples: int, channels: Collection[int] | None
+    ) -> Tensor:
+        """The same of few bins and no more than values: NumPy's calls take a third of the time."""
+        x = samples.detach().numpy()
+        filtered = np.empty((*x.shape[:-1], num_samples), x.dtype)
+        with np.errstate(all="ignore"):  # 0 times Inf is a NaN, as it should be
+            for length, start, chosen, is_wanted in self._groups_for(channels):
+                kept = x[..., chosen, start : start + num_samples + length - 1]
+                if is_wanted:
+                    matrix = self._matrix(length, num_samples, samples).numpy()
+                    filtered[..., chosen, :] = kept @ matrix
+                else:
+                    filtered[..., chosen, :] = np.abs(kept).max(-1, keepdims=True)
+        return torch.from_numpy(filtered)
+
+    def _groups_for(self, channels: Collection[int] | None) -> list[_Group]:
+        """Frames, where theirs starts, channels of theirs, and whether these are wanted."""
         key = None if channels is None else tuple(channels)
         if key not in self._wanted:
             wanted = range(len(self.window_lengths)) if key is None else frozenset(key)
-            groups = [
-                (length, [c for c in own if (c in wanted) == is_wanted], is_wanted)
-                for length, own in self._groups
-                for is_wanted in (True, False)
-            ]
-            self._wanted = {key: [group for group in groups if group[1]]}  # the last one asked for
+            self._wanted = {key: []}  # the last one asked for
+            for length, own in self._groups:
+                start = self.context_before - reach(length, self.align)[0]
+                for is_wanted in (True, False):
+                    if chosen := [c for c in own if (c in wanted) == is_wanted]:
+                        self._wanted[key].append((length, start, chosen, is_wanted))
         return self._wanted[key]
 
     def check(self, samples: Tensor) -> None:
