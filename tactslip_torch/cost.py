@@ -9,6 +9,7 @@ thread. The model prunes a search; what is promised is timed as a whole (``timin
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -60,7 +61,8 @@ class CostModel:
         base_us: of a call that does nothing.
         group_us: by group, once if any of its parts is needed.
         part_us: by group, of each of its parts.
-        rest_us: by number of features, what filter, scaling, head and checks add.
+        rest_us: what filter, scaling, head and checks add.
+        rest_of_one_us: and more for each feature.
         tail: p99 over p50, usually.
         error: median relative error on the timings it was fitted to.
     """
@@ -68,7 +70,8 @@ class CostModel:
     base_us: float
     group_us: Mapping[str, float]
     part_us: Mapping[str, float]
-    rest_us: Mapping[int, float]
+    rest_us: float
+    rest_of_one_us: float
     tail: float
     error: float
 
@@ -78,7 +81,8 @@ class CostModel:
 
     def compute_us(self, parts: set[Part], num_features: int) -> float:
         """p99 of a whole call, from raw samples to the decision."""
-        return self.tail * (self.features_us(parts) + self.rest_us[num_features])
+        rest_us = self.rest_us + num_features * self.rest_of_one_us
+        return self.tail * (self.features_us(parts) + rest_us)
 
     def bill(self, needed: Sequence[set[Part]]) -> tuple[Tensor, Tensor]:
         """What ``rank_per_cost`` takes: which parts each feature needs, and their prices.
@@ -97,7 +101,7 @@ class CostModel:
         prices = [round(1000 * self._price(part)) for part in parts]
         for index, (group, which) in enumerate(parts):
             if group == "columns" and which:
-                prices[index] += max(round(1000 * self._rest_of_one), 1)
+                prices[index] += max(round(1000 * self.rest_of_one_us), 1)
         return needs, torch.tensor(prices)
 
     def facts(self) -> dict[str, Any]:
@@ -108,16 +112,11 @@ class CostModel:
                 name: {"group_us": self.group_us[name], "part_us": self.part_us[name], "part": what}
                 for name, what in GROUPS.items()
             },
-            "rest_us": {str(size): value for size, value in self.rest_us.items()},
+            "rest_us": self.rest_us,
+            "rest_of_one_us": self.rest_of_one_us,
             "p99_over_p50": self.tail,
             "median_relative_error": self.error,
         }
-
-    @property
-    def _rest_of_one(self) -> float:
-        """What one more feature adds to the rest."""
-        least, most = min(self.rest_us), max(self.rest_us)
-        return (self.rest_us[most] - self.rest_us[least]) / max(most - least, 1)
 
     def _price(self, part: Part) -> float:
         group, which = part
@@ -160,20 +159,21 @@ def measure_costs(
     """
     needed = parts_of(make_plan(pool.hand, pool.level, pool.names))
     bins = single_bins(pool, pool.bin_samples)
-    timings = []
+    timings, sizes = [], sorted(set(sizes))
     designs = list(_designs(needed, sizes))
     with one_thread():
         for selected in watch(designs, "cost of feature groups"):
             extractor = FeatureExtractor(pool, selected, engine)
             timings.append(time_calls(extractor, bins, calls))
-        rest, tails = {}, []
+        rest, tails = [], []
         for size in sizes:
             some = _spread(range(len(pool.names)), size)
             of_features = time_calls(FeatureExtractor(pool, some, engine), bins, calls)
             detector = stand_in(pool, channel_filter, some, engine)
             whole = time_detector(detector, calls)
             tails.append(whole.p99_us / whole.p50_us)
-            rest[size] = max(whole.p50_us - of_features.p50_us, 0.0)
+            rest.append(whole.p50_us - of_features.p50_us)
+    rest_us, rest_of_one_us = _line(sizes, rest)
     taken = torch.tensor([timing.p50_us for timing in timings], dtype=torch.float64)
     counts = torch.stack([_counted(set().union(*(needed[i] for i in s))) for s in designs])
     prices = _nonnegative(counts / taken[:, None])
@@ -182,7 +182,8 @@ def measure_costs(
         base_us=float(prices[0]),
         group_us=dict(zip(names, prices[1 : 1 + len(names)].tolist(), strict=True)),
         part_us=dict(zip(names, prices[1 + len(names) :].tolist(), strict=True)),
-        rest_us=rest,
+        rest_us=rest_us,
+        rest_of_one_us=rest_of_one_us,
         tail=median(tails),
         error=float(((counts @ prices) / taken - 1).abs().median()),
     )
@@ -235,6 +236,18 @@ def _counted(parts: set[Part]) -> Tensor:
     counts += [float((group, ()) in parts) for group in GROUPS]
     counts += [float(sum(p[0] == group and p[1] != () for p in parts)) for group in GROUPS]
     return torch.tensor(counts, dtype=torch.float64)
+
+
+def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
+    """Height at 0 and slope, neither negative: medians, which one bad timing does not move.
+
+    Reference:
+        Sen (1968), Journal of the American Statistical Association 63, 1379-1389.
+    """
+    points = list(zip(x, y, strict=True))
+    slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.combinations(points, 2)]
+    slope = max(median(slopes), 0.0) if slopes else 0.0
+    return max(median(height - slope * place for place, height in points), 0.0), slope
 
 
 def _nonnegative(rows: Tensor) -> Tensor:

@@ -55,7 +55,7 @@ def searcher(source=None, recipe=RECIPE, **changes):
         name, material = str(batch.recording), batch.recording.material
         survey.update(name, material, batch.features, batch.is_slip)
     prices = dict.fromkeys(GROUPS, 1.0)
-    costs = CostModel(10.0, prices, prices, dict.fromkeys(search.sizes, 50.0), 2.0, 0.0)
+    costs = CostModel(10.0, prices, prices, 50.0, 0.0, 2.0, 0.0)
     filters = {"centred": maker.channel_filter}
     return Searcher(search, recipe, maker.pool, costs, {"centred": survey}, filters)
 
