@@ -82,13 +82,16 @@ def pareto_figure(found: Mapping[str, Any], path: str | Path) -> None:
     left.axvline(limits["deadline_ms"], color="black", linestyle=":", linewidth=1)
     left.set_xlabel("worst-case latency, onset to decision, ms")
     left.set_ylabel("balanced accuracy, a material left out, %")
-    left.set_title("shortest hop; dotted: the deadline", fontsize=10)
+    title = "front: shortest hop; chosen: longest that keeps the deadline (dotted)"
+    left.set_title(title, fontsize=10)
     _panel(right, found, lambda row: row["p99_us"], 1)
     right.axvline(limits["compute_us"], color="black", linestyle=":", linewidth=1)
     right.set_xscale("log")
+    for each in (right.xaxis.set_major_formatter, right.xaxis.set_minor_formatter):
+        each("{x:.0f}")
     right.set_xlabel("compute, raw samples to decision, p99, us")
     right.set_title("one bin, one thread; dotted: the limit", fontsize=10)
-    right.legend(frameon=False, loc="lower right", fontsize=9)
+    right.legend(loc="lower right", fontsize=9, edgecolor="none")
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=150)
 
