@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-HUGE_CV, FLOOR_CV = 1e4, 9e5
+from tactslip_torch.features.descriptors import CV_FLOOR
+
+FLOOR_CV = 0.9 / CV_FLOOR  # beyond it the floor stands in for the mean
 ELSEWHERE = 1e-4
 
 
@@ -17,8 +19,8 @@ def feature_errors(found: Tensor, reference: Tensor, names: Sequence[object]) ->
 
     An error is counted over max(magnitude of the reference, standard deviation of its column).
     Entropy, which steps, is in bits; a mode counts as elsewhere beyond 1e-4 of that size. A cv
-    beyond 1e4 is the rounding of a mean near 0: its inverse is compared as part of 1, and beyond
-    9e5, where the floor under the mean stands, without its sign.
+    about 1e6 has the floor in the place of its mean, which is rounding, its sign too: there the
+    sign may differ.
 
     Args:
         found: features to be judged.
@@ -42,13 +44,8 @@ def feature_errors(found: Tensor, reference: Tensor, names: Sequence[object]) ->
     distance = torch.where(is_finite, (found - reference).abs(), 0.0)
     relative = torch.where(distance == 0, 0.0, distance / size)
     is_cv = torch.tensor([kind == "cv" for kind in kinds])
-    is_huge = is_cv & is_finite & (reference.abs() > HUGE_CV)
-    inverse = (1 / found - 1 / reference).abs()
-    unsigned = (found.abs() - reference.abs()).abs() / size
-    inverse = torch.where(
-        reference.abs() > FLOOR_CV, torch.minimum(inverse, unsigned.nan_to_num(torch.inf)), inverse
-    )
-    relative = torch.where(is_huge, inverse, relative)
+    is_floor = is_cv & is_finite & (reference.abs() > FLOOR_CV)
+    relative = torch.where(is_floor, (found.abs() - reference.abs()).abs() / size, relative)
     worst: dict[str, float] = {}
     for kind in dict.fromkeys(kinds):
         mine = torch.tensor([other == kind for other in kinds])

@@ -27,8 +27,7 @@ DEGENERATE_KINDS = (
     "dead_channel",
 )
 KINDS = PLAIN_KINDS + DEGENERATE_KINDS
-HUGE_CV = 1e4  # beyond it cv is the rounding of a mean near 0; 1/cv, mean over std, is compared
-FLOOR_CV = 9e5  # here the mean is rounding altogether (descriptors.CV_FLOOR), its sign too
+FLOOR_CV = 9e5  # beyond it the mean is rounding (descriptors.CV_FLOOR), its sign too
 
 
 def some_hand(kinds: str) -> HandLayout:
@@ -84,9 +83,9 @@ def worst_errors(found: Tensor, reference: Tensor, names: Sequence[str]) -> dict
     """Largest error of each descriptor, over max(magnitude of the reference, std of its column).
 
     Entropy is in bits, and mode is the share of values that are elsewhere than the reference's by
-    1e-4 of that size. A cv beyond ``HUGE_CV`` in the reference counts by its inverse, as part of 1,
-    and without its sign where only the floor under the mean is left. A spread below 1e-5 of what is
-    usual is a root of rounding, and counts by its square.
+    1e-4 of that size. A cv beyond ``FLOOR_CV`` in the reference, where only the floor under the
+    mean is left, counts without its sign. A spread below 1e-5 of what is usual is a root of
+    rounding, and counts by its square.
     """
     assert found.shape == reference.shape == (len(found), len(names))
     assert reference.isfinite().all(), "the reference itself is not finite"
@@ -96,11 +95,8 @@ def worst_errors(found: Tensor, reference: Tensor, names: Sequence[str]) -> dict
     size = torch.maximum(reference.abs(), usual)
     error = (found - reference).abs()
     relative = torch.where(error == 0, 0.0, error / size)
-    huge = (reference.abs() > HUGE_CV) & torch.tensor([str(n).endswith("cv") for n in names])
-    inverse = (1 / found - 1 / reference).abs()
-    unsigned = (found.abs() - reference.abs()).abs() / size
-    inverse = torch.where(reference.abs() > FLOOR_CV, torch.minimum(inverse, unsigned), inverse)
-    relative = torch.where(huge, inverse, relative)
+    has_no_sign = (reference.abs() > FLOOR_CV) & torch.tensor([str(n)[-2:] == "cv" for n in names])
+    relative = torch.where(has_no_sign, (found.abs() - reference.abs()).abs() / size, relative)
     squared = (found.square() - reference.square()).abs() / size.square()
     is_spread = torch.tensor([str(n).endswith("spread") for n in names])
     relative = torch.where(is_spread & (reference < 1e-5 * size), squared, relative)

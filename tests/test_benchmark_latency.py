@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import clocks, selection
+from benchmarks import clocks, engines, selection
 from benchmarks.bins import raw_bins
 from benchmarks.detectors import Timed, timed_detector
 from benchmarks.engines import ENGINES, FLOAT32, FLOAT64
@@ -123,6 +123,24 @@ def test_the_loop_gives_the_detectors_score(timed: Timed, name: str, has_knee: b
     spread = float(wanted.std())
     assert score(1) == pytest.approx(float(wanted[1]), abs=1e-6 * spread)
     assert score(1 + sizes.bins) == score(1)
+
+
+def test_the_pruned_loop_filters_only_what_is_wanted(
+    timed: Timed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    savgol, seen = ways.loop.savgol, []
+
+    def counted(samples: Any, *rest: Any) -> Any:
+        seen.append(len(samples))
+        return savgol(samples, *rest)
+
+    monkeypatch.setattr(ways.loop, "savgol", counted)
+    few = replace(timed, selected=timed.selected[:2], scaler=FeatureScaler.fit(torch.eye(2)))
+    few = replace(few, z=timed.z[:, :2].contiguous(), head=lambda z: z[:, 0])
+    ways._looped(few, raw_bins(1).numpy(), few.selected)(0)
+    names = engines.pool_of(FLOAT64).names
+    assert seen == [len({names[index].channel for index in few.selected})]
+    assert seen[0] < 24
 
 
 # --------------------------------------------------------------------------------------- report

@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -78,10 +80,13 @@ def looped(
     return loop.features(bin_, names, pool.hand.names)
 
 
-def test_the_loop_filters_as_the_package(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("savgol", [loop.savgol, loop.savgol_in_groups])
+def test_the_loop_filters_as_the_package(
+    rng: np.random.Generator, savgol: Callable[..., NDArray[np.float64]]
+) -> None:
     filters = ChannelFilter([51] * 14 + [11] * 10)
     samples = rng.standard_normal((24, 150))
-    found = loop.savgol(samples, filters.window_lengths, 1, filters.context)
+    found = savgol(samples, filters.window_lengths, 1, filters.context)
     wanted = filters.valid(torch.from_numpy(samples)).numpy()
     np.testing.assert_allclose(found, wanted, atol=1e-12)
 
@@ -139,6 +144,19 @@ def test_errors_are_those_that_the_engines_are_held_to(pool: FeaturePool, kind: 
     assert made["worst"] == pytest.approx(max(wanted.values()))
     assert wanted[made["at"]] == max(wanted.values())
     assert made["not_finite"] == 0
+
+
+@pytest.mark.parametrize(
+    ("cv", "found", "error"),
+    [(1e6, -1e6, 0.0), (1e6, 2e6, 1.0), (5e5, -5e5, 2.0), (2e4, 4e4, 1.0)],
+)
+def test_only_the_sign_of_a_cv_at_the_floor_may_differ(
+    cv: float, found: float, error: float
+) -> None:
+    reference, other = (torch.tensor([[of]], dtype=torch.float64) for of in (cv, found))
+    assert feature_errors(other, reference, ["a cv"])["worst"] == error
+    assert worst_errors(other, reference, ["a cv"])["cv"] == error
+    assert feature_errors(-reference, reference, ["a mean"])["worst"] == 2.0
 
 
 def test_errors_count_what_is_not_finite() -> None:

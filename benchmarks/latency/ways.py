@@ -133,16 +133,19 @@ def _looped(timed: Timed, samples: Any, wanted: Any) -> Callable[[int], float]:
     names = [(n.channel, n.component, n.domain, n.descriptor) for n in chosen]
     place = {index: at for at, index in enumerate(wanted)}
     used = [place[index] for index in timed.selected]
+    channels = list(dict.fromkeys(name.channel for name in chosen))  # the others are not filtered
+    rows = [pool.hand.names.index(channel) for channel in channels]
+    lengths = [WINDOW_LENGTHS[row] for row in rows]
     machine = timed.kernel_sum()
     support, beta = (np.asarray(of) for of in (machine.support, machine.beta))
     low, high = (np.asarray(of) for of in (timed.scaler.minimum, timed.scaler.maximum))
     knee = None if timed.scaler.knee is None else np.asarray(timed.scaler.knee)
 
     def score(number: int) -> float:
-        raw = samples[number % len(samples)].astype(np.float64)
-        filtered = loop.savgol(raw, WINDOW_LENGTHS, 1, channel_filter.context)
+        raw = samples[number % len(samples)][rows].astype(np.float64)
+        filtered = loop.savgol(raw, lengths, 1, channel_filter.context)
         with others.quiet():
-            x = loop.features(filtered, names, pool.hand.names)[used]
+            x = loop.features(filtered, names, channels)[used]
         if knee is not None:
             x = np.sign(x) * knee * np.log1p(np.abs(x) / knee)
         z = np.clip(2 * (x - low) / (high - low) - 1, -1, 1)
@@ -160,7 +163,7 @@ def _rocket(sizes: Sizes, samples: Any) -> Callable[[int], Any]:
 
     def score(number: int) -> Any:
         raw = samples[number % len(samples)].astype(np.float64)
-        filtered = loop.savgol(raw, WINDOW_LENGTHS, 1, context)
+        filtered = loop.savgol_in_groups(raw, WINDOW_LENGTHS, 1, context)
         return scores(filtered[None].astype(np.float32))
 
     return score
