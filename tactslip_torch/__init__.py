@@ -1,6 +1,7 @@
 """Slip detection for robot hands that feel, in PyTorch (He et al. 2026, and beyond)."""
 
 from tactslip_torch.data.recording import Recording
+from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
@@ -13,6 +14,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Channel",
+    "FeatureExtractor",
     "FeatureName",
     "FeaturePool",
     "HandLayout",

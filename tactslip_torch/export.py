@@ -56,7 +56,7 @@ class _RawJudgement(nn.Module):
 
 
 def export_onnx(detector: SlipDetector, path: str | os.PathLike[str]) -> float:
-    """Write ``samples [B, C, n + 2 * context] -> score [B], valid [B]``, float32, and check it.
+    """Write ``samples [B, C, before + n + after] -> score [B], valid [B]``, float32, and check it.
 
     Returns:
         ``onnx_error`` of the file.
@@ -192,7 +192,9 @@ def _describe_in_file(detector: SlipDetector, path: Path) -> None:
         "unit": "V",
         "sample_rate_hz": f"{detector.pool.sample_rate_hz:g}",
         "bin_samples": str(detector.pool.bin_samples),
-        "context_samples": str(detector.context),
+        "context_before_samples": str(detector.context_before),
+        "context_after_samples": str(detector.context_after),
+        "look_ahead_samples": str(detector.look_ahead),
         "simulated": str(bool(detector.info.get("simulated", False))).lower(),
         "slip_if_score_at_least": "0",
         "valid": "false: a channel in use is dead, or held a NaN or Inf and was left out",
@@ -203,7 +205,8 @@ def _describe_in_file(detector: SlipDetector, path: Path) -> None:
 
 def _input_shape(detector: SlipDetector) -> tuple[int, int]:
     pool = detector.pool
-    return len(pool.hand), pool.bin_samples + 2 * detector.context
+    context = detector.context_before + detector.context_after
+    return len(pool.hand), pool.bin_samples + context
 
 
 @contextlib.contextmanager

@@ -113,9 +113,9 @@ def test_raw_scores_are_those_of_filtered_bins(detector):
     samples = noise(1, num_samples=1000)[0]
     starts = torch.tensor([25, 300, 875])
     filtered = bins_at(detector.channel_filter(samples), starts, 100)
-    raw = bins_at(samples, starts - detector.context, 150)
+    raw = bins_at(samples, starts - detector.context_before, 150)
     torch.testing.assert_close(detector.score_raw(raw), detector(filtered), rtol=1e-9, atol=1e-9)
-    assert detector.context == 25
+    assert (detector.context_before, detector.context_after) == (25, 25)
 
 
 def test_leading_axes_are_kept(detector):
@@ -473,3 +473,36 @@ def test_many_bins_are_judged_as_few_are(method):
     for parts, whole in zip(zip(*few, strict=True), many, strict=True):
         assert whole.shape[:2] == (3, 50)
         torch.testing.assert_close(whole.flatten(0, 1), torch.cat(parts), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("align", ["centred", "causal"])
+@pytest.mark.parametrize("kind", ["SG", "PVDF"])
+def test_a_score_waits_for_its_look_ahead_and_no_longer(kind, align):
+    """What lies behind may be garbage; of what lies before, the last sample counts."""
+    whole = random_detector()
+    chosen = [
+        place for place, name in enumerate(whole.selected_names) if name.channel.startswith(kind)
+    ]
+    head = QuadraticForm(
+        torch.eye(len(chosen)).double(),
+        torch.ones(len(chosen)).double(),
+        torch.tensor(0.1).double(),
+    )
+    scaler = FeatureScaler(whole.scaler.minimum[chosen], whole.scaler.maximum[chosen])
+    smooth = ChannelFilter(whole.channel_filter.window_lengths, align=align)
+    detector = SlipDetector(whole.pool, smooth, [whole.selected[i] for i in chosen], scaler, head)
+    assert detector.look_ahead == {"causal": 0, "centred": {"SG": 25, "PVDF": 5}[kind]}[align]
+    samples = noise(6)
+    first = detector.context_before + 100 + detector.look_ahead
+    expected = detector.judge_raw(samples)
+    for garbage in (0.0, 1e3, torch.nan):
+        spoilt = samples.clone()
+        spoilt[:, [i for i, c in enumerate(whole.pool.hand.channels) if c.kind == kind], first:] = (
+            garbage
+        )
+        judged = detector.judge_raw(spoilt)
+        assert torch.equal(judged.score, expected.score)
+        assert judged.is_valid.all()
+    moved = samples.clone()
+    moved[..., first - 1] += 1.0
+    assert (detector.judge_raw(moved).score != expected.score).all()

@@ -143,7 +143,8 @@ def test_the_file_says_what_a_host_must_know_of_its_input(detector, session):
     facts = session.get_modelmeta().custom_metadata_map
     assert facts["channels"].split(",") == list(detector.pool.hand.names)
     expected = {"unit": "V", "sample_rate_hz": "2000", "bin_samples": "100"}
-    expected |= {"context_samples": "25", "slip_if_score_at_least": "0", "simulated": "true"}
+    expected |= {"context_before_samples": "25", "context_after_samples": "25"}
+    expected |= {"look_ahead_samples": "25", "slip_if_score_at_least": "0", "simulated": "true"}
     assert {name: facts[name] for name in expected} == expected
 
 

@@ -2,8 +2,10 @@
 
 import copy
 import pickle
+import sys
 from importlib import util
 
+import numpy as np
 import pytest
 import torch
 from engine_bins import assert_equals_reference, bins_of
@@ -177,12 +179,60 @@ def test_a_stream_hands_on_batch_by_batch(engine, generator):
         assert len(asked) == count + 1  # nothing is read ahead
 
 
-def test_auto_takes_numba_where_it_is_installed(monkeypatch):
+def test_auto_takes_numba_where_it_is_installed(monkeypatch, generator):
     assert module.resolved("auto") == ("compiled" if util.find_spec("numba") else "eager")
     monkeypatch.setattr(module, "find_spec", lambda name: None)
-    assert FeatureExtractor(POOL, SELECTED).engine == "eager"
-    with pytest.raises(ValueError, match=r'pip install "tactslip_torch\[fast\]"'):
+    extractor = FeatureExtractor(POOL, SELECTED)
+    assert extractor.engine == "eager"
+    assert extractor(noise(3, generator)).isfinite().all()
+    with pytest.raises(ValueError, match=r'not installed; pip install "tactslip_torch\[fast\]"'):
         FeatureExtractor(POOL, SELECTED, "compiled")
+
+
+def test_a_numba_that_cannot_be_used_is_passed_over_in_words(monkeypatch):
+    """As after an upgrade of NumPy."""
+    monkeypatch.setitem(sys.modules, "tactslip_torch.features.compiled.engine", None)
+    monkeypatch.delattr("tactslip_torch.features.compiled.engine", raising=False)
+    with pytest.warns(
+        UserWarning, match="numba cannot be used: .*; features are made by engine eager"
+    ):
+        assert FeatureExtractor(POOL, SELECTED).engine == "eager"
+    with pytest.raises(ValueError, match="needs numba, which cannot be used"):
+        FeatureExtractor(POOL, SELECTED, "compiled")
+
+
+@pytest.mark.parametrize("engine", FAST)
+@pytest.mark.parametrize("num", [1, 20])
+def test_inference_mode_leaves_nothing_behind(engine, num, generator):
+    """Neither in a detector's parts, nor in what engines keep."""
+    bins = noise(num, generator)
+    extractor = FeatureExtractor(POOL, SELECTED, engine)
+    with torch.inference_mode():
+        first = extractor(bins)
+    assert torch.equal(extractor(bins), first)
+    with torch.inference_mode():
+        assert torch.equal(extractor(bins), first)
+    pool = FeaturePool(HAND)
+    with torch.inference_mode():
+        pool.validity(bins)
+    moving = bins.clone().requires_grad_()
+    assert pool.validity(moving).all()
+
+
+@pytest.mark.parametrize("engine", FAST)
+def test_the_callers_bins_are_left_alone(engine, generator):
+    bins = noise(20, generator)
+    bins[3, 2, 50], bins[7, 20, 10], bins[9, 20, 10] = torch.nan, 1e300, -torch.inf
+    before = bins.clone()
+    FeatureExtractor(POOL, None, engine)(bins)
+    torch.testing.assert_close(bins, before, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("kind", [torch.tensor, np.array, tuple])
+def test_a_selection_is_any_sequence_of_whole_numbers(kind):
+    assert FeatureExtractor(POOL, kind([7, 3])).selected == (7, 3)
+    with pytest.raises(TypeError):
+        FeatureExtractor(POOL, [3.7])
 
 
 @pytest.mark.parametrize(

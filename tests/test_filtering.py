@@ -1,3 +1,6 @@
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import oracles
 import pytest
@@ -10,6 +13,7 @@ from tactslip_torch.signals.filtering import ChannelFilter, reach, savgol_filter
 
 WINDOWS = [(1, 0), (3, 1), (5, 2), (11, 1), (51, 1), (51, 3), (11, 0), (7, 6)]
 WINDOW_OF_CHANNEL = [51, 11, 51, 5]
+CHOICES = [(0, 1), (2, 3), (1, 2), (0, 1, 2, 3)]
 
 
 @pytest.mark.parametrize(("window", "order"), WINDOWS)
@@ -277,3 +281,22 @@ def test_only_the_channels_wanted_are_filtered(align, rng):
     assert (part[0, 3] == in_frame).all()
     assert part[1, 0].isnan().all()
     assert (part[2, 3] == torch.inf).all()
+
+
+def test_threads_share_a_filter(rng):
+    """Each asks for other channels first; the interpreter changes threads as often as it can."""
+    samples = torch.from_numpy(rng.standard_normal((1, 4, 150)))
+    expected = {
+        wanted: ChannelFilter([51, 51, 11, 11]).valid(samples, wanted) for wanted in CHOICES
+    }
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            for _ in range(100):
+                smooth = ChannelFilter([51, 51, 11, 11])
+                tasks = [(w, pool.submit(smooth.valid, samples, w)) for w in CHOICES * 4]
+                for wanted, task in tasks:
+                    torch.testing.assert_close(task.result(), expected[wanted])
+    finally:
+        sys.setswitchinterval(before)

@@ -20,15 +20,16 @@ def score_recording(
     session = onnxruntime.InferenceSession(model_path, providers=["CPUExecutionProvider"])
     facts = session.get_modelmeta().custom_metadata_map
     num_channels = len(facts["channels"].split(","))
-    length, context = int(facts["bin_samples"]), int(facts["context_samples"])
+    length, before = int(facts["bin_samples"]), int(facts["context_before_samples"])
+    window = before + length + int(facts["context_after_samples"])
     if samples.ndim != 2 or samples.shape[0] != num_channels:
         raise ValueError(f"expected [{num_channels}, samples], got {samples.shape}")
-    if samples.shape[1] < length + 2 * context:
-        raise ValueError(f"a bin needs {length + 2 * context} samples, got {samples.shape[1]}")
-    windows = np.lib.stride_tricks.sliding_window_view(samples, length + 2 * context, axis=1)
+    if samples.shape[1] < window:
+        raise ValueError(f"a bin needs {window} samples, got {samples.shape[1]}")
+    windows = np.lib.stride_tricks.sliding_window_view(samples, window, axis=1)
     bins = np.ascontiguousarray(windows[:, ::length].swapaxes(0, 1), dtype=np.float32)
     scores, valid = session.run(["score", "valid"], {"samples": bins})
-    starts = context + length * np.arange(len(bins))
+    starts = before + length * np.arange(len(bins))
     return starts / float(facts["sample_rate_hz"]), scores, valid
 
 

@@ -2,15 +2,16 @@
 
 ``"reference"`` is ``FeaturePool`` itself: differentiable, on any device, the truth in tests.
 ``"eager"`` and ``"compiled"`` carry out a plan of the least work, forwards only and on the CPU:
-PyTorch and NumPy, or kernels compiled by numba. All give the same values to rounding. Where a
-derivative is asked for, a graph is recorded or bins lie on another device, the reference takes
-over; so it does for each bin that holds a NaN, an Inf or magnitudes beyond ``ordinary_sizes``.
-The bits of a bin do not depend on the bins beside it.
+PyTorch and NumPy, or kernels compiled by numba. All give the same values to rounding; where a
+value is all rounding (the sign of cv at a mean of 0, the mode of values equal but for rounding)
+they may differ. Where a derivative is asked for, a graph is recorded or bins lie on another device,
+the reference takes over; so it does for each bin with magnitudes beyond ``ordinary_sizes``.
 """
 
 from __future__ import annotations
 
-import threading
+import operator
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from typing import Any, Literal, Protocol, get_args
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.eager.engine import EagerEngine
+from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool, saturating
@@ -93,13 +95,14 @@ class FeatureExtractor:
         engine: EngineName = "auto",
     ) -> None:
         num = len(pool.names)
-        outside = [int(i) for i in selected or () if not 0 <= i < num]
+        chosen = range(num) if selected is None else [operator.index(i) for i in selected]
+        outside = [i for i in chosen if not 0 <= i < num]
         if outside:
             raise ValueError(
                 f"selected features must lie in 0..{num - 1}, the pool's {num}, got {outside[0]}"
             )
         self.pool = pool
-        self.selected = tuple(range(num)) if selected is None else tuple(int(i) for i in selected)
+        self.selected = tuple(chosen)
         self.engine = resolved(engine)
         self.plan = make_plan(pool.hand, pool.level, self.names)
         self._index = None if selected is None else torch.tensor(self.selected)
@@ -125,8 +128,21 @@ class FeatureExtractor:
         dtype = dtype or bins.dtype
         if not is_plain(bins):
             return self._reference(bins, dtype)
+        with torch.inference_mode(False), torch.no_grad():  # what engines keep outlives the mode
+            return self._values(bins, dtype)
+
+    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
+        """Features of one batch of bins after the other; no more than one is held.
+
+        Shape:
+            - of each batch: ``[*, C, n]``; of what is handed on for it: ``[*, K]``
+        """
+        for bins in batches:
+            yield self(bins)
+
+    def _values(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
         flat = bins.detach().flatten(0, -3) if bins.ndim > 2 else bins.detach()[None]
-        out = torch.empty(len(flat), len(self.selected), dtype=dtype)
+        out = torch.empty(len(flat), len(self.selected), dtype=dtype, device="cpu")
         engine = None if self.engine == "reference" else self._engine_for(bins.dtype)
         chunk_bins = _REFERENCE_CHUNK if engine is None else engine.chunk_bins
 
@@ -145,26 +161,29 @@ class FeatureExtractor:
             for_each(work, starts)
         return out.reshape(*bins.shape[:-2], len(self.selected))
 
-    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Features of one batch of bins after the other; no more than one is held.
-
-        Shape:
-            - of each batch: ``[*, C, n]``; of what is handed on for it: ``[*, K]``
-        """
-        for bins in batches:
-            yield self(bins)
-
     def _carry_out(self, engine: Engine, bins: Tensor, out: Tensor) -> None:
         """The plan by an engine, and the reference for bins that are not ordinary."""
         x, scale, is_ordinary = engine.read(bins)
         if is_ordinary.all():
             engine(x, scale, out)
             return
-        # the engine sees zeros in their place: so the bits of a bin do not depend on its neighbours
-        strange = (~is_ordinary).nonzero()[0].tolist()
-        x[strange], scale[strange] = 0.0, 0.0
+        # the engine sees zeros where values are strange: bits do not depend on neighbours
+        broken, odd = [], []
+        for index in (~is_ordinary).nonzero()[0].tolist():
+            size = x[index].abs().amax(-1)
+            is_broken = ~size.isfinite()
+            low, high = ordinary_sizes(torch.float64)
+            if bool((is_broken | (size == 0) | ((size >= low) & (size <= high))).all()):
+                broken.append((index, is_broken.nonzero().flatten().tolist()))
+                x[index, is_broken], scale[index] = 0.0, torch.where(is_broken, 0.0, size)
+            else:
+                odd.append(index)
+                x[index], scale[index] = 0.0, 0.0
         engine(x, scale, out)
-        for index in strange:
+        for index, places in broken:
+            for place in places:
+                out[index, self._columns[place]] = torch.nan
+        for index in odd:
             out[index] = self._reference(bins[index], out.dtype)
 
     def _reference(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
@@ -175,10 +194,10 @@ class FeatureExtractor:
 
     def _engine_for(self, bins: torch.dtype) -> Engine:
         dtype = bins if self.pool.arithmetic == "native" else torch.float64
-        with self._making:
-            if dtype not in self._engines:
-                self._engines[dtype] = self._made(dtype)
-            return self._engines[dtype]
+        engine = self._engines.get(dtype)
+        if engine is None:  # two threads may make one each; a lock could be lost in a fork
+            engine = self._engines.setdefault(dtype, self._made(dtype))
+        return engine
 
     def _made(self, dtype: torch.dtype) -> Engine:
         if self.engine == "eager":
@@ -189,11 +208,14 @@ class FeatureExtractor:
 
     def _start(self) -> None:
         self._engines: dict[torch.dtype, Engine] = {}
-        self._making = threading.Lock()
+        plan = self.plan
+        owner = [(plan.rows[w.row].channel, w.place) for w in plan.wanted]
+        owner += [(share.channel, share.place) for share in plan.shares]
+        self._columns = [[p for c, p in owner if c == channel] for channel in plan.channels]
 
     def __getstate__(self) -> dict[str, Any]:
         """Without engines, which hold workspaces of threads."""
-        return {k: v for k, v in self.__dict__.items() if k not in ("_engines", "_making")}
+        return {name: value for name, value in self.__dict__.items() if name != "_engines"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -204,16 +226,29 @@ def resolved(engine: EngineName) -> EngineName:
     """The engine that a name means on this machine.
 
     Raises:
-        ValueError: for an unknown name, or ``"compiled"`` without numba.
+        ValueError: for an unknown name, or ``"compiled"`` where numba is absent or cannot be used.
     """
     if engine not in get_args(EngineName):
         raise ValueError(f"engine must be one of {', '.join(get_args(EngineName))}, got {engine!r}")
-    has_numba = find_spec("numba") is not None
-    if engine == "compiled" and not has_numba:
+    if engine not in ("auto", "compiled"):
+        return engine
+    is_installed, trouble = find_spec("numba") is not None, _trouble()
+    if engine == "compiled" and trouble:
         raise ValueError(
-            'engine "compiled" needs numba, which is not installed; pip install '
+            f'engine "compiled" needs numba, which {trouble}; pip install '
             '"tactslip_torch[fast]", or use engine "eager"'
         )
-    if engine == "auto":
-        return "compiled" if has_numba else "eager"
-    return engine
+    if trouble and is_installed:
+        warnings.warn(f"numba {trouble}; features are made by engine eager", stacklevel=2)
+    return "eager" if trouble else "compiled"
+
+
+def _trouble() -> str:
+    """Why kernels cannot be compiled here; empty if they can."""
+    if find_spec("numba") is None:
+        return "is not installed"
+    try:
+        from tactslip_torch.features.compiled import engine  # noqa: F401  # a second, once
+    except Exception as error:  # another numba or NumPy than it was made for
+        return f"cannot be used: {str(error).splitlines()[0]}"
+    return ""

@@ -240,9 +240,8 @@ class FeaturePool(nn.Module):
             - bins: ``[*, C, n]``
             - output: ``[*, C]``, bool
         """
-        high, low = bins.amax(-1), bins.amin(-1)
-        span = (high - low) * self._inverse_span(bins)  # so that nothing underflows
-        return span > torch.maximum(high, -low)
+        high, low = bins.amax(-1), bins.amin(-1)  # by the inverse, so that nothing underflows
+        return (high - low) * self._inverse_span(bins) > torch.maximum(high, -low)
 
     def _inverse_span(self, like: Tensor) -> Tensor:
         """One over the least span that resolves, as a part of the magnitude, ``[C]``."""
@@ -251,7 +250,8 @@ class FeaturePool(nn.Module):
             if self.arithmetic == "native" and like.dtype == torch.float32:
                 for film in self._films:
                     least[film] = NATIVE_SPAN
-            self._inverses[like.dtype] = 1 / torch.tensor(least, dtype=like.dtype)
+            with torch.inference_mode(False):  # it may be needed for a gradient later
+                self._inverses[like.dtype] = torch.tensor(least, dtype=like.dtype).reciprocal()
         return self._inverses[like.dtype].to(like.device)
 
     def is_missing(self, bins: Tensor) -> Tensor:

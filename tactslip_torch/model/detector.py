@@ -47,7 +47,8 @@ class SlipDetector(nn.Module):
         - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
         - score: ``[*]``, dtype of ``bins``; at least 0 means slip
         - inside: ``bins -> features [*, F] -> selected [*, K] -> scaled [*, K] -> score [*]``
-        - raw samples, for ``score_raw`` and ``judge_raw``: ``[*, C, n + 2 * context]``
+        - raw samples, for ``score_raw`` and ``judge_raw``: ``[*, C, before + n + after]``, with
+          ``context_before`` and ``context_after`` samples around the bin
 
     Raises:
         ValueError: if the parts disagree about the number of channels or features.
@@ -106,9 +107,23 @@ class SlipDetector(nn.Module):
         return self.extractor.names
 
     @property
-    def context(self) -> int:
-        """Samples ``score_raw`` needs on each side of a bin."""
-        return self.channel_filter.context
+    def context_before(self) -> int:
+        """Samples that a raw bin comes with before it; of a causal filter all of them."""
+        return self.channel_filter.context_before
+
+    @property
+    def context_after(self) -> int:
+        """Samples that a raw bin comes with behind it, ``look_ahead`` of which matter."""
+        return self.channel_filter.context_after
+
+    @property
+    def look_ahead(self) -> int:
+        """Samples behind a bin that its score waits for: those the channels in use are filtered by.
+
+        What stands behind them may be anything; so a stream that uses films alone waits for 5
+        samples, 2.5 ms, and fills up the rest.
+        """
+        return max(self.channel_filter.reaches[i][1] for i in self.extractor.plan.channels)
 
     def forward(self, bins: Tensor) -> Tensor:
         """Score filtered bins; at least 0 means slip, NaN where a needed value is not finite.
@@ -122,18 +137,20 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: if the number of channels or samples is another.
         """
+        self.pool.check(bins)
         return _in_parts(self._score, bins)
 
     def score_raw(self, samples: Tensor) -> Tensor:
-        """Filter and score raw bins that come with ``context`` samples on each side.
+        """Filter and score raw bins that come with their context.
 
         Shape:
-            - samples: ``[*, C, n + 2 * context]``, volts
+            - samples: ``[*, C, context_before + n + context_after]``, volts
             - output: ``[*]``, dtype of ``samples``
 
         Raises:
             ValueError: if the number of channels or samples is another.
         """
+        self.channel_filter.check(samples)
         return _in_parts(self._score_raw, samples)
 
     def judge(self, bins: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
@@ -157,13 +174,13 @@ class SlipDetector(nn.Module):
         return _in_parts(self._judge, bins)
 
     def judge_raw(self, samples: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
-        """``judge`` for raw bins that come with ``context`` samples on each side.
+        """``judge`` for raw bins that come with their context.
 
         A NaN or Inf in the context of a bin makes the channel missing as well, if the frame of its
         filter reaches that far; under ``"raise"`` any is refused.
 
         Shape:
-            - samples: ``[*, C, n + 2 * context]``, volts
+            - samples: ``[*, C, context_before + n + context_after]``, volts
 
         Raises:
             ValueError: as ``judge``.

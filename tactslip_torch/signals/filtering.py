@@ -244,15 +244,16 @@ class ChannelFilter(nn.Module):
     def _groups_for(self, channels: Collection[int] | None) -> list[_Group]:
         """Frames, where theirs starts, channels of theirs, and whether these are wanted."""
         key = None if channels is None else tuple(channels)
-        if key not in self._wanted:
+        if (groups := self._wanted.get(key)) is None:
             wanted = range(len(self.window_lengths)) if key is None else frozenset(key)
-            self._wanted = {key: []}  # the last one asked for
+            groups = []
             for length, own in self._groups:
                 start = self.context_before - reach(length, self.align)[0]
                 for is_wanted in (True, False):
                     if chosen := [c for c in own if (c in wanted) == is_wanted]:
-                        self._wanted[key].append((length, start, chosen, is_wanted))
-        return self._wanted[key]
+                        groups.append((length, start, chosen, is_wanted))
+            self._wanted = {key: groups}  # the last one asked for, whole: other threads may look
+        return groups
 
     def check(self, samples: Tensor) -> None:
         """Refuse what are no samples of this hand.
