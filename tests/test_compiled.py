@@ -1,7 +1,9 @@
 """The compiled engine equals the reference, on bins of every kind and for any part of the pool."""
 
+import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -20,11 +22,18 @@ from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.plan import make_plan
 
 numba = pytest.importorskip("numba")
+from tactslip_torch.features.compiled import engine as compiled_engine  # noqa: E402
+from tactslip_torch.features.compiled import kept  # noqa: E402
+from tactslip_torch.features.compiled.bins import describe_bins  # noqa: E402
 from tactslip_torch.features.compiled.engine import CompiledEngine  # noqa: E402
-from tactslip_torch.features.compiled.jit import _folder, kernel  # noqa: E402
+from tactslip_torch.features.compiled.jit import kernel  # noqa: E402
+from tactslip_torch.features.compiled.products import pick, shift  # noqa: E402
+from tactslip_torch.features.compiled.ranked import describe_sorted  # noqa: E402
+from tactslip_torch.features.compiled.read import read_bins  # noqa: E402
 from tactslip_torch.features.compiled.steps import ADD, OWN, chain_of  # noqa: E402
 
 STATISTICS = {"double": torch.float64, "mixed": torch.float32}
+KERNELS = (read_bins, shift, pick, describe_bins, describe_sorted)
 HAND = some_hand("GFF")
 DESCRIPTORS = sorted({name.descriptor for name in FeaturePool(HAND).names})
 RANKS = (51, 51, 27, 27, 15, 15, 10, 9)  # of A1, D1, A2, .. of 100 samples
@@ -219,6 +228,48 @@ def test_read_takes_channels_and_finds_what_is_not_ordinary(dtype):
     assert torch.equal(scale[good], bins[good][:, [0, 2]].double().abs().amax(-1))
 
 
+@pytest.mark.parametrize("statistics", STATISTICS)
+def test_modes_of_torch_leave_no_trace(statistics):
+    pool = FeaturePool(HAND)
+    bins = bins_of("tied", 9, HAND, 100, generator())
+
+    def both_sizes(engine):
+        return [run(engine, bins), run(engine, bins[:1])]
+
+    plain = engine_of(pool, pool.names, statistics)
+    expected = both_sizes(plain)
+    with torch.inference_mode():
+        inside = engine_of(pool, pool.names, statistics)
+        found = both_sizes(inside) + both_sizes(plain)
+        outs = [engine.read(bins[:1])[0] for engine in (inside, plain)]
+    found += both_sizes(inside) + both_sizes(plain)
+    for x in outs:
+        x[0] = 0.0  # as the extractor does with strange bins
+    with torch.device("meta"):
+        elsewhere = engine_of(pool, pool.names, statistics)
+        elsewhere.read(bins[:1])
+    found += both_sizes(elsewhere)
+    for one, other in zip(found, expected * 5, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_chunks_shrink_with_rows_and_never_vanish():
+    for num_films in (100, 256):
+        pool = FeaturePool(some_hand("F" * num_films))
+        plan = make_plan(pool.hand, pool.level, pool.names)
+        engine = CompiledEngine(pool, plan, torch.float32)
+        assert 1 <= engine.chunk_bins <= max(1, 3000 // len(plan.rows))
+
+
+def test_a_dead_film_takes_no_product_of_its_own():
+    pool = FeaturePool(HAND)
+    names = [name for name in pool.names if name.domain == "freq"]
+    engine = engine_of(pool, names, "double")
+    engine._steps = engine._steps._replace(dense=torch.nan * engine._steps.dense)
+    zeros = torch.zeros(3, len(HAND), 100, dtype=torch.float64)
+    assert_equals_reference(run(engine, zeros), reference(pool, zeros, names), names, mixed=False)
+
+
 # What the work is ----------------------------------------------------------------------------
 
 
@@ -245,16 +296,75 @@ def test_chains_form_what_is_wanted(seed):
     assert sum(RANKS[b] for b in formed) <= sum(RANKS[b] for b in alone)
 
 
-def test_compiled_code_is_kept_apart_for_each_state_of_the_sources(tmp_path, monkeypatch):
-    before = _folder("")
+@pytest.fixture
+def fresh_folder():
+    """``folder`` that looks anew."""
+    kept.folder.cache_clear()
+    yield kept.folder
+    kept.folder.cache_clear()
+
+
+def test_compiled_code_is_kept_apart_for_each_state_of_the_sources(
+    tmp_path, monkeypatch, fresh_folder
+):
+    before = fresh_folder("")
     assert before.parent.name == "__pycache__"
-    assert _folder(str(tmp_path)) == tmp_path / before.name
-    source = tmp_path / "compiled_other.py"
-    monkeypatch.setattr("tactslip_torch.features.compiled.jit.__file__", str(source))
+    assert fresh_folder(str(tmp_path)) == tmp_path / before.name
+    source = tmp_path / "other.py"
+    monkeypatch.setattr(kept, "__file__", str(source))
     source.write_text("a = 1")
-    one = _folder("")
+    one = fresh_folder("")
     source.write_text("a = 2")
-    assert one.name != _folder("").name
+    fresh_folder.cache_clear()
+    assert one.name != fresh_folder("").name
+
+
+def test_compiled_code_goes_elsewhere_where_a_folder_is_refused(
+    tmp_path, monkeypatch, fresh_folder
+):
+    taken = tmp_path / "file"
+    taken.touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "mine"))
+    found = fresh_folder(str(taken))
+    assert found.parent == tmp_path / "mine" / "tactslip_torch" / "numba"
+    fresh_folder.cache_clear()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(taken))
+    assert fresh_folder(str(taken)) is None
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(taken))
+    compiled = kernel(read_bins.py_func)
+    assert compiled.stats.cache_path is None  # nowhere, rather than where it may be stale
+    kept.note("anything")
+    assert not kept.is_noted("anything")
+
+
+def test_old_folders_of_other_digests_go(tmp_path, fresh_folder):
+    old, new, foreign = (tmp_path / name for name in ("tactslip_torch-a", "tactslip_torch-b", "c"))
+    for path in (old, new, foreign):
+        (path / "within").mkdir(parents=True)
+    month_ago = time.time() - 31 * 24 * 3600
+    for path in (old, foreign):
+        os.utime(path, (month_ago, month_ago))
+    own = fresh_folder(str(tmp_path))
+    assert set(tmp_path.iterdir()) == {own, new, foreign}
+
+
+@pytest.mark.parametrize("statistics", STATISTICS)
+def test_a_warm_engine_is_known_to_be(tmp_path, monkeypatch, fresh_folder, statistics):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(compiled_engine, "_WARM", set())
+    pool = FeaturePool(HAND)
+    engine = engine_of(pool, pool.names[:1], statistics)
+    assert not engine.is_ready()
+    engine.warm_up()
+    assert engine.is_ready()
+    num_before = [len(k.signatures) for k in KERNELS]
+    whole = engine_of(pool, pool.names, statistics)
+    assert whole.is_ready()
+    run(whole, bins_of("random", 2, HAND, 100, generator()))
+    run(whole, bins_of("random", 2, HAND, 100, generator()).float())
+    assert [len(k.signatures) for k in KERNELS] == num_before, "something was left to compile"
+    compiled_engine._WARM.clear()
+    assert engine.is_ready(), "another process finds the note"
 
 
 def test_kernels_work_where_they_cannot_be_kept():

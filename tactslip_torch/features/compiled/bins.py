@@ -229,7 +229,7 @@ def _in_frequency(
             if is_constant[b] < 0:
                 is_constant[b] = False
                 if not _is_alive(spectrum, steps):
-                    flat = high - low < NOISE * scale / steps.gain[b]
+                    flat = high - low <= NOISE * scale / steps.gain[b]  # 0 of 0 too: a dead film
                     value = spectrum[0] / steps.ones[0] * scale
                     if not flat:
                         flat, value = _constant(y, steps.dense[b], scale, desk.shifted)

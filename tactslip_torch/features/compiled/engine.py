@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +13,7 @@ from torch import Tensor
 
 from tactslip_torch.features.compiled.bins import describe_bins
 from tactslip_torch.features.compiled.jit import Array
+from tactslip_torch.features.compiled.kept import is_noted, note
 from tactslip_torch.features.compiled.products import Products, ProductSpace
 from tactslip_torch.features.compiled.ranked import describe_sorted
 from tactslip_torch.features.compiled.read import read_bins
@@ -23,12 +26,14 @@ from tactslip_torch.features.compiled.steps import (
 )
 from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.linear_maps import LinearMaps
-from tactslip_torch.features.plan import Plan
+from tactslip_torch.features.plan import Plan, make_plan
 from tactslip_torch.features.pool import FeaturePool
 
 _MANY_ROWS = 100
-_FEW, _MANY = 16, 64
-"""Bins a chunk for many rows, whose memory should fit the cache, and for few."""
+_MOST_BINS, _MOST_ROWS = 64, 2800
+"""Bins a chunk for few rows, and rows a chunk for many, whose memory should fit the cache."""
+_WARM: set[str] = set()
+"""Kinds of engine whose kernels this process has compiled or loaded."""
 _SIZES = ordinary_sizes(torch.float64)
 
 
@@ -50,8 +55,9 @@ class _Workspace(NamedTuple):
 class CompiledEngine:
     """Carries out a plan on ordinary bins, on the CPU and forwards only.
 
-    Linear maps are products in float64. Kernels walk over the bins, describe each branch and
-    spectrum while it lies in cache, and leave deviations to be sorted, all at once.
+    Branches are products in float64; lines are products in the dtype of the statistics, of bins
+    scaled to order one. Kernels walk over the bins, describe each branch and spectrum while it
+    lies in cache, and leave deviations to be sorted, all at once.
 
     Args:
         pool: what features there are.
@@ -63,10 +69,15 @@ class CompiledEngine:
     """
 
     def __init__(self, pool: FeaturePool, plan: Plan, dtype: torch.dtype) -> None:
+        with _ordinary_memory():
+            self._prepare(pool, plan, dtype)
+
+    def _prepare(self, pool: FeaturePool, plan: Plan, dtype: torch.dtype) -> None:
         maps = LinearMaps.of(pool)
-        self.chunk_bins = _FEW if len(plan.rows) > _MANY_ROWS else _MANY
+        num_rows = len(plan.rows)
+        self.chunk_bins = _MOST_BINS if num_rows <= _MANY_ROWS else max(1, _MOST_ROWS // num_rows)
         made, chains = formings(plan, maps, self.chunk_bins)
-        self._dtype = dtype
+        self._pool, self._dtype = pool, dtype
         self.num_features = plan.num_features
         self._channels = np.array(plan.channels, np.int64)
         self._steps = steps_of(plan, maps, made, chains)
@@ -74,6 +85,32 @@ class CompiledEngine:
         self._num_sorted = tuple(len(rows) for rows in sorted_rows(plan))
         self._products = Products(maps, made, len(self._steps.film_channel), self.chunk_bins, dtype)
         self._local = threading.local()
+
+    def is_ready(self) -> bool:
+        """Whether the kernels need no compiling: done in this process, or kept on disk."""
+        return self._kind in _WARM or is_noted(self._kind)
+
+    def warm_up(self) -> None:
+        """Compile all kernels, or load them: for a plan of any features, and any bins."""
+        if self._kind in _WARM:
+            return
+        pool = self._pool
+        few = {c.kind: c.name for c in pool.hand.channels}.values()
+        names = [name for name in pool.names if name.channel in few]
+        with _ordinary_memory():
+            engine = CompiledEngine(pool, make_plan(pool.hand, pool.level, names), self._dtype)
+            for dtype in (torch.float32, torch.float64):
+                bins = torch.zeros(1, len(pool.hand), pool.bin_samples, dtype=dtype)
+                x, scale, _ = engine.read(bins)
+                engine(x, scale, torch.empty(1, engine.num_features))
+        _WARM.add(self._kind)
+        note(self._kind)
+
+    @property
+    def _kind(self) -> str:
+        """What decides which kernels there are: a hand without films needs fewer."""
+        kinds = sorted({channel.kind for channel in self._pool.hand.channels})
+        return "-".join([str(self._dtype).removeprefix("torch."), *kinds])
 
     def read(self, bins: Tensor) -> tuple[Tensor, Tensor, Array]:
         """What ``__call__`` takes, from bins of all channels, in memory of this thread.
@@ -130,7 +167,8 @@ class CompiledEngine:
     def _workspace(self) -> _Workspace:
         space: _Workspace | None = getattr(self._local, "space", None)
         if space is None:
-            space = self._local.space = self._new_workspace()
+            with _ordinary_memory():
+                space = self._local.space = self._new_workspace()
         return space
 
     def _new_workspace(self) -> _Workspace:
@@ -150,3 +188,10 @@ class CompiledEngine:
             is_ordinary=np.empty(num, np.bool_),
             desk=desk_of(self._steps, number),
         )
+
+
+@contextmanager
+def _ordinary_memory() -> Iterator[None]:
+    """Tensors made within are the CPU's and may be written to anywhere, whatever modes are on."""
+    with torch.inference_mode(False), torch.device("cpu"):
+        yield

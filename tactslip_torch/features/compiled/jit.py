@@ -1,12 +1,7 @@
-"""How kernels are compiled: once for each kind of number, and kept on disk until a source changes.
-
-numba looks at the file of a cached function alone, and would not notice a change in another file
-that it calls into; so the folder of the cache carries a digest of all of them.
-"""
+"""How kernels are compiled: once for each kind of number, and kept until a source changes."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -15,6 +10,8 @@ import numba
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.extending import intrinsic
+
+from tactslip_torch.features.compiled.kept import folder
 
 Array = np.ndarray[Any, Any]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -40,13 +37,20 @@ def careful_kernel(function: Function) -> Function:
 
 def _kept(function: Function, **options: Any) -> Function:
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(_folder(before))
+    wanted = folder(before)
+    if wanted is None:
+        return _compiled(function, **options)
+    numba.config.CACHE_DIR = str(wanted)
     try:
-        return _compiled(function, cache=True, **options)
-    except RuntimeError:  # no folder may be written to
+        compiled = _compiled(function, cache=True, **options)
+    except RuntimeError:  # numba keeps nothing of a function without a file
         return _compiled(function, **options)
     finally:
         numba.config.CACHE_DIR = before
+    path = cast(Any, compiled).stats.cache_path
+    if not Path(path).is_relative_to(wanted):  # numba took another folder, which may be stale
+        return _compiled(function, **options)
+    return compiled
 
 
 def _compiled(function: Function, **options: Any) -> Function:
@@ -55,7 +59,7 @@ def _compiled(function: Function, **options: Any) -> Function:
     return cast(Function, compiled(function))
 
 
-def _of_two(name: str) -> Callable[..., Any]:
+def _of_two(name: str, fast: bool) -> Callable[..., Any]:
     """An instruction of two numbers of one kind, which loops are vectorised with."""
 
     def typed(context: Any, a: Any, b: Any) -> Any:
@@ -64,23 +68,16 @@ def _of_two(name: str) -> Callable[..., Any]:
             function = builder.module.declare_intrinsic(
                 name, [kind], ir.FunctionType(kind, [kind] * 2)
             )
-            return builder.call(function, values, fastmath=("fast",))
+            return builder.call(function, values, fastmath=("fast",) if fast else ())
 
         return a(a, b), emitted
 
     return cast(Callable[..., Any], intrinsic(typed))
 
 
-smaller = _of_two("llvm.minnum")
-"""The smaller of two floats; ``min`` keeps LLVM from vectorising a loop."""
-larger = _of_two("llvm.maxnum")
-"""The larger of two floats."""
-
-
-def _folder(chosen: str) -> Path:
-    """Where compiled code is kept: beneath ``NUMBA_CACHE_DIR`` if set, else beside the sources."""
-    here = Path(__file__).parent
-    digest = hashlib.sha256()
-    for source in sorted(here.glob("*.py")):
-        digest.update(source.read_bytes())
-    return (Path(chosen) if chosen else here / "__pycache__") / digest.hexdigest()[:16]
+smaller = _of_two("llvm.minnum", fast=True)
+"""The smaller of two floats, neither of them NaN; ``min`` keeps LLVM from vectorising a loop."""
+larger = _of_two("llvm.maxnum", fast=True)
+"""The larger of two floats, neither of them NaN."""
+larger_number = _of_two("llvm.maxnum", fast=False)
+"""The larger of two floats; of a float and a NaN the float."""

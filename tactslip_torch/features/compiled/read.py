@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tactslip_torch.features.compiled.jit import Array, careful_kernel, larger
+from tactslip_torch.features.compiled.jit import Array, careful_kernel, larger_number
 
 
 @careful_kernel
@@ -33,7 +33,7 @@ def read_bins(
                 v = np.float64(row[i])
                 size = abs(v)
                 to[i] = v
-                most = larger(most, size)
+                most = larger_number(most, size)
                 num_bad += not size <= high
             scale[m, c] = most
             is_good &= num_bad == 0 and (most >= low or most == 0)
