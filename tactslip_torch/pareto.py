@@ -30,19 +30,25 @@ from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
+from tactslip_torch.deadline.front import Candidate, nondominated, worth_timing
+from tactslip_torch.deadline.latency import (
+    DEFINITION,
+    Latency,
+    least_latency_ms,
+    longest_hop,
+    shortest_hop,
+)
+from tactslip_torch.deadline.search import Search, Searcher
+from tactslip_torch.deadline.timing import Timing, time_in_fresh_process
+from tactslip_torch.deadline.workshop import Timed, Workshop
 from tactslip_torch.experiment import common_facts, feature_cache, feature_parts, save_config
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.files import whole_file
-from tactslip_torch.front import Candidate, nondominated, worth_timing
-from tactslip_torch.latency import DEFINITION, Latency, least_latency_ms, longest_hop, shortest_hop
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.report.pareto import none_meets, pareto_figure, pareto_table
-from tactslip_torch.search import Search, Searcher
 from tactslip_torch.signals.filtering import Align
-from tactslip_torch.timing import Timing, time_in_fresh_process
-from tactslip_torch.workshop import Timed, Workshop
 
 EXIT_NONE_MEETS = 1
 

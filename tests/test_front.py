@@ -7,21 +7,21 @@ import pytest
 import torch
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
 
-from tactslip_torch.cost import GROUPS, CostModel
 from tactslip_torch.data.splits import seen6
 from tactslip_torch.datamodule import SlipDataModule
+from tactslip_torch.deadline.cost import GROUPS, CostModel
+from tactslip_torch.deadline.front import Candidate, nondominated, worth_timing
+from tactslip_torch.deadline.latency import Latency
+from tactslip_torch.deadline.search import Search, Searcher
 from tactslip_torch.features.groups import allowed, of_fingers
 from tactslip_torch.features.names import FeatureName, pool_names
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import rank_features, t_scores
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.front import Candidate, nondominated, worth_timing
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.latency import Latency
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.recipe import fit_frame, recalls_mean, stand_for
-from tactslip_torch.search import Search, Searcher
 from tactslip_torch.signals.filtering import ChannelFilter
 
 SMALL = {

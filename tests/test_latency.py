@@ -2,7 +2,7 @@
 
 import pytest
 
-from tactslip_torch.latency import (
+from tactslip_torch.deadline.latency import (
     Latency,
     least_latency_ms,
     longest_hop,

@@ -13,18 +13,18 @@ import tactslip_torch.pareto as command
 from tactslip_torch import SlipDetector
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import seen6, unseen4
+from tactslip_torch.deadline.front import Candidate
+from tactslip_torch.deadline.latency import Latency
+from tactslip_torch.deadline.search import Search
+from tactslip_torch.deadline.timing import Timing
+from tactslip_torch.deadline.workshop import Workshop
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.front import Candidate
-from tactslip_torch.latency import Latency
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.report.pareto import none_meets, pareto_table
-from tactslip_torch.search import Search
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.timing import Timing
-from tactslip_torch.workshop import Workshop
 
 TINY = (
     "data._target_=test_commands.TinyRecordings",
@@ -218,7 +218,7 @@ def test_those_without_head_room_come_last(monkeypatch, tmp_path):
         met.append([str(name) for name in detector.selected_names])
         return Timing(100.0, 100.0 * (len(met) + 2), calls)
 
-    monkeypatch.setattr("tactslip_torch.workshop.time_detector", played)
+    monkeypatch.setattr("tactslip_torch.deadline.workshop.time_detector", played)
     slow = Timing(50.0, 900_000.0, 20)
     monkeypatch.setattr(command, "time_in_fresh_process", lambda *a: slow)
     found = run(tmp_path, "deadline_ms=500", "compute_us=400", "headroom=1.3", "tries=9")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from tactslip_torch.latency import Latency
+from tactslip_torch.deadline.latency import Latency
 from tactslip_torch.signals.filtering import Align
 
 

@@ -17,7 +17,9 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from tactslip_torch.cost import CostModel, parts_of
+from tactslip_torch.deadline.cost import CostModel, parts_of
+from tactslip_torch.deadline.front import Candidate
+from tactslip_torch.deadline.latency import Latency, look_ahead_samples, shortest_hop
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.groups import Channels, Components, allowed, of_fingers
 from tactslip_torch.features.plan import make_plan
@@ -25,8 +27,6 @@ from tactslip_torch.features.pool import Arithmetic, FeaturePool
 from tactslip_torch.features.ranking import rank_per_cost, rank_weighted
 from tactslip_torch.features.selection import rank_distinct, rank_features, t_scores
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.front import Candidate
-from tactslip_torch.latency import Latency, look_ahead_samples, shortest_hop
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.planning import validate

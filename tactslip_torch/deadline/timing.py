@@ -1,4 +1,4 @@
-"""How long a decision takes here: ``python -m tactslip_torch.timing detector.pt [calls [engine]]``.
+"""How long a decision takes here: ``python -m tactslip_torch.deadline.timing detector.pt [calls [engine]]``.
 
 One bin at a time and one thread, as a live loop calls it, from raw samples to the decision. Prints
 a line of JSON: p50 and p99 in microseconds. Calls in which the system gave the processor to someone
@@ -93,7 +93,7 @@ def time_in_fresh_process(
     Raises:
         ValueError: if that process fails; its last line is named.
     """
-    command = [sys.executable, "-m", "tactslip_torch.timing", os.fspath(path), str(calls)]
+    command = [sys.executable, "-m", "tactslip_torch.deadline.timing", os.fspath(path), str(calls)]
     command.append(engine)
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -128,7 +128,9 @@ def single_bins(pool: FeaturePool, num_samples: int) -> list[Tensor]:
 def main(arguments: Sequence[str]) -> None:
     """Print the timing of a saved detector as a line of JSON."""
     if not 1 <= len(arguments) <= 3:
-        raise SystemExit("usage: python -m tactslip_torch.timing detector.pt [calls [engine]]")
+        raise SystemExit(
+            "usage: python -m tactslip_torch.deadline.timing detector.pt [calls [engine]]"
+        )
     path, calls, engine = [*arguments, *("1000", "auto")[len(arguments) - 1 :]]
     with one_thread():
         detector = SlipDetector.load(Path(path), cast(EngineName, engine))

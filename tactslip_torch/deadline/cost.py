@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tactslip_torch.deadline.timing import one_thread, single_bins, time_calls, time_detector
 from tactslip_torch.features.extractor import EngineName, FeatureExtractor
 from tactslip_torch.features.plan import ORDERED, Plan, make_plan
 from tactslip_torch.features.pool import FeaturePool
@@ -25,7 +26,6 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.timing import one_thread, single_bins, time_calls, time_detector
 
 GROUPS: Mapping[str, str] = {
     "gauges": "a gauge read and described",

@@ -8,26 +8,26 @@ from typing import Any
 
 import torch
 
-from tactslip_torch.cost import CostModel, measure_costs
 from tactslip_torch.data.labels import needed_windows
 from tactslip_torch.data.splits import Split
 from tactslip_torch.datamodule import SlipDataModule
+from tactslip_torch.deadline.cost import CostModel, measure_costs
+from tactslip_torch.deadline.front import Candidate
+from tactslip_torch.deadline.latency import Latency, shortest_hop
+from tactslip_torch.deadline.search import Search, offset_of
+from tactslip_torch.deadline.timing import Timing, one_thread, time_detector
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pool import Arithmetic, FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.fitting import TrainingPass, solve_facts
-from tactslip_torch.front import Candidate
-from tactslip_torch.latency import Latency, shortest_hop
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.planning import adds_up, plan_detector
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe, fit_frame, recalls_mean, stand_for
-from tactslip_torch.search import Search, offset_of
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import Align
-from tactslip_torch.timing import Timing, one_thread, time_detector
 
 
 @dataclass(frozen=True)
