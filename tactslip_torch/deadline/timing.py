@@ -1,4 +1,6 @@
-"""How long a decision takes here: ``python -m tactslip_torch.deadline.timing detector.pt [calls [engine]]``.
+"""How long a decision takes here, by itself or in a fresh process.
+
+``python -m tactslip_torch.deadline.timing detector.pt [calls [engine]]`` prints it.
 
 One bin at a time and one thread, as a live loop calls it, from raw samples to the decision. Prints
 a line of JSON: p50 and p99 in microseconds. Calls in which the system gave the processor to someone
