@@ -15,6 +15,8 @@ from benchmarks.detectors import Timed
 from benchmarks.engines import FLOAT64
 from tactslip_torch.export import export_onnx
 
+ORT = "onnxruntime, float32 in, float64 inside, with validity"
+
 
 def session(timed: Timed, threads: int) -> Callable[[Any], Any]:
     """Scores by onnxruntime, of raw bins with their context.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,22 @@ RESULTS = Path(__file__).parent / "results"
 EXIT_INTERRUPTED = 130
 
 
-def refuse_folders(
-    parser: argparse.ArgumentParser, parsed: argparse.Namespace, *names: str
-) -> None:
-    """End the program with the parser's error if one of these options names a folder."""
+def refuse_paths(parser: argparse.ArgumentParser, parsed: argparse.Namespace, *names: str) -> None:
+    """End the program with the parser's error if one of these options names no file to write.
+
+    Before anything is measured: the folder is made, and a file of no name is opened in it.
+    """
     for name in names:
         path = getattr(parsed, name)
-        if path and path.is_dir():
+        if not path:
+            continue
+        if path.is_dir():
             parser.error(f"--{name} needs a file, {path} is a folder")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=path.parent).close()
+        except OSError as error:
+            parser.error(f"--{name} cannot be written to {path}: {error.strerror}")
 
 
 def limits_table(rows: Sequence[Mapping[str, Any]], measured: str = "measured") -> str:

@@ -18,13 +18,17 @@ from typing import Any, NamedTuple
 from benchmarks import train
 from benchmarks.features import figure as features_figure
 from benchmarks.features import report as features
+from benchmarks.features.guards import measure as guards
 from benchmarks.latency import figure as latency_figure
 from benchmarks.latency import report as latency
+from benchmarks.model import measure as model_measure
 from benchmarks.model import report as model
 from benchmarks.outcome import QUICK_LINE, RESULTS
 from benchmarks.precision import report as precision
+from benchmarks.rates import NOT_MEASURED, not_measured
 from benchmarks.tables import Table, limits
 from benchmarks.throughput import figure as throughput_figure
+from benchmarks.throughput import measure as throughput_measure
 from benchmarks.throughput import report as throughput
 from tactslip_torch.files import whole_file
 
@@ -50,7 +54,8 @@ class Section(NamedTuple):
         text: what it prints.
         draw: draws its figure; ``None`` where the benchmark itself leaves one.
         about: a line on what was measured.
-        needs: sections without which there is no figure.
+        needs: every section of its report.
+        keys: what its report has besides ``_KEYS``.
     """
 
     title: str
@@ -59,6 +64,7 @@ class Section(NamedTuple):
     draw: Callable[[Report, Path], None] | None = None
     about: Callable[[Report], str] | None = None
     needs: tuple[str, ...] = ()
+    keys: tuple[str, ...] = ()
 
 
 SECTIONS = {
@@ -67,10 +73,15 @@ SECTIONS = {
         features.tables,
         features.report_text,
         features_figure.figure,
-        needs=("pool",),
+        needs=("pool", "roofline", *guards.SECTIONS),
     ),
     "latency": Section(
-        "Latency", latency.tables, latency.report_text, latency_figure.figure, latency.about
+        "Latency",
+        latency.tables,
+        latency.report_text,
+        latency_figure.figure,
+        latency.about,
+        needs=("latency",),
     ),
     "throughput": Section(
         "Throughput",
@@ -78,13 +89,18 @@ SECTIONS = {
         throughput.report_text,
         throughput_figure.figure,
         throughput.about,
-        needs=("batch",),
+        needs=tuple(throughput_measure.SECTIONS),
     ),
-    "train": Section("Training", None, train.report_text),
-    "model": Section("Kernel machine at any size", None, model.report_text),
-    "precision": Section("Precision", None, precision.report_text),
+    "train": Section("Training", None, train.report_text, keys=("experiment", "stages", "wholes")),
+    "model": Section(
+        "Kernel machine at any size", None, model.report_text, needs=tuple(model_measure.SECTIONS)
+    ),
+    "precision": Section(
+        "Precision", None, precision.report_text, keys=("variants", "solves", "ratios")
+    ),
 }
 """By the name of the benchmark and of its file."""
+_KEYS = ("machine", "versions", "limits")
 
 
 def load_reports(folder: Path) -> dict[str, dict[str, Any]]:
@@ -101,17 +117,30 @@ def load_reports(folder: Path) -> dict[str, dict[str, Any]]:
             continue
         try:
             found[name] = json.loads(path.read_text(encoding="utf-8"))
-        except json.JSONDecodeError as error:
+        except ValueError as error:  # JSON's, and that of bytes that are no text
             raise ValueError(f"{path} is not JSON ({error}); measure it again") from None
-        missing = [of for of in SECTIONS[name].needs if of not in found[name]["sections"]]
+        missing = _missing(found[name], SECTIONS[name])
         if missing:
-            raise ValueError(
-                f"{path} has no section {missing[0]}; python -m benchmarks.{name} measures all"
-            )
+            raise ValueError(f"{path} has no {missing}; python -m benchmarks.{name} measures all")
     if not found:
         names = ", ".join(f"{name}.json" for name in SECTIONS)
         raise FileNotFoundError(f"no numbers in {folder}, expected any of {names}; measure first")
     return found
+
+
+def _missing(report: Any, section: Section) -> str:
+    """What a file lacks, in words; empty if it is whole."""
+    if not isinstance(report, dict):
+        return "report in it"
+    sections = report.get("sections", {})
+    lacking = [f"section {name}" for name in section.needs if name not in sections]
+    lacking += [f'"{name}"' for name in (*_KEYS, *section.keys) if name not in report]
+    return next(iter(lacking), "")
+
+
+def is_quick(report: Report) -> bool:
+    """Whether the numbers of a report mean nothing."""
+    return bool(report.get("quick")) or report.get("experiment") == "quick"
 
 
 def markdown(reports: Mapping[str, Report], images: str) -> str:
@@ -121,7 +150,14 @@ def markdown(reports: Mapping[str, Report], images: str) -> str:
         reports: by name, of ``SECTIONS``.
         images: folder of the figures, as the file refers to it.
     """
-    parts = [INTRODUCTION.format(results=images), _limits(reports)]
+    introduction = INTRODUCTION.format(results=images)
+    quick = [name for name, report in reports.items() if is_quick(report)]
+    if quick:
+        introduction = introduction.replace(
+            "# Benchmarks\n",
+            f"# Benchmarks, QUICK: numbers mean nothing\n\n**QUICK runs: {', '.join(quick)}.**\n",
+        )
+    parts = [introduction, _limits(reports)]
     for name, section in SECTIONS.items():
         command = f"`python -m benchmarks.{name}`"
         if name in reports:
@@ -132,23 +168,33 @@ def markdown(reports: Mapping[str, Report], images: str) -> str:
 
 
 def _limits(reports: Mapping[str, Report]) -> str:
-    """How many limits are missed, and every limit of every benchmark that has a table of them."""
-    rows = [
-        {**row, "what": f"{name}: {row['what']}"}
-        for name, report in reports.items()
-        for row in report["limits"]
-        if "what" in row
-    ]
-    missed = sum(not row["ok"] for row in rows)
-    line = f"{len(rows) - missed} of {len(rows)} limits that the project has set itself are met."
-    return "\n\n".join(["## Limits", line, *([limits(rows).markdown()] if rows else [])])
+    """How many limits are met, and every limit of every benchmark that has a table of them.
+
+    A quick run judges nothing, and of a benchmark that has left no numbers nothing is met.
+    """
+    rows: list[dict[str, Any]] = []
+    for name in SECTIONS:
+        if name not in reports:
+            rows.append(not_measured(f"{name}: every limit", ""))
+            continue
+        for row in reports[name]["limits"]:
+            if "what" in row:
+                ok = None if is_quick(reports[name]) else row["ok"]
+                rows.append({**row, "what": f"{name}: {row['what']}", "ok": ok})
+    judged = [row["ok"] for row in rows if row["ok"] is not None]
+    open_ = sum(row["measured"] == NOT_MEASURED for row in rows)
+    line = f"{sum(judged)} of {len(judged)} limits that were measured are met; "
+    line += f"rows not measured: {open_}."
+    if any(is_quick(report) for report in reports.values()):
+        line += " QUICK runs judge no limit."
+    return "\n\n".join(["## Limits", line, limits(rows).markdown()])
 
 
 def _section(name: str, section: Section, report: Report, images: str) -> list[str]:
     facts = ", ".join([*report["machine"].values()])
     versions = ", ".join(f"{what} {of}" for what, of in report["versions"].items())
     parts = [f"`python -m benchmarks.{name}`, on {facts}; {versions}."]
-    if report.get("quick"):
+    if is_quick(report):
         parts.append(f"**{QUICK_LINE}.**")
     if section.about:
         parts.append(f"{section.about(report)[:1].upper()}{section.about(report)[1:]}.")

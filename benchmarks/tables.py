@@ -37,13 +37,12 @@ def limits(rows: Sequence[Mapping[str, Any]], measured: str = "measured") -> Tab
     """Every limit beside what was measured, met or missed.
 
     Args:
-        rows: with ``what``, ``measured``, ``limit`` and ``ok``.
+        rows: with ``what``, ``measured``, ``limit`` and ``ok``, which is ``None`` where there is
+            nothing to judge.
         measured: heads the second column.
     """
-    cells = [
-        [row["what"], row["measured"], row["limit"], "met" if row["ok"] else "MISSED"]
-        for row in rows
-    ]
+    verdicts = {True: "met", False: "MISSED", None: "-"}
+    cells = [[row["what"], row["measured"], row["limit"], verdicts[row["ok"]]] for row in rows]
     return Table(["limits", measured, "limit", ""], cells)
 
 

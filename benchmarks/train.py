@@ -25,6 +25,7 @@ from statistics import median
 from typing import Any, NamedTuple
 
 from benchmarks.machine import machine_facts
+from benchmarks.outcome import refuse_paths
 from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE
 
@@ -470,8 +471,7 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parsed = parser.parse_args(arguments)
     if parsed.repeat < 1:
         parser.error(f"--repeat must be at least 1, got {parsed.repeat}")
-    if parsed.json and parsed.json.is_dir():
-        parser.error(f"--json needs a file, {parsed.json} is a folder")
+    refuse_paths(parser, parsed, "json")
     return parsed
 
 

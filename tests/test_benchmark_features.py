@@ -249,6 +249,18 @@ def test_a_folder_is_no_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--json needs a file, . is a folder" in capsys.readouterr().err
 
 
+def test_a_path_is_tried_before_anything_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "measure", lambda *_: pytest.fail("measured"))
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as error:
+        bench.main(["--quick", "--json", str(tmp_path / "file" / "numbers.json")])
+    assert error.value.code == 2
+    assert "--json cannot be written to" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 def test_a_figure_shows_the_pool(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as error:
         bench.main(["--only", "solve", "--figure", "nowhere.png"])

@@ -151,10 +151,19 @@ def row(way: str, seconds: float, **changes: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize(("seconds", "is_ok"), [(0.99e-3, True), (1.01e-3, False)])
 def test_limit_is_on_the_eager_engine_beside_the_loop(seconds: float, is_ok: bool) -> None:
-    rows = [row(ways.LOOP, 0.2), row(f"eager, {FLOAT32}", seconds), row("part", 1.0)]
-    (limit,) = report.limit_rows(rows)
+    rows = [
+        row(ways.LOOP, 0.2, features=2582),
+        row(f"eager, {FLOAT32}", seconds),
+        row(ways.PRUNED_LOOP, 7 * seconds),
+    ]
+    limit, alike = report.limit_rows(rows)
     assert limit["ok"] is is_ok
-    assert report.limit_rows(rows[1:]) == []
+    assert "(all 2582 features)" in limit["what"]
+    assert "(its 120)" in limit["what"]
+    assert alike["measured"].startswith("7 (")
+    assert alike["ok"] is None
+    assert [of["measured"] for of in report.limit_rows(rows[1:2])] == ["not measured"] * 2
+    assert [of["ok"] for of in report.limit_rows([])] == [None, None]
 
 
 def test_quick_run_measures_every_way(

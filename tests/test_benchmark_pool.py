@@ -90,8 +90,34 @@ def test_limit_on_a_ratio_is_per_bin_and_within_rounds(
         row(peer, [0.1 * times * more, 0.5 * times * more, 9.0 * times], num=1),
     )
     found = pool_report.limit_rows(pool_numbers(*rows))
-    (limit,) = [of for of in found if of["what"].startswith(f"times {peer}")]
+    of_peer = [of for of in found if of["what"].startswith(f"times {peer}")]
+    (limit,) = [of for of in of_peer if of["measured"] != "not measured"]
     assert limit["ok"] is is_ok
+    assert len(of_peer) == 2 * len(bins.KINDS)
+    assert [of["ok"] for of in of_peer if of is not limit] == [None] * (len(of_peer) - 1)
+
+
+def test_only_the_fastest_engine_is_held_to_mini_rocket() -> None:
+    rows = (row("eager, float32", [1.0]), row(MINI_ROCKET, [1.0]), row("compiled, float32", [1.0]))
+    found = pool_report.limit_rows(pool_numbers(*rows))
+    eager, compiled = (
+        next(of for of in found if f"{MINI_ROCKET}, {engine}" in of["what"])
+        for engine in ("eager", "compiled")
+    )
+    assert (eager["ok"], compiled["ok"]) == (None, False)
+    assert "information" in eager["what"]
+    assert eager["measured"] == compiled["measured"] == "1 (1 to 1)"
+
+
+def test_the_oracles_processor_time_stands_beside_its_time() -> None:
+    rows = (
+        row("eager, float32", [1.0], core_s=[2.0]),
+        row(ORACLE, [61.0], core_s=[61.0]),
+    )
+    found = pool_report.limit_rows(pool_numbers(*rows))
+    (limit,) = [of for of in found if ORACLE in of["what"] and of["measured"] != "not measured"]
+    assert limit["ok"] is True
+    assert limit["measured"] == "61 (61 to 61); of core-us 30.5"
 
 
 @pytest.mark.parametrize(
@@ -104,7 +130,7 @@ def test_limit_on_errors_is_on_the_worst_kind_of_bin(name: str, value: float) ->
 
     def missed(degenerate: list[dict[str, Any]]) -> int:
         limits = pool_report.limit_rows(pool_numbers(good) | {"degenerate": degenerate})
-        return sum(not of["ok"] for of in limits if "every kind" in of["what"])
+        return sum(of["ok"] is False for of in limits if "every kind" in of["what"])
 
     assert missed([]) == 0
     assert missed([bad]) == 1
@@ -113,7 +139,7 @@ def test_limit_on_errors_is_on_the_worst_kind_of_bin(name: str, value: float) ->
 def test_float64_is_held_to_more() -> None:
     one = row("eager, float64", [1.0], errors=NO_ERROR | {"worst": 1e-9, "mode_elsewhere": 1e-9})
     limits = pool_report.limit_rows(pool_numbers(one))
-    assert [of["what"].split(",")[0] for of in limits if not of["ok"]] == [
+    assert [of["what"].split(",")[0] for of in limits if of["ok"] is False] == [
         "error of any feature",
         "modes elsewhere",
     ]
@@ -196,6 +222,11 @@ def test_quick_run_measures_the_pool(tmp_path: Path, monkeypatch: pytest.MonkeyP
             assert of["features"] == 2582 or of["errors"] is None
         assert found["reference, float64"]["errors"]["worst"] < 1e-11  # chunks round otherwise
     for of in made["limits"]:
-        assert of["ok"] or "bins/s" in of["what"] or "times" in of["what"] or "mode" in of["what"]
+        assert (
+            of["ok"] is not False
+            or "bins/s" in of["what"]
+            or "times" in of["what"]
+            or "mode" in of["what"]
+        )
     assert len(made["fractions"]) == len(ways)
     assert drawing.stat().st_size > 0

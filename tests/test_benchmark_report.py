@@ -39,13 +39,14 @@ def test_what_was_measured_is_shown_and_what_was_not_is_named(tmp_path: Path) ->
     out = tmp_path / "B.md"
     assert report.main(["--results", str(results), "--out", str(out)]) == 0
     text = out.read_text()
-    assert "1 of 1 limits that the project has set itself are met" in text
+    assert "1 of 1 limits that were measured are met; rows not measured: 6." in text
     assert "![Latency](results/latency.png)" in text
     assert (results / "latency.png").stat().st_size > 0
     assert "| eager, float32 | 120 | 1,000 |" in text
     assert "abacus; torch 2.13.0" in text
     assert "simulated" in text
     for name in set(report.SECTIONS) - {"latency"}:
+        assert f"| {name}: every limit | not measured |" in text
         assert f"Not measured; `python -m benchmarks.{name}` does." in text
 
 
@@ -63,11 +64,34 @@ def test_training_is_text(tmp_path: Path) -> None:
 
 def test_quick_numbers_are_named_so() -> None:
     made = latency_report() | {"quick": True}
-    assert "QUICK" in report.markdown({"latency": made}, "results")
+    text = report.markdown({"latency": made}, "results")
+    assert text.startswith("# Benchmarks, QUICK: numbers mean nothing\n\n**QUICK runs: latency.**")
+    assert "0 of 0 limits" in text
+    assert "| met |" not in text
     assert "QUICK" not in report.markdown({"latency": latency_report()}, "results")
+    trained = report_of([12.0], [10.0]) | {"experiment": "quick"}
+    assert "QUICK runs: train" in report.markdown({"train": trained}, "results")
 
 
-@pytest.mark.parametrize("content", [None, "{", '{"sections": {"solve": {}}}'])
+@pytest.mark.parametrize("name", report.SECTIONS)
+def test_a_file_that_lacks_a_section_is_refused(name: str, tmp_path: Path) -> None:
+    section = report.SECTIONS[name]
+    keys = ("machine", "versions", "limits", *section.keys)
+    whole = {"sections": dict.fromkeys(section.needs, 0), **dict.fromkeys(keys, 0)}
+    write(tmp_path, **{name: whole})
+    assert report.load_reports(tmp_path) == {name: whole}
+    for key in keys:
+        write(tmp_path, **{name: {of: whole[of] for of in whole if of != key}})
+        with pytest.raises(ValueError, match=f'has no "{key}"; python -m benchmarks.{name}'):
+            report.load_reports(tmp_path)
+    for lacking in section.needs:
+        rest = {of: 0 for of in section.needs if of != lacking}
+        write(tmp_path, **{name: whole | {"sections": rest}})
+        with pytest.raises(ValueError, match=f"has no section {lacking};"):
+            report.load_reports(tmp_path)
+
+
+@pytest.mark.parametrize("content", [None, "{", "[]", '{"sections": {"solve": {}}}'])
 def test_without_numbers_one_line_says_so(
     content: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from engine_bins import some_hand
 
+from benchmarks.detectors import timed_detector
 from benchmarks.engines import ENGINES, FLOAT32, pool_of
 from benchmarks.model.worker import WorkerFailedError
 from benchmarks.selection import kept_selection
@@ -36,6 +37,10 @@ def bulk_row(way: str, stage: str, rate: float, threads: int = 2) -> dict[str, A
     return {"way": way, "stage": stage, "threads": threads, "bins": 10, "seconds": [10 / rate]}
 
 
+def measured(limits: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [of for of in limits if of["measured"] != "not measured"]
+
+
 # -------------------------------------------------------------------------------------- limits
 @pytest.mark.parametrize(
     ("way", "stage", "rate", "is_ok"),
@@ -53,8 +58,10 @@ def test_limits_on_bulk(way: str, stage: str, rate: float, is_ok: bool) -> None:
         bulk_row(way, measure.FEATURES, 1e9),
         bulk_row("reference, float32", stage, 1.0),
     ]
-    (limit,) = report.limit_rows({"bulk": {"rows": [*others, bulk_row(way, stage, rate)]}})
+    found = report.limit_rows({"bulk": {"rows": [*others, bulk_row(way, stage, rate)]}})
+    (limit,) = measured(found)
     assert limit["ok"] is is_ok
+    assert [of["ok"] for of in found if of is not limit] == [None] * 3
 
 
 def test_the_best_of_compiled_and_onnxruntime_counts() -> None:
@@ -62,23 +69,25 @@ def test_the_best_of_compiled_and_onnxruntime_counts() -> None:
         bulk_row("compiled, float32", measure.FILTERED, 70_000.0),
         bulk_row(measure.ORT, measure.RAW, 50_000.0),
     ]
-    (limit,) = report.limit_rows({"bulk": {"rows": rows}})
+    (limit,) = measured(report.limit_rows({"bulk": {"rows": rows}}))
     assert limit["ok"]
     assert "compiled" in limit["what"]
 
 
 @pytest.mark.parametrize(("gigabytes", "is_ok"), [(1.49, True), (1.5, False)])
 def test_limit_on_streaming_is_on_the_peak(gigabytes: float, is_ok: bool) -> None:
-    row = {"bins": 10, "peak_bytes": gigabytes * 1e9, "is_pool": False}
-    (limit,) = report.limit_rows({"stream": {"rows": [row]}})
-    assert limit["ok"] is is_ok
+    row = {"bins": 10, "peak_bytes": gigabytes * 1e9, "is_pool": False, "is_finite": not is_ok}
+    peak, finite = measured(report.limit_rows({"stream": {"rows": [row]}}))
+    assert peak["ok"] is is_ok
+    assert finite["ok"] is not is_ok
 
 
 # ---------------------------------------------------------------------------------------- jobs
 def test_streaming_sums_every_bin_once(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
-    extractor = worker._extractor(ENGINES[0], is_pool=False)
-    assert [str(name) for name in extractor.names] == kept_selection()["names"]
+    names = kept_selection()["names"][5:2:-1]
+    extractor = worker._extractor(ENGINES[0], names)
+    assert [str(name) for name in extractor.names] == names
     whole = extractor.__call__
 
     class Counting:
@@ -92,24 +101,36 @@ def test_streaming_sums_every_bin_once(monkeypatch: pytest.MonkeyPatch) -> None:
                 seen.append(len(bins))
                 yield self(bins)
 
-    monkeypatch.setattr(worker, "_extractor", lambda engine, is_pool: Counting())
-    found = worker.stream(ENGINES[0], 25, 10, is_pool=False)
+    monkeypatch.setattr(worker, "_extractor", lambda engine, names: Counting())
+    found = worker.stream(ENGINES[0], 25, 10, names)
     assert (found["bins"], found["is_finite"]) == (25, True)
     assert seen == [10, 10, 5]
 
 
 def test_a_held_batch_counts_itself_and_its_features() -> None:
-    found = worker.hold(ENGINES[0], 3)
-    assert found["own_bytes"] == 3 * 4 * (2400 + 120)
-    assert worker.hold(worker.IN_ONE_PIECE, 3)["own_bytes"] == 3 * 4 * (2400 + 2582)
+    found = worker.hold(ENGINES[0], 3, kept_selection()["names"][:7])
+    assert found["own_bytes"] == 3 * 4 * (2400 + 7)
+    assert worker.hold(worker.IN_ONE_PIECE, 3, None)["own_bytes"] == 3 * 4 * (2400 + 2582)
 
 
 @pytest.mark.slow
 def test_a_job_in_a_process_of_its_own() -> None:
-    found = worker.peak(do="hold", engine=ENGINES[0], batch=2000, threads=1)
+    names = kept_selection()["names"]
+    found = worker.peak(do="hold", engine=ENGINES[0], batch=2000, names=names, threads=1)
     assert found["peak_bytes"] - found["before_bytes"] >= 2000 * 4 * 2400  # the bins at least
     with pytest.raises(WorkerFailedError, match="without an answer"):
         worker.peak(do="nothing", threads=1)
+
+
+def test_jobs_have_the_names_that_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    timed = timed_detector(1)
+    timed = replace(timed, selection=timed.selection | {"names": timed.selection["names"][:3]})
+    jobs: list[dict[str, Any]] = []
+    monkeypatch.setattr(measure, "peak", lambda **job: jobs.append(job) or {})
+    measure.memory(timed, TINY)
+    measure.stream(timed, TINY)
+    few = timed.selection["names"]
+    assert [job["names"] for job in jobs] == [few] * len(ENGINES) + [None, few, None]
 
 
 # ---------------------------------------------------------------------------------------- hands

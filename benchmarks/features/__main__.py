@@ -29,7 +29,7 @@ from benchmarks.outcome import (
     RESULTS,
     keep_figure,
     keep_numbers,
-    refuse_folders,
+    refuse_paths,
 )
 
 SECTIONS: dict[str, Callable[[Sizes], dict[str, Any]]] = {
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = f"where the {what} go (benchmarks/results, if all is measured in full)"
         parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
     parsed = parser.parse_args(arguments)
-    refuse_folders(parser, parsed, "json", "figure")
+    refuse_paths(parser, parsed, "json", "figure")
     if parsed.figure and parsed.only and "pool" not in parsed.only:
         parser.error("--figure shows the section pool; measure it, with roofline if you like")
     if not (parsed.quick or parsed.only):

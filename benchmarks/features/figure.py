@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from benchmarks.bins import KINDS
 from benchmarks.drawing import GREY, LIGHT, bars, colour_of, finish, limit_line, plain_decades
 from benchmarks.engines import FLOAT32, FLOAT64
-from benchmarks.features.pool_report import LEAST_RATE, rate
+from benchmarks.features.pool_report import LEAST_RATE
 from benchmarks.features.roofline import GEMM, MEMORY
 from benchmarks.machine import threads_text
+from benchmarks.rates import rate
 from benchmarks.tables import number
 
 

@@ -26,7 +26,7 @@ from benchmarks.outcome import (
     RESULTS,
     keep_figure,
     keep_numbers,
-    refuse_folders,
+    refuse_paths,
 )
 
 
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = f"where the {what} go (benchmarks/results, unless --quick)"
         parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
     parsed = parser.parse_args(arguments)
-    refuse_folders(parser, parsed, "json", "figure")
+    refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
         parsed.json = parsed.json or RESULTS / "latency.json"
         parsed.figure = parsed.figure or RESULTS / "latency.png"

@@ -8,8 +8,9 @@ from typing import Any
 from benchmarks.clocks import Ratio, paired_ratio
 from benchmarks.engines import FLOAT32
 from benchmarks.latency.measure import row_of
-from benchmarks.latency.ways import LOOP
+from benchmarks.latency.ways import LOOP, PRUNED_LOOP
 from benchmarks.outcome import heading
+from benchmarks.rates import NOT_MEASURED, at_least, information
 from benchmarks.selection import source_text
 from benchmarks.tables import Spread, Table, limits, number
 
@@ -30,18 +31,23 @@ def loop_over(rows: Rows) -> dict[str, Ratio]:
 
 def limit_rows(rows: Rows) -> list[dict[str, Any]]:
     """Limits beside what was measured, and whether they hold."""
-    over, found = loop_over(rows), []
     way = f"eager, {FLOAT32}"
-    if way in over:
-        found.append(
-            {
-                "what": f"p50, {LOOP} / {way}, quadratic head",
-                "measured": Spread(*over[way]).text(),
-                "limit": f">= {TIMES_THE_LOOP:g}",
-                "ok": over[way].median >= TIMES_THE_LOOP,
-            }
-        )
-    return found
+    found = {row["way"]: row for row in rows}
+    features = [found[name]["features"] if name in found else "?" for name in (LOOP, way)]
+    what = f"p50, {LOOP} (all {features[0]} features) / {way}, quadratic head (its {features[1]})"
+    alike = f"p50, {PRUNED_LOOP} / {way} (information: like for like)"
+    ratio = _over(rows, PRUNED_LOOP, way)
+    return [
+        at_least(what, _over(rows, LOOP, way), TIMES_THE_LOOP),
+        information(alike, NOT_MEASURED if ratio is None else ratio.text()),
+    ]
+
+
+def _over(rows: Rows, peer: str, way: str) -> Spread | None:
+    found = [row_of(rows, name) for name in (peer, way)]
+    if None in found:
+        return None
+    return Spread(*paired_ratio(*(row["round_medians_s"] for row in found if row)))
 
 
 def tables(report: Mapping[str, Any]) -> dict[str, list[Table]]:

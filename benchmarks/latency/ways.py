@@ -12,7 +12,7 @@ from benchmarks.bins import WINDOW_LENGTHS, labelled_bins, raw_bins
 from benchmarks.clocks import say
 from benchmarks.detectors import Timed
 from benchmarks.engines import DTYPES, ENGINES, FLOAT32, FLOAT64, pool_of, selected_extractor
-from benchmarks.exported import session
+from benchmarks.exported import ORT, session
 from benchmarks.latency.sizes import Sizes
 from benchmarks.peers import heads, loop, others
 from tactslip_torch.features.extractor import EngineName
@@ -59,9 +59,7 @@ def ours(timed: Timed, sizes: Sizes) -> dict[str, Call]:
     )
     if sizes.has_onnx:
         say("latency: export")
-        calls["onnxruntime, float32, with validity"] = Call(
-            _in_onnxruntime(timed, samples), num, judged=sizes.judged
-        )
+        calls[ORT] = Call(_in_onnxruntime(timed, samples), num, judged=sizes.judged)
     return calls
 
 

@@ -26,7 +26,7 @@ from benchmarks.model.measure import SECTIONS
 from benchmarks.model.report import limit_rows, ratios, report_text
 from benchmarks.model.sizes import QUICK, Sizes
 from benchmarks.model.worker import WorkerFailedError
-from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, keep_numbers, refuse_folders
+from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, keep_numbers, refuse_paths
 
 EXIT_FAILED = 1
 
@@ -77,7 +77,7 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         value = getattr(parsed, name)
         if value is not None and value < 1:
             parser.error(f"--{name} must be at least 1, got {value}")
-    refuse_folders(parser, parsed, "json", "figure")
+    refuse_paths(parser, parsed, "json", "figure")
     if parsed.figure and parsed.only and not set(parsed.only) & set(PANELS):
         parser.error(f"--figure shows {', '.join(PANELS)}; measure one of them")
     if not (parsed.quick or parsed.only):

@@ -18,7 +18,7 @@ import torch
 
 from benchmarks.clocks import on_threads
 from benchmarks.machine import machine_facts, versions
-from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, keep_numbers, refuse_folders
+from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, keep_numbers, refuse_paths
 from benchmarks.precision.data import load_experiment
 from benchmarks.precision.figure import figure
 from benchmarks.precision.measure import measure_variants
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = parser.parse_args(arguments)
     if parsed.threads < 1:
         parser.error(f"--threads must be at least 1, got {parsed.threads}")
-    refuse_folders(parser, parsed, "json", "figure")
+    refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
         parsed.json = parsed.json or RESULTS / "precision.json"
         parsed.figure = parsed.figure or RESULTS / "precision.png"

@@ -23,7 +23,7 @@ from benchmarks.outcome import (
     RESULTS,
     keep_figure,
     keep_numbers,
-    refuse_folders,
+    refuse_paths,
 )
 from benchmarks.throughput.figure import PANELS, figure
 from benchmarks.throughput.measure import SECTIONS
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = f"where the {what} go (benchmarks/results, if all is measured in full)"
         parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
     parsed = parser.parse_args(arguments)
-    refuse_folders(parser, parsed, "json", "figure")
+    refuse_paths(parser, parsed, "json", "figure")
     if parsed.figure and parsed.only and not set(parsed.only) & set(PANELS):
         parser.error(f"--figure shows {', '.join(PANELS)}; measure one of them")
     if not (parsed.quick or parsed.only):

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 
 from benchmarks.drawing import GREY, LIGHT, colour_of, finish, plain_decades
 from benchmarks.machine import threads_text
+from benchmarks.rates import rate
 from benchmarks.tables import Spread
 from benchmarks.throughput.measure import held_bytes
-from benchmarks.throughput.report import rate
 from benchmarks.throughput.worker import IN_ONE_PIECE
 
 Rows = Sequence[Mapping[str, Any]]
@@ -61,13 +61,15 @@ def _batch(axes: Axes, rows: Rows) -> None:
 
 def _over(name: str, label: str, title: str) -> Callable[[Axes, Rows], None]:
     def draw(axes: Axes, rows: Rows) -> None:
-        for way in dict.fromkeys(row["way"] for row in rows):
-            mine = [row for row in rows if row["way"] == way]
+        for way, threads in dict.fromkeys((row["way"], row["threads"]) for row in rows):
+            mine = [row for row in rows if (row["way"], row["threads"]) == (way, threads)]
             times = [Spread.of(row["seconds"]).times(1e6 / row["bins"]) for row in mine]
-            _line(axes, [row[name] for row in mine], times, "-o", colour_of(way), way)
+            style = "--o" if threads == 1 else "-o"
+            label = f"{way}, {threads_text(threads)}"
+            _line(axes, [row[name] for row in mine], times, style, colour_of(way), label)
         axes.set_xlabel(label)
         axes.set_ylabel("us a bin")
-        axes.set_title(f"{title}, {threads_text(rows[0]['threads'])}", fontsize=10)
+        axes.set_title(title, fontsize=10)
 
     return draw
 

@@ -14,7 +14,7 @@ from benchmarks.bins import RANDOM, WINDOW_LENGTHS, bins_of, raw_bins
 from benchmarks.clocks import Way, on_threads, say, shuffled_rounds, shuffled_turns
 from benchmarks.detectors import Timed
 from benchmarks.engines import DTYPES, ENGINES, FLOAT32, FLOAT64
-from benchmarks.exported import session
+from benchmarks.exported import ORT, session
 from benchmarks.machine import threads_text
 from benchmarks.throughput.sizes import Sizes
 from benchmarks.throughput.worker import IN_ONE_PIECE, peak
@@ -24,7 +24,6 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.filtering import ChannelFilter
 
 FEATURES, FILTERED, RAW = "features", "filtered bin to score", "raw bin to score"
-ORT = "onnxruntime, float32, with validity"
 REFERENCE: EngineName = "reference"
 _ONNX_CHUNK = 256  # what it is fastest with
 Calls = dict[str, Callable[[], object]]
@@ -65,7 +64,7 @@ def _bulk_calls(timed: Timed, sizes: Sizes, threads: int) -> tuple[Calls, dict[s
                 calls[name], counts[name] = call, num
     if sizes.has_onnx:
         name = f"{ORT}: {RAW}"
-        few = samples[: sizes.reference_bins]
+        few = samples[: sizes.onnx_bins]
         calls[name], counts[name] = _exported(timed, few, threads), len(few)
     return calls, counts
 
@@ -79,7 +78,8 @@ def _exported(timed: Timed, samples: Tensor, threads: int) -> Callable[[], objec
 def batch(timed: Timed, sizes: Sizes) -> dict[str, Any]:
     """The planned detector from filtered bins to scores, over the number of bins at once."""
     rows = []
-    whole = torch.randn(max(sizes.batches), 24, 100)
+    generator = torch.Generator().manual_seed(sizes.seed)
+    whole = torch.randn(max(sizes.batches), 24, 100, generator=generator)
     for num in sizes.batches:
         bins = whole[:num]
         for threads in sizes.threads:
@@ -145,14 +145,16 @@ def _curve(
     calls: Calls = {
         engine: partial(FeatureExtractor(pool, engine=engine), bins) for engine in ENGINES
     }
-    threads = max(sizes.threads)
-    with torch.inference_mode(), on_threads(threads):
-        turns = shuffled_turns(calls, sizes.few_rounds, sizes.seed, what)
-    about = {"threads": threads, "bins": num, "features": len(pool.names), **facts}
-    return [
-        {"way": f"{engine}, {FLOAT32}", **about, "seconds": of.seconds}
-        for engine, of in turns.items()
-    ]
+    about = {"bins": num, "features": len(pool.names), **facts}
+    rows = []
+    for threads in sizes.threads:
+        with torch.inference_mode(), on_threads(threads):
+            turns = shuffled_turns(calls, sizes.few_rounds, sizes.seed, what)
+        rows += [
+            {"way": f"{engine}, {FLOAT32}", "threads": threads, **about, "seconds": of.seconds}
+            for engine, of in turns.items()
+        ]
+    return rows
 
 
 def memory(timed: Timed, sizes: Sizes) -> dict[str, Any]:
@@ -163,7 +165,8 @@ def memory(timed: Timed, sizes: Sizes) -> dict[str, Any]:
     rows = []
     for engine, num in jobs:
         say(f"memory of {num} bins, {engine}")
-        answer = peak(do="hold", engine=engine, batch=num, threads=threads)
+        names = None if engine == IN_ONE_PIECE else timed.selection["names"]
+        answer = peak(do="hold", engine=engine, batch=num, names=names, threads=threads)
         rows.append({"way": engine, "bins": num, "threads": threads, **answer})
     return {"rows": rows}
 
@@ -179,7 +182,7 @@ def stream(timed: Timed, sizes: Sizes) -> dict[str, Any]:
             engine=ENGINES[0],
             num_bins=num,
             chunk=sizes.chunk,
-            is_pool=is_pool,
+            names=None if is_pool else timed.selection["names"],
             threads=threads,
         )
         about = {"way": f"{ENGINES[0]}, {FLOAT32}", "is_pool": is_pool, "chunk": sizes.chunk}

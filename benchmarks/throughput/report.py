@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.engines import FLOAT32
+from benchmarks.exported import ORT
 from benchmarks.outcome import heading
+from benchmarks.rates import at_least, not_measured, rate
 from benchmarks.selection import source_text
 from benchmarks.tables import Spread, Table, limits, number
-from benchmarks.throughput.measure import FILTERED, ORT, RAW, held_bytes
+from benchmarks.throughput.measure import FILTERED, RAW, held_bytes
 from benchmarks.throughput.worker import IN_ONE_PIECE
 
 LEAST_EAGER, LEAST_COMPILED = 25_000.0, 60_000.0  # bins a second on two threads
@@ -18,14 +20,9 @@ MOST_STREAM_GB = 1.5
 Rows = Sequence[Mapping[str, Any]]
 
 
-def rate(row: Mapping[str, Any]) -> Spread:
-    """Bins a second."""
-    return Spread.of([row["bins"] / seconds for seconds in row["seconds"]])
-
-
 # -------------------------------------------------------------------------------------- limits
 def limit_rows(sections: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Limits beside what was measured, and whether they hold; none of absent sections.
+    """Limits beside what was measured, and whether they hold.
 
     Args:
         sections: name to numbers; any of ``SECTIONS``.
@@ -36,32 +33,39 @@ def limit_rows(sections: Mapping[str, Any]) -> list[dict[str, Any]]:
         (row["way"], row["stage"]): rate(row) for row in rows if row["threads"] == LIMIT_THREADS
     }
     eager, compiled = (f"{engine}, {FLOAT32}" for engine in ("eager", "compiled"))
-    if (eager, FILTERED) in rates:
-        found.append(_at_least(f"{eager}, {FILTERED}", rates[eager, FILTERED], LEAST_EAGER))
     quick = {key: of for key, of in rates.items() if key in ((compiled, FILTERED), (ORT, RAW))}
-    if quick:
-        best = max(quick, key=lambda key: quick[key].median)
-        found.append(_at_least(", ".join(best), quick[best], LEAST_COMPILED))
-    for row in sections.get("stream", {}).get("rows", ()):
-        gigabytes = row["peak_bytes"] / 1e9
-        found.append(
+    best = max(quick, key=lambda key: quick[key].median, default=(compiled, FILTERED))
+    limits_of = {(eager, FILTERED): LEAST_EAGER, best: LEAST_COMPILED}
+    for key, least in limits_of.items():
+        what = f"bins/s on {LIMIT_THREADS} threads, {', '.join(key)}"
+        found.append(at_least(what, rates.get(key), least))
+    return found + _stream_limits(sections.get("stream", {}).get("rows", ()))
+
+
+def _stream_limits(rows: Rows) -> list[dict[str, Any]]:
+    memory = f"< {MOST_STREAM_GB:g} GB"
+    if not rows:
+        finite = not_measured("values streamed, every one finite", "yes")
+        return [not_measured("peak memory, bins streamed", memory), finite]
+    found = []
+    for row in rows:
+        about = f"{row['bins']:,} bins streamed, {_features(row)}"
+        gigabytes, is_finite = row["peak_bytes"] / 1e9, row["is_finite"]
+        found += [
             {
-                "what": f"peak memory, {row['bins']:,} bins streamed, {_features(row)}",
+                "what": f"peak memory, {about}",
                 "measured": f"{gigabytes:.2f} GB",
-                "limit": f"< {MOST_STREAM_GB:g} GB",
+                "limit": memory,
                 "ok": gigabytes < MOST_STREAM_GB,
-            }
-        )
+            },
+            {
+                "what": f"every value finite, {about}",
+                "measured": "yes" if is_finite else "no",
+                "limit": "yes",
+                "ok": is_finite,
+            },
+        ]
     return found
-
-
-def _at_least(what: str, of: Spread, least: float) -> dict[str, Any]:
-    return {
-        "what": f"bins/s on {LIMIT_THREADS} threads, {what}",
-        "measured": of.text(),
-        "limit": f">= {least:,g}",
-        "ok": of.median >= least,
-    }
 
 
 # -------------------------------------------------------------------------------------- tables
@@ -118,13 +122,12 @@ def _batch(rows: Rows) -> Table:
 
 
 def _curve(rows: Rows, name: str, title: str) -> Table:
-    ways = list(dict.fromkeys(row["way"] for row in rows))
-    threads = rows[0]["threads"]
-    found = {(row[name], row["way"]): row for row in rows}
-    header = [f"{title}, {threads} threads", "features", *(f"{way}, us/bin" for way in ways)]
+    ways = list(dict.fromkeys((row["way"], row["threads"]) for row in rows))
+    found = {(row[name], row["way"], row["threads"]): row for row in rows}
+    header = [f"{title}: us/bin", "features", *(f"{way}, {t} thr." for way, t in ways)]
     cells = []
     for value in dict.fromkeys(row[name] for row in rows):
-        each = [found[value, way] for way in ways]
+        each = [found[value, *way] for way in ways]
         times = [Spread.of(row["seconds"]).times(1e6 / row["bins"]).text() for row in each]
         cells.append([f"{value:,}", f"{each[0]['features']:,}", *times])
     return Table(header, cells)

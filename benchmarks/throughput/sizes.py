@@ -12,13 +12,14 @@ class Sizes:
     Args:
         recordings: simulated, to whose bins the head is fitted.
         bulk_bins: of a call that is to be as fast as can be.
-        reference_bins: of a call of the reference, and of the exported file.
+        reference_bins: of a call of the reference.
+        onnx_bins: of a call of the exported file.
         batches: bins at once, of the curve over batches.
         many: batches from here on are timed call by call, smaller ones in blocks.
         bins_ms: lengths of bins, of the curve over lengths.
         channels: numbers of channels, of the curve over channels.
         curve_samples: of all channels of a call of these two curves.
-        threads: one after the other; curves over lengths and channels take the most.
+        threads: one after the other; memory and streams take the most.
         held: bins at once, of the curve of memory.
         pieced: bins that the pool takes in one piece, for comparison.
         streamed: bins that pass as chunks.
@@ -33,6 +34,7 @@ class Sizes:
     recordings: int = 8
     bulk_bins: int = 4096
     reference_bins: int = 64
+    onnx_bins: int = 1024
     batches: tuple[int, ...] = (1, 4, 16, 64, 256, 1024, 4096, 16_384, 65_536)
     many: int = 1024
     bins_ms: tuple[int, ...] = (10, 20, 50, 100, 200, 400)
@@ -54,6 +56,7 @@ QUICK = Sizes(
     recordings=1,
     bulk_bins=64,
     reference_bins=8,
+    onnx_bins=8,
     batches=(1, 16, 64),
     many=64,
     bins_ms=(10, 50),

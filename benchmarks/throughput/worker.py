@@ -1,6 +1,6 @@
 """A process of its own, so that its peak of memory is that of one task.
 
-``peak(job)`` starts it with a job as JSON and returns its answer.
+``peak(job)`` starts it, hands it a job as JSON, and returns its answer.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,7 @@ from torch import Tensor
 from benchmarks.bins import RANDOM, bins_of
 from benchmarks.engines import FLOAT32, FLOAT64, pool_of
 from benchmarks.model.worker import WorkerFailedError, peak_bytes
-from benchmarks.selection import kept_selection
-from tactslip_torch.features.extractor import EngineName, FeatureExtractor
+from tactslip_torch.features.extractor import FeatureExtractor
 
 IN_ONE_PIECE = "in one piece"
 _PREPARED = 4096  # different bins; more are these in another order
@@ -40,31 +39,36 @@ def peak(**job: Any) -> dict[str, Any]:
         WorkerFailedError: if it ends without an answer.
     """
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.throughput.worker", json.dumps(job)],
+        [sys.executable, "-m", "benchmarks.throughput.worker"],
+        input=json.dumps(job),
         stdout=subprocess.PIPE,
         text=True,
         check=False,
         cwd=Path(__file__).parents[2],
     )
     if done.returncode:
-        raise WorkerFailedError(f"a worker ended without an answer to {job}; see above")
+        what = {name: of for name, of in job.items() if name != "names"}  # there are many
+        raise WorkerFailedError(f"a worker ended without an answer to {what}; see above")
     answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return answer
 
 
-def hold(engine: str, batch: int) -> dict[str, Any]:
-    """Features of one batch that is held in memory with them."""
-    make = _maker(engine, is_pool=engine == IN_ONE_PIECE)
+def hold(engine: str, batch: int, names: Sequence[str] | None) -> dict[str, Any]:
+    """Features of one batch that is held in memory with them; the whole pool without names."""
+    make = pool_of(FLOAT64) if engine == IN_ONE_PIECE else _extractor(engine, names)
     make(bins_of(RANDOM, 8).float())
     before = peak_bytes()
-    bins = torch.randn(batch, 24, 100)
+    bins = torch.randn(batch, 24, 100, generator=torch.Generator().manual_seed(0))
     features = make(bins)
     return {"before_bytes": before, "own_bytes": bins.nbytes + features.nbytes}
 
 
-def stream(engine: str, num_bins: int, chunk: int, is_pool: bool) -> dict[str, Any]:
-    """Features of many bins, chunk by chunk, to a consumer that keeps their sums."""
-    extractor = _extractor(engine, is_pool)
+def stream(engine: str, num_bins: int, chunk: int, names: Sequence[str] | None) -> dict[str, Any]:
+    """Features of many bins, chunk by chunk, to a consumer that keeps their sums.
+
+    The whole pool without names.
+    """
+    extractor = _extractor(engine, names)
     prepared = bins_of(RANDOM, min(chunk, _PREPARED)).float()
     extractor(prepared[:8])
     before = peak_bytes()
@@ -88,21 +92,17 @@ def stream(engine: str, num_bins: int, chunk: int, is_pool: bool) -> dict[str, A
 JOBS: dict[str, Callable[..., dict[str, Any]]] = {"hold": hold, "stream": stream}
 
 
-def _extractor(engine: Any, is_pool: bool) -> FeatureExtractor:
+def _extractor(engine: Any, names: Sequence[str] | None) -> FeatureExtractor:
     pool = pool_of(FLOAT32)
-    if is_pool:
+    if names is None:
         return FeatureExtractor(pool, engine=engine)
     place = {str(name): index for index, name in enumerate(pool.names)}
-    return FeatureExtractor(pool, [place[name] for name in kept_selection()["names"]], engine)
-
-
-def _maker(engine: EngineName | str, is_pool: bool) -> Callable[[Tensor], Tensor]:
-    return pool_of(FLOAT64) if engine == IN_ONE_PIECE else _extractor(engine, is_pool)
+    return FeatureExtractor(pool, [place[name] for name in names], engine)
 
 
 def main() -> None:
     """Entry point of the worker."""
-    job = json.loads(sys.argv[1])
+    job = json.load(sys.stdin)
     torch.set_num_threads(job.pop("threads"))
     with torch.inference_mode():
         answer = JOBS[job.pop("do")](**job)
