@@ -154,6 +154,34 @@ def test_spectra_alone_know_which_branches_are_rounding():
     )
 
 
+@pytest.mark.parametrize(("num", "level"), [(100, 4), (50, 3), (20, 1)])
+@pytest.mark.parametrize("offset", [0.0, 1.0])
+def test_small_values_beside_a_spike_keep_their_digits_in_float32(offset, num, level):
+    pool = FeaturePool(HAND, bin_samples=num, level=level)
+    bins = bins_of("impulses", 60, HAND, num, generator())
+    bins[::2] *= 1e3  # volts; the others are noise of one volt, which says what is usual
+    bins += offset
+    found, expected = Running(pool, pool.names, "mixed")(bins), pool(bins)
+    assert_equals_reference(found, expected, pool.names, mixed=True)
+
+
+@pytest.mark.parametrize("descriptor", ["median", "iqr"])
+def test_a_spike_for_each_descriptor_alone(descriptor):
+    pool = FeaturePool(HAND)
+    names = [name for name in pool.names if name.descriptor == descriptor]
+    spikes = 1e3 * bins_of("impulses", 20, HAND, 100, generator())
+    among = Running(pool, pool.names, "mixed")(spikes)
+    columns = [pool.names.index(name) for name in names]
+    found = Running(pool, names, "mixed")(spikes)
+    torch.testing.assert_close(found, among[:, columns], rtol=1e-4, atol=1e-10)
+    for seed in range(8):  # parts of rows, in any order
+        pick = torch.randperm(len(names), generator=generator(seed))[:5].tolist()
+        found = Running(pool, [names[i] for i in pick], "mixed")(spikes)
+        torch.testing.assert_close(
+            found, among[:, [columns[i] for i in pick]], rtol=1e-4, atol=1e-10
+        )
+
+
 # Manners -------------------------------------------------------------------------------------
 
 
@@ -222,11 +250,16 @@ def test_small_lines_beside_an_offset_keep_their_digits_in_float32():
     torch.testing.assert_close(found, reference(pool, bins, names), rtol=1e-5, atol=0)
 
 
-def test_two_threads_at_once():
+@pytest.mark.parametrize("statistics", STATISTICS)
+def test_two_threads_at_once_on_batches_of_any_size(statistics):
     pool = FeaturePool(HAND)
-    run = Running(pool, pool.names)
-    batches = [bins_of("random", 64, HAND, 100, generator(seed)) for seed in range(8)]
-    expected = [run(bins) for bins in batches]
+    run = Running(pool, pool.names, statistics)
+    sizes = (64, 1, 33, 7, 64, 2, 90, 1)
+    batches = [
+        bins_of(("random", "tied", "impulses", "constants")[seed % 4], size, HAND, 100, generator())
+        for seed, size in enumerate(sizes)
+    ]
+    expected = [Running(pool, pool.names, statistics)(bins) for bins in batches]
     with ThreadPoolExecutor(2) as threads:
         found = list(threads.map(run, batches * 3))
     for one, other in zip(found, expected * 3, strict=True):

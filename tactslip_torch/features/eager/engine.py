@@ -103,7 +103,7 @@ class Run:
             self._in_time = InTime(first, layout, forming, table, scratch)
         if last.split < last.stop:
             self._spectra = Spectra(last, layout, forming, table, scratch)
-        self._rows = [PartRows(part, layout, table, scratch) for part in parts]
+        self._rows = [PartRows(part, layout, table, scratch, forming.rows) for part in parts]
 
     def __call__(self, x: Array, scale: Array, out: Array) -> None:
         """As the engine."""

@@ -68,6 +68,21 @@ def rank_in_run(continues: Array, spare: Array, other: Array) -> Array:
     return rank
 
 
+def first_of_longest(continues: Array, spare: Array, other: Array) -> Array:
+    """Where the longest run of each row begins, the first of equally long ones.
+
+    Shape:
+        - continues, spare, other: ``[rows, n]``, as those of ``rank_in_run``; the first value of a
+          row continues nothing
+        - output: ``[rows]``
+    """
+    flat = (each.reshape(-1) for each in (continues, spare, other))
+    rank = rank_in_run(*flat).reshape(continues.shape)
+    last = rank.argmax(1)  # the first maximum: the end of the first longest run
+    found: Array = last - rank[np.arange(len(rank)), last]
+    return found
+
+
 class Ordered:
     """Views of memory for sorted rows, and what is read off them.
 
@@ -142,16 +157,13 @@ class Ordered:
         if not len(rows):
             return rows, self.sorted[rows, 0]
         num = gaps.shape[1]
-        continues, spare, other = (each[: len(rows) * num] for each in self._ranks)
-        grid = continues.reshape(-1, num)
-        grid[:, 0] = 0
+        continues, spare, other = (each[: len(rows) * num].reshape(-1, num) for each in self._ranks)
+        continues[:, 0] = 0
         near = gaps[rows, :-1]
         if self._rounding:
             near -= self._rounding * self.sorted[rows, 1:]
-        np.less_equal(near, tolerance[rows, None], out=grid[:, 1:], casting="unsafe")
-        rank = rank_in_run(continues, spare, other).reshape(-1, num)
-        last = rank.argmax(1)  # the first maximum: the end of the first longest run
-        first = last - rank[np.arange(len(rows)), last]
+        np.less_equal(near, tolerance[rows, None], out=continues[:, 1:], casting="unsafe")
+        first = first_of_longest(continues, spare, other)
         rows, first = rows[first > 0], first[first > 0]
         return rows, self.sorted[rows, first]
 

@@ -11,6 +11,7 @@ from tactslip_torch.features.eager.forming import index_of
 from tactslip_torch.features.eager.layout import Layout, Part
 from tactslip_torch.features.eager.order import Ordered
 from tactslip_torch.features.eager.scratch import Scratch
+from tactslip_torch.features.eager.small import Small
 from tactslip_torch.features.eager.table import TINIEST, Table
 from tactslip_torch.features.plan import ORDERED
 
@@ -30,9 +31,12 @@ class PartRows:
         layout: of the plan.
         table: where it goes.
         scratch: where heights are.
+        exact: ``[rows in time, M, n]``, float64, what heights of the part's rows were made of.
     """
 
-    def __init__(self, part: Part, layout: Layout, table: Table, scratch: Scratch) -> None:
+    def __init__(
+        self, part: Part, layout: Layout, table: Table, scratch: Scratch, exact: Array
+    ) -> None:
         maps, num_bins = layout.maps, scratch.num_bins
         num = maps.num_samples if part.first < part.split else maps.num_lines
         self._shape = (part.stop - part.first, num_bins, num)
@@ -61,9 +65,9 @@ class PartRows:
         self._mean_hertz = float(hertz.mean())
         self._variance_hertz = float(hertz.var(correction=0))
         self._raw = scratch.raw
-        self._choose(part, layout, scratch)
+        self._choose(part, layout, scratch, exact[part.first : part.split])
 
-    def _choose(self, part: Part, layout: Layout, scratch: Scratch) -> None:
+    def _choose(self, part: Part, layout: Layout, scratch: Scratch, exact: Array) -> None:
         """Which of these rows want what."""
         here = {
             name: [row - part.first for row in rows if part.first <= row < part.stop]
@@ -87,10 +91,18 @@ class PartRows:
         ]
         entropy = here.get("entropy", [])
         ordered = {row for name in ORDERED for row in here.get(name, ())}
-        self._sorted = index_of([*entropy, *sorted(ordered - {*entropy})])
-        self._quantised = index_of(entropy)
-        num = len(ordered.union(entropy))
+        chosen = [*entropy, *sorted(ordered - {*entropy})]
+        self._sorted, self._quantised = index_of(chosen), index_of(entropy)
+        num = len(chosen)
         self._order = Ordered(scratch, num, self._shape[2], len(entropy)) if num else None
+        small = {
+            name: [row for row in here[name] if row < len(exact)]
+            for name in sorted(ORDERED & self._names)
+        }
+        small = {name: rows for name, rows in small.items() if rows}
+        is_coarse = self._values.dtype == np.float32
+        has_quantiles = "median" in small or "iqr" in small
+        self._small = Small(exact, small, self._here) if is_coarse and has_quantiles else None
         correlated = here.get("correlation", [])
         self._correlated = index_of(correlated)
         self._raw_of = [layout.raw_of[part.first + row] for row in correlated]
@@ -170,6 +182,8 @@ class PartRows:
             which, found = order.modes(self._pick("finest", rows), span, self._pick("floor", rows))
             mode[which] += found * span[which]
             self._put("mode", rows, mode)
+        if self._small is not None:
+            self._small()
         if "entropy" in names:
             self._put("entropy", self._quantised, order.entropy())
 
