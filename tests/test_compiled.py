@@ -18,12 +18,13 @@ from engine_bins import (
 )
 
 from tactslip_torch import FeaturePool, HandLayout
+from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
 from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.plan import make_plan
 
 numba = pytest.importorskip("numba")
 from tactslip_torch.features.compiled import engine as compiled_engine  # noqa: E402
-from tactslip_torch.features.compiled import kept  # noqa: E402
+from tactslip_torch.features.compiled import kept, numbering  # noqa: E402
 from tactslip_torch.features.compiled.bins import describe_bins  # noqa: E402
 from tactslip_torch.features.compiled.engine import CompiledEngine  # noqa: E402
 from tactslip_torch.features.compiled.jit import kernel  # noqa: E402
@@ -77,6 +78,27 @@ def test_whole_pool_on_bins_of_every_kind(kind, spectrum, statistics):
     assert_equals_reference(found, pool(bins), pool.names, statistics == "mixed")
     if statistics == "mixed":
         assert_modes_are_fair(found[:6], bins[:6], pool, pool.names)
+
+
+def taps_and_steps(kind, num, hand, n, noise):
+    """Bins that are quiet but for a tap, or before and after a step; noise in parts of either."""
+    made = generator(3)
+    shape = (num, len(hand), n)
+    place = torch.randint(1, n - 1, (*shape[:2], 1), generator=made)
+    time = torch.arange(n)
+    form = time == place if kind == "tap" else time >= place
+    size = torch.randn(*shape[:2], 1, generator=made, dtype=torch.float64)
+    return size * (form + noise * torch.randn(shape, generator=made, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("noise", [1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("kind", ["tap", "step"])
+@pytest.mark.parametrize("num", [100, 65])
+def test_quiet_but_for_a_tap_or_a_step(num, kind, noise):
+    pool = FeaturePool(HAND, bin_samples=num, level=3)
+    bins = taps_and_steps(kind, 40, HAND, num, noise)
+    found = run(engine_of(pool, pool.names, "mixed"), bins)
+    assert_equals_reference(found, pool(bins), pool.names, mixed=True)
 
 
 @pytest.mark.parametrize("statistics", STATISTICS)
@@ -302,6 +324,11 @@ def fresh_folder():
     kept.folder.cache_clear()
     yield kept.folder
     kept.folder.cache_clear()
+
+
+def test_every_descriptor_has_a_number():
+    assert {*numbering.DESCRIPTORS} == {*TIME_DESCRIPTORS, *SPECTRUM_DESCRIPTORS}
+    assert len(numbering.DESCRIPTORS) == len({*numbering.DESCRIPTORS})
 
 
 def test_compiled_code_is_kept_apart_for_each_state_of_the_sources(

@@ -50,6 +50,7 @@ class _Workspace(NamedTuple):
     scale: Tensor
     is_ordinary: Array
     desk: Desk
+    room: Array
 
 
 class CompiledEngine:
@@ -161,7 +162,8 @@ class CompiledEngine:
         for rows, fact, sorts in zip((samples, lines), facts, self._sorts, strict=True):
             if rows.shape[1]:
                 rows.sort(axis=-1)
-                describe_sorted(rows, fact, sorts, values.numpy(), limit)
+                written, room = values.numpy(), space.room
+                describe_sorted(rows, fact, sorts, bins, steps.dense, room, written, limit)
         out.copy_(values)
 
     def _workspace(self) -> _Workspace:
@@ -187,6 +189,7 @@ class CompiledEngine:
             scale=torch.empty(num, len(self._channels), dtype=torch.float64),
             is_ordinary=np.empty(num, np.bool_),
             desk=desk_of(self._steps, number),
+            room=np.empty((2, n)),
         )
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tactslip_torch.features.compiled.jit import Array, inner, larger, smaller
-from tactslip_torch.features.compiled.steps import (
+from tactslip_torch.features.compiled.numbering import (
     CENTROID,
     CORRELATION,
     CV,
@@ -19,7 +19,6 @@ from tactslip_torch.features.compiled.steps import (
     ENERGY,
     ENTROPY,
     KURTOSIS,
-    LINES,
     MEAN,
     MEAN_DEVIATION,
     PEAK_FACTOR,
@@ -27,11 +26,8 @@ from tactslip_torch.features.compiled.steps import (
     SKEWNESS,
     SPREAD,
     STD,
-    TIME,
-    WANTS_CENTROID,
-    WANTS_ENTROPY,
-    Steps,
 )
+from tactslip_torch.features.compiled.steps import LINES, TIME, WANTS_CENTROID, WANTS_ENTROPY, Steps
 
 _TOP = 255
 _CV_FLOOR = 1e-6

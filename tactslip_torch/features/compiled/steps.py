@@ -11,30 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from tactslip_torch.features.compiled.jit import Array
-from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
+from tactslip_torch.features.compiled.numbering import DESCRIPTORS
 from tactslip_torch.features.linear_maps import LinearMaps
-from tactslip_torch.features.plan import ORDERED, Plan
+from tactslip_torch.features.plan import ORDERED, Plan, Row
 from tactslip_torch.features.runs import entropy_growth
 
-DESCRIPTORS = TIME_DESCRIPTORS + SPECTRUM_DESCRIPTORS[-2:]
-(
-    MEAN,
-    MEDIAN,
-    MODE,
-    RANGE,
-    MEAN_DEVIATION,
-    STD,
-    CV,
-    IQR,
-    SKEWNESS,
-    KURTOSIS,
-    ENERGY,
-    ENTROPY,
-    PEAK_FACTOR,
-    CORRELATION,
-    CENTROID,
-    SPREAD,
-) = range(len(DESCRIPTORS))
 TIME, LINES = 0, 1
 SKIP, OWN, ADD = range(3)
 WANTS_ENTROPY, WANTS_CENTROID = 1, 2
@@ -100,11 +81,15 @@ class Sorts(NamedTuple):
         start: ``[S + 1]``, which part of the next two is a sorted row's.
         what: ``"median"``, ``"mode"`` or ``"iqr"``, by number.
         place: their columns.
+        channel: ``[S]``, where in the bins each row's channel lies.
+        branch: ``[S]``, which it is; -1 for a gauge's bin, -2 for a spectrum.
     """
 
     start: Array
     what: Array
     place: Array
+    channel: Array
+    branch: Array
 
 
 class Forming(NamedTuple):
@@ -286,10 +271,18 @@ def sorts_of(plan: Plan) -> tuple[Sorts, Sorts]:
         if w.descriptor in ORDERED
     ]
     samples, lines = (
-        Sorts(*_by_row(rows, [w for w in ordered if w[0] in set(rows)]))
+        Sorts(
+            *_by_row(rows, [w for w in ordered if w[0] in set(rows)]),
+            channel=np.array([plan.channels.index(plan.rows[r].channel) for r in rows], np.int64),
+            branch=np.array([_branch_in_time(plan.rows[r]) for r in rows], np.int64),
+        )
         for rows in sorted_rows(plan)
     )
     return samples, lines
+
+
+def _branch_in_time(row: Row) -> int:
+    return -2 if row.kind == "freq" else row.branch
 
 
 def _by_row(rows: Iterable[int], wanted: list[tuple[int, int, int]]) -> tuple[Array, Array, Array]:
