@@ -12,7 +12,7 @@ import torch
 from oracles import assert_columns_close
 from torch import Tensor
 
-from benchmarks import clocks
+from benchmarks import clocks, outcome
 from benchmarks.arithmetic import NATIVE, WIDE
 from benchmarks.clocks import Way, paired_ratio
 from benchmarks.features import __main__ as bench
@@ -259,6 +259,21 @@ def test_a_path_is_tried_before_anything_is_measured(
     assert error.value.code == 2
     assert "--json cannot be written to" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_folder_that_takes_no_file_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(dir: Path) -> None:
+        raise PermissionError(13, f"{dir.name} is locked")
+
+    monkeypatch.setattr(bench, "measure", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr(outcome.tempfile, "TemporaryFile", refuse)
+    with pytest.raises(SystemExit) as error:
+        bench.main(["--quick", "--figure", str(tmp_path / "shut" / "it.png")])
+    assert error.value.code == 2
+    assert "--figure cannot be written to" in (shown := capsys.readouterr().err)
+    assert "shut is locked" in shown
 
 
 def test_a_figure_shows_the_pool(capsys: pytest.CaptureFixture[str]) -> None:

@@ -65,8 +65,8 @@ def _over(name: str, label: str, title: str) -> Callable[[Axes, Rows], None]:
             mine = [row for row in rows if (row["way"], row["threads"]) == (way, threads)]
             times = [Spread.of(row["seconds"]).times(1e6 / row["bins"]) for row in mine]
             style = "--o" if threads == 1 else "-o"
-            label = f"{way}, {threads_text(threads)}"
-            _line(axes, [row[name] for row in mine], times, style, colour_of(way), label)
+            whose = f"{way}, {threads_text(threads)}"
+            _line(axes, [row[name] for row in mine], times, style, colour_of(way), whose)
         axes.set_xlabel(label)
         axes.set_ylabel("us a bin")
         axes.set_title(title, fontsize=10)
