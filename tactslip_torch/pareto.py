@@ -2,9 +2,11 @@
 
 Measures what groups of features cost on this machine; searches features, channels, components,
 filter, head, precision and hop for the front of worst-case latency and compute against accuracy;
-times those on the front; and writes the most accurate detector that meets both limits, timed once
-more in a fresh process. Leaves ``pareto.json``, ``pareto.png``, ``detector.pt`` and the resolved
-configuration. Exit status 1 if no detector meets the limits; all but the detector is written then.
+times those on the front and close to the limits. Those that meet both limits by that timing are
+timed again in a fresh process, in order of accuracy, the last try kept for the one with most
+head-room; the first that meets both there is written. Leaves ``pareto.json``, ``pareto.png``, the
+resolved configuration and, last of all, ``detector.pt``. Exit status 1 if no detector meets the
+limits; all but the detector is written then.
 
 Only training recordings are searched on. The test cycles of the seen materials judge the detector
 once it is chosen; of unseen materials nothing is read.
@@ -16,7 +18,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -30,12 +32,15 @@ from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
+from tactslip_torch.deadline.cost import CostModel
 from tactslip_torch.deadline.front import Candidate, nondominated, worth_timing
 from tactslip_torch.deadline.latency import (
     DEFINITION,
     Latency,
+    Limits,
+    check_hops,
+    check_number,
     least_latency_ms,
-    longest_hop,
     shortest_hop,
 )
 from tactslip_torch.deadline.search import Search, Searcher
@@ -51,39 +56,11 @@ from tactslip_torch.report.pareto import none_meets, pareto_figure, pareto_table
 from tactslip_torch.signals.filtering import Align
 
 EXIT_NONE_MEETS = 1
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What a detector has to keep.
-
-    Args:
-        deadline_ms: from the onset of slip to the decision, at worst.
-        compute_us: from the last sample to the decision, p99.
-        hops_ms: between bins, to choose from.
-
-    Raises:
-        ValueError: for limits that are not positive.
-    """
-
-    deadline_ms: float
-    compute_us: float
-    hops_ms: Sequence[float]
-
-    def __post_init__(self) -> None:
-        for name in ("deadline_ms", "compute_us"):
-            value = getattr(self, name)
-            if isinstance(value, str) or not value > 0:
-                raise ValueError(f"{name} must be a positive number, got {value!r}")
-
-    def latency(self, parts: Latency, compute_us: float) -> Latency:
-        """The same parts with another compute, and the longest hop that keeps the limits."""
-        given = replace(parts, compute_us=compute_us)
-        return longest_hop(given, self.hops_ms, self.deadline_ms, self.compute_us)
-
-    def misses(self, latency: Latency) -> list[str]:
-        """Which limits are not kept, in words."""
-        return latency.misses(self.deadline_ms, self.compute_us)
+EXIT_INTERRUPTED = 130
+VALIDATION = (
+    "a material left out at a time, training recordings only; ranking and scaling saw the material "
+    "left out, the machine alone is refitted; it chose"
+)
 
 
 def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
@@ -102,6 +79,8 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
     started = time.perf_counter()
     with feature_cache(config.cache) as cache:
         limits, shop = _prepared(config, cache)
+        for name in ("pareto.json", "pareto.png", "detector.pt"):
+            (folder / name).unlink(missing_ok=True)  # of an earlier run
         save_config(config, folder)
         shop.look()
         costs = shop.costs()
@@ -112,47 +91,66 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
             keeping = [each for each in candidates if not limits.misses(each.latency)]
             best = max(keeping or candidates, key=lambda each: each.balanced_accuracy)
             candidates += searcher.without_fingers(best, bar)
-        timed = shop.timed(worth_timing(candidates, shop.search.most_timed))
-        front = [timed[place] for place in nondominated([each.point for each in timed])]
-        scale = median(each.timing.p99_us / each.candidate.latency.compute_us for each in timed)
-        chosen, tries = _chosen(config, limits, shop, timed, folder)
+        timed = shop.timed(worth_timing(candidates, shop.search.most_timed, limits))
+        trial = folder / "trial.pt"
+        try:
+            found = _chosen(config, limits, shop, timed, trial)
+            found = _facts(config, limits, shop, costs, candidates, timed) | found
+            found["seconds"] = time.perf_counter() - started
+            with whole_file(folder / "pareto.json") as temporary:
+                temporary.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
+            pareto_figure(found, folder / "pareto.png")
+            if found["chosen"]:
+                trial.replace(folder / "detector.pt")
+        finally:
+            trial.unlink(missing_ok=True)
+    print("\n" + pareto_table(found))
+    print(f"\nresults in {folder}")
+    return found
+
+
+def _facts(
+    config: DictConfig,
+    limits: Limits,
+    shop: Workshop,
+    costs: CostModel,
+    candidates: Sequence[Candidate],
+    timed: Sequence[Timed],
+) -> dict[str, Any]:
+    """What was searched and timed, JSON-able."""
+    front = [timed[place] for place in nondominated([each.point for each in timed])]
+    scale = median(each.timing.p99_us / each.candidate.latency.compute_us for each in timed)
     source = next(iter(shop.makers.values())).source
-    found = common_facts(source, shop.pool, config) | {
+    return common_facts(source, shop.pool, config) | {
         "definition": DEFINITION,
         "limits": {"deadline_ms": limits.deadline_ms, "compute_us": limits.compute_us},
         "headroom": config.headroom,
-        "validation": "a material left out at a time, training recordings only; it chose",
+        "validation": VALIDATION,
         "engine": next(iter(shop.makers.values())).extractor.engine,
-        "chosen": chosen,
-        "tries": tries,
-        "front": [row_of(shop, each, each.latency, each.timing) for each in front],
+        "front": [row_of(shop, each, limits, each.latency, each.timing) for each in front],
         "timed": len(timed),
         "searched": len(candidates),
         "measured_over_modelled": scale,
         "modelled": [_modelled(each, scale, limits) for each in candidates],
         "costs": costs.facts(),
-        "seconds": time.perf_counter() - started,
     }
-    with whole_file(folder / "pareto.json") as temporary:
-        temporary.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
-    pareto_figure(found, folder / "pareto.png")
-    print("\n" + pareto_table(found))
-    print(f"\nresults in {folder}")
-    return found
 
 
 def _prepared(config: DictConfig, cache: FeatureCache) -> tuple[Limits, Workshop]:
     """The parts of the configuration; refuses limits that nothing can keep."""
     search: Search = instantiate(config.search, _convert_="all")
     limits = Limits(config.deadline_ms, config.compute_us, search.hops_ms)
+    check_number("headroom", config.headroom, least=1)
+    for name in ("retime_calls", "tries"):
+        check_number(name, config[name], whole=True)
+    check_number("most_summed", config.most_summed, least=0, whole=True)
     rule: LabelRule = instantiate(config.labels)
     recipe: Recipe = instantiate(config.recipe, _convert_="all")
     source: RecordingSource = instantiate(config.data, _convert_="all")
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     if len(folds) > 1:
         raise ValueError(f"pareto makes one detector, split has {len(folds)} folds; take another")
-    if not config.headroom >= 1:
-        raise ValueError(f"headroom must be at least 1, got {config.headroom}")
+    check_hops(search.hops_ms, source.sample_rate_hz)
     makers: dict[Align, FeatureMaker] = {}
     for align in search.aligns:
         features = {**config.features, "align": align}
@@ -178,43 +176,47 @@ def _check_physics(limits: Limits, bin_ms: float, makers: dict[Align, FeatureMak
 
 
 def _chosen(
-    config: DictConfig, limits: Limits, shop: Workshop, timed: Sequence[Timed], folder: Path
-) -> tuple[dict[str, Any] | None, list[dict[str, Any]]]:
-    """The most accurate detector that meets the limits in a fresh process, or none; and the tries.
+    config: DictConfig, limits: Limits, shop: Workshop, timed: Sequence[Timed], trial: Path
+) -> dict[str, Any]:
+    """The first that meets the limits in a fresh process too, or none; and all tries.
 
-    Those that meet them with head-room are tried first, then those that just meet them; each as
-    fitted to the sample, which takes as long as what is then fitted to all bins and timed again.
-    Only that one is kept.
+    Each is tried as fitted to the sample, which takes as long as what is then fitted to all bins
+    and timed again. Only that one is chosen; it is what ``trial`` then holds.
     """
-    able: list[tuple[Timed, Latency]] = []
-    for headroom in (config.headroom, 1.0):
-        tried = [each for each, _ in able]
-        for each in sorted((each for each in timed if each not in tried), key=_preferred):
-            latency = limits.latency(each.latency, headroom * each.timing.p99_us)
-            if not limits.misses(latency):
-                able.append((each, latency))
+    able = [
+        each
+        for each in timed
+        if not limits.misses(limits.latency(each.latency, each.timing.p99_us))
+    ]
     tries: list[dict[str, Any]] = []
-    trial = folder / "trial.pt"
-    try:
-        for each, wanted in bar(able[: config.tries], "again, in a fresh process", "detector"):
-            for from_all in (False, True):
-                detector = shop.make(each.candidate, each.arithmetic, from_all=from_all)
-                detector.info |= {"experiment": config.name, "seed": config.seed}
-                detector.save(trial)
-                engine = detector.extractor.engine
-                timing = time_in_fresh_process(trial, config.retime_calls, engine)
-                latency = replace(wanted, compute_us=timing.p99_us)
-                misses = limits.misses(latency)
-                fitted = {"fitted_to": detector.info["fitted_to"], "misses": misses}
-                tries.append(row_of(shop, each, latency, timing) | fitted)
-                if misses:
-                    break
-            else:
-                trial.replace(folder / "detector.pt")
-                return tries[-1] | {"test": shop.judged(detector)}, tries
-    finally:
-        trial.unlink(missing_ok=True)
-    return None, tries
+    chosen, tried = None, 0
+    for each in bar(_in_turn(able, limits, config.tries), "again, in a fresh process", "detector"):
+        tried += 1
+        for from_all in (False, True):
+            detector = shop.make(each.candidate, each.arithmetic, from_all=from_all)
+            detector.info |= {"experiment": config.name, "seed": config.seed}
+            detector.save(trial)
+            engine = detector.extractor.engine
+            timing = time_in_fresh_process(trial, config.retime_calls, engine)
+            latency = limits.latency(each.latency, timing.p99_us, config.headroom)
+            about = {"fitted_to": detector.info["fitted_to"], "engine": engine}
+            tries.append(row_of(shop, each, limits, latency, timing) | about)
+            if tries[-1]["misses"]:
+                break
+        else:
+            chosen = tries[-1] | {"test": shop.judged(detector)}
+            break
+    return {"chosen": chosen, "tries": tries, "tried": tried, "not_tried": len(able) - tried}
+
+
+def _in_turn(able: Sequence[Timed], limits: Limits, tries: int) -> list[Timed]:
+    """Those to try: by accuracy, the last of several the one with most head-room of those left."""
+    ordered = sorted(able, key=_preferred)
+    first = ordered[: tries - 1 if tries > 1 else 1]
+    left = ordered[len(first) :]
+    if tries > 1 and left:
+        first.append(max(left, key=lambda each: limits.headroom(each.latency)))
+    return first
 
 
 def _modelled(candidate: Candidate, scale: float, limits: Limits) -> list[float]:
@@ -230,8 +232,10 @@ def _preferred(timed: Timed) -> tuple[float, bool, float]:
     return -accuracy, timed.arithmetic != "double", timed.timing.p99_us
 
 
-def row_of(shop: Workshop, timed: Timed, latency: Latency, timing: Timing) -> dict[str, Any]:
-    """A detector of the front as JSON-able facts."""
+def row_of(
+    shop: Workshop, timed: Timed, limits: Limits, latency: Latency, timing: Timing
+) -> dict[str, Any]:
+    """A detector as JSON-able facts."""
     candidate, names = timed.candidate, shop.pool.names
     selected = [names[index] for index in candidate.selected]
     return {
@@ -247,8 +251,10 @@ def row_of(shop: Workshop, timed: Timed, latency: Latency, timing: Timing) -> di
         "penalty": candidate.penalty,
         "arithmetic": timed.arithmetic,
         "latency": latency.facts(),
+        "misses": limits.misses(latency),
         "p50_us": timing.p50_us,
         "p99_us": timing.p99_us,
+        "p99_all_us": timing.p99_all_us,
         "interrupted": timing.interrupted,
         "modelled_us": candidate.latency.compute_us,
         "validation": candidate.balanced_accuracy,
@@ -261,7 +267,11 @@ def row_of(shop: Workshop, timed: Timed, latency: Latency, timing: Timing) -> di
 def main(config: DictConfig) -> None:
     """Entry point."""
     with errors_in_one_line():
-        found = pareto(config, Path(HydraConfig.get().runtime.output_dir))
+        try:
+            found = pareto(config, Path(HydraConfig.get().runtime.output_dir))
+        except KeyboardInterrupt:
+            print("interrupted: no detector is written", file=sys.stderr)
+            raise SystemExit(EXIT_INTERRUPTED) from None
         if found["chosen"] is None:
             print(none_meets(found), file=sys.stderr)
             raise SystemExit(EXIT_NONE_MEETS)

@@ -11,7 +11,7 @@ from tactslip_torch.data.splits import seen6
 from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.deadline.cost import GROUPS, CostModel
 from tactslip_torch.deadline.front import Candidate, nondominated, worth_timing
-from tactslip_torch.deadline.latency import Latency
+from tactslip_torch.deadline.latency import Latency, Limits
 from tactslip_torch.deadline.search import Search, Searcher
 from tactslip_torch.features.groups import allowed, of_fingers
 from tactslip_torch.features.names import FeatureName, pool_names
@@ -111,9 +111,22 @@ def test_fingers_are_those_of_the_channels():
         ({"arithmetics": ["half"]}, r"search.arithmetics: unknown 'half'"),
         ({"sizes": []}, r"search.sizes is empty, expected at least one value"),
         ({"rankings": []}, r"search.rankings is empty"),
-        ({"sizes": [0, 3]}, r"search.sizes must be positive, got 0"),
-        ({"hops_ms": [5.0, -1.0]}, r"search.hops_ms must be positive, got -1"),
-        ({"bins": 0}, r"search.bins must be positive, got 0"),
+        ({"sizes": [0, 3]}, r"search.sizes must be a positive whole number, got 0"),
+        ({"sizes": 8}, r"search.sizes must be a list in brackets, got 8"),
+        ({"sizes": [8.5]}, r"search.sizes must be a positive whole number, got 8.5"),
+        ({"sizes": ["a"]}, r"search.sizes must be a positive whole number, got 'a'"),
+        ({"channels": "all"}, r"search.channels must be a list in brackets, got 'all'"),
+        ({"hops_ms": [5.0, -1.0]}, r"search.hops_ms must be a positive finite number, got -1"),
+        ({"hops_ms": [None]}, r"search.hops_ms must be a positive finite number, got None"),
+        ({"penalties": [1.0, 0]}, r"search.penalties must be a positive finite number, got 0"),
+        ({"penalties": ["x"]}, r"search.penalties must be a positive finite number, got 'x'"),
+        ({"penalties": [float("inf")]}, r"search.penalties must be a .* finite number, got inf"),
+        ({"bins": 0}, r"search.bins must be a positive whole number, got 0"),
+        ({"calls": True}, r"search.calls must be a positive whole number, got True"),
+        ({"cost_power": -1}, r"search.cost_power must be a finite number of at least 0, got -1"),
+        ({"alpha": "a"}, r"search.alpha must be a finite number of at least 0, got 'a'"),
+        ({"alpha": 1.5}, r"search.alpha must be at most 1, got 1.5"),
+        ({"drop_fingers": None}, r"search.drop_fingers must be true or false, got None"),
         ({"degrees": [3]}, r"search.degrees must be of 1 and 2, got \[3\]"),
     ],
 )
@@ -269,16 +282,40 @@ def candidate(worst_ms, compute_us, accuracy):
     return Candidate("centred", "all", "all", "t", 2, 0.1, (1,), accuracy, {}, latency)
 
 
+WIDE = Limits(1000.0, 1e6, [5.0])
+NONE = Limits(1.0, 1.0, [5.0])
+
+
 def test_worth_timing_goes_by_layers():
     line = [candidate(60.0 + i, 100.0 * (i + 1), 0.5 + 0.04 * i) for i in range(10)]
     behind = [candidate(60.5 + i, 110.0 * (i + 1), 0.45 + 0.04 * i) for i in range(10)]
-    assert worth_timing([*behind, *line], 10) == line
-    more = worth_timing([*behind, *line], 13)
+    assert worth_timing([*behind, *line], 10, NONE) == line
+    more = worth_timing([*behind, *line], 13, NONE)
     assert more[:10] == line
-    assert more[10:] == [behind[0], behind[4], behind[9]]
-    assert worth_timing([*behind, *line], 3) == [line[0], line[4], line[9]]
-    assert worth_timing(line, 1) == [line[0]]
-    assert worth_timing(line[:2] * 2, 30) == line[:2] * 2
+    # the most accurate, then a spread of the rest by compute
+    assert more[10:] == [behind[9], behind[0], behind[8]]
+    assert worth_timing([*behind, *line], 4, NONE) == [line[9], line[0], line[4], line[8]]
+    assert worth_timing(line, 1, WIDE) == [line[9]]
+    assert worth_timing(line[:2] * 2, 30, WIDE) == line[:2] * 2
+    # all near: half by accuracy, the rest spread
+    assert worth_timing(line, 6, WIDE) == [line[9], line[8], line[7], line[0], line[3], line[6]]
+
+
+def test_what_is_close_to_the_limits_is_timed(rng):
+    """Two filters: the quick one waits longer, so accuracy does not rise with compute."""
+    line = [candidate(61.0, 100.0 + 10 * i, 0.8 - 0.001 * (39 - i)) for i in range(40)]
+    line += [candidate(59.0, 500.0 + 10 * i, 0.6 + 0.001 * i) for i in range(40)]
+    limits = Limits(80.0, 300.0, [5.0])
+    for _ in range(3):
+        given = [line[i] for i in rng.permutation(80)]
+        assert len(nondominated([each.point for each in given])) == 80
+        timed = worth_timing(given, 10, limits)
+        assert len({each.point for each in timed}) == 10
+        # 450 us and 300 us at most, then 200 us, best first: the model may err either way
+        compute = [each.latency.compute_us for each in timed]
+        assert compute[:5] == [490.0, 450.0, 300.0, 200.0, 440.0]
+        assert {100.0, 890.0} < set(compute)  # the cheapest and the dearest
+        assert max(each.balanced_accuracy for each in line) == timed[0].balanced_accuracy
 
 
 def test_look_ahead_is_that_of_the_filter():

@@ -4,6 +4,8 @@ import pytest
 
 from tactslip_torch.deadline.latency import (
     Latency,
+    Limits,
+    check_hops,
     least_latency_ms,
     longest_hop,
     look_ahead_samples,
@@ -86,3 +88,35 @@ def test_hops():
 def test_parts_that_are_none_are_refused(parts, message):
     with pytest.raises(ValueError, match=message):
         Latency(*parts)
+
+
+def test_the_hop_leaves_head_room_where_one_does():
+    limits = Limits(80.0, 500.0, [5.0, 10.0, 25.0])
+    parts = Latency(4.6, 50.0, 5.0, 1.0)
+    assert limits.latency(parts, 380.0).hop_ms == 25  # 79.98 ms
+    roomy = limits.latency(parts, 380.0, headroom=1.25)
+    assert (roomy.hop_ms, roomy.compute_us) == (10, 380)  # 25 ms with 475 us are 80.075 ms
+    assert limits.latency(parts, 390.0, headroom=1.5).hop_ms == 25  # 585 us are none: without
+    assert limits.misses(limits.latency(parts, 501.0)) == ["compute 501 us above compute_us=500"]
+
+
+def test_head_room_is_how_often_compute_fits():
+    limits = Limits(60.0, 5000.0, [5.0])
+    assert limits.headroom(Latency(2.0, 50.0, 5.0, 400.0)) == pytest.approx(3.0 / 0.4)
+    assert limits.headroom(Latency(0.0, 50.0, 2.0, 400.0)) == pytest.approx(2.0 / 0.4)
+    assert Limits(900.0, 500.0, [5.0]).headroom(Latency(2.0, 50.0, 5.0, 400.0)) == 1.25
+
+
+@pytest.mark.parametrize("value", [None, "abc", True, 0, -1.0, float("inf"), float("nan")])
+def test_limits_are_finite_positive_numbers(value):
+    for name in ("deadline_ms", "compute_us"):
+        given = {"deadline_ms": 80, "compute_us": 500, "hops_ms": [5.0]} | {name: value}
+        with pytest.raises(ValueError, match=rf"{name} must be a positive finite number, got"):
+            Limits(**given)
+
+
+def test_hops_are_whole_samples():
+    check_hops([0.5, 5, 12.5, 25.0], RATE_HZ)
+    check_hops([0.1 + 0.2], 10_000)
+    with pytest.raises(ValueError, match=r"5.3 ms are 10.6 samples at 2000 Hz, .* of 0.5 ms"):
+        check_hops([5, 5.3], RATE_HZ)

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from scipy import signal
 from test_commands import TinyRecordings, composed
 
@@ -14,15 +15,15 @@ from tactslip_torch import SlipDetector
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import seen6, unseen4
 from tactslip_torch.deadline.front import Candidate
-from tactslip_torch.deadline.latency import Latency
+from tactslip_torch.deadline.latency import Latency, Limits
 from tactslip_torch.deadline.search import Search
 from tactslip_torch.deadline.timing import Timing
-from tactslip_torch.deadline.workshop import Workshop
+from tactslip_torch.deadline.workshop import Timed, Workshop
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.report.pareto import none_meets, pareto_table
+from tactslip_torch.report.pareto import _plain_ticks, none_meets, pareto_table
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -63,6 +64,8 @@ def test_the_files_and_the_parts_of_the_promise(written):
     folder, found = written
     assert json.loads((folder / "pareto.json").read_text()) == found
     names = {"pareto.json", "pareto.png", "detector.pt", "config.yaml"}
+    assert found["validation"] in pareto_table(found)
+    assert "ranking and scaling saw the material left out" in found["validation"]
     assert {path.name for path in folder.iterdir()} == names
     assert (folder / "pareto.png").read_bytes().startswith(b"\x89PNG")
     assert found["simulated"] is False
@@ -126,6 +129,14 @@ def test_the_table_says_what_the_files_do(written, capsys):
     assert "look-ahead" in table
     assert f"{100 * found['chosen']['test']['balanced_accuracy']:.2f} %" in table
     assert "SIMULATED" in pareto_table(found | {"simulated": True})
+    assert "engine eager; p50" in table
+    assert f"{found['tried']} tried there, {found['not_tried']} not tried" in table
+    chosen = found["chosen"]
+    assert f"p99 of all calls {chosen['p99_all_us']:.0f} us" in table
+    for share, is_busy in ((0.05, False), (0.0612, True)):
+        busy = pareto_table(found | {"chosen": chosen | {"interrupted": share}})
+        said = f"machine busy: {100 * share:.1f} % of calls interrupted"
+        assert (said in busy.splitlines()[-2]) == is_busy
 
 
 # Limits ------------------------------------------------------------------------------------------
@@ -147,14 +158,21 @@ def fails(monkeypatch, capsys, tmp_path, *arguments):
             ["search.aligns=[centred]", "deadline_ms=57.5"],
             "least look-ahead 2.5 ms are 57.5 ms before any compute; give more, or a shorter",
         ),
-        (["compute_us=0"], "compute_us must be a positive number, got 0"),
-        (["compute_us=-3"], "compute_us must be a positive number, got -3"),
-        (["deadline_ms=soon"], "deadline_ms must be a positive number, got 'soon'"),
+        (["compute_us=0"], "compute_us must be a positive finite number, got 0"),
+        (["compute_us=-3"], "compute_us must be a positive finite number, got -3"),
+        (["deadline_ms=soon"], "deadline_ms must be a positive finite number, got 'soon'"),
+        (["deadline_ms=null"], "deadline_ms must be a positive finite number, got None"),
+        (["deadline_ms=inf"], "deadline_ms must be a positive finite number, got inf"),
+        (["headroom=abc"], "headroom must be a finite number of at least 1, got 'abc'"),
+        (["tries=0"], "tries must be a positive whole number, got 0"),
+        (["retime_calls=0"], "retime_calls must be a positive whole number, got 0"),
+        (["search.sizes=8"], "search.sizes must be a list in brackets, got 8"),
+        (["search.hops_ms=[5.3]"], "search.hops_ms: 5.3 ms are 10.6 samples at 2000 Hz"),
         (["search.channels=[toes]"], "search.channels: unknown 'toes', expected some of all"),
         (["search.components=[cheap]"], "search.components: unknown 'cheap'"),
         (["search.sizes=[]"], "search.sizes is empty, expected at least one value"),
         (["split=leave_one_material_out"], "split has 10 folds"),
-        (["headroom=0.5"], "headroom must be at least 1, got 0.5"),
+        (["headroom=0.5"], "headroom must be a finite number of at least 1, got 0.5"),
         (["search.sizes=[5000]"], "an empty selection: no group of this hand"),
     ],
 )
@@ -163,6 +181,11 @@ def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, arguments, message
         monkeypatch.setattr("test_pareto.TINY", tuple(o for o in TINY if "split." not in o))
         materials = "M1,M2,M3,M4,M5,M6,iron,cloth,copper,wood"
         arguments = [arguments[0], f"data.materials=[{materials}]"]
+
+    def never(*args):
+        raise AssertionError("worked before it refused")
+
+    monkeypatch.setattr(Workshop, "look", never)
     status, line = fails(monkeypatch, capsys, tmp_path, *arguments)
     assert status == 2
     assert line.startswith("error: ")
@@ -171,10 +194,13 @@ def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, arguments, message
 
 
 def test_none_that_meets_the_limits_is_said_plainly(monkeypatch, capsys, tmp_path):
+    (tmp_path / "detector.pt").write_text("of an earlier run")
     status, line = fails(monkeypatch, capsys, tmp_path, "compute_us=1", "search.sizes=[4]")
     assert status == 1
-    assert "no detector meets deadline_ms=80 and compute_us=1: the quickest takes" in line
     found = json.loads((tmp_path / "pareto.json").read_text())
+    quickest = min(row["p99_us"] for row in found["front"])  # misses least
+    said = f"the closest has compute {quickest:.0f} us above compute_us=1"
+    assert f"no detector meets deadline_ms=80 and compute_us=1: {said}" in line
     assert found["chosen"] is None
     assert found["front"]
     assert (tmp_path / "pareto.png").exists()
@@ -187,11 +213,13 @@ def test_one_that_fails_in_the_fresh_process_gives_way_to_the_next(monkeypatch, 
 
     def played(path, calls, engine):
         assert path.exists()
-        return Timing(50.0, next(given), calls)
+        us = next(given)
+        return Timing(50.0, us, us, calls)
 
     monkeypatch.setattr(command, "time_in_fresh_process", played)
     found = run(tmp_path, *EASY)
     first, second, third = found["tries"]
+    assert (found["tried"], found["not_tried"]) == (2, 1)
     assert first["misses"][1] == "compute 900000 us above compute_us=400000"
     assert second["selected"] == third["selected"] == found["chosen"]["selected"]
     assert (second["misses"], third["misses"]) == ([], [])
@@ -202,29 +230,106 @@ def test_one_that_fails_in_the_fresh_process_gives_way_to_the_next(monkeypatch, 
 
 
 def test_all_that_fail_there_leave_none(monkeypatch, tmp_path):
-    slow = Timing(50.0, 900_000.0, 20)
+    slow = Timing(50.0, 900_000.0, 900_000.0, 20)
     monkeypatch.setattr(command, "time_in_fresh_process", lambda *a: slow)
     found = run(tmp_path, *EASY, "tries=2")
     assert found["chosen"] is None
     assert len(found["tries"]) == 2
-    assert "of 2 tried again the last misses by latency" in none_meets(found)
+    said = none_meets(found)
+    assert "in a fresh process (2 tried, 1 that met both when timed not tried): the closest" in said
+    assert " and ".join(found["tries"][0]["misses"]) in said
     assert not (tmp_path / "detector.pt").exists()
 
 
-def test_those_without_head_room_come_last(monkeypatch, tmp_path):
+def test_those_that_meet_the_limits_go_by_accuracy(monkeypatch, tmp_path):
     met = []
 
     def played(detector, calls):
         met.append([str(name) for name in detector.selected_names])
-        return Timing(100.0, 100.0 * (len(met) + 2), calls)
+        us = 100.0 * (len(met) + 2)
+        return Timing(100.0, us, us, calls)
 
     monkeypatch.setattr("tactslip_torch.deadline.workshop.time_detector", played)
-    slow = Timing(50.0, 900_000.0, 20)
+    slow = Timing(50.0, 900_000.0, 900_000.0, 20)
     monkeypatch.setattr(command, "time_in_fresh_process", lambda *a: slow)
-    found = run(tmp_path, "deadline_ms=500", "compute_us=400", "headroom=1.3", "tries=9")
-    # 300, 400 and 500 us: the first has head-room, the second just meets the limit
+    found = run(tmp_path, "deadline_ms=500", "compute_us=400", "tries=9")
+    # 300, 400 and 500 us: two of them keep the limit
     assert len(met) == 3
-    assert [row["selected"] for row in found["tries"]] == met[:2]
+    assert sorted(row["selected"] for row in found["tries"]) == sorted(met[:2])
+    scores = [row["validation"] for row in found["tries"]]
+    assert scores == sorted(scores, reverse=True)
+
+
+def test_the_last_try_is_for_the_one_with_most_head_room():
+    def timed(accuracy, us, ahead=0.0):
+        latency = Latency(ahead, 50.0, 5.0, us)
+        made = candidate(balanced_accuracy=accuracy, latency=latency)
+        return Timed(made, "double", Timing(us, us, us, 20), latency)
+
+    limits = Limits(80.0, 500.0, [5.0])
+    able = [timed(0.5 + i / 100, 200.0 + 20 * i) for i in range(10)]
+    able[2] = quick = timed(0.52, 50.0)
+    best_first = able[::-1]
+    assert command._in_turn(able, limits, 3) == [*best_first[:2], quick]
+    assert command._in_turn(able, limits, 1) == best_first[:1]
+    assert command._in_turn(able, limits, 9) == [*best_first[:8], able[0]]  # the quick one was met
+    assert command._in_turn(able, limits, 10) == command._in_turn(able, limits, 99) == best_first
+    assert command._in_turn([], limits, 5) == []
+
+
+def test_what_is_missed_least_is_said():
+    def row(worst_ms, compute_us, hop_ms):
+        latency = Latency(worst_ms - 40 - hop_ms - compute_us / 1000, 40.0, hop_ms, compute_us)
+        return {"latency": latency.facts(), "misses": latency.misses(80.0, 500.0)}
+
+    found = {"limits": {"deadline_ms": 80.0, "compute_us": 500.0}, "tries": []}
+    found["front"] = [row(50.5, 900.0, 5.0), row(50.5, 421.0, 0.4), row(99.0, 100.0, 5.0)]
+    assert none_meets(found).endswith(": the closest has compute 421 us not below the hop 0.4 ms")
+
+
+def test_an_error_has_a_line_of_its_own(monkeypatch, capsys, tmp_path):
+    def broken(self, *job):
+        raise ValueError("one bin is odd")
+
+    monkeypatch.setattr(command.Searcher, "_scored", broken)
+    status, line = fails(monkeypatch, capsys, tmp_path)
+    assert (status, line) == (2, "error: one bin is odd")
+
+
+def test_ctrl_c_is_one_line(monkeypatch, capsys, tmp_path):
+    def stopped(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "time_in_fresh_process", stopped)
+    status, line = fails(monkeypatch, capsys, tmp_path, *EASY)
+    assert (status, line) == (130, "interrupted: no detector is written")
+    assert not (tmp_path / "trial.pt").exists()
+    assert not (tmp_path / "detector.pt").exists()
+
+
+def test_the_detector_is_put_in_place_last(monkeypatch, tmp_path):
+    def broken(found, path):
+        assert (tmp_path / "pareto.json").exists()
+        assert not (tmp_path / "detector.pt").exists()
+        raise ValueError("no room on the disk")
+
+    monkeypatch.setattr(command, "pareto_figure", broken)
+    with pytest.raises(ValueError, match="no room"):
+        run(tmp_path, *EASY, "search.sizes=[4]")
+    assert not list(tmp_path.glob("*.pt"))
+
+
+@pytest.mark.parametrize(("low", "high"), [(410.0, 480.0), (30.0, 4000.0), (90.0, 700.0)])
+def test_ticks_are_plain_numbers(low, high):
+    axes = Figure().subplots()
+    axes.set_xscale("log")
+    axes.set_xlim(low, high)
+    _plain_ticks(axes)
+    inside = [tick for tick in axes.get_xticks() if low <= tick <= high]
+    assert 3 <= len(inside) <= 8
+    shown = axes.xaxis.get_major_formatter().format_ticks(inside)
+    assert [float(text) for text in shown] == pytest.approx(inside)
+    assert len(axes.get_xticks(minor=True)) == 0
 
 
 def test_unseen_materials_are_never_read(monkeypatch, tmp_path):
@@ -236,7 +341,7 @@ def test_unseen_materials_are_never_read(monkeypatch, tmp_path):
         return load(self, recording, windows)
 
     monkeypatch.setattr(TinyRecordings, "load", watched)
-    monkeypatch.setattr(command, "time_in_fresh_process", lambda *a: Timing(50.0, 100.0, 20))
+    monkeypatch.setattr(command, "time_in_fresh_process", lambda *a: Timing(50.0, 100.0, 100.0, 20))
     run(tmp_path, *EASY, "cache=off", "search.sizes=[4]")
     assert {name[0] for name in read} == {"A", "B"}
     # the test cycles once and at the end, by the detector that was chosen by then

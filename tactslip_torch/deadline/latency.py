@@ -8,8 +8,9 @@ not. Bins that straddle the onset often say slip earlier; nothing here counts on
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -93,6 +94,87 @@ class Latency:
             "compute_us": self.compute_us,
             "load": self.load,
         }
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a detector has to keep.
+
+    Args:
+        deadline_ms: from the onset of slip to the decision, at worst.
+        compute_us: from the last sample to the decision, p99.
+        hops_ms: between bins, to choose from.
+
+    Raises:
+        ValueError: for limits that are no finite positive numbers.
+    """
+
+    deadline_ms: float
+    compute_us: float
+    hops_ms: Sequence[float]
+
+    def __post_init__(self) -> None:
+        check_number("deadline_ms", self.deadline_ms)
+        check_number("compute_us", self.compute_us)
+
+    def latency(self, parts: Latency, compute_us: float, headroom: float = 1.0) -> Latency:
+        """The same parts with another compute, and the longest hop that keeps the limits.
+
+        Where a hop keeps them with ``headroom`` times the compute as well, the longest of those.
+        """
+        for factor in (headroom, 1.0):
+            given = replace(parts, compute_us=factor * compute_us)
+            found = longest_hop(given, self.hops_ms, self.deadline_ms, self.compute_us)
+            if not self.misses(found):
+                break
+        return replace(found, compute_us=compute_us)
+
+    def misses(self, latency: Latency) -> list[str]:
+        """Which limits are not kept, in words."""
+        return latency.misses(self.deadline_ms, self.compute_us)
+
+    def headroom(self, latency: Latency) -> float:
+        """How many times its compute a detector could take; less than 1 if it misses a limit."""
+        left_us = 1000 * min(self.deadline_ms - latency.samples_ms, latency.hop_ms)
+        return min(self.compute_us, left_us) / latency.compute_us
+
+
+def check_number(
+    name: str, value: object, *, least: float | None = None, whole: bool = False
+) -> None:
+    """Refuse what is no finite number, positive or of at least so much, and whole if it has to be.
+
+    Raises:
+        ValueError: that names it.
+
+    Example:
+        >>> check_number("tries", 0, whole=True)
+        Traceback (most recent call last):
+        ValueError: tries must be a positive whole number, got 0
+    """
+    kinds = int if whole else (int, float)
+    if isinstance(value, kinds) and not isinstance(value, bool) and math.isfinite(value):
+        is_enough = value > 0 if least is None else value >= least
+        if is_enough:
+            return
+    kind = "whole number" if whole else "finite number"
+    wanted = f"a positive {kind}" if least is None else f"a {kind} of at least {least:g}"
+    raise ValueError(f"{name} must be {wanted}, got {value!r}")
+
+
+def check_hops(hops_ms: Sequence[float], sample_rate_hz: float) -> None:
+    """Refuse hops that are no whole number of samples.
+
+    Raises:
+        ValueError: that names the first.
+    """
+    for hop in hops_ms:
+        samples = hop * sample_rate_hz / 1000
+        if not math.isclose(samples, round(samples), rel_tol=1e-9):
+            raise ValueError(
+                f"search.hops_ms: {hop:g} ms are {samples:g} samples at {sample_rate_hz:g} Hz, "
+                f"expected a whole number; give a multiple of {1000 / sample_rate_hz:g} ms"
+            )
 
 
 def look_ahead_samples(channel_filter: ChannelFilter, channels: Iterable[int]) -> int:

@@ -2,8 +2,8 @@
 
 For each alignment of the filter, over groups of channels and of components, features are ranked in
 several ways; heads of several sizes and degrees are scored by closed-form validation, a material
-left out at a time, on a bounded sample of training bins. These scores choose, so that of the one
-chosen is a little too good. What a candidate costs is modelled (``cost``).
+left out at a time, on a bounded sample of training bins. Ranking and scaling saw that material, and
+these scores choose, so that of the one chosen is a little too good. Costs are modelled (``cost``).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from tactslip_torch.deadline.cost import CostModel, parts_of
 from tactslip_torch.deadline.front import Candidate
-from tactslip_torch.deadline.latency import Latency, look_ahead_samples, shortest_hop
+from tactslip_torch.deadline.latency import Latency, check_number, look_ahead_samples, shortest_hop
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.groups import Channels, Components, allowed, of_fingers
 from tactslip_torch.features.plan import make_plan
@@ -90,7 +91,9 @@ class Search:
 
     def __post_init__(self) -> None:
         for name in (*_NAMES, "sizes", "degrees", "hops_ms", "penalties"):
-            given = list(getattr(self, name))
+            given = getattr(self, name)
+            if isinstance(given, str) or not isinstance(given, Sequence):
+                raise ValueError(f"search.{name} must be a list in brackets, got {given!r}")
             if not given:
                 raise ValueError(f"search.{name} is empty, expected at least one value")
             known = get_args(_NAMES[name]) if name in _NAMES else given
@@ -99,13 +102,19 @@ class Search:
                 raise ValueError(
                     f"search.{name}: unknown {unknown[0]!r}, expected some of {', '.join(known)}"
                 )
-        for name in ("sizes", "hops_ms", "penalties", "bins", "most_timed", "calls"):
-            value = getattr(self, name)
-            least = min(value) if isinstance(value, Sequence) else value
-            if not least > 0:
-                raise ValueError(f"search.{name} must be positive, got {least}")
-        if set(self.degrees) - {1, 2}:
+        for name in ("sizes", "degrees", "hops_ms", "penalties"):
+            for value in getattr(self, name):
+                check_number(f"search.{name}", value, whole=name in ("sizes", "degrees"))
+        for name in ("bins", "most_timed", "calls"):
+            check_number(f"search.{name}", getattr(self, name), whole=True)
+        for name in ("alpha", "cost_power"):
+            check_number(f"search.{name}", getattr(self, name), least=0)
+        if self.alpha > 1:
+            raise ValueError(f"search.alpha must be at most 1, got {self.alpha}")
+        if max(self.degrees) > 2:
             raise ValueError(f"search.degrees must be of 1 and 2, got {list(self.degrees)}")
+        if not isinstance(self.drop_fingers, bool):
+            raise ValueError(f"search.drop_fingers must be true or false, got {self.drop_fingers}")
 
     def groups(self, pool: FeaturePool) -> list[tuple[str, str, Tensor]]:
         """Groups of channels and components that differ and are large enough, with their masks.
@@ -196,7 +205,6 @@ class Searcher:
     def _all(self, jobs: Sequence[_Job], watch: Watch) -> list[list[Candidate]]:
         """What each job finds, in their order; every job is done by one thread."""
         found: list[list[Candidate]] = [[] for _ in jobs]
-        ticks = iter(watch(range(len(jobs)), "search, rankings"))
         ticking = threading.Lock()
 
         def work(number: int) -> None:
@@ -204,9 +212,10 @@ class Searcher:
             with ticking:
                 next(ticks)
 
-        for_each(work, range(len(jobs)))
-        for _ in ticks:  # closes what is shown
-            pass
+        with closing(tick for tick in watch(range(len(jobs)), "search, rankings")) as ticks:
+            for_each(work, range(len(jobs)))
+            for _ in ticks:  # shows that all is done
+                pass
         return found
 
     def _scored(
