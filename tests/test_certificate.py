@@ -47,7 +47,7 @@ def test_an_error_is_laid_to_the_stage_that_makes_it():
 
 
 def test_scaled_features_and_their_errors():
-    detector, samples = small_detector(arithmetic="native", engine="reference"), raw_bins(20)
+    detector, samples = small_detector(arithmetic="native", engine="reference"), raw_bins(16)
     compared = compare(detector, samples)
     with torch.no_grad():
         filtered = detector.channel_filter.valid(samples)
@@ -59,7 +59,7 @@ def test_scaled_features_and_their_errors():
     torch.testing.assert_close(
         compared.scaled_error, (rounded.double() - scaled).abs(), rtol=0, atol=3e-7
     )
-    assert compared.scaled_error.shape == (20, NUM_FEATURES)
+    assert compared.scaled_error.shape == (16, NUM_FEATURES)
 
 
 def test_bins_do_not_depend_on_their_number():

@@ -506,3 +506,27 @@ def test_a_score_waits_for_its_look_ahead_and_no_longer(kind, align):
     moved = samples.clone()
     moved[..., first - 1] += 1.0
     assert (detector.judge_raw(moved).score != expected.score).all()
+
+
+@pytest.mark.parametrize("head", ["quadratic", "watched", "constant feature"])
+def test_one_bin_is_judged_as_many_are(head):
+    """By NumPy or by modules: with a NaN, a dead channel, values beyond any knee, both dtypes."""
+    detector = random_detector()
+    if head == "constant feature":
+        detector.scaler.minimum[3] = detector.scaler.maximum[3]
+    if head == "watched":
+        detector.head.register_forward_hook(lambda *_: None)
+    samples = noise(8)
+    samples[1, 16, 70], samples[2, 17], samples[3, 18] = torch.nan, 0.5, 1e200 * samples[3, 18]
+    for dtype in (torch.float64, torch.float32):
+        given = samples.to(dtype)
+        whole = detector.judge_raw(given)
+        for index, one in enumerate(given):
+            alone = detector.judge_raw(one)
+            assert alone.score.dtype == dtype
+            for found, expected in zip(alone, whole, strict=True):
+                torch.testing.assert_close(found, expected[index], rtol=1e-5, atol=1e-6)
+    detector.float()
+    torch.testing.assert_close(
+        detector(samples[:1, :, 25:125]), detector(samples[..., 25:125])[:1], rtol=1e-4, atol=1e-5
+    )

@@ -124,6 +124,22 @@ def test_float32_bins_are_computed_in_float64_and_rounded_once(engine, generator
     assert torch.equal(extractor(bins), extractor(bins.double()).float())
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_after_a_warm_up_nothing_is_made_any_more(engine, generator, monkeypatch):
+    extractor = FeatureExtractor(POOL, SELECTED, engine).warm_up()
+    monkeypatch.setattr(extractor, "_made", lambda dtype: pytest.fail("an engine was made"))
+    for dtype in (torch.float32, torch.float64):
+        assert extractor(noise(2, generator, dtype)).isfinite().all()
+
+
+def test_the_first_use_on_a_machine_is_announced(generator, monkeypatch, caplog):
+    from tactslip_torch.features.compiled.engine import CompiledEngine
+
+    monkeypatch.setattr(CompiledEngine, "is_ready", lambda engine: False)
+    FeatureExtractor(POOL, SELECTED, "compiled")(noise(1, generator))
+    assert "compiling kernels for features: some 20 s, once" in caplog.text
+
+
 @pytest.mark.parametrize("engine", FAST)
 def test_an_energy_beyond_float32_saturates(engine, generator):
     index = [i for i, name in enumerate(POOL.names) if str(name) == "SG1 raw time energy"]

@@ -10,6 +10,7 @@ the reference takes over; so it does for each bin with magnitudes beyond ``ordin
 
 from __future__ import annotations
 
+import logging
 import operator
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -29,6 +30,7 @@ from tactslip_torch.plain import is_plain
 from tactslip_torch.threads import for_each
 
 EngineName = Literal["auto", "compiled", "eager", "reference"]
+_LOG = logging.getLogger(__name__)
 _FEW_BINS = 4  # so few are done here: another thread would take longer to start
 _REFERENCE_CHUNK = 16  # what fits the cache of a processor
 
@@ -71,7 +73,8 @@ class FeatureExtractor:
     Args:
         pool: what features there are.
         selected: pool indices of the features wanted, in the order of the output; default: all.
-        engine: ``"auto"`` takes the compiled one where numba is installed, else the eager one.
+        engine: ``"auto"`` takes the compiled one where numba is installed, else the eager one. Its
+            first use on a machine takes some 20 s (``warm_up``).
 
     Attributes:
         plan: the least work for these features.
@@ -130,6 +133,13 @@ class FeatureExtractor:
             return self._reference(bins, dtype)
         with torch.inference_mode(False), torch.no_grad():  # what engines keep outlives the mode
             return self._values(bins, dtype)
+
+    def warm_up(self) -> FeatureExtractor:
+        """Make ready what the first bins would wait for, kernels among it; returns itself."""
+        if self.engine != "reference":
+            for dtype in (torch.float64, torch.float32):
+                self._engine_for(dtype)
+        return self
 
     def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
         """Features of one batch of bins after the other; no more than one is held.
@@ -204,7 +214,11 @@ class FeatureExtractor:
             return EagerEngine(self.pool, self.plan, dtype)
         from tactslip_torch.features.compiled.engine import CompiledEngine  # numba takes a second
 
-        return CompiledEngine(self.pool, self.plan, dtype)
+        engine = CompiledEngine(self.pool, self.plan, dtype)
+        if not engine.is_ready():
+            _LOG.warning("compiling kernels for features: some 20 s, once; then they are kept")
+        engine.warm_up()  # here, where an interrupt is heard
+        return engine
 
     def _start(self) -> None:
         self._engines: dict[torch.dtype, Engine] = {}

@@ -241,9 +241,9 @@ class FeaturePool(nn.Module):
             - output: ``[*, C]``, bool
         """
         high, low = bins.amax(-1), bins.amin(-1)  # by the inverse, so that nothing underflows
-        return (high - low) * self._inverse_span(bins) > torch.maximum(high, -low)
+        return (high - low) * self.inverse_span(bins) > torch.maximum(high, -low)
 
-    def _inverse_span(self, like: Tensor) -> Tensor:
+    def inverse_span(self, like: Tensor) -> Tensor:
         """One over the least span that resolves, as a part of the magnitude, ``[C]``."""
         if like.dtype not in self._inverses:
             least = [64 * torch.finfo(like.dtype).eps] * len(self.hand)

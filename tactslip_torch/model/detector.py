@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,14 +17,11 @@ from tactslip_torch.features.guards import is_nowhere
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool, saturating
 from tactslip_torch.model.detector_file import Head, damaged, read_detector, write_detector
-from tactslip_torch.model.judgement import Judgement, Nonfinite, check_nonfinite
+from tactslip_torch.model.few_bins import FEW_BINS, FewBins
+from tactslip_torch.model.judgement import Judgement, Nonfinite, check_nonfinite, judged_in_parts
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.plain import is_plain
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.threads import in_parts
-
-Said = TypeVar("Said", Tensor, Judgement)
-_PART_BINS = 64
 
 
 class SlipDetector(nn.Module):
@@ -55,8 +52,8 @@ class SlipDetector(nn.Module):
     """
 
     typical: Tensor
-    _channel_index: Tensor  # of each selected feature
-    _needed_index: Tensor  # of the channels in use
+    channel_index: Tensor  # of each selected feature
+    needed_index: Tensor  # of the channels in use
 
     def __init__(
         self,
@@ -95,11 +92,12 @@ class SlipDetector(nn.Module):
         self.head = head
         self.selected = extractor.selected
         self.info = dict(info or {})
+        self._few: FewBins | None = None
         self.register_buffer("typical", typical.to(next(head.buffers()), copy=True))
         channels = [pool.hand.names.index(name.channel) for name in self.selected_names]
         indices = {"channel": channels, "needed": sorted(set(channels))}
         for name, index in indices.items():
-            self.register_buffer(f"_{name}_index", torch.tensor(index), persistent=False)
+            self.register_buffer(f"{name}_index", torch.tensor(index), persistent=False)
 
     @property
     def selected_names(self) -> tuple[FeatureName, ...]:
@@ -138,7 +136,7 @@ class SlipDetector(nn.Module):
             ValueError: if the number of channels or samples is another.
         """
         self.pool.check(bins)
-        return _in_parts(self._score, bins)
+        return judged_in_parts(self._score, bins)
 
     def score_raw(self, samples: Tensor) -> Tensor:
         """Filter and score raw bins that come with their context.
@@ -151,7 +149,7 @@ class SlipDetector(nn.Module):
             ValueError: if the number of channels or samples is another.
         """
         self.channel_filter.check(samples)
-        return _in_parts(self._score_raw, samples)
+        return judged_in_parts(self._score_raw, samples)
 
     def judge(self, bins: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
         """Score filtered bins of a hand whose sensors may fail: a finite score, and its validity.
@@ -171,7 +169,7 @@ class SlipDetector(nn.Module):
         """
         self.pool.check(bins)
         check_nonfinite(nonfinite, bins, self.pool.hand.names)
-        return _in_parts(self._judge, bins)
+        return judged_in_parts(self._judge, bins)
 
     def judge_raw(self, samples: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
         """``judge`` for raw bins that come with their context.
@@ -187,7 +185,7 @@ class SlipDetector(nn.Module):
         """
         self.channel_filter.check(samples)
         check_nonfinite(nonfinite, samples, self.pool.hand.names)
-        return _in_parts(self._judge_raw, samples)
+        return judged_in_parts(self._judge_raw, samples)
 
     def validity(self, bins: Tensor) -> Tensor:
         """Whether every channel in use can be trusted (``FeaturePool.validity``), as ``judge``.
@@ -209,6 +207,8 @@ class SlipDetector(nn.Module):
         return score
 
     def _score(self, bins: Tensor) -> Tensor:
+        if (few := self._few_bins(bins)) is not None:
+            return few.score(self._features(bins.detach()), bins.dtype)
         return saturating(self.score_features(self._features(bins)), bins.dtype)
 
     def _score_raw(self, samples: Tensor) -> Tensor:
@@ -221,6 +221,9 @@ class SlipDetector(nn.Module):
     def _judge(self, bins: Tensor, given: Tensor | None = None) -> Judgement:
         """Scores of filtered bins, valid by the dtype they were given in, which is the score's."""
         given = bins if given is None else given
+        if (few := self._few_bins(bins)) is not None:
+            bins, given = bins.detach(), given.detach()
+            return few.judge(self._features, self.pool.widen(bins), given)
         bins = self.pool.widen(bins)
         is_missing = self.pool.is_missing(bins)
         is_whole = is_nowhere(is_missing)
@@ -228,12 +231,21 @@ class SlipDetector(nn.Module):
             bins = torch.where(is_missing[..., None], 0.0, bins)
         scaled = self._scale(self._features(bins))
         if not is_whole:
-            is_typical = is_missing.index_select(-1, self._channel_index)
+            is_typical = is_missing.index_select(-1, self.channel_index)
             scaled = torch.where(is_typical, self.typical, scaled)
         score = saturating(self.head(scaled), given.dtype)
         is_trusted = self.pool.is_alive(given) & ~is_missing
         is_valid = self._needed(is_trusted) & score.isfinite()
         return Judgement(score, is_valid, is_missing)
+
+    def _few_bins(self, bins: Tensor) -> FewBins | None:
+        """The way for few bins and values alone, if this is one for it."""
+        is_watched = any(m._forward_hooks or m._forward_pre_hooks for m in (self.scaler, self.head))
+        if is_watched or not is_plain(bins) or bins.shape[:-2].numel() > FEW_BINS:
+            return None
+        if self._few is None or not self._few.is_of(self):
+            self._few = FewBins(self) if FewBins.suits(self.scaler, self.head) else None
+        return self._few
 
     def _filter(self, samples: Tensor) -> Tensor:
         return self.channel_filter.valid(self.pool.widen(samples), self.extractor.plan.channels)
@@ -248,6 +260,7 @@ class SlipDetector(nn.Module):
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SlipDetector:
         """``float()`` and ``to()``: ranges of features stay float64, as offsets cancel there."""
         exact = dict(self.scaler.named_buffers())
+        self._few = None  # its views would be of what was before
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch has no annotations
         for name, value in exact.items():
             setattr(self.scaler, name, value.to(getattr(self.scaler, name).device))
@@ -255,7 +268,7 @@ class SlipDetector(nn.Module):
 
     def _needed(self, is_trusted: Tensor) -> Tensor:
         """Whether all channels in use are trusted, ``[*, C] -> [*]``."""
-        return is_trusted.index_select(-1, self._needed_index).all(-1)
+        return is_trusted.index_select(-1, self.needed_index).all(-1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the detector to one file, whole or not at all."""
@@ -276,18 +289,3 @@ class SlipDetector(nn.Module):
             return cls(*parts, engine=engine)
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise damaged(path, error) from error
-
-
-def _in_parts(judge: Callable[[Tensor], Said], x: Tensor) -> Said:
-    """What ``judge`` says of bins ``[*, C, n]``, of many in parts that stay in a cache."""
-    if not is_plain(x) or x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS:
-        return judge(x)
-
-    def joined(parts: Sequence[Tensor]) -> Tensor:
-        whole: Tensor = torch.cat(list(parts)).unflatten(0, x.shape[:-2])
-        return whole
-
-    found = in_parts(judge, x.flatten(0, -3).split(_PART_BINS))
-    if isinstance(found[0], Judgement):
-        return Judgement(*map(joined, zip(*found, strict=True)))
-    return joined(found)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, TypeVar, get_args
 
+import torch
 from torch import Tensor
 
+from tactslip_torch.plain import is_plain
 from tactslip_torch.signals.finite import refuse_nonfinite
+from tactslip_torch.threads import in_parts
 
 Nonfinite = Literal["mask", "raise"]
 _POLICIES = get_args(Nonfinite)
+_PART_BINS = 64
 
 
 class Judgement(NamedTuple):
@@ -28,6 +32,9 @@ class Judgement(NamedTuple):
     is_missing: Tensor
 
 
+Said = TypeVar("Said", Tensor, Judgement)
+
+
 def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
     """Hold samples ``[*, C, n]`` of the named channels against a policy.
 
@@ -38,3 +45,18 @@ def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
         raise ValueError(f"nonfinite must be 'mask' or 'raise', got {policy!r}")
     if policy == "raise":
         refuse_nonfinite(samples, names, "repair the samples, or take nonfinite='mask'")
+
+
+def judged_in_parts(judge: Callable[[Tensor], Said], x: Tensor) -> Said:
+    """What ``judge`` says of bins ``[*, C, n]``: of many in parts that stay in a cache."""
+    if not is_plain(x) or x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS:
+        return judge(x)
+
+    def joined(parts: Sequence[Tensor]) -> Tensor:
+        whole: Tensor = torch.cat(list(parts)).unflatten(0, x.shape[:-2])
+        return whole
+
+    found = in_parts(judge, x.flatten(0, -3).split(_PART_BINS))
+    if isinstance(found[0], Judgement):
+        return Judgement(*map(joined, zip(*found, strict=True)))
+    return joined(found)
