@@ -33,7 +33,8 @@ def pareto_table(found: Mapping[str, Any]) -> str:
     )
     head.append(found["definition"])
     head.append(f"validation: {found['validation']}")
-    head.append(_busy(max(row["interrupted"] for row in found["front"])))
+    interrupted = max(row["interrupted"] for row in found["front"])
+    head.append(f"{_busy(interrupted)} (the most of any detector on the front)")
     header = ["latency ms", "look-ahead", "bin", "hop", "compute us", "p50 us"]
     header += ["valid. %", "K", "deg.", "numbers", "filter", "channels", "components", "ranking"]
     rows = [
@@ -75,7 +76,7 @@ def _busy(interrupted: float) -> str:
     percent = f"{100 * interrupted:.1f} %"
     if interrupted > _BUSY:
         return f"machine busy: {percent} of calls interrupted, which do not count; time again"
-    return f"calls that the system interrupted do not count: at most {percent} of a detector's"
+    return f"{percent} of calls interrupted by the system, which do not count"
 
 
 def pareto_figure(found: Mapping[str, Any], path: str | Path) -> None:
