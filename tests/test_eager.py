@@ -17,6 +17,7 @@ from tactslip_torch import FeaturePool, HandLayout
 from tactslip_torch.features.eager.engine import EagerEngine
 from tactslip_torch.features.eager.linear import linear_of
 from tactslip_torch.features.eager.order import quantile_weights, rank_in_run
+from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.signals.spectrum import amplitude_spectrum
@@ -332,3 +333,11 @@ def test_blocks_form_branches_and_spectra(seed):
             torch.testing.assert_close(
                 found, expected[list(block.films), block.branch], rtol=1e-9, atol=1e-9
             )
+
+
+def test_how_numpy_treats_errors_is_the_callers_business():
+    bins = bins_of("random", 3, HandLayout.paper24(), 100, torch.Generator().manual_seed(0))
+    extractor = FeatureExtractor(FeaturePool(HandLayout.paper24()), None, "eager")
+    expected = extractor(bins * 2.0**-310)
+    with np.errstate(all="raise"):
+        assert torch.equal(extractor(bins * 2.0**-310), expected)
