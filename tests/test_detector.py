@@ -461,17 +461,17 @@ def test_a_later_format_is_refused(saved):
 def test_many_bins_are_judged_as_few_are(method):
     """In parts, on several threads, with leading axes; a broken channel is found in its part."""
     detector = random_detector()
-    samples = noise(150)
+    samples = noise(600)
     if method.startswith("judge"):
-        samples[77, 20, 60] = torch.nan
+        samples[377, 20, 60] = torch.nan
     bins = samples if method.endswith("raw") else samples[..., 25:125]
     judge = getattr(detector, method)
-    few = [judge(part) for part in bins.split(1)]
-    many = judge(bins.reshape(3, 50, *bins.shape[1:]))
+    few = [judge(part) for part in bins.split(30)]
+    many = judge(bins.reshape(3, 200, *bins.shape[1:]))
     if isinstance(many, torch.Tensor):
         few, many = [(one,) for one in few], (many,)
     for parts, whole in zip(zip(*few, strict=True), many, strict=True):
-        assert whole.shape[:2] == (3, 50)
+        assert whole.shape[:2] == (3, 200)
         torch.testing.assert_close(whole.flatten(0, 1), torch.cat(parts), rtol=1e-10, atol=1e-12)
 
 

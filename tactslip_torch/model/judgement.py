@@ -14,7 +14,7 @@ from tactslip_torch.threads import in_parts
 
 Nonfinite = Literal["mask", "raise"]
 _POLICIES = get_args(Nonfinite)
-_PART_BINS = 64
+_PART_BINS = 256
 
 
 class Judgement(NamedTuple):
