@@ -50,5 +50,5 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
     limit_line(axes, BIN_PERIOD_US, "a bin every 50 ms", 0.95)
     plain_decades(axes.xaxis)
     axes.grid(axis="x", color=LIGHT)
-    axes.set_xlabel("us from raw samples to a score: dot p50, bar p99; in brackets features made")
+    axes.set_xlabel("us from raw samples to a score\ndot p50, bar p99; in brackets: features made")
     finish(drawing, report, "Latency of one bin on one thread", path)
