@@ -1,3 +1,4 @@
+import copy
 import io
 import os
 import pickle
@@ -530,3 +531,16 @@ def test_one_bin_is_judged_as_many_are(head):
     torch.testing.assert_close(
         detector(samples[:1, :, 25:125]), detector(samples[..., 25:125])[:1], rtol=1e-4, atol=1e-5
     )
+
+
+def test_one_bin_sees_what_is_changed_in_place_and_in_copies():
+    """As ``load_state_dict`` does; what was judged before leaves nothing behind."""
+    detector, other = random_detector(), random_detector()
+    for buffer in (other.scaler.maximum, other.head.linear, other.head.constant):
+        buffer.mul_(1.5)
+    bins = noise(6)[..., 25:125]
+    assert detector(bins[0]).isfinite()
+    copied = copy.deepcopy(detector)
+    for changed in (detector, copied):
+        changed.load_state_dict(other.state_dict())
+        torch.testing.assert_close(changed(bins[0]), other(bins)[0], rtol=1e-9, atol=1e-9)

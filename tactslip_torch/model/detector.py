@@ -247,6 +247,10 @@ class SlipDetector(nn.Module):
             self._few = FewBins(self) if FewBins.suits(self.scaler, self.head) else None
         return self._few
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without views of tensors, which in a copy would be of others."""
+        return self.__dict__ | {"_few": None}
+
     def _filter(self, samples: Tensor) -> Tensor:
         return self.channel_filter.valid(self.pool.widen(samples), self.extractor.plan.channels)
 
@@ -260,7 +264,6 @@ class SlipDetector(nn.Module):
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SlipDetector:
         """``float()`` and ``to()``: ranges of features stay float64, as offsets cancel there."""
         exact = dict(self.scaler.named_buffers())
-        self._few = None  # its views would be of what was before
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch has no annotations
         for name, value in exact.items():
             setattr(self.scaler, name, value.to(getattr(self.scaler, name).device))

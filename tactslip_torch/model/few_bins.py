@@ -7,6 +7,7 @@ most of its time between calls, not in them.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -53,10 +54,10 @@ class FewBins:
 
     def __init__(self, parts: Parts) -> None:
         assert isinstance(parts.head, QuadraticForm)  # suits
-        self._of = (parts.pool, parts.scaler, parts.head)
+        self._of = _held(parts)
         self._pool, self._scaler, head = parts.pool, parts.scaler, parts.head
-        self._minimum = parts.scaler.minimum.numpy()
-        self._width = (parts.scaler.maximum - parts.scaler.minimum).numpy()
+        # views: what is changed in place, as by load_state_dict, is seen here
+        self._minimum, self._maximum = parts.scaler.minimum.numpy(), parts.scaler.maximum.numpy()
         self._knee = None if parts.scaler.knee is None else parts.scaler.knee.numpy()
         self._quadratic = head.quadratic.numpy()
         self._linear, self._constant = head.linear.numpy(), head.constant.numpy()
@@ -66,19 +67,18 @@ class FewBins:
 
     @staticmethod
     def suits(scaler: FeatureScaler, head: Head) -> bool:
-        """Whether these are of the usual kind: a quadratic form on the CPU, no constant feature."""
+        """Whether these are of the usual kind: a quadratic form, on the CPU and for values."""
         tensors = [*scaler.buffers(), *head.buffers()]
         return (
             type(head) is QuadraticForm
             and type(scaler) is FeatureScaler
             and all(each.device.type == "cpu" and not each.requires_grad for each in tensors)
-            and bool((scaler.maximum > scaler.minimum).all())
         )
 
     def is_of(self, parts: Parts) -> bool:
-        """Whether it was made of these."""
-        now = (parts.pool, parts.scaler, parts.head)
-        return all(then is each for then, each in zip(self._of, now, strict=True))
+        """Whether it was made of these, none of their tensors replaced since."""
+        now = _held(parts)
+        return len(now) == len(self._of) and all(map(operator.is_, now, self._of))
 
     def score(self, features: Tensor, dtype: torch.dtype) -> Tensor:
         """Scores ``[*]`` of selected features ``[*, K]``."""
@@ -104,17 +104,22 @@ class FewBins:
 
     def _scaled(self, features: Tensor) -> Array:
         """As ``FeatureScaler``, in the dtype of the head."""
-        x = features.numpy()
+        x, width = features.numpy(), self._maximum - self._minimum
+        if not width.min() > 0:  # a constant feature
+            return self._usual(features)
         if self._knee is not None:
             size = np.abs(x)
             ratio = size / self._knee
             if not ratio.max(initial=0.0) < math.inf:
-                usual: Array = self._scaler(features).numpy()
-                return usual.astype(self._linear.dtype, copy=False)
+                return self._usual(features)
             bent = np.where(ratio < self._tiny, size, self._knee * np.log1p(ratio))
             x = np.copysign(bent, x)
-        scaled: Array = (2 * ((x - self._minimum) / self._width) - 1).clip(-1, 1)
+        scaled: Array = (2 * ((x - self._minimum) / width) - 1).clip(-1, 1)
         return scaled.astype(self._linear.dtype, copy=False)
+
+    def _usual(self, features: Tensor) -> Array:
+        usual: Array = self._scaler(features).numpy()
+        return usual.astype(self._linear.dtype, copy=False)
 
     def _score(self, scaled: Array, dtype: torch.dtype) -> Tensor:
         """As ``QuadraticForm``, saturating at the largest number of a dtype."""
@@ -134,3 +139,9 @@ class FewBins:
             high, low = seen.max(-1), seen.min(-1)
         span = (high - low) * self._pool.inverse_span(given).numpy()
         return np.asarray(span > np.maximum(high, -low)), is_missing
+
+
+def _held(parts: Parts) -> tuple[Any, ...]:
+    scaler, head = parts.scaler, parts.head
+    tensors = (*scaler._buffers.values(), *head._buffers.values(), parts.typical)
+    return (parts.pool, scaler, head, *tensors)
