@@ -67,8 +67,8 @@ class FeatureExtractor:
     """Features of filtered bins, the whole pool or those selected, as fast as can be.
 
     float32 bins are computed in float64 and rounded once; for a pool whose arithmetic is
-    ``"native"`` the fast engines keep linear maps in float64 and take statistics in float32 of
-    rows scaled to order one, which is nearer to float64 than the reference in float32 throughout.
+    ``"native"`` the fast engines form branches in float64 and take statistics in float32 of rows
+    scaled to order one, which is nearer to float64 than the reference in float32 throughout.
 
     Args:
         pool: what features there are.
@@ -178,11 +178,11 @@ class FeatureExtractor:
             engine(x, scale, out)
             return
         # the engine sees zeros where values are strange: bits do not depend on neighbours
+        low, high = ordinary_sizes(torch.float64)
         broken, odd = [], []
         for index in (~is_ordinary).nonzero()[0].tolist():
             size = x[index].abs().amax(-1)
             is_broken = ~size.isfinite()
-            low, high = ordinary_sizes(torch.float64)
             if bool((is_broken | (size == 0) | ((size >= low) & (size <= high))).all()):
                 broken.append((index, is_broken.nonzero().flatten().tolist()))
                 x[index, is_broken], scale[index] = 0.0, torch.where(is_broken, 0.0, size)

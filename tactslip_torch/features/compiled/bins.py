@@ -120,6 +120,24 @@ def _at(m: int, kind: int, f: int, b: int, steps: Steps) -> int:
 
 
 @inner
+def _approximate(
+    m: int, what: int, f: int, level: int, formed: Array, steps: Steps, total: Array
+) -> None:
+    """Bring ``total`` from the next coarser approximation of a film to the one of this level."""
+    how, width = steps.chain[what, f, level], total.size
+    if how == OWN:
+        at = _at(m, what, f, 2 * level, steps)
+        own = formed[at : at + width]
+        for i in range(width):
+            total[i] = own[i]
+    elif how == ADD:
+        at = _at(m, what, f, 2 * level + 3, steps)
+        detail = formed[at : at + width]
+        for i in range(width):
+            total[i] += detail[i]
+
+
+@inner
 def _in_time(
     m: int,
     f: int,
@@ -148,17 +166,7 @@ def _in_time(
         square += desk.raw[i] * desk.raw[i]
     total = desk.shifted
     for level in range(steps.chain.shape[2] - 1, -1, -1):
-        how = steps.chain[TIME, f, level]
-        if how == OWN:
-            at = _at(m, TIME, f, 2 * level, steps)
-            own = formed[at : at + n]
-            for i in range(n):
-                total[i] = own[i]
-        elif how == ADD:
-            at = _at(m, TIME, f, 2 * level + 3, steps)
-            detail = formed[at : at + n]
-            for i in range(n):
-                total[i] += detail[i]
+        _approximate(m, TIME, f, level, formed, steps, total)
         for kind in range(2):
             b = 2 * level + kind
             row = steps.row[TIME, f, b]
@@ -208,17 +216,7 @@ def _in_frequency(
     total = desk.sums
     low, high, _ = extent(y)
     for level in range(steps.chain.shape[2] - 1, -1, -1):
-        how = steps.chain[LINES, f, level]
-        if how == OWN:
-            at = _at(m, LINES, f, 2 * level, steps)
-            own = formed[at : at + width]
-            for i in range(width):
-                total[i] = own[i]
-        elif how == ADD:
-            at = _at(m, LINES, f, 2 * level + 3, steps)
-            detail = formed[at : at + width]
-            for i in range(width):
-                total[i] += detail[i]
+        _approximate(m, LINES, f, level, formed, steps, total)
         for kind in range(2):
             b = 2 * level + kind
             row = steps.row[LINES, f, b]
