@@ -147,9 +147,14 @@ def test_quick_is_small_and_has_every_role():
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_composes(group, option):
     name = "pareto" if group == "search" else "train"
-    section = composed(f"{group}={option}", name=name)[group]
+    config = composed(f"{group}={option}", name=name)
+    section = config[group]
     assert section
-    if group != "features":  # plain values, for ``feature_parts``
+    if group == "scene":  # knobs, for the recordings
+        assert section.name == option
+        source = instantiate(config.data, cycles=1, materials=["M3", "wood"], _convert_="all")
+        assert [str(r.scene) for r in source.ids] == [option, option]
+    elif group != "features":  # plain values, for ``feature_parts``
         assert callable(get_object(section._target_))
 
 

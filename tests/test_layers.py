@@ -264,7 +264,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
         "report.certificate",
         "report.pareto",
     ),
-    "numba": ("features.compiled.*",),
+    "numba": ("features.compiled.*", "simulation.dynamics.compiled"),
 }
 
 # These need torch and the standard library alone.

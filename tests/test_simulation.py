@@ -209,7 +209,9 @@ def test_paper_scenes_are_the_protocol_and_take_flat_overrides():
 
 BAD_SCENES = {
     r"unknown material 'M7'; known are M1, .*wood": lambda: Scene("M7"),
-    r"unknown fidelity 'fast'; there is kinematic": lambda: Scene("M1", fidelity="fast"),
+    r"unknown fidelity 'fast'; there is kinematic, lugre, patch": lambda: Scene(
+        "M1", fidelity="fast"
+    ),
     r"sample_rate_hz must be positive and finite, got 0": lambda: Scene("M1", sample_rate_hz=0),
     r"acceleration_m_s2 must be positive": lambda: Scene("M1", acceleration_m_s2=-1.0),
     r"strokes must hold at least one stroke, got none": lambda: Scene("M1", strokes=()),

@@ -7,9 +7,10 @@ from tactslip_torch.simulation import SEEN_MATERIALS, Contact, Disturbances, Sce
 from tactslip_torch.simulation.friction import shear_share, sliding_gate, slips
 from tactslip_torch.simulation.grasp import draw_grasp
 from tactslip_torch.simulation.grid import Grid, causal_response
+from tactslip_torch.simulation.kinematic import KinematicContact
 from tactslip_torch.simulation.motion import Motion, arm_strokes
 from tactslip_torch.simulation.randomness import normal_blocks
-from tactslip_torch.simulation.sensors import element_friction, highpass_response
+from tactslip_torch.simulation.sensors import highpass_response
 
 RATE_HZ = 2000.0
 
@@ -96,9 +97,11 @@ def test_friction_stays_in_its_cone_sticks_before_and_falls_after_letting_go():
     scene = Scene("M6", cycle=2)
     plan, grasp = arm_strokes(scene.strokes, scene.acceleration_m_s2), draw_grasp(scene)
     motion, slipping = Motion(plan, whole_grid(15.4)), slips(grasp, plan)
+    contact_of = KinematicContact(scene, grasp, plan).on(motion.grid)
     t = motion.grid.time_s.ravel()
     for element in grasp.touching:
-        normal_n, friction_n = element_friction(scene, grasp, slipping, motion, element)
+        contact = contact_of(int(element))
+        normal_n, friction_n = contact.normal_n, contact.friction_n
         assert np.all((friction_n >= 0) & (friction_n <= grasp.surface.mu_s * normal_n + 1e-12))
         share = shear_share(grasp, slipping, motion, element, 0.008).ravel()
         # no jump but the fall at letting go: stretching, relaxing and sticking are continuous

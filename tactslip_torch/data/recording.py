@@ -21,13 +21,16 @@ class RecordingId:
     Args:
         material: what the hand slid on.
         cycle: number of the cycle on that material, from 0.
+        scene: what was done with the hand; the paper's protocol unless said otherwise.
     """
 
     material: str
     cycle: int
+    scene: str = "paper"
 
     def __str__(self) -> str:
-        return f"{self.material}/{self.cycle}"
+        scene = "" if self.scene == "paper" else f"/{self.scene}"
+        return f"{self.material}/{self.cycle}{scene}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,8 @@ class Recording:
         sliding_s: ``(start, end)`` of every stretch in which the contact slides.
         annotated_onsets_s: the onsets as a person marked them, if that differs; labels use
             these unless told otherwise. Defaults to ``onsets_s``.
+        non_slip_s: ``(start, end)`` of stretches without slip that are as telling as the second
+            before an onset: the hand is carried, tapped, gripped.
         provenance: where it comes from; simulated recordings say ``{"simulated": True, ...}``.
 
     Raises:
@@ -58,6 +63,7 @@ class Recording:
     onsets_s: tuple[float, ...]
     sliding_s: tuple[tuple[float, float], ...]
     annotated_onsets_s: tuple[float, ...] = ()
+    non_slip_s: tuple[tuple[float, float], ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -106,7 +112,11 @@ class Timeline(Protocol):
 
     @property
     def speeds_mm_s(self) -> tuple[float, ...]:
-        """Steady speed of each stroke."""
+        """Steady speed of each stroke that slides."""
+
+    @property
+    def non_slip_s(self) -> tuple[tuple[float, float], ...]:
+        """Stretches without slip in which the hand is handled."""
 
 
 class RecordingSource(Protocol):

@@ -1,6 +1,14 @@
 """The simulated hand: scenes in, recordings with exact truth out."""
 
-from tactslip_torch.simulation.knobs import Contact, Disturbances, Sensors, Stroke
+from tactslip_torch.simulation.knobs import (
+    Contact,
+    Disturbances,
+    Dynamics,
+    Faults,
+    Handling,
+    Sensors,
+    Stroke,
+)
 from tactslip_torch.simulation.materials import (
     MATERIALS,
     SEEN_MATERIALS,
@@ -24,6 +32,9 @@ __all__ = [
     "UNSEEN_MATERIALS",
     "Contact",
     "Disturbances",
+    "Dynamics",
+    "Faults",
+    "Handling",
     "Material",
     "Scene",
     "Sensors",

@@ -32,10 +32,11 @@ class Common:
 
     Args:
         scene: whose disturbances.
-        motion: the arm's motion, and where.
+        motion: the arm's own, and where; its plan may be empty.
+        duration_s: of the recording.
     """
 
-    def __init__(self, scene: Scene, motion: Motion) -> None:
+    def __init__(self, scene: Scene, motion: Motion, duration_s: float) -> None:
         plan, grid = motion.plan, motion.grid
         self.grid = grid
         num = len(scene.hand)
@@ -52,9 +53,10 @@ class Common:
             * lognormal(session, 0.4, (num, len(ARM_MODES_HZ)))
         )
         self._mains = _mains(scene, grid) if knobs.mains_mv > 0 else None
-        self._motor = _motor(scene, motion) if knobs.motor_vibration_mv > 0 else None
-        self._arm = _arm_ringing(scene, plan, grid) if knobs.arm_transient_mv > 0 else None
-        self._bursts = _draw_bursts(scene, plan[-1].stop_s)
+        self._motor = _motor(scene, motion) if plan and knobs.motor_vibration_mv > 0 else None
+        rings = plan and knobs.arm_transient_mv > 0
+        self._arm = _arm_ringing(scene, plan, grid) if rings else None
+        self._bursts = _draw_bursts(scene, duration_s)
 
     def channel(self, index: int) -> Array:
         """Volts of all disturbances in one channel, ``[K, B]``."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tactslip_torch.simulation.contact import Slips
 from tactslip_torch.simulation.grasp import Grasp
 from tactslip_torch.simulation.motion import ArmStroke, Motion
 from tactslip_torch.simulation.randomness import Array
@@ -25,24 +26,20 @@ SLIDE_RISE_S = 0.004
 
 
 @dataclass(frozen=True, eq=False)
-class Slips:
-    """Every slip of every element; arrays over S strokes and E elements.
+class StickSlips(Slips):
+    """``Slips`` with the shear between them, as a share of ``mu_s N``.
 
     Args:
-        start_s: when the element lets go, ``[S, E]``; NaN for elements that do not touch.
-        end_s: when it sticks again, ``[S, E]``.
-        shear_before: shear at the start of each stroke, as a share of ``mu_s N``, ``[S, E]``.
-        shear_after: shear as the arm stops, ``[S, E]``.
+        shear_before: at the start of each stroke, ``[S, E]``.
+        shear_after: as the stroke stops, ``[S, E]``.
     """
 
-    start_s: Array
-    end_s: Array
     shear_before: Array
     shear_after: Array
 
 
-def slips(grasp: Grasp, plan: tuple[ArmStroke, ...]) -> Slips:
-    """When each element lets go and sticks again, stroke after stroke."""
+def slips(grasp: Grasp, plan: tuple[ArmStroke, ...]) -> StickSlips:
+    """When each element lets go and sticks again, over a plan of strokes that slide."""
     shape = (len(plan), len(grasp.load_n))
     start_s, end_s, before = np.empty(shape), np.empty(shape), np.zeros(shape)
     after_slide = _shear_after_slide(grasp)
@@ -56,7 +53,7 @@ def slips(grasp: Grasp, plan: tuple[ArmStroke, ...]) -> Slips:
         end_s[number] = stroke.time_of_travel_s(stroke.distance_mm - restick_mm)
     lifted = grasp.load_n <= 0
     start_s[:, lifted] = end_s[:, lifted] = np.nan
-    return Slips(start_s, end_s, before, np.broadcast_to(after_slide, shape))
+    return StickSlips(start_s, end_s, before, np.broadcast_to(after_slide, shape))
 
 
 def _shear_after_slide(grasp: Grasp) -> Array:
@@ -78,7 +75,9 @@ def sliding_gate(slips: Slips, element: int, stroke: int, time_s: Array) -> Arra
     return -np.expm1(-since / SLIDE_RISE_S)
 
 
-def shear_share(grasp: Grasp, slips: Slips, motion: Motion, element: int, recoil_s: float) -> Array:
+def shear_share(
+    grasp: Grasp, slips: StickSlips, motion: Motion, element: int, recoil_s: float
+) -> Array:
     """Friction force over ``mu_s N`` of one element, in ``[0, 1]``; zero before the first stroke.
 
     Shape:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tactslip_torch.simulation.materials import MATERIALS, Material
 from tactslip_torch.simulation.randomness import Array, Key, generator, log_uniform, lognormal
-from tactslip_torch.simulation.scene import Scene
+from tactslip_torch.simulation.scene import PAPER, Scene
 
 MAX_PRESLIDING_FACTOR = 1.5
 """Largest factor of an element's presliding travel on the recording's (``Scene`` relies on it)."""
@@ -29,7 +29,8 @@ def session_key(scene: Scene, purpose: str) -> Key:
 
 def recording_key(scene: Scene, purpose: str) -> Key:
     """The key of a draw that belongs to one recording."""
-    return (scene.seed, "recording", _session(scene), scene.material, scene.cycle, purpose)
+    kind = () if scene.name == PAPER else (scene.name,)
+    return (scene.seed, "recording", _session(scene), scene.material, scene.cycle, *kind, purpose)
 
 
 def _session(scene: Scene) -> str | int:

@@ -14,6 +14,7 @@ import numpy as np
 
 from tactslip_torch.simulation.grid import Grid
 from tactslip_torch.simulation.knobs import Stroke
+from tactslip_torch.simulation.knobs.strokes import Moves
 from tactslip_torch.simulation.randomness import Array
 
 
@@ -23,12 +24,13 @@ class ArmStroke:
 
     Args:
         start_s: when the arm begins to move.
-        origin_mm: where it begins.
+        origin_mm: how far the hand has slid before.
         acceleration_mm_s2: of both ramps.
         peak_mm_s: highest speed, the steady one unless the stroke is short.
         ramp_s: duration of each ramp.
         stop_s: when the arm is at rest again.
         distance_mm: travel.
+        moves: who does: see ``Stroke``.
     """
 
     start_s: float
@@ -38,6 +40,17 @@ class ArmStroke:
     ramp_s: float
     stop_s: float
     distance_mm: float
+    moves: Moves = "hand"
+
+    @property
+    def slides(self) -> bool:
+        """Whether hand and object move against each other."""
+        return self.moves != "both"
+
+    @property
+    def drives(self) -> bool:
+        """Whether the arm moves."""
+        return self.moves != "object"
 
     def travel_mm(self, time_s: Array) -> Array:
         """Distance from the stroke's origin, clamped before and after the stroke."""
@@ -75,16 +88,19 @@ def arm_strokes(strokes: tuple[Stroke, ...], acceleration_m_s2: float) -> tuple[
         peak = min(stroke.speed_mm_s, math.sqrt(a * stroke.distance_mm))
         start_s = now_s + stroke.pause_s
         now_s = start_s + stroke.distance_mm / peak + peak / a
-        plan.append(ArmStroke(start_s, here_mm, a, peak, peak / a, now_s, stroke.distance_mm))
-        here_mm += stroke.distance_mm
+        plan.append(
+            ArmStroke(start_s, here_mm, a, peak, peak / a, now_s, stroke.distance_mm, stroke.moves)
+        )
+        here_mm += stroke.distance_mm if stroke.slides else 0.0
     return tuple(plan)
 
 
 class Motion:
-    """The arm's motion on a grid, computed once for all elements.
+    """A motion on a grid, computed once for all elements.
 
     Args:
-        plan: the arm's strokes.
+        plan: the strokes that count: those that slide for the contact's motion, those that the
+            arm drives for its own.
         grid: where.
 
     Attributes:
@@ -95,10 +111,10 @@ class Motion:
     def __init__(self, plan: tuple[ArmStroke, ...], grid: Grid) -> None:
         self.plan, self.grid = plan, grid
         self.travel_mm = tuple(stroke.travel_mm(grid.time_s) for stroke in plan)
-        self.position_mm: Array = np.sum(self.travel_mm, axis=0)
+        self.position_mm: Array = sum(self.travel_mm, np.zeros(grid.time_s.shape))
 
     @cached_property
     def speed_mm_s(self) -> Array:
         """Speed over all strokes, ``[K, B]``."""
-        speed: Array = np.sum([stroke.speed_mm_s(self.grid.time_s) for stroke in self.plan], axis=0)
-        return speed
+        speeds = (stroke.speed_mm_s(self.grid.time_s) for stroke in self.plan)
+        return sum(speeds, np.zeros(self.grid.time_s.shape))

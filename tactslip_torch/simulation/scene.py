@@ -8,10 +8,18 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.simulation.knobs import Contact, Disturbances, Sensors, Stroke
+from tactslip_torch.simulation.knobs import (
+    Contact,
+    Disturbances,
+    Dynamics,
+    Faults,
+    Handling,
+    Sensors,
+    Stroke,
+)
 from tactslip_torch.simulation.materials import MATERIALS, SEEN_MATERIALS, UNSEEN_MATERIALS
 
-FIDELITIES = ("kinematic",)
+FIDELITIES = ("kinematic", "lugre", "patch")
 """The rungs that exist, cheapest first."""
 
 SIMULATION_VERSION = 1
@@ -24,7 +32,13 @@ _GROUPS: dict[str, type[Any]] = {
     "contact": Contact,
     "sensors": Sensors,
     "disturbances": Disturbances,
+    "handling": Handling,
+    "faults": Faults,
+    "dynamics": Dynamics,
 }
+
+PAPER = "paper"
+"""The scene that the paper recorded, by the name of its configuration."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +48,15 @@ class Scene:
     Args:
         material: id in ``MATERIALS``.
         hand: the channels; elements are its distinct (finger, segment) pairs.
-        strokes: at least one; each longer than 1.5 times the longest presliding travel.
+        name: of the kind of scene; scenes of other names are other draws of the same session.
+        strokes: at least one; those that slide longer than 1.5 times the longest presliding travel.
         contact: how the hand touches and slides.
         sensors: the sensing elements and their front end.
         disturbances: what is not slip.
+        handling: what loads the contact without sliding.
+        faults: what is broken behind the sensors.
+        dynamics: knobs of the dynamic rungs.
+        tail_s: rest behind the last stroke.
         acceleration_m_s2: of the arm, at each start and stop.
         sample_rate_hz: samples per second and channel.
         fidelity: the rung to simulate on, one of ``FIDELITIES``.
@@ -63,12 +82,17 @@ class Scene:
     contact: Contact = field(default_factory=Contact)
     sensors: Sensors = field(default_factory=Sensors)
     disturbances: Disturbances = field(default_factory=Disturbances)
+    handling: Handling = field(default_factory=Handling)
+    faults: Faults = field(default_factory=Faults)
+    dynamics: Dynamics = field(default_factory=Dynamics)
+    tail_s: float = 0.0
     acceleration_m_s2: float = 0.5
     sample_rate_hz: float = 2000.0
     fidelity: str = "kinematic"
     seed: int = 0
     session: str | int | None = None
     cycle: int = 0
+    name: str = PAPER
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "strokes", tuple(self.strokes))
@@ -86,16 +110,18 @@ class Scene:
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value}")
+        if not 0 <= self.tail_s < math.inf:
+            raise ValueError(f"tail_s must be finite and not negative, got {self.tail_s}")
         self._require_strokes()
         self._require_contact()
 
     def _require_strokes(self) -> None:
-        """Refuse scenes without slip: this rung's recordings have an onset per stroke."""
+        """Refuse strokes that may end before they slip: each that slides has an onset."""
         if not self.strokes:
             raise ValueError("strokes must hold at least one stroke, got none")
         longest_mm = 1.5 * self.contact.presliding_mm[1]
         for number, stroke in enumerate(self.strokes, 1):
-            if stroke.distance_mm <= 1.5 * longest_mm:
+            if stroke.slides and stroke.distance_mm <= 1.5 * longest_mm:
                 raise ValueError(
                     f"stroke {number} of {stroke.distance_mm:g} mm is too short to slip surely: "
                     f"presliding may take {longest_mm:g} mm; it needs {1.5 * longest_mm:g} mm"
@@ -104,9 +130,13 @@ class Scene:
     def _require_contact(self) -> None:
         """Refuse contacts that this hand or this material contradicts."""
         contact, known = self.contact, set(self.hand.names)
-        strangers = sorted(set(contact.touching or ()) - known)
-        if strangers:
-            raise ValueError(f"contact.touching names {strangers}, which this hand does not have")
+        for what, named in (
+            ("contact.touching", contact.touching or ()),
+            ("faults", self.faults.names),
+        ):
+            strangers = sorted(set(named) - known)
+            if strangers:
+                raise ValueError(f"{what} names {strangers}, which this hand does not have")
         loads = dict(contact.finger_loads)
         touching = known if contact.touching is None else set(contact.touching)
         if not any(c.name in touching and loads.get(c.finger, 1.0) > 0 for c in self.hand.channels):
@@ -162,9 +192,9 @@ def paper_scenes(
         cycles: recordings per material.
         materials: ids in ``MATERIALS``.
         hand: defaults to the paper's.
-        overrides: any field of ``Scene``, or directly any field of ``Contact``, ``Sensors`` or
-            ``Disturbances``, such as the calibrated ``friction_noise_mv``, ``presliding_mm`` and
-            ``burst_rate_hz``. A group or a stroke may be a mapping of its fields.
+        overrides: any field of ``Scene``, or directly any field of one of its groups, such as the
+            calibrated ``friction_noise_mv``, ``presliding_mm`` and ``burst_rate_hz``. A group or a
+            stroke may be a mapping of its fields.
 
     Raises:
         ValueError: if a scene is bad, an override is no such field, or there is no cycle.
@@ -209,6 +239,6 @@ def _grouped(overrides: Mapping[str, Any]) -> dict[str, Any]:
     if unknown:
         raise ValueError(
             f"unknown override {', '.join(unknown)}; a scene has {', '.join(sorted(known))} "
-            "and the fields of Contact, Sensors and Disturbances"
+            f"and the fields of {', '.join(group.__name__ for group in _GROUPS.values())}"
         )
     return values

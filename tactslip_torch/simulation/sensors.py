@@ -13,10 +13,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.simulation.friction import Slips, shear_share
-from tactslip_torch.simulation.grasp import Grasp, recording_key, session_key
+from tactslip_torch.simulation.grasp import recording_key, session_key
 from tactslip_torch.simulation.grid import Grid
-from tactslip_torch.simulation.motion import Motion
 from tactslip_torch.simulation.randomness import Array, generator, lognormal, normal_blocks
 from tactslip_torch.simulation.scene import Scene
 from tactslip_torch.simulation.vibration import Vibration
@@ -26,9 +24,6 @@ SG_VIBRATION_SHARE = 0.08
 
 FORCE_FLUCTUATION = 0.03
 """Slow fluctuation of friction over its mean while sliding, rms (prior, ours)."""
-
-RUNOUT_PERIOD_MM = 180.0
-"""Travel over which the normal load rises and falls (prior, ours)."""
 
 DRIFT_TONES = 4
 """Slow sines that make up a channel's drift, .05 to 2 Hz."""
@@ -66,24 +61,6 @@ def draw_front(scene: Scene) -> Front:
         white_v=1e-3 * floor_mv * lognormal(session, 0.2, num),
         offset_v=np.where(is_sg, sg_offset, pvdf_offset),
     )
-
-
-def element_friction(
-    scene: Scene, grasp: Grasp, slips: Slips, motion: Motion, element: int
-) -> tuple[Array, Array]:
-    """Normal force and friction force in newtons, ``[K, B]`` each; never above ``mu_s N``.
-
-    The normal force has the surface's run-out and creeps after the grasp like the shear.
-    """
-    angle = 2 * np.pi / RUNOUT_PERIOD_MM * motion.position_mm
-    runout = scene.contact.runout * np.sin(angle + grasp.runout_phase[element])
-    since_grasp_s = np.maximum(motion.grid.time_s, 0.0) + 1.0
-    creep = np.exp(-since_grasp_s / (5.0 * grasp.relaxation_time_s[element]))
-    normal_n = (
-        grasp.load_n[element] * (1.0 + runout) * (1.0 + 0.3 * grasp.relaxation[element] * creep)
-    )
-    share = shear_share(grasp, slips, motion, element, scene.contact.recoil_s)
-    return normal_n, grasp.surface.mu_s * normal_n * share
 
 
 @lru_cache(maxsize=8)

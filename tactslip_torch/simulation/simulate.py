@@ -1,6 +1,6 @@
 """A scene in, a recording out.
 
-The kinematic rung: arm motion, quasi-static contact, vibration, sensors. Only the channels and
+Arm motion, contact on the scene's rung, vibration, sensors. Only the channels and
 the stretches of time that are asked for are computed; elements out of contact cost no friction.
 """
 
@@ -14,16 +14,16 @@ import torch
 from numpy.typing import NDArray
 
 from tactslip_torch.data.recording import Recording
+from tactslip_torch.simulation.contact import ContactModel
 from tactslip_torch.simulation.disturbances import Common
-from tactslip_torch.simulation.friction import Slips, slips
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp
 from tactslip_torch.simulation.grid import Grid, block_samples_for
+from tactslip_torch.simulation.ladder import contact_model
 from tactslip_torch.simulation.motion import ArmStroke, Motion, arm_strokes
 from tactslip_torch.simulation.randomness import Array
 from tactslip_torch.simulation.scene import SIMULATION_VERSION, Scene
 from tactslip_torch.simulation.sensors import (
     draw_front,
-    element_friction,
     film_volts,
     front_end,
     gauge_volts,
@@ -65,14 +65,14 @@ def simulate(
         raise ValueError(f"dtype must be floating, got {dtype}")
     plan = arm_strokes(scene.strokes, scene.acceleration_m_s2)
     grasp = draw_grasp(scene)
-    slipping = slips(grasp, plan)
-    truth = timeline_of(scene, plan, grasp, slipping)
+    model = contact_model(scene, grasp, plan)
+    truth = timeline_of(scene, plan, grasp, model.slips)
     wanted = _wanted_samples(scene, truth, windows)
     indices = _channel_indices(scene, channels)
     volts = np.full((len(scene.hand), truth.num_samples), np.nan)
     if wanted and indices:
         grid = _covering_grid(scene, wanted)
-        rows = _RUNGS[scene.fidelity](scene, plan, grasp, slipping, grid, indices)
+        rows = _volts(scene, plan, grasp, model, grid, indices)
         for index in indices:
             _place(volts[index], rows[index], grid, wanted)
     return Recording(
@@ -83,41 +83,41 @@ def simulate(
         onsets_s=truth.onsets_s,
         sliding_s=truth.sliding_s,
         annotated_onsets_s=truth.annotated_onsets_s,
+        non_slip_s=truth.non_slip_s,
         provenance=_provenance(scene),
     )
 
 
-def _kinematic(
+def _volts(
     scene: Scene,
     plan: tuple[ArmStroke, ...],
     grasp: Grasp,
-    slipping: Slips,
+    model: ContactModel,
     grid: Grid,
     indices: list[int],
 ) -> dict[int, Array]:
     """Volts of the channels asked for on the grid, ``[K, B]`` each."""
-    history, _, now = grid.history
-    motion, before = Motion(plan, grid), Motion(plan, history)
-    front, common = draw_front(scene), Common(scene, motion)
-    field = shared_field(scene, grasp, motion)
+    _, _, now = grid.history
+    driven = Motion(tuple(stroke for stroke in plan if stroke.drives), grid)
+    sliding = Motion(tuple(stroke for stroke in plan if stroke.slides), grid)
+    front, common = draw_front(scene), Common(scene, driven, plan[-1].stop_s + scene.tail_s)
+    field = shared_field(scene, grasp, sliding)
     volts = {index: common.channel(index) for index in indices}
     elements = {int(grasp.element_of_channel[index]) for index in indices}
+    contact_of = model.on(grid)
     for element in sorted(elements & set(grasp.touching.tolist())):
-        vibration = element_vibration(scene, grasp, slipping, field, element)
-        normal_n, friction_n = element_friction(scene, grasp, slipping, before, element)
+        contact = contact_of(element)
+        vibration = element_vibration(scene, grasp, model.slips, contact, field, element)
         for index in indices:
             if grasp.element_of_channel[index] != element:
                 continue
             if scene.hand.channels[index].kind == "SG":
-                felt = gauge_volts(scene, normal_n[now], friction_n[now], vibration)
+                normal_n, friction_n = contact.normal_n[now], contact.friction_n[now]
+                felt = gauge_volts(scene, normal_n, friction_n, vibration)
             else:
-                felt = film_volts(scene, grid, friction_n, vibration)
+                felt = film_volts(scene, grid, contact.friction_n, vibration)
             volts[index] += front.gain[index] * felt
     return {index: front_end(scene, front, index, grid, volts[index]) for index in indices}
-
-
-_RUNGS = {"kinematic": _kinematic}
-"""What computes each of ``FIDELITIES``: truth, windows and front end are shared by all rungs."""
 
 
 def _wanted_samples(
@@ -177,6 +177,7 @@ def _provenance(scene: Scene) -> dict[str, object]:
         "simulated": True,
         "fidelity": scene.fidelity,
         "seed": scene.seed,
+        "scene": scene.name,
         "material": scene.material,
         "session": scene.session,
         "cycle": scene.cycle,

@@ -12,16 +12,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactslip_torch.simulation.friction import Slips, slips
+from tactslip_torch.simulation.contact import Slips
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp, recording_key
+from tactslip_torch.simulation.ladder import contact_model
 from tactslip_torch.simulation.motion import ArmStroke, arm_strokes
 from tactslip_torch.simulation.randomness import Array, generator
 from tactslip_torch.simulation.scene import Scene
 
+RINGING_S = 0.3
+"""How long the arm's ringing counts as handling after a stroke (ours)."""
+
 
 @dataclass(frozen=True)
 class Timeline:
-    """When what happens, one entry per stroke.
+    """When what happens, one entry per stroke that slides unless said otherwise.
 
     Args:
         duration_s: of the recording, a whole number of samples.
@@ -30,7 +34,9 @@ class Timeline:
         onsets_s: when the contact begins to slide, exact.
         annotated_onsets_s: the same as a person would mark it, with jitter.
         sliding_s: ``(onset, end)`` of each slide.
-        arm_s: ``(start, stop)`` of the arm.
+        arm_s: ``(start, stop)`` of every stroke of the arm.
+        non_slip_s: stretches without slip in which the hand is handled: what a detector of motors
+            or knocks would call slip.
     """
 
     duration_s: float
@@ -40,6 +46,7 @@ class Timeline:
     annotated_onsets_s: tuple[float, ...]
     sliding_s: tuple[tuple[float, float], ...]
     arm_s: tuple[tuple[float, float], ...]
+    non_slip_s: tuple[tuple[float, float], ...] = ()
 
 
 def timeline(scene: Scene) -> Timeline:
@@ -54,7 +61,7 @@ def timeline(scene: Scene) -> Timeline:
     """
     plan = arm_strokes(scene.strokes, scene.acceleration_m_s2)
     grasp = draw_grasp(scene)
-    return timeline_of(scene, plan, grasp, slips(grasp, plan))
+    return timeline_of(scene, plan, grasp, contact_model(scene, grasp, plan).slips)
 
 
 def timeline_of(scene: Scene, plan: tuple[ArmStroke, ...], grasp: Grasp, slips: Slips) -> Timeline:
@@ -62,15 +69,21 @@ def timeline_of(scene: Scene, plan: tuple[ArmStroke, ...], grasp: Grasp, slips: 
     down = grasp.touching
     onsets = [_weighted_median(row[down], grasp.load_n[down]) for row in slips.start_s]
     ends = [_weighted_median(row[down], grasp.load_n[down]) for row in slips.end_s]
-    num_samples = math.ceil(plan[-1].stop_s * scene.sample_rate_hz - 1e-6)
+    num_samples = math.ceil((plan[-1].stop_s + scene.tail_s) * scene.sample_rate_hz - 1e-6)
+    duration_s = num_samples / scene.sample_rate_hz
     return Timeline(
-        duration_s=num_samples / scene.sample_rate_hz,
+        duration_s=duration_s,
         num_samples=num_samples,
-        speeds_mm_s=tuple(stroke.speed_mm_s for stroke in scene.strokes),
+        speeds_mm_s=tuple(stroke.speed_mm_s for stroke in scene.strokes if stroke.slides),
         onsets_s=tuple(onsets),
         annotated_onsets_s=tuple(_annotated(scene, onsets, ends)),
         sliding_s=tuple(zip(onsets, ends, strict=True)),
-        arm_s=tuple((stroke.start_s, stroke.stop_s) for stroke in plan),
+        arm_s=tuple((stroke.start_s, stroke.stop_s) for stroke in plan if stroke.drives),
+        non_slip_s=tuple(
+            (stroke.start_s, min(stroke.stop_s + RINGING_S, duration_s))
+            for stroke in plan
+            if not stroke.slides
+        ),
     )
 
 

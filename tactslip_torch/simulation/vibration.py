@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.simulation.friction import Slips, sliding_gate
+from tactslip_torch.simulation.contact import ElementContact, Slips
 from tactslip_torch.simulation.grasp import Grasp, Surface, recording_key, session_key
 from tactslip_torch.simulation.grid import Grid, causal_response
 from tactslip_torch.simulation.motion import Motion
@@ -28,9 +28,6 @@ LOW_BAND_HZ = 25.0
 
 LINE_DAMPING = 0.5
 """Damping ratio with which lines meet the skin: a patch is many bristles (prior, ours)."""
-
-STOP_PULSE_SHARE = 0.2
-"""Burst of sticking again over that of letting go (ours)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +125,7 @@ def band_responses(grasp: Grasp, element: int, grid: Grid) -> NDArray[np.complex
 
 
 def element_vibration(
-    scene: Scene, grasp: Grasp, slips: Slips, field: Field, element: int
+    scene: Scene, grasp: Grasp, slips: Slips, contact: ElementContact, field: Field, element: int
 ) -> Vibration:
     """One touching element's vibration over the whole grid; work only where it slides."""
     grid, shape = field.grid, field.grid.time_s.shape
@@ -139,7 +136,7 @@ def element_vibration(
         if rows.start == rows.stop:
             continue
         responses = band_responses(grasp, element, grid) if responses is None else responses
-        gate = sliding_gate(slips, element, stroke, grid.time_s[rows])
+        gate = contact.slide[rows]
         part = Grid(grid.blocks[rows], grid.block_samples, grid.sample_rate_hz)
         noise = [
             part.coloured_noise((*recording_key(scene, band), element), response)
@@ -159,7 +156,7 @@ def element_vibration(
         vibration.high[rows] += gate * high
         vibration.low[rows] += gate * (np.sqrt(low_share) * friction * noise[1])
         vibration.fluctuation[rows] += gate * noise[1]
-    _add_bursts(scene, grasp, slips, element, grid, vibration.high)
+    vibration.high[:] += contact.release_v
     return vibration
 
 
@@ -174,21 +171,3 @@ def _element_lines(scene: Scene, field: Field, element: int, rows: slice) -> Arr
             for line in range(num_lines):
                 total += mixture[part, line] * field.lines[part, line, rows]
     return total
-
-
-def _add_bursts(
-    scene: Scene, grasp: Grasp, slips: Slips, element: int, grid: Grid, volts: Array
-) -> None:
-    """Add the ringing of the skin at each letting go and, weaker, at each sticking again."""
-    omega = 2 * np.pi * grasp.resonance_hz[element]
-    decay = grasp.damping[element] * omega
-    rng = generator(*recording_key(scene, "onset pulse"), element)
-    strengths = lognormal(rng, 0.3, (len(slips.start_s), 2))
-    full_v = scene.contact.onset_pulse_v * grasp.friction_n[element]
-    for stroke, pair in enumerate(strengths):
-        starts = (slips.start_s[stroke, element], slips.end_s[stroke, element])
-        for start_s, strength, share in zip(starts, pair, (1.0, -STOP_PULSE_SHARE), strict=True):
-            rows = grid.overlapping(start_s, start_s + 12.0 / decay)
-            since = np.maximum(grid.time_s[rows] - start_s, 0.0)
-            ringing = np.exp(-decay * since) * np.sin(omega * since)
-            volts[rows] += share * full_v * strength * ringing
