@@ -27,7 +27,7 @@ def test_a_foreign_file_is_left_alone(name, tmp_path):
         ("extremes=0", "extremes must be a whole number from 1 on, below 2^63, got 0"),
         ("fold=other", "fold must be one of unseen4, got other"),
         ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3"),
-        ("+data.scene.broken=A/0", "repair or leave out A/0"),
+        ("+scene.broken=A/0", "repair or leave out A/0"),
     ],
 )
 def test_bad_input_is_one_line(override, line, tmp_path, monkeypatch, capsys):

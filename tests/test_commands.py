@@ -35,7 +35,7 @@ class TinyRecordings:
 
     is_simulated = False
 
-    def __init__(self, seed, cycles, materials, channels=None, scene=None):
+    def __init__(self, seed, cycles, materials, channels=None, scene=None, **simulated):
         rows = [
             {"name": f"{kind}{i}", "kind": kind, "finger": finger, "segment": "distal"}
             for kind in ("SG", "PVDF")
@@ -43,6 +43,7 @@ class TinyRecordings:
         ]
         self.hand = HandLayout.from_rows(rows[-channels:] if channels else rows)
         knobs = {"slide_s": 0.8, "quiet": (), "rate": 2000.0, "broken": ""} | (scene or {})
+        assert not simulated.get("others")
         self.sample_rate_hz = knobs["rate"]
         self.ids = tuple(RecordingId(m, c) for m in materials for c in range(cycles))
         self._seed, self._knobs = seed, knobs
@@ -56,6 +57,7 @@ class TinyRecordings:
             annotated_onsets_s=onsets,
             sliding_s=tuple((onset, onset + slide_s) for onset in onsets),
             speeds_mm_s=(20.0, 40.0),
+            non_slip_s=(),
         )
 
     def key(self, recording):
@@ -340,7 +342,7 @@ def test_a_finished_run_can_be_taken_up_again(tiny, tmp_path):
     [
         "data.cycles=6",
         "data.seed=1",
-        "+data.scene.slide_s=0.7",
+        "+scene.slide_s=0.7",
         "split.seed=1",
         "split.train_share=0.75",
         "labels=half_second",
@@ -411,7 +413,7 @@ def evaluated(tiny, folder, *overrides):
     ("override", "line"),
     [
         ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3 SG2"),
-        ("+data.scene.rate=1000.0", "the features expect 2000 Hz, the recordings have 1000 Hz"),
+        ("+scene.rate=1000.0", "the features expect 2000 Hz, the recordings have 1000 Hz"),
         ("labels.bin_ms=100", "the features expect bins of 100 samples, labels.bin_ms=100 makes"),
         ("split.seen=[A,Foo]", "no recording of material 'Foo'; the set has A, B, C"),
     ],
@@ -452,7 +454,7 @@ def assert_one_line(error, expected):
         (["recipe.num_features=0"], "recipe.num_features must be at least 1"),
         (["recipe.penalties=[]"], "recipe.penalties must be positive, got []"),
         (["recipe.balance=smote"], "recipe.balance must be one of undersample, weights"),
-        (["+data.scene.misspelt=1"], "unknown override misspelt"),
+        (["+scene.misspelt=1"], "unknown override misspelt"),
         (["data.channels=[{name: film, kind: FSR, finger: index, segment: distal}]"], "FSR"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
@@ -470,7 +472,7 @@ def test_an_absent_class_is_named(tmp_path, num_workers):
     """Slides of 30 ms hold no bin of 50 ms: there is non-slip alone."""
     overrides = [o for o in TINY if not o.startswith("num_workers")]
     config = composed(
-        *overrides, "cache=off", "+data.scene.slide_s=0.03", f"num_workers={num_workers}"
+        *overrides, "cache=off", "+scene.slide_s=0.03", f"num_workers={num_workers}"
     )
     with pytest.raises(ValueError, match="slip") as caught:
         train(config, tmp_path)
@@ -479,14 +481,14 @@ def test_an_absent_class_is_named(tmp_path, num_workers):
 
 def test_a_class_absent_from_one_material_alone_is_named(tmp_path):
     """Material B never slips: C cannot be chosen on it."""
-    config = composed(*TINY, "cache=off", "+data.scene.quiet=[B]")
+    config = composed(*TINY, "cache=off", "+scene.quiet=[B]")
     with pytest.raises(ValueError, match="slip") as caught:
         train(config, tmp_path)
     assert_one_line(caught.value, "slip")
 
 
 def test_a_class_absent_from_what_is_judged_is_no_perfect_score(tmp_path):
-    returned, metrics = run_train(tmp_path, *TINY, "cache=off", "+data.scene.quiet=[C]")
+    returned, metrics = run_train(tmp_path, *TINY, "cache=off", "+scene.quiet=[C]")
     scores = metrics["splits"]["unseen"]
     assert scores["slip_recall"] is None
     assert scores["balanced_accuracy"] is None
@@ -506,7 +508,7 @@ def test_a_detector_that_was_not_given_is_asked_for(tmp_path, capsys):
 
 def test_strokes_can_be_configured():
     """``scene`` takes any knob of the scenes; ``Scene.from_dict`` knows how."""
-    strokes = "+data.scene.strokes=[{speed_mm_s: 30.0, distance_mm: 50.0}]"
+    strokes = "+scene.strokes=[{speed_mm_s: 30.0, distance_mm: 50.0}]"
     source = instantiate(composed(strokes, "data.cycles=1").data, _convert_="all")
     assert source.timeline(source.ids[0]).speeds_mm_s == (30.0,)
 

@@ -30,7 +30,7 @@ TINY = (
 def read(source):
     by_cycle = seen6(source.ids, seen=["a", "b", "c"])[0]
     maker = small_maker(source)
-    materials = Materials(len(maker.pool.names), 30, 2000)
+    materials = Materials(maker.pool, 30, 2000)
     for batch in SlipDataModule(maker, by_cycle, 0).loader(["train", "test"]):
         materials.update(batch, by_cycle.roles[batch.recording])
     return materials

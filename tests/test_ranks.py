@@ -63,7 +63,7 @@ def test_torchrun_starts_it_as_well(cache, tmp_path):
 
 
 def test_what_another_process_cannot_read_is_named(cache, tmp_path):
-    scene = "+data.scene.broken=A/1"  # the second of the training recordings
+    scene = "+scene.broken=A/1"  # the second of the training recordings
     done = launched(tmp_path / "ddp", "cache=off", scene, "trainer.strategy=ddp",
                     "trainer.devices=2")  # fmt: skip
     assert done.returncode != 0
