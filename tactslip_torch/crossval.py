@@ -36,6 +36,7 @@ from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.experiment import feature_cache, feature_parts, save_config
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
+from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.files import whole_file
 from tactslip_torch.model.fit import TrainingBins, fit_machine
@@ -49,7 +50,7 @@ class Materials:
     """What one pass over all recordings keeps of each material.
 
     Args:
-        num_features: size of the pool.
+        pool: the features.
         train_bins: bins of each material and class to fit on.
         judged_bins: and to judge on.
 
@@ -58,8 +59,9 @@ class Materials:
         judged: bins by material, of ``"train"`` and of ``"test"`` cycles.
     """
 
-    def __init__(self, num_features: int, train_bins: int, judged_bins: int) -> None:
-        self.num_features = num_features
+    def __init__(self, pool: FeaturePool, train_bins: int, judged_bins: int) -> None:
+        self.pool = pool
+        self.num_features = len(pool.names)
         self.train_bins = train_bins
         self.judged_bins = judged_bins
         self.surveys: dict[str, Survey] = {}
@@ -101,7 +103,8 @@ def judge(materials: Materials, recipe: Recipe, unseen: Sequence[str]) -> dict[s
     """
     seen = sorted(set(materials.surveys) - set(unseen))
     survey = materials.survey_of(seen)
-    plan = plan_detector(recipe, survey, _quietly)
+    allowed = recipe.allowed(materials.pool)
+    plan = plan_detector(recipe, survey, _quietly, allowed=allowed)
     sample = survey.sample.bins()
     weights = stand_for(sample, recipe, survey.moments.count.tolist())
     training = TrainingBins(plan.frame(sample.features), sample.is_slip, weights)
@@ -154,7 +157,7 @@ def crossval(config: DictConfig, folder: Path) -> dict[str, Any]:
         for name, recipe in instantiate(config.recipes, _convert_="all").items()
     }
     save_config(config, folder)
-    materials = _read(config, source, names)
+    materials = _read(config, source, names, recipes.values())
     choices = list(itertools.combinations(names, num_unseen))
     jobs = [(recipe, unseen) for recipe in recipes.values() for unseen in choices]
     found_in_order = iter(_each(materials, jobs, config.num_workers))
@@ -176,13 +179,17 @@ def crossval(config: DictConfig, folder: Path) -> dict[str, Any]:
     return found
 
 
-def _read(config: DictConfig, source: RecordingSource, names: Sequence[str]) -> Materials:
+def _read(
+    config: DictConfig, source: RecordingSource, names: Sequence[str], recipes: Iterable[Recipe]
+) -> Materials:
     rule: LabelRule = instantiate(config.labels)
     by_cycle: Split = seen6(
         source.ids, seen=names, train_share=config.train_share, seed=config.seed
     )[0]
     pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
-    materials = Materials(len(pool.names), config.train_bins, config.judged_bins)
+    for recipe in recipes:
+        recipe.allowed(pool)  # refuses before any work
+    materials = Materials(pool, config.train_bins, config.judged_bins)
     num_threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the processors belong to those who make features
     with feature_cache(config.cache) as cache:

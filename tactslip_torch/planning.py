@@ -54,6 +54,8 @@ class Plan:
             sensor is missing.
         validation: one row per choice: what was chosen from, and the balanced accuracy of
             each held-out group.
+        among: of a recipe that restricts the ranking: to what, how many features that leaves
+            (``matching``), and the numbers chosen from after cutting them to it; else ``None``.
     """
 
     frame: Frame
@@ -66,6 +68,7 @@ class Plan:
     threshold: FeatureThreshold
     typical: tuple[float, ...]
     validation: list[dict[str, Any]] = field(default_factory=list)
+    among: dict[str, Any] | None = None
 
     @property
     def adds_up(self) -> bool:
@@ -86,6 +89,7 @@ class Plan:
             "rival": self.threshold.to_dict(),
             "typical": list(self.typical),
             "validation": self.validation,
+            "among": self.among,
         }
 
     @classmethod
@@ -102,15 +106,21 @@ class Plan:
             threshold=FeatureThreshold(**facts["rival"]),
             typical=tuple(facts["typical"]),
             validation=list(facts["validation"]),
+            among=facts["among"],
         )
 
 
 def plan_detector(
-    recipe: Recipe, survey: Survey, progress: Progress, frame: Frame | None = None
+    recipe: Recipe,
+    survey: Survey,
+    progress: Progress,
+    frame: Frame | None = None,
+    allowed: Tensor | None = None,
 ) -> Plan:
     """Rank, scale, and choose K, c and C by closed-form validation on held-out groups.
 
-    Features that were ranked and scaled elsewhere come as a ``frame``.
+    Features that were ranked and scaled elsewhere come as a ``frame``; which ones may be selected
+    here, for a recipe that restricts them, as ``allowed``, what ``recipe.allowed`` says.
 
     A held-out score is that of the machine refitted without the bin's group, from one
     factorisation per choice (``model.held_out``), with ranking and scaling held. So it chooses,
@@ -119,13 +129,18 @@ def plan_detector(
     Raises:
         ValueError: if a class is absent or a solve fails.
     """
-    frame = frame or choose_frame(recipe, survey)
+    frame = frame or choose_frame(recipe, survey, allowed)
+    sizes = sorted({min(size, len(frame.selected)) for size in recipe.sizes})
+    if sizes[-1] < recipe.sizes[-1]:
+        log.warning(
+            "recipe.num_features=%d is cut to %d: no more match", recipe.sizes[-1], sizes[-1]
+        )
     sample = survey.sample.bins()
     counts = survey.moments.count.tolist()
     weights = stand_for(sample, recipe, counts)
     choices = [
         (size, kernel, penalty)
-        for size in recipe.sizes
+        for size in sizes
         for kernel in recipe.kernels
         for penalty in recipe.penalties_ascending
     ]
@@ -167,7 +182,13 @@ def plan_detector(
         threshold=best_threshold(selected, sample.is_slip),
         typical=_typical(frame(sample.features), sample.is_slip, weights),
         validation=rows,
+        among=None if allowed is None else _narrowed(recipe, allowed, sizes),
     )
+
+
+def _narrowed(recipe: Recipe, allowed: Tensor, sizes: Sequence[int]) -> dict[str, Any]:
+    matching = int(allowed.sum())
+    return {"wanted": recipe.facts()["among"], "matching": matching, "num_features": list(sizes)}
 
 
 def _typical(scaled: Tensor, is_slip: Tensor, weights: Tensor) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ and ``crossval`` without.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -17,6 +17,8 @@ from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.features.groups import checked_attributes, matching
+from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import (
     ScoreVariance,
     rank_distinct,
@@ -55,6 +57,9 @@ class Recipe:
         sample_bins: bins of each group and class that the first pass keeps for quantiles,
             correlations, the single-feature rival and validation. Exact ranges and the t-test take
             every bin.
+        among: ranks only features that match (ours), such as ``{"kind": "SG", "descriptor":
+            "mean"}``: of each attribute a value, or one of several. ``num_features`` is cut to
+            what matches.
 
     Raises:
         ValueError: for an unknown name or a number that is not positive.
@@ -74,10 +79,13 @@ class Recipe:
     balance: Balance = "undersample"
     group_by: GroupBy = "material"
     sample_bins: int = 400
+    among: Mapping[str, str | Sequence[str]] | None = None
 
     def __post_init__(self) -> None:
         for name in ("num_features", "offsets", "penalties"):
             object.__setattr__(self, name, _several(getattr(self, name)))
+        if self.among is not None:
+            object.__setattr__(self, "among", checked_attributes("recipe.among", self.among))
         choices = {
             "score_variance": ("pooled", "welch"),
             "kernel": ("polynomial", "rbf"),
@@ -135,6 +143,19 @@ class Recipe:
                 f"recipe.num_features={self.sizes[-1]} exceeds the pool's {num_features}"
             )
 
+    def allowed(self, pool: FeaturePool) -> Tensor | None:
+        """Which features of a pool may be selected, ``[F]``, bool; ``None`` if all.
+
+        Raises:
+            ValueError: if ``among`` names a value that no feature has, or nothing matches.
+        """
+        if self.among is None:
+            return None
+        try:
+            return matching(pool.hand, pool.names, self.among)
+        except ValueError as error:
+            raise ValueError(f"recipe.among: {error}") from None
+
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Kernels to choose from."""
@@ -145,6 +166,8 @@ class Recipe:
     def facts(self) -> dict[str, Any]:
         """All arguments as JSON-able values; ``Recipe(**facts)`` is the same again."""
         facts = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+        if self.among is not None:
+            facts["among"] = {k: list(_several(v)) for k, v in self.among.items()}
         inf = not math.isfinite(self.penalties_ascending[-1])
         return facts | ({"penalties": ["inf"]} if inf else {})  # JSON has no infinity
 
@@ -181,22 +204,31 @@ class Frame:
         )
 
 
-def choose_frame(recipe: Recipe, survey: Survey) -> Frame:
+def choose_frame(recipe: Recipe, survey: Survey, allowed: Tensor | None = None) -> Frame:
     """Rank and scale on what the first pass learned of the training bins.
 
+    Args:
+        recipe: how.
+        survey: what was learned.
+        allowed: what ``recipe.allowed`` says; no more features are taken than it lets pass.
+
     Raises:
-        ValueError: if a class is absent or the pool is smaller than the selection.
+        ValueError: if a class is absent, the pool is smaller than the selection, or a recipe with
+            ``among`` comes without ``allowed``.
     """
-    sample = survey.sample.bins()
-    most = recipe.sizes[-1]
-    scores = t_scores(survey.moments, recipe.score_variance)
+    if recipe.among is not None and allowed is None:
+        raise ValueError("recipe.among needs the names of features; hand over recipe.allowed(pool)")
+    sample, most = survey.sample.bins(), recipe.sizes[-1]
+    scores, features = t_scores(survey.moments, recipe.score_variance), sample.features
+    places = torch.arange(len(scores))
+    if allowed is not None:
+        places = allowed.nonzero().flatten()
+        scores, features, most = scores[places], features[:, places], min(most, len(places))
     if recipe.most_correlation < 1:
-        order = rank_distinct(
-            scores, sample.features, sample.is_slip, most, recipe.most_correlation
-        )
+        order = rank_distinct(scores, features, sample.is_slip, most, recipe.most_correlation)
     else:
         order = rank_features(scores, most)
-    return fit_frame(recipe, survey, order.tolist())
+    return fit_frame(recipe, survey, places[order].tolist())
 
 
 def fit_frame(recipe: Recipe, survey: Survey, selected: Sequence[int]) -> Frame:

@@ -79,6 +79,7 @@ def _collect(config: DictConfig) -> str:
     with feature_cache(config.cache) as cache:
         data = _data(config, cache)
         recipe.check_pool(len(data.maker.pool.names))
+        recipe.allowed(data.maker.pool)  # refuses before any work
         about = _about(config, recipe, data)
         part, parts = _shard(config.shard)
         loader = bar(data.loader(["train"], part - 1, parts), f"shard {config.shard}", "recording")
@@ -124,7 +125,8 @@ def _plan(config: DictConfig) -> str:
     survey = _only(config.inputs, Survey)
     _check_complete(survey.about, survey.ledger.entries)
     recipe = Recipe(**survey.about["recipe"])
-    plan = plan_detector(recipe, survey, bar)
+    pool = FeaturePool(HandLayout.from_rows(survey.about["channels"]), **survey.about["pool"])
+    plan = plan_detector(recipe, survey, bar, allowed=recipe.allowed(pool))
     scaler = dict(plan.frame.scaler.state_dict())
     save_table(config.out, PLAN_FORM, {"plan": plan.facts(), "about": survey.about}, scaler)
     return f"{len(plan.frame.selected)} features, C={plan.penalty:g}"

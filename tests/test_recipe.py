@@ -5,9 +5,15 @@ import json
 import numpy as np
 import pytest
 import torch
+from small_set import SMALL_HAND
 
 from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.deadline.workshop import Workshop
+from tactslip_torch.features.groups import matching
+from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.planning import Plan, plan_detector
 from tactslip_torch.recipe import (
     Recipe,
     bin_weights,
@@ -139,8 +145,11 @@ def test_recalls_mean_by_hand():
 
 
 def test_facts_are_json_even_of_an_infinite_penalty():
-    for recipe in (Recipe(), Recipe(penalties=float("inf")), Recipe(num_features=[3, 5])):
+    among = {"kind": "SG", "descriptor": ["mean", "std"]}
+    recipes = [Recipe(), Recipe(penalties=float("inf")), Recipe(num_features=[3, 5])]
+    for recipe in [*recipes, Recipe(among=among)]:
         again = Recipe(**json.loads(json.dumps(recipe.facts(), allow_nan=False)))
+        assert again.among == recipe.among
         assert again.penalties_ascending == recipe.penalties_ascending
         assert again.sizes == recipe.sizes
 
@@ -169,9 +178,104 @@ def test_groups_are_materials_or_fifths_of_the_cycles():
         ({"most_correlation": 0.0}, r"recipe.most_correlation must lie in \(0, 1\]"),
         ({"sample_bins": 1}, r"recipe.sample_bins must be at least 2"),
         ({"degree": 0}, r"degree of the kernel must be a whole number"),
+        ({"among": {"kinds": "SG"}}, r"recipe.among: unknown 'kinds', expected some of kind, f"),
+        ({"among": {"kind": []}}, r"recipe.among.kind must be a name or several, got \[\]"),
+        ({"among": {"kind": 3}}, r"recipe.among.kind must be a name or several, got 3"),
+        ({"among": {}}, r"recipe.among must be like .*, got {}"),
+        ({"among": "SG"}, r"recipe.among must be like .*, got 'SG'"),
     ],
     ids=str,
 )
 def test_bad_recipes_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         Recipe(**change)
+
+
+# ------------------------------------------------------------------------- recipes with among
+POOL = FeaturePool(HandLayout.paper24())
+
+
+def told_apart(rng, pool):
+    """A survey of bins of a pool's features, some of which tell the classes apart."""
+    survey = Survey(len(pool.names), 50)
+    for group in "ab":
+        is_slip = torch.arange(60) % 2 == 0
+        features = torch.from_numpy(rng.standard_normal((60, len(pool.names))))
+        features += torch.from_numpy(rng.random(len(pool.names))) * is_slip[:, None]
+        survey.update(group, group, features.float(), is_slip)
+    return survey
+
+
+@pytest.mark.parametrize(
+    ("wanted", "does", "num"),
+    [
+        ({"kind": "SG"}, lambda n: n.channel.startswith("SG"), 14 * 13),
+        ({"kind": "PVDF"}, lambda n: n.channel.startswith("PVDF"), 10 * 240),
+        ({"kind": "SG", "descriptor": "mean"}, lambda n: str(n).endswith("raw time mean"), 14),
+        ({"finger": "thumb"}, lambda n: n.channel in ("SG13", "SG14", "PVDF9", "PVDF10"), 26 + 480),
+        ({"channel": ["SG2", "PVDF3"]}, lambda n: n.channel in ("SG2", "PVDF3"), 13 + 240),
+        ({"component": "D1", "domain": "time"}, lambda n: " D1 time " in str(n), 10 * 14),
+        ({"descriptor": ["mean", "std"], "component": ["A1", "A2"]}, None, 10 * 2 * 2 * 2),
+    ],
+    ids=str,
+)
+def test_what_matches_has_every_attribute_that_is_asked_for(wanted, does, num):
+    mask = matching(POOL.hand, POOL.names, wanted)
+    assert int(mask.sum()) == num
+    if does is not None:
+        assert mask.tolist() == [does(name) for name in POOL.names]
+
+
+def test_a_recipe_without_among_allows_everything():
+    assert Recipe().allowed(POOL) is None
+
+
+@pytest.mark.parametrize("most_correlation", [1.0, 0.995])
+def test_only_what_matches_is_ranked_and_in_the_order_of_the_whole_ranking(most_correlation, rng):
+    pool = FeaturePool(SMALL_HAND)
+    survey = told_apart(rng, pool)
+    recipe = Recipe(
+        num_features=9, among={"domain": "freq"}, most_correlation=most_correlation, penalties=0.1
+    )
+    plan = plan_detector(recipe, survey, lambda items, what: items, allowed=recipe.allowed(pool))
+    every = choose_frame(Recipe(num_features=len(pool.names)), survey).selected
+    of_spectra = [index for index in every if pool.names[index].domain == "freq"]
+    assert list(plan.frame.selected) == of_spectra[:9]
+    expected = {"wanted": {"domain": ["freq"]}, "matching": len(of_spectra), "num_features": [9]}
+    assert plan.among == expected
+    assert Plan.of(json.loads(json.dumps(plan.facts())), plan.frame.scaler).among == expected
+
+
+def test_more_features_than_match_are_cut_and_the_facts_say_so(rng, caplog):
+    pool = FeaturePool(SMALL_HAND)
+    recipe = Recipe(num_features=[2, 60, 120], among={"kind": "SG"}, penalties=(0.1, 1.0))
+    plan = plan_detector(
+        recipe, told_apart(rng, pool), lambda items, what: items, allowed=recipe.allowed(pool)
+    )
+    assert plan.among == {"wanted": {"kind": ["SG"]}, "matching": 13, "num_features": [2, 13]}
+    assert [row["num_features"] for row in plan.validation] == [2, 2, 13, 13]
+    assert {pool.names[index].channel for index in plan.frame.selected} == {"SG1"}
+    assert "recipe.num_features=120 is cut to 13" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("among", "message"),
+    [
+        ({"descriptor": "meen"}, "no feature has descriptor='meen', expected some of mean, median"),
+        ({"kind": "SG", "domain": "freq"}, "no feature has kind=SG, domain=freq together"),
+        ({"finger": ["thumb", "toe"]}, "no feature has finger='toe', expected some of little, r"),
+    ],
+    ids=str,
+)
+def test_what_nothing_matches_is_refused_in_one_line(among, message):
+    with pytest.raises(ValueError, match=f"^recipe.among: {message}") as caught:
+        Recipe(among=among).allowed(POOL)
+    assert "\n" not in str(caught.value)
+
+
+def test_among_is_never_silently_ignored(rng):
+    recipe = Recipe(num_features=3, among={"kind": "SG"})
+    with pytest.raises(ValueError, match=r"hand over recipe.allowed\(pool\)"):
+        plan_detector(recipe, told_apart(rng, FeaturePool(SMALL_HAND)), lambda items, what: items)
+    with pytest.raises(ValueError, match=r"recipe.among is not for a search"):
+        Workshop({}, None, None, recipe)

@@ -63,6 +63,9 @@ class Workshop:
         most_summed: features up to which a quadratic head is fitted to all training bins.
         num_workers: processes that make features.
 
+    Raises:
+        ValueError: if the recipe restricts its features, as the search does in its own way.
+
     Attributes:
         surveys: of the training recordings, by alignment, once ``look`` has been called.
     """
@@ -76,6 +79,10 @@ class Workshop:
         most_summed: int = 120,
         num_workers: int | None = None,
     ) -> None:
+        if recipe.among is not None:
+            raise ValueError(
+                "recipe.among is not for a search; use search.channels and search.components"
+            )
         self.makers, self.fold, self.search = makers, fold, search
         self.recipe = replace(recipe, sample_bins=search.bins)
         self.most_summed = most_summed
