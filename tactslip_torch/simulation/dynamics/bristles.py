@@ -2,7 +2,7 @@
 
 The deflections are eliminated: a stage ``Z = z + a Z'(V, Z)`` of length ``a`` from the base ``z``
 has the solution below in closed form, so that only the speed ``V`` is left to be solved for.
-PHYSICS.md, stiffness; Canudas de Wit, Olsson, Astrom and Lischinsky (1995), IEEE TAC 40(3), 419-425.
+Canudas de Wit, Olsson, Astrom and Lischinsky (1995), IEEE TAC 40(3), 419-425.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def carried(patch: Patch, normal_n: Tensor) -> Tensor:
         - normal_n: ``[*]``
         - output: ``[*, n]``
     """
-    floor = torch.finfo(normal_n.dtype).tiny ** 0.5
+    floor = torch.finfo(normal_n.dtype).tiny ** 0.25
     return torch.where(normal_n > floor, normal_n, 0.0)[..., None] * patch.pressure
 
 
@@ -92,6 +92,7 @@ def pull(patch: Patch, load: Tensor, base: Tensor, speed: Tensor, stage_s: float
     A bristle without load has no friction, ``Z = Z' = 0``, and all of ``V`` is its slip.
 
     Args:
+        patch: the bristles.
         load: of each bristle, from ``carried``.
         base: deflections that the stage starts from, from ``clamped``.
         speed: not negative; for a patch that moves back turn the signs of ``base`` and the result.

@@ -86,10 +86,10 @@ class Lanes:
     @property
     def shape(self) -> torch.Size:
         """The lanes' shape."""
-        shapes = {f.name: getattr(self, f.name).shape for f in fields(self)}
-        del shapes["pressure"]
+        tensors: dict[str, Tensor] = {f.name: getattr(self, f.name) for f in fields(self)}
+        shapes = {name: t.shape for name, t in tensors.items() if name != "pressure"}
         try:
-            return torch.broadcast_shapes(*shapes.values())
+            return torch.Size(torch.broadcast_shapes(*shapes.values()))
         except RuntimeError:
             listed = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
             raise ValueError(f"expected shapes that broadcast, got {listed}") from None
@@ -167,6 +167,7 @@ class LaneState:
         What goes beyond ``mu_s N`` is lost in the first step.
 
         Args:
+            lanes: whose state it is.
             force_n: with which the skin pulls the patch.
             relaxing_share: part of it that the Maxwell arm holds, from 0 (long at rest) to 1.
 

@@ -11,6 +11,7 @@ so there is always a root and a bracket. PHYSICS.md, stiffness.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -25,6 +26,9 @@ from tactslip_torch.simulation.dynamics.bristles import (
     pull,
 )
 from tactslip_torch.simulation.dynamics.lanes import Lanes, LaneState
+
+GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
+"""Length of a stage in steps."""
 
 MOST_EVALUATIONS = 64
 """Cap on evaluations of a stage's equation."""
@@ -65,6 +69,8 @@ def stage(skin: Skin, base: LaneState, arm: Tensor, normal_n: Tensor, guess: Ten
     """The end of a stage of length ``a`` from ``base``; differentiable.
 
     Args:
+        skin: constants of the stage.
+        base: values that the stage starts from.
         arm: speed at the stage's time, ``[*]``.
         normal_n: load at that time, ``[*]``.
         guess: speed to start the search from.

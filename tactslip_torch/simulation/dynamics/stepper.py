@@ -1,23 +1,27 @@
-"""Lanes carried through time by SDIRK2, two implicit stages a step (PHYSICS.md, stiffness).
+"""The door of the dynamic rung: lanes carried through time under a drive, by either engine.
 
-The second stage ends at the step's end, so what a trace holds obeys the balance of forces to
-rounding. Order 2 and L-stable: Alexander (1977), SIAM J. Numer. Anal. 14(6), 1006-1021.
+SDIRK2 (PHYSICS.md, stiffness): order 2, L-stable, and its second stage ends at the step's end, so
+that what a trace holds obeys the balance of forces to rounding. Alexander (1977), SIAM J. Numer.
+Anal. 14(6), 1006-1021.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
+from tactslip_torch.simulation.dynamics import eager
 from tactslip_torch.simulation.dynamics.lanes import Lanes, LaneState
-from tactslip_torch.simulation.dynamics.stage import Stage, skin_of, stage
+from tactslip_torch.simulation.dynamics.stage import GAMMA
 
-GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
-"""Length of a stage in steps."""
+EngineName = Literal["auto", "compiled", "eager"]
 
 Drive = Callable[[Tensor], tuple[Tensor, Tensor]]
 """From times ``[n]`` in s, float64, to arm's speeds in m/s and loads in N.
@@ -25,7 +29,7 @@ Drive = Callable[[Tensor], tuple[Tensor, Tensor]]
 Both broadcast to ``[n, *]`` with the lanes' shape ``*``.
 """
 
-_DRIVEN_AT_ONCE = 1 << 16  # numbers that a drive is asked for in one go
+_DRIVEN_AT_ONCE = 1 << 16  # numbers that a drive is asked for in one go; they fit a cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +60,7 @@ def integrate(
     step_s: float,
     every: int = 1,
     start_s: float = 0.0,
+    engine: EngineName = "auto",
 ) -> tuple[Trace, LaneState]:
     """Carry lanes through time under a drive.
 
@@ -63,11 +68,15 @@ def integrate(
     integrate piece by piece, each from the state that the one before it gave back.
 
     Args:
+        lanes: skin and friction.
         state: where the lanes are at ``start_s``.
         drive: the arm's speed over the surface and the load, at the times of the stages.
         num_steps: how many steps, a multiple of ``every``.
         step_s: their length; 125 to 250 us are accurate, any is stable.
         every: of how many steps the last is kept.
+        start_s: time at which the first step starts.
+        engine: ``"compiled"`` is for float64 on the CPU and has no gradient; ``"auto"`` takes it
+            where it can, else ``"eager"``. They agree to rounding.
 
     Returns:
         The trace, its entry ``i`` at ``start_s + (i + 1) every step_s``, and the last state.
@@ -77,35 +86,35 @@ def integrate(
 
     Raises:
         ValueError: for a number of steps that is not a multiple of ``every``, a step that is not
-            positive, or shapes of ``state`` or ``drive`` that do not fit the lanes.
+            positive, shapes of ``state`` or ``drive`` that do not fit the lanes, an unknown engine,
+            or one that cannot do this.
     """
     _check(lanes, state, num_steps, step_s, every)
-    skin, rows = skin_of(lanes, GAMMA * step_s), []
-    arm = normal = torch.empty(0)
+    chosen = _resolved(engine)
+    parts: list[tuple[Tensor, ...]] = []
     at_once = max(1, _DRIVEN_AT_ONCE // (2 * max(1, lanes.shape.numel())))
-    for number in range(num_steps):
-        place = number % at_once
-        if place == 0:
-            steps = range(number, min(number + at_once, num_steps))
-            arm, normal = driven(lanes, drive, steps, step_s, start_s)
-        first = stage(skin, state, arm[2 * place], normal[2 * place], state.speed_m_s)
-        last = stage(
-            skin,
-            _ahead(state, first.rates, (1.0 - GAMMA) * step_s),
-            arm[2 * place + 1],
-            normal[2 * place + 1],
-            state.speed_m_s + (first.state.speed_m_s - state.speed_m_s) / GAMMA,
-        )
-        state = last.state
-        if (number + 1) % every == 0:
-            rows.append(_row(lanes, last, arm[2 * place + 1]))
-    if not rows:
+    for done in range(0, num_steps, at_once):
+        steps = range(done, min(done + at_once, num_steps))
+        arm, normal = _driven(lanes, drive, steps, step_s, start_s)
+        if chosen == "compiled" and (lack := _lack(lanes, state, arm, normal)):
+            if engine == "compiled":
+                raise ValueError(f'engine "compiled" {lack}; use engine "eager"')
+            chosen = "eager"
+        if chosen == "compiled":
+            from tactslip_torch.simulation.dynamics import compiled  # numba takes a second
+
+            part, state = compiled.carry(lanes, state, arm, normal, step_s, every, done % every)
+        else:
+            part, state = eager.carry(lanes, state, arm, normal, step_s, every, done % every)
+        parts.append(part)
+    if not parts:
         nothing = lanes.pressure.new_empty((0, *lanes.shape))
-        return Trace(*[nothing] * 4, nothing.bool()), state
-    return Trace(*(torch.stack(column) for column in zip(*rows, strict=True))), state
+        return Trace(nothing, nothing, nothing, nothing, nothing.bool()), state
+    friction, inertia, speed, slip, incipient = map(torch.cat, zip(*parts, strict=True))
+    return Trace(friction, inertia, speed, slip, incipient), state
 
 
-def driven(
+def _driven(
     lanes: Lanes, drive: Drive, steps: range, step_s: float, start_s: float
 ) -> tuple[Tensor, Tensor]:
     """What drives the stages of some steps, two rows a step: ``[2 n, *]`` both."""
@@ -124,26 +133,42 @@ def driven(
         ) from None
 
 
-def _ahead(state: LaneState, rates: LaneState, time_s: float) -> LaneState:
-    return LaneState(
-        state.stretch_m + time_s * rates.stretch_m,
-        state.speed_m_s + time_s * rates.speed_m_s,
-        state.relaxing_n + time_s * rates.relaxing_n,
-        state.bristle_m + time_s * rates.bristle_m,
-    )
+def _lack(lanes: Lanes, state: LaneState, arm: Tensor, normal: Tensor) -> str:
+    """Why kernels cannot do this; empty if they can."""
+    if lanes.pressure.dtype != torch.float64 or lanes.pressure.device.type != "cpu":
+        return f"needs float64 on the CPU, got {lanes.pressure.dtype} on {lanes.pressure.device}"
+    tensors = (*vars(lanes).values(), *vars(state).values(), arm, normal)
+    if torch.is_grad_enabled() and any(values.requires_grad for values in tensors):
+        return "has no gradient, which is asked for"
+    return ""
 
 
-def _row(lanes: Lanes, last: Stage, arm: Tensor) -> tuple[Tensor, ...]:
-    state = last.state
-    slips = last.slip_m_s
-    moving = (slips.abs() > 0.5 * arm.abs()[..., None]).any(-1) & (arm != 0)
-    return (
-        lanes.stiffness_n_m * state.stretch_m + state.relaxing_n,
-        last.inertia_n,
-        state.speed_m_s,
-        (slips * lanes.pressure).sum(-1),
-        moving,
-    )
+def _resolved(engine: EngineName) -> EngineName:
+    """The engine that a name means on this machine, or one line why it cannot be."""
+    if engine not in get_args(EngineName):
+        raise ValueError(f"engine must be one of {', '.join(get_args(EngineName))}, got {engine!r}")
+    if engine == "eager":
+        return engine
+    is_installed, trouble = find_spec("numba") is not None, _trouble()
+    if engine == "compiled" and trouble:
+        raise ValueError(
+            f'engine "compiled" needs numba, which {trouble}; pip install '
+            '"tactslip_torch[fast]", or use engine "eager"'
+        )
+    if trouble and is_installed:
+        warnings.warn(f"numba {trouble}; lanes are carried by engine eager", stacklevel=3)
+    return "eager" if trouble else "compiled"
+
+
+def _trouble() -> str:
+    """Why kernels cannot be compiled here; empty if they can."""
+    if find_spec("numba") is None:
+        return "is not installed"
+    try:
+        from tactslip_torch.simulation.dynamics import compiled  # noqa: F401  # a second, once
+    except Exception as error:  # another numba or NumPy than it was made for
+        return f"cannot be used: {str(error).splitlines()[0]}"
+    return ""
 
 
 def _check(lanes: Lanes, state: LaneState, num_steps: int, step_s: float, every: int) -> None:
