@@ -32,7 +32,8 @@ class RecordingFeatures(NamedTuple):
     Shape:
         - features: ``[N, F]``, float32, the whole pool
         - is_slip: ``[N]``, bool
-        - speed_mm_s: ``[N]``, steady speed of the stroke of each bin
+        - speed_mm_s: ``[N]``, steady speed of the stroke of each bin, 0 for bins of no stroke
+        - position: ``[N]``, place beside the onset, as ``LabelledBins`` has it
         - roles: role to ``[N]``, bool
     """
 
@@ -40,6 +41,7 @@ class RecordingFeatures(NamedTuple):
     features: Tensor
     is_slip: Tensor
     speed_mm_s: Tensor
+    position: Tensor
     roles: dict[str, Tensor]
     seconds: dict[str, float]
 
@@ -112,9 +114,11 @@ class FeatureMaker:
         if self.rule.shuffle_seed is not None:
             place = self.source.ids.index(recording)
             is_slip = shuffled(is_slip, self.rule.shuffle_seed, place)
-        speeds = torch.tensor(times.speeds_mm_s)[bins.stroke]
+        speeds = torch.tensor([*times.speeds_mm_s, 0.0])[bins.stroke]  # -1, of no stroke: the 0
         roles = split.bin_roles(recording, len(is_slip))
-        return RecordingFeatures(recording, features, is_slip, speeds, roles, seconds)
+        return RecordingFeatures(
+            recording, features, is_slip, speeds, bins.position, roles, seconds
+        )
 
     def key(self, recording: RecordingId) -> str:
         """A digest of everything that determines the features of a recording."""
@@ -130,7 +134,12 @@ class FeatureMaker:
         """Where the bins of a recording lie, and what they are; no sample is needed for that."""
         onsets = times.annotated_onsets_s if self.rule.onsets == "annotated" else times.onsets_s
         return label_bins(
-            self.rule, onsets, times.sliding_s, times.duration_s, self.source.sample_rate_hz
+            self.rule,
+            onsets,
+            times.sliding_s,
+            times.duration_s,
+            self.source.sample_rate_hz,
+            times.non_slip_s,
         )
 
     def _features(

@@ -32,6 +32,7 @@ class SmallTimeline:
     annotated_onsets_s: tuple[float, ...] = (1.1,)
     sliding_s: tuple[tuple[float, float], ...] = ((1.1, 1.95),)
     speeds_mm_s: tuple[float, ...] = (20.0,)
+    non_slip_s: tuple[tuple[float, float], ...] = ()
 
 
 class SmallSet:

@@ -6,10 +6,18 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from small_set import SmallSet, SmallTimeline, small_maker
 
 from tactslip_torch import FeaturePool, HandLayout, Recording
-from tactslip_torch.data.labels import LabelRule, label_bins, needed_windows, shuffled
+from tactslip_torch.data.labels import (
+    NO_POSITION,
+    LabelRule,
+    label_bins,
+    needed_windows,
+    shuffled,
+)
 from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.splits import Split
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -20,8 +28,8 @@ SLIDES = ((2.0, 7.0), (9.0, 11.5), (13.5, 13.5 + 100 / 60))
 DURATION = 15.5
 
 
-def lay(rule=None, onsets=ONSETS, slides=SLIDES, duration_s=DURATION, rate=RATE):
-    return label_bins(rule or LabelRule(), onsets, slides, duration_s, rate)
+def lay(rule=None, onsets=ONSETS, slides=SLIDES, duration_s=DURATION, rate=RATE, non_slip=()):
+    return label_bins(rule or LabelRule(), onsets, slides, duration_s, rate, non_slip)
 
 
 def of_stroke(bins, stroke, is_slip):
@@ -118,6 +126,145 @@ def test_a_slide_shorter_than_a_bin_has_no_slip_bin():
     bins = lay(onsets=(2.0,), slides=((2.0, 2.03),))
     assert len(bins.starts) == 20
     assert not bool(bins.is_slip.any())
+
+
+# Positions -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("layout", "lead"), [("whole_slide", 20), ("half_second", 10)])
+def test_positions_count_from_the_onset(layout, lead):
+    bins = lay(LabelRule(layout=layout))
+    assert bins.position.dtype == torch.int64
+    for stroke in range(3):
+        mine = bins.stroke == stroke
+        before, after = (bins.position[mine & (bins.is_slip == s)].tolist() for s in (False, True))
+        assert before == list(range(-lead, 0))
+        assert after == list(range(len(after)))
+    edges = torch.tensor([round((o - (0.01 if lead == 20 else 0)) * RATE) for o in ONSETS])
+    assert torch.equal(bins.starts, edges[bins.stroke] + 100 * bins.position)
+
+
+@pytest.mark.parametrize("hop_ms", [25.0, 150.0])
+def test_the_last_bin_before_an_onset_is_minus_one_at_any_hop(hop_ms):
+    bins = lay(LabelRule(hop_ms=hop_ms))
+    for stroke in range(3):
+        quiet, slip = (
+            (bins.stroke == stroke) & (bins.is_slip == is_slip) for is_slip in (False, True)
+        )
+        assert int(bins.position[quiet].max()) == -1
+        assert int(bins.position[slip].min()) == 0
+        assert set(np.diff(bins.position[quiet | slip])) == {1}
+
+
+def test_bins_cut_by_the_slide_before_keep_their_positions():
+    bins = lay(onsets=(2.0, 3.3), slides=((2.0, 3.0), (3.3, 4.3)), duration_s=5.0)
+    quiet = bins.position[~bins.is_slip & (bins.stroke == 1)].tolist()
+    assert quiet == list(range(-5, 0))  # 0.29 s hold five bins of 20
+
+
+# Stretches without slip ----------------------------------------------------------------------
+
+
+def by_hand(strokes, slides, stretches, bin_samples, hop, num_samples):
+    """Starts in stretches, sample by sample: nothing of a stroke, a slide or a bin is met."""
+    taken = np.zeros(num_samples, dtype=bool)
+    for start in strokes:
+        taken[start : start + bin_samples] = True
+    for start, end in slides:
+        taken[start:end] = True
+    found = []
+    for first, last in stretches:
+        own = [
+            start
+            for start in range(first, last, hop)
+            if start + bin_samples <= last and not taken[start : start + bin_samples].any()
+        ]
+        for start in own:
+            taken[start : start + bin_samples] = True
+        found += own
+    return found
+
+
+@pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
+@pytest.mark.parametrize("hop_ms", [None, 25.0, 70.0])
+@given(
+    stretches=st.lists(
+        st.tuples(st.integers(0, 30999), st.integers(1, 9000)).map(
+            lambda pair: (pair[0], min(sum(pair), 31000))
+        ),
+        max_size=3,
+    ),
+    jitter=st.floats(-0.045, 0.045),
+)
+def test_bins_of_stretches_meet_no_other_bin_and_no_slide(layout, hop_ms, stretches, jitter):
+    rule = LabelRule(layout=layout, hop_ms=hop_ms)
+    annotated = tuple(onset + jitter for onset in ONSETS)
+    seconds = tuple((start / RATE, end / RATE) for start, end in stretches)
+    plain, bins = lay(rule, annotated), lay(rule, annotated, non_slip=seconds)
+    num = len(plain.starts)
+    for name in ("starts", "is_slip", "stroke", "position"):  # strokes are laid as ever
+        assert torch.equal(getattr(bins, name)[:num], getattr(plain, name)), name
+    shift = 0.01 if layout == "whole_slide" else 0.0
+    slides = [
+        (min(round((mark - shift) * RATE), int(start * RATE)), int(np.ceil(end * RATE)))
+        for mark, (start, end) in zip(annotated, SLIDES, strict=True)
+    ]
+    hop = 100 if hop_ms is None else round(2 * hop_ms)
+    expected = by_hand(plain.starts.tolist(), slides, stretches, 100, hop, 31000)
+    assert bins.starts[num:].tolist() == expected
+    assert not bool(bins.is_slip[num:].any())
+    assert set(bins.stroke[num:].tolist()) <= {-1}
+    assert set(bins.position[num:].tolist()) <= {NO_POSITION}
+
+
+def test_a_slide_shorter_than_a_bin_is_still_no_place_for_a_non_slip_bin():
+    for onset in (2.0, 1.995, 2.02):  # as annotated; the contact slides from 2.0 on
+        bins = lay(onsets=(onset,), slides=((2.0, 2.03),), non_slip=((1.5, 3.0),))
+        own = bins.starts[bins.stroke == -1] / RATE
+        assert not bool(bins.is_slip.any())
+        assert len(own) > 10
+        assert bool(((own >= 2.03) | (own + 0.05 <= min(onset - 0.01, 2.0) + 1e-9)).all())
+
+
+@pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
+def test_a_recording_without_onsets_has_the_bins_of_its_stretches(layout):
+    rule = LabelRule(layout=layout)
+    bins = lay(rule, (), (), 3.0, non_slip=((0.0, 1.0), (1.2 + 0.1, 3.0)))
+    assert bins.starts.tolist() == [*range(0, 2000, 100), *range(2600, 6000, 100)]
+    assert bins.starts.dtype == bins.stroke.dtype == bins.position.dtype == torch.int64
+    assert bins.is_slip.dtype == torch.bool
+    assert not bool(bins.is_slip.any())
+    assert needed_windows(bins, 25, 3.0, RATE) == [(0.0, 2025 / RATE), (2575 / RATE, 3.0)]
+
+
+def test_a_recording_of_nothing_has_no_bins():
+    bins = lay(onsets=(), slides=())
+    assert [len(part) for part in (bins.starts, bins.is_slip, bins.stroke, bins.position)] == 4 * [
+        0
+    ]
+    assert needed_windows(bins, 25, DURATION, RATE) == []
+
+
+@pytest.mark.parametrize("stretch", [(15.0, 15.6), (-0.1, 1.0)])
+def test_a_stretch_that_leaves_the_recording_is_refused(stretch):
+    with pytest.raises(ValueError, match=r"the non-slip stretch from .* leaves the recording of"):
+        lay(non_slip=(stretch,))
+
+
+def test_a_feature_maker_lays_bins_in_stretches_and_gives_them_no_speed():
+    class Handled(SmallSet):
+        def timeline(self, recording):
+            return SmallTimeline(non_slip_s=((1.96, 2.0), (0.0, 0.09)))
+
+    recording = RecordingId("a", 0)
+    split = Split("all", {recording: "train"})
+    plain, made = (small_maker(s)(recording, split) for s in (SmallSet(), Handled()))
+    assert len(made.is_slip) == len(plain.is_slip) + 1  # 40 ms hold no bin, 90 hold one
+    assert torch.equal(made.features[:-1], plain.features)
+    assert made.speed_mm_s.tolist() == [*plain.speed_mm_s.tolist(), 0.0]
+    assert made.position.tolist() == [*range(-20, 17), NO_POSITION]
+    assert not bool(made.is_slip[-1])
+    assert small_maker(SmallSet()).key(recording) != small_maker(Handled()).key(recording)
 
 
 # Whose onsets --------------------------------------------------------------------------------

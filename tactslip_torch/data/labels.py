@@ -2,7 +2,8 @@
 
 ``whole_slide`` is what the authors' scripts do and the published confusion matrices fit: one second
 of non-slip before each onset, the whole slide as slip, the onset moved 10 ms earlier.
-``half_second`` is what the paper's text says: half a second on either side of each onset.
+``half_second`` is what the paper's text says: half a second on either side of each onset. Stretches
+in which the hand is handled without slip, which the paper did not record, are non-slip in both.
 """
 
 from __future__ import annotations
@@ -10,13 +11,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
 Layout = Literal["whole_slide", "half_second"]
 OnsetSource = Literal["annotated", "exact"]
+
+NO_POSITION = torch.iinfo(torch.int64).min
+"""The position of a bin that belongs to no stroke."""
 
 
 @dataclass(frozen=True)
@@ -59,15 +63,19 @@ class LabelledBins:
     """Bins of one recording.
 
     Args:
-        starts: ``[N]``, first sample of each bin, ascending within a stroke.
+        starts: ``[N]``, first sample of each bin, ascending within a stroke or stretch.
         is_slip: ``[N]``, bool.
-        stroke: ``[N]``, index of the stroke each bin belongs to.
+        stroke: ``[N]``, index of the stroke each bin belongs to; -1 for bins of a stretch without
+            slip, which are behind those of all strokes.
+        position: ``[N]``, int64, place of the bin beside its onset: -1 is the last bin before it,
+            0 the first slip bin. ``NO_POSITION`` where the stroke is -1.
         bin_samples: length of every bin.
     """
 
     starts: Tensor
     is_slip: Tensor
     stroke: Tensor
+    position: Tensor
     bin_samples: int
 
 
@@ -77,31 +85,36 @@ def label_bins(
     sliding_s: Sequence[tuple[float, float]],
     duration_s: float,
     sample_rate_hz: float,
+    non_slip_s: Sequence[tuple[float, float]] = (),
 ) -> LabelledBins:
-    """Lay bins around the onsets of a recording.
+    """Lay bins around the onsets of a recording, and in its stretches without slip.
 
     A slip bin lies wholly before the end of its slide, a non-slip bin wholly between the end of the
-    slide before and the onset.
+    slide before and the onset, or wholly inside a stretch. Bins of a stretch start with it, a hop
+    apart; those that would meet a bin of a stroke, one of an earlier stretch, or a slide are left
+    out. A recording without onsets and stretches has no bins.
 
     Args:
         rule: the layout.
         onsets_s: one per stroke, annotated or exact as the caller chose.
-        sliding_s: start and end of each slide; only the ends are used.
+        sliding_s: start and end of each slide, exact. Strokes read only the ends.
         duration_s: length of the recording.
         sample_rate_hz: of the recording.
+        non_slip_s: start and end of each stretch that is non-slip beside what is around onsets.
 
     Raises:
-        ValueError: if a bin would lie outside the recording, or a bin is no whole number of
-            samples.
+        ValueError: if a bin would lie outside the recording, a stretch does, or a bin is no whole
+            number of samples.
     """
     bin_samples = _whole_samples(rule.bin_ms, sample_rate_hz, "bin_ms")
     hop = bin_samples
     if rule.hop_ms is not None:
         hop = _whole_samples(rule.hop_ms, sample_rate_hz, "hop_ms")
     lead_s, shift_s = (1.0, 0.010) if rule.layout == "whole_slide" else (0.5, 0.0)
-    starts, slips, strokes = [], [], []
+    parts: list[_Part] = []
+    is_taken = torch.zeros(round(duration_s * sample_rate_hz), dtype=torch.bool)  # by bin or slide
     previous_end = 0
-    for stroke, (onset_s, (_, end_s)) in enumerate(zip(onsets_s, sliding_s, strict=True)):
+    for stroke, (onset_s, (start_s, end_s)) in enumerate(zip(onsets_s, sliding_s, strict=True)):
         edge = round((onset_s - shift_s) * sample_rate_hz)
         first = edge - round(lead_s * sample_rate_hz)
         last = int(end_s * sample_rate_hz)
@@ -120,11 +133,62 @@ def label_bins(
         before = torch.arange(first, edge - bin_samples + 1, hop)
         before = before[before >= previous_end]
         after = torch.arange(edge, max(last - bin_samples + 1, edge), hop)
-        starts += [before, after]
-        slips += [torch.zeros(len(before)), torch.ones(len(after))]
-        strokes += [torch.full((len(before) + len(after),), stroke)]
+        parts.append(_Part(before, torch.arange(-len(before), 0), stroke, is_slip=False))
+        parts.append(_Part(after, torch.arange(len(after)), stroke, is_slip=True))
         previous_end = math.ceil(end_s * sample_rate_hz)
-    return LabelledBins(torch.cat(starts), torch.cat(slips).bool(), torch.cat(strokes), bin_samples)
+        is_taken[min(edge, int(start_s * sample_rate_hz)) : previous_end] = True
+    within = torch.arange(bin_samples)
+    for part in parts:
+        is_taken[part.starts[:, None] + within] = True
+    for stretch in non_slip_s:
+        starts = _starts_inside(stretch, bin_samples, hop, duration_s, sample_rate_hz)
+        free = starts[~is_taken[starts[:, None] + within].any(-1)]
+        is_taken[free[:, None] + within] = True
+        parts.append(_Part(free, torch.full_like(free, NO_POSITION), -1, is_slip=False))
+    return _joined(parts, bin_samples)
+
+
+class _Part(NamedTuple):
+    """Bins of one stroke or stretch and one kind."""
+
+    starts: Tensor
+    position: Tensor
+    stroke: int
+    is_slip: bool
+
+
+def _joined(parts: Sequence[_Part], bin_samples: int) -> LabelledBins:
+    lengths = torch.tensor([len(part.starts) for part in parts], dtype=torch.int64)
+    nothing = torch.zeros(0, dtype=torch.int64)
+
+    def of_bins(values: Sequence[int]) -> Tensor:
+        return torch.tensor(values, dtype=torch.int64).repeat_interleave(lengths)
+
+    return LabelledBins(
+        torch.cat([nothing, *(part.starts for part in parts)]),
+        of_bins([part.is_slip for part in parts]).bool(),
+        of_bins([part.stroke for part in parts]),
+        torch.cat([nothing, *(part.position for part in parts)]),
+        bin_samples,
+    )
+
+
+def _starts_inside(
+    stretch: tuple[float, float],
+    bin_samples: int,
+    hop: int,
+    duration_s: float,
+    sample_rate_hz: float,
+) -> Tensor:
+    """First samples of the bins that lie wholly inside a stretch, from its start on."""
+    first = math.ceil(stretch[0] * sample_rate_hz - 1e-6)  # what was meant as a whole sample is one
+    last = math.floor(stretch[1] * sample_rate_hz + 1e-6)
+    if first < 0 or last > round(duration_s * sample_rate_hz):
+        raise ValueError(
+            f"the non-slip stretch from {stretch[0]:.3f} s to {stretch[1]:.3f} s leaves the "
+            f"recording of {duration_s:.3f} s"
+        )
+    return torch.arange(first, max(last - bin_samples + 1, first), hop)
 
 
 def needed_windows(
