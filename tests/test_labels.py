@@ -226,6 +226,19 @@ def test_a_slide_shorter_than_a_bin_is_still_no_place_for_a_non_slip_bin():
         assert bool(((own >= 2.03) | (own + 0.05 <= min(onset - 0.01, 2.0) + 1e-9)).all())
 
 
+@pytest.mark.parametrize(
+    ("annotated", "stretch"),
+    [(2.04, (1.98, 2.03)), (1.88, (1.93, 1.98))],
+    ids=["from the exact start on", "from the annotated onset on"],
+)
+def test_between_annotated_and_exact_onset_nothing_is_non_slip(annotated, stretch):
+    """Where a long hop leaves room for a bin; moved away by a second there is one."""
+    rule = LabelRule(hop_ms=150.0)
+    assert -1 not in lay(rule, (annotated,), ((2.0, 4.0),), non_slip=(stretch,)).stroke
+    moved = tuple(edge + 3.0 for edge in stretch)
+    assert -1 in lay(rule, (annotated,), ((2.0, 4.0),), non_slip=(moved,)).stroke
+
+
 @pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
 def test_a_recording_without_onsets_has_the_bins_of_its_stretches(layout):
     rule = LabelRule(layout=layout)
