@@ -1,4 +1,4 @@
-"""What every channel hears that is not slip: arm, motor, mains, knocks.
+"""What every channel hears that is not slip: arm, motor, mains, a machine, knocks.
 
 Each is a common signal (or a few) times one coupling per channel. Everything is a function of
 absolute time, so any stretch can be computed alone.
@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from tactslip_torch.simulation.events import Stretch, smooth_step
 from tactslip_torch.simulation.grasp import recording_key, session_key
 from tactslip_torch.simulation.grid import Grid, causal_response
+from tactslip_torch.simulation.machine import machine_wave
 from tactslip_torch.simulation.motion import ArmStroke, Motion
-from tactslip_torch.simulation.randomness import Array, generator, lognormal
+from tactslip_torch.simulation.randomness import Array, generator, log_uniform, lognormal
 from tactslip_torch.simulation.scene import Scene
 
 ARM_MODES_HZ = (6.0, 6.5, 15.0, 56.0, 87.0, 277.0)
@@ -25,6 +27,11 @@ MAINS_ORDERS = (1, 2, 3, 5, 7, 9)
 
 MOTOR_PITCH_MM = (0.37, 0.61)
 """Arm travel per turn of two gears that are heard (prior, ours)."""
+
+MAINS_BURST_S = (0.1, 1.0)
+"""How long the mains is stronger in a burst; log-uniform (prior, ours)."""
+
+_MAINS_RAMP_S = 0.02  # of a burst, at both ends
 
 
 class Common:
@@ -43,7 +50,9 @@ class Common:
         knobs = scene.disturbances
         session = generator(*session_key(scene, "couplings"))
         mains_v = 1e-3 * knobs.mains_mv * lognormal(session, knobs.mains_session_spread)
-        self._mains_v = mains_v * lognormal(session, 0.4, num)
+        couplings = lognormal(session, 0.4, num)
+        self._mains_v = mains_v * couplings
+        self._mains_burst_v = 1e-3 * knobs.mains_burst_mv * couplings
         self._motor_v = 1e-3 * knobs.motor_vibration_mv * lognormal(session, 0.3, num)
         signs = np.where(session.random((num, len(ARM_MODES_HZ))) < 0.5, -1.0, 1.0)
         self._arm_v = (
@@ -52,17 +61,25 @@ class Common:
             * signs
             * lognormal(session, 0.4, (num, len(ARM_MODES_HZ)))
         )
-        self._mains = _mains(scene, grid) if knobs.mains_mv > 0 else None
+        self._mains_bursts = mains_bursts(scene, duration_s)
+        hums = knobs.mains_mv > 0 or self._mains_bursts
+        self._mains = _mains(scene, grid) if hums else None
+        self._mains_envelope = _burst_envelope(self._mains_bursts, grid)
         self._motor = _motor(scene, motion) if plan and knobs.motor_vibration_mv > 0 else None
         rings = plan and knobs.arm_transient_mv > 0
         self._arm = _arm_ringing(scene, plan, grid) if rings else None
         self._bursts = _draw_bursts(scene, duration_s)
+        self._machine = machine_wave(scene, duration_s, grid) if knobs.machine_mv > 0 else None
+        session = generator(*session_key(scene, "machine couplings"))
+        self._machine_v = 1e-3 * knobs.machine_mv * lognormal(session, 0.4, num)
 
     def channel(self, index: int) -> Array:
         """Volts of all disturbances in one channel, ``[K, B]``."""
         volts = np.zeros(self.grid.time_s.shape)
         if self._mains is not None:
             volts += self._mains_v[index] * self._mains
+            if self._mains_bursts:
+                volts += self._mains_burst_v[index] * self._mains_envelope * self._mains
         if self._motor is not None:
             rows, motor = self._motor
             volts[rows] += self._motor_v[index] * motor
@@ -70,6 +87,8 @@ class Common:
             rows, modes = self._arm
             for gain, mode in zip(self._arm_v[index], modes, strict=True):
                 volts[rows] += gain * mode
+        if self._machine is not None:
+            volts += self._machine_v[index] * self._machine
         self._add_bursts(index, volts)
         return volts
 
@@ -96,6 +115,26 @@ def _mains(scene: Scene, grid: Grid) -> Array:
         if order * hertz < 0.5 * scene.sample_rate_hz:
             wave += level * np.sin(order * angle + phase)
     return wave
+
+
+def mains_bursts(scene: Scene, duration_s: float) -> tuple[Stretch, ...]:
+    """When the mains is stronger; bursts may overlap, and then add."""
+    rng = generator(*recording_key(scene, "mains bursts"))
+    num = int(rng.poisson(scene.disturbances.mains_bursts_per_s * duration_s))
+    starts_s = duration_s * rng.random(num)
+    ends_s = [start_s + log_uniform(rng, MAINS_BURST_S) for start_s in starts_s]
+    return tuple(zip(starts_s.tolist(), ends_s, strict=True))
+
+
+def _burst_envelope(bursts: tuple[Stretch, ...], grid: Grid) -> Array:
+    """1 in every burst, with smooth ends, and 0 outside, ``[K, B]``."""
+    envelope = np.zeros(grid.time_s.shape)
+    for start_s, end_s in bursts:
+        rows = grid.overlapping(start_s, end_s)
+        t = grid.time_s[rows]
+        rise, fall = ((t - start_s) / _MAINS_RAMP_S, (end_s - t) / _MAINS_RAMP_S)
+        envelope[rows] += smooth_step(rise) * smooth_step(fall)
+    return envelope
 
 
 def _motor(scene: Scene, motion: Motion) -> tuple[slice, Array]:

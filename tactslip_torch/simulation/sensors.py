@@ -28,6 +28,12 @@ FORCE_FLUCTUATION = 0.03
 DRIFT_TONES = 4
 """Slow sines that make up a channel's drift, .05 to 2 Hz."""
 
+WARMING_TIMES = 2.0
+"""Time constants of warming that a recording lasts (prior, ours)."""
+
+FILM_WARMING_SHARE = 0.02
+"""Of a gauge's warming, what is left behind a film's high-pass (prior, ours)."""
+
 _DRIFT_NODES = 8  # per block, joined by straight lines
 
 
@@ -91,7 +97,13 @@ def gauge_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: Vib
     )
 
 
-def film_volts(scene: Scene, grid: Grid, friction_n: Array, vibration: Vibration) -> Array:
+def film_volts(
+    scene: Scene,
+    grid: Grid,
+    friction_n: Array,
+    vibration: Vibration,
+    press_n: Array | None = None,
+) -> Array:
     """What a PVDF film of unit gain says of its element.
 
     Args:
@@ -99,9 +111,12 @@ def film_volts(scene: Scene, grid: Grid, friction_n: Array, vibration: Vibration
         grid: where the volts are wanted.
         friction_n: friction on ``grid.history``.
         vibration: on ``grid``; behind the high-pass already.
+        press_n: normal force that taps and grips add, on ``grid.history``; the film feels it
+            like friction (prior, ours). ``None`` without any.
     """
     _, before, now = grid.history
-    strain_v = scene.sensors.pvdf_shear_v_per_n * friction_n
+    force_n = friction_n if press_n is None else friction_n + press_n
+    strain_v = scene.sensors.pvdf_shear_v_per_n * force_n
     response = highpass_response(
         scene.sensors.pvdf_highpass_hz, grid.block_samples, grid.sample_rate_hz
     )
@@ -128,11 +143,30 @@ def drift(scene: Scene, index: int, grid: Grid) -> Array:
     return np.asarray(lines.reshape(grid.time_s.shape), dtype=np.float64)
 
 
-def front_end(scene: Scene, front: Front, index: int, grid: Grid, volts: Array) -> Array:
+def warming(scene: Scene, index: int, grid: Grid, duration_s: float) -> Array:
+    """How far one channel's zero has moved as the hand warms up, in volts, ``[K, B]``.
+
+    Nothing at first, fast in the beginning and slower later, with a sign and size of the
+    channel's own; a film moves a fiftieth as far as a gauge.
+    """
+    rng = generator(*recording_key(scene, "warming"), index)
+    share = 1.0 if scene.hand.channels[index].kind == "SG" else FILM_WARMING_SHARE
+    sign = 1.0 if rng.random() < 0.5 else -1.0
+    far_v = 1e-3 * scene.sensors.warming_mv * share * sign * float(lognormal(rng, 0.5))
+    since = np.maximum(grid.time_s, 0.0) / duration_s
+    way: Array = np.expm1(-WARMING_TIMES * since) / np.expm1(-WARMING_TIMES)
+    return far_v * way
+
+
+def front_end(
+    scene: Scene, front: Front, index: int, grid: Grid, volts: Array, duration_s: float
+) -> Array:
     """What the converter says: with offset, drift and white noise, between the rails, in steps."""
     key = (*recording_key(scene, "white"), scene.hand.names[index])
     noise = front.white_v[index] * normal_blocks(key, grid.blocks, grid.block_samples)
     total = volts + front.offset_v[index] + drift(scene, index, grid) + noise
+    if scene.sensors.warming_mv > 0:
+        total = total + warming(scene, index, grid, duration_s)
     rail_v = scene.sensors.rail_v
     step: float = 2.0 * rail_v / 2.0**scene.sensors.num_bits
     quantised: Array = np.clip(np.round(total / step) * step, -rail_v, rail_v - step)

@@ -1,7 +1,7 @@
 """A scene in, a recording out.
 
-Arm motion, contact on the scene's rung, vibration, sensors. Only the channels and
-the stretches of time that are asked for are computed; elements out of contact cost no friction.
+Arm motion, contact on the scene's rung, handling, vibration, sensors, faults. Only the channels
+and the stretches of time that are asked for are computed; elements out of contact cost no friction.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.simulation.contact import ContactModel
 from tactslip_torch.simulation.disturbances import Common
+from tactslip_torch.simulation.faults import held_samples, recorded_channels, stuck_volts
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp
 from tactslip_torch.simulation.grid import Grid, block_samples_for
-from tactslip_torch.simulation.ladder import contact_model
+from tactslip_torch.simulation.handling import Handled
 from tactslip_torch.simulation.motion import ArmStroke, Motion, arm_strokes
 from tactslip_torch.simulation.randomness import Array
+from tactslip_torch.simulation.resting import scene_contact
 from tactslip_torch.simulation.scene import SIMULATION_VERSION, Scene
 from tactslip_torch.simulation.sensors import (
     draw_front,
@@ -53,8 +55,8 @@ def simulate(
         - samples: ``[C, T]`` for the whole hand and duration, volts; NaN where not asked for
 
     Raises:
-        ValueError: if a window lies outside the recording or is empty, a channel is unknown, or
-            ``dtype`` is not floating.
+        ValueError: if a window lies outside the recording or is empty, a channel is unknown,
+            ``dtype`` is not floating, or the contact cannot take the handling that is asked for.
 
     Example:
         >>> recording = simulate(Scene("M1"), windows=[(2.0, 2.1)], channels=["PVDF7"])
@@ -65,16 +67,24 @@ def simulate(
         raise ValueError(f"dtype must be floating, got {dtype}")
     plan = arm_strokes(scene.strokes, scene.acceleration_m_s2)
     grasp = draw_grasp(scene)
-    model = contact_model(scene, grasp, plan)
+    model = scene_contact(scene, grasp, plan)
     truth = timeline_of(scene, plan, grasp, model.slips)
     wanted = _wanted_samples(scene, truth, windows)
     indices = _channel_indices(scene, channels)
     volts = np.full((len(scene.hand), truth.num_samples), np.nan)
+    recorded, stuck = recorded_channels(scene), stuck_volts(scene)
+    felt = sorted({recorded[index] for index in indices if index not in stuck})
     if wanted and indices:
-        grid = _covering_grid(scene, wanted)
-        rows = _volts(scene, plan, grasp, model, grid, indices)
+        held = held_samples(scene, truth.num_samples)
+        grid = _covering_grid(scene, held, wanted)
+        rows = _volts(scene, plan, grasp, model, grid, felt)
+        runs = _runs(held, grid, wanted)
         for index in indices:
-            _place(volts[index], rows[index], grid, wanted)
+            for run, source in runs:
+                if index in stuck:
+                    volts[index, run] = stuck[index]
+                else:
+                    volts[index, run] = rows[recorded[index]].reshape(-1)[source]
     return Recording(
         samples=torch.from_numpy(volts).to(dtype),
         sample_rate_hz=scene.sample_rate_hz,
@@ -100,24 +110,32 @@ def _volts(
     _, _, now = grid.history
     driven = Motion(tuple(stroke for stroke in plan if stroke.drives), grid)
     sliding = Motion(tuple(stroke for stroke in plan if stroke.slides), grid)
-    front, common = draw_front(scene), Common(scene, driven, plan[-1].stop_s + scene.tail_s)
+    duration_s = plan[-1].stop_s + scene.tail_s
+    front, common = draw_front(scene), Common(scene, driven, duration_s)
     field = shared_field(scene, grasp, sliding)
     volts = {index: common.channel(index) for index in indices}
     elements = {int(grasp.element_of_channel[index]) for index in indices}
-    contact_of = model.on(grid)
+    contact_of, handled = model.on(grid), Handled(scene, grasp, plan)
     for element in sorted(elements & set(grasp.touching.tolist())):
         contact = contact_of(element)
         vibration = element_vibration(scene, grasp, model.slips, contact, field, element)
+        normal_n, shear_n, press_n = contact.normal_n, contact.friction_n, None
+        if not handled.is_idle:
+            press_n = handled.press_n(element, normal_n, grid.history[0])
+            normal_n = normal_n + press_n
+            shear_n = shear_n + handled.shear_n(element, grid.history[0].time_s)
+            vibration.high[:] += handled.knock_v(element, grid)
         for index in indices:
             if grasp.element_of_channel[index] != element:
                 continue
             if scene.hand.channels[index].kind == "SG":
-                normal_n, friction_n = contact.normal_n[now], contact.friction_n[now]
-                felt = gauge_volts(scene, normal_n, friction_n, vibration)
+                felt = gauge_volts(scene, normal_n[now], shear_n[now], vibration)
             else:
-                felt = film_volts(scene, grid, contact.friction_n, vibration)
+                felt = film_volts(scene, grid, shear_n, vibration, press_n)
             volts[index] += front.gain[index] * felt
-    return {index: front_end(scene, front, index, grid, volts[index]) for index in indices}
+    return {
+        index: front_end(scene, front, index, grid, volts[index], duration_s) for index in indices
+    }
 
 
 def _wanted_samples(
@@ -152,23 +170,23 @@ def _channel_indices(scene: Scene, channels: Iterable[str] | None) -> list[int]:
     return [index for index, name in enumerate(names) if name in asked]
 
 
-def _covering_grid(scene: Scene, wanted: list[tuple[int, int]]) -> Grid:
-    """The blocks that the wanted samples touch."""
+def _covering_grid(scene: Scene, held: NDArray[np.int64], wanted: list[tuple[int, int]]) -> Grid:
+    """The blocks of the samples that stand in the wanted ones."""
     size = block_samples_for(scene.sample_rate_hz)
-    blocks: set[int] = set()
-    for first, last in wanted:
-        blocks.update(range(first // size, (last - 1) // size + 1))
-    return Grid(np.array(sorted(blocks), dtype=np.int64), size, scene.sample_rate_hz)
+    blocks = [np.unique(held[first:last] // size) for first, last in wanted]
+    return Grid(np.unique(np.concatenate(blocks)), size, scene.sample_rate_hz)
 
 
-def _place(out: Array, rows: Array, grid: Grid, wanted: list[tuple[int, int]]) -> None:
-    """Copy the wanted samples of a channel's blocks to their places, and no others."""
+def _runs(
+    held: NDArray[np.int64], grid: Grid, wanted: list[tuple[int, int]]
+) -> list[tuple[slice, NDArray[np.int64]]]:
+    """Every window, and where on the grid, its blocks in a row, its samples come from."""
     size = grid.block_samples
+    runs = []
     for first, last in wanted:
-        low: NDArray[np.int64] = np.searchsorted(grid.blocks, [first // size])
-        run = rows[int(low[0]) :].reshape(-1)  # a window's blocks follow each other
-        offset = first - first // size * size
-        out[first:last] = run[offset : offset + last - first]
+        block, offset = np.divmod(held[first:last], size)
+        runs.append((slice(first, last), np.searchsorted(grid.blocks, block) * size + offset))
+    return runs
 
 
 def _provenance(scene: Scene) -> dict[str, object]:

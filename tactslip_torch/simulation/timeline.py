@@ -14,13 +14,11 @@ import numpy as np
 
 from tactslip_torch.simulation.contact import Slips
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp, recording_key
-from tactslip_torch.simulation.ladder import contact_model
+from tactslip_torch.simulation.handling import Handled
 from tactslip_torch.simulation.motion import ArmStroke, arm_strokes
 from tactslip_torch.simulation.randomness import Array, generator
+from tactslip_torch.simulation.resting import scene_contact
 from tactslip_torch.simulation.scene import Scene
-
-RINGING_S = 0.3
-"""How long the arm's ringing counts as handling after a stroke (ours)."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +32,9 @@ class Timeline:
         onsets_s: when the contact begins to slide, exact.
         annotated_onsets_s: the same as a person would mark it, with jitter.
         sliding_s: ``(onset, end)`` of each slide.
-        arm_s: ``(start, stop)`` of every stroke of the arm.
-        non_slip_s: stretches without slip in which the hand is handled: what a detector of motors
-            or knocks would call slip.
+        arm_s: ``(start, stop)`` of every stroke that the arm drives, sliding or not.
+        non_slip_s: stretches without slip in which the hand is handled, ascending and apart: what
+            a detector of motors or knocks would call slip.
     """
 
     duration_s: float
@@ -52,6 +50,9 @@ class Timeline:
 def timeline(scene: Scene) -> Timeline:
     """What is true of the scene's recording, without simulating its samples.
 
+    Raises:
+        ValueError: if the contact cannot take the handling that is asked for: see ``Handled``.
+
     Example:
         >>> truth = timeline(Scene("M5"))
         >>> [round(onset) for onset in truth.onsets_s]
@@ -61,11 +62,15 @@ def timeline(scene: Scene) -> Timeline:
     """
     plan = arm_strokes(scene.strokes, scene.acceleration_m_s2)
     grasp = draw_grasp(scene)
-    return timeline_of(scene, plan, grasp, contact_model(scene, grasp, plan).slips)
+    return timeline_of(scene, plan, grasp, scene_contact(scene, grasp, plan).slips)
 
 
 def timeline_of(scene: Scene, plan: tuple[ArmStroke, ...], grasp: Grasp, slips: Slips) -> Timeline:
-    """The timeline of a scene whose contact is drawn already."""
+    """The timeline of a scene whose contact is drawn already.
+
+    Raises:
+        ValueError: if the contact cannot take the handling that is asked for: see ``Handled``.
+    """
     down = grasp.touching
     onsets = [_weighted_median(row[down], grasp.load_n[down]) for row in slips.start_s]
     ends = [_weighted_median(row[down], grasp.load_n[down]) for row in slips.end_s]
@@ -79,11 +84,7 @@ def timeline_of(scene: Scene, plan: tuple[ArmStroke, ...], grasp: Grasp, slips: 
         annotated_onsets_s=tuple(_annotated(scene, onsets, ends)),
         sliding_s=tuple(zip(onsets, ends, strict=True)),
         arm_s=tuple((stroke.start_s, stroke.stop_s) for stroke in plan if stroke.drives),
-        non_slip_s=tuple(
-            (stroke.start_s, min(stroke.stop_s + RINGING_S, duration_s))
-            for stroke in plan
-            if not stroke.slides
-        ),
+        non_slip_s=Handled(scene, grasp, plan).stretches_s(duration_s),
     )
 
 
