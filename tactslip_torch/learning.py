@@ -17,6 +17,7 @@ import lightning as L
 import torch
 from torch import Tensor, nn
 
+from tactslip_torch.data.labels import NO_POSITION
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.datamodule import SlipDataModule
@@ -43,6 +44,7 @@ class _Judged(NamedTuple):
     says_slip: Tensor
     rival_says_slip: Tensor
     speed_mm_s: Tensor
+    position: Tensor
 
 
 class SlipLearner(L.LightningModule):
@@ -181,9 +183,8 @@ class SlipLearner(L.LightningModule):
         rival = self.threshold(chosen) if self.threshold else torch.zeros_like(says_slip)
         for role, mask in batch.roles.items():
             if bool(mask.any()):
-                decisions = (
-                    part[mask] for part in (batch.is_slip, says_slip, rival, batch.speed_mm_s)
-                )
+                parts = (batch.is_slip, says_slip, rival, batch.speed_mm_s, batch.position)
+                decisions = (part[mask] for part in parts)
                 self._judged[role].append(_Judged(batch.recording, *decisions))
 
     def on_test_epoch_end(self) -> None:
@@ -198,11 +199,14 @@ class SlipLearner(L.LightningModule):
             if not parts:
                 continue
             materials = [part.recording.material for part in parts for _ in part.truth]
+            scenes = [part.recording.scene for part in parts for _ in part.truth]
             truth = torch.cat([part.truth for part in parts])
             says_slip = torch.cat([part.says_slip for part in parts])
             rival = torch.cat([part.rival_says_slip for part in parts])
             speeds = torch.cat([part.speed_mm_s for part in parts]).tolist()
-            scores = bin_metrics(truth, says_slip, materials, speeds)
+            places = torch.cat([part.position for part in parts]).tolist()
+            positions = [None if place == NO_POSITION else place for place in places]
+            scores = bin_metrics(truth, says_slip, materials, speeds, scenes, positions)
             self.metrics["splits"][role] = scores
             rivals[role] = split_metrics(confusion_matrix(truth, rival))
             for name in ("accuracy", "balanced_accuracy"):

@@ -21,7 +21,14 @@ from tactslip_torch.evaluate import evaluate
 from tactslip_torch.train import train
 
 SCORES = {"accuracy", "balanced_accuracy", "non_slip_recall", "slip_recall"}
-ONE_SPLIT = SCORES | {"confusion", "num_bins", "per_material", "per_speed"}
+ONE_SPLIT = SCORES | {
+    "confusion",
+    "num_bins",
+    "per_material",
+    "per_speed",
+    "per_scene",
+    "per_position",
+}
 BAD_INPUT = (ValueError, KeyError, TypeError, OSError, InstantiationException)
 
 
@@ -471,9 +478,7 @@ def test_bad_input_is_refused_before_anything_is_simulated(overrides, line, tmp_
 def test_an_absent_class_is_named(tmp_path, num_workers):
     """Slides of 30 ms hold no bin of 50 ms: there is non-slip alone."""
     overrides = [o for o in TINY if not o.startswith("num_workers")]
-    config = composed(
-        *overrides, "cache=off", "+scene.slide_s=0.03", f"num_workers={num_workers}"
-    )
+    config = composed(*overrides, "cache=off", "+scene.slide_s=0.03", f"num_workers={num_workers}")
     with pytest.raises(ValueError, match="slip") as caught:
         train(config, tmp_path)
     assert_one_line(caught.value, "no slip")

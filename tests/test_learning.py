@@ -1,5 +1,7 @@
 """What the learner learns from, and that it learns from nothing else."""
 
+from dataclasses import replace
+
 import lightning as L
 import pytest
 import torch
@@ -119,6 +121,43 @@ def test_metrics_count_every_bin_once_in_its_role():
     }
     assert list(splits["unseen"]["per_material"]) == ["c"]
     assert list(splits["train"]["per_speed"]) == ["20"]
+    for scores in splits.values():
+        assert {scene: of["num_bins"] for scene, of in scores["per_scene"].items()} == {
+            "paper": scores["num_bins"]
+        }
+        places = scores["per_position"]
+        assert list(places) == [str(place) for place in range(-20, 17)]
+        (quiet_right, _), (_, slip_right) = scores["confusion"]
+        right = [
+            sum(of["num_right"] for of in list(places.values())[s])
+            for s in (slice(20), slice(20, None))
+        ]
+        assert right == [quiet_right, slip_right]
+
+
+def test_bins_of_no_stroke_have_no_position_but_a_scene():
+    class Handled(SmallSet):
+        """The second cycle of each material is another scene, with a stretch without slip."""
+
+        def __init__(self):
+            super().__init__()
+            kinds = ("paper", "tapped")
+            self.ids = tuple(
+                RecordingId(r.material, r.cycle, kinds[r.cycle == 1]) for r in self.ids
+            )
+
+        def timeline(self, recording):
+            times = super().timeline(recording)
+            stretch = ((0.0, 0.05),) if recording.scene == "tapped" else ()
+            return replace(times, non_slip_s=stretch)
+
+    source = Handled()
+    splits = learn(source, unseen_c(source)).metrics["splits"]
+    scores = splits["unseen"]
+    counted = {scene: of["num_bins"] for scene, of in scores["per_scene"].items()}
+    assert counted == {"paper": 4 * 37, "tapped": 38}
+    assert scores["per_speed"]["0"]["num_bins"] == 1
+    assert sum(of["num_bins"] for of in scores["per_position"].values()) == 5 * 37
 
 
 def test_the_detector_judges_filtered_bins_as_the_test_did():

@@ -101,15 +101,63 @@ def test_groups_equal_the_scores_of_their_own_bins_and_add_up() -> None:
     assert set(scores) == SCORE_KEYS | {"per_material", "per_speed"}
 
 
-def test_merged_scores_equal_those_of_all_bins_together() -> None:
+def test_scenes_are_groups_as_materials_are() -> None:
+    truth, predicted = random_bins(5)
+    scenes = [("taps", "paper")[i % 2] for i in range(len(truth))]
+    scores = bin_metrics(truth, predicted, scenes, [20.0] * len(truth), scenes)
+    assert scores["per_scene"] == scores["per_material"]
+    assert list(scores["per_scene"]) == ["taps", "paper"]
+    one = bin_metrics(truth, predicted, scenes, [20.0] * len(truth), ["paper"] * len(truth))
+    assert list(one["per_scene"]) == ["paper"]
+
+
+def test_recall_by_position_is_the_share_of_right_bins_there(rng: np.random.Generator) -> None:
+    num_bins = 4000
+    places = rng.integers(-24, 60, num_bins)
+    truth = torch.from_numpy(places >= 0)
+    predicted = truth ^ torch.from_numpy(rng.random(num_bins) < 0.2)
+    of_stroke = rng.random(num_bins) < 0.9
+    positions = [int(p) if mine else None for p, mine in zip(places, of_stroke, strict=True)]
+    scores = bin_metrics(truth, predicted, ["a"] * num_bins, [0.0] * num_bins, None, positions)
+    found = scores["per_position"]
+    assert list(found) == ["<-20", *map(str, range(-20, 20)), "20+"]
+    at = {"<-20": places < -20, "20+": places >= 20} | {str(p): places == p for p in range(-20, 20)}
+    for label, rows in at.items():
+        rows = rows & of_stroke
+        expected = recall_score(
+            truth[rows],
+            predicted[rows],
+            pos_label=label == "20+" or (label[0] != "<" and int(label) >= 0),
+        )
+        assert found[label]["recall"] == pytest.approx(expected, abs=1e-14)
+        assert found[label]["num_bins"] == rows.sum()
+    assert "per_scene" not in scores
+    assert json.loads(json.dumps(scores, allow_nan=False)) == scores
+
+
+def test_positions_without_bins_are_left_out() -> None:
+    truth = torch.tensor([False, True, True])
+    scores = bin_metrics(truth, truth, ["a"] * 3, [20.0] * 3, positions=[-1, 19, None])
+    assert list(scores["per_position"]) == ["-1", "19"]
+
+
+def test_merged_scores_equal_those_of_all_bins_together(rng: np.random.Generator) -> None:
     truth, predicted = random_bins(4)
     materials = ["ABS" if i < 200 else "iron" for i in range(len(truth))]  # iron: second part only
     speeds = [(20.0, 40.0)[i % 2] for i in range(len(truth))]
+    scenes = ["paper" if i < 300 else "taps" for i in range(len(truth))]
+    places = [int(p) if p > -25 else None for p in rng.integers(-30, 30, len(truth))]
+    groups = (materials, speeds, scenes, places)
     parts = [
+        bin_metrics(truth[rows], predicted[rows], *(group[rows] for group in groups))
+        for rows in (slice(0, 150), slice(150, None))
+    ]
+    assert merged_metrics(parts) == bin_metrics(truth, predicted, *groups)
+    plain = [
         bin_metrics(truth[rows], predicted[rows], materials[rows], speeds[rows])
         for rows in (slice(0, 150), slice(150, None))
     ]
-    assert merged_metrics(parts) == bin_metrics(truth, predicted, materials, speeds)
+    assert merged_metrics(plain) == bin_metrics(truth, predicted, materials, speeds)
 
 
 @pytest.mark.parametrize("slip", [True, False])
@@ -148,6 +196,10 @@ def test_wrong_input_is_named() -> None:
         bin_metrics(truth, predicted, ["ABS"], [20.0] * 4)
     with pytest.raises(ValueError, match=r"speeds_mm_s must have one entry per bin, 4, got 5"):
         bin_metrics(truth, predicted, ["ABS"] * 4, [20.0] * 5)
+    with pytest.raises(ValueError, match=r"scenes must have one entry per bin, 4, got 3"):
+        bin_metrics(truth, predicted, ["ABS"] * 4, [20.0] * 4, ["paper"] * 3)
+    with pytest.raises(ValueError, match=r"positions must have one entry per bin, 4, got 0"):
+        bin_metrics(truth, predicted, ["ABS"] * 4, [20.0] * 4, positions=[])
 
 
 # ---------------------------------------------------------------------------------- published
@@ -208,6 +260,15 @@ def test_materials_table_has_each_material_and_speed_of_each_split() -> None:
     groups = [row[-6] for row in rows[:5]]
     assert groups == ["acrylic", "ABS", "20 mm/s", "40 mm/s", "60 mm/s"]
     assert sum(int(row[-1]) for row in rows[:2]) == 500
+
+
+def test_materials_table_has_scenes_where_there_are_several() -> None:
+    truth, predicted = random_bins(6)
+    scenes = [("paper", "taps")[i % 2] for i in range(len(truth))]
+    for given, expected in ((scenes, ["scene paper", "scene taps"]), (["paper"] * len(truth), [])):
+        scores = bin_metrics(truth, predicted, ["a"] * len(truth), [20.0] * len(truth), given)
+        rows = rows_of(materials_table({"simulated": False, "splits": {"test": scores}}))[1:]
+        assert [row[-6] for row in rows] == ["a", "20 mm/s", *expected]
 
 
 def test_timing_table_takes_a_given_total() -> None:

@@ -8,6 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+_FIRST, _LAST = -20, 19
+POSITIONS = (f"<{_FIRST}", *map(str, range(_FIRST, _LAST + 1)), f"{_LAST + 1}+")
+"""Places beside an onset that ``bin_metrics`` counts, earliest first."""
+
 
 def confusion_matrix(is_slip_true: Tensor, is_slip_predicted: Tensor) -> list[list[int]]:
     """Number of bins by truth and prediction.
@@ -77,45 +81,64 @@ def bin_metrics(
     is_slip_predicted: Tensor,
     materials: Sequence[str],
     speeds_mm_s: Sequence[float],
+    scenes: Sequence[str] | None = None,
+    positions: Sequence[int | None] | None = None,
 ) -> dict[str, Any]:
-    """Scores of a split: of all its bins, of each material, and of each stroke speed.
+    """Scores of a split: of all its bins, and of groups of them.
 
     Returns what ``split_metrics`` returns plus ``per_material`` (in order of appearance) and
-    ``per_speed`` (slowest first; keys ``"20"``, ``"40"``, ...), each a dict of such scores.
+    ``per_speed`` (slowest first; keys ``"20"``, ``"40"``, ...; ``"0"`` for bins of no stroke), each
+    a dict of such scores. With ``scenes``, even if all are one, also ``per_scene``, in order of
+    appearance. With ``positions`` also ``per_position``: ``recall``, ``num_right`` and ``num_bins``
+    at each place beside the onset that has bins, ``"-20"`` to ``"19"``, earlier ones together as
+    ``"<-20"`` and later ones as ``"20+"``.
 
     Args:
         is_slip_true: what each bin is.
         is_slip_predicted: what the detector calls it.
         materials: the material of each bin.
         speeds_mm_s: the steady speed of the stroke each bin belongs to.
+        scenes: the kind of scene of each bin.
+        positions: the place of each bin beside the onset of its stroke, 0 for the first slip bin;
+            None for bins of no stroke, which have none.
 
     Shape:
-        - all four: ``[N]``
+        - all: ``[N]``
 
     Raises:
         ValueError: if the lengths differ or the tensors are not bool vectors.
     """
     whole = split_metrics(confusion_matrix(is_slip_true, is_slip_predicted))
     num_bins = whole["num_bins"]
-    for name, labels in (("materials", materials), ("speeds_mm_s", speeds_mm_s)):
-        if len(labels) != num_bins:
+    for name, labels in (
+        ("materials", materials),
+        ("speeds_mm_s", speeds_mm_s),
+        ("scenes", scenes),
+        ("positions", positions),
+    ):
+        if labels is not None and len(labels) != num_bins:
             raise ValueError(f"{name} must have one entry per bin, {num_bins}, got {len(labels)}")
 
     def by_group(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
-        members: dict[str, list[int]] = {}
-        for position, label in enumerate(labels):
-            members.setdefault(label, []).append(position)
         return {
             label: split_metrics(confusion_matrix(is_slip_true[rows], is_slip_predicted[rows]))
-            for label, rows in members.items()
+            for label, rows in _members(labels).items()
         }
 
+    groups = {"per_material": by_group(materials)}
     per_speed = by_group(f"{float(speed):g}" for speed in speeds_mm_s)
-    return {
-        **whole,
-        "per_material": by_group(materials),
-        "per_speed": {key: per_speed[key] for key in sorted(per_speed, key=float)},
-    }
+    groups["per_speed"] = {key: per_speed[key] for key in sorted(per_speed, key=float)}
+    if scenes is not None:
+        groups["per_scene"] = by_group(scenes)
+    if positions is not None:
+        is_right = is_slip_true == is_slip_predicted
+        members = _members(_position_label(place) for place in positions)
+        groups["per_position"] = {
+            label: _recall(int(is_right[members[label]].sum()), len(members[label]))
+            for label in POSITIONS
+            if label in members
+        }
+    return {**whole, **groups}
 
 
 def summed_metrics(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
@@ -125,7 +148,9 @@ def summed_metrics(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def merged_metrics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Scores of all bins of several ``bin_metrics`` together, from their summed confusions.
+    """Scores of all bins of several ``bin_metrics`` together, from their summed counts.
+
+    Groups are those that any of the parts has.
 
     Example:
         >>> half = {**split_metrics([[1, 0], [0, 1]]), "per_material": {}, "per_speed": {}}
@@ -133,13 +158,48 @@ def merged_metrics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         [[2, 0], [0, 2]]
     """
     groups: dict[str, dict[str, Any]] = {}
-    for kind in ("per_material", "per_speed"):
-        labels = dict.fromkeys(label for part in parts for label in part[kind])
-        groups[kind] = {
-            label: summed_metrics(part[kind][label] for part in parts if label in part[kind])
-            for label in labels
-        }
+    for kind in ("per_material", "per_speed", "per_scene"):
+        having = [part[kind] for part in parts if kind in part]
+        if having:
+            labels = dict.fromkeys(label for own in having for label in own)
+            groups[kind] = {
+                label: summed_metrics(own[label] for own in having if label in own)
+                for label in labels
+            }
+    having = [part["per_position"] for part in parts if "per_position" in part]
+    if having:
+        groups["per_position"] = {}
+        for label in POSITIONS:
+            own = [places[label] for places in having if label in places]
+            if own:
+                counts = (sum(place[name] for place in own) for name in ("num_right", "num_bins"))
+                groups["per_position"][label] = _recall(*counts)
     return {**summed_metrics(parts), **groups}
+
+
+def _members(labels: Iterable[str]) -> dict[str, list[int]]:
+    """Which bins have each label, labels in order of appearance."""
+    members: dict[str, list[int]] = {}
+    for row, label in enumerate(labels):
+        members.setdefault(label, []).append(row)
+    return members
+
+
+def _position_label(position: int | None) -> str:
+    """The entry of ``POSITIONS`` for a place; of none, a word that is not among them."""
+    if position is None:
+        return "none"
+    if position < _FIRST:
+        return POSITIONS[0]
+    return POSITIONS[-1] if position > _LAST else str(position)
+
+
+def _recall(num_right: int, num_bins: int) -> dict[str, Any]:
+    return {
+        "recall": _ratio(num_right, num_bins),
+        "num_right": num_right,
+        "num_bins": num_bins,
+    }
 
 
 def _ratio(part: int, whole: int) -> float | None:

@@ -43,7 +43,7 @@ def splits_table(metrics: Mapping[str, Any]) -> str:
 
 
 def materials_table(metrics: Mapping[str, Any]) -> str:
-    """The same scores within each split for each material and each stroke speed.
+    """The same scores within each split for each material, stroke speed and, of several, scene.
 
     Args:
         metrics: the content of ``metrics.json``.
@@ -52,6 +52,8 @@ def materials_table(metrics: Mapping[str, Any]) -> str:
     for name, split in metrics["splits"].items():
         groups = dict(split.get("per_material", {}))
         groups |= {f"{speed} mm/s": of for speed, of in split.get("per_speed", {}).items()}
+        if len(scenes := split.get("per_scene", {})) > 1:
+            groups |= {f"scene {scene}": of for scene, of in scenes.items()}
         for position, (group, scores) in enumerate(groups.items()):
             first = name if position == 0 else ""
             rows.append([first, group, *_score_cells(scores), str(scores["num_bins"])])
