@@ -76,6 +76,7 @@ class SlipLearner(L.LightningModule):
         self.pool = pool
         self.channel_filter = channel_filter
         self.recipe = recipe or Recipe()
+        self._allowed = self.recipe.allowed(pool)
         self.detector = detector
         self.threshold: FeatureThreshold | None = None
         if detector and "rival" in detector.info:
@@ -133,7 +134,9 @@ class SlipLearner(L.LightningModule):
         self._survey = parts[0]
         for part in parts[1:]:
             self._survey.merge(part)
-        self._plan = from_first_rank(lambda: plan_detector(self.recipe, self._survey, bar))
+        self._plan = from_first_rank(
+            lambda: plan_detector(self.recipe, self._survey, bar, allowed=self._allowed)
+        )
         self.seconds["validation"] = time.perf_counter() - passed
         if self._is_single_pass:
             self._second = self._sampled()
@@ -246,6 +249,7 @@ class SlipLearner(L.LightningModule):
             name: facts[name] for name in ("kernel", "penalty", "balance", "num_bins", "validation")
         }
         self.facts["head"] = head.cost._asdict()
+        self.facts["among"] = plan.among
         self.facts["solve"] = solve_facts(head)
         self.seconds["solve"] = time.perf_counter() - started
         self.detector = SlipDetector(
