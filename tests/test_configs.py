@@ -78,17 +78,38 @@ def test_an_experiment_is_global_and_names_itself(name):
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_an_experiment_adds_no_key(name):
-    """A misspelt key in an experiment file is added silently, so hold it against its groups."""
+    """A misspelt key in an experiment file is added silently, so hold it against its groups.
+
+    Keys of further scenes are knobs, and the source refuses unknown ones.
+    """
     content = yaml.safe_load((conf_dir() / "exp" / f"{name}.yaml").read_text())
     groups = [
         f"{key.removeprefix('override /')}={option}"
         for entry in content.pop("defaults", [])
         for key, option in entry.items()
+        if key.startswith("override /")
     ]
-    without = OmegaConf.to_container(composed(*groups))
-    known = set(keys_of(without))
-    assert set(keys_of(content)) <= known
-    assert set(keys_of(OmegaConf.to_container(composed(f"+exp={name}")))) == known
+    known = set(keys_of(OmegaConf.to_container(composed(*groups)))) - {"data.others"}
+    whole = OmegaConf.to_container(composed(f"+exp={name}"))
+    for section in (content, whole):
+        section.setdefault("data", {}).pop("others", None)
+    assert set(keys_of(content)) <= known | {"data"}  # nothing but scenes
+    assert set(keys_of(whole)) == known
+
+
+def test_a_misspelt_knob_of_a_further_scene_is_refused():
+    config = composed("+exp=confound", "+data.others.taps.taps_per_sec=3.0")
+    with pytest.raises(InstantiationException, match="unknown override taps_per_sec"):
+        instantiate(config.data, _convert_="all")
+
+
+def test_confound_trains_on_scenes_it_has_and_judges_some_it_never_met():
+    source, (protocol, with_scenes) = folds_of(composed("+exp=confound"))
+    trained = [{r.scene for r in fold.having("train")} for fold in (protocol, with_scenes)]
+    assert trained == [{"paper"}, {"paper", "arm_motion", "pulled", "motor_off"}]
+    for role in ("test", "unseen"):
+        judged = {r.scene for r in with_scenes.having(role)}
+        assert judged == {r.scene for r in source.ids} > trained[1]
 
 
 def test_a_misspelt_key_would_be_seen():

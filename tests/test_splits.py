@@ -6,6 +6,7 @@ import torch
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import (
     Split,
+    confound,
     leave_one_material_out,
     random_bins,
     seen6,
@@ -110,6 +111,112 @@ def test_grouped_splits_never_divide_a_recording():
             masks = split.bin_roles(recording, 7)
             assert bool(masks[role].all())
             assert sum(int(mask.sum()) for mask in masks.values()) == 7
+
+
+# By cycle, of several scenes --------------------------------------------------------------------
+
+
+def with_others(kinds=("taps", "carried"), cycles=10, others=6):
+    paper = recordings(cycles=cycles)
+    return paper + [
+        RecordingId(r.material, r.cycle, k) for k in kinds for r in paper if r.cycle < others
+    ]
+
+
+@pytest.mark.parametrize("make", [unseen4, seen6])
+def test_a_set_of_another_scene_is_split_as_the_papers_is(make):
+    materials = {"seen": SEEN} | ({"unseen": UNSEEN} if make is unseen4 else {})
+    tapped = [RecordingId(r.material, r.cycle, "taps") for r in recordings()]
+    for seed in (0, 1):
+        plain = make(recordings(), **materials, seed=seed)[0].roles
+        roles = make(tapped, **materials, seed=seed)[0].roles
+        assert roles == {RecordingId(r.material, r.cycle, "taps"): plain[r] for r in plain}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_cycle_is_on_one_side_in_all_its_scenes(seed):
+    whole = with_others()
+    for split in (
+        *unseen4(whole, seen=SEEN, unseen=UNSEEN, seed=seed),
+        *seen6(whole, seen=SEEN, seed=seed),
+        *leave_one_material_out(whole, materials=SEEN, seed=seed),
+    ):
+        sides = {}
+        for recording, role in split.roles.items():
+            sides.setdefault((recording.material, recording.cycle), set()).add(role)
+        assert all(len(roles) == 1 for roles in sides.values())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_scene_has_its_share_of_both_sides(seed):
+    split = unseen4(with_others(), seen=SEEN, unseen=UNSEEN, seed=seed)[0]
+    for scene, num_train, num_test in (("paper", 5 + 3, 1 + 1), ("taps", 5, 1), ("carried", 5, 1)):
+        for material in SEEN:
+            counts = [
+                sum(r.scene == scene for r in of_role(split, role, material))
+                for role in ("train", "test")
+            ]
+            assert counts == [num_train, num_test]
+
+
+# The confounded protocol -------------------------------------------------------------------------
+
+
+def both(**changes):
+    whole = {"recordings": with_others(), "seen": SEEN, "unseen": UNSEEN}
+    return confound(**(whole | {"trained_scenes": ["carried"]} | changes))
+
+
+def test_the_folds_of_confound_are_judged_on_the_same_recordings():
+    protocol, with_scenes = both()
+    assert [protocol.name, with_scenes.name] == ["protocol", "with_scenes"]
+    grouped = unseen4(with_others(), seen=SEEN, unseen=UNSEEN)[0]
+    for role in ("test", "unseen"):
+        assert of_role(protocol, role) == of_role(with_scenes, role) == of_role(grouped, role)
+        assert {r.scene for r in of_role(protocol, role)} == {"paper", "taps", "carried"}
+
+
+def test_the_folds_of_confound_differ_in_the_scenes_trained_on():
+    protocol, with_scenes = both()
+    trained, more = of_role(protocol, "train"), of_role(with_scenes, "train")
+    assert {r.scene for r in trained} == {"paper"}
+    assert {r.scene for r in more} == {"paper", "carried"}
+    assert {r for r in more if r.scene == "paper"} == trained
+    cycles = {(r.material, r.cycle) for r in trained}
+    assert {(r.material, r.cycle) for r in more if r.scene == "carried"} <= cycles
+    judged = {(r.material, r.cycle) for r in with_scenes.having("test", "unseen")}
+    assert not judged & {(r.material, r.cycle) for r in more}
+
+
+def test_what_confound_trains_on_can_be_chosen():
+    _, with_scenes = both(trained_scenes=["taps", "carried", "paper"])
+    assert {r.scene for r in of_role(with_scenes, "train")} == {"paper", "taps", "carried"}
+    assert both(seed=1)[0].roles == both(seed=1)[0].roles != both(seed=2)[0].roles
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        (
+            {"trained_scenes": []},
+            r"trained_scenes must name a scene .* got \[\]; the set has paper",
+        ),
+        ({"trained_scenes": ["paper"]}, r"trained_scenes must name a scene beside the paper's"),
+        (
+            {"trained_scenes": ["taps", "wet"]},
+            "needs recordings of scene wet; the set has paper, taps",
+        ),
+        (
+            {"recordings": [RecordingId(m, c, "taps") for m in SEEN + UNSEEN for c in range(3)]},
+            "needs recordings of scene paper, carried; the set has taps: add them to data.others",
+        ),
+        ({"unseen": []}, "no recording has the role 'unseen'"),
+        ({"seen": ["M9"]}, "no recording of material 'M9'"),
+    ],
+)
+def test_confound_says_what_it_lacks(changes, line):
+    with pytest.raises(ValueError, match=line):
+        both(**changes)
 
 
 # By bin --------------------------------------------------------------------------------------

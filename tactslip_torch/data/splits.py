@@ -1,8 +1,9 @@
 """Who is trained on and who is not (REFERENCE.md section 5, *Split*).
 
 A split gives every bin of every recording a role. The default groups by cycle, stratified by
-material: neighbouring bins of one slide never stand on both sides. The authors' split, random over
-bins, is here to show what that leaks.
+material: neighbouring bins of one slide never stand on both sides. Of a set with several kinds of
+scenes, a cycle is on one side in all of them. The authors' split, random over bins, is here to show
+what that leaks.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from torch import Tensor
 from tactslip_torch.data.recording import RecordingId
 
 ROLES = ("train", "test", "unseen")
+PAPER_SCENE = RecordingId.scene
+"""The scene of recordings that are the paper's protocol."""
 
 
 @dataclass(frozen=True)
@@ -140,25 +143,86 @@ def leave_one_material_out(
     return folds
 
 
+def confound(
+    recordings: Sequence[RecordingId],
+    *,
+    seen: Sequence[str],
+    unseen: Sequence[str],
+    trained_scenes: Sequence[str],
+    train_share: float = 0.8,
+    seed: int = 0,
+) -> list[Split]:
+    """Two folds that differ in the scenes trained on, and are judged on the same recordings.
+
+    ``protocol`` trains on the paper's scene alone, ``with_scenes`` on the same cycles of the
+    trained scenes as well. Both are judged on the test cycles of the seen materials and all cycles
+    of the unseen ones, of every scene; training cycles of other scenes are not used.
+
+    Args:
+        recordings: of the paper's scene and of others.
+        seen: materials to train and test on, by cycle.
+        unseen: materials to judge on only.
+        trained_scenes: kinds of scenes that ``with_scenes`` trains on beside the paper's.
+        train_share: of the cycles.
+        seed: of the draw.
+
+    Raises:
+        ValueError: as ``unseen4``; or if the set lacks the paper's scene or a trained one, or no
+            scene is to be trained on.
+    """
+    grouped = unseen4(recordings, seen=seen, unseen=unseen, train_share=train_share, seed=seed)[0]
+    there = list(dict.fromkeys(recording.scene for recording in recordings))
+    added = [scene for scene in trained_scenes if scene != PAPER_SCENE]
+    if not added:
+        raise ValueError(
+            "split.trained_scenes must name a scene beside the paper's to train on, got "
+            f"{list(trained_scenes)}; the set has {', '.join(there)}"
+        )
+    missing = [scene for scene in (PAPER_SCENE, *added) if scene not in there]
+    if missing:
+        raise ValueError(
+            f"split confound needs recordings of scene {', '.join(missing)}; the set has "
+            f"{', '.join(there)}: add them to data.others"
+        )
+    folds = []
+    for name, scenes in (("protocol", [PAPER_SCENE]), ("with_scenes", [PAPER_SCENE, *added])):
+        roles = {
+            recording: role
+            for recording, role in grouped.roles.items()
+            if role != "train" or recording.scene in scenes
+        }
+        folds.append(_checked(Split(name, roles), ROLES))
+    return folds
+
+
 def _by_cycle(
     recordings: Sequence[RecordingId], materials: Sequence[str], train_share: float, seed: int
 ) -> dict[RecordingId, str]:
     """``train`` and ``test`` drawn within each material, at least one cycle each if there are two.
 
     The draw of a material depends on the seed and its place among its own cycles alone, so leaving
-    another material out does not change it.
+    another material out does not change it. A cycle is on one side in all its scenes; cycles that
+    are there in different scenes are drawn apart, each kind as above, so that each scene has its
+    share.
     """
     _check_share(train_share)
     roles: dict[RecordingId, str] = {}
     for material in materials:
-        cycles = _cycles_of(recordings, material)
+        cycles: dict[int, list[RecordingId]] = {}
+        for recording in _cycles_of(recordings, material):
+            cycles.setdefault(recording.cycle, []).append(recording)
+        alike: dict[tuple[str, ...], list[int]] = {}
+        for cycle, members in cycles.items():
+            alike.setdefault(tuple(member.scene for member in members), []).append(cycle)
         generator = torch.Generator().manual_seed(seed * 1_000_003 + zlib.crc32(material.encode()))
-        num_train = round(train_share * len(cycles))
-        if len(cycles) > 1:
-            num_train = min(max(num_train, 1), len(cycles) - 1)
-        order = torch.randperm(len(cycles), generator=generator).tolist()
-        for place, index in enumerate(order):
-            roles[cycles[index]] = "train" if place < num_train else "test"
+        for numbers in alike.values():
+            num_train = round(train_share * len(numbers))
+            if len(numbers) > 1:
+                num_train = min(max(num_train, 1), len(numbers) - 1)
+            order = torch.randperm(len(numbers), generator=generator).tolist()
+            for place, index in enumerate(order):
+                role = "train" if place < num_train else "test"
+                roles |= dict.fromkeys(cycles[numbers[index]], role)
     return roles
 
 
