@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 import torch
-from small_set import SMALL_HAND
+from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
+from test_learning import learn, unseen_c
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.deadline.workshop import Workshop
@@ -13,6 +14,7 @@ from tactslip_torch.features.groups import matching
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.learning import SlipLearner
 from tactslip_torch.planning import Plan, plan_detector
 from tactslip_torch.recipe import (
     Recipe,
@@ -279,3 +281,18 @@ def test_among_is_never_silently_ignored(rng):
         plan_detector(recipe, told_apart(rng, FeaturePool(SMALL_HAND)), lambda items, what: items)
     with pytest.raises(ValueError, match=r"recipe.among is not for a search"):
         Workshop({}, None, None, recipe)
+
+
+@pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec.*")
+def test_a_learner_takes_features_that_match_and_refuses_early_what_none_matches():
+    source = SmallSet()
+    wanted = {"kind": "SG", "descriptor": ["mean", "std"]}
+    learner = learn(source, unseen_c(source), recipe=small_recipe(among=wanted))
+    assert {str(name) for name in learner.detector.selected_names} == {
+        "SG1 raw time mean",
+        "SG1 raw time std",
+    }
+    assert learner.facts["among"]["matching"] == 2
+    maker = small_maker(SmallSet())
+    with pytest.raises(ValueError, match=r"^recipe.among: no feature has finger='toe'"):
+        SlipLearner(maker.pool, maker.channel_filter, small_recipe(among={"finger": "toe"}))
