@@ -23,6 +23,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "plain": (),
     "progress": (),
     "data.recording": ("hand",),
+    "data.archive": ("data.recording", "hand", "files"),
+    "data.folder": ("data.archive", "data.recording", "files"),
     "data.labels": ("data.recording",),
     "data.splits": ("data.recording",),
     "simulation.*": ("hand", "data.recording", "simulation.*"),
@@ -233,6 +235,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "progress",
     ),
     "pareto": ("*",),
+    "facts": ("signals.*", "data.*", "hand"),
+    "bracket": (),
+    "calibrate": ("*",),
+    "generate": ("*",),
     "config": ("*",),
 }
 
@@ -246,6 +252,8 @@ ENTRY = (
     "crossval",
     "certify",
     "pareto",
+    "calibrate",
+    "generate",
     "config",
 )
 
@@ -262,7 +270,10 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
         "report.crossval",
         "report.validation",
         "report.certificate",
+        "report.confound",
         "report.pareto",
+        "report.signals",
+        "report.calibration",
     ),
     "numba": ("features.compiled.*", "simulation.dynamics.compiled"),
 }

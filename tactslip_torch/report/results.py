@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tactslip_torch.files import whole_file
+from tactslip_torch.report.confound import by_detector, confound_figure, confound_table
 from tactslip_torch.report.figures import confusion_figure, selected_features_figure
 from tactslip_torch.report.tables import (
     materials_table,
@@ -24,6 +25,8 @@ def write_results(
 ) -> None:
     """Write ``metrics.json`` and the figures of a run into a folder.
 
+    Results on several kinds of scenes also get ``confound.png``.
+
     Args:
         folder: made if it is not there.
         metrics: JSON-able, with ``simulated`` and ``splits``.
@@ -31,17 +34,21 @@ def write_results(
     """
     with whole_file(folder / "metrics.json") as temporary:
         temporary.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
-    confusion_figure(metrics, folder / "confusion.png")
+    confusion_figure(_by_fold(metrics), folder / "confusion.png")
     simulated = metrics["simulated"]
     if selected:
         selected_features_figure(selected, folder / "selected_features.png", simulated=simulated)
+    if by_detector(metrics):
+        confound_figure(metrics, folder / "confound.png")
     if metrics.get("validation"):
         validation_figure(metrics["validation"], folder / "validation.png", simulated=simulated)
 
 
 def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
-    parts = [splits_table(metrics), materials_table(metrics)]
+    parts = [splits_table(_by_fold(metrics)), materials_table(_by_fold(metrics))]
+    if by_detector(metrics):
+        parts.append(confound_table(metrics))
     if selected:
         parts.append(selected_table(selected))
     if metrics.get("validation"):
@@ -51,3 +58,26 @@ def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, st
     if metrics.get("timing_s"):
         parts.append(timing_table(metrics["timing_s"]))
     print("\n" + "\n\n".join(parts))
+
+
+def _by_fold(metrics: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The same with a split for each role of each fold, where detectors are to be compared.
+
+    Folds that are judged on the same scenes are rivals, and the sum of their bins is neither's.
+    """
+    found = by_detector(metrics)
+    if len(found) < 2:
+        return metrics
+    splits = {
+        f"{name} {role}": scores for name, own in found.items() for role, scores in own.items()
+    }
+    rivals = {
+        f"{name} {role}": scores
+        for name, fold in metrics["folds"].items()
+        for role, scores in fold["baselines"]["best_single_feature"]["splits"].items()
+    }
+    return {
+        "simulated": metrics["simulated"],
+        "splits": splits,
+        "baselines": {"best_single_feature": {"splits": rivals}},
+    }
