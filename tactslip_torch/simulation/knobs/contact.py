@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from tactslip_torch.simulation.knobs.calibrated import CALIBRATED
 from tactslip_torch.simulation.knobs.checks import require_finite
 
 PAPER_FINGER_LOADS = (
@@ -65,12 +66,12 @@ class Contact:
     mu_s: float | None = None
     mu_k: float | None = None
     friction_spread: float = 0.2
-    presliding_mm: tuple[float, float] = (0.3, 3.0)
+    presliding_mm: tuple[float, float] = CALIBRATED["presliding_mm"]
     presliding_spread: float = 0.2
     relaxation: tuple[float, float] = (0.1, 0.3)
     relaxation_time_s: tuple[float, float] = (0.2, 2.0)
     recoil_s: float = 0.008
-    friction_noise_mv: float = 8.0
+    friction_noise_mv: float = CALIBRATED["friction_noise_mv"]
     friction_noise_exponent: float = 0.75
     friction_noise_low_share: float = 0.3
     texture_scale: float = 1.0

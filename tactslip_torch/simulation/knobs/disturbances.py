@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tactslip_torch.simulation.knobs.calibrated import CALIBRATED
 from tactslip_torch.simulation.knobs.checks import require_finite
 
 
@@ -42,7 +43,7 @@ class Disturbances:
     mains_burst_mv: float = 50.0
     machine_mv: float = 0.0
     machine_hz: tuple[float, float] = (12.0, 60.0)
-    burst_rate_hz: float = 0.3
+    burst_rate_hz: float = CALIBRATED["burst_rate_hz"]
     burst_mv: float = 30.0
     label_jitter_ms: float = 15.0
 

@@ -1,0 +1,222 @@
+"""What a simulated recording must look like: REFERENCE.md section 6, row *signals*.
+
+Each fact holds on recordings of the seen materials, and fails once the samples are shuffled in
+time (or negated, where sign matters).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import savgol_filter
+
+from tactslip_torch.facts import (
+    ALL,
+    FACTS,
+    QUIET,
+    SUSTAINED,
+    Fact,
+    Signals,
+    filtered,
+    finest_detail_share,
+    judge_facts,
+    num_barely_responding,
+    pvdf_onset_burst,
+    pvdf_slide_over_rest,
+    pvdf_speed_growth,
+    sg_offset_spread,
+    sg_rise_v,
+    sg_variation,
+)
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.simulation import SEEN_MATERIALS, Scene, simulate
+
+HAND = HandLayout.paper24()
+NUM_CYCLES = 3
+RATE_HZ = 2000.0
+BY_NAME = {fact.name: fact for fact in FACTS}
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return {
+        material: [
+            filtered(simulate(Scene(material, cycle=cycle)), HAND) for cycle in range(NUM_CYCLES)
+        ]
+        for material in SEEN_MATERIALS
+    }
+
+
+def changed(recordings, change):
+    return {
+        material: [replace(s, sg=change(s.sg), pvdf=change(s.pvdf)) for s in seen]
+        for material, seen in recordings.items()
+    }
+
+
+def shuffled(samples):
+    """The same values of every channel in another order."""
+    return samples[:, np.random.default_rng(0).permutation(samples.shape[1])]
+
+
+# --- recordings ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_a_fact_holds_on_recordings_and_fails_on_shuffled_ones(recordings, name):
+    fact = BY_NAME[name]
+    values = fact.values(recordings)
+    assert values
+    assert all(map(fact.allows, values.values())), values
+    spoilt = fact.values(changed(recordings, shuffled))
+    assert spoilt.keys() == values.keys()
+    assert not any(map(fact.allows, spoilt.values())), spoilt
+
+
+def test_levels_that_fall_are_no_rise(recordings):
+    spoilt = BY_NAME["sg_rise"].values(changed(recordings, np.negative))
+    assert not any(map(BY_NAME["sg_rise"].allows, spoilt.values())), spoilt
+
+
+def test_rough_and_tacky_materials_are_the_loudest(recordings):
+    level_v = {
+        material: np.median([np.std(s.slide(s.pvdf, 1), axis=-1) for s in seen])
+        for material, seen in recordings.items()
+    }
+    assert min(level_v[m] for m in SUSTAINED) > 3 * max(level_v[m] for m in QUIET)
+
+
+def test_the_facts_are_those_of_the_paper():
+    assert set(ALL) == set(SEEN_MATERIALS) == {*QUIET, *SUSTAINED}
+    assert SUSTAINED == ("M1", "M6")
+    judged = {name: set(fact.materials) | set(fact.over) for name, fact in BY_NAME.items()}
+    assert judged.pop("pvdf_abrupt") == judged.pop("barely") == set(QUIET)
+    assert judged.pop("pvdf_sustained") == set(SUSTAINED)
+    assert all(materials == set(ALL) for materials in judged.values())
+    floor = BY_NAME["pvdf_slide_over_rest"]
+    assert (floor.statistic, floor.low) == (pvdf_slide_over_rest, 1.5)  # PHYSICS.md
+
+
+def test_judging_says_what_was_found(recordings):
+    some = {material: recordings[material] for material in ("M1", "M2")}
+    judged = {fact["name"]: fact for fact in judge_facts(some)}
+    assert set(judged) == set(BY_NAME)
+    for name, fact in judged.items():
+        assert fact["values"] == BY_NAME[name].values(some)
+        assert fact["holds"]
+    assert judged["d1"]["values"].keys() == some.keys()
+    spoilt = judge_facts(changed(some, shuffled))
+    assert not any(fact["holds"] for fact in spoilt)
+
+
+def test_facts_about_materials_that_are_not_there_are_not_judged(recordings):
+    names = {fact["name"] for fact in judge_facts({"M1": recordings["M1"]})}
+    gone = {"pvdf_abrupt", "pvdf_abrupt_contrast", "barely"}
+    assert names == set(BY_NAME) - gone
+
+
+def test_one_material_outside_the_range_is_enough_to_fail(recordings):
+    quiet = changed({"M3": recordings["M3"]}, shuffled)
+    judged = {fact["name"]: fact for fact in judge_facts(recordings | quiet)}
+    assert not judged["pvdf_slide_over_rest"]["holds"]
+    assert judged["pvdf_sustained"]["holds"]
+
+
+# --- statistics on signals made by hand ---------------------------------------------------------
+
+
+def made(sg=None, pvdf=None, seconds=16.0):
+    """A recording with onsets at 2, 9 and 13.5 s as the paper's; one channel each."""
+    silent = np.zeros((1, round(seconds * RATE_HZ)))
+    sliding_s = ((2.0, 7.0), (9.0, 11.5), (13.5, 15.2))
+    onsets_s = tuple(start for start, _ in sliding_s)
+    return Signals(
+        silent if sg is None else sg, silent if pvdf is None else pvdf, RATE_HZ, onsets_s, sliding_s
+    )
+
+
+def tone(level_at_rest, levels_in_slides, hertz=50.0, seconds=16.0):
+    """A sine of the given rms at rest and in each slide, one channel."""
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    level = np.full(t.shape, level_at_rest)
+    for (start_s, end_s), value in zip(made().sliding_s, levels_in_slides, strict=True):
+        level[(t >= start_s) & (t < end_s)] = value
+    return (level * np.sqrt(2) * np.sin(2 * np.pi * hertz * t))[None]
+
+
+def test_statistics_of_tones_are_their_levels():
+    seen = [made(pvdf=tone(0.5, (2.0, 3.0, 6.0)))]
+    assert pvdf_slide_over_rest(seen) == pytest.approx(6.0, rel=1e-3)
+    assert pvdf_speed_growth(seen) == pytest.approx(1.5, rel=1e-3)
+    assert sg_variation([made(sg=tone(0.5, (2.0, 3.0, 6.0)))]) == pytest.approx(6.0, rel=1e-3)
+
+
+def test_a_burst_is_the_onset_over_the_slide():
+    pvdf = tone(1.0, (1.0, 1.0, 1.0))
+    for onset_s in made().onsets_s:
+        pvdf[:, round((onset_s - 0.02) * RATE_HZ) : round((onset_s + 0.04) * RATE_HZ)] *= 5.0
+    assert pvdf_onset_burst([made(pvdf=pvdf)]) == pytest.approx(5.0, rel=1e-3)
+
+
+def test_channels_that_hear_no_onset_are_counted():
+    deaf, keen = tone(1.0, (1.0, 1.0, 1.0)), tone(1.0, (9.0, 9.0, 9.0))
+    seen = [made(pvdf=np.concatenate([deaf, keen, deaf])), made(pvdf=np.concatenate([keen, deaf]))]
+    assert num_barely_responding(seen) == 1.5
+
+
+def test_the_rise_is_the_step_of_the_mean_level():
+    t = np.arange(32000) / RATE_HZ
+    sg = np.stack([0.3 * (t > 2.0) - 1.0, 0.1 * (t > 2.0) + 2.0])
+    assert sg_rise_v([made(sg=sg)]) == pytest.approx(0.2)
+
+
+def test_the_spread_of_offsets_counts_in_variations():
+    sg = np.concatenate([tone(0.01, (1, 1, 1)) + offset for offset in (-1.0, 1.0)])
+    assert sg_offset_spread([made(sg=sg)]) == pytest.approx(100.0, rel=1e-3)
+
+
+def test_the_finest_detail_is_what_alternates():
+    slow, fast = tone(1.0, (1, 1, 1), hertz=20.0), tone(1.0, (1, 1, 1), hertz=900.0)
+    assert finest_detail_share([made(pvdf=slow)]) < 1e-4
+    assert finest_detail_share([made(pvdf=fast)]) > 0.8
+
+
+def test_a_contrast_is_the_least_over_the_largest():
+    fact = Fact("contrast", "", pvdf_slide_over_rest, ("a", "b"), 1.5, over=("c", "d"))
+    levels = {"a": 3.0, "b": 4.0, "c": 1.0, "d": 2.0}
+    recordings = {name: [made(pvdf=tone(1.0, (v, v, v)))] for name, v in levels.items()}
+    (value,) = fact.values(recordings).values()
+    assert value == pytest.approx(1.5, rel=1e-3)
+
+
+# --- filtering ----------------------------------------------------------------------------------
+
+
+def test_signals_are_filtered_as_the_paper_does():
+    recording = simulate(Scene("M2"))
+    signals = filtered(recording, HAND)
+    samples = recording.samples.double().numpy()
+    np.testing.assert_allclose(signals.sg, savgol_filter(samples[:14], 51, 1), atol=1e-12)
+    np.testing.assert_allclose(signals.pvdf, savgol_filter(samples[14:], 11, 1), atol=1e-12)
+    assert signals.onsets_s == recording.onsets_s
+    assert signals.sliding_s == recording.sliding_s
+
+
+def test_kinds_are_told_by_the_hand_not_by_place():
+    rows = HAND.to_rows()
+    turned = HandLayout.from_rows(rows[::-1])
+    recording = simulate(Scene("M2"))
+    other = replace(recording, samples=recording.samples.flip(0))
+    np.testing.assert_array_equal(
+        filtered(other, turned).pvdf, filtered(recording, HAND).pvdf[::-1]
+    )
+
+
+def test_a_hand_or_protocol_that_shows_no_facts_is_refused():
+    films = HandLayout.from_rows([row for row in HAND.to_rows() if row["kind"] == "PVDF"])
+    recording = simulate(Scene("M1"), channels=["PVDF1"])
+    with pytest.raises(ValueError, match=r"facts need SG and PVDF channels, the hand has \['PVDF'"):
+        filtered(replace(recording, samples=recording.samples[14:]), films)
+    short = simulate(Scene("M1", strokes=Scene("M1").strokes[:2]), channels=["PVDF1"])
+    with pytest.raises(ValueError, match="facts need three strokes, got 2"):
+        filtered(short, HAND)
