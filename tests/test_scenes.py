@@ -1,0 +1,241 @@
+"""Every scene of ``conf/scene/``: its truth is the contact's, and its bytes are always the same.
+
+What each scene does to the signals is tested in the ``test_scenes_*`` files beside this one.
+"""
+
+import hashlib
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scene_files import NAMES, SCENE_FILES, insides, is_within, scene_of, whole_grid
+
+from tactslip_torch.simulation import (
+    MATERIALS,
+    Contact,
+    Faults,
+    Handling,
+    Scene,
+    Stroke,
+    simulate,
+    timeline,
+)
+from tactslip_torch.simulation.resting import scene_contact
+from tactslip_torch.simulation.source import SimulatedRecordings
+
+EXPECTED = {"arm_motion", "taps", "grips", "pulled", "motor_off", "motor_only", "machine", "drift"}
+EXPECTED |= {"mains_bursts", "dead_channel", "saturated_channel", "swapped_channels"}
+EXPECTED |= {"dropped_samples", "paper"}
+TWO = ("M3", "M6")
+CASES = [(name, material) for name in NAMES for material in TWO]
+
+
+def test_the_scenes_are_there_and_say_what_they_are():
+    assert set(NAMES) >= EXPECTED
+    for path in SCENE_FILES:
+        assert path.read_text().startswith("# "), path.name
+
+
+# Truth ---------------------------------------------------------------------------------------
+
+
+def sliding_load(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Share of the normal load that slides at every sample, and whether any element does."""
+    truth, (grasp, plan, _) = timeline(scene), insides(scene)
+    grid = whole_grid(truth.num_samples)
+    contact_of = scene_contact(scene, grasp, plan).on(grid)
+    share = np.zeros(truth.num_samples)
+    for element in grasp.touching.tolist():
+        slides = contact_of(element).slide.reshape(-1)[: truth.num_samples] > 0
+        share += grasp.load_n[element] / grasp.load_n.sum() * slides
+    return share, share > 0
+
+
+@pytest.mark.parametrize(("name", "material"), CASES)
+def test_truth_is_what_the_contact_does(name, material):
+    scene = scene_of(name, material)
+    truth = timeline(scene)
+    share, any_slides = sliding_load(scene)
+    assert truth.speeds_mm_s == tuple(s.speed_mm_s for s in scene.strokes if s.moves != "both")
+    assert len(truth.onsets_s) == len(truth.sliding_s) == len(truth.annotated_onsets_s)
+    assert len(truth.onsets_s) == len(truth.speeds_mm_s)
+    changes = np.flatnonzero(np.diff(share >= 0.5 - 1e-12))  # last samples before each change
+    edges = np.array(truth.sliding_s).reshape(-1) * 2000
+    assert len(changes) == len(edges)
+    np.testing.assert_allclose(changes + 1, edges, atol=1.5)
+    quiet = is_within(truth.non_slip_s, truth.num_samples)
+    assert not (quiet & any_slides).any()
+    bounds = np.array(truth.non_slip_s).reshape(-1)
+    assert np.all(np.diff(bounds) > 0)  # ascending, apart, none empty
+    assert np.all((bounds >= 0) & (bounds <= truth.duration_s))
+
+
+def test_scenes_that_handle_the_hand_say_where_and_the_others_do_not():
+    handled = {name for name in NAMES if timeline(scene_of(name, "M3")).non_slip_s}
+    assert handled == {"arm_motion", "taps", "grips"}
+    assert timeline(scene_of("arm_motion", "M3")).onsets_s == ()
+    assert timeline(scene_of("pulled", "M3")).arm_s == ()
+
+
+def test_a_recording_carries_the_truth_of_its_scene():
+    for name in ("arm_motion", "taps", "pulled"):
+        scene = scene_of(name, "wood")
+        recording, truth = simulate(scene, windows=[]), timeline(scene)
+        for field in ("onsets_s", "annotated_onsets_s", "sliding_s", "speeds_mm_s", "non_slip_s"):
+            assert getattr(recording, field) == getattr(truth, field)
+        assert recording.samples.shape == (24, truth.num_samples)
+        assert recording.provenance["scene"] == name
+
+
+def test_a_tail_is_rest_behind_the_last_stroke():
+    scene = scene_of("arm_motion", "M2")
+    longer = replace(scene, tail_s=scene.tail_s + 0.5)
+    assert timeline(longer).num_samples == timeline(scene).num_samples + 1000
+    assert timeline(longer).arm_s == timeline(scene).arm_s
+
+
+# Bytes ---------------------------------------------------------------------------------------
+
+
+def digest(scene: Scene) -> str:
+    return hashlib.sha256(simulate(scene).samples.numpy().tobytes()).hexdigest()
+
+
+@pytest.mark.parametrize(("name", "material"), CASES)
+def test_windows_and_channels_equal_the_whole(name, material):
+    scene = scene_of(name, material, cycle=1)
+    truth, whole = timeline(scene), simulate(scene).samples
+    middles = [0.5 * (start_s + end_s) for start_s, end_s in truth.non_slip_s[:2]]
+    windows = [(at_s - 0.004, at_s + 0.013) for at_s in (*middles, *truth.onsets_s)]
+    windows += [(0.0, 0.01), (3.333, 3.6), (truth.duration_s - 0.1, truth.duration_s)]
+    names = ["SG2", "SG10", "PVDF1", "PVDF7"]
+    part = simulate(scene, windows=windows, channels=names).samples
+    asked = torch.zeros(whole.shape, dtype=torch.bool)
+    for start_s, end_s in windows:
+        asked[:, round(start_s * 2000) : round(end_s * 2000)] = True
+    asked &= torch.tensor([channel in names for channel in scene.hand.names])[:, None]
+    assert torch.equal(part[asked], whole[asked])
+    assert part[~asked].isnan().all()
+    assert whole.isfinite().all()
+
+
+def test_same_bytes_in_another_order():
+    scenes = [scene_of(name, material, cycle=1) for name, material in CASES]
+    forward = [digest(scene) for scene in scenes]
+    assert [digest(scene) for scene in reversed(scenes)] == forward[::-1]
+    assert len(set(forward)) == len(scenes)
+
+
+def test_scenes_are_plain_json_and_lose_nothing():
+    for name in NAMES:
+        scene = scene_of(name, "M4")
+        assert Scene.from_dict(json.loads(json.dumps(scene.to_dict()))) == scene
+        assert hash(scene) == hash(Scene.from_dict(scene.to_dict()))
+
+
+def test_a_scene_of_another_name_is_another_draw_of_the_same_session():
+    scene = scene_of("machine", "M1", burst_rate_hz=0.0)
+    other = replace(scene, name="another")
+    assert digest(scene) != digest(other)
+    assert timeline(scene).onsets_s != timeline(other).onsets_s
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_material_takes_any_scene(name):
+    for material in MATERIALS:
+        scene = scene_of(name, material, cycle=2)
+        recording = simulate(scene, windows=[(1.5, 1.7)], channels=["SG10", "PVDF7"])
+        assert int(recording.samples.isfinite().sum()) == 2 * 400
+
+
+def test_where_nothing_slides_all_rungs_are_one():
+    bytes_of = {
+        digest(scene_of("arm_motion", "M6", fidelity=rung))
+        for rung in ("kinematic", "lugre", "patch")
+    }
+    assert len(bytes_of) == 1
+
+
+def test_kinds_of_scenes_stand_beside_each_other_in_one_set():
+    arm = [{"speed_mm_s": 40.0, "distance_mm": 20.0, "pause_s": 0.5, "moves": "both"}]
+    source = SimulatedRecordings(
+        cycles=1, materials=["M1"], others={"carried": {"strokes": arm, "tail_s": 0.5}}
+    )
+    paper, carried = source.ids
+    assert source.timeline(carried).onsets_s == ()
+    assert source.timeline(carried).non_slip_s[0][0] == 0.5
+    assert len(source.timeline(paper).onsets_s) == 3
+    assert source.load(carried).samples.isfinite().all()
+
+
+# Refusals ------------------------------------------------------------------------------------
+
+CARRY = (Stroke(40.0, 20.0, 0.5, "both"),)
+AT_ONCE = (Stroke(40.0, 20.0, 0.5), Stroke(40.0, 20.0, 0.0, "both"))
+
+BAD_SCENES = {
+    r"faults names \['PVDF99'\], which this hand does not have": lambda: Scene(
+        "M1", faults=Faults(dead=("PVDF99",))
+    ),
+    r"faults names \['X'\], which this hand": lambda: Scene(
+        "M1", faults=Faults(swapped=(("X", "SG1"),))
+    ),
+    r"Faults names SG1 twice; a channel has one fault": lambda: Faults(
+        dead=("SG1",), saturated=("SG1",)
+    ),
+    r"Faults\.swapped takes pairs of channels, got \('SG1', 'SG1'\)": lambda: Faults(
+        swapped=(("SG1", "SG1"),)
+    ),
+    r"Faults\.drop_ms must be at most 200, got \(1\.0, 300\.0\)": lambda: Faults(
+        drop_ms=(1.0, 300.0)
+    ),
+    r"Faults\.drops_per_s must be finite and not negative, got -1": lambda: Faults(drops_per_s=-1),
+    r"Handling\.taps_per_s must be finite and not negative, got -1": lambda: Handling(
+        taps_per_s=-1
+    ),
+    r"Handling\.carried_kg must be finite and not negative, got nan": lambda: Handling(
+        carried_kg=float("nan")
+    ),
+    r"Handling\.tap_n must be \(low, high\), 0 < low <= high, got \(2, 1\)": lambda: Handling(
+        tap_n=(2, 1)
+    ),
+    r"Stroke\.moves must be one of hand, object, both, got 'nobody'": lambda: Stroke(
+        40.0, moves="nobody"
+    ),
+    r"tail_s must be finite and not negative, got -1": lambda: Scene("M1", tail_s=-1),
+    r"no element in contact": lambda: scene_of("arm_motion", "M1", load_n=0.0),
+    r"carrying 50 kg at 0\.5 m/s2 takes 25 N, more than half of the [\d.]+ N of static": lambda: (
+        timeline(Scene("M1", strokes=CARRY, handling=Handling(carried_kg=50.0)))
+    ),
+    r"in stroke 2, and up to 1 may be left of the slide before: pause longer": lambda: simulate(
+        Scene("M1", strokes=AT_ONCE), windows=[]
+    ),
+    r"no rest long enough for taps of up to 0\.04 s, 0\.1 s to settle and 0\.1 s": lambda: timeline(
+        Scene("M1", strokes=(Stroke(40.0, 20.0, 0.2),), handling=Handling(taps_per_s=1.0))
+    ),
+    r"no rest long enough for grips of up to 1 s": lambda: timeline(
+        Scene("M1", strokes=(Stroke(40.0, 20.0, 1.1),), handling=Handling(grips_per_s=1.0))
+    ),
+    r"machine_hz must lie below 27 Hz at 60 samples a second, got \(30, 50\)": lambda: simulate(
+        scene_of("machine", "M1", machine_hz=(30, 50), sample_rate_hz=60.0)
+    ),
+}
+
+
+@pytest.mark.parametrize("message", BAD_SCENES)
+def test_bad_scenes_are_refused_in_one_line(message):
+    with pytest.raises(ValueError, match=message) as refusal:
+        BAD_SCENES[message]()
+    assert "\n" not in str(refusal.value)
+
+
+def test_what_is_refused_for_one_contact_passes_for_another():
+    heavy = Handling(carried_kg=10.0)
+    firm = Contact(load_n=5.0)
+    with pytest.raises(ValueError, match="more than half"):
+        timeline(Scene("M4", strokes=CARRY, handling=heavy))
+    assert timeline(Scene("M4", strokes=CARRY, handling=heavy, contact=firm)).non_slip_s
+    rested = (AT_ONCE[0], replace(AT_ONCE[1], pause_s=1.0))
+    assert len(timeline(Scene("M1", strokes=rested)).non_slip_s) == 1
