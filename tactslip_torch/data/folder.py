@@ -1,0 +1,150 @@
+"""A folder of recordings: one file each, found again by what determined it, and a manifest."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tactslip_torch.data.archive import Archived, archived_key, load_recording, save_recording
+from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
+from tactslip_torch.files import whole_file
+
+MANIFEST = "manifest.csv"
+
+
+class Format(NamedTuple):
+    """How recordings are kept in files: write one, read it, read no more of it than its key."""
+
+    save: Callable[..., None]
+    load: Callable[[Path], Archived]
+    key: Callable[[Path], dict[str, Any]]
+
+
+FORMATS = {"npz": Format(save_recording, load_recording, archived_key)}
+"""By the ending of their files; a further format is a further line."""
+
+
+class Written(NamedTuple):
+    """A recording that has its file: its line of the manifest, and what that took."""
+
+    line: dict[str, Any]
+    made: bool
+    duration_s: float
+    num_bytes: int
+
+
+@dataclass(frozen=True)
+class RecordingFolder:
+    """Recordings of a source as files in a folder, made where they are not there yet.
+
+    Args:
+        source: the recordings.
+        folder: where the files are.
+        ending: of the files, one of ``FORMATS``.
+        made_by: what determines the samples beside the source's keys: code and libraries.
+
+    Raises:
+        ValueError: if there is no such format.
+    """
+
+    source: RecordingSource
+    folder: Path
+    ending: str
+    made_by: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        if self.ending not in FORMATS:
+            raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {self.ending!r}")
+
+    def path(self, recording: RecordingId) -> Path:
+        """The recording's file."""
+        name = f"{recording.material}_{recording.scene}_{recording.cycle:02d}.{self.ending}"
+        return self.folder / name
+
+    def key(self, recording: RecordingId) -> dict[str, Any]:
+        """What determines the recording's file, as JSON gives it back."""
+        facts = {"recording": dict(self.source.key(recording)), **self.made_by}
+        plain: dict[str, Any] = json.loads(json.dumps(facts, allow_nan=False))
+        return plain
+
+    def check(self) -> None:
+        """Refuse names that files cannot have, and to replace a file that is not ours.
+
+        Raises:
+            ValueError: if there is such a name or file.
+        """
+        paths = [self.path(recording) for recording in self.source.ids]
+        if not paths:
+            raise ValueError("no recording to write; give at least one of materials=[M1,...]")
+        for path in paths:
+            if path.parent != self.folder or not re.fullmatch(r"[\w.+-]+", path.name):
+                raise ValueError(f"{path.name!r} cannot name a file; give the scene another name")
+        if len(set(paths)) < len(paths):
+            raise ValueError("two recordings would have one file; give a scene another name")
+        for path in filter(Path.exists, paths):
+            try:
+                FORMATS[self.ending].key(path)
+            except ValueError as error:
+                raise ValueError(f"{error}; move it away, or give another folder") from error
+
+    def load(self, recording: RecordingId) -> Archived:
+        """What the recording's file holds.
+
+        Raises:
+            FileNotFoundError: if there is none.
+            ValueError: if it is damaged.
+        """
+        return FORMATS[self.ending].load(self.path(recording))
+
+    def write(self, recording: RecordingId) -> Written:
+        """Make the recording's file, unless it is there, whole, and of the same key."""
+        path, key = self.path(recording), self.key(recording)
+        content = self._found(recording, key)
+        made = content is None
+        if content is None:
+            content = self.source.load(recording)
+            FORMATS[self.ending].save(path, content, self.source.hand, key)
+        line = manifest_line(path.name, recording, content)
+        return Written(line, made, content.duration_s, path.stat().st_size)
+
+    def write_manifest(self, written: Sequence[Written]) -> None:
+        """Write the lines of recordings to ``manifest.csv``, whole or not at all."""
+        with (
+            whole_file(self.folder / MANIFEST) as temporary,
+            temporary.open("w", newline="", encoding="utf-8") as file,
+        ):
+            table = csv.DictWriter(file, list(written[0].line), lineterminator="\n")
+            table.writeheader()
+            table.writerows(one.line for one in written)
+
+    def _found(self, recording: RecordingId, key: Mapping[str, Any]) -> Recording | None:
+        try:
+            archived = self.load(recording)
+        except (FileNotFoundError, ValueError):  # not there, or ours but damaged: see check
+            return None
+        return archived.recording if archived.key == key else None
+
+
+def manifest_line(file: str, recording: RecordingId, content: Recording) -> dict[str, Any]:
+    """A recording's line of the manifest; of what there may be several it holds a JSON list."""
+    origin = content.provenance
+    return {
+        "file": file,
+        "material": recording.material,
+        "cycle": recording.cycle,
+        "scene": recording.scene,
+        "onsets_s": json.dumps(content.onsets_s),
+        "annotated_onsets_s": json.dumps(content.annotated_onsets_s),
+        "sliding_s": json.dumps(content.sliding_s),
+        "non_slip_s": json.dumps(content.non_slip_s),
+        "speeds_mm_s": json.dumps(content.speeds_mm_s),
+        "sample_rate_hz": content.sample_rate_hz,
+        "simulated": str(bool(origin.get("simulated"))).lower(),
+        "fidelity": origin.get("fidelity", ""),
+        "seed": origin.get("seed", ""),
+    }
