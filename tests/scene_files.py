@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 
 from tactslip_torch.config import conf_dir
@@ -36,7 +37,7 @@ def scene_of(name: str, material: str, cycle: int = 0, **changes: Any) -> Scene:
 
 
 def volts(scene: Scene) -> np.ndarray:
-    return simulate(scene).samples.double().numpy()
+    return simulate(scene, dtype=torch.float64).samples.numpy()
 
 
 def difference(name: str, material: str, knob: str, cycle: int = 0, **changes: Any) -> np.ndarray:
@@ -67,6 +68,11 @@ def insides(scene: Scene) -> tuple[Grasp, tuple[ArmStroke, ...], Handled]:
     grasp = draw_grasp(scene)
     plan = arm_strokes(scene.strokes, scene.acceleration_m_s2)
     return grasp, plan, Handled(scene, grasp, plan)
+
+
+def end_s(scene: Scene) -> float:
+    """Where disturbances end: not rounded up to a whole number of samples."""
+    return insides(scene)[1][-1].stop_s + scene.tail_s
 
 
 def whole_grid(num_samples: int) -> Grid:
