@@ -47,7 +47,7 @@ def slips(grasp: Grasp, plan: tuple[ArmStroke, ...]) -> StickSlips:
     for number, stroke in enumerate(plan):
         if number:
             pause_s = stroke.start_s - plan[number - 1].stop_s
-            before[number] = after_slide * _relaxed(grasp, np.asarray(pause_s))
+            before[number] = after_slide * relaxed(grasp, np.asarray(pause_s))
         travel_mm = (1.0 - before[number]) * grasp.presliding_mm
         start_s[number] = stroke.time_of_travel_s(travel_mm)
         end_s[number] = stroke.time_of_travel_s(stroke.distance_mm - restick_mm)
@@ -62,7 +62,7 @@ def _shear_after_slide(grasp: Grasp) -> Array:
     return np.full(len(grasp.load_n), ratio + RESTICK_SHARE * (1.0 - ratio))
 
 
-def _relaxed(grasp: Grasp, rest_s: Array, element: int | slice = slice(None)) -> Array:
+def relaxed(grasp: Grasp, rest_s: Array, element: int | slice = slice(None)) -> Array:
     """Share of the shear left after a rest."""
     decay = -np.expm1(-rest_s / grasp.relaxation_time_s[element])
     return np.asarray(1.0 - grasp.relaxation[element] * decay, dtype=np.float64)
@@ -95,7 +95,7 @@ def shear_share(
         sliding = ratio + (1.0 - ratio) * np.exp(-np.maximum(t - let_go_s, 0.0) / recoil_s)
         after = slips.shear_after[number, element]
         sticking = after - (stroke.distance_mm - travel_mm) / presliding_mm
-        rest = after * _relaxed(grasp, np.maximum(t - stroke.stop_s, 0.0), element)
+        rest = after * relaxed(grasp, np.maximum(t - stroke.stop_s, 0.0), element)
         value = np.where(t > let_go_s, sliding, np.minimum(stretching, 1.0))
         value = np.where(t >= stick_s, sticking, value)
         value = np.where(t >= stroke.stop_s, rest, value)

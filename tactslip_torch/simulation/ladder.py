@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from tactslip_torch.simulation.contact import ContactModel
+from tactslip_torch.simulation.dynamics.contact import DynamicContact
 from tactslip_torch.simulation.grasp import Grasp
 from tactslip_torch.simulation.kinematic import KinematicContact
 from tactslip_torch.simulation.motion import ArmStroke
@@ -12,6 +13,8 @@ from tactslip_torch.simulation.scene import Scene
 
 _RUNGS: dict[str, Callable[[Scene, Grasp, tuple[ArmStroke, ...]], ContactModel]] = {
     "kinematic": KinematicContact,
+    "lugre": DynamicContact,
+    "patch": DynamicContact,
 }
 """What models each of ``FIDELITIES``."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactslip_torch.simulation.grasp import Grasp
 from tactslip_torch.simulation.randomness import Array
@@ -13,12 +14,17 @@ RUNOUT_PERIOD_MM = 180.0
 
 
 def normal_force(
-    scene: Scene, grasp: Grasp, element: int, position_mm: Array, time_s: Array
+    scene: Scene,
+    grasp: Grasp,
+    element: int | NDArray[np.int64],
+    position_mm: Array,
+    time_s: Array,
 ) -> Array:
     """Newtons: the surface's run-out over travel, and creep after the grasp like the shear.
 
     Shape:
-        - position_mm, time_s, output: any one shape
+        - position_mm, time_s, output: any one shape; with several elements ``[E]`` the times are
+          ``[*, 1]`` and the output is ``[*, E]``
     """
     angle = 2 * np.pi / RUNOUT_PERIOD_MM * position_mm
     runout = scene.contact.runout * np.sin(angle + grasp.runout_phase[element])

@@ -30,6 +30,11 @@ class Material:
             broad ``k^-a`` part.
         texture_mv: rms of the texture's vibration at 40 mm/s and 1 N at a PVDF film (prior, ours).
         character: see ``Character``.
+        stribeck_mm_s: speed over which static becomes kinetic friction on the dynamic rungs;
+            near the speeds of sliding it makes a material stick and slip (PHYSICS.md).
+        fast_ratio: kinetic over static friction far above that speed, on the dynamic rungs, where
+            it is not ``mu_ratio``: a tacky material's is the mean over sticking and slipping at
+            the speeds of sliding. The range is drawn with ``mu_ratio``, low with low.
 
     Raises:
         ValueError: if friction is not positive, kinetic exceeds static friction, or a range is
@@ -45,6 +50,8 @@ class Material:
     line_share: float
     texture_mv: float
     character: Character
+    stribeck_mm_s: float = 10.0
+    fast_ratio: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.mu_s > 0:
@@ -79,11 +86,13 @@ def _prior(
         line_share,
         texture_mv,
         character,
+        *((50.0, (0.4, 0.55)) if character == "tacky" else (10.0, None)),
     )
 
 
 # Friction, Ra and wavelengths: PHYSICS.md's table. Texture levels: rough 150 mV and smooth 10 mV
-# (its starting knobs), the materials between by roughness and softness (prior, ours).
+# (its starting knobs), the materials between by roughness and softness (prior, ours). The tacky
+# fast_ratio: with it the force oscillates by about a quarter (prior, ours).
 MATERIALS: dict[str, Material] = {
     "M1": _prior("ABS", 0.8, (5.0, 12.0), 150.0, "rough", (0.18, 0.22), 0.05),
     "M2": _prior("aluminium foil", 0.7, (0.15, 0.25), 10.0),

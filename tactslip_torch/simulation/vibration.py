@@ -94,11 +94,15 @@ def _lines(scene: Scene, grasp: Grasp, position_mm: Array, speed_mm_s: Array) ->
 
 
 def _line_table(scene: Scene, surface: Surface) -> tuple[list[float], list[float]]:
-    """Wavelengths in mm and weights whose squares sum to 1; empty without a wavelength."""
-    if surface.wavelength_mm is None:
+    """Wavelengths in mm and weights whose squares sum to 1; empty without a wavelength.
+
+    A tacky material's lines stand for its stick-slip, so a rung that sticks and slips has none.
+    """
+    tacky = surface.material.character == "tacky"
+    if surface.wavelength_mm is None or (tacky and scene.fidelity != "kinematic"):
         return [], []
     rng = generator(*session_key(scene, "lines"), scene.material)
-    orders = np.repeat([1, 2, 3, 4], 2) if surface.material.character == "tacky" else np.ones(6)
+    orders = np.repeat([1, 2, 3, 4], 2) if tacky else np.ones(6)
     spread = lognormal(rng, surface.material.line_bandwidth, len(orders))
     weights = (1.0 / orders) / np.sqrt(np.sum(1.0 / orders**2))
     return (surface.wavelength_mm * spread / orders).tolist(), weights.tolist()

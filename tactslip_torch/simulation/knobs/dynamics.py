@@ -17,14 +17,17 @@ class Dynamics:
     Args:
         step_us: of the integration; a whole number of steps makes a sample.
         bristle_share: share of the presliding travel that the bristles of the ``"patch"`` rung
-            take, the skin behind them the rest (prior, ours). It sets how long incipient slip is.
+            take, the skin behind them the rest (prior, ours). It sets how long incipient slip is,
+            and how gently the patch lets go: a bristle's friction falls with the patch's speed.
         num_bristles: of the ``"patch"`` rung, under a Hertz pressure.
         bristle_stiffness_n_m: of the single bristle of the ``"lugre"`` rung.
+        skin_damping: damping ratio of the skin beyond that with which the kinematic rung rings
+            (prior, ours). Without it smooth materials stick and slip on soft skin at 20 to 60 mm/s.
         bristle_damping: damping ratio of the bristles with the skin's mass (prior, ours).
         viscous_n_s_m: viscous friction, which the kinematic rung does not have.
         release_v_per_n: PVDF volts per newton of the skin's inertia: what a film at the
-            surface hears when the skin lets go and rings (prior, ours: the kinematic rung's onset
-            pulse at a kinetic over static friction of .85).
+            surface hears when the skin lets go (prior, ours: so that the bursts of M2 to M5
+            stand out of their slides on the ``"lugre"`` rung, REFERENCE.md section 6, *signals*).
 
     Raises:
         ValueError: if a knob is negative or not finite, a step is longer than 5 ms or zero, or
@@ -32,12 +35,13 @@ class Dynamics:
     """
 
     step_us: float = 250.0
-    bristle_share: float = 0.5
+    bristle_share: float = 0.2
     num_bristles: int = 24
     bristle_stiffness_n_m: float = 1e5
+    skin_damping: float = 0.5
     bristle_damping: float = 1.0
     viscous_n_s_m: float = 0.0
-    release_v_per_n: float = 3.3
+    release_v_per_n: float = 8.0
 
     def __post_init__(self) -> None:
         require_finite(self)
