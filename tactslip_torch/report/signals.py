@@ -30,7 +30,7 @@ Channels = Sequence[Mapping[str, str]]
 """Rows of ``name``, ``kind``, ``finger``, ``segment``, as ``HandLayout.to_rows`` gives them."""
 
 _STRETCHES = 1200  # of each line, of which the least and the greatest sample are drawn
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#AA4488", "#C58A00", "#3A94C4", "#444444")
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#AA4488", "#E69F00", "#444444", "#56B4E9")
 _PALER = {"distal": 0.0, "middle": 0.3, "proximal": 0.5}
 _INK, _GREY = "#222222", "#666666"
 _SLIDE: dict[str, Any] = {"facecolor": "#E4E4E4", "edgecolor": "none", "zorder": 0}
@@ -78,13 +78,13 @@ class SignalRow:
     non_slip_s: Sequence[tuple[float, float]] = ()
 
     def around(self, stroke: int, before_s: float, after_s: float) -> tuple[float, float]:
-        """Where to look for a stroke: around its onset or, if nothing slips, its start.
+        """Where to look for a stroke: around its onset or, where nothing slips, its start.
 
-        Strokes count from 1 in the order of time; the last stands for those that are not there,
-        and the whole recording for a stroke where there is none.
+        Strokes count from 1; the last stands for those that are not there, and the whole
+        recording for a stroke where there is none.
         """
         duration_s = self.volts.shape[-1] / self.sample_rate_hz
-        begins = sorted([*self.onsets_s, *(start for start, _ in self.non_slip_s)])
+        begins = self.onsets_s or [start for start, _ in self.non_slip_s]
         if not begins:
             return 0.0, duration_s
         centre_s = begins[min(stroke, len(begins)) - 1]
@@ -125,13 +125,15 @@ def draw_signals(
         views: ``(start, end)`` in seconds of what is shown of each row, ``None`` for all.
 
     Raises:
-        ValueError: if there is no row, or views or channels are fewer or more than there are.
+        ValueError: if there is no row, or channels or views are fewer or more than wanted.
     """
     if not rows:
         raise ValueError("no recording to draw; give at least one row")
-    wrong = [row.title for row in rows if len(row.volts) != len(channels)]
-    if wrong or (views is not None and len(views) != len(rows)):
-        raise ValueError(f"a view per row and {len(channels)} channels in each, not in {wrong}")
+    for row in rows:
+        if len(row.volts) != len(channels):
+            raise ValueError(f"{row.title} has {len(row.volts)} channels, not {len(channels)}")
+    if views is not None and len(views) != len(rows):
+        raise ValueError(f"views must be one per row, got {len(views)} for {len(rows)}")
     present = {channel["kind"] for channel in channels}
     columns = [column for column in _COLUMNS if column.kind in present]
     figure = Figure(figsize=(13.0, 1.9 * len(rows) + 1.3), layout="constrained")

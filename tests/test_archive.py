@@ -1,0 +1,278 @@
+"""Recordings in files: what goes in comes out, bit for bit, and nothing else is read as one."""
+
+import json
+import time
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from tactslip_torch import HandLayout, Recording
+from tactslip_torch.data.archive import FORM, archived_key, load_recording, save_recording
+
+TRUTH = ("onsets_s", "annotated_onsets_s", "sliding_s", "non_slip_s", "speeds_mm_s")
+times = st.floats(0, 100, allow_nan=False)
+stretches = st.tuples(times, times).map(lambda pair: (min(pair), max(pair)))
+words = st.text(st.characters(exclude_characters="\0"), max_size=8)
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(words, inner, max_size=3),
+    max_leaves=6,
+)
+facts = st.dictionaries(words, plain, max_size=4)
+KEY = {"scene": {"seed": 3}, "code": "abc"}
+
+
+def hand_of(names):
+    kinds = ("SG", "PVDF")
+    return HandLayout.from_rows(
+        {"name": name, "kind": kinds[i % 2], "finger": f"f{i}", "segment": name[::-1]}
+        for i, name in enumerate(names)
+    )
+
+
+def recording(**changes):
+    generator = torch.Generator().manual_seed(5)
+    values = {
+        "samples": torch.randn(2, 400, generator=generator),
+        "sample_rate_hz": 2000.0,
+        "material": "M1",
+        "speeds_mm_s": (20.0, 40.0),
+        "onsets_s": (0.05, 0.1 + 1e-9),
+        "sliding_s": ((0.05, 0.1), (0.1, 0.2)),
+        "annotated_onsets_s": (0.06, 1 / 3),
+        "non_slip_s": ((0.01, 0.02),),
+        "provenance": {"simulated": True, "seed": 3, "fidelity": "kinematic"},
+    }
+    return Recording(**(values | changes))
+
+
+def assert_same(found, wanted):
+    assert found.samples.dtype == wanted.samples.dtype
+    assert found.samples.numpy().tobytes() == wanted.samples.numpy().tobytes()
+    assert found.samples.shape == wanted.samples.shape
+    for name in (*TRUTH, "sample_rate_hz", "material", "provenance"):
+        assert getattr(found, name) == getattr(wanted, name), name
+
+
+@given(data=st.data())
+@settings(max_examples=60)
+def test_what_goes_in_comes_out(tmp_path_factory, data):
+    names = data.draw(st.lists(words, min_size=1, max_size=4, unique=True))
+    dtype = data.draw(st.sampled_from([np.float32, np.float64]))
+    width = np.dtype(dtype).itemsize
+    num_samples = data.draw(st.integers(0, 9))
+    size = len(names) * num_samples * width
+    raw = data.draw(st.binary(min_size=size, max_size=size))  # every NaN and subnormal as well
+    samples = np.frombuffer(raw, dtype).reshape(len(names), num_samples).copy()
+    strokes = data.draw(st.integers(0, 3))
+
+    def some(what):
+        return tuple(data.draw(st.lists(what, min_size=strokes, max_size=strokes)))
+
+    wanted = Recording(
+        torch.from_numpy(samples),
+        data.draw(st.floats(0.1, 1e6)),
+        data.draw(words),
+        some(times),
+        some(times),
+        some(stretches),
+        some(times),
+        tuple(data.draw(st.lists(stretches, max_size=3))),
+        data.draw(facts),
+    )
+    key = data.draw(facts)
+    path = tmp_path_factory.mktemp("archive") / "a.npz"
+    save_recording(path, wanted, hand_of(names), key)
+    found = load_recording(path)
+    assert_same(found.recording, wanted)
+    assert found.hand == hand_of(names)
+    assert found.key == key
+    assert archived_key(path) == key
+
+
+def test_numpy_alone_reads_it(tmp_path):
+    wanted, hand = recording(), hand_of(["a", "bc"])
+    save_recording(tmp_path / "a.npz", wanted, hand, KEY)
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as content:
+        np.testing.assert_array_equal(content["samples"], wanted.samples.numpy())
+        assert content["units"] == "V"
+        assert content["channel_name"].tolist() == ["a", "bc"]
+        assert content["channel_kind"].tolist() == ["SG", "PVDF"]
+        assert content["channel_finger"].tolist() == ["f0", "f1"]
+        assert content["channel_segment"].tolist() == ["a", "cb"]
+        assert content["sliding_s"].tolist() == [list(pair) for pair in wanted.sliding_s]
+        assert json.loads(str(content["provenance"])) == wanted.provenance
+
+
+def test_equal_recordings_are_equal_bytes_at_any_time(tmp_path, monkeypatch):
+    save_recording(tmp_path / "a.npz", recording(), hand_of("ab"), KEY)
+    monkeypatch.setattr(time, "time", lambda: 2e9)
+    save_recording(tmp_path / "b.npz", recording(), hand_of("ab"), dict(reversed(KEY.items())))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_samples_in_any_layout_are_kept(tmp_path):
+    strided = torch.arange(24.0).reshape(12, 2).T
+    assert not strided.is_contiguous()
+    save_recording(tmp_path / "a.npz", recording(samples=strided), hand_of("ab"), {})
+    assert torch.equal(load_recording(tmp_path / "a.npz").recording.samples, strided)
+
+
+# What cannot be kept -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "names", "key", "said"),
+    [
+        ({"samples": torch.zeros(2, 9, dtype=torch.float16)}, "ab", {}, "float32 or float64.*16"),
+        ({"samples": torch.zeros(2, 9, dtype=torch.int64)}, "ab", {}, "float32 or float64.*int64"),
+        ({}, "abc", {}, "the hand has 3 channels, the recording 2"),
+        ({"material": "M1\0"}, "ab", {}, "must not hold a NUL"),
+        ({}, ["a", "b\0"], {}, "must not hold a NUL"),
+        ({"provenance": {"by": object()}}, "ab", {}, "provenance must be plain JSON"),
+        ({}, "ab", {"rate": float("nan")}, "key must be plain JSON"),
+    ],
+)
+def test_what_cannot_be_kept_is_refused_and_nothing_is_lost(tmp_path, changes, names, key, said):
+    path = tmp_path / "a.npz"
+    path.write_bytes(b"before")
+    with pytest.raises(ValueError, match=said):
+        save_recording(path, recording(**changes), hand_of(names), key)
+    assert path.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+# What is no recording ------------------------------------------------------------------------
+
+
+def assert_refused(path, said="is damaged or no recording of ours"):
+    for read in (load_recording, archived_key):
+        with pytest.raises(ValueError, match=said) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+        assert str(path) in str(caught.value)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    np.savez(tmp_path / "theirs.npz", samples=np.zeros((2, 9)))
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    np.save(tmp_path / "pickled.npy", np.array([{}], dtype=object), allow_pickle=True)
+    (tmp_path / "empty.npz").write_bytes(b"")
+    (tmp_path / "text.npz").write_text("time,volts\n0,1\n")
+    torch.save({"format": FORM}, tmp_path / "torch.npz")
+    for path in sorted(tmp_path.iterdir()):
+        assert_refused(path)
+
+
+def test_nothing_pickled_is_read(tmp_path):
+    """A file like ours whose samples are Python objects: loading those would run code."""
+    path = tmp_path / "a.npz"
+    save_recording(path, recording(), hand_of("ab"), KEY)
+    with np.load(path) as content:
+        parts = dict(content)
+    np.savez(path, **(parts | {"samples": np.array([[print], [print]], dtype=object)}))
+    with pytest.raises(ValueError, match="is damaged"):
+        load_recording(path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"samples": np.zeros((2, 9), dtype=np.int32)},
+        {"samples": np.zeros(9)},
+        {"samples": np.zeros((3, 9))},
+        {"samples": np.zeros((2, 9), dtype=np.complex64)},
+        {"units": np.array("mV")},
+        {"channel_kind": np.array(["SG", "IMU"])},
+        {"channel_name": np.array(["a", "a"])},
+        {"channel_name": np.array(["a"])},
+        {"onsets_s": np.array([0.1])},
+        {"sliding_s": np.zeros((2, 3))},
+        {"sample_rate_hz": np.array(-1.0)},
+        {"provenance": np.array("{")},
+        {"key": np.array("3")},
+    ],
+)
+def test_parts_that_do_not_belong_together_are_refused(tmp_path, changes):
+    path = tmp_path / "a.npz"
+    save_recording(path, recording(), hand_of("ab"), KEY)
+    with np.load(path) as content:
+        parts = dict(content)
+    np.savez(path, **parts)
+    assert_same(load_recording(path).recording, recording())  # rewritten, but whole
+    np.savez(path, **(parts | changes))
+    with pytest.raises(ValueError, match="is damaged or no recording of ours"):
+        load_recording(path)
+
+
+def test_a_later_format_is_named(tmp_path):
+    path = tmp_path / "a.npz"
+    save_recording(path, recording(), hand_of("ab"), KEY)
+    with np.load(path) as content:
+        parts = dict(content)
+    np.savez(path, **(parts | {"format": np.array("tactslip_torch recording 2")}))
+    assert_refused(path, "must be of format 'tactslip_torch recording 1', got '.* 2'")
+
+
+def test_a_part_that_is_missing_is_noticed(tmp_path):
+    path = tmp_path / "a.npz"
+    save_recording(path, recording(), hand_of("ab"), KEY)
+    with np.load(path) as content:
+        parts = dict(content)
+    for name in parts:
+        np.savez(path, **{other: parts[other] for other in parts if other != name})
+        with pytest.raises(ValueError, match="is damaged"):
+            load_recording(path)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "a.npz"
+    save_recording(path, recording(), hand_of("ab"), KEY)
+    return path.read_bytes()
+
+
+@given(where=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
+@example(where=0.5, bits=1)
+@settings(max_examples=150)
+def test_a_damaged_byte_is_noticed_or_does_not_matter(whole, tmp_path_factory, where, bits):
+    content = bytearray(whole)
+    content[int(where * len(content))] ^= bits
+    path = tmp_path_factory.mktemp("damaged") / "a.npz"
+    path.write_bytes(content)
+    try:
+        found = load_recording(path)
+    except ValueError:
+        return
+    assert_same(found.recording, recording())
+    assert (found.hand, found.key) == (hand_of("ab"), KEY)
+
+
+def test_a_damaged_sample_is_noticed(whole, tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(whole)
+    with zipfile.ZipFile(path) as archive:
+        start = archive.getinfo("samples.npy").header_offset
+    for offset in (400, 1000, 2000):
+        content = bytearray(whole)
+        content[start + offset] ^= 1
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="is damaged"):
+            load_recording(path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_a_cut_file_is_refused(whole, tmp_path, share):
+    path = tmp_path / "a.npz"
+    path.write_bytes(whole[: int(share * len(whole))])
+    assert_refused(path)
+
+
+def test_no_file_is_said_as_such(tmp_path):
+    for read in (load_recording, archived_key):
+        with pytest.raises(FileNotFoundError, match=r"no file at .*a\.npz"):
+            read(tmp_path / "a.npz")
