@@ -9,7 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 RESOLUTION = 0.02
-"""Points closer than this on the line of difficulty are not told apart."""
+"""How closely a target is bracketed on the line of difficulty."""
+
+FACTS_RESOLUTION = 0.1
+"""How closely the place is bracketed where the facts begin to fail."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +76,11 @@ def _is_met(point: Point, target: float, tolerance: float) -> bool:
 def _between(near: Point, far: Point, target: float, way: int) -> float | None:
     """A place within the bracket, or ``None`` if it is too narrow."""
     low, high = way * near.difficulty, way * far.difficulty
-    if high - low <= RESOLUTION:
+    crosses = way * (far.accuracy - target) <= 0
+    if high - low <= (RESOLUTION if crosses else FACTS_RESOLUTION):
         return None
     share = 0.5
-    if way * (far.accuracy - target) <= 0:
+    if crosses:
         share = (near.accuracy - target) / (near.accuracy - far.accuracy)
     place = low + min(max(share, 0.1), 0.9) * (high - low)
     return way * round(min(max(place, low + RESOLUTION / 2), high - RESOLUTION / 2), 2)
