@@ -22,7 +22,7 @@ from tactslip_torch.simulation.dynamics import (
 )
 
 FINE_S = 50e-6
-UNTIL_S = 0.12
+UNTIL_S = 0.08
 CASES = {
     "smooth 20 mm/s": (SMOOTH, 0.02),
     "smooth 60 mm/s": (SMOOTH, 0.06),
@@ -285,6 +285,19 @@ def test_engines_agree(n: int) -> None:
         torch.testing.assert_close(mine, other, rtol=1e-8, atol=1e-15)
 
 
+def test_a_load_below_nothing_is_none(engine: str) -> None:
+    lanes = varied(2)
+    start = LaneState.sticking(lanes)
+
+    def pulled(times: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:
+        arm, _ = shaken(times)
+        return arm, torch.sin(90.0 * times)[:, None, None].clamp(least)
+
+    below, _ = integrate(lanes, start, lambda t: pulled(t, -1.0), 300, 250e-6, engine=engine)
+    none, _ = integrate(lanes, start, lambda t: pulled(t, 0.0), 300, 250e-6, engine=engine)
+    assert_same(none, below)
+
+
 def test_pieces_make_the_whole(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
     lanes = varied(4)
     start = LaneState.sticking(lanes)
@@ -305,6 +318,29 @@ def test_pieces_make_the_whole(engine: str, monkeypatch: pytest.MonkeyPatch) -> 
     for other in (same, state):
         for mine, its in zip(vars(end).values(), vars(other).values(), strict=True):
             assert torch.equal(mine, its)
+
+
+def test_no_bit_depends_on_a_neighbour() -> None:
+    """Compiled, a lane's bytes are the same in any order, company and block."""
+    pytest.importorskip("numba")
+    masses, loads = torch.linspace(0.0, 1e-2, 37), torch.linspace(0.0, 2.0, 37)
+
+    def friction(order: torch.Tensor) -> torch.Tensor:
+        lanes = TACKY.lanes(m=masses[order], pressure=hertz_pressure(3))
+        load = loads[order].double()
+        trace, _ = integrate(
+            lanes,
+            LaneState.sticking(lanes),
+            lambda t: (0.05 * torch.sin(70.0 * t)[:, None], load.expand(len(t), -1)),
+            400,
+            250e-6,
+            engine="compiled",
+        )
+        return trace.friction_n
+
+    together, order = friction(torch.arange(37)), torch.arange(36, -1, -1)
+    assert torch.equal(friction(order), together[:, order])
+    assert torch.equal(friction(order[:5]), together[:, order[:5]])
 
 
 def test_each_lane_is_alone(engine: str) -> None:
@@ -350,11 +386,11 @@ def test_manners(dtype: torch.dtype, engine: str) -> None:
 
 def test_auto_takes_what_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("numba")
-    from tactslip_torch.simulation.dynamics import compiled
+    from tactslip_torch.simulation.dynamics import packing
 
     taken = []
-    carry = compiled.carry
-    monkeypatch.setattr(compiled, "carry", lambda *a: taken.append(1) or carry(*a))
+    carry = packing.carry
+    monkeypatch.setattr(packing, "carry", lambda *a: taken.append(1) or carry(*a))
     lanes = varied()
     integrate(lanes, LaneState.sticking(lanes), shaken, 2, 250e-6)
     assert taken

@@ -1,37 +1,39 @@
-"""The scheme of ``stage`` and ``stepper`` as a kernel that numba compiles: float64, on the CPU.
+"""The scheme of ``stage`` and ``eager`` as a kernel that numba compiles: float64, on the CPU.
 
-Line by line what the eager engine does, lane by lane in place of all at once, so that both take the
-same steps of Newton. All that is compiled stands in this file: numba looks for changes here alone.
+Lanes are carried in blocks of 16, each with the steps of Newton that the eager engine takes; those
+that are done wait for the slowest. What belongs to a block lies in one array, 16 numbers for each
+quantity, so that LLVM sees that none overlap and uses vectors; loops over fewer it would unroll
+first. A block is always full, so that no lane's bits depend on its place or its neighbours. All
+that is compiled stands in this file: numba looks for changes here alone.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-import torch
-from torch import Tensor
-
-from tactslip_torch.simulation.dynamics.lanes import Lanes, LaneState
-from tactslip_torch.simulation.dynamics.stage import GAMMA, MOST_EVALUATIONS, PATIENCE
 
 Array = np.ndarray[Any, Any]
-Constants = tuple[float, float, float, float, float]
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+_SIDE = 16  # lanes in a block
 _FADED = 6.5
-_NEAR = 1e-4  # Stribeck speeds, below which exp(-(v/vs)^2) is its series to rounding
 _EPS = float(np.finfo(np.float64).eps)
-_CLOSE = math.sqrt(_EPS)
+_CLOSE = _EPS**0.5
 _FLOOR = float(np.finfo(np.float64).tiny) ** 0.25
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"reassoc", "contract", "nsz", "arcp"},
 }
+
+# Where the numbers of a quantity start; the first twelve are given, the next three the state.
+_M, _K, _K1, _TAU, _C, _MU_S, _MU_K, _VS, _S, _D0, _RELAXED, _INERTIA = range(0, 12 * _SIDE, _SIDE)
+_U, _V, _Q, _U0, _V0, _Q0, _START, _RATE_V = range(12 * _SIDE, 20 * _SIDE, _SIDE)
+_ARM, _LOAD, _TURN, _OFFSET, _LOW, _HIGH, _X, _TRIED = range(20 * _SIDE, 28 * _SIDE, _SIDE)
+_DONE, _MU, _MU_SLOPE, _FORCE, _SLOPE, _END = range(28 * _SIDE, 34 * _SIDE, _SIDE)
 
 
 def _inner(function: Function) -> Function:
@@ -46,107 +48,141 @@ def _kernel(function: Function) -> Function:
 
 
 @_inner
-def _fading(ratio: float) -> float:
-    """``exp(-ratio^2)``."""
-    if ratio >= _FADED:
-        return 0.0
-    square = ratio * ratio
-    if ratio < _NEAR:
-        return 1.0 - square
-    return math.exp(-square)
+def _friction(at: Array) -> None:
+    """Friction coefficient and slope at the speeds; ``exp(-r^2)`` as a power, in vectors."""
+    for b in range(_SIDE):
+        ratio = at[_X + b] / at[_VS + b]
+        ratio = ratio if ratio < _FADED else _FADED
+        y = ratio * ratio * (-1.0 / 256.0)
+        power = 1.0
+        for k in range(11, 0, -1):
+            power = 1.0 + y / k * power
+        for _ in range(8):
+            power *= power
+        power = power if ratio < _FADED else 0.0
+        fading = (at[_MU_S + b] - at[_MU_K + b]) * power
+        at[_MU + b] = at[_MU_K + b] + fading
+        at[_MU_SLOPE + b] = fading * (-2.0 * ratio / at[_VS + b])
+        at[_FORCE + b] = 0.0
+        at[_SLOPE + b] = 0.0
 
 
 @_inner
-def _left(
-    v: float,
-    a: float,
-    inertia: float,
-    offset: float,
-    load: Array,
-    base: Array,
-    constants: Constants,
-) -> tuple[float, float, float]:
-    """What is left of a stage's equation at a speed, its slope, and the bristles' force."""
-    s, d0, mu_s, mu_k, stribeck = constants
-    ratio = min(v / stribeck, _FADED)
-    fading = (mu_s - mu_k) * _fading(ratio)
-    mu = mu_k + fading
-    mu_slope = fading * (-2.0 * ratio / stribeck)
-    lag = a * s
-    force = 0.0
-    slope = 0.0
-    for i in range(load.shape[0]):
-        most = load[i] * mu_k
-        g = load[i] * mu
-        g_slope = load[i] * mu_slope
-        below, damped = g + lag * v, most + d0 * v
-        if load[i] == 0.0:
-            below, damped = 1.0, 1.0
+def _pull(at: Array, bent: Array, weight: float, i: int, a: float) -> None:
+    """Add a bristle's force and slope: ``bristles.pull``."""
+    for b in range(_SIDE):
+        x, s, d0, load = at[_X + b], at[_S + b], at[_D0 + b], at[_LOAD + b] * weight
+        base, lag = bent[i, b], a * s
+        most, g, g_slope = load * at[_MU_K + b], load * at[_MU + b], load * at[_MU_SLOPE + b]
+        below = g + lag * x if load > 0.0 else 1.0
+        damped = most + d0 * x if load > 0.0 else 1.0
         both = 1.0 / (below * damped)
         share, damped = damped * both, below * both
-        reached = base[i] + a * v
+        reached = base + a * x
         bristle = g * reached * share
-        free = g - s * base[i]
-        rate = v * free * share
+        free = g - s * base
+        rate = x * free * share
         damping = d0 * most * damped
-        force += s * bristle + damping * rate
-        slope += (
+        at[_FORCE + b] += s * bristle + damping * rate
+        at[_SLOPE + b] += (
             s * (g_slope * reached + g * a - bristle * (g_slope + lag))
-            + damping * (free + v * g_slope - rate * (g_slope + lag))
+            + damping * (free + x * g_slope - rate * (g_slope + lag))
         ) * share - damping * d0 * damped * rate
-    return inertia * v + offset + a * force, inertia + a * slope, force
 
 
 @_inner
-def _root(
-    guess: float,
-    high: float,
-    search: tuple[int, int],
-    a: float,
-    inertia: float,
-    offset: float,
-    load: Array,
-    base: Array,
-    constants: Constants,
-) -> float:
-    """``stage._root`` of one lane."""
-    most_evaluations, patience = search
-    low = 0.0
-    v = min(max(guess, 0.0), high)
-    was_low = False
-    for number in range(most_evaluations):
-        left, slope, force = _left(v, a, inertia, offset, load, base, constants)
-        exact = abs(left) <= 4.0 * _EPS * (inertia * v + abs(offset) + a * abs(force))
-        if left < 0.0:
-            low = v
-        else:
-            high = v
-        wanted = v - left / slope
-        outside = not (wanted >= low and wanted <= high)
-        if number >= patience and number % 2 == 1:
-            outside = True
-        if outside:
-            if exact:
-                return v
-            if not was_low and number < patience:
-                wanted = low
-                was_low = True
-            else:
-                wanted = low + 0.5 * (high - low)
-        elif exact or abs(wanted - v) <= _CLOSE * v:
-            return wanted
-        v = wanted
-    return v
+def _newton(at: Array, a: float, halve: bool, may_try: bool) -> float:
+    """One step for each speed, as in ``stage._root``; how many lanes are not done."""
+    still = 0.0
+    for b in range(_SIDE):
+        x, low, high, done = at[_X + b], at[_LOW + b], at[_HIGH + b], at[_DONE + b]
+        offset, force, inertia = at[_OFFSET + b], at[_FORCE + b], at[_INERTIA + b]
+        left = inertia * x + offset + a * force
+        exact = abs(left) <= 4.0 * _EPS * (inertia * x + abs(offset) + a * abs(force))
+        low, high = (x, high) if left < 0.0 else (low, x)
+        wanted = x - left / (inertia + a * at[_SLOPE + b])
+        inside = (wanted >= low) & (wanted <= high) & (not halve)
+        to_low = (not inside) & (not exact) & may_try & (at[_TRIED + b] == 0.0)
+        close = exact | (inside & (abs(wanted - x) <= _CLOSE * x))
+        other = low if to_low else low + 0.5 * (high - low)
+        other = x if exact else other
+        wanted = wanted if inside else other
+        at[_X + b] = x if done > 0.0 else wanted
+        at[_LOW + b] = low
+        at[_HIGH + b] = high
+        at[_TRIED + b] = 1.0 if to_low else at[_TRIED + b]
+        done = 1.0 if close else done
+        at[_DONE + b] = done
+        still += 1.0 - done
+    return still
+
+
+@_inner
+def _begin(at: Array, z: Array, bent: Array, pressure: Array, a: float) -> None:
+    """Set up a stage: loads, what bristles start from, the side of the root and its bracket."""
+    for b in range(_SIDE):
+        ahead = at[_RELAXED + b] * (at[_Q0 + b] + a * at[_K1 + b] * at[_ARM + b])
+        pulled = at[_K + b] * (at[_U0 + b] + a * at[_ARM + b]) + ahead
+        at[_OFFSET + b] = -at[_M + b] * at[_V0 + b] - a * (pulled + at[_C + b] * at[_ARM + b])
+        at[_FORCE + b] = 0.0
+        load = at[_LOAD + b]
+        at[_LOAD + b] = load if load > _FLOOR else 0.0
+    for i in range(pressure.shape[0]):
+        for b in range(_SIDE):
+            most = at[_LOAD + b] * pressure[i] * (at[_MU_S + b] / at[_S + b])
+            base = z[i, b]
+            base = base if base > -most else -most
+            base = base if base < most else most
+            bent[i, b] = base
+            at[_FORCE + b] += at[_S + b] * base
+    for b in range(_SIDE):
+        offset = at[_OFFSET + b]
+        turn = -1.0 if offset + a * at[_FORCE + b] > 0.0 else 1.0
+        offset *= turn
+        high = (3.0 * a * at[_MU_S + b] * at[_LOAD + b] - offset) / at[_INERTIA + b]
+        high = high if high > 0.0 else 0.0
+        x = turn * at[_X + b]
+        x = x if x > 0.0 else 0.0
+        at[_X + b] = x if x < high else high
+        at[_TURN + b], at[_OFFSET + b], at[_HIGH + b] = turn, offset, high
+        at[_LOW + b], at[_TRIED + b], at[_DONE + b] = 0.0, 0.0, 0.0
+    for i in range(pressure.shape[0]):
+        for b in range(_SIDE):
+            bent[i, b] *= at[_TURN + b]
+
+
+@_inner
+def _end(
+    at: Array, z: Array, bent: Array, rates: Array, pressure: Array, a: float, rest: float
+) -> None:
+    """Take the stage's end, and from there ``rest`` of its rates."""
+    _friction(at)
+    for i in range(pressure.shape[0]):
+        for b in range(_SIDE):
+            x, s, turn = at[_X + b], at[_S + b], at[_TURN + b]
+            load, base = at[_LOAD + b] * pressure[i], bent[i, b]
+            g = load * at[_MU + b]
+            share = turn / (g + a * s * x if load > 0.0 else 1.0)
+            rate = x * (g - s * base) * share
+            rates[i, b] = rate
+            z[i, b] = g * (base + a * x) * share + rest * rate
+    for b in range(_SIDE):
+        v = at[_TURN + b] * at[_X + b]
+        stretching = at[_ARM + b] - v
+        q = at[_RELAXED + b] * (at[_Q0 + b] + a * at[_K1 + b] * stretching)
+        rate_v = (v - at[_V0 + b]) / a
+        at[_U + b] = at[_U0 + b] + (a + rest) * stretching
+        at[_V + b] = v + rest * rate_v
+        at[_Q + b] = q + rest * (at[_K1 + b] * stretching - q / at[_TAU + b])
+        at[_RATE_V + b] = rate_v
 
 
 @_kernel
-def _carry(
+def carry_blocks(
     table: Array,
+    states: Array,
+    bristles: Array,
     pressure: Array,
-    u: Array,
-    v: Array,
-    q: Array,
-    z: Array,
     arm: Array,
     normal: Array,
     step_s: float,
@@ -157,140 +193,66 @@ def _carry(
     out: Array,
     incipient: Array,
 ) -> None:
-    """Carry lanes through some steps: ``u [L], v [L], q [L], z [L, n]``, in place.
+    """Carry lanes through some steps; ``states [3, L]`` and ``bristles [L, n]`` in place.
 
-    ``table [L, 11]`` holds mass, k, k1, tau, c, mu_s, mu_k, vs, s and d0 of a bristle, and sigma2;
-    ``arm`` and ``normal [2 K, 1 or L]`` two rows a step; ``out [4, t, L]`` takes friction, inertia,
-    speed and slip of the steps that are kept, ``incipient [t, L]`` the rest.
+    ``table [12, L]`` holds mass, k, k1, tau, c, mu_s, mu_k, vs, s and d0 of a bristle,
+    ``1 / (1 + a / tau)`` and ``A``; ``arm`` and ``normal [2 K, 1 or L]`` two rows a step;
+    ``out [4, t, L]`` takes friction, inertia, speed and slip, ``incipient [t, L]`` the rest.
     """
-    num_bristles = pressure.shape[0]
-    load = np.empty(num_bristles)
-    base = np.empty(num_bristles)
-    now = np.empty(num_bristles)
-    rate = np.empty(num_bristles)
+    num_lanes, n = bristles.shape
+    most_evaluations, patience = search
+    at, z = np.zeros(_END), np.empty((n, _SIDE))
+    bent, rates = np.empty((n, _SIDE)), np.empty((n, _SIDE))
     a = gamma * step_s
-    rest = (1.0 - gamma) * step_s
-    for lane in range(u.shape[0]):
-        m, k, k1, tau = table[lane, 0], table[lane, 1], table[lane, 2], table[lane, 3]
-        c, mu_s, mu_k, stribeck = table[lane, 4], table[lane, 5], table[lane, 6], table[lane, 7]
-        s, d0, sigma2 = table[lane, 8], table[lane, 9], table[lane, 10]
-        constants = (s, d0, mu_s, mu_k, stribeck)
-        relaxed = 1.0 / (1.0 + a / tau)
-        inertia = m + a * (a * (k + k1 * relaxed) + (c + sigma2))
-        arm_column = lane if arm.shape[1] > 1 else 0
-        normal_column = lane if normal.shape[1] > 1 else 0
-        u_now, v_now, q_now = u[lane], v[lane], q[lane]
-        for i in range(num_bristles):
-            now[i] = z[lane, i]
+    arm_by, normal_by = int(arm.shape[1] > 1), int(normal.shape[1] > 1)
+    for first in range(0, num_lanes, _SIDE):
+        num = min(_SIDE, num_lanes - first)
+        for b in range(_SIDE):  # the last lane fills up the last block
+            lane = min(first + b, num_lanes - 1)
+            for row in range(12):
+                at[row * _SIDE + b] = table[row, lane]
+            for row in range(3):
+                at[_U + row * _SIDE + b] = states[row, lane]
+            for i in range(n):
+                z[i, b] = bristles[lane, i]
         for step in range(arm.shape[0] // 2):
-            u_base, v_base, q_base = u_now, v_now, q_now
-            guess = v_now
-            v_start = v_now
+            for b in range(_SIDE):
+                at[_START + b] = at[_X + b] = at[_V + b]
             for which in range(2):
-                w = arm[2 * step + which, arm_column]
-                n = normal[2 * step + which, normal_column]
-                n = n if n > _FLOOR else 0.0
-                ahead = relaxed * (q_base + a * k1 * w)
-                offset = -m * v_base - a * (k * (u_base + a * w) + ahead + c * w)
-                held = 0.0
-                for i in range(num_bristles):
-                    load[i] = n * pressure[i]
-                    most = load[i] * (mu_s / s)
-                    base[i] = min(max(now[i], -most), most)
-                    held += s * base[i]
-                side = 1.0
-                if offset + a * held > 0.0:
-                    side = -1.0
-                    offset = -offset
-                    for i in range(num_bristles):
-                        base[i] = -base[i]
-                high = max((3.0 * a * mu_s * n - offset) / inertia, 0.0)
-                x = _root(side * guess, high, search, a, inertia, offset, load, base, constants)
-                mu = mu_k + (mu_s - mu_k) * _fading(min(x / stribeck, _FADED))
-                for i in range(num_bristles):
-                    g = load[i] * mu
-                    share = 1.0 / (g + a * s * x) if load[i] > 0.0 else 1.0
-                    now[i] = side * g * (base[i] + a * x) * share
-                    rate[i] = side * x * (g - s * base[i]) * share
-                v_now = side * x
-                stretching = w - v_now
-                accelerating = (v_now - v_base) / a
-                u_now = u_base + a * stretching
-                q_now = relaxed * (q_base + a * k1 * stretching)
-                if which == 0:
-                    guess = v_start + (v_now - v_start) / gamma
-                    u_base += rest * stretching
-                    q_base += rest * (k1 * stretching - q_now / tau)
-                    v_base += rest * accelerating
-                    for i in range(num_bristles):
-                        turned = side * base[i]
-                        now[i] = turned + rest * rate[i]
+                for b in range(_SIDE):
+                    lane = min(first + b, num_lanes - 1)
+                    at[_ARM + b] = arm[2 * step + which, arm_by * lane]
+                    at[_LOAD + b] = normal[2 * step + which, normal_by * lane]
+                for b in range(3 * _SIDE):
+                    at[_U0 + b] = at[_U + b]
+                _begin(at, z, bent, pressure, a)
+                for number in range(most_evaluations):
+                    _friction(at)
+                    for i in range(n):
+                        _pull(at, bent, pressure[i], i, a)
+                    late = number >= patience
+                    if _newton(at, a, late and number % 2 == 1, not late) == 0.0:
+                        break
+                _end(at, z, bent, rates, pressure, a, (1 - which) * (step_s - 2.0 * a))
+                for b in range(_SIDE):
+                    v = at[_TURN + b] * at[_X + b]
+                    at[_X + b] = at[_START + b] + (v - at[_START + b]) / gamma
             number = ago + step + 1
             if number % every == 0:
-                row = number // every - 1
-                slip = 0.0
-                some = False
-                for i in range(num_bristles):
-                    each = v_now - rate[i]
-                    slip += pressure[i] * each
-                    some = some or abs(each) > 0.5 * abs(w)
-                out[0, row, lane] = k * u_now + q_now
-                out[1, row, lane] = m * accelerating
-                out[2, row, lane] = v_now
-                out[3, row, lane] = slip
-                incipient[row, lane] = some and w != 0.0
-        u[lane], v[lane], q[lane] = u_now, v_now, q_now
-        for i in range(num_bristles):
-            z[lane, i] = now[i]
-
-
-def carry(
-    lanes: Lanes, state: LaneState, arm: Tensor, normal: Tensor, step_s: float, every: int, ago: int
-) -> tuple[tuple[Tensor, ...], LaneState]:
-    """``eager.carry`` of float64 on the CPU, without gradient."""
-    n, shape = lanes.num_bristles, lanes.shape
-    columns = (
-        lanes.mass_kg,
-        lanes.stiffness_n_m,
-        lanes.relaxing_n_m,
-        lanes.relaxation_time_s,
-        lanes.damping_n_s_m,
-        lanes.mu_s,
-        lanes.mu_k,
-        lanes.stribeck_m_s,
-        lanes.bristle_stiffness_n_m / n,
-        lanes.bristle_damping_n_s_m / n,
-        lanes.viscous_n_s_m,
-    )
-    table = torch.stack([column.expand(shape).reshape(-1) for column in columns], -1)
-    u, v, q, z = (values.detach().numpy().copy() for values in vars(state).values())
-    num_rows = (ago + len(arm) // 2) // every
-    out = np.empty((4, num_rows, u.size))
-    incipient = np.empty((num_rows, u.size), dtype=np.bool_)
-    _carry(
-        table.detach().numpy(),
-        np.ascontiguousarray(lanes.pressure.detach().numpy()),
-        u.reshape(-1),
-        v.reshape(-1),
-        q.reshape(-1),
-        z.reshape(-1, n),
-        _columns(arm),
-        _columns(normal),
-        step_s,
-        GAMMA,
-        (MOST_EVALUATIONS, PATIENCE),
-        every,
-        ago,
-        out,
-        incipient,
-    )
-    rows = [torch.from_numpy(values).reshape(num_rows, *shape) for values in (*out, incipient)]
-    return tuple(rows), LaneState(*map(torch.from_numpy, (u, v, q, z)))
-
-
-def _columns(rows: Tensor) -> Array:
-    """What drives the stages, as one column if all lanes are driven alike; ``[2 K, 1 or L]``."""
-    sides = zip(rows.stride()[1:], rows.shape[1:], strict=True)
-    alike = all(step == 0 or size == 1 for step, size in sides)
-    rows = rows.detach().reshape(len(rows), rows.shape[1:].numel())
-    return rows[:, : 1 if alike else None].contiguous().numpy()
+                for b in range(num):
+                    row, lane = number // every - 1, first + b
+                    slip, some = 0.0, False
+                    for i in range(n):
+                        each = at[_V + b] - rates[i, b]
+                        slip += pressure[i] * each
+                        some = some or abs(each) > 0.5 * abs(at[_ARM + b])
+                    out[0, row, lane] = at[_K + b] * at[_U + b] + at[_Q + b]
+                    out[1, row, lane] = at[_M + b] * at[_RATE_V + b]
+                    out[2, row, lane] = at[_V + b]
+                    out[3, row, lane] = slip
+                    incipient[row, lane] = some and at[_ARM + b] != 0.0
+        for b in range(num):
+            for row in range(3):
+                states[row, first + b] = at[_U + row * _SIDE + b]
+            for i in range(n):
+                bristles[first + b, i] = z[i, b]

@@ -101,9 +101,9 @@ def integrate(
                 raise ValueError(f'engine "compiled" {lack}; use engine "eager"')
             chosen = "eager"
         if chosen == "compiled":
-            from tactslip_torch.simulation.dynamics import compiled  # numba takes a second
+            from tactslip_torch.simulation.dynamics import packing  # numba takes a second
 
-            part, state = compiled.carry(lanes, state, arm, normal, step_s, every, done % every)
+            part, state = packing.carry(lanes, state, arm, normal, step_s, every, done % every)
         else:
             part, state = eager.carry(lanes, state, arm, normal, step_s, every, done % every)
         parts.append(part)
@@ -165,7 +165,7 @@ def _trouble() -> str:
     if find_spec("numba") is None:
         return "is not installed"
     try:
-        from tactslip_torch.simulation.dynamics import compiled  # noqa: F401  # a second, once
+        from tactslip_torch.simulation.dynamics import packing  # noqa: F401  # a second, once
     except Exception as error:  # another numba or NumPy than it was made for
         return f"cannot be used: {str(error).splitlines()[0]}"
     return ""
