@@ -109,6 +109,8 @@ def confound_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
         _dots(panels[row][0], own, scenes, colours, "non_slip_recall", is_error=True)
         _dots(panels[row][1], own, scenes, colours, "slip_recall", is_error=False)
         panels[row][0].set_title(_JUDGED.get(role, role), loc="left", fontsize=10.5)
+    panels[-1][0].set_xlim(left=0)
+    panels[-1][1].set_xlim(right=100)
     panels[-1][0].set_xlabel("false slips, % of non-slip bins: fewer is better", fontsize=9.5)
     panels[-1][1].set_xlabel("slips found, % of slip bins: more is better", fontsize=9.5)
     _legend(figure, colours, scored)
@@ -144,24 +146,36 @@ def _dots(
     *,
     is_error: bool,
 ) -> None:
-    """A line per scene with a dot for each detector: the recall in percent, or what it lacks."""
+    """A line per scene with a dot for each detector: the recall in percent, or what it lacks.
+
+    Dots of a scene stand a little below each other, so that equal ones are seen.
+    """
     for place, scene in enumerate(scenes):
         own = [one for one in scored if one.scene == scene and one.scores[key] is not None]
         if not own:
-            style: dict[str, Any] = {"fontsize": 8.5, "color": _GREY, "va": "center"}
-            axes.annotate(
-                "no such bins", (0.5, place), xycoords=axes.get_yaxis_transform(), **style
-            )
+            words = "nothing but slip" if is_error else "no slip in this scene"
+            style: dict[str, Any] = {
+                "fontsize": 8.5,
+                "color": _GREY,
+                "ha": "center",
+                "va": "center",
+            }
+            style["bbox"] = {"fc": "white", "ec": "none", "pad": 2.0}
+            axes.annotate(words, (0.5, place), xycoords=axes.get_yaxis_transform(), **style)
             continue
         values = [100 * (1 - one.scores[key] if is_error else one.scores[key]) for one in own]
-        axes.plot([min(values), max(values)], [place, place], color="#BBBBBB", lw=2, zorder=1)
-        for one, value in zip(own, values, strict=True):
+        below = [0.13 * (len(own) - 1 - 2 * number) for number in range(len(own))]
+        heights = [place + step / max(1, len(own) - 1) for step in below]
+        axes.plot(values, heights, color="#BBBBBB", lw=2, zorder=1)
+        for one, value, height in zip(own, values, heights, strict=True):
             colour = colours[one.detector]
             fill = "white" if one.is_trained is False else colour
-            axes.plot(value, place, "o", color=colour, mfc=fill, mew=1.8, ms=7.5, zorder=2)
-    axes.set_yticks(range(len(scenes)), [scene.replace("_", " ") for scene in scenes], fontsize=9.5)
+            style = {"color": colour, "mfc": fill, "mew": 1.8, "ms": 7.5, "clip_on": False}
+            axes.plot(value, height, "o", zorder=2, **style)
+    names = ["paper's protocol" if name == "paper" else name.replace("_", " ") for name in scenes]
+    axes.set_yticks(range(len(scenes)), names, fontsize=9.5)
     axes.set_ylim(-0.6, len(scenes) - 0.4)
-    axes.grid(axis="x", color=_GRID)
+    axes.grid(color=_GRID)
     axes.set_axisbelow(True)
     axes.tick_params(length=0, labelcolor=_INK)
     axes.spines[["top", "right", "left"]].set_visible(False)

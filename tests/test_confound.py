@@ -1,0 +1,349 @@
+"""Detectors side by side on kinds of scenes: what is counted, shown, and learned from scenes."""
+
+import contextlib
+import io
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from small_set import RATE_HZ, SMALL_HAND, SmallTimeline
+from test_report import assert_drawn_atomically, rows_of
+
+from tactslip_torch.config import conf_dir
+from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.evaluate import evaluate
+from tactslip_torch.report.confound import (
+    by_detector,
+    confound_figure,
+    confound_rows,
+    confound_table,
+)
+from tactslip_torch.report.results import print_results, write_results
+from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
+from tactslip_torch.train import train
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*isinstance.treespec, LeafSpec.*",
+    "ignore:The '.*_dataloader' does not have many workers",
+    "ignore:.*does not have many workers",
+)
+
+SCENES = ("carried", "paper", "tapped")  # in order of appearance
+KEYS = ("non_slip_recall", "slip_recall", "balanced_accuracy")
+
+
+class SmallScenes:
+    """Two channels: the gauge hums while the arm moves, the film rustles while the hand slides.
+
+    ``arm_motion`` has the hum alone, ``pulled`` and ``motor_off`` the rustle alone, all others
+    both, as the protocol.
+    """
+
+    is_simulated = True
+    hand = SMALL_HAND
+    sample_rate_hz = RATE_HZ
+
+    def __init__(self, *, cycles, materials, scene, others, **_):
+        kinds = {scene["name"]: cycles} | {k: v.get("cycles", cycles) for k, v in others.items()}
+        self.ids = tuple(
+            RecordingId(m, c, k) for k, num in kinds.items() for m in materials for c in range(num)
+        )
+
+    def timeline(self, recording):
+        if recording.scene != "arm_motion":
+            return SmallTimeline()
+        rest = dict.fromkeys(("onsets_s", "annotated_onsets_s", "sliding_s", "speeds_mm_s"), ())
+        return SmallTimeline(**rest, non_slip_s=((1.1, 1.95),))
+
+    def key(self, recording):
+        return {"scenes": str(recording)}
+
+    def load(self, recording, windows=None):
+        generator = torch.Generator().manual_seed(sum(str(recording).encode()) * 7919)
+        gauge, film = torch.randn(2, 4000, generator=generator)
+        moving = slice(2200, 3900)
+        if recording.scene not in ("pulled", "motor_off"):
+            gauge[moving] *= 6.0
+        if recording.scene != "arm_motion":
+            film[moving] *= 1.6
+        times = self.timeline(recording)
+        facts = (times.speeds_mm_s, times.onsets_s, times.sliding_s)
+        return Recording(torch.stack([gauge, film]), RATE_HZ, recording.material, *facts)
+
+
+SMALL = (
+    "data._target_=test_confound.SmallScenes",
+    "data.materials=[a,b,c]",
+    "data.cycles=6",
+    "split.seen=[a,b]",
+    "split.unseen=[c]",
+    "split.train_share=0.5",
+    "cache=off",
+    "num_workers=0",
+)
+
+
+def composed(*overrides, name="train"):
+    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+        return compose(name, [*SMALL, *overrides])
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory):
+    """``+exp=confound`` on the small scenes: the folder, and what it printed."""
+    folder = tmp_path_factory.mktemp("confound")
+    recipe = ("recipe.num_features=10", "recipe.penalties=[0.1,1.0]", "recipe.sample_bins=100")
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        train(composed("+exp=confound", *recipe, "export=false"), folder)
+    return folder, printed.getvalue()
+
+
+def made(seed=0, *, simulated=True, scenes=SCENES, roles=("train", "test", "unseen")):
+    """Metrics of two folds, and the bins they are of."""
+    rng = np.random.default_rng(seed)
+    bins, folds = {}, {}
+    for fold, trained in (("protocol", ("paper",)), ("with_scenes", ("carried", "paper"))):
+        folds[fold] = {"splits": {}, "baselines": {"best_single_feature": {"splits": {}}}}
+        for role in roles:
+            own = [s for s in scenes if role != "train" or s in trained]
+            labels = [own[i % len(own)] for i in range(600)]
+            truth = torch.from_numpy(rng.random(600) < 0.7)
+            truth &= torch.tensor([label != "carried" for label in labels])
+            says = truth ^ torch.from_numpy(rng.random(600) < 0.15)
+            bins[fold, role] = labels, truth, says
+            scores = bin_metrics(truth, says, ["a"] * 600, [20.0] * 600, labels)
+            folds[fold]["splits"][role] = scores
+    metrics = {"simulated": simulated, "splits": folds["protocol"]["splits"], "folds": folds}
+    return metrics | {"baselines": {}}, bins
+
+
+# What is compared --------------------------------------------------------------------------------
+
+
+def test_detectors_are_the_folds_or_the_only_one():
+    metrics, _ = made()
+    assert list(by_detector(metrics)) == ["protocol", "with_scenes"]
+    single = {key: value for key, value in metrics.items() if key != "folds"}
+    assert by_detector(single) == {"detector": metrics["splits"]}
+
+
+def test_results_of_one_scene_have_nothing_to_compare(tmp_path, capsys):
+    metrics, _ = made(scenes=("paper",))
+    assert by_detector(metrics) == {}
+    assert by_detector({"splits": {"test": split_metrics([[1, 0], [0, 1]])}}) == {}
+    write_results(tmp_path, metrics, [])
+    assert not (tmp_path / "confound.png").exists()
+    print_results(metrics, [])
+    assert "detector" not in capsys.readouterr().out
+    with pytest.raises(ValueError, match="no split with several kinds of scenes"):
+        confound_figure(metrics, tmp_path / "other.png")
+    assert not (tmp_path / "other.png").exists()
+
+
+# The table ---------------------------------------------------------------------------------------
+
+
+def test_the_table_has_the_scores_of_the_bins_of_each_detector_and_scene():
+    metrics, bins = made()
+    header, *rows = confound_rows(metrics)
+    assert header[:5] == ["judged on", "scene", "detector", "trained on it", "bins"]
+    assert [row[:3] for row in rows] == [
+        [role, scene, fold]
+        for role in ("test", "unseen")
+        for scene in ("paper", "carried", "tapped")  # the protocol, what was trained on, the rest
+        for fold in ("protocol", "with_scenes")
+    ]
+    for role, scene, fold, _, num_bins, *cells in rows:
+        labels, truth, says = bins[fold, role]
+        mine = torch.tensor([label == scene for label in labels])
+        expected = split_metrics(confusion_matrix(truth[mine], says[mine]))
+        assert int(num_bins) == int(mine.sum())
+        known = [expected[key] for key in KEYS]
+        assert cells == ["-" if value is None else f"{100 * value:.2f}" for value in known]
+        assert (cells[1] == "-") == (scene == "carried")  # no slip there
+
+
+def test_the_table_says_which_scenes_were_trained_on():
+    metrics, _ = made()
+    told = {(row[1], row[2]): row[3] for row in confound_rows(metrics)[1:]}
+    assert told == {
+        ("paper", "protocol"): "yes",
+        ("paper", "with_scenes"): "yes",
+        ("carried", "protocol"): "no",
+        ("carried", "with_scenes"): "yes",
+        ("tapped", "protocol"): "no",
+        ("tapped", "with_scenes"): "no",
+    }
+    saved = {key: value for key, value in metrics.items() if key != "folds"} | {"detector": {}}
+    assert {row[3] for row in confound_rows(saved)[1:]} == {"-"}  # another run trained it
+
+
+def test_the_table_is_aligned_and_says_simulated():
+    table = confound_table(made()[0])
+    assert table.startswith("SIMULATED")
+    assert rows_of(table)[2][:5] == ["test", "paper", "protocol", "yes", "200"]
+    assert "simulated" not in confound_table(made(simulated=False)[0]).lower()
+
+
+def test_rivals_are_printed_apart_not_summed(capsys):
+    metrics, _ = made()
+    print_results(metrics, [])
+    rows = rows_of(capsys.readouterr().out)
+    for fold in ("protocol", "with_scenes"):
+        scores = metrics["folds"][fold]["splits"]["unseen"]
+        expected = [f"{100 * scores[key]:.2f}" for key in ("accuracy", "balanced_accuracy")]
+        row = next(row for row in rows if row[0] == f"{fold} unseen")
+        assert row[1:3] == expected
+        assert row[-1] == "600"
+
+
+# The figure --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Figures as they are saved."""
+    figures = []
+
+    def keep(self, target, **_):
+        figures.append(self)
+        Path(target).write_bytes(b"drawn")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", keep)
+    return figures
+
+
+def dots_of(axes):
+    return [line for line in axes.lines if line.get_marker() == "o"]
+
+
+def test_each_dot_of_the_figure_is_a_score(drawn, tmp_path):
+    metrics, _ = made()
+    confound_figure(metrics, tmp_path / "confound.png")
+    (figure,) = drawn
+    for row, role in enumerate(("test", "unseen")):
+        names = [label.get_text() for label in figure.axes[2 * row].get_yticklabels()]
+        assert names == ["tapped", "carried", "paper's protocol"]  # from below
+        for column, key in enumerate(("non_slip_recall", "slip_recall")):
+            axes = figure.axes[2 * row + column]
+            found = {
+                (line.get_color(), names[round(float(line.get_ydata()[0]))]): float(
+                    line.get_xdata()[0]
+                )
+                for line in dots_of(axes)
+            }
+            expected = {}
+            for colour, fold in (("#D55E00", "protocol"), ("#0072B2", "with_scenes")):
+                scenes = metrics["folds"][fold]["splits"][role]["per_scene"]
+                for scene, scores in scenes.items():
+                    if scores[key] is not None:
+                        name = "paper's protocol" if scene == "paper" else scene
+                        value = 1 - scores[key] if column == 0 else scores[key]
+                        expected[colour, name] = 100 * value
+            assert found == pytest.approx(expected)
+
+
+def test_the_figure_says_simulated_what_was_trained_on_and_where_no_slip_is(drawn, tmp_path):
+    for simulated in (True, False):
+        confound_figure(made(simulated=simulated)[0], tmp_path / "confound.png")
+    titles = [figure.get_suptitle() for figure in drawn]
+    assert ["SIMULATED" in title for title in titles] == [True, False]
+    false_slips, found = drawn[0].axes[:2]
+    hollow = [
+        (line.get_color(), round(float(line.get_ydata()[0])))
+        for line in dots_of(false_slips)
+        if line.get_markerfacecolor() == "white"
+    ]
+    assert sorted(hollow) == [("#0072B2", 0), ("#D55E00", 0), ("#D55E00", 1)]
+    assert [text.get_text() for text in found.texts] == ["no slip in this scene"]
+    assert not false_slips.texts
+
+
+@pytest.mark.parametrize("roles", [("train", "test", "unseen"), ("train", "test")])
+def test_the_figure_is_drawn_whole(tmp_path, roles):
+    confound_figure(made(roles=roles)[0], tmp_path / "confound.png")
+    assert_drawn_atomically(tmp_path / "confound.png")
+
+
+# The experiment, on small scenes -----------------------------------------------------------------
+
+
+def test_a_run_on_several_scenes_leaves_table_and_figure(ran):
+    folder, printed = ran
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert list(metrics["folds"]) == ["protocol", "with_scenes"]
+    assert confound_table(metrics) in printed
+    for name in (
+        "confound.png",
+        "confusion.png",
+        "protocol/detector.pt",
+        "with_scenes/detector.pt",
+    ):
+        assert (folder / name).is_file(), name
+
+
+def test_scenes_tell_a_detector_of_slip_from_one_of_motors(ran):
+    """In the protocol the hum is the clearest sign of slip; only other scenes show it is none."""
+    metrics = json.loads((ran[0] / "metrics.json").read_text())
+    for role in ("test", "unseen"):
+        before, after = (
+            metrics["folds"][fold]["splits"][role]["per_scene"]
+            for fold in ("protocol", "with_scenes")
+        )
+        assert before["paper"]["balanced_accuracy"] > 0.95
+        assert before["arm_motion"]["non_slip_recall"] < 0.3
+        assert after["arm_motion"]["non_slip_recall"] > 0.7
+        for scene in ("pulled", "motor_off"):
+            assert before[scene]["slip_recall"] < 0.8
+            assert after[scene]["slip_recall"] > 0.9
+        assert before["arm_motion"]["slip_recall"] is None
+
+
+def test_both_folds_judge_the_same_bins(ran):
+    metrics = json.loads((ran[0] / "metrics.json").read_text())
+    for role in ("test", "unseen"):
+        one, other = (
+            {
+                scene: [sum(row) for row in scores["confusion"]]
+                for scene, scores in fold["splits"][role]["per_scene"].items()
+            }
+            for fold in metrics["folds"].values()
+        )
+        assert one == other
+        assert len(one) == 8
+
+
+# A saved detector --------------------------------------------------------------------------------
+
+
+def judged(ran, folder, *overrides):
+    model = f"model={ran[0] / 'with_scenes' / 'detector.pt'}"
+    return evaluate(composed(model, *overrides, name="evaluate"), folder)
+
+
+def test_evaluate_on_a_scene_without_slip_has_no_slip_recall(ran, tmp_path, capsys):
+    metrics = judged(ran, tmp_path, "scene=arm_motion")
+    out = capsys.readouterr().out
+    for role, num in (("train", 6), ("test", 6), ("unseen", 6)):
+        scores = metrics["splits"][role]
+        assert scores["num_bins"] == num * 17
+        assert scores["slip_recall"] is scores["balanced_accuracy"] is None
+        assert scores["non_slip_recall"] == scores["accuracy"]
+        row = next(row for row in rows_of(out) if row[0] == role)
+        percent = f"{100 * scores['accuracy']:.2f}"
+        assert row == [role, percent, "-", percent, "-", str(num * 17)]
+    assert re.search(r"^\s*paper  ", out, re.MULTILINE) is None  # its numbers are of its protocol
+    assert not (tmp_path / "confound.png").exists()
+
+
+def test_evaluate_on_several_scenes_draws_them(ran, tmp_path, capsys):
+    kinds = [f"+scene@data.others.{kind}={kind}" for kind in ("arm_motion", "pulled")]
+    metrics = judged(ran, tmp_path, *kinds)
+    assert confound_table(metrics) in capsys.readouterr().out
+    assert (tmp_path / "confound.png").is_file()
+    assert {row[2] for row in confound_rows(metrics)[1:]} == {"detector"}
+    assert list(metrics["splits"]["unseen"]["per_scene"]) == ["arm_motion", "paper", "pulled"]
