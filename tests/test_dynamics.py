@@ -384,6 +384,23 @@ def test_manners(dtype: torch.dtype, engine: str) -> None:
     assert same is start
 
 
+def test_on_any_device(device: torch.device) -> None:
+    lanes = varied(3)
+    there = Lanes(*(values.to(device) for values in vars(lanes).values()))
+    start = LaneState.sticking(there, 0.1, 0.5)
+
+    def drive(times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        assert times.device == start.stretch_m.device
+        arm, load = shaken(times.cpu())
+        return arm.to(device), load.to(device)
+
+    trace, state = integrate(there, start, drive, 60, 250e-6, engine="eager")
+    here = LaneState.sticking(lanes, 0.1, 0.5)
+    same, _ = integrate(lanes, here, shaken, 60, 250e-6, engine="eager")
+    assert state.bristle_m.device == start.stretch_m.device
+    assert_same(same, Trace(*(values.cpu() for values in vars(trace).values())), 1e-9)
+
+
 def test_auto_takes_what_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("numba")
     from tactslip_torch.simulation.dynamics import packing

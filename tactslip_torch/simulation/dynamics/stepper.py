@@ -42,7 +42,8 @@ class Trace:
         speed_m_s: of the patch over the surface.
         slip_m_s: that speed less the bristles' rates, each by its share of the load. More than
             half of the arm's speed is gross sliding.
-        incipient: whether a bristle slips at more than half of the speed of an arm that moves.
+        incipient: whether a bristle slips at more than half of the speed of an arm that moves; so
+            does any without load, which the patch drags along.
     """
 
     friction_n: Tensor
