@@ -79,6 +79,17 @@ def test_scenes_that_handle_the_hand_say_where_and_the_others_do_not():
     assert timeline(scene_of("pulled", "M3")).arm_s == ()
 
 
+def test_a_carried_stretch_ends_before_a_slide_and_with_the_recording():
+    carried, slide = Stroke(40.0, 20.0, 0.5, "both"), Stroke(40.0, 20.0, 0.1)
+    scene = Scene("M3", strokes=(carried, slide, replace(carried, pause_s=1.0)))
+    truth = timeline(scene)
+    starts, stops = zip(*truth.arm_s, strict=True)
+    assert truth.non_slip_s[0] == (starts[0], starts[1])
+    assert truth.non_slip_s[1] == (starts[2], truth.duration_s)
+    longer = timeline(replace(scene, tail_s=1.0, strokes=(carried, replace(slide, pause_s=1.0))))
+    assert longer.non_slip_s == ((starts[0], stops[0] + 0.3),)
+
+
 def test_a_recording_carries_the_truth_of_its_scene():
     for name in ("arm_motion", "taps", "pulled"):
         scene = scene_of(name, "wood")

@@ -76,6 +76,21 @@ def test_a_machine_shakes_with_the_square_of_its_speed_and_turns_without_a_break
     assert rms(whole_run) == pytest.approx(1.0, rel=0.02)
 
 
+def test_a_machine_runs_up_and_down_with_its_speed(monkeypatch):
+    monkeypatch.setattr("tactslip_torch.simulation.machine.ORDERS", (1,))
+    scene = scene_of("machine", "M3", machine_hz=(200.0, 200.1))
+    duration_s = timeline(scene).duration_s
+    start_s, stop_s = machine_runs(scene, duration_s)[0]
+    wave = machine_wave(scene, duration_s, whole_grid(round(duration_s * RATE_HZ))).reshape(-1)
+    for from_s, to_s, turns in (
+        (start_s + 0.1, start_s + 0.2, 10.0),  # half of 200 Hz, in the middle of the ramp
+        (start_s + 0.5, start_s + 0.6, 20.0),
+        (stop_s - 0.2, stop_s - 0.1, 10.0),
+    ):
+        crossings = np.sum(np.diff(np.sign(part(wave, from_s, to_s))) != 0)
+        assert crossings == pytest.approx(2 * turns, abs=1.5)
+
+
 def test_a_machine_is_the_sessions_and_its_runs_are_the_recordings():
     def level(cycle: int, **changes: str) -> np.ndarray:
         scene = scene_of("machine", "M3", cycle, **changes)
@@ -86,6 +101,9 @@ def test_a_machine_is_the_sessions_and_its_runs_are_the_recordings():
     first, second, other = level(0), level(1), level(0, session="another")
     np.testing.assert_allclose(first, second, rtol=0.05)
     assert np.abs(np.log(first / other)).max() > 0.3
+    speeds = {rotation_hz(scene_of("machine", "M3", cycle)) for cycle in range(3)}
+    assert len(speeds) == 1
+    assert rotation_hz(scene_of("machine", "M3", session="another")) not in speeds
     runs = [machine_runs(scene_of("machine", "M3", cycle), 15.0) for cycle in (0, 1)]
     assert runs[0] != runs[1]
     long = machine_runs(scene_of("machine", "M3"), 100.0)
