@@ -88,6 +88,9 @@ def _fast_ratio(scene: Scene, surface: Surface) -> float:
 def lanes_of(each: list[Skins], dtype: torch.dtype, device: torch.device) -> Lanes:
     """Lanes of several recordings, one after the other; they have equally many bristles."""
     columns = zip(*(skin[:-1] for skin in each), strict=True)
-    tensors = (torch.from_numpy(np.concatenate(column)).to(device, dtype) for column in columns)
+    values = {
+        name: torch.from_numpy(np.concatenate(column)).to(device, dtype)
+        for name, column in zip(Skins._fields, columns, strict=False)
+    }
     pressure = hertz_pressure(each[0].num_bristles, dtype=torch.float64)
-    return Lanes(*tensors, pressure.to(device, dtype))
+    return Lanes(**values, pressure=pressure.to(device, dtype))
