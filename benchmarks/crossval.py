@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.seeds import RESULTS, ROOT, between_markers
+from benchmarks.outcome import RESULTS, ROOT, between_markers
 from tactslip_torch.features.cache import source_digest
 from tactslip_torch.files import whole_file
 from tactslip_torch.report.crossval import crossval_figure, material_rows, split_rows

@@ -14,7 +14,8 @@ from tactslip_torch.files import whole_file
 
 SIMULATED_LINE = "SIMULATED bins: what things cost, nothing about a real hand"
 QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
-RESULTS = Path(__file__).parent / "results"
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
 EXIT_INTERRUPTED = 130
 
 
@@ -62,6 +63,19 @@ def heading(report: Mapping[str, Any], about: str, parts: Sequence[str]) -> str:
     ]
     quick = [QUICK_LINE] if report["quick"] else []
     return "\n\n".join(["\n".join(lines + quick), *parts, *quick])
+
+
+def between_markers(text: str, name: str, content: str) -> str:
+    """``text`` with what stands between ``<!-- name -->`` and ``<!-- /name -->`` replaced.
+
+    Raises:
+        ValueError: if a marker is missing.
+    """
+    start, end = f"<!-- {name} -->", f"<!-- /{name} -->"
+    if start not in text or end not in text:
+        raise ValueError(f"the markers {start} and {end} are not both there")
+    before, rest = text.split(start, 1)
+    return f"{before}{start}\n{content}\n{end}{rest.split(end, 1)[1]}"
 
 
 def keep_numbers(report: Mapping[str, Any], path: Path | None) -> None:

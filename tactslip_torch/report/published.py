@@ -35,6 +35,12 @@ SPLITS: Mapping[str, PublishedSplit] = MappingProxyType(
     }
 )
 
+LARGER_CLASS = 0.753
+"""Share of slip among the bins of figure 6: what calling all of them slip would score."""
+
+BINS_PER_MINUTE = 20 * 60
+"""Bins of 50 ms, with which a recall of non-slip is a number of false slips a minute."""
+
 NUM_SELECTED = 120
 
 SELECTED_BY_KIND: Mapping[str, int] = MappingProxyType({"SG": 6, "PVDF": 114})

@@ -1,0 +1,144 @@
+"""What the paper's data could not show: places beside onsets, strokes, ablations, leakage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from benchmarks.reproduction.results import (
+    SCORES,
+    Report,
+    labels_of,
+    percent,
+    recall_beside_onset,
+    rival_percent,
+    roles_of,
+    runs_of,
+    text,
+)
+from benchmarks.tables import Table
+
+PLACES: Mapping[str, Sequence[str]] = {
+    "-20 to -11": [str(place) for place in range(-20, -10)],
+    "-10 to -4": [str(place) for place in range(-10, -3)],
+    **{str(place): [str(place)] for place in range(-3, 3)},
+    "3 to 9": [str(place) for place in range(3, 10)],
+    "10 to 19": [str(place) for place in range(10, 20)],
+    "20 and on": ["20+"],
+}
+"""Bins beside an onset by where they stand; 0 is the first that is labelled slip."""
+
+
+def places_table(report: Report) -> Table:
+    """Recall by the place of a bin beside its onset."""
+    columns = [
+        (name, role, f"{name}, {role}")
+        for name in ("unseen4", "unseen4 robust")
+        for role in ("test", "unseen")
+        if role in roles_of(report, name)
+    ]
+    rows = []
+    for words, places in PLACES.items():
+        found = [recall_beside_onset(report, name, role, places) for name, role, _ in columns]
+        if any(found):
+            label = "non-slip" if words.startswith("-") else "slip"
+            rows.append([f"{words} ({label})", *map(text, found)])
+    note = "Recall, %: bins that were called what they are labelled. A bin is 50 ms."
+    return Table(["bin beside its onset", *(column[2] for column in columns)], rows, note)
+
+
+def strokes_table(report: Report) -> Table:
+    """Scores by the speed of the stroke."""
+    rows = []
+    for name in ("unseen4", "unseen4 robust"):
+        for role in ("test", "unseen"):
+            for speed in labels_of(report, name, role, "per_speed"):
+                group = ("per_speed", [speed])
+                cells = [text(percent(report, name, role, score, group)) for score in SCORES]
+                rows.append([f"{name}, {role}, {speed} mm/s", *cells])
+    return Table(["stroke", *(f"{name}, %" for name in SCORES.values())], rows)
+
+
+class Ablation(NamedTuple):
+    """A detector that is denied something.
+
+    Attributes:
+        what: it has.
+        experiment: as it is stored.
+        is_rival: whether the best single selected feature with a threshold is meant.
+    """
+
+    what: str
+    experiment: str
+    is_rival: bool = False
+
+
+ABLATIONS = (
+    Ablation("everything", "unseen4"),
+    Ablation("PVDF films only", "PVDF only"),
+    Ablation("means of the SGs only", "SG means only"),
+    Ablation("the best single selected feature with a threshold", "unseen4", is_rival=True),
+    Ablation("everything, the motors' vibration off", "motor_off"),
+    Ablation("everything, the motors' vibration alone", "motor_only"),
+    Ablation("everything, labels permuted", "shuffled"),
+)
+
+
+def ablation_percent(report: Report, ablation: Ablation, role: str, score: str) -> list[float]:
+    """A score of an ablation, a number a seed."""
+    found = rival_percent if ablation.is_rival else percent
+    return found(report, ablation.experiment, role, score)
+
+
+def ablations_table(report: Report) -> Table:
+    """What a detector scores with a part of the signals or of the scene, paper's recipe."""
+    rows = []
+    for ablation in ABLATIONS:
+        runs = runs_of(report, ablation.experiment)
+        if not runs:
+            continue
+        cells = [
+            text(ablation_percent(report, ablation, role, score))
+            for role in ("test", "unseen")
+            for score in ("balanced_accuracy", "non_slip_recall", "slip_recall")
+        ]
+        rows.append([ablation.what, *cells, str(len(runs)), _num_features(ablation, runs)])
+    scores = ("balanced, %", "non-slip, %", "slip, %")
+    columns = [f"{role}: {score}" for role in ("test", "unseen") for score in scores]
+    header = ["trained and judged with", *columns, "seeds", "features"]
+    note = "Split by cycle, whole slides, the paper's recipe. Permuted labels must show 50 %."
+    return Table(header, rows, note)
+
+
+def _num_features(ablation: Ablation, runs: Sequence[Mapping[str, object]]) -> str:
+    if ablation.is_rival:
+        return "1"
+    numbers = sorted({len(list(run["selected"])) for run in runs})  # type: ignore[call-overload]
+    return " to ".join(map(str, dict.fromkeys([numbers[0], numbers[-1]])))
+
+
+LAYOUTS = {
+    "whole slides": ("random_bins", "unseen4"),
+    "half a second on either side": ("half_second random_bins", "half_second"),
+}
+"""The experiment split at random over bins and the one split by cycle, by layout."""
+
+
+def leak(report: Report, layout: str, score: str) -> list[float]:
+    """Test score of the split at random less that by cycle, in points, a number a seed."""
+    at_random, by_cycle = (percent(report, name, "test", score) for name in LAYOUTS[layout])
+    both = min(len(at_random), len(by_cycle))
+    return [a - b for a, b in zip(at_random[:both], by_cycle[:both], strict=True)]
+
+
+def leak_table(report: Report) -> Table:
+    """What a split at random over bins adds to the test score."""
+    rows = []
+    for layout, (at_random, by_cycle) in LAYOUTS.items():
+        for score, name in SCORES.items():
+            found = leak(report, layout, score)
+            if found:
+                both = [percent(report, of, "test", score) for of in (at_random, by_cycle)]
+                rows.append([f"{name}, {layout}", *map(text, both), text(found, sign="+")])
+    header = ["test bins", "at random over bins, %", "by cycle, %", "leak, points"]
+    return Table(header, rows, "The leak is that of each seed, then mean and spread.")

@@ -1,0 +1,183 @@
+"""REPRODUCTION.md and the short table of README.md, from stored results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from benchmarks.reproduction.beside import (
+    CALIBRATED,
+    NOT_COMPARABLE,
+    PREDICTED,
+    beside,
+    is_calibrated,
+    signals_table,
+)
+from benchmarks.reproduction.beyond import ablations_table, leak_table, places_table, strokes_table
+from benchmarks.reproduction.confound import conclusion, confound_tables
+from benchmarks.reproduction.experiments import EXPERIMENTS
+from benchmarks.reproduction.reasons import reasons
+from benchmarks.reproduction.results import Report, percent, rival_percent, runs_of, text
+from benchmarks.reproduction.selected import selected_table
+from benchmarks.tables import Table
+from tactslip_torch.report import published
+
+COMMAND = "python -m benchmarks.reproduction"
+FIGURES = {
+    "seeds": "reproduction.png",
+    "places": "reproduction_places.png",
+    "confound": "reproduction_confound.png",
+}
+"""Files of the figures, beside the results."""
+
+QUICK_LINE = "**QUICK: a few recordings, to see that it runs. The numbers mean nothing.**"
+
+
+def page(report: Report, images: str) -> str:
+    """The content of REPRODUCTION.md.
+
+    Args:
+        report: as it is stored.
+        images: folder of the figures, as the file refers to it.
+    """
+    parts = [_introduction(report), *_first(report), *_second(report, images)]
+    parts += _third(report, images)
+    found = reasons(report)
+    if found:
+        parts += ["## Where ours differs, and why we think so", *found]
+    return "\n\n".join([*parts, _knobs(report), _runs(report)]) + "\n"
+
+
+def _introduction(report: Report) -> str:
+    settings = f" --seeds {report['seeds']}" + (" --quick" if report["quick"] else "")
+    quick = f"\n\n{QUICK_LINE}" if report["quick"] else ""
+    return f"""# Reproduction, on a SIMULATED hand
+
+**Every number of ours below is SIMULATED; the paper's are of a real hand, whose recordings are
+private.** Written by `{COMMAND}{settings}` from `benchmarks/results/reproduction.json`; no number
+is typed by hand. A seed is another simulated set and another split; numbers are mean ± standard
+deviation over seeds.{quick}
+
+The paper is {published.PAPER}. Every row that stands beside it is marked: {CALIBRATED}, the
+simulation was set by it; {PREDICTED}, it was not, whatever came out is shown; {NOT_COMPARABLE},
+something else was measured."""
+
+
+def _first(report: Report) -> list[str]:
+    parts = ["## 1. What was published, and ours beside", "### Scores"]
+    for title, table in beside(report).items():
+        parts += [f"**{title}.**", table.markdown()]
+    if runs_of(report, "random_bins"):
+        parts += ["### Selected features", selected_table(report).markdown()]
+    return [*parts, "### Signals", signals_table(report).markdown()]
+
+
+def _second(report: Report, images: str) -> list[str]:
+    if not runs_of(report, "unseen4"):
+        return []
+    return [
+        "## 2. What the paper's data could not show",
+        "### Beside the onset",
+        f"![Recall beside the onset]({images}/{FIGURES['places']})",
+        places_table(report).markdown(),
+        "### By stroke",
+        strokes_table(report).markdown(),
+        "### With less",
+        ablations_table(report).markdown(),
+        "### Leakage",
+        leak_table(report).markdown(),
+        f"![Every seed]({images}/{FIGURES['seeds']})",
+    ]
+
+
+def _third(report: Report, images: str) -> list[str]:
+    if not runs_of(report, "confound"):
+        return []
+    parts = [
+        "## 3. Does it feel slip, or hear the arm?",
+        "In the paper's protocol slip and arm motion are the same thing. Here a detector of the "
+        "protocol, and one that was trained on scenes which part the two as well, are judged on "
+        "such scenes (`+exp=confound`, default recipe; scenes not marked were trained on by "
+        "neither).",
+    ]
+    for title, table in confound_tables(report).items():
+        parts += [f"**{title}.**", table.markdown()]
+    parts.append(f"![Both detectors, scene by scene]({images}/{FIGURES['confound']})")
+    return [*parts, *conclusion(report)]
+
+
+def _knobs(report: Report) -> str:
+    known = report["calibrated"]
+    values = {name: _value(value) for name, value in known["values"].items()}
+    lines = ["## What was calibrated, and how", f"{known['provenance'].rstrip('.')}."]
+    if is_calibrated(report):
+        target = known["target"]
+        lines.append(
+            f"Aim: {100 * target['accuracy']:.2f} % ({target['row']}). Reached: "
+            f"{100 * known['accuracy']:.2f} %, mean over seeds "
+            f"{', '.join(map(str, known['seeds']))}, none of which is below: {known['verdict']}."
+        )
+    table = Table(["knob", "frozen value"], [list(row) for row in values.items()])
+    return "\n\n".join([*lines, table.markdown()])
+
+
+def _value(value: Any) -> str:
+    return " to ".join(f"{of:g}" for of in value) if isinstance(value, list) else f"{value:g}"
+
+
+def _runs(report: Report) -> str:
+    rows = []
+    for name, runs in report["runs"].items():
+        minutes = sum(run["seconds"] for run in runs) / 60
+        command = f"`train {' '.join(report['commands'][name])}`"
+        rows.append([name, EXPERIMENTS[name].about, command, str(len(runs)), f"{minutes:.1f}"])
+    facts = ", ".join([*report["machine"].values()])
+    versions = ", ".join(f"{name} {of}" for name, of in report["versions"].items())
+    total = sum(float(row[-1]) for row in rows)
+    note = f"{total:.0f} minutes in all, on {facts}; {versions}."
+    header = ["experiment", "", "command", "seeds", "minutes"]
+    return "## What was run\n\n" + Table(header, rows, note).markdown()
+
+
+# ---------------------------------------------------------------------------------- for README.md
+SHORT = {
+    "random_bins": ("test",),
+    "unseen4": ("train", "test", "unseen"),
+    "unseen4 robust": ("test", "unseen"),
+    "half_second": ("test", "unseen"),
+    "shuffled": ("test",),
+}
+"""Experiments and roles of the short table."""
+
+BELOW: Mapping[tuple[str, str], str] = {
+    ("random_bins", "test"): "test",
+    ("unseen4", "unseen"): "unseen",
+}
+"""Rows below which the paper's stands."""
+
+_COLUMNS = {
+    "accuracy": "accuracy %",
+    "balanced_accuracy": "balanced accuracy %",
+    "non_slip_recall": "non-slip recall %",
+    "slip_recall": "slip recall %",
+}
+
+
+def short_table(report: Report) -> str:
+    """The block between the markers in README.md."""
+    rows = []
+    for name, roles in SHORT.items():
+        for role in roles:
+            cells = [text(percent(report, name, role, score)) for score in _COLUMNS]
+            rival = text(rival_percent(report, name, role, "balanced_accuracy"))
+            if runs_of(report, name):
+                num = len(runs_of(report, name))
+                rows.append([f"`{name}` {role}, simulated, {num} seeds", *cells, rival])
+            if (name, role) in BELOW:
+                paper = published.SPLITS[BELOW[name, role]]
+                values = [getattr(paper, score) for score in _COLUMNS]
+                of_paper = ["" if value is None else f"{100 * value:.2f}" for value in values]
+                rows.append([f"paper, real hand, {BELOW[name, role]}", *of_paper, ""])
+    header = ["experiment", *_COLUMNS.values(), "best single selected feature, balanced %"]
+    table = Table(header, rows).markdown()
+    return f"{QUICK_LINE}\n\n{table}" if report["quick"] else table
