@@ -264,9 +264,9 @@ def varied(n: int = 1, dtype: torch.dtype = torch.float64) -> Lanes:
 
 
 def shaken(times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Back and forth under a load that goes away and comes back, another one for each lane."""
+    """Back and forth under a load that goes away and comes back, other ones for each lane."""
     t = times[:, None, None]
-    arm = 0.05 * torch.sin(70.0 * t)
+    arm = torch.tensor([[0.05, 0.06, 0.04], [0.02, 0.05, 0.07]]) * torch.sin(70.0 * t)
     load = torch.tensor([[1.0, 0.5, 2.0], [1.5, 1.0, 0.1]]) * (0.7 + torch.sin(90.0 * t)).clamp(0)
     return arm, load
 
