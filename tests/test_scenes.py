@@ -13,6 +13,7 @@ import torch
 from scene_files import NAMES, SCENE_FILES, insides, is_within, scene_of, whole_grid
 
 from tactslip_torch.simulation import (
+    FIDELITIES,
     MATERIALS,
     Contact,
     Faults,
@@ -70,6 +71,21 @@ def test_truth_is_what_the_contact_does(name, material):
     bounds = np.array(truth.non_slip_s).reshape(-1)
     assert np.all(np.diff(bounds) > 0)  # ascending, apart, none empty
     assert np.all((bounds >= 0) & (bounds <= truth.duration_s))
+
+
+@pytest.mark.parametrize("rung", FIDELITIES)
+def test_handling_keeps_clear_of_slides_on_every_rung(rung):
+    strokes = (Stroke(40.0, 20.0, 1.0), Stroke(60.0, 30.0, 1.0, "both"), Stroke(40.0, 20.0, 0.6))
+    handling = Handling(taps_per_s=4.0, grips_per_s=1.0, grip_s=(0.2, 0.4))
+    scene = Scene("M6", strokes=strokes, handling=handling, fidelity=rung, tail_s=1.0)
+    truth, (_, any_slides) = timeline(scene), sliding_load(scene)
+    quiet = is_within(truth.non_slip_s, truth.num_samples)
+    assert quiet.mean() > 0.2
+    assert any_slides.mean() > 0.1
+    assert not (quiet & any_slides).any()
+    assert len(truth.onsets_s) == 2
+    for start_s, end_s in truth.sliding_s:
+        assert any_slides[round(2000 * start_s) : round(2000 * end_s)].mean() > 0.9
 
 
 def test_scenes_that_handle_the_hand_say_where_and_the_others_do_not():
