@@ -1,0 +1,399 @@
+"""Recordings written to a folder: which files there are, what they hold, and what is kept."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from oracles import savgol
+from test_commands import BAD_INPUT, TinyRecordings, composed
+
+from tactslip_torch import HandLayout, simulate
+from tactslip_torch import generate as module
+from tactslip_torch.config import one_line
+from tactslip_torch.data.archive import load_recording, save_recording
+from tactslip_torch.data.folder import FORMATS, RecordingFolder, Written, manifest_line
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.generate import folder_problem, generate, written_table
+from tactslip_torch.simulation.scene import Scene
+from tactslip_torch.simulation.source import SimulatedRecordings
+
+PAPER = HandLayout.paper24()
+TRUTH = ("onsets_s", "annotated_onsets_s", "sliding_s", "non_slip_s", "speeds_mm_s")
+TINY = ("data._target_=test_generate.CountedRecordings", "materials=[A,B]", "cycles=3")
+CARRIED = ("scene=arm_motion", "materials=[M2,M6]", "cycles=1")
+
+
+class CountedRecordings(TinyRecordings):
+    """A stand-in that counts what is loaded here, and fails where it is told to."""
+
+    loads = 0
+    fails = ""
+
+    def load(self, recording, windows=None):
+        CountedRecordings.loads += 1
+        if str(recording) == self.fails:
+            raise ValueError(f"{recording} cannot be read")
+        return super().load(recording, windows)
+
+
+@pytest.fixture(autouse=True)
+def _fresh(monkeypatch):
+    monkeypatch.setattr(CountedRecordings, "loads", 0)
+    monkeypatch.setattr(CountedRecordings, "fails", "")
+
+
+def run(folder, *overrides, workers=0, figure=False):
+    """What ``generate`` returns for the tiny set, or for the simulated one."""
+    own = overrides if any(o.startswith("scene=") for o in overrides) else (*TINY, *overrides)
+    return generate(
+        composed(f"num_workers={workers}", f"figure={figure}", *own, name="generate"), folder
+    )
+
+
+def manifest(folder):
+    with (folder / "manifest.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.npz"))}
+
+
+# What is written -----------------------------------------------------------------------------
+
+
+def test_files_hold_the_recordings_of_the_source_bit_for_bit(tmp_path, capsys):
+    run(tmp_path, *CARRIED, "seed=5")
+    source = SimulatedRecordings(seed=5, cycles=1, materials=["M2", "M6"])
+    plain = Scene("M2", seed=5).to_dict()
+    assert set(contents(tmp_path)) == {"M2_arm_motion_00.npz", "M6_arm_motion_00.npz"}
+    for name in contents(tmp_path):
+        recording, hand, key = load_recording(tmp_path / name)
+        again = simulate(Scene.from_dict(key["recording"]))
+        assert torch.equal(recording.samples, again.samples)
+        assert recording.samples.isfinite().all()
+        for truth in TRUTH:
+            assert getattr(recording, truth) == getattr(again, truth)
+        assert hand == source.hand == PAPER
+        assert key["recording"]["seed"] == 5
+        assert key["recording"]["name"] == "arm_motion"
+        assert recording.provenance == again.provenance
+        assert recording.provenance["simulated"] is True
+        assert recording.onsets_s == ()
+        assert len(recording.non_slip_s) == 3
+    assert set(key["recording"]) == set(plain)
+    out = capsys.readouterr().out
+    assert out.startswith("\nSIMULATED data")
+    assert out.endswith(f"recordings in {tmp_path}\n")
+
+
+def test_the_manifest_lists_the_files_with_their_truth(tmp_path):
+    run(tmp_path, *CARRIED)
+    lines = manifest(tmp_path)
+    assert [line["file"] for line in lines] == ["M2_arm_motion_00.npz", "M6_arm_motion_00.npz"]
+    for line in lines:
+        recording = load_recording(tmp_path / line["file"]).recording
+        assert (line["material"], line["cycle"]) == (recording.material, "0")
+        assert (line["scene"], line["fidelity"], line["seed"]) == ("arm_motion", "kinematic", "0")
+        assert line["simulated"] == "true"
+        assert float(line["sample_rate_hz"]) == recording.sample_rate_hz == 2000.0
+        for name in TRUTH:
+            listed = json.loads(json.dumps(getattr(recording, name)))
+            assert json.loads(line[name]) == listed
+        assert len(json.loads(line["non_slip_s"])) == 3
+
+
+def test_a_recording_that_is_not_simulated_is_not_called_so(tmp_path, capsys):
+    run(tmp_path)
+    assert {line["simulated"] for line in manifest(tmp_path)} == {"false"}
+    assert "SIMULATED" not in capsys.readouterr().out
+
+
+def test_any_number_of_processes_writes_the_same_bytes(tmp_path):
+    found = [run(tmp_path / str(n), workers=n) for n in (0, 1, 2)]
+    one, *others = [contents(tmp_path / str(n)) for n in (0, 1, 2)]
+    assert len(one) == 6
+    assert others == [one, one]
+    lines = [(tmp_path / str(n) / "manifest.csv").read_bytes() for n in (0, 1, 2)]
+    assert lines[0] == lines[1] == lines[2]
+    assert found[0] == found[1] == found[2]
+
+
+def test_kinds_of_scenes_share_a_folder_and_have_rows_of_their_own(tmp_path, capsys):
+    others = "+data.others.quiet={strokes: [{speed_mm_s: 60.0, distance_mm: 10.0}], cycles: 2}"
+    short = "+data.scene.strokes=[{speed_mm_s: 40.0, distance_mm: 20.0, pause_s: 0.5}]"
+    run(tmp_path, "scene=paper", "materials=[M1]", "cycles=1", short, others)
+    assert set(contents(tmp_path)) == {
+        "M1_paper_00.npz",
+        "M1_quiet_00.npz",
+        "M1_quiet_01.npz",
+    }
+    assert [line["scene"] for line in manifest(tmp_path)] == ["paper", "quiet", "quiet"]
+    rows = [line.split()[:3] for line in capsys.readouterr().out.splitlines()]
+    for row in (["paper", "1", "1"], ["quiet", "2", "2"], ["all", "3", "3"]):
+        assert row in rows
+
+
+def test_the_table_counts():
+    line = {"scene": "paper", "simulated": "true"}
+    written = [Written(line, True, 10.25, 2_000_000), Written(line, False, 5.0, 500_000)]
+    head, names, row, last = written_table(written, 3.25).splitlines()
+    assert head.startswith("SIMULATED")
+    assert row.split() == ["paper", "2", "1", "15.2", "2.5"]
+    assert names.split() == ["scene", "recordings", "made", "now", "seconds", "of", "signal", "MB"]
+    assert last == "took 3.2 s"
+
+
+# What is kept --------------------------------------------------------------------------------
+
+
+def test_finished_files_are_kept_and_lost_or_damaged_ones_made_again(tmp_path):
+    first = run(tmp_path)
+    assert CountedRecordings.loads == 6
+    assert all(one.made for one in first)
+    before, list_before = contents(tmp_path), (tmp_path / "manifest.csv").read_bytes()
+    (tmp_path / "A_paper_01.npz").unlink()
+    damaged = bytearray(before["B_paper_02.npz"])
+    damaged[5000] ^= 1
+    (tmp_path / "B_paper_02.npz").write_bytes(damaged)
+    second = run(tmp_path)
+    assert CountedRecordings.loads == 8
+    assert [one.line["file"] for one in second if one.made] == ["A_paper_01.npz", "B_paper_02.npz"]
+    assert contents(tmp_path) == before
+    assert (tmp_path / "manifest.csv").read_bytes() == list_before
+    assert not any(one.made for one in run(tmp_path))
+
+
+@pytest.mark.parametrize("change", ["seed=1", "+data.scene.slide_s=0.7"])
+def test_files_of_another_scene_are_made_anew(tmp_path, change):
+    run(tmp_path)
+    before = contents(tmp_path)
+    assert all(one.made for one in run(tmp_path, change))
+    after = contents(tmp_path)
+    assert all(after[name] != before[name] for name in before)
+    assert not any(one.made for one in run(tmp_path, change))
+
+
+def test_files_of_other_code_are_made_anew(tmp_path, monkeypatch):
+    run(tmp_path)
+    monkeypatch.setattr(module, "source_digest", lambda package: "changed")
+    assert all(one.made for one in run(tmp_path))
+    assert {load_recording(p).key["code"] for p in tmp_path.glob("*.npz")} == {"changed"}
+
+
+def test_more_cycles_add_to_what_is_there(tmp_path):
+    run(tmp_path, "cycles=1")
+    made = [one.made for one in run(tmp_path, "cycles=3")]
+    assert made == [False, True, True] * 2
+    assert len(manifest(tmp_path)) == 6
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_run_that_fails_keeps_what_it_finished_and_has_no_manifest(
+    tmp_path, monkeypatch, workers
+):
+    monkeypatch.setattr(CountedRecordings, "fails", "B/0")
+    with pytest.raises(ValueError, match="B/0 cannot be read"):
+        run(tmp_path, workers=workers)
+    finished = contents(tmp_path)
+    assert {"A_paper_00.npz", "A_paper_01.npz", "A_paper_02.npz"} <= set(finished)
+    assert "B_paper_00.npz" not in finished
+    assert not (tmp_path / "manifest.csv").exists()
+    assert not list(tmp_path.glob(".*"))
+    monkeypatch.setattr(CountedRecordings, "fails", "")
+    again = run(tmp_path, workers=workers)
+    assert [one.made for one in again[:4]] == [False, False, False, True]
+    assert finished.items() <= contents(tmp_path).items()
+    assert len(manifest(tmp_path)) == 6
+
+
+def test_a_manifest_never_speaks_of_files_that_were_replaced(tmp_path, monkeypatch):
+    run(tmp_path)
+    monkeypatch.setattr(CountedRecordings, "fails", "B/2")
+    with pytest.raises(ValueError, match="B/2"):
+        run(tmp_path, "seed=1")
+    assert not (tmp_path / "manifest.csv").exists()
+
+
+# What is refused -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("content", [b"", b"my own notes", b"PK\x03\x04 zipped"])
+def test_a_file_that_is_not_ours_is_never_replaced(tmp_path, content):
+    run(tmp_path, "cycles=1")
+    before = contents(tmp_path)
+    (tmp_path / "B_paper_02.npz").write_bytes(content)
+    loads, listed = CountedRecordings.loads, (tmp_path / "manifest.csv").read_bytes()
+    with pytest.raises(ValueError, match=r"B_paper_02\.npz is damaged or no .*move it away"):
+        run(tmp_path)
+    assert contents(tmp_path) == before | {"B_paper_02.npz": content}
+    assert CountedRecordings.loads == loads
+    assert (tmp_path / "manifest.csv").read_bytes() == listed
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["materials=[M1,M9]", "scene=paper"], "data: unknown material 'M9'; known are M1, M2"),
+        (["materials=M1", "scene=paper"], r"materials must be a list such as \[M1,M6\], got 'M1'"),
+        (["materials=[]", "scene=paper"], "no recording to write; give at least one"),
+        (["cycles=0", "scene=paper"], "data: cycles must be at least 1, got 0"),
+        (["data.fidelity=real", "scene=paper"], "data: unknown fidelity 'real'; there is kinem"),
+        (["+data.scene.mu_k=2.0", "scene=paper"], "data: contact.mu_k must not exceed mu_s"),
+        (
+            ["scene=paper", "scene.name=a/b", "materials=[M1]"],
+            "cannot name a file; give the scene",
+        ),
+        (["format=csv"], "format must be one of npz, got 'csv'"),
+        (["num_workers=-1"], "num_workers must be null or a number of processes, got -1"),
+        (["num_workers=many"], "num_workers must be null or a number of processes, got 'many'"),
+        (["figure=true", "cycle=3"], r"cycle must lie in 0\.\.2 to be drawn, got 3"),
+        (["figure=true", "stroke=0"], "stroke counts from 1, got 0"),
+        (["~features.frames.PVDF"], "features.frames has no frame for PVDF channels"),
+        (["features.frames.SG=50"], "window_length must be odd"),
+        (["features.align=late"], "align must be one of"),
+    ],
+)
+def test_bad_input_is_one_line_and_touches_nothing(tmp_path, overrides, said):
+    if any(o.startswith("scene=") for o in overrides):
+        config = composed(*overrides, name="generate")
+    else:
+        config = composed(*TINY, "figure=false", *overrides, name="generate")
+    with pytest.raises(BAD_INPUT) as caught:
+        generate(config, tmp_path)
+    line = one_line(caught.value)
+    assert re.search(said, line), line
+    assert "\n" not in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_recordings_never_share_a_file(tmp_path):
+    class Clash(TinyRecordings):
+        ids = ()
+
+    source = Clash(0, 1, ["A"])
+    source.ids = (RecordingId("A_b", 0, "c"), RecordingId("A", 0, "b_c"))
+    with pytest.raises(ValueError, match="two recordings would have one file"):
+        RecordingFolder(source, tmp_path, "npz", {}).check()
+
+
+def test_a_folder_that_cannot_be_made_is_said_in_one_line(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for place in (tmp_path / "file", tmp_path / "file" / "below" / "it"):
+        problem = folder_problem(["seed=1", f"hydra.run.dir={place}"])
+        assert problem is not None
+        assert problem.startswith(f"cannot write to hydra.run.dir={place}: ")
+        assert "\n" not in problem
+    assert folder_problem([f"hydra.run.dir={tmp_path / 'a' / 'b'}"]) is None
+    assert folder_problem([f"hydra.run.dir='{tmp_path / 'a b'}'"]) is None
+    sweep = ["-m", f"hydra.sweep.dir={tmp_path / 'file'}", f"hydra.run.dir={tmp_path}"]
+    assert "hydra.sweep.dir" in folder_problem(sweep)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]  # nothing is left behind
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("hydra.run.dir=file/out", "error: cannot write to hydra.run.dir="),
+        ("materials=[M1,M9]", "error: data: unknown material 'M9'"),
+    ],
+)
+def test_the_command_ends_with_one_line_and_status_2(tmp_path, argument, said):
+    (tmp_path / "file").write_text("mine")
+    done = subprocess.run(
+        [sys.executable, "-m", "tactslip_torch.generate", argument],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith(said)
+    assert done.stderr.count("\n") == 1
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+# What is drawn -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """What the figures are made of, by file name, instead of the figures."""
+    found = {}
+
+    def keep(rows, channels, path, *, title, views=None):
+        found[Path(path).name] = (rows, channels, title, views)
+
+    monkeypatch.setattr(module, "signals_figure", keep)
+    return found
+
+
+def test_the_figures_show_each_material_filtered(tmp_path, drawn):
+    run(tmp_path, "cycle=1", "features.frames.SG=31", figure=True)
+    assert set(drawn) == {"recordings_paper.png", "onset_paper.png"}
+    whole, near = drawn["recordings_paper.png"], drawn["onset_paper.png"]
+    assert [row.title for row in whole[0]] == ["A", "B"]
+    for row in whole[0]:
+        content, hand, _ = load_recording(tmp_path / f"{row.title}_paper_01.npz")
+        assert whole[1] == hand.to_rows()
+        for channel, raw, seen in zip(hand.channels, content.samples, row.volts, strict=True):
+            frame = 31 if channel.kind == "SG" else 11
+            np.testing.assert_allclose(seen, savgol(raw.double().numpy(), frame), atol=1e-12)
+        assert row.onsets_s == content.onsets_s
+        assert row.sliding_s == content.sliding_s
+    assert whole[2] == near[2] == "Recordings: scene paper, cycle 1"
+    assert whole[3] is None
+    assert near[3] == [(pytest.approx(1.1), 4.5)] * 2  # two seconds before 3.1 s, to the end
+
+
+def test_simulated_recordings_are_called_so_with_their_fidelity(tmp_path, drawn):
+    run(tmp_path, *CARRIED, "seed=2", figure=True)
+    rows, _, title, views = drawn["onset_arm_motion.png"]
+    assert title == ("SIMULATED recordings: scene arm_motion, cycle 0, fidelity kinematic, seed 2")
+    assert all(row.onsets_s == () and len(row.non_slip_s) == 3 for row in rows)
+    for row, (start, end) in zip(rows, views, strict=True):
+        assert start == pytest.approx(max(0.0, row.non_slip_s[1][0] - 2.0))
+        assert end - start <= 5.0
+
+
+def test_the_figures_are_written(tmp_path):
+    run(tmp_path, "materials=[A]", "cycles=1", figure=True)
+    for name in ("recordings_paper.png", "onset_paper.png"):
+        content = (tmp_path / name).read_bytes()
+        assert content.startswith(b"\x89PNG")
+        assert len(content) < 1e6
+
+
+# Formats -------------------------------------------------------------------------------------
+
+
+def test_a_further_format_is_one_line(tmp_path, monkeypatch):
+    """What a new format has to give, shown with one that keeps everything in another file."""
+    npz = FORMATS["npz"]
+    monkeypatch.setitem(FORMATS, "copy", npz)
+    found = run(tmp_path, "format=copy", "cycles=1")
+    assert [one.line["file"] for one in found] == ["A_paper_00.copy", "B_paper_00.copy"]
+    assert load_recording(tmp_path / "A_paper_00.copy").recording.material == "A"
+    assert not any(one.made for one in run(tmp_path, "format=copy", "cycles=1"))
+
+
+def test_a_line_of_the_manifest_says_what_the_recording_says(tmp_path):
+    source = TinyRecordings(0, 1, ["A"])
+    content = source.load(source.ids[0])
+    line = manifest_line("a.npz", source.ids[0], content)
+    assert (line["file"], line["material"], line["scene"]) == ("a.npz", "A", "paper")
+    assert (line["simulated"], line["fidelity"], line["seed"]) == ("false", "", "")
+    assert json.loads(line["onsets_s"]) == list(content.onsets_s)
+    save_recording(tmp_path / "a.npz", content, source.hand, {})
+    again = load_recording(tmp_path / "a.npz").recording
+    assert manifest_line("a.npz", source.ids[0], again) == line
