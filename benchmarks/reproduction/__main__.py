@@ -37,7 +37,9 @@ from tactslip_torch.simulation.source import SimulatedRecordings
 KEPT = RESULTS / "reproduction.json"
 
 
-def measure(seeds: int, names: Sequence[str], folder: Path, quick: bool) -> dict[str, Any]:
+def measure(
+    seeds: int, names: Sequence[str], folder: Path, quick: bool, all_seeds: bool = False
+) -> dict[str, Any]:
     """The report: every experiment on every seed, JSON-able.
 
     Args:
@@ -45,6 +47,7 @@ def measure(seeds: int, names: Sequence[str], folder: Path, quick: bool) -> dict
         names: of the experiments.
         folder: of runs and of the cache of features.
         quick: whether few recordings are enough.
+        all_seeds: for every experiment, also for those that take fewer.
 
     Raises:
         RuntimeError: if a training fails.
@@ -55,7 +58,7 @@ def measure(seeds: int, names: Sequence[str], folder: Path, quick: bool) -> dict
     started = time.perf_counter()
     for seed in range(seeds):
         for name in names:
-            if seed >= EXPERIMENTS[name].num_seeds(seeds):
+            if seed >= EXPERIMENTS[name].num_seeds(seeds) and not all_seeds:
                 continue
             overrides = [*overrides_of(name, quick), f"seed={seed}"]
             place = folder / f"{name.replace(' ', '-')}-{seed}"
@@ -116,6 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs", type=Path, metavar="FOLDER", help="of runs and cached features")
     parser.add_argument("--experiments", nargs="+", default=list(EXPERIMENTS), choices=EXPERIMENTS)
     parser.add_argument("--quick", action="store_true", help="few recordings, to see that it runs")
+    parser.add_argument("--all-seeds", action="store_true", help="for every experiment")
     parser.add_argument("--report", action="store_true", help="write from what is kept, train none")
     parsed = parser.parse_args(arguments)
     if parsed.seeds < 1:
@@ -125,7 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         folder = parsed.runs or ROOT / "outputs" / f"reproduction{'-quick' * parsed.quick}"
         names = [name for name in EXPERIMENTS if name in parsed.experiments]
         try:
-            report = measure(parsed.seeds, names, folder.resolve(), parsed.quick)
+            report = measure(parsed.seeds, names, folder.resolve(), parsed.quick, parsed.all_seeds)
         except RuntimeError as error:
             print(f"error: {error}", file=sys.stderr)
             return 1

@@ -37,12 +37,12 @@ class Setting(NamedTuple):
     Attributes:
         title: heads its table.
         experiment: as it is stored.
-        marks: mark and reason of a quantity, from its role and what it is.
+        marks: mark and reason of a quantity, from the report.
     """
 
     title: str
     experiment: str
-    marks: Callable[[Quantity, bool], tuple[str, str]]
+    marks: Callable[[Quantity, Report], tuple[str, str]]
 
 
 def _of(role: str, score: str) -> Callable[[Report, str], list[float]]:
@@ -92,9 +92,10 @@ QUANTITIES = tuple(_quantities())
 AIM = "accuracy, test bins, %"
 
 
-def _authors(quantity: Quantity, is_calibrated: bool) -> tuple[str, str]:
-    if quantity.what == AIM and is_calibrated:
-        return CALIBRATED, "three knobs are set so that other seeds score the paper's"
+def _authors(quantity: Quantity, report: Report) -> tuple[str, str]:
+    if quantity.what == AIM and is_calibrated(report):
+        verdict = report["calibrated"]["verdict"]
+        return CALIBRATED, f"three knobs were set by it, on other seeds: {verdict}"
     if quantity.what == AIM:
         return PREDICTED, "the knobs stand at their starting values"
     if quantity.ours is larger_class:
@@ -102,16 +103,18 @@ def _authors(quantity: Quantity, is_calibrated: bool) -> tuple[str, str]:
     return PREDICTED, "no knob was set by it"
 
 
-def _by_cycle(quantity: Quantity, is_calibrated: bool) -> tuple[str, str]:
+def _by_cycle(quantity: Quantity, report: Report) -> tuple[str, str]:
     if quantity.role == "unseen":
         return PREDICTED, "no unseen material was looked at"
+    if quantity.role == "train":
+        return PREDICTED, "no knob was set by it"
     if quantity.ours is larger_class:
         return PREDICTED, "follows from where bins are laid"
     return NOT_COMPARABLE, "the paper's test bins have neighbours among its training bins"
 
 
-def _never(why: str) -> Callable[[Quantity, bool], tuple[str, str]]:
-    return lambda quantity, is_calibrated: (NOT_COMPARABLE, why)
+def _never(why: str) -> Callable[[Quantity, Report], tuple[str, str]]:
+    return lambda quantity, report: (NOT_COMPARABLE, why)
 
 
 _HALF = "the published matrices do not fit half a second on either side: it makes 50 % non-slip"
@@ -161,7 +164,7 @@ def _rows(report: Report, setting: Setting) -> list[Sequence[str]]:
         values = quantity.ours(report, setting.experiment)
         if values:
             ours, digits = MeanSd.of(values), quantity.digits
-            mark, why = setting.marks(quantity, is_calibrated(report))
+            mark, why = setting.marks(quantity, report)
             cells = [quantity.what, f"{quantity.paper:.{digits}f}", ours.text(digits)]
             rows.append([*cells, f"{ours.mean - quantity.paper:+.{digits}f}", mark, why])
     return rows

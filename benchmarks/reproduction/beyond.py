@@ -78,8 +78,8 @@ ABLATIONS = (
     Ablation("PVDF films only", "PVDF only"),
     Ablation("means of the SGs only", "SG means only"),
     Ablation("the best single selected feature with a threshold", "unseen4", is_rival=True),
-    Ablation("everything, the motors' vibration off", "motor_off"),
-    Ablation("everything, the motors' vibration alone", "motor_only"),
+    Ablation("everything, motors and jolts of the arm off", "motor_off"),
+    Ablation("everything, motors and jolts of the arm alone", "motor_only"),
     Ablation("everything, labels permuted", "shuffled"),
 )
 

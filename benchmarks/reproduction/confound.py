@@ -84,7 +84,8 @@ def recalls(report: Report, fold: str, role: str, scene: str) -> list[float]:
 
 def scenes_of(report: Report) -> list[str]:
     """Scenes that both are judged on, the protocol first."""
-    return labels_of(report, "confound: protocol", "test", "per_scene")
+    found = labels_of(report, "confound: protocol", "test", "per_scene")
+    return sorted(found, key=lambda scene: scene != PAPER_SCENE)
 
 
 def others_of(report: Report) -> list[str]:
@@ -200,7 +201,16 @@ def _hears(report: Report) -> str:
             "On none of these does it fall more than 10 points behind the protocol: on the "
             "simulated hand it feels slip more than it hears the arm."
         )
+    worst = min(others_of(report), key=lambda scene: _mean(report, scene))
+    parts.append(
+        f"Of all scenes it is fooled most by `{worst}`: mean recall "
+        f"{text(recalls(report, 'protocol', 'test', worst))} %, in the protocol {text(base)} %."
+    )
     return " ".join(parts)
+
+
+def _mean(report: Report, scene: str) -> float:
+    return MeanSd.of(recalls(report, "protocol", "test", scene)).mean
 
 
 def _for_recorders(found: Verdict) -> str:

@@ -39,14 +39,18 @@ EXPERIMENTS: dict[str, Experiment] = {
         ("+exp=random_bins", "recipe=paper"),
     ),
     "shuffled": Experiment(
-        "labels permuted; must show 50 %", ("+exp=seen6", "recipe=paper", "labels.shuffle_seed=1")
+        "labels permuted; must show 50 %",
+        ("+exp=seen6", "recipe=paper", "labels.shuffle_seed=1"),
+        most_seeds=2,
     ),
     "SG means only": Experiment(
         "means of the strain gauges alone",
         ("+exp=unseen4", "recipe=paper", "recipe.among={kind:SG,descriptor:mean}"),
     ),
     "PVDF only": Experiment(
-        "features of the films alone", ("+exp=unseen4", "recipe=paper", "recipe.among={kind:PVDF}")
+        "features of the films alone",
+        ("+exp=unseen4", "recipe=paper", "recipe.among={kind:PVDF}"),
+        most_seeds=3,
     ),
     # ... these of another ...
     "half_second": Experiment(
@@ -59,19 +63,19 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     # ... and each of these its own
     "motor_off": Experiment(
-        "the motors' vibration off",
+        "the arm neither heard nor felt",
         ("+exp=unseen4", "recipe=paper", "scene=motor_off"),
-        most_seeds=3,
+        most_seeds=2,
     ),
     "motor_only": Experiment(
-        "the motors' vibration alone",
+        "the arm alone, next to no contact",
         ("+exp=unseen4", "recipe=paper", "scene=motor_only"),
-        most_seeds=3,
+        most_seeds=2,
     ),
     "confound": Experiment(
         "judged on scenes where arm and slip part, the default recipe",
         ("+exp=confound",),
-        most_seeds=3,
+        most_seeds=2,
     ),
 }
 """By name, as tables call them."""

@@ -109,7 +109,7 @@ def confound_figure(report: Report, path: Path) -> None:
     """
     scenes = scenes_of(report)
     drawing = Figure(figsize=(9.2, 0.5 * len(scenes) + 1.6), layout="constrained")
-    panels = drawing.subplots(1, len(ROLES), sharey=True)
+    panels = drawing.subplots(1, len(ROLES), sharey=True, sharex=True)
     for axes, role in zip(panels, ROLES, strict=True):
         for shift, (fold, color) in zip((-0.14, 0.14), COLORS.items(), strict=True):
             for place, scene in enumerate(scenes):
@@ -117,7 +117,8 @@ def confound_figure(report: Report, path: Path) -> None:
                 at = [place + shift] * len(values)
                 axes.plot(values, at, "o", color=color, alpha=0.45, ms=4.5, mew=0)
                 axes.plot(MeanSd.of(values).mean, place + shift, "|", color=color, ms=12, mew=2)
-        axes.set_title("seen materials, test cycles" if role == "test" else "unseen materials")
+        title = "seen materials, test cycles" if role == "test" else "unseen materials"
+        axes.set_title(title, fontsize=10)
         axes.set_xlabel("mean recall of the classes there are, %")
         axes.grid(axis="x", color=LIGHT)
     for fold, color in COLORS.items():

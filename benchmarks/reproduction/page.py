@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -51,25 +52,43 @@ def page(report: Report, images: str) -> str:
 def _introduction(report: Report) -> str:
     settings = f" --seeds {report['seeds']}" + (" --quick" if report["quick"] else "")
     quick = f"\n\n{QUICK_LINE}" if report["quick"] else ""
-    return f"""# Reproduction, on a SIMULATED hand
+    parts = [
+        "# Reproduction, on a SIMULATED hand",
+        "**Every number of ours below is SIMULATED; the paper's are of a real hand, whose "
+        f"recordings are private.** Written by `{COMMAND}{settings}`, which trains the experiments "
+        "listed at the end and keeps what they count in `benchmarks/results/reproduction.json`; no "
+        "result is typed by hand. A seed is another simulated set and another split; numbers are "
+        f"mean ± standard deviation over seeds.{quick}",
+        f"The paper is {published.PAPER}. Every row that stands beside it is marked: {CALIBRATED}, "
+        f"the simulation was set by it; {PREDICTED}, it was not, and whatever came out is shown; "
+        f"{NOT_COMPARABLE}, something else was measured.",
+    ]
+    return "\n\n".join(parts)
 
-**Every number of ours below is SIMULATED; the paper's are of a real hand, whose recordings are
-private.** Written by `{COMMAND}{settings}` from `benchmarks/results/reproduction.json`; no number
-is typed by hand. A seed is another simulated set and another split; numbers are mean ± standard
-deviation over seeds.{quick}
 
-The paper is {published.PAPER}. Every row that stands beside it is marked: {CALIBRATED}, the
-simulation was set by it; {PREDICTED}, it was not, whatever came out is shown; {NOT_COMPARABLE},
-something else was measured."""
+def shown(table: Table) -> str:
+    """A table of Markdown with columns of numbers to the right and words to the left."""
+    columns = list(zip(*table.rows, strict=True))
+    is_number = [
+        place > 0 and all(re.match(r"[+-]?\d|-?$", cell) for cell in column)
+        for place, column in enumerate(columns)
+    ]
+    lines = table.markdown().split("\n")
+    lines[1] = f"| {' | '.join('---:' if of else '---' for of in is_number)} |"
+    return "\n".join(lines)
 
 
 def _first(report: Report) -> list[str]:
     parts = ["## 1. What was published, and ours beside", "### Scores"]
     for title, table in beside(report).items():
-        parts += [f"**{title}.**", table.markdown()]
+        parts += [f"**{title}.**", shown(table)]
     if runs_of(report, "random_bins"):
-        parts += ["### Selected features", selected_table(report).markdown()]
-    return [*parts, "### Signals", signals_table(report).markdown()]
+        parts += ["### Selected features", shown(selected_table(report))]
+    onset = (
+        f"Of the onset the paper shows one figure and states no metric: {NOT_COMPARABLE}; recall "
+        "beside the onset is in part 2."
+    )
+    return [*parts, "### Onset", onset, "### Signals", shown(signals_table(report))]
 
 
 def _second(report: Report, images: str) -> list[str]:
@@ -79,13 +98,13 @@ def _second(report: Report, images: str) -> list[str]:
         "## 2. What the paper's data could not show",
         "### Beside the onset",
         f"![Recall beside the onset]({images}/{FIGURES['places']})",
-        places_table(report).markdown(),
+        shown(places_table(report)),
         "### By stroke",
-        strokes_table(report).markdown(),
+        shown(strokes_table(report)),
         "### With less",
-        ablations_table(report).markdown(),
+        shown(ablations_table(report)),
         "### Leakage",
-        leak_table(report).markdown(),
+        shown(leak_table(report)),
         f"![Every seed]({images}/{FIGURES['seeds']})",
     ]
 
@@ -101,7 +120,7 @@ def _third(report: Report, images: str) -> list[str]:
         "neither).",
     ]
     for title, table in confound_tables(report).items():
-        parts += [f"**{title}.**", table.markdown()]
+        parts += [f"**{title}.**", shown(table)]
     parts.append(f"![Both detectors, scene by scene]({images}/{FIGURES['confound']})")
     return [*parts, *conclusion(report)]
 
@@ -109,16 +128,18 @@ def _third(report: Report, images: str) -> list[str]:
 def _knobs(report: Report) -> str:
     known = report["calibrated"]
     values = {name: _value(value) for name, value in known["values"].items()}
-    lines = ["## What was calibrated, and how", f"{known['provenance'].rstrip('.')}."]
+    how = known["provenance"].rstrip(".")
+    lines = ["## What was calibrated, and how", f"{how[0].upper()}{how[1:]}."]
     if is_calibrated(report):
         target = known["target"]
         lines.append(
             f"Aim: {100 * target['accuracy']:.2f} % ({target['row']}). Reached: "
             f"{100 * known['accuracy']:.2f} %, mean over seeds "
-            f"{', '.join(map(str, known['seeds']))}, none of which is below: {known['verdict']}."
+            f"{', '.join(map(str, known['seeds']))}, none of which is in a table above: "
+            f"{known['verdict']}."
         )
     table = Table(["knob", "frozen value"], [list(row) for row in values.items()])
-    return "\n\n".join([*lines, table.markdown()])
+    return "\n\n".join([*lines, shown(table)])
 
 
 def _value(value: Any) -> str:
@@ -136,7 +157,7 @@ def _runs(report: Report) -> str:
     total = sum(float(row[-1]) for row in rows)
     note = f"{total:.0f} minutes in all, on {facts}; {versions}."
     header = ["experiment", "", "command", "seeds", "minutes"]
-    return "## What was run\n\n" + Table(header, rows, note).markdown()
+    return "## What was run\n\n" + shown(Table(header, rows, note))
 
 
 # ---------------------------------------------------------------------------------- for README.md
@@ -179,5 +200,5 @@ def short_table(report: Report) -> str:
                 of_paper = ["" if value is None else f"{100 * value:.2f}" for value in values]
                 rows.append([f"paper, real hand, {BELOW[name, role]}", *of_paper, ""])
     header = ["experiment", *_COLUMNS.values(), "best single selected feature, balanced %"]
-    table = Table(header, rows).markdown()
+    table = shown(Table(header, rows))
     return f"{QUICK_LINE}\n\n{table}" if report["quick"] else table

@@ -30,7 +30,7 @@ def reasons(report: Report) -> list[str]:
         _leak(report),
         _motor(report),
     ]
-    return [part for part in parts if part]
+    return [part.rstrip() for part in parts if part]
 
 
 def beside_paper(values: Sequence[float], paper: float) -> str:
@@ -63,9 +63,13 @@ def _seen(report: Report) -> str:
     verdict = report["calibrated"]["verdict"]
     line += f"This one number is calibrated, on other seeds ({verdict}). "
     if stand == "above":
+        if "bound" in verdict:
+            line += "The knobs went as far as their priors allow and no further. "
+        elif "do not hold" in verdict:
+            line += "Beyond, the signals no longer look like the paper's. "
         line += (
-            "What keeps it above is that the conditions on the signals hold no further: noise, "
-            "mounting and onset labels of a real hand vary in more ways than three knobs do."
+            "We think it stays above because noise, mounting and onset labels of a real hand vary "
+            "in more ways than three knobs do."
         )
     return line
 
@@ -92,9 +96,9 @@ def _asymmetry(report: Report) -> str:
         line += f"of those 4 to 20 bins before {text(early)} %. "
         if fall > 1:
             line += (
-                "So errors gather where the skin already stretches and labels jitter: one bin of "
-                "20 is 5 % of non-slip, of 61 on average 1.6 % of slip, which is what makes the "
-                "classes uneven. "
+                "So errors gather where the skin already stretches and labels jitter: one bin of a "
+                f"stroke is {_share_of_one(report, 0):.1f} % of its non-slip and "
+                f"{_share_of_one(report, 1):.1f} % of its slip, which makes the classes uneven. "
             )
         else:
             line += "So here errors do not gather at the onset as we expect of a real hand. "
@@ -104,6 +108,16 @@ def _asymmetry(report: Report) -> str:
             "that settle and a person's late labels."
         )
     return line
+
+
+def _share_of_one(report: Report, is_slip: int) -> float:
+    """What a bin of a stroke is of all its bins of that class, in percent, on average."""
+    strokes = bins = 0
+    for run in runs_of(report, "unseen4"):
+        split = run["splits"]["test"]
+        strokes += split["per_position"]["0" if is_slip else "-1"][1]
+        bins += sum(split["confusion"][is_slip])
+    return 100 * strokes / bins
 
 
 def _unseen(report: Report) -> str:
@@ -212,12 +226,12 @@ def _motor(report: Report) -> str:
     if not (alone and off and both):
         return ""
     line = (
-        f"**Slip or motors.** With the motors' vibration off the test score is {text(off)} %, "
-        f"with it alone {text(alone)} %, with both {text(both)} %, balanced. "
+        f"**Slip or motors.** With motors and jolts of the arm off the test score is {text(off)} "
+        f"%, with them alone {text(alone)} %, with both {text(both)} %, balanced. "
     )
     if MeanSd.of(alone).mean > 75:
         return line + (
-            "Sound of the arm alone goes far, since in this protocol the arm moves whenever the "
+            "The arm alone goes far, since in this protocol the arm moves whenever the "
             "contact slips: a high score in it is no evidence that slip was felt, neither here "
             "nor in the paper."
         )
