@@ -5,12 +5,13 @@ import pytest
 
 from tactslip_torch.simulation import SEEN_MATERIALS, Contact, Disturbances, Scene, Stroke, timeline
 from tactslip_torch.simulation.friction import shear_share, sliding_gate, slips
-from tactslip_torch.simulation.grasp import draw_grasp
+from tactslip_torch.simulation.grasp import draw_grasp, recording_key
 from tactslip_torch.simulation.grid import Grid, causal_response
 from tactslip_torch.simulation.kinematic import KinematicContact
 from tactslip_torch.simulation.motion import Motion, arm_strokes
 from tactslip_torch.simulation.randomness import normal_blocks
 from tactslip_torch.simulation.sensors import highpass_response
+from tactslip_torch.simulation.vibration import band_responses, element_vibration, shared_field
 
 RATE_HZ = 2000.0
 
@@ -166,3 +167,25 @@ def test_film_passes_no_constant_and_a_fast_step_whole():
     tau_s = 1 / (2 * np.pi * 6.6)
     t = np.arange(100) / RATE_HZ
     np.testing.assert_allclose(step[:100], np.exp(-t / tau_s), atol=0.015)
+
+
+def test_two_slides_in_one_block_sound_once_each():
+    short = (Stroke(60.0, 12.0, 0.3), Stroke(60.0, 12.0, 0.01))
+    contact = Contact(lifted_fraction=0.0, presliding_mm=(0.1, 0.1), texture_scale=0.0)
+    scene = Scene("M2", strokes=short, contact=contact, cycle=1)
+    plan, grasp = arm_strokes(scene.strokes, scene.acceleration_m_s2), draw_grasp(scene)
+    grid = whole_grid(plan[-1].stop_s)
+    element = int(grasp.touching[0])
+    state = KinematicContact(scene, grasp, plan).on(grid)(element)
+    field = shared_field(scene, grasp, Motion(plan, grid))
+    felt = element_vibration(scene, grasp, state, field, element).fluctuation
+    response = band_responses(grasp, element, grid)[1]
+    noise = grid.coloured_noise((*recording_key(scene, "low"), element), response)
+    slips_of = state.slide > 0
+    both = [
+        ((grid.time_s[row] < plan[0].stop_s) & slips_of[row]).any()
+        and ((grid.time_s[row] > plan[1].start_s) & slips_of[row]).any()
+        for row in range(len(grid.blocks))
+    ]
+    assert any(both)
+    np.testing.assert_allclose(felt, state.slide * noise, atol=1e-12)

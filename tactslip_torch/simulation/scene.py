@@ -22,7 +22,7 @@ from tactslip_torch.simulation.materials import MATERIALS, SEEN_MATERIALS, UNSEE
 FIDELITIES = ("kinematic", "lugre", "patch")
 """The rungs that exist, cheapest first."""
 
-SIMULATION_VERSION = 1
+SIMULATION_VERSION = 2
 """Raised whenever the samples of some scene change; part of ``Scene.to_dict``, so of cache keys."""
 
 PAPER_STROKES = (Stroke(20.0), Stroke(40.0), Stroke(60.0))

@@ -118,7 +118,7 @@ def _volts(
     contact_of, handled = model.on(grid), Handled(scene, grasp, plan)
     for element in sorted(elements & set(grasp.touching.tolist())):
         contact = contact_of(element)
-        vibration = element_vibration(scene, grasp, model.slips, contact, field, element)
+        vibration = element_vibration(scene, grasp, contact, field, element)
         normal_n, shear_n, press_n = contact.normal_n, contact.friction_n, None
         if not handled.is_idle:
             press_n = handled.press_n(element, normal_n, grid.history[0])

@@ -73,7 +73,8 @@ def timeline_of(scene: Scene, plan: tuple[ArmStroke, ...], grasp: Grasp, slips: 
     """
     down = grasp.touching
     onsets = [_weighted_median(row[down], grasp.load_n[down]) for row in slips.start_s]
-    ends = [_weighted_median(row[down], grasp.load_n[down]) for row in slips.end_s]
+    sticking = [np.nan_to_num(row[down], nan=-np.inf) for row in slips.end_s]  # never slid
+    ends = [_weighted_median(row, grasp.load_n[down]) for row in sticking]
     num_samples = math.ceil((plan[-1].stop_s + scene.tail_s) * scene.sample_rate_hz - 1e-6)
     duration_s = num_samples / scene.sample_rate_hz
     return Timeline(

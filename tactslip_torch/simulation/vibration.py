@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.simulation.contact import ElementContact, Slips
+from tactslip_torch.simulation.contact import ElementContact
 from tactslip_torch.simulation.grasp import Grasp, Surface, recording_key, session_key
 from tactslip_torch.simulation.grid import Grid, causal_response
 from tactslip_torch.simulation.motion import Motion
@@ -129,16 +129,13 @@ def band_responses(grasp: Grasp, element: int, grid: Grid) -> NDArray[np.complex
 
 
 def element_vibration(
-    scene: Scene, grasp: Grasp, slips: Slips, contact: ElementContact, field: Field, element: int
+    scene: Scene, grasp: Grasp, contact: ElementContact, field: Field, element: int
 ) -> Vibration:
-    """One touching element's vibration over the whole grid; work only where it slides."""
+    """One touching element's vibration over the whole grid; work only in blocks that slide."""
     grid, shape = field.grid, field.grid.time_s.shape
     vibration = Vibration(np.zeros(shape), np.zeros(shape), np.zeros(shape))
     responses = None
-    for stroke in range(len(slips.start_s)):
-        rows = grid.overlapping(slips.start_s[stroke, element], slips.end_s[stroke, element])
-        if rows.start == rows.stop:
-            continue
+    for rows in _runs(np.asarray(contact.slide.any(axis=-1))):
         responses = band_responses(grasp, element, grid) if responses is None else responses
         gate = contact.slide[rows]
         part = Grid(grid.blocks[rows], grid.block_samples, grid.sample_rate_hz)
@@ -162,6 +159,12 @@ def element_vibration(
         vibration.fluctuation[rows] += gate * noise[1]
     vibration.high[:] += contact.release_v
     return vibration
+
+
+def _runs(chosen: NDArray[np.bool_]) -> list[slice]:
+    """The stretches of rows that are chosen."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]])))
+    return [slice(int(low), int(high)) for low, high in edges.reshape(-1, 2)]
 
 
 def _element_lines(scene: Scene, field: Field, element: int, rows: slice) -> Array:
