@@ -234,7 +234,10 @@ def _lane_height(known: list[Array]) -> float:
     if not known:
         return 1.0
     bulk = [np.subtract(*np.quantile(v, [0.99, 0.01])) for v in known]
-    height_v = max(np.quantile(bulk, 0.75), 0.35 * np.median([np.ptp(v) for v in known]))
+    bursts = [np.ptp(v) for v in known]
+    height_v = max(
+        np.quantile(bulk, 0.75), 0.35 * np.median(bursts), 1.5 * max(bursts) / len(bursts)
+    )
     return float(height_v) if height_v > 0 else 1.0
 
 
