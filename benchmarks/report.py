@@ -1,7 +1,7 @@
 """BENCHMARKS.md and its figures from kept numbers: ``python -m benchmarks.report``.
 
-Reads the JSON files that the benchmarks leave in ``benchmarks/results``, draws the figures of
-features, latency and throughput anew beside them, and writes ``BENCHMARKS.md`` in the root of the
+Reads the JSON files that the benchmarks leave in ``benchmarks/results``, draws the figures of those
+that can be drawn anew beside them, and writes ``BENCHMARKS.md`` in the root of the
 repository. No number in it is typed by hand. What was not measured is named with its command.
 """
 
@@ -26,6 +26,8 @@ from benchmarks.model import report as model
 from benchmarks.outcome import QUICK_LINE, RESULTS
 from benchmarks.precision import report as precision
 from benchmarks.rates import NOT_MEASURED, not_measured
+from benchmarks.simulation import figure as simulation_figure
+from benchmarks.simulation import report as simulation
 from benchmarks.tables import Table, limits
 from benchmarks.throughput import figure as throughput_figure
 from benchmarks.throughput import measure as throughput_measure
@@ -97,6 +99,14 @@ SECTIONS = {
     ),
     "precision": Section(
         "Precision", None, precision.report_text, keys=("variants", "solves", "ratios")
+    ),
+    "simulation": Section(
+        "The simulated hand",
+        simulation.tables,
+        simulation.report_text,
+        simulation_figure.figure,
+        simulation.about,
+        needs=simulation.SECTIONS,
     ),
 }
 """By the name of the benchmark and of its file."""

@@ -40,6 +40,15 @@ class Skins(NamedTuple):
     viscous_n_s_m: Array
     num_bristles: int
 
+    def columns(self) -> dict[str, Array]:
+        """All but the number of bristles, by name."""
+        return {name: getattr(self, name) for name in self._fields[:-1]}
+
+    def only(self, elements: slice) -> Skins:
+        """Some of the elements."""
+        own = {name: column[elements] for name, column in self.columns().items()}
+        return Skins(**own, num_bristles=self.num_bristles)
+
 
 def skins(scene: Scene, grasp: Grasp) -> Skins:
     """Skin and bristles of every touching element.
@@ -87,10 +96,10 @@ def _fast_ratio(scene: Scene, surface: Surface) -> float:
 
 def lanes_of(each: list[Skins], dtype: torch.dtype, device: torch.device) -> Lanes:
     """Lanes of several recordings, one after the other; they have equally many bristles."""
-    columns = zip(*(skin[:-1] for skin in each), strict=True)
+    columns = [skin.columns() for skin in each]
     values = {
-        name: torch.from_numpy(np.concatenate(column)).to(device, dtype)
-        for name, column in zip(Skins._fields, columns, strict=False)
+        name: torch.from_numpy(np.concatenate([own[name] for own in columns])).to(device, dtype)
+        for name in columns[0]
     }
     pressure = hertz_pressure(each[0].num_bristles, dtype=torch.float64)
     return Lanes(**values, pressure=pressure.to(device, dtype))
