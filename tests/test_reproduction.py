@@ -37,6 +37,7 @@ def run_of(seed=0, roles=("train", "test", "unseen"), rival=0.7, selected=(), **
             "splits": {role: counts(rival, rival) for role in roles},
         },
         "selected": list(selected),
+        "validation": None,
     }
 
 
@@ -194,6 +195,16 @@ def test_an_ablation_that_was_not_run_is_left_out_and_the_rival_is_the_threshold
     assert rows["means of the SGs only"][-1] == "14"
     assert rows["the best single selected feature with a threshold"][1] == "75.00"
     assert rows["everything"][1] == "85.00"
+
+
+def test_recipes_are_compared_on_training_materials_seed_by_seed():
+    paper = [run_of(i) | {"validation": v} for i, v in enumerate((0.91, 0.84, 0.90))]
+    robust = [run_of(i) | {"validation": v} for i, v in enumerate((0.93, 0.83, 0.95))]
+    table = beyond.validation_table(report_of(**{"unseen4": paper, "unseen4 robust": robust}))
+    mean, spread = statistics.mean([91, 84, 90]), statistics.stdev([91, 84, 90])
+    assert table.rows[0][1:] == [f"{mean:.2f} ± {spread:.2f}", "91.00, 84.00, 90.00"]
+    assert table.note.endswith("`robust` is the better one for 2 of 3 seeds.")
+    assert "seeds" not in beyond.validation_table(report_of(unseen4=paper)).note
 
 
 def test_scores_by_stroke():

@@ -14,7 +14,13 @@ from benchmarks.reproduction.beside import (
     is_calibrated,
     signals_table,
 )
-from benchmarks.reproduction.beyond import ablations_table, leak_table, places_table, strokes_table
+from benchmarks.reproduction.beyond import (
+    ablations_table,
+    leak_table,
+    places_table,
+    strokes_table,
+    validation_table,
+)
 from benchmarks.reproduction.confound import conclusion, confound_tables
 from benchmarks.reproduction.experiments import EXPERIMENTS
 from benchmarks.reproduction.reasons import reasons
@@ -103,6 +109,8 @@ def _second(report: Report, images: str) -> list[str]:
         shown(strokes_table(report)),
         "### With less",
         shown(ablations_table(report)),
+        "### Recipes",
+        shown(validation_table(report)),
         "### Leakage",
         shown(leak_table(report)),
         f"![Every seed]({images}/{FIGURES['seeds']})",
