@@ -9,7 +9,7 @@ from tactslip_torch.facts import filtered
 from tactslip_torch.simulation import SEEN_MATERIALS, paper_scenes
 from tactslip_torch.simulation.batch import simulate_many
 
-GENTLE = {"patch": {"pvdf_abrupt": 1.5, "pvdf_sustained": 6.0}}
+GENTLE = {"patch": {"pvdf_abrupt": 1.25}}
 """A patch lets go bristle by bristle, so its bursts are weaker; shuffled ones are 1."""
 
 

@@ -75,7 +75,7 @@ def skins(scene: Scene, grasp: Grasp) -> Skins:
         stiffness_n_m=(1.0 - relaxing) * skin,
         relaxing_n_m=relaxing * skin,
         relaxation_time_s=grasp.relaxation_time_s[down],
-        damping_n_s_m=2.0 * (knobs.skin_damping + grasp.damping[down]) * mass * omega,
+        damping_n_s_m=2.0 * (knobs.sliding_damping + grasp.damping[down]) * mass * omega,
         mu_s=surface.mu_s * same,
         mu_k=_fast_ratio(scene, surface) * surface.mu_s * same,
         stribeck_m_s=1e-3 * surface.material.stribeck_mm_s * same,

@@ -21,7 +21,7 @@ class Dynamics:
             and how gently the patch lets go: a bristle's friction falls with the patch's speed.
         num_bristles: of the ``"patch"`` rung, under a Hertz pressure.
         bristle_stiffness_n_m: of the single bristle of the ``"lugre"`` rung.
-        skin_damping: damping ratio of the skin beyond that with which the kinematic rung rings
+        sliding_damping: damping ratio of the skin beyond that with which the kinematic rung rings
             (prior, ours). Without it smooth materials stick and slip on soft skin at 20 to 60 mm/s.
         bristle_damping: damping ratio of the bristles with the skin's mass (prior, ours).
         viscous_n_s_m: viscous friction, which the kinematic rung does not have.
@@ -35,13 +35,13 @@ class Dynamics:
     """
 
     step_us: float = 250.0
-    bristle_share: float = 0.2
+    bristle_share: float = 0.15
     num_bristles: int = 24
     bristle_stiffness_n_m: float = 1e5
-    skin_damping: float = 0.5
+    sliding_damping: float = 1.0
     bristle_damping: float = 1.0
     viscous_n_s_m: float = 0.0
-    release_v_per_n: float = 8.0
+    release_v_per_n: float = 14.0
 
     def __post_init__(self) -> None:
         require_finite(self)
