@@ -105,10 +105,47 @@ def test_scenes_are_groups_as_materials_are() -> None:
     truth, predicted = random_bins(5)
     scenes = [("taps", "paper")[i % 2] for i in range(len(truth))]
     scores = bin_metrics(truth, predicted, scenes, [20.0] * len(truth), scenes)
-    assert scores["per_scene"] == scores["per_material"]
+    alone = bin_metrics(truth, predicted, scenes, [20.0] * len(truth))
+    assert scores["per_scene"] == alone["per_material"]
     assert list(scores["per_scene"]) == ["taps", "paper"]
     one = bin_metrics(truth, predicted, scenes, [20.0] * len(truth), ["paper"] * len(truth))
     assert list(one["per_scene"]) == ["paper"]
+
+
+def test_of_several_scenes_groups_count_the_papers_bins_alone() -> None:
+    truth, predicted = random_bins(7)
+    num = len(truth)
+    scenes = [("taps", "paper", "grips")[i % 3] for i in range(num)]
+    groups = [["a" if i < 200 else "b" for i in range(num)], [20.0 * (i % 4) for i in range(num)]]
+    positions = [i % 9 - 4 for i in range(num)]
+    scores = bin_metrics(truth, predicted, *groups, scenes, positions)
+    rows = [i for i in range(num) if scenes[i] == "paper"]
+    labels = [[group[i] for i in rows] for group in groups]
+    places = [positions[i] for i in rows]
+    expected = bin_metrics(truth[rows], predicted[rows], *labels, None, places)
+    for kind in ("per_material", "per_speed", "per_position"):
+        assert scores[kind] == expected[kind]
+    assert scores["num_bins"] == num
+    unlike = ["taps" if scene == "paper" else "grips" for scene in scenes]  # and none the paper's
+    none = bin_metrics(truth, predicted, *groups, unlike, positions)
+    assert none["per_material"] == none["per_speed"] == none["per_position"] == {}
+    for parts in (scenes, unlike):
+        by_scene = [
+            bin_metrics(
+                truth[own],
+                predicted[own],
+                *([group[i] for i in own] for group in groups),
+                [scene] * len(own),
+                [positions[i] for i in own],
+            )
+            for scene in dict.fromkeys(parts)
+            for own in [[i for i in range(num) if parts[i] == scene]]
+        ]
+        assert merged_metrics(by_scene) == bin_metrics(truth, predicted, *groups, parts, positions)
+    taps = [i for i in range(num) if scenes[i] == "taps"]  # of one kind, whichever, all count
+    labels = [[group[i] for i in taps] for group in groups]
+    one = bin_metrics(truth[taps], predicted[taps], *labels, ["taps"] * len(taps))
+    assert sum(of["num_bins"] for of in one["per_material"].values()) == len(taps)
 
 
 def test_recall_by_position_is_the_share_of_right_bins_there(rng: np.random.Generator) -> None:
@@ -267,8 +304,22 @@ def test_materials_table_has_scenes_where_there_are_several() -> None:
     scenes = [("paper", "taps")[i % 2] for i in range(len(truth))]
     for given, expected in ((scenes, ["scene paper", "scene taps"]), (["paper"] * len(truth), [])):
         scores = bin_metrics(truth, predicted, ["a"] * len(truth), [20.0] * len(truth), given)
-        rows = rows_of(materials_table({"simulated": False, "splits": {"test": scores}}))[1:]
-        assert [row[-6] for row in rows] == ["a", "20 mm/s", *expected]
+        table = materials_table({"simulated": False, "splits": {"test": scores}})
+        line = "of several scenes: materials and speeds are of the paper's scene alone"
+        assert (table.splitlines()[0] == line) == bool(expected)
+        assert [row[-6] for row in rows_of(table)[1 + bool(expected) :]] == [
+            "a",
+            "20 mm/s",
+            *expected,
+        ]
+
+
+def test_bins_of_no_stroke_are_called_so() -> None:
+    truth, predicted = random_bins(8)
+    speeds = [(0.0, 20.0)[i % 2] for i in range(len(truth))]
+    scores = bin_metrics(truth, predicted, ["a"] * len(truth), speeds)
+    table = materials_table({"simulated": False, "splits": {"test": scores}})
+    assert [row[-6] for row in rows_of(table)[1:]] == ["a", "no stroke", "20 mm/s"]
 
 
 def test_timing_table_takes_a_given_total() -> None:
@@ -316,6 +367,29 @@ def test_confusion_figure(tmp_path: Path, simulated: bool) -> None:
     path.write_bytes(b"an older figure")
     confusion_figure(metrics_of(simulated), path)
     assert_drawn_atomically(path)
+
+
+@pytest.mark.parametrize(
+    ("scenes", "is_papers"), [(("paper",), True), (("taps",), False), (("paper", "taps"), False)]
+)
+def test_the_papers_numbers_stand_beside_its_own_scenes_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenes: tuple[str, ...], is_papers: bool
+) -> None:
+    truth, predicted = random_bins(9)
+    kinds = [scenes[i % len(scenes)] for i in range(len(truth))]
+    scores = bin_metrics(truth, predicted, ["a"] * len(truth), [20.0] * len(truth), kinds)
+    metrics = {"simulated": True, "splits": {"test": scores}}
+    drawn = []
+
+    def keep(figure: Any, target: Path, **_: object) -> None:
+        drawn.append(figure)
+        target.write_bytes(b"drawn")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", keep)
+    confusion_figure(metrics, tmp_path / "confusion.png")
+    (panel,) = drawn[0].axes
+    assert ("paper: non-slip 93.8" in panel.get_xlabel()) == is_papers
+    assert any(row[0] == "paper" for row in rows_of(splits_table(metrics))) == is_papers
 
 
 def test_confusion_figure_with_many_splits_and_an_absent_class(tmp_path: Path) -> None:

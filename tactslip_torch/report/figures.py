@@ -35,7 +35,7 @@ _COUNT_STYLE: dict[str, Any] = {"padding": 2, "fontsize": _SMALL, "color": _GREY
 def confusion_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
     """Write one confusion matrix per split: bins counted, and percent of each true class.
 
-    The paper's recalls are the caption of a panel where it states them.
+    The paper's recalls are the caption of a panel where it states them, of scenes of its own.
 
     Args:
         metrics: the content of ``metrics.json``.
@@ -81,12 +81,12 @@ def _confusion_panel(axes: Axes, name: str, scores: Mapping[str, Any]) -> None:
     axes.set_ylabel("truth", fontsize=_TEXT, color=_GREY)
     axes.set_title(name, fontsize=_TEXT + 1, fontweight="bold", pad=21)
     axes.text(0.5, -0.545, _accuracies(scores), ha="center", fontsize=_SMALL)  # below the title
-    axes.set_xlabel(f"prediction\n{_caption(name)}", fontsize=_SMALL, color=_GREY)
+    axes.set_xlabel(f"prediction\n{_caption(name, scores)}", fontsize=_SMALL, color=_GREY)
 
 
-def _caption(split: str) -> str:
-    """The paper's numbers for a split, in two short lines; empty where it has none."""
-    paper = published.SPLITS.get(split)
+def _caption(split: str, scores: Mapping[str, Any]) -> str:
+    """The paper's numbers beside a split's, in two short lines; empty where it has none."""
+    paper = published.beside(split, scores)
     if paper is None:
         return "\n"
     if paper.non_slip_recall is None or paper.slip_recall is None:

@@ -10,8 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 PAPER = "He et al. 2026, arXiv:2603.18370"
+
+PAPER_SCENE = "paper"
+"""The kind of scene that is the paper's protocol, in ``per_scene`` of scores."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,17 @@ SPLITS: Mapping[str, PublishedSplit] = MappingProxyType(
         "unseen": PublishedSplit(0.9195, 0.8605, 0.744, 0.977),
     }
 )
+
+
+def beside(split: str, scores: Mapping[str, Any]) -> PublishedSplit | None:
+    """The paper's scores to put beside ours: none of a split it lacks, or of scenes not its own.
+
+    Args:
+        split: name of the split.
+        scores: ours; without ``per_scene`` they are of the paper's scene.
+    """
+    return SPLITS.get(split) if set(scores.get("per_scene", {})) <= {PAPER_SCENE} else None
+
 
 LARGER_CLASS = 0.753
 """Share of slip among the bins of figure 6: what calling all of them slip would score."""

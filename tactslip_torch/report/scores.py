@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tactslip_torch.report.published import PAPER_SCENE
+
 _FIRST, _LAST = -20, 19
 POSITIONS = (f"<{_FIRST}", *map(str, range(_FIRST, _LAST + 1)), f"{_LAST + 1}+")
 """Places beside an onset that ``bin_metrics`` counts, earliest first."""
@@ -93,6 +95,9 @@ def bin_metrics(
     at each place beside the onset that has bins, ``"-20"`` to ``"19"``, earlier ones together as
     ``"<-20"`` and later ones as ``"20+"``.
 
+    Of several kinds of scenes, materials, speeds and positions count bins of the paper's scene
+    alone: pooled, they would say more of which scenes there are than of a material.
+
     Args:
         is_slip_true: what each bin is.
         is_slip_predicted: what the detector calls it.
@@ -119,20 +124,23 @@ def bin_metrics(
         if labels is not None and len(labels) != num_bins:
             raise ValueError(f"{name} must have one entry per bin, {num_bins}, got {len(labels)}")
 
-    def by_group(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
+    is_one = scenes is None or len(set(scenes)) < 2
+    counted = [is_one or scene == PAPER_SCENE for scene in scenes or [PAPER_SCENE] * num_bins]
+
+    def by_group(members: Mapping[str, list[int]]) -> dict[str, dict[str, Any]]:
         return {
             label: split_metrics(confusion_matrix(is_slip_true[rows], is_slip_predicted[rows]))
-            for label, rows in _members(labels).items()
+            for label, rows in members.items()
         }
 
-    groups = {"per_material": by_group(materials)}
-    per_speed = by_group(f"{float(speed):g}" for speed in speeds_mm_s)
+    groups = {"per_material": by_group(_members(materials, counted))}
+    per_speed = by_group(_members([f"{float(speed):g}" for speed in speeds_mm_s], counted))
     groups["per_speed"] = {key: per_speed[key] for key in sorted(per_speed, key=float)}
     if scenes is not None:
-        groups["per_scene"] = by_group(scenes)
+        groups["per_scene"] = by_group(_members(scenes))
     if positions is not None:
         is_right = is_slip_true == is_slip_predicted
-        members = _members(_position_label(place) for place in positions)
+        members = _members([_position_label(place) for place in positions], counted)
         groups["per_position"] = {
             label: _recall(int(is_right[members[label]].sum()), len(members[label]))
             for label in POSITIONS
@@ -150,7 +158,7 @@ def summed_metrics(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 def merged_metrics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Scores of all bins of several ``bin_metrics`` together, from their summed counts.
 
-    Groups are those that any of the parts has.
+    Groups are those that any of the parts has; of several kinds of scenes again the paper's alone.
 
     Example:
         >>> half = {**split_metrics([[1, 0], [0, 1]]), "per_material": {}, "per_speed": {}}
@@ -158,16 +166,19 @@ def merged_metrics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         [[2, 0], [0, 2]]
     """
     groups: dict[str, dict[str, Any]] = {}
+    is_one = len({scene for part in parts for scene in part.get("per_scene", {})}) < 2
+    counted = [part for part in parts if is_one or PAPER_SCENE in part.get("per_scene", {})]
     for kind in ("per_material", "per_speed", "per_scene"):
-        having = [part[kind] for part in parts if kind in part]
-        if having:
+        if any(kind in part for part in parts):
+            own_parts = parts if kind == "per_scene" else counted
+            having = [part[kind] for part in own_parts if kind in part]
             labels = dict.fromkeys(label for own in having for label in own)
             groups[kind] = {
                 label: summed_metrics(own[label] for own in having if label in own)
                 for label in labels
             }
-    having = [part["per_position"] for part in parts if "per_position" in part]
-    if having:
+    if any("per_position" in part for part in parts):
+        having = [part["per_position"] for part in counted if "per_position" in part]
         groups["per_position"] = {}
         for label in POSITIONS:
             own = [places[label] for places in having if label in places]
@@ -177,11 +188,12 @@ def merged_metrics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {**summed_metrics(parts), **groups}
 
 
-def _members(labels: Iterable[str]) -> dict[str, list[int]]:
-    """Which bins have each label, labels in order of appearance."""
+def _members(labels: Sequence[str], counted: Sequence[bool] | None = None) -> dict[str, list[int]]:
+    """Which bins, of those counted, have each label, labels in order of appearance."""
     members: dict[str, list[int]] = {}
     for row, label in enumerate(labels):
-        members.setdefault(label, []).append(row)
+        if counted is None or counted[row]:
+            members.setdefault(label, []).append(row)
     return members
 
 

@@ -14,6 +14,7 @@ from tactslip_torch.report import published
 
 SIMULATED_LINE = "SIMULATED data: numbers of a simulated hand, not of the paper's"
 PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
+PAPER_SCENE_LINE = "of several scenes: materials and speeds are of the paper's scene alone"
 
 _SCORES = {
     "accuracy": "accuracy %",
@@ -38,29 +39,34 @@ def splits_table(metrics: Mapping[str, Any]) -> str:
         rows.append([name, *_score_cells(scores), str(scores["num_bins"])])
         if rival and name in rival["splits"]:
             rows.append(["  one feature", *_score_cells(rival["splits"][name]), "-"])
-        is_papers = set(scores.get("per_scene", {})) <= {"paper"}
-        if name in published.SPLITS and is_papers:
-            rows.append(["  paper", *_score_cells(vars(published.SPLITS[name])), "-"])
+        if paper := published.beside(name, scores):
+            rows.append(["  paper", *_score_cells(vars(paper)), "-"])
     return _titled(metrics, aligned(["split", *_SCORES.values(), "bins"], rows), PAPER_LINE)
 
 
 def materials_table(metrics: Mapping[str, Any]) -> str:
     """The same scores within each split for each material, stroke speed and, of several, scene.
 
+    Where there are several scenes, a line above says that materials and speeds are of the paper's
+    alone (``bin_metrics``).
+
     Args:
         metrics: the content of ``metrics.json``.
     """
     rows = []
+    head = []
     for name, split in metrics["splits"].items():
         groups = dict(split.get("per_material", {}))
-        groups |= {f"{speed} mm/s": of for speed, of in split.get("per_speed", {}).items()}
+        for speed, of in split.get("per_speed", {}).items():
+            groups["no stroke" if speed == "0" else f"{speed} mm/s"] = of
         if len(scenes := split.get("per_scene", {})) > 1:
+            head = [PAPER_SCENE_LINE]
             groups |= {f"scene {scene}": of for scene, of in scenes.items()}
         for position, (group, scores) in enumerate(groups.items()):
             first = name if position == 0 else ""
             rows.append([first, group, *_score_cells(scores), str(scores["num_bins"])])
     header = ["split", "group", *_SCORES.values(), "bins"]
-    return _titled(metrics, aligned(header, rows, num_left=2))
+    return _titled(metrics, "\n".join([*head, aligned(header, rows, num_left=2)]))
 
 
 def timing_table(timing_s: Mapping[str, float]) -> str:
