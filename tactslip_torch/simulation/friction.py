@@ -89,6 +89,8 @@ def shear_share(
     next_starts_s = [stroke.start_s for stroke in motion.plan[1:]] + [np.inf]
     for number, (stroke, next_s) in enumerate(zip(motion.plan, next_starts_s, strict=True)):
         rows = motion.grid.overlapping(stroke.start_s, next_s)
+        if rows.start == rows.stop:
+            continue
         t, travel_mm = time_s[rows], motion.travel_mm[number][rows]
         let_go_s, stick_s = slips.start_s[number, element], slips.end_s[number, element]
         stretching = slips.shear_before[number, element] + travel_mm / presliding_mm

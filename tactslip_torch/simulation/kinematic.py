@@ -56,14 +56,17 @@ class KinematicContact:
         scene, grasp, volts = self._scene, self._grasp, np.zeros(grid.time_s.shape)
         omega = 2 * np.pi * grasp.resonance_hz[element]
         decay = grasp.damping[element] * omega
+        times_s = np.stack([self.slips.start_s[:, element], self.slips.end_s[:, element]], axis=1)
+        places = [grid.overlapping(t, t + 12.0 / decay) for t in times_s.ravel().tolist()]
+        if all(rows.start == rows.stop for rows in places):
+            return volts
         rng = generator(*recording_key(scene, "onset pulse"), element)
-        strengths = lognormal(rng, 0.3, (len(self._plan), 2))
+        strengths = lognormal(rng, 0.3, times_s.shape)
         full_v = scene.contact.onset_pulse_v * grasp.friction_n[element]
-        for stroke, pair in enumerate(strengths):
-            starts = (self.slips.start_s[stroke, element], self.slips.end_s[stroke, element])
-            for start_s, strength, share in zip(starts, pair, SHARES, strict=True):
-                rows = grid.overlapping(start_s, start_s + 12.0 / decay)
-                since = np.maximum(grid.time_s[rows] - start_s, 0.0)
-                ringing = np.exp(-decay * since) * np.sin(omega * since)
-                volts[rows] += share * full_v * strength * ringing
+        sizes = (np.array(SHARES) * full_v * strengths).ravel()
+        for rows, start_s, size in zip(places, times_s.ravel(), sizes, strict=True):
+            if rows.start == rows.stop:
+                continue
+            since = np.maximum(grid.time_s[rows] - start_s, 0.0)
+            volts[rows] += size * (np.exp(-decay * since) * np.sin(omega * since))
         return volts

@@ -9,6 +9,7 @@ speed over wavelength, which run with the arm's position. Then a burst where it 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,15 +118,32 @@ def _resonance(frequency_hz: Array, resonance_hz: float, damping: float) -> Arra
 def band_responses(grasp: Grasp, element: int, grid: Grid) -> NDArray[np.complex128]:
     """Filters of the high and of the low part, of unit power, ``[2, B + 1]``.
 
-    The high part: rate of a height spectrum ``k^-a``, so ``f^(1 - a/2)``, behind the skin.
+    The high part: rate of a height spectrum ``k^-a``, so ``f^(1 - a/2)``, behind the skin. They
+    belong to the session, so its recordings share them.
     """
-    f = np.maximum(grid.frequency_hz(), 1.0)
-    tilt = (f / LOW_BAND_HZ) ** (1.0 - 0.5 * grasp.surface.spectral_exponent)
-    skin = _resonance(f, float(grasp.resonance_hz[element]), float(grasp.damping[element]))
+    return _band_responses(
+        grasp.surface.spectral_exponent,
+        float(grasp.resonance_hz[element]),
+        float(grasp.damping[element]),
+        grid.block_samples,
+        grid.sample_rate_hz,
+    )
+
+
+@lru_cache(maxsize=256)
+def _band_responses(
+    exponent: float, resonance_hz: float, damping: float, block_samples: int, rate_hz: float
+) -> NDArray[np.complex128]:
+    nowhere = Grid(np.zeros(0, dtype=np.int64), block_samples, rate_hz)
+    f = np.maximum(nowhere.frequency_hz(), 1.0)
+    tilt = (f / LOW_BAND_HZ) ** (1.0 - 0.5 * exponent)
+    skin = _resonance(f, resonance_hz, damping)
     step = (f / LOW_BAND_HZ) ** 4
     high = tilt * skin * np.sqrt(step / (1 + step))
     low = np.sqrt(f**2 / (f**2 + 4.0) / (1 + step))
-    return causal_response(np.stack([high, low]), unit_power=True)
+    responses = causal_response(np.stack([high, low]), unit_power=True)
+    responses.flags.writeable = False
+    return responses
 
 
 def element_vibration(
