@@ -1,7 +1,8 @@
 """Judge a saved detector: ``python -m tactslip_torch.evaluate model=detector.pt split=unseen4``.
 
 Prints the tables and writes the figures that ``train`` does, for any set, labels and split. Says so
-where recordings the detector was trained on are among those it is judged on.
+where recordings the detector was trained on are among those it is judged on. Recordings that
+several folds hold out are judged once.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from tactslip_torch.config import (
 )
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.data.splits import Split
+from tactslip_torch.data.splits import Split, judged_once
 from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.experiment import (
     DTYPES,
@@ -64,17 +65,18 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     if is_first:
         save_config(config, folder)
     parts: dict[str, dict[str, Any]] = {}
-    overlaps: dict[str, dict[str, list[str]]] = {}
+    overlaps = {fold.name: overlap(detector, source, fold) for fold in folds}
     with feature_cache(config.cache) as cache:
         filters = detector.channel_filter
         dtype = DTYPES[detector.info.get("features_dtype", "float64")]
         maker = FeatureMaker(source, detector.pool, filters, rule, cache, dtype)
-        for fold in folds:
-            overlaps[fold.name] = overlap(detector, source, fold)
-            if is_first:
-                _note(fold, overlaps[fold.name])
+        for fold in folds if is_first else ():
+            _note(fold, overlaps[fold.name])
+        once = judged_once(folds)
+        for fold in once:
             learner = SlipLearner(detector.pool, filters, detector=detector)
-            trainer = make_trainer(config.trainer, folder)
+            place = folder if len(once) == 1 else folder / fold.name  # each its own logs
+            trainer = make_trainer(config.trainer, place)
             data = SlipDataModule(maker, fold, config.num_workers)
             trainer.test(learner, datamodule=data, verbose=False)
             parts[fold.name] = learner.metrics["splits"]

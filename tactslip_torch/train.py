@@ -28,7 +28,7 @@ from tactslip_torch.config import (
 )
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.data.splits import Split
+from tactslip_torch.data.splits import Split, are_rivals
 from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.experiment import (
     common_facts,
@@ -79,7 +79,8 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         folder: where results go.
 
     Returns:
-        Accuracy and balanced accuracy of each role, such as ``"unseen/accuracy"``.
+        Accuracy and balanced accuracy of each role, such as ``"unseen/accuracy"``; of rival folds
+        each its own, such as ``"protocol/unseen/accuracy"``.
 
     Raises:
         ValueError: for bad input, in one line.
@@ -105,7 +106,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             data = SlipDataModule(maker, fold, config.num_workers)
             learner = SlipLearner(pool, channel_filter, recipe)
             fold_metrics[fold.name] = _run_fold(config, place, data, learner)
-    metrics = common_facts(source, pool, config) | _combined(fold_metrics)
+    metrics = common_facts(source, pool, config) | _combined(fold_metrics, are_rivals(folds))
     metrics["timing_s"]["total"] = time.perf_counter() - started
     by_name = {str(name): name for name in pool.names}
     rows = feature_rows([by_name[name] for name in metrics["selected"]], source.hand)
@@ -193,25 +194,30 @@ def _checkpoint(given: str | None, fold: Split) -> Path | None:
     return next((candidate for candidate in found if candidate.is_file()), None)
 
 
-def _combined(folds: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """One fold as it is; of several, confusions are summed and the shared selection is named."""
+def _combined(folds: dict[str, dict[str, Any]], of_rivals: bool) -> dict[str, Any]:
+    """One fold as it is; of several, confusions are summed and the shared selection is named.
+
+    Rivals are judged on the same bins, so theirs are not summed: ``splits`` then has each role of
+    each fold, such as ``"protocol/unseen"``.
+    """
     if len(folds) == 1:
         return next(iter(folds.values()))
     parts = list(folds.values())
-    roles = list(dict.fromkeys(role for part in parts for role in part["splits"]))
-    rivals = [part["baselines"]["best_single_feature"]["splits"] for part in parts]
+    splits: dict[str, list[dict[str, Any]]] = {}
+    singles: dict[str, list[dict[str, Any]]] = {}
+    for name, part in folds.items():
+        before = f"{name}/" if of_rivals else ""
+        for role, scores in part["splits"].items():
+            splits.setdefault(before + role, []).append(scores)
+        for role, scores in part["baselines"]["best_single_feature"]["splits"].items():
+            singles.setdefault(before + role, []).append(scores)
     shared = set.intersection(*(set(part["selected"]) for part in parts))
     return {
-        "splits": {
-            role: merged_metrics([p["splits"][role] for p in parts if role in p["splits"]])
-            for role in roles
-        },
+        "splits": {role: merged_metrics(scores) for role, scores in splits.items()},
         "baselines": {
             "best_single_feature": {
                 "feature": "each fold's own",
-                "splits": {
-                    role: summed_metrics([r[role] for r in rivals if role in r]) for role in roles
-                },
+                "splits": {role: summed_metrics(scores) for role, scores in singles.items()},
             }
         },
         "selected": [name for name in parts[0]["selected"] if name in shared],

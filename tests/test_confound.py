@@ -94,12 +94,12 @@ def composed(*overrides, name="train"):
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory):
-    """``+exp=confound`` on the small scenes: the folder, and what it printed."""
+    """``+exp=confound`` on the small scenes: the folder, what it printed, what it returned."""
     folder = tmp_path_factory.mktemp("confound")
     recipe = ("recipe.num_features=10", "recipe.penalties=[0.1,1.0]", "recipe.sample_bins=100")
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        train(composed("+exp=confound", *recipe, "export=false"), folder)
-    return folder, printed.getvalue()
+        returned = train(composed("+exp=confound", *recipe, "export=false"), folder)
+    return folder, printed.getvalue(), returned
 
 
 def made(seed=0, *, simulated=True, scenes=SCENES, roles=("train", "test", "unseen")):
@@ -117,7 +117,8 @@ def made(seed=0, *, simulated=True, scenes=SCENES, roles=("train", "test", "unse
             bins[fold, role] = labels, truth, says
             scores = bin_metrics(truth, says, ["a"] * 600, [20.0] * 600, labels)
             folds[fold]["splits"][role] = scores
-    metrics = {"simulated": simulated, "splits": folds["protocol"]["splits"], "folds": folds}
+    splits = {f"{f}/{role}": s for f, of in folds.items() for role, s in of["splits"].items()}
+    metrics = {"simulated": simulated, "splits": splits, "folds": folds}
     return metrics | {"baselines": {}}, bins
 
 
@@ -127,8 +128,8 @@ def made(seed=0, *, simulated=True, scenes=SCENES, roles=("train", "test", "unse
 def test_detectors_are_the_folds_or_the_only_one():
     metrics, _ = made()
     assert list(by_detector(metrics)) == ["protocol", "with_scenes"]
-    single = {key: value for key, value in metrics.items() if key != "folds"}
-    assert by_detector(single) == {"detector": metrics["splits"]}
+    single = metrics["folds"]["protocol"]
+    assert by_detector(single) == {"detector": single["splits"]}
 
 
 def test_results_of_one_scene_have_nothing_to_compare(tmp_path, capsys):
@@ -178,7 +179,7 @@ def test_the_table_says_which_scenes_were_trained_on():
         ("tapped", "protocol"): "no",
         ("tapped", "with_scenes"): "no",
     }
-    saved = {key: value for key, value in metrics.items() if key != "folds"} | {"detector": {}}
+    saved = {"splits": metrics["folds"]["protocol"]["splits"], "detector": {}}
     assert {row[3] for row in confound_rows(saved)[1:]} == {"-"}  # another run trained it
 
 
@@ -196,7 +197,7 @@ def test_rivals_are_printed_apart_not_summed(capsys):
     for fold in ("protocol", "with_scenes"):
         scores = metrics["folds"][fold]["splits"]["unseen"]
         expected = [f"{100 * scores[key]:.2f}" for key in ("accuracy", "balanced_accuracy")]
-        row = next(row for row in rows if row[0] == f"{fold} unseen")
+        row = next(row for row in rows if row[0] == f"{fold}/unseen")
         assert row[1:3] == expected
         assert row[-1] == "600"
 
@@ -273,7 +274,7 @@ def test_the_figure_is_drawn_whole(tmp_path, roles):
 
 
 def test_a_run_on_several_scenes_leaves_table_and_figure(ran):
-    folder, printed = ran
+    folder, printed, _ = ran
     metrics = json.loads((folder / "metrics.json").read_text())
     assert list(metrics["folds"]) == ["protocol", "with_scenes"]
     assert confound_table(metrics) in printed
@@ -317,6 +318,29 @@ def test_both_folds_judge_the_same_bins(ran):
         assert len(one) == 8
 
 
+def test_scores_of_rivals_are_each_ones_own_and_no_sums(ran):
+    metrics = json.loads((ran[0] / "metrics.json").read_text())
+    roles = ("train", "test", "unseen")
+    expected = {
+        f"{fold}/{role}": metrics["folds"][fold]["splits"][role]
+        for fold in ("protocol", "with_scenes")
+        for role in roles
+    }
+    assert metrics["splits"] == expected
+    singles = metrics["baselines"]["best_single_feature"]["splits"]
+    assert singles == {
+        f"{fold}/{role}": of["baselines"]["best_single_feature"]["splits"][role]
+        for fold, of in metrics["folds"].items()
+        for role in roles
+    }
+    assert ran[2] == {
+        f"{place}/{name}": scores[name]
+        for place, scores in expected.items()
+        for name in ("accuracy", "balanced_accuracy")
+    }
+    assert ran[2]["protocol/test/accuracy"] != ran[2]["with_scenes/test/accuracy"]
+
+
 # A saved detector --------------------------------------------------------------------------------
 
 
@@ -347,3 +371,13 @@ def test_evaluate_on_several_scenes_draws_them(ran, tmp_path, capsys):
     assert (tmp_path / "confound.png").is_file()
     assert {row[2] for row in confound_rows(metrics)[1:]} == {"detector"}
     assert list(metrics["splits"]["unseen"]["per_scene"]) == ["arm_motion", "paper", "pulled"]
+
+
+def test_evaluate_counts_bins_that_both_folds_hold_out_once(ran, tmp_path):
+    metrics = judged(ran, tmp_path, "+exp=confound", "cache=off")
+    trained = json.loads((ran[0] / "metrics.json").read_text())["folds"]["with_scenes"]
+    for role in ("train", "test", "unseen"):  # with_scenes trains on all that protocol does
+        assert metrics["splits"][role]["confusion"] == trained["splits"][role]["confusion"]
+    assert list(metrics["overlap"]) == ["protocol", "with_scenes"]
+    for fold in metrics["overlap"]:
+        assert (tmp_path / fold / "csv" / "metrics.csv").is_file()

@@ -6,7 +6,9 @@ import torch
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import (
     Split,
+    are_rivals,
     confound,
+    judged_once,
     leave_one_material_out,
     random_bins,
     seen6,
@@ -274,6 +276,39 @@ def test_folds_keep_a_materials_draw():
     tests = [of_role(fold, "test", "M2") for fold in folds if "M2" not in fold.name]
     assert len(tests) == 4
     assert all(test == tests[0] for test in tests)
+
+
+# Folds together ------------------------------------------------------------------------------
+
+
+def several_scenes():
+    kinds = ("paper", "taps", "pulled")
+    whole = [RecordingId(r.material, r.cycle, k) for r in recordings(cycles=4) for k in kinds]
+    return confound(whole, seen=SEEN, unseen=UNSEEN, trained_scenes=["pulled"])
+
+
+def test_rivals_hold_out_the_same_recordings():
+    rest = leave_one_material_out(recordings(), materials=[*SEEN, *UNSEEN])
+    assert are_rivals(several_scenes())
+    assert are_rivals([*rest, Split("again", rest[1].roles)])
+    assert not are_rivals(rest)
+    assert not are_rivals([drawn()])
+
+
+@pytest.mark.parametrize("rivals", [True, False])
+def test_one_detector_meets_a_recording_once_in_each_role(rivals):
+    plain = leave_one_material_out(recordings(), materials=[*SEEN, *UNSEEN])
+    folds = several_scenes() if rivals else plain
+    kept = judged_once(folds)
+    pairs = [pair for fold in kept for pair in fold.roles.items()]
+    assert len(pairs) == len(set(pairs)) < sum(len(fold.roles) for fold in folds)
+    assert set(pairs) == {pair for fold in folds for pair in fold.roles.items()}
+    assert judged_once([*folds, folds[0]]) == kept  # nothing is left of the last one
+
+
+def test_folds_by_bin_keep_their_draws():
+    folds = random_bins(recordings(), seen=SEEN) * 2
+    assert judged_once(folds) == folds
 
 
 # Errors --------------------------------------------------------------------------------------

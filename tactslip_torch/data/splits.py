@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -193,6 +193,33 @@ def confound(
         }
         folds.append(_checked(Split(name, roles), ROLES))
     return folds
+
+
+def are_rivals(folds: Sequence[Split]) -> bool:
+    """Whether any two folds hold out the same recordings.
+
+    Each then judges a detector of its own on the same bins, and a sum over them is neither's score.
+    """
+    held_out = [tuple(fold.having("test", "unseen")) for fold in folds]
+    return len(set(held_out)) < len(held_out)
+
+
+def judged_once(folds: Sequence[Split]) -> list[Split]:
+    """The folds for one and the same detector: each recording once in each of its roles.
+
+    A recording stays in the first fold that gives it the role; folds that lose all are left out.
+    Those split by bin keep theirs, since their draws hang on all of their recordings.
+    """
+    known: set[tuple[RecordingId, str]] = set()
+    kept = []
+    for fold in folds:
+        roles = dict(fold.roles)
+        if fold.test_share_of_bins is None:
+            roles = {r: role for r, role in roles.items() if (r, role) not in known}
+            known |= roles.items()
+        if roles:
+            kept.append(replace(fold, roles=roles))
+    return kept
 
 
 def _by_cycle(

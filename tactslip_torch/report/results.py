@@ -34,7 +34,7 @@ def write_results(
     """
     with whole_file(folder / "metrics.json") as temporary:
         temporary.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
-    confusion_figure(_by_fold(metrics), folder / "confusion.png")
+    confusion_figure(metrics, folder / "confusion.png")
     simulated = metrics["simulated"]
     if selected:
         selected_features_figure(selected, folder / "selected_features.png", simulated=simulated)
@@ -46,7 +46,7 @@ def write_results(
 
 def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
-    parts = [splits_table(_by_fold(metrics)), materials_table(_by_fold(metrics))]
+    parts = [splits_table(metrics), materials_table(metrics)]
     if by_detector(metrics):
         parts.append(confound_table(metrics))
     if selected:
@@ -58,26 +58,3 @@ def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, st
     if metrics.get("timing_s"):
         parts.append(timing_table(metrics["timing_s"]))
     print("\n" + "\n\n".join(parts))
-
-
-def _by_fold(metrics: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The same with a split for each role of each fold, where detectors are to be compared.
-
-    Folds that are judged on the same scenes are rivals, and the sum of their bins is neither's.
-    """
-    found = by_detector(metrics)
-    if len(found) < 2:
-        return metrics
-    splits = {
-        f"{name} {role}": scores for name, own in found.items() for role, scores in own.items()
-    }
-    rivals = {
-        f"{name} {role}": scores
-        for name, fold in metrics["folds"].items()
-        for role, scores in fold["baselines"]["best_single_feature"]["splits"].items()
-    }
-    return {
-        "simulated": metrics["simulated"],
-        "splits": splits,
-        "baselines": {"best_single_feature": {"splits": rivals}},
-    }
