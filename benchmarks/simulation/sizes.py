@@ -32,7 +32,7 @@ class Sizes:
     rounds: int = 3
     elements: int = 3
     behind_s: float = 0.05
-    eager: int = 30
+    eager: int = 100
     eager_mm: float = 0.8
     batch: int = 100
     cycles: int = 6
