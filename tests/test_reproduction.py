@@ -520,11 +520,11 @@ def test_the_short_table_has_the_papers_rows_below_what_they_compare_with():
     report = report_of(random_bins=[run_of()], unseen4=[run_of()])
     lines = [line.split("|")[1].strip() for line in page.short_table(report).splitlines()[2:]]
     assert lines == [
-        "`random_bins` test, simulated, 1 seeds",
+        "`random_bins` test, simulated, 1 seed",
         "paper, real hand, test",
-        "`unseen4` train, simulated, 1 seeds",
-        "`unseen4` test, simulated, 1 seeds",
-        "`unseen4` unseen, simulated, 1 seeds",
+        "`unseen4` train, simulated, 1 seed",
+        "`unseen4` test, simulated, 1 seed",
+        "`unseen4` unseen, simulated, 1 seed",
         "paper, real hand, unseen",
     ]
     assert published.SPLITS["unseen"].accuracy == 0.9195

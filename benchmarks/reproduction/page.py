@@ -137,7 +137,7 @@ def _knobs(report: Report) -> str:
     known = report["calibrated"]
     values = {name: _value(value) for name, value in known["values"].items()}
     how = known["provenance"].rstrip(".")
-    lines = ["## What was calibrated, and how", f"{how[0].upper()}{how[1:]}."]
+    lines = ["## What was calibrated, and how", f"Provenance: {how}."]
     if is_calibrated(report):
         target = known["target"]
         lines.append(
@@ -201,7 +201,9 @@ def short_table(report: Report) -> str:
             rival = text(rival_percent(report, name, role, "balanced_accuracy"))
             if runs_of(report, name):
                 num = len(runs_of(report, name))
-                rows.append([f"`{name}` {role}, simulated, {num} seeds", *cells, rival])
+                rows.append(
+                    [f"`{name}` {role}, simulated, {num} seed{'s' * (num > 1)}", *cells, rival]
+                )
             if (name, role) in BELOW:
                 paper = published.SPLITS[BELOW[name, role]]
                 values = [getattr(paper, score) for score in _COLUMNS]
