@@ -18,6 +18,9 @@ from tactslip_torch.simulation.randomness import Array
 class Slips:
     """Every slip of every element; arrays over S strokes that slide and E elements.
 
+    One slip a stroke: where an element sticks and slips, from the first letting go to the last
+    sticking, the stick phases between included.
+
     Args:
         start_s: when the element lets go, ``[S, E]``; NaN for elements that do not touch.
         end_s: when it sticks again for good, ``[S, E]``.
@@ -34,8 +37,9 @@ class ElementContact:
     Args:
         normal_n: newtons, on ``grid.history``.
         friction_n: newtons, on ``grid.history``; never above static friction.
-        slide: slip speed over the speed between hand and object, on the grid: 0 sticking, 1
-            sliding steadily, above 1 where the skin springs back.
+        slide: slip speed over the speed between hand and object, on the grid: 0 sticking, or
+            where nothing drives it; 1 sliding steadily; above 1 where the skin springs back, by
+            much where the arm is slow.
         release_v: what a film of unit gain hears of letting go and sticking again, on the grid.
     """
 

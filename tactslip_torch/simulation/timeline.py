@@ -31,7 +31,8 @@ class Timeline:
         speeds_mm_s: steady speeds.
         onsets_s: when the contact begins to slide, exact.
         annotated_onsets_s: the same as a person would mark it, with jitter.
-        sliding_s: ``(onset, end)`` of each slide.
+        sliding_s: ``(onset, end)`` of each slide. On the dynamic rungs a slide of a tacky material
+            includes its stick phases.
         arm_s: ``(start, stop)`` of every stroke that the arm drives, sliding or not.
         non_slip_s: stretches without slip in which the hand is handled, ascending and apart: what
             a detector of motors or knocks would call slip.

@@ -155,7 +155,7 @@ def element_vibration(
     responses = None
     for rows in _runs(np.asarray(contact.slide.any(axis=-1))):
         responses = band_responses(grasp, element, grid) if responses is None else responses
-        gate = contact.slide[rows]
+        slide = contact.slide[rows]
         part = Grid(grid.blocks[rows], grid.block_samples, grid.sample_rate_hz)
         noise = [
             part.coloured_noise((*recording_key(scene, band), element), response)
@@ -165,6 +165,11 @@ def element_vibration(
         friction = grasp.surface.mu_ratio * grasp.surface.mu_s * root_load
         friction = friction * field.friction_level[rows]
         texture = root_load * field.texture_level[rows]
+        gate = slide
+        if scene.fidelity != "kinematic":  # a speed of its own, where the other is a fading in
+            friction = friction * _powered(slide, scene.contact.friction_noise_exponent)
+            texture = texture * _powered(slide, grasp.surface.texture_exponent)
+            gate = np.ones(slide.shape)
         low_share, line_share = (
             scene.contact.friction_noise_low_share,
             grasp.surface.material.line_share,
@@ -174,9 +179,14 @@ def element_vibration(
         high = broad * noise[0] + np.sqrt(line_share) * texture * lines
         vibration.high[rows] += gate * high
         vibration.low[rows] += gate * (np.sqrt(low_share) * friction * noise[1])
-        vibration.fluctuation[rows] += gate * noise[1]
+        vibration.fluctuation[rows] += np.minimum(slide, 1.0) * noise[1]
     vibration.high[:] += contact.release_v
     return vibration
+
+
+def _powered(slide: Array, exponent: float) -> Array:
+    """Level over that at the arm's speed; none where nothing slides, whatever the power."""
+    return np.where(slide > 0, slide**exponent, 0.0)
 
 
 def _runs(chosen: NDArray[np.bool_]) -> list[slice]:

@@ -2,7 +2,9 @@
 
 Static friction and presliding travel say how stiff skin and bristles are in series, resonance and
 damping ratio how heavy and how damped the skin is, its relaxation which part of it is a Maxwell
-arm. PHYSICS.md, *Chain per sensing element*. SI units from here on.
+arm. Part of the damping of sliding goes with friction, as what feeds stick-slip does: a damping
+ratio alone is too little for some skins or too much for others. PHYSICS.md, *Chain per sensing
+element*. SI units from here on.
 """
 
 from __future__ import annotations
@@ -75,7 +77,8 @@ def skins(scene: Scene, grasp: Grasp) -> Skins:
         stiffness_n_m=(1.0 - relaxing) * skin,
         relaxing_n_m=relaxing * skin,
         relaxation_time_s=grasp.relaxation_time_s[down],
-        damping_n_s_m=2.0 * (knobs.sliding_damping + grasp.damping[down]) * mass * omega,
+        damping_n_s_m=2.0 * (knobs.sliding_damping + grasp.damping[down]) * mass * omega
+        + knobs.sliding_damping_s_m * static_n,
         mu_s=surface.mu_s * same,
         mu_k=_fast_ratio(scene, surface) * surface.mu_s * same,
         stribeck_m_s=1e-3 * surface.material.stribeck_mm_s * same,

@@ -50,7 +50,8 @@ class StrokeTrace:
         span: which samples; rows are from ``first`` to ``first + num``.
         friction_n: what the skin transmits, ``[num + 1, E]`` float32.
         inertia_n: of the skin, ``[num + 1, E]`` float32.
-        slide: slip speed over the arm's, ``[num + 1, E]`` float32.
+        slide: slip speed over the arm's, 0 where it slips back or the arm rests,
+            ``[num + 1, E]`` float32.
         start_s: when gross sliding begins, NaN where it never does, ``[E]``.
         end_s: when it ends for good, ``[E]``.
         incipient_s: when the first bristle slides, ``[E]``.
@@ -213,7 +214,7 @@ def _stroke_trace(
     incipient_s = np.where(some.any(0), np.fmin(incipient_s, start_s), np.nan)
     lead = (job.shear_n, np.zeros_like(job.shear_n), np.zeros_like(job.shear_n))
     floor = MOVING_SHARE * 1e-3 * job.stroke.peak_mm_s
-    slide = np.where(arm > 0, np.clip(slip / np.maximum(arm, floor), 0.0, 5.0), 0.0)
+    slide = np.where(arm > 0, np.maximum(slip / np.maximum(arm, floor), 0.0), 0.0)
     kept = [
         np.concatenate([row[None], rows]).astype(np.float32)
         for row, rows in zip(lead, (friction, inertia, slide), strict=True)

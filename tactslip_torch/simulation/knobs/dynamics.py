@@ -22,7 +22,12 @@ class Dynamics:
         num_bristles: of the ``"patch"`` rung, under a Hertz pressure.
         bristle_stiffness_n_m: of the single bristle of the ``"lugre"`` rung.
         sliding_damping: damping ratio of the skin beyond that with which the kinematic rung rings
-            (prior, ours). Without it smooth materials stick and slip on soft skin at 20 to 60 mm/s.
+            (prior, ours).
+        sliding_damping_s_m: more of it, in N s/m per newton of static friction (prior, ours).
+            Friction that falls with speed feeds a slide, at 20 mm/s with up to 1.8 of these for a
+            smooth material and 8 for a tacky one: between them the one slides smoothly on any skin
+            and the other sticks and slips, but for the softest skins of all, and for most of the
+            ``"patch"`` rung's.
         bristle_damping: damping ratio of the bristles with the skin's mass (prior, ours).
         viscous_n_s_m: viscous friction, which the kinematic rung does not have.
         release_v_per_n: PVDF volts per newton of the skin's inertia: what a film at the
@@ -38,7 +43,8 @@ class Dynamics:
     bristle_share: float = 0.15
     num_bristles: int = 24
     bristle_stiffness_n_m: float = 1e5
-    sliding_damping: float = 1.0
+    sliding_damping: float = 0.5
+    sliding_damping_s_m: float = 1.8
     bristle_damping: float = 1.0
     viscous_n_s_m: float = 0.0
     release_v_per_n: float = 14.0
