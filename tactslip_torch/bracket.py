@@ -42,6 +42,7 @@ def next_difficulty(
     Begins at 0 and steps towards the target until it is crossed, the facts fail or the bound is
     reached; then narrows the bracket, by a secant kept off its ends if it crosses the target, by
     halves if facts alone fail at its far end. Of points where the facts fail none is returned to.
+    Places are whole hundredths, except a bound that is none; a step is ``RESOLUTION`` or more.
 
     Example:
         >>> next_difficulty([Point(0.0, 0.99, True)], 0.96, 0.001, (-3, 3))
@@ -66,7 +67,9 @@ def next_difficulty(
             return _between(near, point, target, way)
         near = point
     reached = way * near.difficulty
-    return None if reached >= bound else way * round(min(reached + step, bound), 2)
+    if reached >= bound:
+        return None
+    return way * min(round(reached + max(step, RESOLUTION), 2), bound)
 
 
 def _is_met(point: Point, target: float, tolerance: float) -> bool:

@@ -59,8 +59,17 @@ class Signals:
         return self.part(samples, 0.5 * (start_s + end_s), end_s - 0.05)
 
     def rest(self, samples: Array, stroke: int = 0) -> Array:
-        """From 1.2 to .3 s before an onset: before stretching, after the last stop's ringing."""
+        """From 1.2 to .3 s before an onset: before stretching, after the last stop's ringing.
+
+        Raises:
+            ValueError: if the recording begins later than that.
+        """
         onset_s = self.onsets_s[stroke]
+        if onset_s < 1.2:
+            raise ValueError(
+                f"facts need 1.2 s of rest before each onset, onset {stroke + 1} is at "
+                f"{onset_s:.3f} s; record or simulate a longer pause before the stroke"
+            )
         return self.part(samples, onset_s - 1.2, onset_s - 0.3)
 
 

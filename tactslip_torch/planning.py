@@ -106,7 +106,7 @@ class Plan:
             threshold=FeatureThreshold(**facts["rival"]),
             typical=tuple(facts["typical"]),
             validation=list(facts["validation"]),
-            among=facts["among"],
+            among=facts.get("among"),  # older plans know no such restriction
         )
 
 

@@ -31,7 +31,7 @@ SMALL = (
     "recipe.penalties=[0.1,1.0]",
     "num_workers=0",
 )
-TINY = (*SMALL, "seeds=[1000]", "fact_cycles=1", "most_points=2")
+TINY = (*SMALL, "seeds=[1000]", "fact_cycles=1", "most_points=2", "step=1.5")
 
 
 def tiny(*overrides):
@@ -79,6 +79,24 @@ def test_the_search_ends_at_the_bound(sign, bounds):
     points = searched(lambda d: 0.96 + sign * 0.1 - 0.001 * d, bounds=bounds)
     assert [point.difficulty for point in points] == [0.0, sign * 1.0, sign * 2.0, sign * 2.5]
     assert chosen_point(points, 0.96) == 3
+
+
+@pytest.mark.parametrize("width", [0.333, 0.337, 1.004, 0.003])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_bound_between_hundredths_is_tried_once(width, sign):
+    points = searched(lambda d: 0.96 + sign * 0.1 - 0.001 * d, bounds=(-width, width))
+    assert points[-1].difficulty == sign * width
+    assert len(points) == (3 if width > 1 else 2)
+
+
+def test_within_bounds_between_hundredths_a_target_is_met():
+    points = searched(lambda d: 0.96 - 0.05 * (d - 0.317), bounds=(-0.333, 0.333))
+    assert abs(points[-1].accuracy - 0.96) <= 0.001
+
+
+def test_the_least_step_still_gets_on():
+    tried = [Point(0.0, 0.99, True)]
+    assert next_difficulty(tried, 0.96, 0.001, (-3, 3), step=0.001) == 0.02
 
 
 @pytest.mark.parametrize("edge", [0.31, 1.5, 2.2])
@@ -153,7 +171,22 @@ def test_a_damaged_file_of_frozen_values_is_refused(tmp_path, name, value):
     path.write_text(json.dumps({"values": values}))
     assert read_calibrated(path) == values | {"presliding_mm": (0.3, 3.0)}
     path.write_text(json.dumps({"values": values | {name: value}}))
-    with pytest.raises(ValueError, match=f"must hold {name} as .* positive, got"):
+    wanted = f"must hold {name} as .* positive, got .*; restore it from the release"
+    with pytest.raises(ValueError, match=wanted):
+        read_calibrated(path)
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"values": 3}', "[]", "null", "3", '{"values": null}'])
+def test_what_is_no_file_of_frozen_values_is_one_line(tmp_path, text):
+    path = tmp_path / "calibrated.json"
+    with pytest.raises(FileNotFoundError, match=r"no calibrated knobs .*restore it from the rel"):
+        read_calibrated(path)
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"must hold .*; restore it from the release") as refusal:
+        read_calibrated(path)
+    assert "\n" not in str(refusal.value)
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(ValueError, match=r"must hold JSON.*; restore it from the release"):
         read_calibrated(path)
 
 

@@ -220,3 +220,12 @@ def test_a_hand_or_protocol_that_shows_no_facts_is_refused():
     short = simulate(Scene("M1", strokes=Scene("M1").strokes[:2]), channels=["PVDF1"])
     with pytest.raises(ValueError, match="facts need three strokes, got 2"):
         filtered(short, HAND)
+
+
+def test_an_onset_without_rest_before_it_is_refused():
+    ramp = np.arange(32000.0)[None] / RATE_HZ  # its value is its time
+    early = replace(made(sg=ramp), onsets_s=(1.1, 1.2, 9.0))
+    with pytest.raises(ValueError, match=r"^facts need 1\.2 s of rest .* onset 1 is at 1\.100 s"):
+        early.rest(early.sg)
+    np.testing.assert_allclose(early.rest(early.sg, 1)[0, [0, -1]], [0.0, 0.8995], atol=1e-9)
+    np.testing.assert_allclose(early.rest(early.sg, 2)[0, [0, -1]], [7.8, 8.6995], atol=1e-9)

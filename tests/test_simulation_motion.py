@@ -8,6 +8,7 @@ from tactslip_torch.simulation.friction import shear_share, sliding_gate, slips
 from tactslip_torch.simulation.grasp import draw_grasp, recording_key
 from tactslip_torch.simulation.grid import Grid, causal_response
 from tactslip_torch.simulation.kinematic import KinematicContact
+from tactslip_torch.simulation.materials import MATERIALS
 from tactslip_torch.simulation.motion import Motion, arm_strokes
 from tactslip_torch.simulation.randomness import normal_blocks
 from tactslip_torch.simulation.sensors import highpass_response
@@ -132,6 +133,18 @@ def test_material_friction_can_be_set_exactly():
     grasp = draw_grasp(Scene("M5", contact=Contact(mu_s=0.5, mu_k=0.4)))
     assert grasp.surface.mu_s == 0.5
     assert grasp.surface.mu_ratio == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_kinetic_friction_asked_for_is_kept_whatever_static_friction_is_drawn(share):
+    own = MATERIALS["M5"].mu_s
+    mu_k = share * own
+    plain = [draw_grasp(Scene("M5", seed=seed)).surface.mu_s for seed in range(12)]
+    assert min(plain) < own < max(plain)
+    for seed, drawn in enumerate(plain):
+        surface = draw_grasp(Scene("M5", seed=seed, contact=Contact(mu_k=mu_k))).surface
+        assert surface.mu_s * surface.mu_ratio == pytest.approx(mu_k, rel=1e-12)
+        assert surface.mu_s == max(drawn, mu_k)
 
 
 def test_noise_blocks_depend_on_their_index_alone():

@@ -76,7 +76,8 @@ def draw_surface(scene: Scene) -> Surface:
     if contact.mu_s is not None:
         mu_s = contact.mu_s
     if contact.mu_k is not None:
-        ratio = min(1.0, contact.mu_k / mu_s)
+        mu_s = max(mu_s, contact.mu_k)  # one drawn below it would lower what was asked for
+        ratio = contact.mu_k / mu_s
     return Surface(
         material=material,
         mu_s=mu_s,

@@ -9,6 +9,7 @@ so calibration has one unknown. ``simulation/calibrated.json`` holds what
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,20 +72,30 @@ def read_calibrated(path: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it lacks a knob or holds no positive numbers.
+        ValueError: if it is no JSON, lacks a knob or holds no positive numbers. Nothing can start
+            without it, ``calibrate`` included, so each error says to restore it.
     """
-    values = json.loads(path.read_text(encoding="utf-8")).get("values", {})
+    restore = "restore it from the release (reinstall tactslip_torch)"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileNotFoundError(f"no calibrated knobs at {path}; {restore}") from None
+    except ValueError as error:
+        raise ValueError(f"{path} must hold JSON, but: {error}; {restore}") from None
+    values = content.get("values") if isinstance(content, dict) else None
+    if not isinstance(values, dict):
+        raise ValueError(f"{path} must hold an object with an object 'values'; {restore}")
     knobs: dict[str, Any] = {}
     for name, prior in PRIORS.items():
-        value = values.get(name)
+        value: Any = values.get(name)
         is_range = isinstance(prior.start, tuple)
         numbers = value if is_range and isinstance(value, list) else [value]
         if len(numbers) != 1 + is_range or not all(
-            isinstance(number, int | float) and number > 0 for number in numbers
+            isinstance(number, int | float) and 0 < number < math.inf for number in numbers
         ):
             raise ValueError(
                 f"{path} must hold {name} as {'[low, high]' if is_range else 'a number'}, "
-                f"positive, got {value!r}; write it again with calibrate write=true"
+                f"positive, got {value!r}; {restore}"
             )
         knobs[name] = tuple(map(float, numbers)) if is_range else float(value)
     return knobs

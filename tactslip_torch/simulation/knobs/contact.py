@@ -31,7 +31,8 @@ class Contact:
         touching: names of channels whose elements may touch; ``None`` for all. An element is a
             segment of a finger with all its channels.
         mu_s: static friction instead of the material's prior, without spread.
-        mu_k: kinetic friction instead of the material's prior, without spread.
+        mu_k: kinetic friction instead of the material's prior, without spread. A ``mu_s`` that
+            is drawn is raised to it where it falls below.
         friction_spread: spread of ``mu_s`` between sessions (prior, ours; a fifth of it between
             recordings).
         presliding_mm: *calibrated.* Range of the travel that stretches the skin before a fresh
