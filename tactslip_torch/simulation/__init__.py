@@ -1,5 +1,6 @@
 """The simulated hand: scenes in, recordings with exact truth out."""
 
+from tactslip_torch.simulation.batch import simulate_many
 from tactslip_torch.simulation.knobs import (
     Contact,
     Disturbances,
@@ -42,5 +43,6 @@ __all__ = [
     "Timeline",
     "paper_scenes",
     "simulate",
+    "simulate_many",
     "timeline",
 ]
