@@ -104,7 +104,9 @@ def _newton(at: Array, a: float, halve: bool, may_try: bool) -> float:
         inside = (wanted >= low) & (wanted <= high) & (not halve)
         to_low = (not inside) & (not exact) & may_try & (at[_TRIED + b] == 0.0)
         close = exact | (inside & (abs(wanted - x) <= _CLOSE * x))
-        other = low if to_low else low + 0.5 * (high - low)
+        half = low + 0.5 * (high - low)
+        close |= not ((half > low) & (half < high))  # no number between, or NaN
+        other = low if to_low else half
         other = x if exact else other
         wanted = wanted if inside else other
         at[_X + b] = x if done > 0.0 else wanted
@@ -187,7 +189,8 @@ def carry_blocks(
     normal: Array,
     step_s: float,
     gamma: float,
-    search: tuple[int, int],
+    patience: int,
+    gross: float,
     every: int,
     ago: int,
     out: Array,
@@ -196,11 +199,11 @@ def carry_blocks(
     """Carry lanes through some steps; ``states [3, L]`` and ``bristles [L, n]`` in place.
 
     ``table [12, L]`` holds mass, k, k1, tau, c, mu_s, mu_k, vs, s and d0 of a bristle,
-    ``1 / (1 + a / tau)`` and ``A``; ``arm`` and ``normal [2 K, 1 or L]`` two rows a step;
+    ``1 / (1 + a / tau)`` and ``A``; ``patience`` and ``gross`` are ``stage``'s and ``lanes``';
+    ``arm`` and ``normal [2 K, 1 or L]`` two rows a step;
     ``out [4, t, L]`` takes friction, inertia, speed and slip, ``incipient [t, L]`` the rest.
     """
     num_lanes, n = bristles.shape
-    most_evaluations, patience = search
     at, z = np.zeros(_END), np.empty((n, _SIDE))
     bent, rates = np.empty((n, _SIDE)), np.empty((n, _SIDE))
     a = gamma * step_s
@@ -226,13 +229,14 @@ def carry_blocks(
                 for b in range(3 * _SIDE):
                     at[_U0 + b] = at[_U + b]
                 _begin(at, z, bent, pressure, a)
-                for number in range(most_evaluations):
+                number, still = 0, 1.0
+                while still > 0.0:  # it ends: see stage.PATIENCE
                     _friction(at)
                     for i in range(n):
                         _pull(at, bent, pressure[i], i, a)
                     late = number >= patience
-                    if _newton(at, a, late and number % 2 == 1, not late) == 0.0:
-                        break
+                    still = _newton(at, a, late and number % 2 == 1, not late)
+                    number += 1
                 _end(at, z, bent, rates, pressure, a, (1 - which) * (step_s - 2.0 * a))
                 for b in range(_SIDE):
                     v = at[_TURN + b] * at[_X + b]
@@ -245,7 +249,7 @@ def carry_blocks(
                     for i in range(n):
                         each = at[_V + b] - rates[i, b]
                         slip += pressure[i] * each
-                        some = some or abs(each) > 0.5 * abs(at[_ARM + b])
+                        some = some or abs(each) > gross * abs(at[_ARM + b])
                     out[0, row, lane] = at[_K + b] * at[_U + b] + at[_Q + b]
                     out[1, row, lane] = at[_M + b] * at[_RATE_V + b]
                     out[2, row, lane] = at[_V + b]

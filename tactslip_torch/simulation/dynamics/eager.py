@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from tactslip_torch.simulation.dynamics.lanes import Lanes, LaneState
+from tactslip_torch.simulation.dynamics.lanes import GROSS_SHARE, Lanes, LaneState
 from tactslip_torch.simulation.dynamics.stage import GAMMA, Stage, skin_of, stage
 
 
@@ -71,5 +71,5 @@ def _row(lanes: Lanes, last: Stage, arm: Tensor) -> tuple[Tensor, ...]:
         last.inertia_n,
         state.speed_m_s,
         (slips * lanes.pressure).sum(-1),
-        (slips.abs() > 0.5 * arm.abs()[..., None]).any(-1) & (arm != 0),
+        (slips.abs() > GROSS_SHARE * arm.abs()[..., None]).any(-1) & (arm != 0),
     )

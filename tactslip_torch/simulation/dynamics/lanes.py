@@ -13,6 +13,9 @@ from typing import Self
 import torch
 from torch import Tensor
 
+GROSS_SHARE = 0.5
+"""Of the arm's speed, above which an element slides grossly, and a bristle at all."""
+
 _ROUNDINGS = 64.0  # how many roundings the sum of the pressure may be off
 
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.simulation.dynamics.compiled import carry_blocks
-from tactslip_torch.simulation.dynamics.lanes import Lanes, LaneState
-from tactslip_torch.simulation.dynamics.stage import GAMMA, MOST_EVALUATIONS, PATIENCE
+from tactslip_torch.simulation.dynamics.lanes import GROSS_SHARE, Lanes, LaneState
+from tactslip_torch.simulation.dynamics.stage import GAMMA, PATIENCE
 
 Array = np.ndarray[Any, Any]
 
@@ -53,7 +53,8 @@ def carry(
         _columns(normal),
         step_s,
         GAMMA,
-        (MOST_EVALUATIONS, PATIENCE),
+        PATIENCE,
+        GROSS_SHARE,
         every,
         ago,
         out,

@@ -12,6 +12,7 @@ so there is always a root and a bracket. PHYSICS.md, stiffness.
 from __future__ import annotations
 
 import math
+from itertools import count
 from typing import NamedTuple
 
 import torch
@@ -30,11 +31,12 @@ from tactslip_torch.simulation.dynamics.lanes import Lanes, LaneState
 GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
 """Length of a stage in steps."""
 
-MOST_EVALUATIONS = 64
-"""Cap on evaluations of a stage's equation."""
-
 PATIENCE = 10
-"""Evaluations after which every other step halves the bracket, whatever Newton says."""
+"""Evaluations after which every other step halves the bracket, whatever Newton says.
+
+So the search ends: by then or, at the latest, when no number lies within the bracket, which in
+float64 takes 1074 + 1024 + 53 halvings of the widest there is.
+"""
 
 
 class Skin(NamedTuple):
@@ -130,14 +132,16 @@ def _root(
 
     Newton's steps; one that would leave the bracket goes to its lower end the first time (the
     force bends down with the speed, so that Newton climbs from there) and halves it later. A lane
-    that is done no longer moves, so that its result does not depend on its neighbours.
+    is done where the equation holds to rounding, a step of Newton within the bracket is so small
+    that the next would be rounding, or no number is left within the bracket. It then no longer
+    moves, so that its result does not depend on its neighbours.
     """
     eps = torch.finfo(offset.dtype).eps
     low = torch.zeros_like(high)
     speed = torch.minimum(guess.clamp(min=0.0), high)
     done = torch.zeros_like(high, dtype=torch.bool)
     was_low = done
-    for number in range(MOST_EVALUATIONS):
+    for number in count():
         left, slope, at = _left(skin, load, base, offset, speed)
         scale = skin.inertia * speed + offset.abs() + skin.stage_s * at.force.abs()
         below = left < 0
@@ -148,13 +152,14 @@ def _root(
         if number >= PATIENCE and number % 2:
             outside = torch.ones_like(outside)
         half = low + 0.5 * (high - low)
+        empty = ~((half > low) & (half < high))  # also where it is NaN
         to_low = outside & ~was_low & (number < PATIENCE)
         wanted = torch.where(outside, torch.where(to_low, low, half), wanted)
         was_low = was_low | to_low
         close = (wanted - speed).abs() <= eps**0.5 * speed
         exact = left.abs() <= 4.0 * eps * scale
         speed = torch.where(done | exact & outside, speed, wanted)
-        done = done | exact | close & ~outside
+        done = done | exact | close & ~outside | empty
         if bool(done.all()):
             break
     return speed

@@ -26,7 +26,7 @@ from tactslip_torch.simulation.dynamics.drive import (
     span_of,
     stroke_drive,
 )
-from tactslip_torch.simulation.dynamics.lanes import LaneState
+from tactslip_torch.simulation.dynamics.lanes import GROSS_SHARE, LaneState
 from tactslip_torch.simulation.dynamics.physics import Skins, lanes_of, skins
 from tactslip_torch.simulation.dynamics.stepper import EngineName, Trace, integrate
 from tactslip_torch.simulation.friction import StickSlips, slips
@@ -37,9 +37,6 @@ from tactslip_torch.simulation.scene import Scene
 
 MOVING_SHARE = 0.02
 """Of its highest speed, below which the arm counts as at rest (ours)."""
-
-GROSS_SHARE = 0.5
-"""Of the arm's speed, above which an element slides grossly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +107,8 @@ def traces_of(
         engine: see ``integrate``.
 
     Raises:
-        ValueError: if no whole number of steps makes a sample, or elements that carry half of a
-            recording's load never slide in a stroke.
+        ValueError: if no whole number of steps makes a sample. Whether a hand slides enough is
+            ``require_sliding``'s to say.
     """
     if find_spec("numba") is None and engine == "auto":
         _say_slow()
