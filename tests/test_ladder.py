@@ -18,7 +18,7 @@ from tactslip_torch.simulation.dynamics.contact import DynamicContact
 from tactslip_torch.simulation.grasp import draw_grasp
 from tactslip_torch.simulation.grid import Grid, block_samples_for
 from tactslip_torch.simulation.knobs import Dynamics
-from tactslip_torch.simulation.ladder import contact_model
+from tactslip_torch.simulation.ladder import scene_contact
 from tactslip_torch.simulation.motion import Motion, arm_strokes
 from tactslip_torch.simulation.vibration import element_vibration, shared_field
 
@@ -32,7 +32,7 @@ DYNAMIC = ("lugre", "patch")
 def model_of(scene):
     plan = arm_strokes(scene.strokes, scene.acceleration_m_s2)
     grasp = draw_grasp(scene)
-    return contact_model(scene, grasp, plan), grasp, plan
+    return scene_contact(scene, grasp, plan), grasp, plan
 
 
 def contacts(scene):
@@ -125,7 +125,7 @@ def test_elements_let_go_when_their_own_load_lets_them(rung):
     late = found_s - expected_s
     assert np.corrcoef(found_s, expected_s)[0, 1] > 0.98
     assert np.abs(late).max() < (0.006 if rung == "lugre" else 0.02)
-    kinematic = contact_model(replace(scene, fidelity="kinematic"), grasp, plan).slips.start_s
+    kinematic = scene_contact(replace(scene, fidelity="kinematic"), grasp, plan).slips.start_s
     assert np.abs(kinematic[0, down] - expected_s).max() > 0.02
 
 

@@ -23,7 +23,7 @@ from tactslip_torch.simulation import (
     simulate,
     timeline,
 )
-from tactslip_torch.simulation.resting import scene_contact
+from tactslip_torch.simulation.ladder import scene_contact
 from tactslip_torch.simulation.source import SimulatedRecordings
 
 EXPECTED = {"arm_motion", "taps", "grips", "pulled", "motor_off", "motor_only", "machine", "drift"}

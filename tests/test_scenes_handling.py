@@ -24,7 +24,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from tactslip_torch.simulation import Handling, Scene, Stroke, timeline
 from tactslip_torch.simulation.events import MARGIN_S, quiet_stretches
-from tactslip_torch.simulation.resting import scene_contact
+from tactslip_torch.simulation.ladder import scene_contact
 from tactslip_torch.simulation.sensors import draw_front
 
 TWO = ("M3", "M6")

@@ -19,7 +19,7 @@ from tactslip_torch.simulation.friction import shear_share
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp
 from tactslip_torch.simulation.grid import Grid, block_samples_for
 from tactslip_torch.simulation.knobs import Stroke
-from tactslip_torch.simulation.ladder import contact_model
+from tactslip_torch.simulation.ladder import scene_contact
 from tactslip_torch.simulation.motion import ArmStroke, Motion, arm_strokes
 from tactslip_torch.simulation.scene import Scene
 
@@ -136,7 +136,7 @@ def kinematic_errors(found: list[Element]) -> dict[str, Any]:
     for element in found:
         scene = replace(element.scene, fidelity="kinematic")
         rate_hz, plan = scene.sample_rate_hz, (element.stroke,)
-        model: Any = contact_model(scene, element.grasp, plan)
+        model: Any = scene_contact(scene, element.grasp, plan)
         lane = int(element.grasp.touching[0])
         size, first = block_samples_for(rate_hz), int(np.floor(element.stroke.start_s * rate_hz))
         num = int(element.until_s * rate_hz)

@@ -86,7 +86,7 @@ def shear_share(
     time_s = motion.grid.time_s
     share = np.zeros_like(time_s)
     presliding_mm, ratio = grasp.presliding_mm[element], grasp.surface.mu_ratio
-    next_starts_s = [stroke.start_s for stroke in motion.plan[1:]] + [np.inf]
+    next_starts_s = [*(stroke.start_s for stroke in motion.plan), np.inf][1:]
     for number, (stroke, next_s) in enumerate(zip(motion.plan, next_starts_s, strict=True)):
         rows = motion.grid.overlapping(stroke.start_s, next_s)
         if rows.start == rows.stop:

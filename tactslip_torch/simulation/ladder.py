@@ -19,8 +19,8 @@ _RUNGS: dict[str, Callable[[Scene, Grasp, tuple[ArmStroke, ...]], ContactModel]]
 """What models each of ``FIDELITIES``."""
 
 
-def contact_model(scene: Scene, grasp: Grasp, plan: tuple[ArmStroke, ...]) -> ContactModel:
-    """The contact of a scene on its rung.
+def scene_contact(scene: Scene, grasp: Grasp, plan: tuple[ArmStroke, ...]) -> ContactModel:
+    """The contact of a scene on its rung; where nothing slides all rungs are one, and free.
 
     Args:
         scene: says which rung.

@@ -20,9 +20,9 @@ from tactslip_torch.simulation.faults import held_samples, recorded_channels, st
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp
 from tactslip_torch.simulation.grid import Grid, block_samples_for
 from tactslip_torch.simulation.handling import Handled
+from tactslip_torch.simulation.ladder import scene_contact
 from tactslip_torch.simulation.motion import ArmStroke, Motion, arm_strokes
 from tactslip_torch.simulation.randomness import Array
-from tactslip_torch.simulation.resting import scene_contact
 from tactslip_torch.simulation.scene import SIMULATION_VERSION, Scene
 from tactslip_torch.simulation.sensors import (
     draw_front,

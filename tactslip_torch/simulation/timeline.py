@@ -15,9 +15,9 @@ import numpy as np
 from tactslip_torch.simulation.contact import Slips
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp, recording_key
 from tactslip_torch.simulation.handling import Handled
+from tactslip_torch.simulation.ladder import scene_contact
 from tactslip_torch.simulation.motion import ArmStroke, arm_strokes
 from tactslip_torch.simulation.randomness import Array, generator
-from tactslip_torch.simulation.resting import scene_contact
 from tactslip_torch.simulation.scene import Scene
 
 
