@@ -6,12 +6,13 @@ published for them, as a mean over seeds that no reported result uses. The quali
 (``facts.py``) must hold there; else it stays at the closest point tried where they do, and says
 how much is missing. Nothing else of the paper's results is read, and no unseen material is ever
 simulated. Leaves ``calibration.json``, ``calibration.png`` and the resolved configuration;
-``write=true`` also freezes the values as the defaults of the knobs.
+``write=true`` also freezes the values as the defaults of the knobs, and only of this protocol.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -22,7 +23,7 @@ import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 import tactslip_torch
 from tactslip_torch.bracket import Point, chosen_point, next_difficulty
@@ -67,7 +68,8 @@ def seen_accuracy(maker: FeatureMaker, data: SlipDataModule, recipe: Recipe, wha
     ]
     for recording, features, is_slip in training:
         survey.update(str(recording), recipe.group(recording), features, is_slip)
-    plan = plan_detector(recipe, survey, _quietly)
+    allowed = recipe.allowed(maker.pool)
+    plan = plan_detector(recipe, survey, _quietly, allowed=allowed)
     gathered = TrainingPass(plan)
     for recording, features, is_slip in training:
         gathered.update(str(recording), features, is_slip)
@@ -166,18 +168,41 @@ def _check(config: DictConfig) -> None:
             f"calibration simulates seen materials only, {', '.join(SEEN_MATERIALS)}; "
             f"got {', '.join(strangers)}"
         )
-    seeds = list(config.seeds)
-    if not seeds or len(set(seeds)) < len(seeds) or any(seed < FIRST_SEED for seed in seeds):
+    seeds = config.seeds
+    if not isinstance(seeds, ListConfig) or any(type(seed) is not int for seed in seeds):
+        raise ValueError(f"seeds must be a list of whole numbers, such as [1000,1001], got {seeds}")
+    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < FIRST_SEED:
         raise ValueError(
             f"seeds must differ and be {FIRST_SEED} or more, those below are for reported "
             f"results; got {seeds}"
         )
-    low, high = config.bounds
-    if not low <= 0 <= high:
-        raise ValueError(f"bounds must hold 0, the starting values; got [{low:g}, {high:g}]")
-    for name in ("tolerance", "step", "most_points", "fact_cycles"):
-        if not config[name] > 0:
-            raise ValueError(f"{name} must be positive, got {config[name]}")
+    bounds = config.bounds
+    ends = bounds if isinstance(bounds, ListConfig) else ()
+    if len(ends) != 2 or any(type(end) not in (int, float) for end in ends):
+        raise ValueError(f"bounds must be two numbers, such as [-2,2], got {bounds}")
+    if not bounds[0] <= 0 <= bounds[1]:
+        raise ValueError(f"bounds must hold 0, the starting values; got {bounds}")
+    for name in ("tolerance", "step"):
+        if type(config[name]) not in (int, float) or not 0 < config[name] < math.inf:
+            raise ValueError(f"{name} must be a positive number, got {config[name]}")
+    for name in ("most_points", "fact_cycles"):
+        if type(config[name]) is not int or config[name] < 1:
+            raise ValueError(f"{name} must be a positive whole number, got {config[name]}")
+    if config.write and (changed := _changed_sections(config)):
+        raise ValueError(
+            f"write=true freezes what the protocol of conf/calibrate.yaml finds, and "
+            f"{', '.join(changed)} differ from it; leave those overrides out, or write=true"
+        )
+
+
+def _changed_sections(config: DictConfig) -> list[str]:
+    """Groups of the configuration that are not as ``conf/calibrate.yaml`` composes them."""
+    own: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "calibrate.yaml"))
+    options = {k: v for entry in own["defaults"] if entry != "_self_" for k, v in entry.items()}
+    groups: Any = {k: OmegaConf.load(conf_dir() / k / f"{v}.yaml") for k, v in options.items()}
+    whole: Any = OmegaConf.to_container(OmegaConf.merge(groups, own))
+    given: Any = OmegaConf.to_container(config)  # unresolved: seeds come in turn
+    return [group for group in groups if given[group] != whole[group]]
 
 
 def _found(
@@ -187,7 +212,8 @@ def _found(
     kept = tried[index]
     protocol = OmegaConf.to_container(config, resolve=True)
     assert isinstance(protocol, dict)
-    names = ("data", "labels", "split", "features", "recipe", "tolerance", "bounds", "step")
+    groups = ("data", "labels", "split", "features", "recipe")
+    numbers = ("tolerance", "bounds", "step", "most_points", "fact_cycles")
     return {
         "simulated": True,
         "provenance": (
@@ -209,7 +235,7 @@ def _found(
         },
         "facts": kept["facts"],
         "points": tried,
-        "protocol": {name: protocol[name] for name in (*names, "fact_cycles")},
+        "protocol": {name: protocol[name] for name in groups + numbers},
         "versions": {
             "tactslip_torch": tactslip_torch.__version__,
             "simulation": SIMULATION_VERSION,

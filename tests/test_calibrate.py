@@ -233,6 +233,8 @@ def test_the_command_leaves_all_it_tried(found):
     assert (folder / "calibration.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "config.yaml").exists()
     assert str(folder) not in (folder / "calibration.json").read_text()
+    protocol = {name: content["protocol"][name] for name in ("step", "most_points", "fact_cycles")}
+    assert protocol == {"step": 1.5, "most_points": 2, "fact_cycles": 1}
 
 
 def test_unseen_materials_and_their_results_are_used_nowhere(tmp_path, found, monkeypatch):
@@ -254,10 +256,33 @@ def test_the_published_test_accuracy_is_the_target(tmp_path, monkeypatch):
     assert content["points"][1]["difficulty"] == 1.5
 
 
-def test_write_freezes_the_values_that_knobs_then_take(tmp_path, monkeypatch):
+@pytest.fixture
+def whole(found, monkeypatch):
+    """The protocol of ``conf/calibrate.yaml``, with the points of a smaller one put in."""
+
+    def composed_with(*overrides, holds=True):
+        def point(_, difficulty):
+            facts = [fact | {"holds": holds} for fact in found[0]["points"][1]["facts"]]
+            knobs = json.loads(json.dumps(knobs_at(difficulty)))
+            scores = {"accuracy": 0.97, "accuracy_by_seed": [0.97, 0.97, 0.97]}
+            return {
+                "difficulty": difficulty,
+                "knobs": knobs,
+                "facts": facts,
+                "holds": holds,
+            } | scores
+
+        monkeypatch.setattr(command, "evaluate_point", point)
+        return composed("write=true", *overrides, name="calibrate")
+
+    return composed_with
+
+
+def test_write_freezes_the_values_that_knobs_then_take(tmp_path, monkeypatch, whole):
     frozen = tmp_path / "package" / "calibrated.json"
     monkeypatch.setattr(command, "CALIBRATED_PATH", frozen)
-    content = calibrate(tiny("write=true"), tmp_path)
+    content = calibrate(whole(), tmp_path)
+    assert content["difficulty"] in (0.0, 2.0)
     assert frozen.read_bytes() == (tmp_path / "calibration.json").read_bytes()
     assert read_calibrated(frozen) == knobs_at(content["difficulty"])
 
@@ -268,12 +293,52 @@ def test_without_write_nothing_is_frozen(tmp_path, monkeypatch):
     assert not (tmp_path / "calibrated.json").exists()
 
 
-def test_facts_that_fail_at_the_start_are_an_error_and_freeze_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "CALIBRATED_PATH", tmp_path / "calibrated.json")
-    loud = ("write=true", "+scene.mains_mv=300")  # nobody hears M5 slide
+def test_facts_that_fail_at_the_start_are_an_error(tmp_path):
+    loud = "+scene.mains_mv=300"  # nobody hears M5 slide
     with pytest.raises(ValueError, match=r"the facts .*pvdf_slide_over_rest.* do not hold"):
-        calibrate(tiny(*loud), tmp_path / "results")
+        calibrate(tiny(loud), tmp_path / "results")
+
+
+def test_facts_that_fail_at_the_start_freeze_nothing(tmp_path, monkeypatch, whole):
+    monkeypatch.setattr(command, "CALIBRATED_PATH", tmp_path / "calibrated.json")
+    with pytest.raises(ValueError, match=r"the facts .*pvdf_slide_over_rest.* do not hold"):
+        calibrate(whole(holds=False), tmp_path / "results")
     assert not (tmp_path / "calibrated.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "section"),
+    [
+        ("labels=half_second", "labels"),
+        ("split=seen6", "split"),
+        ("split.train_share=0.5", "split"),
+        ("recipe=robust", "recipe"),
+        ("recipe.among={kind:SG}", "recipe"),
+        ("scene=taps", "scene"),
+        ("+scene.mains_mv=300", "scene"),
+        ("features.align=causal", "features"),
+        ("data.cycles=2", "data"),
+        ("data.fidelity=lugre", "data"),
+        ("+data.others.taps.taps_per_s=2.0", "data"),
+    ],
+)
+def test_another_protocol_is_not_frozen(tmp_path, whole, override, section):
+    with pytest.raises(ValueError, match=f"^write=true freezes .*, and {section} differ from it"):
+        calibrate(whole(override), tmp_path / "results")
+    assert not (tmp_path / "results").exists()
+    calibrate(whole(override, "write=false", "most_points=1"), tmp_path / "results")
+
+
+def test_a_recipe_that_restricts_the_ranking_scores_as_in_train(tmp_path, found):
+    films = "recipe.among={kind:PVDF,domain:freq}"
+    point = evaluate_point(tiny(films), 0.0)
+    scene = [
+        f"+scene.{name}={str(value).replace(' ', '')}" for name, value in point["knobs"].items()
+    ]
+    overrides = (*SMALL, *scene, films, "+exp=random_bins", "data.materials=[M1,M5]")
+    config = composed(*overrides, "recipe=paper", "seed=1000", "cache=off", "export=false")
+    assert train(config, tmp_path)["test/accuracy"] == point["accuracy"]
+    assert point["accuracy"] != found[0]["points"][0]["accuracy"]
 
 
 @pytest.mark.parametrize(
@@ -284,8 +349,20 @@ def test_facts_that_fail_at_the_start_are_an_error_and_freeze_nothing(tmp_path, 
         ("seeds=[1000,1000]", "seeds must differ"),
         ("seeds=[]", "seeds must differ"),
         ("bounds=[1,2]", r"bounds must hold 0, .* got \[1, 2\]"),
-        ("tolerance=0", "tolerance must be positive, got 0"),
-        ("most_points=0", "most_points must be positive, got 0"),
+        ("seeds=1000", r"seeds must be a list of whole numbers, .* got 1000"),
+        ("seeds=[1000.5]", r"seeds must be a list of whole numbers, .* got \[1000.5\]"),
+        ("seeds=null", r"seeds must be a list of whole numbers, .* got None"),
+        ("bounds=3", r"bounds must be two numbers, such as \[-2,2\], got 3"),
+        ("bounds=[-1]", r"bounds must be two numbers, .* got \[-1\]"),
+        ("bounds=[-1,a]", r"bounds must be two numbers, .* got \[-1, 'a'\]"),
+        ("bounds=[nan,1]", r"bounds must hold 0"),
+        ("tolerance=0", "tolerance must be a positive number, got 0"),
+        ("tolerance=abc", "tolerance must be a positive number, got abc"),
+        ("tolerance=nan", "tolerance must be a positive number, got nan"),
+        ("step=null", "step must be a positive number, got None"),
+        ("most_points=0", "most_points must be a positive whole number, got 0"),
+        ("most_points=1.5", "most_points must be a positive whole number, got 1.5"),
+        ("fact_cycles=true", "fact_cycles must be a positive whole number, got True"),
     ],
 )
 def test_what_is_no_calibration_is_refused(tmp_path, override, message):
