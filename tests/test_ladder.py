@@ -5,6 +5,8 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import version
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -14,12 +16,14 @@ from tactslip_torch.simulation import Contact, Disturbances, Scene, Stroke, simu
 from tactslip_torch.simulation.batch import simulate_many
 from tactslip_torch.simulation.contact import ElementContact
 from tactslip_torch.simulation.dynamics import contact as dynamic
+from tactslip_torch.simulation.dynamics import stepper
 from tactslip_torch.simulation.dynamics.contact import DynamicContact
 from tactslip_torch.simulation.grasp import draw_grasp
 from tactslip_torch.simulation.grid import Grid, block_samples_for
 from tactslip_torch.simulation.knobs import Dynamics
 from tactslip_torch.simulation.ladder import scene_contact
 from tactslip_torch.simulation.motion import Motion, arm_strokes
+from tactslip_torch.simulation.source import SimulatedRecordings
 from tactslip_torch.simulation.vibration import element_vibration, shared_field
 
 SHORT = (Stroke(40.0, 20.0, 0.6), Stroke(60.0, 20.0, 0.4))
@@ -354,6 +358,41 @@ def test_a_batch_in_float32_or_by_the_eager_engine_is_the_same_to_rounding():
             assert (one.samples - other.samples).abs().max() < tolerance
             np.testing.assert_allclose(one.onsets_s, other.onsets_s, atol=1e-4)
         assert [samples_digest(simulate(s)) for s in scenes] == [samples_digest(w) for w in wanted]
+
+
+def test_provenance_and_keys_name_the_engine_of_a_dynamic_rung(monkeypatch):
+    strokes = (Stroke(60.0, 16.0, 0.1),)
+    scenes = [Scene("M2", strokes=strokes, fidelity=rung) for rung in RUNGS]
+    plain, lugre, _ = found = [simulate(scene).provenance for scene in scenes]
+    assert "integrator" not in plain
+    has_numba = find_spec("numba") is not None
+    engine = {"engine": "compiled", "numba_version": version("numba")} if has_numba else None
+    engine = engine or {"engine": "eager", "torch_version": version("torch")}
+    for one in found[1:]:
+        assert one["integrator"] == engine | {"dtype": "float64", "device": "cpu"}
+    (other,) = simulate_many(scenes[1:2], engine="eager", dtype=torch.float32)
+    by = other.provenance["integrator"]
+    assert (by["engine"], by["dtype"], by["torch_version"]) == (
+        "eager",
+        "float32",
+        version("torch"),
+    )
+    keys = {}
+    for rung in ("kinematic", "lugre"):
+        source = SimulatedRecordings(
+            cycles=1, materials=["M2"], fidelity=rung, scene={"strokes": strokes}
+        )
+        (recording,) = source.ids
+        keys[rung] = [json.dumps(source.key(recording))]
+        with monkeypatch.context() as without:
+            without.setattr(stepper, "find_spec", lambda name: None)
+            keys[rung].append(json.dumps(source.key(recording)))
+        key = json.loads(keys[rung][0])
+        assert Scene.from_dict(key) == Scene("M2", strokes=strokes, fidelity=rung)
+        assert key.get("integrator", lugre["integrator"]) == lugre["integrator"]
+    assert keys["kinematic"][0] == keys["kinematic"][1]
+    assert '"engine": "eager"' in keys["lugre"][1]
+    assert (keys["lugre"][0] != keys["lugre"][1]) == has_numba
 
 
 # --- refusals -----------------------------------------------------------------------------------

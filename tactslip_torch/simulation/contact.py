@@ -6,7 +6,7 @@ from what it says here, whichever it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -55,6 +55,10 @@ class ContactModel(Protocol):
     @property
     def slips(self) -> Slips:
         """When each element slides, over all strokes that do."""
+
+    @property
+    def integrator(self) -> Mapping[str, str]:
+        """What integrated it, by name and release; empty for formulas."""
 
     def on(self, grid: Grid) -> Callable[[int], ElementContact]:
         """What computes a touching element's contact on a grid."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -30,6 +30,7 @@ class KinematicContact:
 
     def __init__(self, scene: Scene, grasp: Grasp, plan: tuple[ArmStroke, ...]) -> None:
         self.slips = slips(grasp, plan)
+        self.integrator: Mapping[str, str] = {}
         self._scene, self._grasp, self._plan = scene, grasp, plan
 
     def on(self, grid: Grid) -> Callable[[int], ElementContact]:

@@ -45,6 +45,9 @@ PAPER = "paper"
 class Scene:
     """What is simulated. Equal scenes give equal bytes.
 
+    On the dynamic rungs they do by one engine in one release: by numba's kernel or, without numba,
+    by torch, which round apart. Provenance and the keys of ``SimulatedRecordings`` name which.
+
     Args:
         material: id in ``MATERIALS``.
         hand: the channels; elements are its distinct (finger, segment) pairs.
@@ -160,13 +163,14 @@ class Scene:
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Scene:
-        """The scene that ``to_dict`` wrote.
+        """The scene that ``to_dict`` wrote, or of a recording's key.
 
         Raises:
             ValueError: if the scene is a bad one.
             TypeError: if a key is unknown.
         """
-        values = {k: v for k, v in plain.items() if k != "simulation_version"}
+        beside = ("simulation_version", "integrator")
+        values = {k: v for k, v in plain.items() if k not in beside}
         if "hand" in values:
             values["hand"] = HandLayout.from_rows(values["hand"])
         if "strokes" in values:

@@ -94,7 +94,7 @@ def simulate(
         sliding_s=truth.sliding_s,
         annotated_onsets_s=truth.annotated_onsets_s,
         non_slip_s=truth.non_slip_s,
-        provenance=_provenance(scene),
+        provenance=_provenance(scene, model),
     )
 
 
@@ -189,9 +189,9 @@ def _runs(
     return runs
 
 
-def _provenance(scene: Scene) -> dict[str, object]:
+def _provenance(scene: Scene, model: ContactModel) -> dict[str, object]:
     """Where the recording comes from."""
-    return {
+    facts = {
         "simulated": True,
         "fidelity": scene.fidelity,
         "seed": scene.seed,
@@ -202,3 +202,4 @@ def _provenance(scene: Scene) -> dict[str, object]:
         "simulation_version": SIMULATION_VERSION,
         "numpy_version": np.__version__,
     }
+    return facts | ({"integrator": dict(model.integrator)} if model.integrator else {})

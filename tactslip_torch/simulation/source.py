@@ -7,6 +7,7 @@ from typing import Any
 
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.simulation.dynamics.stepper import integrator
 from tactslip_torch.simulation.materials import SEEN_MATERIALS, UNSEEN_MATERIALS
 from tactslip_torch.simulation.scene import PAPER, paper_scenes
 from tactslip_torch.simulation.simulate import simulate
@@ -66,8 +67,11 @@ class SimulatedRecordings:
         return timeline(self._scenes[recording])
 
     def key(self, recording: RecordingId) -> Mapping[str, Any]:
-        """The scene, as plain values."""
-        return self._scenes[recording].to_dict()
+        """The scene as plain values and, on a dynamic rung, what integrates it here."""
+        scene = self._scenes[recording]
+        if scene.fidelity == "kinematic":
+            return scene.to_dict()
+        return {**scene.to_dict(), "integrator": integrator()}
 
     def load(
         self, recording: RecordingId, windows: Sequence[tuple[float, float]] | None = None

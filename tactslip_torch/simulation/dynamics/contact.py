@@ -82,6 +82,7 @@ class DynamicContact:
 
     Attributes:
         slips: truth.
+        integrator: what integrated it, ``stepper.integrator``; empty if there is no stroke.
         incipient_s: when the first bristle of each element slides, ``[S, E]``.
 
     Raises:
@@ -93,6 +94,7 @@ class DynamicContact:
         self._traces = scene_traces(scene) if plan else ()
         require_sliding(grasp, dict(enumerate(self._traces)))
         self._rest = slips(grasp, plan)
+        self.integrator = self._traces[0].integrator if plan else {}
         self.slips = Slips(
             self._spread([trace.start_s for trace in self._traces]),
             self._spread([trace.end_s for trace in self._traces]),

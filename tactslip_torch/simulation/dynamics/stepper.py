@@ -11,6 +11,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Literal, get_args
 
@@ -113,6 +114,33 @@ def integrate(
         return Trace(nothing, nothing, nothing, nothing, nothing.bool()), state
     friction, inertia, speed, slip, incipient = map(torch.cat, zip(*parts, strict=True))
     return Trace(friction, inertia, speed, slip, incipient), state
+
+
+def integrator(
+    engine: EngineName = "auto",
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+) -> dict[str, str]:
+    """What carries lanes of a kind here without gradient: engines and their releases round apart.
+
+    Raises:
+        ValueError: for an unknown engine, or one that cannot be used here.
+
+    Example:
+        >>> integrator("eager")["engine"]
+        'eager'
+    """
+    kind = torch.device(device).type
+    chosen = _resolved(engine)
+    if (dtype, kind) != (torch.float64, "cpu"):
+        chosen = "eager"
+    runs_on = "numba" if chosen == "compiled" else "torch"
+    return {
+        "engine": chosen,
+        f"{runs_on}_version": version(runs_on),
+        "dtype": str(dtype).removeprefix("torch."),
+        "device": kind,
+    }
 
 
 def _driven(

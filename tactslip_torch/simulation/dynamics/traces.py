@@ -28,7 +28,7 @@ from tactslip_torch.simulation.dynamics.drive import (
 )
 from tactslip_torch.simulation.dynamics.lanes import GROSS_SHARE, LaneState
 from tactslip_torch.simulation.dynamics.physics import Skins, lanes_of, skins
-from tactslip_torch.simulation.dynamics.stepper import EngineName, Trace, integrate
+from tactslip_torch.simulation.dynamics.stepper import EngineName, Trace, integrate, integrator
 from tactslip_torch.simulation.friction import StickSlips, slips
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp
 from tactslip_torch.simulation.motion import ArmStroke, arm_strokes
@@ -52,6 +52,7 @@ class StrokeTrace:
         start_s: when gross sliding begins, NaN where it never does, ``[E]``.
         end_s: when it ends for good, ``[E]``.
         incipient_s: when the first bristle slides, ``[E]``.
+        integrator: what integrated it: see ``integrator``.
     """
 
     span: Span
@@ -61,6 +62,7 @@ class StrokeTrace:
     start_s: Array
     end_s: Array
     incipient_s: Array
+    integrator: Mapping[str, str]
 
 
 class _Job(NamedTuple):
@@ -177,10 +179,11 @@ def _integrated(
             every,
             engine=engine,
         )
+    by = integrator(engine, dtype, device)
     ends = np.cumsum([len(job.shear_n) for job in jobs])
     columns = _columns(trace, drive, num)
     return [
-        _stroke_trace(job, *(column[:, end - len(job.shear_n) : end] for column in columns))
+        _stroke_trace(job, by, *(column[:, end - len(job.shear_n) : end] for column in columns))
         for job, end in zip(jobs, ends.tolist(), strict=True)
     ]
 
@@ -200,7 +203,13 @@ def _columns(trace: Trace, drive: StrokeDrive, num: int) -> tuple[Array, ...]:
 
 
 def _stroke_trace(
-    job: _Job, friction: Array, inertia: Array, slip: Array, arm: Array, incipient: Array
+    job: _Job,
+    by: Mapping[str, str],
+    friction: Array,
+    inertia: Array,
+    slip: Array,
+    arm: Array,
+    incipient: Array,
 ) -> StrokeTrace:
     """What is kept of one stroke of one recording; ``[num, E]``."""
     rate_hz, first = job.scene.sample_rate_hz, job.span.first
@@ -216,7 +225,7 @@ def _stroke_trace(
         np.concatenate([row[None], rows]).astype(np.float32)
         for row, rows in zip(lead, (friction, inertia, slide), strict=True)
     ]
-    return StrokeTrace(job.span, kept[0], kept[1], kept[2], start_s, end_s, incipient_s)
+    return StrokeTrace(job.span, kept[0], kept[1], kept[2], start_s, end_s, incipient_s, by)
 
 
 def _gross(excess: Array, first: int, rate_hz: float) -> tuple[Array, Array]:
