@@ -31,6 +31,14 @@ EXPECTED |= {"mains_bursts", "dead_channel", "saturated_channel", "swapped_chann
 EXPECTED |= {"dropped_samples", "paper"}
 TWO = ("M3", "M6")
 CASES = [(name, material) for name in NAMES for material in TWO]
+ON_RUNGS = [(n, rung) for n in ("pulled", "arm_motion", "taps") for rung in ("lugre", "patch")]
+
+
+def short_on(rung: str, name: str, material: str, cycle: int = 0) -> Scene:
+    """A scene's first two strokes on a rung, no longer than they must be."""
+    scene = scene_of(name, material, cycle, fidelity=rung)
+    strokes = tuple(replace(stroke, distance_mm=20.0) for stroke in scene.strokes[:2])
+    return replace(scene, strokes=strokes)
 
 
 def test_the_scenes_are_there_and_say_what_they_are():
@@ -42,14 +50,17 @@ def test_the_scenes_are_there_and_say_what_they_are():
 # Truth ---------------------------------------------------------------------------------------
 
 
-def sliding_load(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Share of the normal load that slides at every sample, and whether any element does."""
+def sliding_load(scene: Scene, beyond: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Share of the normal load that slides at every sample, and whether any element does.
+
+    ``beyond`` is what share of the arm's speed it takes to count.
+    """
     truth, (grasp, plan, _) = timeline(scene), insides(scene)
     grid = whole_grid(truth.num_samples)
     contact_of = scene_contact(scene, grasp, plan).on(grid)
     share = np.zeros(truth.num_samples)
     for element in grasp.touching.tolist():
-        slides = contact_of(element).slide.reshape(-1)[: truth.num_samples] > 0
+        slides = contact_of(element).slide.reshape(-1)[: truth.num_samples] > beyond
         share += grasp.load_n[element] / grasp.load_n.sum() * slides
     return share, share > 0
 
@@ -71,6 +82,29 @@ def test_truth_is_what_the_contact_does(name, material):
     bounds = np.array(truth.non_slip_s).reshape(-1)
     assert np.all(np.diff(bounds) > 0)  # ascending, apart, none empty
     assert np.all((bounds >= 0) & (bounds <= truth.duration_s))
+
+
+@pytest.mark.parametrize(("name", "rung"), ON_RUNGS)
+def test_truth_is_what_the_contact_does_on_dynamic_rungs(name, rung):
+    scene = short_on(rung, name, "M5")
+    truth = timeline(scene)
+    gross, _ = sliding_load(scene, beyond=0.5)
+    _, any_slides = sliding_load(scene)
+    speeds = () if name == "arm_motion" else (20.0, 40.0)
+    assert truth.speeds_mm_s == speeds
+    assert len(truth.onsets_s) == len(truth.sliding_s) == len(truth.annotated_onsets_s)
+    assert len(truth.onsets_s) == len(speeds)
+    assert any_slides.any() == bool(speeds)
+    for speed, (start_s, end_s) in zip(speeds, truth.sliding_s, strict=True):
+        within = gross[round(2000 * start_s) + 1 : round(2000 * end_s) - 1]
+        assert len(within) > 0.4 * 20.0 / speed * 2000  # half of the way and more
+        assert (within >= 0.5 - 1e-12).mean() > 0.9
+    margin_s = 2 / 2000
+    slides = [(start_s - margin_s, end_s + margin_s) for start_s, end_s in truth.sliding_s]
+    assert gross[~is_within(slides, truth.num_samples)].max() < 0.5 + 1e-12
+    quiet = is_within(truth.non_slip_s, truth.num_samples)
+    assert quiet.any() == (name != "pulled")
+    assert not (quiet & any_slides).any()
 
 
 @pytest.mark.parametrize("rung", FIDELITIES)
@@ -132,7 +166,15 @@ def digest(scene: Scene) -> str:
 
 @pytest.mark.parametrize(("name", "material"), CASES)
 def test_windows_and_channels_equal_the_whole(name, material):
-    scene = scene_of(name, material, cycle=1)
+    assert_windows_equal_the_whole(scene_of(name, material, cycle=1))
+
+
+@pytest.mark.parametrize(("name", "rung"), ON_RUNGS)
+def test_windows_and_channels_equal_the_whole_on_dynamic_rungs(name, rung):
+    assert_windows_equal_the_whole(short_on(rung, name, "M6", cycle=1))
+
+
+def assert_windows_equal_the_whole(scene):
     truth, whole = timeline(scene), simulate(scene).samples
     middles = [0.5 * (start_s + end_s) for start_s, end_s in truth.non_slip_s[:2]]
     windows = [(at_s - 0.004, at_s + 0.013) for at_s in (*middles, *truth.onsets_s)]

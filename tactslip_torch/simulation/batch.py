@@ -1,7 +1,8 @@
 """Many recordings at once: their lanes are integrated side by side, on any device.
 
-``simulate`` is the batch of one. The compiled engine carries lanes one after the other, so there a
-batch saves little; the eager engine makes few large calls of what would be many small ones.
+``simulate`` is the batch of one. The compiled engine carries lanes by 16, which the elements of
+one recording nearly fill, so there a batch saves little; the eager engine makes few large calls of
+what would be many small ones.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
 """Loads that are not slip: a carried object's inertia, taps, changes of grip.
 
 They come on top of what a rung says of the contact, and only where nothing slides: at rest and in
-strokes that move ``"both"``, away from any stroke that slides (``events.MARGIN_S``). Taps and
+strokes that move ``"both"``, away from any stroke that slides (``events.MARGIN_S``). One thing
+reaches further: a carried object's shear outlasts its stroke by ``JERK_S``, into a slide that
+begins sooner, where it is heard and moves no truth. Taps and
 grips press harder and never less, and carried shear stays below half of static friction, so a
 contact that sticks goes on sticking: no slip begins or ends by them. Everything is a function of
 absolute time.

@@ -41,14 +41,15 @@ class Contact:
             ours), cut at a factor 1.5.
         relaxation: range of the share of shear that a long pause relaxes, at most 1.
         relaxation_time_s: range of its time constant.
-        recoil_s: time constant of the shear's fall from static to kinetic (prior, ours).
+        recoil_s: time constant of the shear's fall from static to kinetic (prior, ours). On the
+            kinematic rung alone: the others integrate that fall.
         friction_noise_mv: *calibrated.* Broadband friction noise of every sliding element, rms
             at a PVDF film for mu = 1, 1 N and 40 mm/s.
         friction_noise_exponent: power of speed it grows with.
         friction_noise_low_share: share of its power below 25 Hz.
         texture_scale: factor on every material's texture (prior, ours).
         onset_pulse_v: first swing of the PVDF burst when an element lets go, per newton of
-            friction.
+            friction. On the kinematic rung alone: see ``Dynamics.release_v_per_n``.
         runout: relative change of normal load along the travel.
         skin_resonance_hz: range of the skin's resonance, drawn per session.
         skin_damping: range of its damping ratio (prior, ours).
