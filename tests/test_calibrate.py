@@ -319,7 +319,7 @@ def test_facts_that_fail_at_the_start_freeze_nothing(tmp_path, monkeypatch, whol
         ("features.align=causal", "features"),
         ("data.cycles=2", "data"),
         ("data.fidelity=lugre", "data"),
-        ("+data.others.taps.taps_per_s=2.0", "data"),
+        ("others=confound", "others"),
     ],
 )
 def test_another_protocol_is_not_frozen(tmp_path, whole, override, section):

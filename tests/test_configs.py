@@ -78,10 +78,7 @@ def test_an_experiment_is_global_and_names_itself(name):
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_an_experiment_adds_no_key(name):
-    """A misspelt key in an experiment file is added silently, so hold it against its groups.
-
-    Keys of further scenes are knobs, and the source refuses unknown ones.
-    """
+    """A misspelt key in an experiment file is added silently, so hold it against its groups."""
     content = yaml.safe_load((conf_dir() / "exp" / f"{name}.yaml").read_text())
     groups = [
         f"{key.removeprefix('override /')}={option}"
@@ -89,18 +86,37 @@ def test_an_experiment_adds_no_key(name):
         for key, option in entry.items()
         if key.startswith("override /")
     ]
-    known = set(keys_of(OmegaConf.to_container(composed(*groups)))) - {"data.others"}
-    whole = OmegaConf.to_container(composed(f"+exp={name}"))
-    for section in (content, whole):
-        section.setdefault("data", {}).pop("others", None)
-    assert set(keys_of(content)) <= known | {"data"}  # nothing but scenes
-    assert set(keys_of(whole)) == known
+    known = set(keys_of(OmegaConf.to_container(composed(*groups))))
+    assert set(keys_of(content)) <= known
+    assert set(keys_of(OmegaConf.to_container(composed(f"+exp={name}")))) == known
 
 
 def test_a_misspelt_knob_of_a_further_scene_is_refused():
-    config = composed("+exp=confound", "+data.others.taps.taps_per_sec=3.0")
+    config = composed("+exp=confound", "+others.taps.taps_per_sec=3.0")
     with pytest.raises(InstantiationException, match="unknown override taps_per_sec"):
         instantiate(config.data, _convert_="all")
+
+
+def test_further_scenes_are_those_of_their_files_and_any_knob_can_be_set():
+    config = composed("others=confound", "others.taps.cycles=2", "+others.grips.machine_mv=3.0")
+    for name, knobs in config.others.items():
+        of_file = yaml.safe_load((conf_dir() / "scene" / f"{name}.yaml").read_text())
+        added = {"machine_mv": 3.0} if name == "grips" else {}
+        assert knobs == of_file | added | {"cycles": 2 if name == "taps" else 8}
+    source = instantiate(config.data, cycles=9, materials=["M1"], _convert_="all")
+    counts = {name: sum(r.scene == name for r in source.ids) for name in config.others}
+    assert counts == dict.fromkeys(config.others, 8) | {"taps": 2}
+    assert sum(r.scene == "paper" for r in source.ids) == 9
+
+
+@pytest.mark.parametrize(
+    "name", ["train", "evaluate", "generate", "stats", "certify", "crossval", "pareto", "calibrate"]
+)
+def test_every_entry_point_on_recordings_takes_further_scenes(name):
+    assert not composed(name=name).data.others
+    config = composed("others=confound", name=name)
+    assert config.data.others == config.others
+    assert "arm_motion" in config.others
 
 
 def test_confound_trains_on_scenes_it_has_and_judges_some_it_never_met():
@@ -170,8 +186,10 @@ def test_every_option_composes(group, option):
     name = "pareto" if group == "search" else "train"
     config = composed(f"{group}={option}", name=name)
     section = config[group]
-    assert section
-    if group == "scene":  # knobs, for the recordings
+    assert section or (group, option) == ("others", "none")
+    if group == "others":
+        assert config.data.others == section
+    elif group == "scene":  # knobs, for the recordings
         assert section.name == option
         source = instantiate(config.data, cycles=1, materials=["M3", "wood"], _convert_="all")
         assert [str(r.scene) for r in source.ids] == [option, option]

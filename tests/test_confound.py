@@ -365,7 +365,7 @@ def test_evaluate_on_a_scene_without_slip_has_no_slip_recall(ran, tmp_path, caps
 
 
 def test_evaluate_on_several_scenes_draws_them(ran, tmp_path, capsys):
-    kinds = [f"+scene@data.others.{kind}={kind}" for kind in ("arm_motion", "pulled")]
+    kinds = [f"+scene@others.{kind}={kind}" for kind in ("arm_motion", "pulled")]
     metrics = judged(ran, tmp_path, *kinds)
     assert confound_table(metrics) in capsys.readouterr().out
     assert (tmp_path / "confound.png").is_file()

@@ -127,7 +127,7 @@ def test_any_number_of_processes_writes_the_same_bytes(tmp_path):
 
 
 def test_kinds_of_scenes_share_a_folder_and_have_rows_of_their_own(tmp_path, capsys):
-    others = "+data.others.quiet={strokes: [{speed_mm_s: 60.0, distance_mm: 60.0}], cycles: 2}"
+    others = "+others.quiet={strokes: [{speed_mm_s: 60.0, distance_mm: 60.0}], cycles: 2}"
     short = "+data.scene.strokes=[{speed_mm_s: 60.0, distance_mm: 60.0, pause_s: 0.5}]"
     run(tmp_path, "scene=paper", "materials=[M1]", "cycles=1", short, others)
     assert set(contents(tmp_path)) == {

@@ -469,7 +469,7 @@ def test_fewer_seeds_are_never_more_and_quick_is_small():
     assert EXPERIMENTS["motor_off"].num_seeds(7) < 7
     assert EXPERIMENTS["motor_off"].num_seeds(1) == 1
     assert "data.cycles=2" in overrides_of("unseen4", quick=True)
-    assert "data.others.arm_motion.cycles=2" in overrides_of("confound", quick=True)
+    assert "others.arm_motion.cycles=2" in overrides_of("confound", quick=True)
     for name in ("random_bins", "unseen4", "half_second", "half_second random_bins"):
         assert EXPERIMENTS[name].num_seeds(5) == 5
 

@@ -210,7 +210,7 @@ def test_what_confound_trains_on_can_be_chosen():
         ),
         (
             {"recordings": [RecordingId(m, c, "taps") for m in SEEN + UNSEEN for c in range(3)]},
-            "needs recordings of scene paper, carried; the set has taps: add them to data.others",
+            "needs recordings of scene paper, carried; the set has taps: add them, as others=",
         ),
         ({"unseen": []}, "no recording has the role 'unseen'"),
         ({"seen": ["M9"]}, "no recording of material 'M9'"),

@@ -80,7 +80,7 @@ EXPERIMENTS: dict[str, Experiment] = {
 }
 """By name, as tables call them."""
 
-CONFOUND = Path(__file__).parents[2] / "conf" / "exp" / "confound.yaml"
+CONFOUND = Path(__file__).parents[2] / "conf" / "others" / "confound.yaml"
 QUICK = ("data.cycles=2", "split.train_share=0.5", "recipe.sample_bins=60")
 """Overrides of every run of ``--quick``."""
 
@@ -89,6 +89,6 @@ def overrides_of(name: str, quick: bool) -> list[str]:
     """Overrides of an experiment; with ``quick`` of few recordings."""
     overrides = [*EXPERIMENTS[name].overrides, *(QUICK if quick else ())]
     if quick and name == "confound":
-        scenes = OmegaConf.select(OmegaConf.load(CONFOUND), "data.others")
-        overrides += [f"data.others.{scene}.cycles=2" for scene in scenes]
+        scenes = [str(name) for name in OmegaConf.load(CONFOUND) if name != "defaults"]
+        overrides += [f"others.{scene}.cycles=2" for scene in scenes]
     return overrides

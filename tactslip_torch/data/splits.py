@@ -182,7 +182,7 @@ def confound(
     if missing:
         raise ValueError(
             f"split confound needs recordings of scene {', '.join(missing)}; the set has "
-            f"{', '.join(there)}: add them to data.others"
+            f"{', '.join(there)}: add them, as others=confound does"
         )
     folds = []
     for name, scenes in (("protocol", [PAPER_SCENE]), ("with_scenes", [PAPER_SCENE, *added])):
