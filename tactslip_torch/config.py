@@ -46,7 +46,7 @@ def unknown_choice(arguments: Sequence[str]) -> str | None:
         >>> unknown_choice(["+exp=unseen4", "seed=3"]) is None
         True
         >>> unknown_choice(["split=seen7"])
-        'unknown split seen7; known: leave_one_material_out, random_bins, seen6, unseen4'
+        'unknown split seen7; known: confound, leave_one_material_out, random_bins, seen6, unseen4'
     """
     for argument in arguments:
         key, found, value = argument.lstrip("+").partition("=")

@@ -50,8 +50,8 @@ def test_no_conf_is_an_error_that_says_where(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["+exp=nope"], "unknown exp nope; known: leave_one_material_out, quick, random_bins"),
-        (["seed=3", "split=seen7"], "unknown split seen7; known: leave_one_material_out"),
+        (["+exp=nope"], "unknown exp nope; known: confound, leave_one_material_out, quick"),
+        (["seed=3", "split=seen7"], "unknown split seen7; known: confound, leave_one_material_out"),
         (["labels=whole"], "unknown labels whole; known: half_second, whole_slide"),
         (["data=real"], "unknown data real; known: simulated"),
         (["-m", "split=seen6,seen7"], "unknown split seen7"),
