@@ -4,7 +4,9 @@ Trains every experiment on every seed. Runs in ``--runs`` that this very code, c
 calibration finished are kept, so it resumes; seeds come one after the other, and experiments that
 share features stand together, so that most are made once. Keeps ``benchmarks/results/
 reproduction.json`` and draws the figures beside it, writes ``REPRODUCTION.md`` and the table
-between the markers in ``README.md``. ``--report`` does the latter from what is kept.
+between the markers in ``README.md``. ``--report`` does the latter from what is kept. With
+``--quick``, or with a part of the experiments, all of it but README.md goes to a folder in
+``outputs``, and no tracked file is touched.
 """
 
 from __future__ import annotations
@@ -13,17 +15,24 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 from benchmarks.machine import machine_facts
 from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, ROOT, between_markers
-from benchmarks.reproduction.experiments import EXPERIMENTS, overrides_of
+from benchmarks.reproduction.experiments import EXPERIMENTS, SEEDS, overrides_of
 from benchmarks.reproduction.figure import confound_figure, places_figure, seeds_figure
-from benchmarks.reproduction.page import COMMAND, FIGURES, page, short_table
+from benchmarks.reproduction.page import (
+    COMMAND,
+    FIGURES,
+    KEPT_NAME,
+    is_part,
+    page,
+    short_table,
+)
 from benchmarks.reproduction.results import Report, runs_of
 from benchmarks.reproduction.runs import kept, run
 from tactslip_torch.data.recording import RecordingId
@@ -34,7 +43,30 @@ from tactslip_torch.simulation.knobs.calibrated import CALIBRATED_PATH
 from tactslip_torch.simulation.materials import SEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings
 
-KEPT = RESULTS / "reproduction.json"
+KEPT = RESULTS / KEPT_NAME
+OUTPUTS = ROOT / "outputs"
+
+
+class Place(NamedTuple):
+    """Where results go.
+
+    Attributes:
+        folder: of the JSON and the figures.
+        page: REPRODUCTION.md.
+        readme: whose block is replaced, or none.
+    """
+
+    folder: Path
+    page: Path
+    readme: Path | None
+
+    @classmethod
+    def of(cls, quick: bool, names: Collection[str]) -> Place:
+        """The tracked files for all experiments in earnest, else a folder of its own."""
+        if not quick and not is_part(names):
+            return cls(RESULTS, ROOT / "REPRODUCTION.md", ROOT / "README.md")
+        folder = OUTPUTS / ("reproduction-quick" if quick else "reproduction-part")
+        return cls(folder, folder / "REPRODUCTION.md", None)
 
 
 def measure(
@@ -93,18 +125,18 @@ def signals(seed: int, cycles: int) -> list[dict[str, Any]]:
     return judge_facts(recordings)
 
 
-def write(report: Report) -> None:
-    """Figures, REPRODUCTION.md and the block in README.md, of what is kept."""
+def write(report: Report, place: Place) -> None:
+    """Figures, REPRODUCTION.md and perhaps the block in README.md, of what is kept."""
     if runs_of(report, "unseen4"):
-        places_figure(report, RESULTS / FIGURES["places"])
+        places_figure(report, place.folder / FIGURES["places"])
     if runs_of(report, "confound"):
-        confound_figure(report, RESULTS / FIGURES["confound"])
-    seeds_figure(report, RESULTS / FIGURES["seeds"])
-    pipeline_figure(RESULTS / "pipeline.png")
-    images = RESULTS.relative_to(ROOT).as_posix()
-    readme = ROOT / "README.md"
-    block = between_markers(readme.read_text(encoding="utf-8"), "reproduction", short_table(report))
-    texts = {ROOT / "REPRODUCTION.md": page(report, images), readme: block}
+        confound_figure(report, place.folder / FIGURES["confound"])
+    seeds_figure(report, place.folder / FIGURES["seeds"])
+    pipeline_figure(place.folder / "pipeline.png")
+    texts = {place.page: page(report, place.folder.relative_to(place.page.parent).as_posix())}
+    if place.readme is not None:
+        before = place.readme.read_text(encoding="utf-8")
+        texts[place.readme] = between_markers(before, "reproduction", short_table(report))
     for path, content in texts.items():
         with whole_file(path) as temporary:
             temporary.write_text(content, encoding="utf-8")
@@ -115,7 +147,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog=COMMAND, description="Train the published experiments and write REPRODUCTION.md."
     )
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="how many (%(default)s)")
+    parser.add_argument(
+        "--seeds", type=int, default=SEEDS, metavar="N", help="how many (%(default)s)"
+    )
     parser.add_argument("--runs", type=Path, metavar="FOLDER", help="of runs and cached features")
     parser.add_argument("--experiments", nargs="+", default=list(EXPERIMENTS), choices=EXPERIMENTS)
     parser.add_argument("--quick", action="store_true", help="few recordings, to see that it runs")
@@ -124,10 +158,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = parser.parse_args(arguments)
     if parsed.seeds < 1:
         parser.error(f"--seeds must be at least 1, got {parsed.seeds}")
+    names = [name for name in EXPERIMENTS if name in parsed.experiments]
+    place = Place.of(parsed.quick, names)
+    path = place.folder / KEPT_NAME
+    if parsed.report and not path.exists():
+        parser.error(f"--report needs {path}; leave --report out, which trains and writes it")
     if not parsed.report:
         torch.set_num_threads(1)  # trainings use the processors
-        folder = parsed.runs or ROOT / "outputs" / f"reproduction{'-quick' * parsed.quick}"
-        names = [name for name in EXPERIMENTS if name in parsed.experiments]
+        folder = parsed.runs or OUTPUTS / f"reproduction{'-quick' * parsed.quick}"
         try:
             report = measure(parsed.seeds, names, folder.resolve(), parsed.quick, parsed.all_seeds)
         except RuntimeError as error:
@@ -135,10 +173,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 1
         except KeyboardInterrupt:
             return EXIT_INTERRUPTED
-        with whole_file(KEPT) as temporary:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as temporary:
             temporary.write_text(json.dumps(report, allow_nan=False) + "\n", encoding="utf-8")
-    write(json.loads(KEPT.read_text(encoding="utf-8")))
-    print(f"{ROOT / 'REPRODUCTION.md'} from {KEPT}")
+    write(json.loads(path.read_text(encoding="utf-8")), place)
+    print(f"{place.page} from {path}")
     return 0
 
 

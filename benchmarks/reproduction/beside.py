@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from benchmarks.reproduction.results import MeanSd, Report, percent, runs_of
+from benchmarks.reproduction.results import MeanSd, Report, percent, runs_of, seeds_text
 from benchmarks.tables import Table
 from tactslip_torch.report import published
 
@@ -100,14 +100,14 @@ def _authors(quantity: Quantity, report: Report) -> tuple[str, str]:
         return PREDICTED, "the knobs stand at their starting values"
     if quantity.ours is larger_class:
         return PREDICTED, "follows from where bins are laid"
-    return PREDICTED, "no knob was set by it"
+    return PREDICTED, "no knob was calibrated by it"
 
 
 def _by_cycle(quantity: Quantity, report: Report) -> tuple[str, str]:
     if quantity.role == "unseen":
-        return PREDICTED, "no unseen material was looked at"
+        return PREDICTED, "calibration looked at none"
     if quantity.role == "train":
-        return PREDICTED, "no knob was set by it"
+        return PREDICTED, "no knob was calibrated by it"
     if quantity.ours is larger_class:
         return PREDICTED, "follows from where bins are laid"
     return NOT_COMPARABLE, "the paper's test bins have neighbours among its training bins"
@@ -173,8 +173,7 @@ def _rows(report: Report, setting: Setting) -> list[Sequence[str]]:
 def seeds_note(report: Report, experiment: str) -> str:
     """How many seeds, and the overrides, in a line."""
     settings = " ".join(report["commands"][experiment])
-    num = len(runs_of(report, experiment))
-    return f"{num} seed{'s' if num > 1 else ''}; `train {settings} seed=...`"
+    return f"{seeds_text(len(runs_of(report, experiment)))}; `train {settings} seed=...`"
 
 
 def signals_table(report: Report) -> Table:

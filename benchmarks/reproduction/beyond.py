@@ -8,10 +8,12 @@ from typing import NamedTuple
 from benchmarks.reproduction.results import (
     SCORES,
     Report,
+    by_seed,
     labels_of,
+    on_shared_seeds,
     percent,
     recall_beside_onset,
-    rival_percent,
+    rival_by_seed,
     roles_of,
     runs_of,
     text,
@@ -79,15 +81,23 @@ ABLATIONS = (
     Ablation("means of the SGs only", "SG means only"),
     Ablation("the best single selected feature with a threshold", "unseen4", is_rival=True),
     Ablation("everything, motors and jolts of the arm off", "motor_off"),
-    Ablation("everything, motors and jolts of the arm alone", "motor_only"),
+    Ablation("motors and jolts of the arm, the contact as good as silent", "motor_only"),
     Ablation("everything, labels permuted", "shuffled"),
 )
 
 
-def ablation_percent(report: Report, ablation: Ablation, role: str, score: str) -> list[float]:
-    """A score of an ablation, a number a seed."""
-    found = rival_percent if ablation.is_rival else percent
+def ablation_by_seed(report: Report, ablation: Ablation, role: str, score: str) -> dict[int, float]:
+    """A score of an ablation in percent, with the seed of each number."""
+    found = rival_by_seed if ablation.is_rival else by_seed
     return found(report, ablation.experiment, role, score)
+
+
+def cost(report: Report, ablation: Ablation, role: str) -> list[float]:
+    """Balanced points that an ablation scores more than everything, of the seeds both have."""
+    score = "balanced_accuracy"
+    own = ablation_by_seed(report, ablation, role, score)
+    whole = by_seed(report, ABLATIONS[0].experiment, role, score)
+    return [a - b for a, b in zip(*on_shared_seeds(own, whole), strict=True)]
 
 
 def ablations_table(report: Report) -> Table:
@@ -97,17 +107,36 @@ def ablations_table(report: Report) -> Table:
         runs = runs_of(report, ablation.experiment)
         if not runs:
             continue
-        cells = [
-            text(ablation_percent(report, ablation, role, score))
-            for role in ("test", "unseen")
-            for score in ("balanced_accuracy", "non_slip_recall", "slip_recall")
-        ]
+        cells = []
+        for role in ("test", "unseen"):
+            cells += [
+                text(list(ablation_by_seed(report, ablation, role, score).values()))
+                for score in ("balanced_accuracy", "non_slip_recall", "slip_recall")
+            ]
+            is_whole = ablation is ABLATIONS[0]
+            cells.append("-" if is_whole else text(cost(report, ablation, role), sign="+"))
         rows.append([ablation.what, *cells, str(len(runs)), _num_features(ablation, runs)])
-    scores = ("balanced, %", "non-slip, %", "slip, %")
+    scores = ("balanced, %", "non-slip, %", "slip, %", "to everything, points")
     columns = [f"{role}: {score}" for role in ("test", "unseen") for score in scores]
     header = ["trained and judged with", *columns, "seeds", "features"]
-    note = "Split by cycle, whole slides, the paper's recipe. Permuted labels must show 50 %."
+    note = (
+        "Split by cycle, whole slides, the paper's recipe. Points are balanced, those of "
+        f"everything taken off at the same seeds{_fewer(report)}. Permuted labels must show 50 %."
+    )
     return Table(header, rows, note)
+
+
+def _fewer(report: Report) -> str:
+    """Which ablations share fewer seeds with everything than it has, as an aside."""
+    whole = by_seed(report, ABLATIONS[0].experiment, "test", "balanced_accuracy")
+    by_num: dict[int, list[str]] = {}
+    for ablation in ABLATIONS:
+        own = ablation_by_seed(report, ablation, "test", "balanced_accuracy")
+        shared = len(on_shared_seeds(own, whole)[0])
+        if own and shared < len(whole):
+            by_num.setdefault(shared, []).append(ablation.experiment)
+    parts = [f"{num} of {len(whole)} for {', '.join(names)}" for num, names in by_num.items()]
+    return f" ({'; '.join(parts)})" if parts else ""
 
 
 def _num_features(ablation: Ablation, runs: Sequence[Mapping[str, object]]) -> str:
@@ -124,15 +153,15 @@ def validation_table(report: Report) -> Table:
     """What recipes score on training materials left out, by which the default was chosen."""
     rows, by_recipe = [], []
     for name, words in RECIPES.items():
-        values = [run["validation"] for run in runs_of(report, name)]
-        if values and None not in values:
+        values = {run["seed"]: run["validation"] for run in runs_of(report, name)}
+        if values and None not in values.values():
             by_recipe.append(values)
-            percents = [100 * value for value in values]
+            percents = [100 * value for value in values.values()]
             by_seed = ", ".join(f"{value:.2f}" for value in percents)
             rows.append([words, text(percents), by_seed])
     note = "Balanced accuracy of the best choice of K and C; no test and no unseen bin is in it."
     if len(by_recipe) == len(RECIPES):
-        paper, robust = by_recipe
+        paper, robust = on_shared_seeds(*by_recipe)
         better = sum(ours > theirs for theirs, ours in zip(paper, robust, strict=True))
         note += f" `robust` is the better one for {better} of {len(paper)} seeds."
     return Table(["recipe", "left-out training materials, %", "by seed"], rows, note)
@@ -146,10 +175,9 @@ LAYOUTS = {
 
 
 def leak(report: Report, layout: str, score: str) -> list[float]:
-    """Test score of the split at random less that by cycle, in points, a number a seed."""
-    at_random, by_cycle = (percent(report, name, "test", score) for name in LAYOUTS[layout])
-    both = min(len(at_random), len(by_cycle))
-    return [a - b for a, b in zip(at_random[:both], by_cycle[:both], strict=True)]
+    """Test score of the split at random less that by cycle, in points, a number a shared seed."""
+    both = [by_seed(report, name, "test", score) for name in LAYOUTS[layout]]
+    return [a - b for a, b in zip(*on_shared_seeds(*both), strict=True)]
 
 
 def leak_table(report: Report) -> Table:
@@ -159,7 +187,11 @@ def leak_table(report: Report) -> Table:
         for score, name in SCORES.items():
             found = leak(report, layout, score)
             if found:
-                both = [percent(report, of, "test", score) for of in (at_random, by_cycle)]
-                rows.append([f"{name}, {layout}", *map(text, both), text(found, sign="+")])
-    header = ["test bins", "at random over bins, %", "by cycle, %", "leak, points"]
-    return Table(header, rows, "The leak is that of each seed, then mean and spread.")
+                both = on_shared_seeds(
+                    *(by_seed(report, of, "test", score) for of in (at_random, by_cycle))
+                )
+                cells = [*map(text, both), text(found, sign="+"), str(len(found))]
+                rows.append([f"{name}, {layout}", *cells])
+    header = ["test bins", "at random over bins, %", "by cycle, %", "leak, points", "seeds"]
+    note = "All of the seeds that both splits have. The leak is that of each, then mean and spread."
+    return Table(header, rows, note)

@@ -26,6 +26,9 @@ class Experiment(NamedTuple):
         return asked if self.most_seeds is None else min(asked, self.most_seeds)
 
 
+SEEDS = 5
+"""How many there are of an experiment that states no fewer."""
+
 EXPERIMENTS: dict[str, Experiment] = {
     # these use the features of one set of recordings ...
     "unseen4": Experiment(
@@ -68,7 +71,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         most_seeds=2,
     ),
     "motor_only": Experiment(
-        "the arm alone, next to no contact",
+        "motors and jolts of the arm, the contact as good as silent",
         ("+exp=unseen4", "recipe=paper", "scene=motor_only"),
         most_seeds=2,
     ),

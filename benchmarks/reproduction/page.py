@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+import shlex
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from benchmarks.reproduction.beside import (
@@ -22,14 +23,22 @@ from benchmarks.reproduction.beyond import (
     validation_table,
 )
 from benchmarks.reproduction.confound import conclusion, confound_tables
-from benchmarks.reproduction.experiments import EXPERIMENTS
+from benchmarks.reproduction.experiments import EXPERIMENTS, SEEDS
 from benchmarks.reproduction.reasons import reasons
-from benchmarks.reproduction.results import Report, percent, rival_percent, runs_of, text
+from benchmarks.reproduction.results import (
+    Report,
+    percent,
+    rival_percent,
+    runs_of,
+    seeds_text,
+    text,
+)
 from benchmarks.reproduction.selected import selected_table
 from benchmarks.tables import Table
 from tactslip_torch.report import published
 
 COMMAND = "python -m benchmarks.reproduction"
+KEPT_NAME = "reproduction.json"
 FIGURES = {
     "seeds": "reproduction.png",
     "places": "reproduction_places.png",
@@ -45,9 +54,9 @@ def page(report: Report, images: str) -> str:
 
     Args:
         report: as it is stored.
-        images: folder of the figures, as the file refers to it.
+        images: folder of the figures and of the JSON, as the file refers to it.
     """
-    parts = [_introduction(report), *_first(report), *_second(report, images)]
+    parts = [_introduction(report, images), *_first(report), *_second(report, images)]
     parts += _third(report, images)
     found = reasons(report)
     if found:
@@ -55,19 +64,40 @@ def page(report: Report, images: str) -> str:
     return "\n\n".join([*parts, _knobs(report), _runs(report)]) + "\n"
 
 
-def _introduction(report: Report) -> str:
+def is_part(names: Collection[str]) -> bool:
+    """Whether experiments are missing among these."""
+    return not set(EXPERIMENTS) <= set(names)
+
+
+def few_seeds(report: Report) -> list[str]:
+    """A line that names experiments of fewer seeds than is the rule; none where there are none."""
+    by_num: dict[int, list[str]] = {}
+    for name, runs in report["runs"].items():
+        if len(runs) < EXPERIMENTS[name].num_seeds(SEEDS):
+            by_num.setdefault(len(runs), []).append(name)
+    parts = [f"{seeds_text(num)} of {', '.join(names)}" for num, names in by_num.items()]
+    if not parts:
+        return []
+    return [f"**Fewer seeds than is the rule ({SEEDS}):** {'; '.join(parts)}."]
+
+
+def _introduction(report: Report, images: str) -> str:
     settings = f" --seeds {report['seeds']}" + (" --quick" if report["quick"] else "")
+    if is_part(report["runs"]):
+        settings += f" --experiments {shlex.join(report['runs'])}"
     quick = f"\n\n{QUICK_LINE}" if report["quick"] else ""
     parts = [
         "# Reproduction, on a SIMULATED hand",
         "**Every number of ours below is SIMULATED; the paper's are of a real hand, whose "
         f"recordings are private.** Written by `{COMMAND}{settings}`, which trains the experiments "
-        "listed at the end and keeps what they count in `benchmarks/results/reproduction.json`; no "
+        f"listed at the end and keeps what they count in `{images}/{KEPT_NAME}`; no "
         "result is typed by hand. A seed is another simulated set and another split; numbers are "
         f"mean ± standard deviation over seeds.{quick}",
+        *few_seeds(report),
         f"The paper is {published.PAPER}. Every row that stands beside it is marked: {CALIBRATED}, "
         f"the simulation was set by it; {PREDICTED}, it was not, and whatever came out is shown; "
-        f"{NOT_COMPARABLE}, something else was measured.",
+        f"{NOT_COMPARABLE}, something else was measured. Of unseen materials calibration looked at "
+        "none; the starting values of all other knobs come from an exploration that did.",
     ]
     return "\n\n".join(parts)
 
@@ -124,8 +154,8 @@ def _third(report: Report, images: str) -> list[str]:
         "## 3. Does it feel slip, or hear the arm?",
         "In the paper's protocol slip and arm motion are the same thing. Here a detector of the "
         "protocol, and one that was trained on scenes which part the two as well, are judged on "
-        "such scenes (`+exp=confound`, default recipe; scenes not marked were trained on by "
-        "neither).",
+        "such scenes (`+exp=confound`, default recipe; scenes that no table marks were trained on "
+        "by neither).",
     ]
     for title, table in confound_tables(report).items():
         parts += [f"**{title}.**", shown(table)]
@@ -200,15 +230,13 @@ def short_table(report: Report) -> str:
             cells = [text(percent(report, name, role, score)) for score in _COLUMNS]
             rival = text(rival_percent(report, name, role, "balanced_accuracy"))
             if runs_of(report, name):
-                num = len(runs_of(report, name))
-                rows.append(
-                    [f"`{name}` {role}, simulated, {num} seed{'s' * (num > 1)}", *cells, rival]
-                )
-            if (name, role) in BELOW:
-                paper = published.SPLITS[BELOW[name, role]]
-                values = [getattr(paper, score) for score in _COLUMNS]
-                of_paper = ["" if value is None else f"{100 * value:.2f}" for value in values]
-                rows.append([f"paper, real hand, {BELOW[name, role]}", *of_paper, ""])
+                num = seeds_text(len(runs_of(report, name)))
+                rows.append([f"`{name}` {role}, simulated, {num}", *cells, rival])
+                if (name, role) in BELOW:
+                    paper = published.SPLITS[BELOW[name, role]]
+                    values = [getattr(paper, score) for score in _COLUMNS]
+                    of_paper = ["" if value is None else f"{100 * value:.2f}" for value in values]
+                    rows.append([f"paper, real hand, {BELOW[name, role]}", *of_paper, ""])
     header = ["experiment", *_COLUMNS.values(), "best single selected feature, balanced %"]
     table = shown(Table(header, rows))
     return f"{QUICK_LINE}\n\n{table}" if report["quick"] else table

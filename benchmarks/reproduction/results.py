@@ -54,7 +54,7 @@ def runs_of(report: Report, experiment: str) -> list[Mapping[str, Any]]:
     """
     name, _, fold = experiment.partition(": ")
     runs = report["runs"].get(name, [])
-    return [run["folds"][fold] for run in runs] if fold else list(runs)
+    return [run["folds"][fold] | {"seed": run["seed"]} for run in runs] if fold else list(runs)
 
 
 def roles_of(report: Report, experiment: str) -> list[str]:
@@ -78,19 +78,52 @@ def percent(
         score: a key of ``SCORES``.
         group: such as ``("per_speed", ["20"])``: of these bins alone, together.
     """
-    found = []
-    for run in runs_of(report, experiment):
-        value = _score(run["splits"].get(role), score, group)
-        if value is not None:
-            found.append(100 * value)
-    return found
+    return list(by_seed(report, experiment, role, score, group).values())
+
+
+def by_seed(
+    report: Report,
+    experiment: str,
+    role: str,
+    score: str,
+    group: tuple[str, Iterable[str]] | None = None,
+) -> dict[int, float]:
+    """As ``percent``, with the seed of each number."""
+    scores = {
+        run["seed"]: _score(run["splits"].get(role), score, group)
+        for run in runs_of(report, experiment)
+    }
+    return {seed: 100 * value for seed, value in scores.items() if value is not None}
 
 
 def rival_percent(report: Report, experiment: str, role: str, score: str) -> list[float]:
     """As ``percent``, of the best single selected feature with a threshold."""
-    rivals = [run["best_single_feature"]["splits"] for run in runs_of(report, experiment)]
-    scores = [_score(splits.get(role), score, None) for splits in rivals]
-    return [100 * value for value in scores if value is not None]
+    return list(rival_by_seed(report, experiment, role, score).values())
+
+
+def rival_by_seed(report: Report, experiment: str, role: str, score: str) -> dict[int, float]:
+    """As ``rival_percent``, with the seed of each number."""
+    scores = {
+        run["seed"]: _score(run["best_single_feature"]["splits"].get(role), score, None)
+        for run in runs_of(report, experiment)
+    }
+    return {seed: 100 * value for seed, value in scores.items() if value is not None}
+
+
+def on_shared_seeds(*scores: Mapping[int, float]) -> list[list[float]]:
+    """The numbers of each at the seeds that all of them have, in one order.
+
+    Example:
+        >>> on_shared_seeds({0: 90.0, 1: 91.0, 2: 92.0}, {2: 80.0, 0: 81.0})
+        [[90.0, 92.0], [81.0, 80.0]]
+    """
+    shared = [seed for seed in scores[0] if all(seed in of for of in scores)]
+    return [[of[seed] for seed in shared] for of in scores]
+
+
+def seeds_text(num: int) -> str:
+    """``1 seed``, ``2 seeds``."""
+    return f"{num} seed{'s' if num != 1 else ''}"
 
 
 def recall_beside_onset(
