@@ -257,7 +257,15 @@ def test_the_published_test_accuracy_is_the_target(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def whole(found, monkeypatch):
+def frozen(tmp_path, monkeypatch):
+    """Where values are frozen: not in the package, whatever a test finds."""
+    path = tmp_path / "package" / "calibrated.json"
+    monkeypatch.setattr(command, "CALIBRATED_PATH", path)
+    return path
+
+
+@pytest.fixture
+def whole(found, frozen, monkeypatch):
     """The protocol of ``conf/calibrate.yaml``, with the points of a smaller one put in."""
 
     def composed_with(*overrides, holds=True):
@@ -278,19 +286,16 @@ def whole(found, monkeypatch):
     return composed_with
 
 
-def test_write_freezes_the_values_that_knobs_then_take(tmp_path, monkeypatch, whole):
-    frozen = tmp_path / "package" / "calibrated.json"
-    monkeypatch.setattr(command, "CALIBRATED_PATH", frozen)
+def test_write_freezes_the_values_that_knobs_then_take(tmp_path, frozen, whole):
     content = calibrate(whole(), tmp_path)
     assert content["difficulty"] in (0.0, 2.0)
     assert frozen.read_bytes() == (tmp_path / "calibration.json").read_bytes()
     assert read_calibrated(frozen) == knobs_at(content["difficulty"])
 
 
-def test_without_write_nothing_is_frozen(tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "CALIBRATED_PATH", tmp_path / "calibrated.json")
+def test_without_write_nothing_is_frozen(tmp_path, frozen):
     calibrate(tiny("most_points=1"), tmp_path / "results")
-    assert not (tmp_path / "calibrated.json").exists()
+    assert not frozen.exists()
 
 
 def test_facts_that_fail_at_the_start_are_an_error(tmp_path):
@@ -299,11 +304,10 @@ def test_facts_that_fail_at_the_start_are_an_error(tmp_path):
         calibrate(tiny(loud), tmp_path / "results")
 
 
-def test_facts_that_fail_at_the_start_freeze_nothing(tmp_path, monkeypatch, whole):
-    monkeypatch.setattr(command, "CALIBRATED_PATH", tmp_path / "calibrated.json")
+def test_facts_that_fail_at_the_start_freeze_nothing(tmp_path, frozen, whole):
     with pytest.raises(ValueError, match=r"the facts .*pvdf_slide_over_rest.* do not hold"):
         calibrate(whole(holds=False), tmp_path / "results")
-    assert not (tmp_path / "calibrated.json").exists()
+    assert not frozen.exists()
 
 
 @pytest.mark.parametrize(
@@ -322,11 +326,12 @@ def test_facts_that_fail_at_the_start_freeze_nothing(tmp_path, monkeypatch, whol
         ("others=confound", "others"),
     ],
 )
-def test_another_protocol_is_not_frozen(tmp_path, whole, override, section):
+def test_another_protocol_is_not_frozen(tmp_path, frozen, whole, override, section):
     with pytest.raises(ValueError, match=f"^write=true freezes .*, and {section} differ from it"):
         calibrate(whole(override), tmp_path / "results")
     assert not (tmp_path / "results").exists()
     calibrate(whole(override, "write=false", "most_points=1"), tmp_path / "results")
+    assert not frozen.exists()
 
 
 def test_a_recipe_that_restricts_the_ranking_scores_as_in_train(tmp_path, found):
