@@ -521,7 +521,7 @@ def test_strokes_can_be_configured():
 # Real processes --------------------------------------------------------------------------------
 
 FAILURES = {
-    "unknown experiment": (["train", "+exp=nope"], "unknown exp nope; known: leave_one"),
+    "unknown experiment": (["train", "+exp=nope"], "unknown exp nope; known: confound, leave_one"),
     "unknown material": (
         ["train", "+exp=quick", "data.materials=[M1,Foo]", "split.seen=[M1]", "split.unseen=[Foo]"],
         "unknown material 'Foo'; known are M1",
