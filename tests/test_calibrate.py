@@ -240,7 +240,7 @@ def test_the_command_leaves_all_it_tried(found):
 def test_unseen_materials_and_their_results_are_used_nowhere(tmp_path, found, monkeypatch):
     monkeypatch.setattr(published, "SPLITS", MappingProxyType({"test": published.SPLITS["test"]}))
     monkeypatch.setattr(materials, "UNSEEN_MATERIALS", ())
-    for name in ("iron", "cloth", "copper", "wood"):
+    for name in ("wood", "copper", "cloth", "iron"):  # they come back in the table's order
         monkeypatch.delitem(materials.MATERIALS, name)
     with pytest.raises(ValueError, match="unknown material 'iron'"):
         paper_scenes(cycles=1, materials=["iron"])  # they are gone indeed
