@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from tactslip_torch.simulation.events import Stretch, draw_events, merged, smooth_step
+from tactslip_torch.simulation.friction import relaxed
 from tactslip_torch.simulation.grasp import Grasp, recording_key
 from tactslip_torch.simulation.grid import Grid
 from tactslip_torch.simulation.motion import ArmStroke
@@ -171,16 +172,10 @@ def _require_carriable(scene: Scene, grasp: Grasp, plan: tuple[ArmStroke, ...]) 
         if stroke.slides:
             stopped_s = stroke.stop_s
         elif stopped_s is not None:
-            left = _most_shear_left(grasp, stroke.start_s - stopped_s)
+            rest_s = np.asarray(stroke.start_s - stopped_s)
+            left = float(relaxed(grasp, rest_s)[grasp.touching].max())
             if left + share > 1.0:
                 raise ValueError(
                     f"{what} {share:.3g} of static friction in stroke {number}, and up to "
                     f"{left:.3g} may be left of the slide before: pause longer or lower carried_kg"
                 )
-
-
-def _most_shear_left(grasp: Grasp, rest_s: float) -> float:
-    """Largest share of static friction that a slide leaves in any element after a rest."""
-    down = grasp.touching
-    decay = -np.expm1(-rest_s / grasp.relaxation_time_s[down])
-    return float(np.max(1.0 - grasp.relaxation[down] * decay))
