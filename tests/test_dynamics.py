@@ -11,6 +11,7 @@ import pytest
 import torch
 from dynamics_oracle import SMOOTH, TACKY, Element, driven, ramped
 
+from tactslip_torch import engines
 from tactslip_torch.simulation.dynamics import (
     Lanes,
     LaneState,
@@ -427,7 +428,7 @@ def test_auto_takes_what_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
     assert trace.friction_n.requires_grad
     with pytest.raises(ValueError, match=r'"compiled" needs float64 on the CPU, got torch.float32'):
         integrate(single, LaneState.sticking(single), shaken, 2, 250e-6, engine="compiled")
-    monkeypatch.setattr(stepper, "find_spec", lambda name: None)
+    monkeypatch.setattr(engines, "find_spec", lambda name: None)
     integrate(lanes, LaneState.sticking(lanes), shaken, 2, 250e-6)
     assert not taken
     with pytest.raises(ValueError, match='"compiled" needs numba, which is not installed'):

@@ -10,7 +10,7 @@ import pytest
 import torch
 from engine_bins import assert_equals_reference, bins_of
 
-from tactslip_torch import FeaturePool, HandLayout
+from tactslip_torch import FeaturePool, HandLayout, engines
 from tactslip_torch.features import extractor as module
 from tactslip_torch.features.extractor import FeatureExtractor
 
@@ -197,7 +197,7 @@ def test_a_stream_hands_on_batch_by_batch(engine, generator):
 
 def test_auto_takes_numba_where_it_is_installed(monkeypatch, generator):
     assert module.resolved("auto") == ("compiled" if util.find_spec("numba") else "eager")
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    monkeypatch.setattr(engines, "find_spec", lambda name: None)
     extractor = FeatureExtractor(POOL, SELECTED)
     assert extractor.engine == "eager"
     assert extractor(noise(3, generator)).isfinite().all()

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
+from tactslip_torch import engines
 from tactslip_torch.simulation import Contact, Disturbances, Scene, Stroke, simulate, timeline
 from tactslip_torch.simulation.batch import simulate_many
 from tactslip_torch.simulation.contact import ElementContact
 from tactslip_torch.simulation.dynamics import contact as dynamic
-from tactslip_torch.simulation.dynamics import stepper
 from tactslip_torch.simulation.dynamics.contact import DynamicContact
 from tactslip_torch.simulation.grasp import draw_grasp
 from tactslip_torch.simulation.grid import Grid, block_samples_for
@@ -385,7 +385,7 @@ def test_provenance_and_keys_name_the_engine_of_a_dynamic_rung(monkeypatch):
         (recording,) = source.ids
         keys[rung] = [json.dumps(source.key(recording))]
         with monkeypatch.context() as without:
-            without.setattr(stepper, "find_spec", lambda name: None)
+            without.setattr(engines, "find_spec", lambda name: None)
             keys[rung].append(json.dumps(source.key(recording)))
         key = json.loads(keys[rung][0])
         assert Scene.from_dict(key) == Scene("M2", strokes=strokes, fidelity=rung)

@@ -12,15 +12,14 @@ from __future__ import annotations
 
 import logging
 import operator
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from importlib.util import find_spec
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, cast, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from tactslip_torch.engines import usable_engine
 from tactslip_torch.features.eager.engine import EagerEngine
 from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.names import FeatureName
@@ -242,27 +241,9 @@ def resolved(engine: EngineName) -> EngineName:
     Raises:
         ValueError: for an unknown name, or ``"compiled"`` where numba is absent or cannot be used.
     """
-    if engine not in get_args(EngineName):
-        raise ValueError(f"engine must be one of {', '.join(get_args(EngineName))}, got {engine!r}")
-    if engine not in ("auto", "compiled"):
-        return engine
-    is_installed, trouble = find_spec("numba") is not None, _trouble()
-    if engine == "compiled" and trouble:
-        raise ValueError(
-            f'engine "compiled" needs numba, which {trouble}; pip install '
-            '"tactslip_torch[fast]", or use engine "eager"'
-        )
-    if trouble and is_installed:
-        warnings.warn(f"numba {trouble}; features are made by engine eager", stacklevel=2)
-    return "eager" if trouble else "compiled"
+    known = get_args(EngineName)
+    return cast(EngineName, usable_engine(engine, known, _load_kernels, "features are made"))
 
 
-def _trouble() -> str:
-    """Why kernels cannot be compiled here; empty if they can."""
-    if find_spec("numba") is None:
-        return "is not installed"
-    try:
-        from tactslip_torch.features.compiled import engine  # noqa: F401  # a second, once
-    except Exception as error:  # another numba or NumPy than it was made for
-        return f"cannot be used: {str(error).splitlines()[0]}"
-    return ""
+def _load_kernels() -> None:
+    from tactslip_torch.features.compiled import engine  # noqa: F401

@@ -8,16 +8,15 @@ Anal. 14(6), 1006-1021.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
-from importlib.util import find_spec
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
 
+from tactslip_torch.engines import usable_engine
 from tactslip_torch.simulation.dynamics import eager
 from tactslip_torch.simulation.dynamics.lanes import Lanes, LaneState
 from tactslip_torch.simulation.dynamics.stage import GAMMA
@@ -174,30 +173,12 @@ def _lack(lanes: Lanes, state: LaneState, arm: Tensor, normal: Tensor) -> str:
 
 def _resolved(engine: EngineName) -> EngineName:
     """The engine that a name means on this machine, or one line why it cannot be."""
-    if engine not in get_args(EngineName):
-        raise ValueError(f"engine must be one of {', '.join(get_args(EngineName))}, got {engine!r}")
-    if engine == "eager":
-        return engine
-    is_installed, trouble = find_spec("numba") is not None, _trouble()
-    if engine == "compiled" and trouble:
-        raise ValueError(
-            f'engine "compiled" needs numba, which {trouble}; pip install '
-            '"tactslip_torch[fast]", or use engine "eager"'
-        )
-    if trouble and is_installed:
-        warnings.warn(f"numba {trouble}; lanes are carried by engine eager", stacklevel=3)
-    return "eager" if trouble else "compiled"
+    known = get_args(EngineName)
+    return cast(EngineName, usable_engine(engine, known, _load_kernels, "lanes are carried"))
 
 
-def _trouble() -> str:
-    """Why kernels cannot be compiled here; empty if they can."""
-    if find_spec("numba") is None:
-        return "is not installed"
-    try:
-        from tactslip_torch.simulation.dynamics import packing  # noqa: F401  # a second, once
-    except Exception as error:  # another numba or NumPy than it was made for
-        return f"cannot be used: {str(error).splitlines()[0]}"
-    return ""
+def _load_kernels() -> None:
+    from tactslip_torch.simulation.dynamics import packing  # noqa: F401
 
 
 def _check(lanes: Lanes, state: LaneState, num_steps: int, step_s: float, every: int) -> None:
