@@ -214,7 +214,9 @@ BAD_SCENES = {
     ),
     r"sample_rate_hz must be positive and finite, got 0": lambda: Scene("M1", sample_rate_hz=0),
     r"acceleration_m_s2 must be positive": lambda: Scene("M1", acceleration_m_s2=-1.0),
-    r"strokes must hold at least one stroke, got none": lambda: Scene("M1", strokes=()),
+    r"a scene needs a stroke, or a tail_s to rest for; it has neither": lambda: Scene(
+        "M1", strokes=()
+    ),
     r"stroke 1 of 2 mm is too short to slip surely": lambda: Scene("M1", strokes=(Stroke(9, 2),)),
     r"Stroke\.speed_mm_s must be positive and finite, got -3": lambda: Stroke(-3.0),
     r"Stroke\.distance_mm must be positive and finite, got 0": lambda: Stroke(3.0, 0),

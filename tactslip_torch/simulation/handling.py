@@ -84,7 +84,12 @@ class Handled:
         return not (self.taps or self.grips or self._carried)
 
     def stretches_s(self, duration_s: float) -> tuple[Stretch, ...]:
-        """Where the hand is handled: ascending, apart, within the recording, never in a slide."""
+        """Where the hand is handled: ascending, apart, within the recording, never in a slide.
+
+        The whole of a recording without strokes: there is nothing else to tell slip from.
+        """
+        if not self._plan:
+            return ((0.0, duration_s),)
         stretches = [event.stretch_s for event in (*self.taps, *self.grips)]
         for number, stroke in enumerate(self._plan):
             later = [s.start_s for s in self._plan[number + 1 :] if s.slides]

@@ -52,14 +52,14 @@ class Scene:
         material: id in ``MATERIALS``.
         hand: the channels; elements are its distinct (finger, segment) pairs.
         name: of the kind of scene; scenes of other names are other draws of the same session.
-        strokes: at least one; those that slide longer than 1.5 times the longest presliding travel.
+        strokes: none for a hand that only holds; those that slide are longer than 1.5 times the longest presliding travel.
         contact: how the hand touches and slides.
         sensors: the sensing elements and their front end.
         disturbances: what is not slip.
         handling: what loads the contact without sliding.
         faults: what is broken behind the sensors.
         dynamics: knobs of the dynamic rungs.
-        tail_s: rest behind the last stroke.
+        tail_s: rest behind the last stroke, or all there is.
         acceleration_m_s2: of the arm, at each start and stop.
         sample_rate_hz: samples per second and channel.
         fidelity: the rung to simulate on, one of ``FIDELITIES``.
@@ -69,7 +69,7 @@ class Scene:
         cycle: index of the recording within its session.
 
     Raises:
-        ValueError: if the material or rung is unknown, there is no stroke, a rate or
+        ValueError: if the material or rung is unknown, there is neither stroke nor rest, a rate or
             acceleration is not positive, no element can touch, kinetic friction exceeds static,
             or a stroke is too short to slip.
 
@@ -120,8 +120,8 @@ class Scene:
 
     def _require_strokes(self) -> None:
         """Refuse strokes that may end before they slip: each that slides has an onset."""
-        if not self.strokes:
-            raise ValueError("strokes must hold at least one stroke, got none")
+        if not self.strokes and self.tail_s == 0:
+            raise ValueError("a scene needs a stroke, or a tail_s to rest for; it has neither")
         longest_mm = 1.5 * self.contact.presliding_mm[1]
         for number, stroke in enumerate(self.strokes, 1):
             if stroke.slides and stroke.distance_mm <= 1.5 * longest_mm:

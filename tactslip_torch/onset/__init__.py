@@ -1,0 +1,1 @@
+"""From scores to alarms: sequential rules, their threshold, streams, and how events are judged."""
