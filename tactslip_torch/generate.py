@@ -10,13 +10,10 @@ around an onset as in the paper's signal figure.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
@@ -36,6 +33,7 @@ from tactslip_torch.progress import bar
 from tactslip_torch.report.signals import SignalRow, signals_figure
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.workers import in_processes
 
 BEFORE_S, AFTER_S = 2.0, 3.0  # of the onset drawn close up: five seconds, as in the paper
 
@@ -70,7 +68,7 @@ def generate(config: DictConfig, folder: Path) -> list[Written]:
     files.check()
     save_config(config, folder)
     (folder / MANIFEST).unlink(missing_ok=True)  # it must not speak of files that are replaced
-    written = list(_each(files, source.ids, count))
+    written = list(in_processes(files.write, source.ids, "recordings", "recording", count))
     files.write_manifest(written)
     seconds = time.perf_counter() - started
     for scene in bar(shown, "figures", "scene") if shown else ():
@@ -144,41 +142,6 @@ def _draw(
     views = [row.around(stroke, BEFORE_S, AFTER_S) for row in rows]
     for name, seen in ((f"recordings_{scene}.png", None), (f"onset_{scene}.png", views)):
         signals_figure(rows, hand.to_rows(), files.folder / name, title=title, views=seen)
-
-
-_folder: RecordingFolder | None = None
-"""What the processes of ``_each`` share."""
-
-
-def _each(
-    files: RecordingFolder, recordings: Sequence[RecordingId], num_workers: int | None
-) -> Iterator[Written]:
-    """Write every recording, in as many processes as there are processors; in order."""
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    count = min(available, 8) if num_workers is None else num_workers
-    count = min(count, len(recordings))
-    if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
-        yield from map(files.write, bar(recordings, "recordings", "recording"))
-        return
-    context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(count, context, _start, (files,)) as pool:
-        try:
-            found = pool.map(_write, recordings)
-            yield from bar(found, "recordings", "recording", total=len(recordings))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _start(files: RecordingFolder) -> None:
-    global _folder
-    _folder = files
-    torch.set_num_threads(1)
-
-
-def _write(recording: RecordingId) -> Written:
-    assert _folder is not None  # _start
-    return _folder.write(recording)
 
 
 def folder_problem(arguments: Sequence[str]) -> str | None:
