@@ -476,7 +476,7 @@ def test_many_bins_are_judged_as_few_are(method):
         torch.testing.assert_close(whole.flatten(0, 1), torch.cat(parts), rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("align", ["centred", "causal"])
+@pytest.mark.parametrize("align", ["centred", "causal", "trailing"])
 @pytest.mark.parametrize("kind", ["SG", "PVDF"])
 def test_a_score_waits_for_its_look_ahead_and_no_longer(kind, align):
     """What lies behind may be garbage; of what lies before, the last sample counts."""
@@ -492,7 +492,7 @@ def test_a_score_waits_for_its_look_ahead_and_no_longer(kind, align):
     scaler = FeatureScaler(whole.scaler.minimum[chosen], whole.scaler.maximum[chosen])
     smooth = ChannelFilter(whole.channel_filter.window_lengths, align=align)
     detector = SlipDetector(whole.pool, smooth, [whole.selected[i] for i in chosen], scaler, head)
-    assert detector.look_ahead == {"causal": 0, "centred": {"SG": 25, "PVDF": 5}[kind]}[align]
+    assert detector.look_ahead == ({"SG": 25, "PVDF": 5}[kind] if align == "centred" else 0)
     samples = noise(6)
     first = detector.context_before + 100 + detector.look_ahead
     expected = detector.judge_raw(samples)

@@ -9,10 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
-from tactslip_torch.signals.filtering import ChannelFilter, reach, savgol_filter
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.signals.savgol import reach, savgol_filter
 
 WINDOWS = [(1, 0), (3, 1), (5, 2), (11, 1), (51, 1), (51, 3), (11, 0), (7, 6)]
 WINDOW_OF_CHANNEL = [51, 11, 51, 5]
+ALIGNS = ["centred", "causal", "trailing"]
 CHOICES = [(0, 1), (2, 3), (1, 2), (0, 1, 2, 3)]
 
 
@@ -43,17 +45,40 @@ def test_causal_equals_scipys_coefficients(window, order, num_samples, rng):
     oracles.assert_columns_close(actual, causal(x, window, order), 1e-9)
 
 
+def trailing(x, window, order=1):
+    """The centred filter half a frame late; the first half frame holds what it begins with."""
+    centred, half = oracles.savgol(x, window, order), window // 2
+    inside = centred[..., : x.shape[-1] - half]
+    return np.concatenate([np.repeat(inside[..., :1], half, axis=-1), inside], axis=-1)
+
+
+@pytest.mark.parametrize(("window", "order"), WINDOWS)
+@pytest.mark.parametrize("num_samples", [51, 52, 200])
+def test_trailing_is_scipys_centred_filter_half_a_frame_late(window, order, num_samples, rng):
+    x = oracles.random_bins(rng, 20, num_samples)
+    actual = savgol_filter(torch.from_numpy(x), window, order, "trailing")
+    oracles.assert_columns_close(actual, trailing(x, window, order), 1e-9)
+
+
+def test_trailing_of_order_one_is_the_mean_of_the_last_samples(rng):
+    x = oracles.random_bins(rng, 90)
+    found = savgol_filter(torch.from_numpy(x), 11, align="trailing")
+    means = [x[i - 10 : i + 1].mean() for i in range(10, 90)]
+    np.testing.assert_allclose(found[10:], means, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("align", ["causal", "trailing"])
 @pytest.mark.parametrize("window", [11, 51])
-def test_causal_uses_nothing_behind_a_sample(window, rng):
+def test_nothing_behind_a_sample_is_used_without_look_ahead(window, align, rng):
     x = torch.from_numpy(oracles.random_bins(rng, 300))
     changed = x.clone()
     changed[200:] += 100
-    before, after = (savgol_filter(y, window, align="causal") for y in (x, changed))
+    before, after = (savgol_filter(y, window, align=align) for y in (x, changed))
     assert torch.equal(after[:200], before[:200])
     assert (after[200] - before[200]).abs() > 1
     changed = x.clone()
     changed[200] += 100
-    last = savgol_filter(changed, window, align="causal") - savgol_filter(x, window, align="causal")
+    last = savgol_filter(changed, window, align=align) - savgol_filter(x, window, align=align)
     assert (last[:200] == 0).all()
     assert last[200 + window - 1].abs() > 1e-3  # the frame reaches so far back
     assert (last[200 + window :] == 0).all()
@@ -188,13 +213,16 @@ def test_valid_is_the_centre_of_the_filtered_whole(num_samples, rng):
 
 @pytest.mark.parametrize("num_samples", [1, 100, 101])
 @pytest.mark.parametrize("order", [1, 2])
-def test_valid_of_a_causal_filter_is_the_end_of_the_filtered_whole(num_samples, order, rng):
-    layer = ChannelFilter(WINDOW_OF_CHANNEL, order, "causal")
+@pytest.mark.parametrize(("align", "oracle"), [("causal", causal), ("trailing", trailing)])
+def test_valid_without_look_ahead_is_the_end_of_the_filtered_whole(
+    num_samples, order, align, oracle, rng
+):
+    layer = ChannelFilter(WINDOW_OF_CHANNEL, order, align)
     assert (layer.context_before, layer.context_after, layer.context) == (50, 0, 25)
     assert layer.reaches == ((50, 0), (10, 0), (50, 0), (4, 0))
     x = oracles.random_bins(rng, 3, 4, 20 + 50 + num_samples)  # 20 samples that nobody needs
     expected = np.stack(
-        [causal(x[:, c], w, order)[:, 70:] for c, w in enumerate(WINDOW_OF_CHANNEL)], axis=1
+        [oracle(x[:, c], w, order)[:, 70:] for c, w in enumerate(WINDOW_OF_CHANNEL)], axis=1
     )
     actual = layer.valid(torch.from_numpy(x[..., 20:].copy()))
     np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-9)
@@ -218,12 +246,12 @@ def test_valid_keeps_its_matrices_to_itself(rng):
 
 
 @pytest.mark.parametrize("channels", [None, (1, 2), (3,), (0, 1, 2, 3)])
-@pytest.mark.parametrize("align", ["centred", "causal"])
+@pytest.mark.parametrize("align", ALIGNS)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_few_bins_are_filtered_as_many_are(channels, align, dtype, rng):
     x = torch.from_numpy(oracles.random_bins(rng, 9, 4, 150)).to(dtype)
     x[0, 1, 40] = torch.nan
-    x[1, 0, 149 if align == "causal" else 0] = torch.inf
+    x[1, 0, 0 if align == "centred" else 149] = torch.inf
     x[2, 3, 75] = -torch.inf
     layer = ChannelFilter(WINDOW_OF_CHANNEL, align=align)
     many = layer.valid(x, channels)
@@ -235,7 +263,7 @@ def test_few_bins_are_filtered_as_many_are(channels, align, dtype, rng):
         torch.testing.assert_close(found, wanted, rtol=close, atol=close, equal_nan=True)
 
 
-@pytest.mark.parametrize("align", ["centred", "causal"])
+@pytest.mark.parametrize("align", ALIGNS)
 def test_channel_filter_manners(align, rng, device):
     x = torch.from_numpy(oracles.random_bins(rng, 2, 4, 160)).to(device)
     layer = ChannelFilter(WINDOW_OF_CHANNEL, align=align).to(device)
@@ -255,11 +283,12 @@ def test_channel_filter_errors():
         layer.valid(torch.zeros(3, 100))
     with pytest.raises(ValueError, match=r"25 samples of context before and 25 behind.* 50"):
         layer.valid(torch.zeros(4, 50))
-    with pytest.raises(ValueError, match=r"50 samples of context before and 0 behind.* 50"):
-        ChannelFilter(WINDOW_OF_CHANNEL, align="causal").valid(torch.zeros(4, 50))
-    with pytest.raises(ValueError, match=r"align must be one of centred, causal, got 'left'"):
+    for align in ("causal", "trailing"):
+        with pytest.raises(ValueError, match=r"50 samples of context before and 0 behind.* 50"):
+            ChannelFilter(WINDOW_OF_CHANNEL, align=align).valid(torch.zeros(4, 50))
+    with pytest.raises(ValueError, match=r"centred, causal, trailing, got 'left'"):
         ChannelFilter([11], align="left")
-    with pytest.raises(ValueError, match=r"align must be one of centred, causal, got 'left'"):
+    with pytest.raises(ValueError, match=r"centred, causal, trailing, got 'left'"):
         reach(11, "left")
     with pytest.raises(ValueError, match=r"50 samples.*51"):
         layer(torch.zeros(4, 50))
@@ -267,7 +296,7 @@ def test_channel_filter_errors():
         ChannelFilter([11, 10])
 
 
-@pytest.mark.parametrize("align", ["centred", "causal"])
+@pytest.mark.parametrize("align", ALIGNS)
 def test_only_the_channels_wanted_are_filtered(align, rng):
     """The others come back as their largest magnitude, which shows what is not finite."""
     smooth = ChannelFilter([51, 51, 11, 11], align=align)

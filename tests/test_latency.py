@@ -43,7 +43,8 @@ def test_look_ahead_is_of_the_channels_in_use():
     centred = ChannelFilter([51, 51, 11, 11])
     assert look_ahead_samples(centred, [0, 2]) == 25
     assert look_ahead_samples(centred, [3, 2]) == 5
-    assert look_ahead_samples(ChannelFilter([51, 51, 11, 11], align="causal"), range(4)) == 0
+    for align in ("causal", "trailing"):
+        assert look_ahead_samples(ChannelFilter([51, 51, 11, 11], align=align), range(4)) == 0
     with pytest.raises(ValueError, match="no channel is in use"):
         look_ahead_samples(centred, [])
 

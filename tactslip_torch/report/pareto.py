@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
 
-_ALIGN_COLOURS = {"centred": "#0072B2", "causal": "#D55E00"}
+_ALIGN_COLOURS = {"centred": "#0072B2", "causal": "#D55E00", "trailing": "#009E73"}
 _CHOSEN = "#009E73"
 _BUSY = 0.05  # share of interrupted calls from which it is said
 

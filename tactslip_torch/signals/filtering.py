@@ -1,136 +1,27 @@
-"""Savitzky-Golay smoothing, the first step (paper section IV-B, REFERENCE.md section 2).
-
-Order 1 is a moving average: -3 dB at 81 Hz for the 11-sample frame of the films and at 17 Hz for
-the 51-sample frame of the gauges. Centred, so it looks half a frame ahead: 2.5 ms and 12.5 ms.
-Causal (ours), the polynomial of the frame behind a sample is evaluated at that sample, the frame's
-last: no look-ahead, but at order 1 nearly four times the variance of white noise comes through,
-some tones below the corner are raised by a third, and the corners move to 200 Hz and 44 Hz.
-"""
+"""Savitzky-Golay smoothing of a hand: a frame of its own for every channel, whole or bin by bin."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from tactslip_torch.plain import is_plain
+from tactslip_torch.signals.savgol import Align as Align
+from tactslip_torch.signals.savgol import edge_matrices, reach, savgol_filter
 
-Align = Literal["centred", "causal"]
-"""Where in its frame a sample lies: ``"centred"`` in the middle, ``"causal"`` at the end."""
 _MOST_MATRICES = 16
 _FEW_BINS = 4
 _Group = tuple[int, int, list[int], bool]
-
-
-def fit_matrix(window_length: int, polyorder: int) -> Tensor:
-    """Least-squares polynomial fit of one frame, as a matrix.
-
-    Shape:
-        - output: ``[window_length, window_length]``, float64; row ``i`` times the frame is the
-          fitted polynomial at sample ``i``. The middle row is the Savitzky-Golay kernel.
-
-    Raises:
-        ValueError: if the frame is even or does not exceed the order.
-    """
-    if window_length < 1 or window_length % 2 == 0:
-        raise ValueError(f"window_length must be odd and positive, got {window_length}")
-    if not 0 <= polyorder < window_length:
-        raise ValueError(
-            f"polyorder must lie in 0..{window_length - 1} for window_length {window_length}, "
-            f"got {polyorder}"
-        )
-    half = window_length // 2
-    position = torch.arange(-half, half + 1, dtype=torch.float64) / max(half, 1)
-    powers = position[:, None] ** torch.arange(polyorder + 1)
-    basis: Tensor = torch.linalg.qr(powers).Q
-    return basis @ basis.T
-
-
-def savgol_filter(
-    x: Tensor, window_length: int, polyorder: int = 1, align: Align = "centred"
-) -> Tensor:
-    """Savitzky-Golay filter along the last axis, ``scipy.signal.savgol_filter(mode="interp")``.
-
-    Samples whose frame would leave the signal take the polynomial fitted to the first or last
-    frame: half a frame at either end, or all but one sample of the first frame if causal.
-    Linear, so gradients flow everywhere; a NaN reaches as far as a frame does and no further.
-
-    Args:
-        x: signal in any unit.
-        window_length: frame in samples, odd; 11 for PVDF and 51 for SG in the paper.
-        polyorder: order of the fitted polynomial, 1 in the paper.
-        align: ``"centred"``, or ``"causal"``: the frame ends with the sample, as
-            ``scipy.signal.savgol_coeffs(pos=window_length - 1)``.
-
-    Shape:
-        - x, output: ``[*, T]`` with ``T >= window_length``
-
-    Raises:
-        ValueError: if the frame is even, not above the order, or longer than the signal, or the
-            alignment is unknown.
-
-    Example:
-        >>> savgol_filter(torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0]), 3)
-        tensor([-0.5000,  1.0000,  1.0000,  1.0000, -0.5000])
-        >>> savgol_filter(torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0]), 3, align="causal")
-        tensor([-0.5000,  1.0000,  2.5000,  1.0000, -0.5000])
-    """
-    fit = fit_matrix(window_length, polyorder).to(x)
-    before, after = reach(window_length, align)
-    if x.shape[-1] < window_length:
-        raise ValueError(
-            f"a signal of {x.shape[-1]} samples is shorter than window_length {window_length}"
-        )
-    if window_length == 1:
-        return x.clone()
-    head = x[..., :window_length] @ fit[:before].T
-    tail = x[..., -window_length:] @ fit[window_length - after :].T
-    return torch.cat([head, _convolve_valid(x, fit[before]), tail], dim=-1)
-
-
-def reach(window_length: int, align: Align) -> tuple[int, int]:
-    """Samples before and after its own that a filtered sample is made of.
-
-    Raises:
-        ValueError: if the alignment is unknown.
-
-    Example:
-        >>> reach(51, "centred"), reach(51, "causal")
-        ((25, 25), (50, 0))
-    """
-    if align not in get_args(Align):
-        raise ValueError(f"align must be one of {', '.join(get_args(Align))}, got {align!r}")
-    half = window_length // 2
-    return (half, half) if align == "centred" else (2 * half, 0)
-
-
-def _convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
-    """Correlate ``[*, T]`` with ``[W]``, keeping the ``T - W + 1`` full overlaps.
-
-    A sum of shifted copies: in float64 over ten times faster than ``conv1d``, which unfolds.
-    """
-    num_kept = x.shape[-1] - len(kernel) + 1
-    total = x[..., :num_kept] * kernel[0]
-    for shift in range(1, len(kernel)):
-        total = torch.addcmul(total, x[..., shift : shift + num_kept], kernel[shift])
-    return total
-
-
-def _overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
-    """``_convolve_valid`` as a matrix ``[num_kept + W - 1, num_kept]``, for short signals."""
-    margin = kernel.new_zeros(num_kept - 1)
-    padded = torch.cat([margin, kernel, margin])
-    return padded.unfold(0, num_kept + len(kernel) - 1, 1).flip(0).T
 
 
 class ChannelFilter(nn.Module):
     """``savgol_filter`` with a frame of its own for every channel.
 
     A bin is filtered exactly with ``context_before`` samples before it and ``context_after``
-    behind: as many on each side if centred, all of them before if causal, ``2 * context`` in all.
+    behind: as many on each side if centred, else all of them before, ``2 * context`` in all.
 
     Args:
         window_lengths: one odd frame per channel, in samples.
@@ -140,7 +31,7 @@ class ChannelFilter(nn.Module):
     Attributes:
         context: half the longest frame; a bin comes with twice as many samples around it.
         context_before: samples needed before a bin to filter it exactly.
-        context_after: and behind it; 0 if causal.
+        context_after: and behind it; 0 unless centred.
 
     Raises:
         ValueError: if a frame is even or does not exceed the order, or the alignment is unknown.
@@ -155,8 +46,7 @@ class ChannelFilter(nn.Module):
         self.align: Align = align
         # float64 and outside the state: cast on use, so they never lose digits
         self._kernels = {
-            length: fit_matrix(length, polyorder)[reach(length, align)[0]]
-            for length in self.window_lengths
+            length: edge_matrices(length, polyorder, align)[1] for length in self.window_lengths
         }
         self.context = max(self.window_lengths) // 2
         self.context_before, self.context_after = reach(max(self.window_lengths), align)
@@ -298,3 +188,10 @@ def _channels(samples: Tensor, chosen: Sequence[int]) -> Tensor:
     if chosen[-1] - chosen[0] + 1 == len(chosen):
         return samples.narrow(-2, chosen[0], len(chosen))
     return samples[..., list(chosen), :]
+
+
+def _overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
+    """``convolve_valid`` as a matrix ``[num_kept + W - 1, num_kept]``, for short signals."""
+    margin = kernel.new_zeros(num_kept - 1)
+    padded = torch.cat([margin, kernel, margin])
+    return padded.unfold(0, num_kept + len(kernel) - 1, 1).flip(0).T
