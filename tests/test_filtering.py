@@ -329,3 +329,12 @@ def test_threads_share_a_filter(rng):
                     torch.testing.assert_close(task.result(), expected[wanted])
     finally:
         sys.setswitchinterval(before)
+
+
+@pytest.mark.parametrize("align", ALIGNS)
+def test_a_recording_is_filtered_in_the_channels_wanted_alone(align, rng):
+    samples = torch.from_numpy(rng.standard_normal((3, 4, 40)))
+    smooth = ChannelFilter([51, 11, 51, 11], align=align)
+    found = smooth(samples, {1, 3})  # the frames of the others would not fit
+    assert torch.equal(found[:, [0, 2]], samples[:, [0, 2]])
+    assert torch.equal(found[:, [1, 3]], savgol_filter(samples[:, [1, 3]], 11, align=align))

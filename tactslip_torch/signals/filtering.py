@@ -62,8 +62,12 @@ class ChannelFilter(nn.Module):
         """Samples before and after its own that each channel's frame takes in."""
         return tuple(reach(length, self.align) for length in self.window_lengths)
 
-    def forward(self, samples: Tensor) -> Tensor:
+    def forward(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:
         """Filter whole recordings.
+
+        Args:
+            samples: whole recordings.
+            channels: which are wanted, by default all; the others come back as they are.
 
         Shape:
             - samples, output: ``[*, C, T]``
@@ -72,11 +76,14 @@ class ChannelFilter(nn.Module):
             ValueError: if the number of channels is another, or ``T`` is shorter than a frame.
         """
         self.check(samples)
-        parts = [
-            savgol_filter(_channels(samples, chosen), length, self.polyorder, self.align)
-            for length, chosen in self._groups
-        ]
-        return _in_order(parts, [i for _, chosen in self._groups for i in chosen])
+        parts, order = [], list[int]()
+        for length, _, chosen, is_wanted in self._groups_for(channels):
+            order += chosen
+            part = _channels(samples, chosen)
+            if is_wanted:
+                part = savgol_filter(part, length, self.polyorder, self.align)
+            parts.append(part)
+        return _in_order(parts, order)
 
     def valid(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:
         """Filter bins that come with their context, keeping only the bins.

@@ -1,0 +1,154 @@
+"""``ChannelFilter`` of a recording in pieces: the same samples, as soon as they are settled.
+
+A sample is settled once what its frame takes in has come. Channels settle together, with the
+longest look-ahead of those in use, so that a piece handed on has all channels of an instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.signals.savgol import convolve_valid, edge_matrices
+
+
+class FilterStream:
+    """A filter that remembers as many samples as its longest frame holds, and no more.
+
+    The pieces it hands on, put together, are ``channel_filter(samples, channels)`` of the whole,
+    bit for bit but at the two ends, where a matrix product may round otherwise.
+
+    Args:
+        channel_filter: the frames of all channels.
+        dtype: in which to filter, float32 or float64; what is pushed is converted.
+        channels: which are wanted, by default all; the others are handed on as they came.
+
+    Attributes:
+        look_ahead: samples behind its own that a sample waits for.
+        frame: samples that must have come before any is settled.
+
+    Raises:
+        ValueError: for another dtype, or if no channel is wanted.
+    """
+
+    def __init__(
+        self,
+        channel_filter: ChannelFilter,
+        dtype: torch.dtype = torch.float64,
+        channels: Collection[int] | None = None,
+    ) -> None:
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"a stream is filtered in float32 or float64, got {dtype}")
+        lengths = channel_filter.window_lengths
+        wanted = sorted(range(len(lengths)) if channels is None else set(channels))
+        if not wanted:
+            raise ValueError("no channel is wanted, expected at least one")
+        self.channel_filter = channel_filter
+        self.dtype = dtype
+        reaches = [channel_filter.reaches[channel] for channel in wanted]
+        self.frame = max(lengths[channel] for channel in wanted)
+        self.look_ahead = max(after for _, after in reaches)
+        self._groups = [
+            (
+                [channel for channel in wanted if lengths[channel] == length],
+                edge_matrices(length, channel_filter.polyorder, channel_filter.align),
+            )
+            for length in dict.fromkeys(lengths[channel] for channel in wanted)
+        ]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream; the next sample is the first of another."""
+        self._held = torch.empty(len(self.channel_filter.window_lengths), 0, dtype=self.dtype)
+        self._num_dropped = 0  # samples before those held
+        self._num_settled = 0
+
+    @property
+    def num_pushed(self) -> int:
+        """Samples that came since the start."""
+        return self._num_dropped + self._held.shape[-1]
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the samples that are remembered."""
+        return self._held.untyped_storage().nbytes()
+
+    def push(self, samples: Tensor) -> Tensor:
+        """Filtered samples that are settled now and were not before.
+
+        Args:
+            samples: what came next; remembered as a copy.
+
+        Shape:
+            - samples: ``[C, n]``, ``n`` from 0
+            - output: ``[C, m]``
+
+        Raises:
+            ValueError: if the number of axes or channels is another; nothing is changed then.
+        """
+        self.check(samples)
+        with torch.no_grad():
+            self._held = torch.cat([self._held, samples.to(self._held)], dim=-1)
+            num = self.num_pushed
+            settled = self._filtered(num - self.look_ahead if num >= self.frame else 0)
+            surplus = max(num - self.frame - self._num_dropped, 0)
+            self._held = self._held[:, surplus:].clone()  # a view would keep all of it
+            self._num_dropped += surplus
+        return settled
+
+    def flush(self) -> Tensor:
+        """The samples still waiting, by the polynomial of the last frame; then as ``reset``.
+
+        Of a stream shorter than ``frame``, which ``ChannelFilter`` refuses, there are none.
+
+        Shape:
+            - output: ``[C, m]``
+        """
+        num = self.num_pushed
+        with torch.no_grad():
+            settled = self._filtered(num if num >= self.frame else 0)
+        self.reset()
+        return settled
+
+    def check(self, samples: Tensor) -> None:
+        """Refuse what is no piece of a stream of this hand.
+
+        Raises:
+            ValueError: if the number of axes or channels is another.
+        """
+        num_channels = len(self.channel_filter.window_lengths)
+        if samples.ndim != 2 or len(samples) != num_channels:
+            raise ValueError(
+                f"expected samples [{num_channels}, n] (channels, time), got {tuple(samples.shape)}"
+            )
+
+    def _filtered(self, stop: int) -> Tensor:
+        """Samples from the first that is not settled up to ``stop``, which are so from now on."""
+        start, self._num_settled = self._num_settled, max(stop, self._num_settled)
+        settled = self._held[:, start - self._num_dropped : self._num_settled - self._num_dropped]
+        settled = settled.clone()
+        if settled.shape[-1] > 0:
+            for chosen, matrices in self._groups:
+                settled[chosen] = self._piece(self._held[chosen], start, stop, matrices)
+        return settled
+
+    def _piece(
+        self, held: Tensor, start: int, stop: int, matrices: tuple[Tensor, Tensor, Tensor]
+    ) -> Tensor:
+        """Samples from ``start`` up to ``stop`` of channels that share a frame."""
+        head, kernel, tail = (matrix.to(held) for matrix in matrices)
+        before, length, after = len(head), len(kernel), len(tail)
+        if length == 1:
+            return held[:, start - self._num_dropped : stop - self._num_dropped]
+        first = max(start, before)
+        last = min(stop, self.num_pushed - after)
+        begin = first - before - self._num_dropped
+        parts = [convolve_valid(held[:, begin : begin + last - first + length - 1], kernel)]
+        if start == 0:
+            parts.insert(0, held[:, :length] @ head.T)
+        if stop > last:
+            parts.append(held[:, -length:] @ tail[last - self.num_pushed + after :].T)
+        return torch.cat(parts, dim=-1)
