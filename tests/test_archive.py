@@ -1,5 +1,6 @@
 """Recordings in files: what goes in comes out, bit for bit, and nothing else is read as one."""
 
+import io
 import json
 import time
 import zipfile
@@ -11,7 +12,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tactslip_torch import HandLayout, Recording
-from tactslip_torch.data.archive import FORM, archived_key, load_recording, save_recording
+from tactslip_torch.data.archive import (
+    FORM,
+    archived_key,
+    load_recording,
+    open_recording,
+    save_recording,
+)
+from tactslip_torch.data.folder import FORMATS, readers, recording_files
 
 TRUTH = ("onsets_s", "annotated_onsets_s", "sliding_s", "non_slip_s", "speeds_mm_s")
 times = st.floats(0, 100, allow_nan=False)
@@ -276,3 +284,172 @@ def test_no_file_is_said_as_such(tmp_path):
     for read in (load_recording, archived_key):
         with pytest.raises(FileNotFoundError, match=r"no file at .*a\.npz"):
             read(tmp_path / "a.npz")
+
+
+# In pieces -----------------------------------------------------------------------------------
+
+
+def assert_same_truth(archived, wanted, key=KEY):
+    """Everything but the samples."""
+    assert archived.recording.samples.shape == (len(wanted.samples), 0)
+    assert archived.recording.samples.dtype == wanted.samples.dtype
+    for name in (*TRUTH, "sample_rate_hz", "material", "provenance"):
+        assert getattr(archived.recording, name) == getattr(wanted, name), name
+    assert archived.hand == hand_of("ab")
+    assert archived.key == key
+
+
+@given(
+    num_samples=st.integers(0, 40),
+    dtype=st.sampled_from([np.float32, np.float64, ">f4", ">f8"]),
+    size=st.integers(1, 50),
+    stretch=st.tuples(st.integers(0, 45), st.integers(0, 45)),
+    write=st.sampled_from(["savez", "savez_compressed", "npy"]),
+    is_transposed=st.booleans(),
+    seed=st.integers(0, 99),
+)
+def test_pieces_are_the_samples(
+    tmp_path_factory, num_samples, dtype, size, stretch, write, is_transposed, seed
+):
+    samples = np.random.default_rng(seed).standard_normal((3, num_samples)).astype(dtype)
+    stored = np.asfortranarray(samples) if is_transposed else samples
+    folder = tmp_path_factory.mktemp("pieces")
+    if write == "npy":  # one instant a row, in either order of the bytes
+        np.save(folder / "a.npy", stored.T)
+    else:
+        getattr(np, write)(folder / "a.npz", samples=stored)
+    (path,) = folder.iterdir()
+    with open_recording(path) as (found, rest):
+        assert rest is None
+        assert (found.num_channels, found.num_samples) == samples.shape
+        pieces = list(found.pieces(size))
+        part = found.read(*stretch)
+    native = samples.astype(samples.dtype.newbyteorder("="))
+    assert [piece.shape[1] for piece in pieces] == [
+        len(native[0, first : first + size]) for first in range(0, num_samples, size)
+    ]
+    whole = torch.cat(pieces, 1).numpy() if pieces else native
+    assert whole.dtype == part.numpy().dtype == native.dtype
+    np.testing.assert_array_equal(whole, native)
+    np.testing.assert_array_equal(part.numpy(), native[:, slice(*stretch)])
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_recording_of_ours_comes_with_its_truth(tmp_path, compressed):
+    path = tmp_path / "a.npz"
+    save_recording(path, recording(), hand_of("ab"), KEY)
+    if compressed:
+        with np.load(path) as content:
+            np.savez_compressed(path, **content)
+    with open_recording(path) as (samples, rest):
+        assert torch.equal(samples.read(0, 400), recording().samples)
+        assert torch.equal(torch.cat(list(samples.pieces(7)), 1), recording().samples)
+    assert_same_truth(rest, recording())
+
+
+def test_no_more_of_a_file_is_read_than_was_asked_for(tmp_path, monkeypatch):
+    """After the one look for damage, bytes are counted; an archive's members may stand anywhere."""
+    path = tmp_path / "a.npz"
+    save_recording(path, recording(samples=torch.randn(2, 100_000)), hand_of("ab"), KEY)
+    with open_recording(path) as (samples, _):
+        counted = CountedFile(samples.file)
+        samples._replace(file=counted).read(60_000, 60_010)
+    assert counted.num_bytes == 2 * 10 * 4
+
+
+class CountedFile:
+    """A file that counts what is read of it."""
+
+    def __init__(self, file):
+        self.file, self.num_bytes = file, 0
+        self.seek = file.seek
+
+    def read(self, size):
+        content = self.file.read(size)
+        self.num_bytes += len(content)
+        return content
+
+
+def test_a_file_that_is_cut_while_it_is_open_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((90_000, 2)))
+    with open_recording(tmp_path / "a.npy") as (samples, _):
+        with (tmp_path / "a.npy").open("r+b") as file:
+            file.truncate(500_000)
+        assert samples.read(0, 10).shape == (2, 10)
+        with pytest.raises(ValueError, match=r"a\.npy was cut while it was read"):
+            samples.read(80_000, 90_000)
+
+
+def test_opened_in_pieces_the_same_files_are_refused(tmp_path, whole):
+    torch.save({"format": FORM}, tmp_path / "torch.npz")
+    (tmp_path / "empty.npz").write_bytes(b"")
+    (tmp_path / "text.npy").write_text("time,volts\n0,1\n")
+    np.savez(tmp_path / "theirs.npz", samples=np.zeros((2, 9)), time=np.zeros(9))
+    np.savez(tmp_path / "nothing.npz", volts=np.zeros((2, 9)))
+    np.savez(tmp_path / "flat.npz", samples=np.zeros(9))
+    np.savez(tmp_path / "whole_numbers.npz", samples=np.zeros((2, 9), dtype=np.int16))
+    np.savez(tmp_path / "halves.npz", samples=np.zeros((2, 9), dtype=np.float16))
+    np.savez(tmp_path / "no_channel.npz", samples=np.zeros((0, 9)))
+    np.savez(tmp_path / "pickled.npz", samples=np.array([[print], [print]], dtype=object))
+    np.save(tmp_path / "pickled.npy", np.array([[{}]], dtype=object), allow_pickle=True)
+    np.save(tmp_path / "deep.npy", np.zeros((2, 3, 4)))
+    np.save(tmp_path / "cut.npy", np.zeros((20, 3)))
+    with (tmp_path / "cut.npy").open("r+b") as file:
+        file.truncate(500)
+    with np.load(io.BytesIO(whole)) as content:
+        parts = dict(content)
+    np.savez(tmp_path / "hand.npz", **(parts | {"channel_name": np.array(["a"])}))
+    np.savez(tmp_path / "units.npz", **(parts | {"units": np.array("mV")}))
+    for path in sorted(tmp_path.iterdir()):
+        with (
+            pytest.raises(ValueError, match="is damaged or no recording of ours") as caught,
+            open_recording(path),
+        ):
+            pass
+        assert str(path) in str(caught.value)
+    np.savez(tmp_path / "later.npz", **(parts | {"format": np.array("tactslip_torch recording 2")}))
+    with (
+        pytest.raises(ValueError, match="must be of format"),
+        open_recording(path.parent / "later.npz"),
+    ):
+        pass
+    with pytest.raises(FileNotFoundError, match="no file at"), open_recording(tmp_path / "b.npz"):
+        pass
+
+
+@given(where=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
+@settings(max_examples=100)
+def test_a_damaged_byte_is_noticed_in_pieces_as_well(whole, tmp_path_factory, where, bits):
+    content = bytearray(whole)
+    content[int(where * len(content))] ^= bits
+    path = tmp_path_factory.mktemp("damaged") / "a.npz"
+    path.write_bytes(content)
+    try:
+        with open_recording(path) as (samples, rest):
+            found = samples.read(0, 400)
+    except ValueError:
+        return
+    assert_same_truth(rest, recording())
+    assert found.numpy().tobytes() == recording().samples.numpy().tobytes()
+
+
+def test_what_goes_wrong_with_an_open_recording_is_not_called_damage(tmp_path):
+    save_recording(tmp_path / "a.npz", recording(), hand_of("ab"), KEY)
+    with pytest.raises(RuntimeError, match="mine"), open_recording(tmp_path / "a.npz") as (file, _):
+        raise RuntimeError("mine")
+    assert file.file.closed
+
+
+def test_a_folder_knows_its_recordings(tmp_path):
+    assert set(readers()) == {*FORMATS, "npy"}
+    for name in ("b.npz", "a.NPY", ".b.1234.tmp.npz", "manifest.csv", "c.png"):
+        (tmp_path / name).touch()
+    assert [path.name for path in recording_files(tmp_path)] == ["a.NPY", "b.npz"]
+    assert recording_files(tmp_path / "b.npz") == [tmp_path / "b.npz"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"no recording in .*empty; give a folder of .npz or .npy"):
+        recording_files(tmp_path / "empty")
+    with pytest.raises(ValueError, match=r"c\.png must end in .npz or .npy"):
+        recording_files(tmp_path / "c.png")
+    with pytest.raises(FileNotFoundError, match="no file or folder at"):
+        recording_files(tmp_path / "nowhere")

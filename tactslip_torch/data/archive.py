@@ -1,20 +1,28 @@
 """Recordings as ``.npz`` files that anything with NumPy can read: samples, truth and origin.
 
 One file holds one recording. Numbers are arrays, words are text arrays, what has no fixed form is
-JSON text; nothing is pickled, and nothing in a file is executed.
+JSON text; nothing is pickled, and nothing in a file is executed. ``open_recording`` leaves the
+samples where they are and reads them by stretches, so a recording may be longer than the memory.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping
+import shutil
+import struct
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from numpy.lib import format as npy
 from numpy.typing import NDArray
+from torch import Tensor
 
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.files import whole_file
@@ -23,6 +31,8 @@ from tactslip_torch.hand import HandLayout
 FORM = "tactslip_torch recording 1"
 UNITS = "V"
 _DTYPES = (torch.float32, torch.float64)
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+_LOCAL_HEADER = struct.Struct("<26xHH")  # of a ZIP member: lengths of its name and extra field
 _Read = TypeVar("_Read")
 
 
@@ -38,6 +48,54 @@ class Archived(NamedTuple):
     recording: Recording
     hand: HandLayout
     key: dict[str, Any]
+
+
+class StoredSamples(NamedTuple):
+    """Samples ``[C, T]`` that stay in an open file from byte ``start`` on until asked for.
+
+    The samples of a channel stand together there or, if not ``is_by_channel``, those of an instant.
+    """
+
+    file: IO[bytes]
+    start: int
+    dtype: np.dtype[Any]
+    num_channels: int
+    num_samples: int
+    is_by_channel: bool
+
+    def read(self, first: int, stop: int) -> Tensor:
+        """Samples from ``first`` to before ``stop``, as far as there are any, ``[C, n]``.
+
+        Raises:
+            ValueError: if the file has been cut since it was opened.
+        """
+        count = max(min(stop, self.num_samples) - first, 0)
+        step, width = 1 if self.is_by_channel else self.num_channels, self.dtype.itemsize
+        rows = self.num_channels // step
+        content = bytearray()
+        for row in range(rows):
+            self.file.seek(self.start + (row * self.num_samples + first * step) * width)
+            content += self.file.read(count * step * width)
+        if len(content) < self.num_channels * count * width:
+            raise ValueError(f"{self.file.name} was cut while it was read; make it again")
+        values = np.frombuffer(content, self.dtype).astype(self.dtype.newbyteorder("="), copy=False)
+        by_channel = values.reshape(rows, count, step).swapaxes(1, 2)
+        return torch.from_numpy(by_channel.reshape(self.num_channels, count))
+
+    def pieces(self, num_samples: int) -> Iterator[Tensor]:
+        """All samples in order, ``num_samples`` at a time and the rest at the end."""
+        for first in range(0, self.num_samples, num_samples):
+            yield self.read(first, first + num_samples)
+
+
+class OpenRecording(NamedTuple):
+    """Samples in a file that is open, and the rest, around a recording of no samples.
+
+    The rest is ``None`` if the file holds samples alone.
+    """
+
+    samples: StoredSamples
+    archived: Archived | None
 
 
 def save_recording(
@@ -94,7 +152,29 @@ def load_recording(path: str | os.PathLike[str]) -> Archived:
         FileNotFoundError: if there is no such file.
         ValueError: if it is damaged or no file of ours.
     """
-    return _read(path, _archived)
+    return _read(path, lambda content: _archived(content, torch.from_numpy(content["samples"])))
+
+
+@contextmanager
+def open_recording(path: str | os.PathLike[str]) -> Iterator[OpenRecording]:
+    """What ``save_recording`` wrote, its samples, once checked for damage, to be read by stretches.
+
+    Compressed ones are unpacked to a temporary file (``TMPDIR``). Volts alone are read as well:
+    a ``.npy`` array ``[T, C]``, or an archive of ``samples`` ``[C, T]``.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged or holds no such samples.
+    """
+    with ExitStack() as stack:
+        file = stack.enter_context(_opened(path))
+        try:
+            stored, is_ours = _stored(file, stack)
+        except Exception as error:
+            raise _damaged(path) from error
+        none = stored.read(0, 0)
+        rest = _read(path, lambda content: _archived(content, none)) if is_ours else None
+        yield OpenRecording(stored, rest)
 
 
 def archived_key(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -107,29 +187,68 @@ def archived_key(path: str | os.PathLike[str]) -> dict[str, Any]:
     return _read(path, lambda content: _plain(content, "key"))
 
 
+def _opened(path: str | os.PathLike[str]) -> IO[bytes]:
+    try:
+        return Path(path).open("rb")
+    except FileNotFoundError:
+        raise FileNotFoundError(f"no file at {os.fspath(path)}") from None
+
+
+def _damaged(path: str | os.PathLike[str]) -> ValueError:
+    return ValueError(f"{os.fspath(path)} is damaged or no recording of ours")
+
+
+def _stored(file: IO[bytes], stack: ExitStack) -> tuple[StoredSamples, bool]:
+    """The samples of a file, and whether it is one of ours; an archive's are read for its sum."""
+    is_array = file.read(len(npy.MAGIC_PREFIX)) == npy.MAGIC_PREFIX
+    file.seek(0)
+    if is_array:
+        return _stored_array(file, is_time_first=True), False
+    with zipfile.ZipFile(file) as archive:
+        member = archive.getinfo("samples.npy")
+        is_packed = member.compress_type != zipfile.ZIP_STORED
+        copied = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115  # by the stack
+        with archive.open(member) as content, Path(os.devnull).open("wb") as nowhere:
+            shutil.copyfileobj(content, copied if is_packed else nowhere)
+        is_ours = archive.namelist() != ["samples.npy"]
+    if is_packed:
+        copied.seek(0)
+        return _stored_array(copied, is_time_first=False), is_ours
+    file.seek(member.header_offset)
+    name, extra = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
+    file.seek(name + extra, os.SEEK_CUR)
+    return _stored_array(file, is_time_first=False), is_ours
+
+
+def _stored_array(file: IO[bytes], *, is_time_first: bool) -> StoredSamples:
+    """The array that begins where the file is, ``[T, C]`` or ``[C, T]``."""
+    version = npy.read_magic(file)  # type: ignore[no-untyped-call]
+    shape, is_fortran, dtype = _HEADERS[version](file)  # type: ignore[no-untyped-call]
+    num_channels, num_samples = reversed(shape) if is_time_first else shape
+    start, needed = file.tell(), num_channels * num_samples * dtype.itemsize
+    is_volts = num_channels and dtype.kind == "f" and dtype.itemsize in (4, 8)
+    if not is_volts or needed > file.seek(0, os.SEEK_END) - start:
+        raise ValueError("samples must be floating volts, and all there")
+    return StoredSamples(file, start, dtype, num_channels, num_samples, is_fortran == is_time_first)
+
+
 def _read(
     path: str | os.PathLike[str], what: Callable[[Mapping[str, NDArray[Any]]], _Read]
 ) -> _Read:
-    name = os.fspath(path)
-    try:
-        file = Path(path).open("rb")  # noqa: SIM115  # closed below
-    except FileNotFoundError:
-        raise FileNotFoundError(f"no file at {name}") from None
-    with file:
+    with _opened(path) as file:
         try:
             with np.load(file, allow_pickle=False) as content:
                 form = str(content["format"])
                 found = what(content) if form == FORM else None
         except Exception as error:  # zip, zlib, NumPy's header and JSON raise many kinds
-            raise ValueError(f"{name} is damaged or no recording of ours") from error
+            raise _damaged(path) from error
     if found is None:
-        raise ValueError(f"{name} must be of format {FORM!r}, got {form!r}")
+        raise ValueError(f"{os.fspath(path)} must be of format {FORM!r}, got {form!r}")
     return found
 
 
-def _archived(content: Mapping[str, NDArray[Any]]) -> Archived:
-    """Everything in a file, each part held against what it must be."""
-    samples = torch.from_numpy(content["samples"])
+def _archived(content: Mapping[str, NDArray[Any]], samples: Tensor) -> Archived:
+    """Everything in a file around its samples, each part held against what it must be."""
     if samples.dtype not in _DTYPES or str(content["units"]) != UNITS:
         raise ValueError("samples must be floating volts")
     columns = ("name", "kind", "finger", "segment")

@@ -6,27 +6,77 @@ import csv
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tactslip_torch.data.archive import Archived, archived_key, load_recording, save_recording
+from tactslip_torch.data.archive import (
+    Archived,
+    OpenRecording,
+    archived_key,
+    load_recording,
+    open_recording,
+    save_recording,
+)
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
 from tactslip_torch.files import whole_file
 
 MANIFEST = "manifest.csv"
+Opener = Callable[[Path], AbstractContextManager[OpenRecording]]
 
 
 class Format(NamedTuple):
-    """How recordings are kept in files: write one, read it, read no more of it than its key."""
+    """How recordings are kept in files.
+
+    Args:
+        save: writes one.
+        load: reads it.
+        key: reads no more of it than its key.
+        open: leaves the samples in the file, to be read by stretches.
+    """
 
     save: Callable[..., None]
     load: Callable[[Path], Archived]
     key: Callable[[Path], dict[str, Any]]
+    open: Opener
 
 
-FORMATS = {"npz": Format(save_recording, load_recording, archived_key)}
+FORMATS = {"npz": Format(save_recording, load_recording, archived_key, open_recording)}
 """By the ending of their files; a further format is a further line."""
+
+ARRAYS: dict[str, Opener] = {"npy": open_recording}
+"""Files of samples alone, which are only read: no truth, no names of channels."""
+
+
+def readers() -> dict[str, Opener]:
+    """How files are opened that hold recordings or samples, by their ending."""
+    return {ending: form.open for ending, form in FORMATS.items()} | ARRAYS
+
+
+def recording_files(place: Path) -> list[Path]:
+    """The file, or those of a folder that ``readers`` know, by name.
+
+    Raises:
+        FileNotFoundError: if there is no such file or folder.
+        ValueError: if the ending is unknown, or the folder holds no such file.
+    """
+    endings = readers()
+    known = " or ".join(f".{ending}" for ending in endings)
+    if place.is_dir():
+        found = [path for path in sorted(place.iterdir()) if _ending(path) in endings]
+        if not found:
+            raise ValueError(f"no recording in {place}; give a folder of {known} files")
+        return found
+    if not place.exists():
+        raise FileNotFoundError(f"no file or folder at {place}")
+    if _ending(place) not in endings:
+        raise ValueError(f"{place} must end in {known} to be read as a recording")
+    return [place]
+
+
+def _ending(path: Path) -> str:
+    return "" if path.name.startswith(".") else path.suffix[1:].lower()
 
 
 class Written(NamedTuple):
