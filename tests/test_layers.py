@@ -180,7 +180,9 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "onset.sequential": (),
     "onset.latch": (),
     "onset.rate": ("onset.sequential", "onset.latch"),
-    "onset.events": (),
+    "onset.matching": (),
+    "onset.resampling": (),
+    "onset.events": ("onset.matching", "onset.resampling"),
     "onset.baselines": ("signals.*", "features.guards", "features.linear_maps", "onset.latch"),
     "onset.scoring": ("model.*", "signals.*"),
     "onset.settings": ("onset.sequential", "model.*"),
@@ -337,6 +339,8 @@ TORCH_ALONE = (
     "onset.sequential",
     "onset.latch",
     "onset.rate",
+    "onset.matching",
+    "onset.resampling",
     "onset.events",
 )
 
