@@ -185,6 +185,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "onset.events": ("onset.matching", "onset.resampling"),
     "onset.baselines": ("signals.*", "features.guards", "features.linear_maps", "onset.latch"),
     "onset.scoring": ("model.*", "signals.*"),
+    "onset.decider": ("onset.latch", "onset.sequential", "onset.settings", "model.calibration"),
     "onset.settings": ("onset.sequential", "model.*"),
     "onset.streaming": ("onset.*", "model.*", "signals.*"),
     "report.*": ("report.*", "files"),
