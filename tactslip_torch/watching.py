@@ -1,4 +1,4 @@
-"""Detectors watch whole recordings: a score per decision, made by workers; nothing else leaves them."""
+"""Detectors watch whole recordings: workers make a score per decision, and hand on nothing else."""
 
 from __future__ import annotations
 

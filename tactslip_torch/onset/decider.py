@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model.calibration import probability
-from tactslip_torch.onset.latch import latch, latch_start
+from tactslip_torch.onset.latch import Latch, latch, latch_start
 from tactslip_torch.onset.sequential import NEUTRAL
 from tactslip_torch.onset.settings import AlarmSettings
 
@@ -36,23 +36,24 @@ class Alarm:
 
 
 class Decisions(NamedTuple):
-    """One entry per decision, in order.
+    """One entry per decision, in order; of several streams at once, one row each.
 
     Attributes:
         number: of the decision in its stream, from 0, ``[m]``, int64.
         available_s: when it can be made, ``[m]``, float64.
-        score: at least 0 is slip, ``[m]``.
-        llr: log likelihood ratio; ``NEUTRAL`` where the decision is not valid, ``[m]``.
-        probability: of slip, by the bin alone, ``[m]``.
-        statistic: of the rule, ``[m]``.
-        is_valid: whether every channel in use could be trusted, ``[m]``.
-        is_alarm: whether it raises an alarm, ``[m]``.
-        is_on: whether an alarm stands after it: the contact's status, ``[m]``.
-        alarms: those raised, in order.
+        onset_s: when the slip began that it speaks of, as far as it can tell, ``[*, m]``, float64.
+        score: at least 0 is slip, ``[*, m]``.
+        llr: log likelihood ratio; ``NEUTRAL`` where the decision is not valid, ``[*, m]``.
+        probability: of slip, by the bin alone, ``[*, m]``.
+        statistic: of the rule, ``[*, m]``.
+        is_valid: whether every channel in use could be trusted, ``[*, m]``.
+        is_alarm: whether it raises an alarm, ``[*, m]``.
+        is_on: whether an alarm stands after it: the contact's status, ``[*, m]``.
     """
 
     number: Tensor
     available_s: Tensor
+    onset_s: Tensor
     score: Tensor
     llr: Tensor
     probability: Tensor
@@ -60,17 +61,40 @@ class Decisions(NamedTuple):
     is_valid: Tensor
     is_alarm: Tensor
     is_on: Tensor
-    alarms: tuple[Alarm, ...]
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """The alarms that were raised, in order; of one stream."""
+        return tuple(
+            Alarm(
+                alarm_s=float(self.available_s[i]),
+                onset_s=float(self.onset_s[i]),
+                score=float(self.score[i]),
+                probability=float(self.probability[i]),
+                statistic=float(self.statistic[i]),
+                is_valid=bool(self.is_valid[i]),
+            )
+            for i in self.is_alarm.nonzero().flatten().tolist()
+        )
 
 
 class Decider:
-    """Scores of one stream in, decisions out; its memory has a fixed size.
+    """Scores in, decisions out; its memory has a fixed size.
 
     Args:
         settings: calibration, rule, threshold.
         sample_rate_hz: of the stream.
         bin_samples: length of a bin.
         look_ahead: samples behind its bin that a decision waits for.
+
+    Example:
+        >>> from tactslip_torch.model.calibration import Platt
+        >>> from tactslip_torch.onset.sequential import KOfN
+        >>> settings = AlarmSettings(20, Platt(4.0, 0.0), KOfN(2, 3), 1.0, target_per_hour=1.0)
+        >>> decider = Decider(settings, 2000.0, bin_samples=100, look_ahead=25)
+        >>> score = torch.tensor([-1.0, -1.0, 0.5, -1.0, 0.6, 0.7])
+        >>> [round(alarm.alarm_s, 4) for alarm in decider.decide(score, score.isfinite()).alarms]
+        [0.1025]
     """
 
     def __init__(
@@ -87,63 +111,59 @@ class Decider:
         """Forget everything; the next decision is number 0 of a stream that begins at a time."""
         self._origin_s = origin_s
         self._number = 0  # Python's integers do not end
-        self._run = 0  # where the unbroken run of positive ratios up to now began
-        self._rule_state: Tensor | None = None
-        self._latch = latch_start(torch.zeros(()))
+        self._state: tuple[Tensor, Latch, Tensor] | None = None
 
     def decide(self, score: Tensor, is_valid: Tensor) -> Decisions:
         """The next decisions.
 
         Shape:
-            - score, is_valid: ``[m]``; m may be 0
+            - score, is_valid: ``[*, m]``; m may be 0, the streams ``*`` are always the same
         """
         settings = self.settings
-        if self._rule_state is None or self._rule_state.dtype != score.dtype:
-            self._rule_state = settings.rule.start(score.new_zeros(()))
+        if self._state is None:
+            like = score.new_zeros(score.shape[:-1])
+            none = torch.zeros(like.shape, dtype=torch.int64)
+            self._state = settings.rule.start(like), latch_start(like), none
+        of_rule, of_latch, run = self._state
         llr = settings.calibration.llr(score)
         llr = torch.where(is_valid & llr.isfinite(), llr, NEUTRAL)
-        statistic, self._rule_state = settings.rule.scan(llr, self._rule_state)
-        is_alarm, is_on, self._latch = latch(
+        statistic, of_rule = settings.rule.scan(llr, of_rule)
+        is_alarm, is_on, of_latch = latch(
             statistic,
             settings.threshold,
             margin=settings.rule.margin,
             rearm=self._rearm,
             refractory=self._refractory,
-            state=self._latch,
+            state=of_latch,
         )
-        chance = probability(llr, settings.slip_share)
-        number = torch.arange(self._number, self._number + len(score))
+        number = torch.arange(self._number, self._number + score.shape[-1])
+        runs = _run_starts(llr, number, run)
+        self._state = of_rule, of_latch, runs[..., -1] if len(number) else run
+        self._number += len(number)
         available_s = self._available_s(number)
-        runs = self._run_starts(llr)
-        alarms = tuple(
-            Alarm(
-                alarm_s=float(available_s[i]),
-                onset_s=self._onset_s(runs[i], float(available_s[i])),
-                score=float(score[i]),
-                probability=float(chance[i]),
-                statistic=float(statistic[i]),
-                is_valid=bool(is_valid[i]),
-            )
-            for i in is_alarm.nonzero().flatten().tolist()
-        )
-        self._number += len(score)
+        began_s = self._available_s(torch.minimum(runs, number)) - settings.lead_s
         return Decisions(
-            number, available_s, score, llr, chance, statistic, is_valid, is_alarm, is_on, alarms
+            number,
+            available_s,
+            torch.minimum(began_s, available_s),
+            score,
+            llr,
+            probability(llr, settings.slip_share),
+            statistic,
+            is_valid,
+            is_alarm,
+            is_on,
         )
 
     def _available_s(self, number: Tensor) -> Tensor:
         samples = number * self.settings.hop_samples + self._first
         return self._origin_s + samples.double() / self._rate
 
-    def _onset_s(self, run: int, alarm_s: float) -> float:
-        began_s = float(self._available_s(torch.tensor(run)))
-        return min(alarm_s, began_s - self.settings.lead_s)
 
-    def _run_starts(self, llr: Tensor) -> list[int]:
-        """Of each decision, the first of the run of positive ratios that ends in it; or itself."""
-        here = torch.arange(self._number, self._number + len(llr))
-        behind = torch.where(llr > 0, self._run, here + 1)  # a run begins behind the last other
-        starts = behind.cummax(0).values if len(llr) else behind
-        if len(llr):
-            self._run = int(starts[-1])
-        return torch.minimum(starts, here).tolist()  # type: ignore[no-any-return]  # of integers
+def _run_starts(llr: Tensor, number: Tensor, before: Tensor) -> Tensor:
+    """Where the unbroken run of positive ratios up to each decision began, ``[*, m]``.
+
+    Behind a decision that is not positive the next one would begin it: its own number and 1.
+    """
+    starts = torch.where(llr > 0, before[..., None], number + 1)
+    return starts.cummax(-1).values if len(number) else starts
