@@ -151,7 +151,9 @@ class SlipDetector(nn.Module):
         self.channel_filter.check(samples)
         return judged_in_parts(self._score_raw, samples)
 
-    def judge(self, bins: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
+    def judge(
+        self, bins: Tensor, nonfinite: Nonfinite = "mask", given: torch.dtype | None = None
+    ) -> Judgement:
         """Score filtered bins of a hand whose sensors may fail: a finite score, and its validity.
 
         Args:
@@ -159,6 +161,8 @@ class SlipDetector(nn.Module):
             nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing,
                 ``typical`` features stand in for its own, and the score is not valid.
                 ``"raise"``: refuse.
+            given: dtype of the samples that the bins were filtered from, by default theirs; that of
+                the score, and what a sensor must resolve to be trusted.
 
         Shape:
             - bins: ``[*, C, n]``
@@ -169,7 +173,7 @@ class SlipDetector(nn.Module):
         """
         self.pool.check(bins)
         check_nonfinite(nonfinite, bins, self.pool.hand.names)
-        return judged_in_parts(self._judge, bins)
+        return judged_in_parts(lambda part: self._judge(part, part.to(given or part.dtype)), bins)
 
     def judge_raw(self, samples: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
         """``judge`` for raw bins that come with their context.
@@ -218,9 +222,8 @@ class SlipDetector(nn.Module):
         bins = self._filter(samples)
         return self._judge(bins, bins.to(samples.dtype))  # sensors resolve no more than they give
 
-    def _judge(self, bins: Tensor, given: Tensor | None = None) -> Judgement:
+    def _judge(self, bins: Tensor, given: Tensor) -> Judgement:
         """Scores of filtered bins, valid by the dtype they were given in, which is the score's."""
-        given = bins if given is None else given
         if (few := self._few_bins(bins)) is not None:
             bins, given = bins.detach(), given.detach()
             return few.judge(self._features, self.pool.widen(bins), given)
