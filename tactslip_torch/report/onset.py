@@ -1,0 +1,245 @@
+"""What a detector heard in a recording: a figure as the paper's last one, and a table of onsets.
+
+The films over time, blue where the status decided is no slip and yellow where it is slip
+(paper section V-D); below them the decided and the true status, and the probability of slip.
+Everything stands at the time at which it was known, so the delay of a decision can be seen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from tactslip_torch.files import whole_file
+from tactslip_torch.report.envelope import Array
+from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+
+REST, SLIP, ALARM = "#0072B2", "#E69F00", "#C6361B"
+_PALE_SLIP = "#FFF0CC"
+_INK, _GREY = "#222222", "#666666"
+_INVALID: dict[str, Any] = {
+    "facecolor": "none",
+    "edgecolor": "#999999",
+    "hatch": "////",
+    "linewidth": 0,
+    "zorder": 0.5,
+}
+_ONSET: dict[str, Any] = {"color": _INK, "linestyle": "-.", "linewidth": 1.1}
+_ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-", "linewidth": 1.1}
+_ESTIMATE: dict[str, Any] = {"color": ALARM, "linestyle": ":", "linewidth": 1.3}
+_MOST_ROWS = 40
+
+Points = tuple[Array, Array]
+"""Times in seconds and values there."""
+Stretches = Sequence[tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """One recording and what was decided of it, as few points as a page can show.
+
+    Args:
+        view: start and end of what is drawn, in seconds.
+        films: volts of each film by its name; NaN is a gap.
+        probability: of slip.
+        is_slip: contact status after each decision, 0 or 1.
+        is_valid: whether the decision can be relied on, 0 or 1.
+        alarms: of each alarm, when it was raised and when its slip is thought to have begun.
+        onsets_s: exact onsets, where they are known.
+        sliding_s: start and end of each slide.
+        is_known: whether the truth is.
+    """
+
+    view: tuple[float, float]
+    films: Mapping[str, Points]
+    probability: Points
+    is_slip: Points
+    is_valid: Points
+    alarms: Stretches = ()
+    onsets_s: Sequence[float] = ()
+    sliding_s: Stretches = ()
+    is_known: bool = False
+
+
+def onset_figure(heard: Heard, path: str | Path, *, title: str) -> None:
+    """Write the figure that ``draw_onsets`` draws as PNG, replaced as a whole if it exists."""
+    figure = draw_onsets(heard, title=title)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=120, facecolor="white")
+
+
+def draw_onsets(heard: Heard, *, title: str) -> Figure:
+    """Draw the films in lanes, the decided and the true status, and the probability of slip.
+
+    Args:
+        heard: what is drawn.
+        title: of the figure; says what is simulated.
+    """
+    heights = [max(1.2, 0.42 * len(heard.films)), 0.55, 1.3]
+    figure = Figure(figsize=(12.0, sum(heights) + 1.3), layout="constrained")
+    panels = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": heights})
+    slips = spans(heard.is_slip, heard.view[1])
+    invalid = spans((heard.is_valid[0], 1 - heard.is_valid[1]), heard.view[1])
+    _draw_films(panels[0], heard, slips)
+    _draw_status(panels[1], heard, slips)
+    _draw_probability(panels[2], heard)
+    for axes in panels:
+        for start, end in invalid:
+            axes.axvspan(start, end, **_INVALID)
+        axes.tick_params(color="#BBBBBB", labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[:].set_color("#BBBBBB")
+    panels[0].set_xlim(*heard.view)
+    panels[2].set_xlabel("time, s", fontsize=9, color=_GREY)
+    figure.suptitle(title, fontsize=11)
+    handles = _legend(heard, bool(invalid))
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=8
+    )
+    return figure
+
+
+def spans(status: Points, end_s: float) -> list[tuple[float, float]]:
+    """Stretches in which a status is on; it holds from its time to the next, at last to the end."""
+    times, values = status
+    is_on = np.concatenate([[False], np.asarray(values) >= 0.5, [False]])
+    edges = np.flatnonzero(is_on[1:] != is_on[:-1])
+    bounds = np.append(times, end_s)[edges].reshape(-1, 2)
+    return [(float(start), float(end)) for start, end in bounds if end > start]
+
+
+def status_at(status: Points, times: Array) -> NDArray[np.bool_]:
+    """Whether a status is on at other times: off before its first."""
+    known, values = status
+    place = np.searchsorted(known, times, side="right")
+    return np.concatenate([[False], np.asarray(values) >= 0.5])[place]
+
+
+def onsets_table(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
+    """Every alarm, and every onset that none found, one a line.
+
+    Args:
+        rows: each with ``file``, ``alarm_s``, ``onset_s``, ``probability``, ``is_valid``,
+            ``true_onset_s``, ``delay_ms`` and ``outcome``; ``None`` where there is none.
+        simulated: whether any recording is.
+    """
+    cells = []
+    for place, row in enumerate(rows[:_MOST_ROWS]):
+        is_first = place == 0 or rows[place - 1]["file"] != row["file"]
+        trust = {None: "-", True: "yes", False: "NO"}[row["is_valid"]]
+        cells.append(
+            [
+                row["file"] if is_first else "",
+                _number(row["alarm_s"], 3),
+                _number(row["onset_s"], 3),
+                _number(row["probability"], 2),
+                trust,
+                _number(row["true_onset_s"], 3),
+                _number(row["delay_ms"], 0),
+                row["outcome"] or "-",
+            ]
+        )
+    header = ["file", "alarm s", "onset s", "P(slip)", "valid", "true onset s", "delay ms"]
+    table = aligned([*header, "outcome"], cells)
+    rest = len(rows) - len(cells)
+    more = [f"and {rest} more, see onsets.csv"] if rest else []
+    return "\n".join([*([SIMULATED_LINE] if simulated else []), table, *more])
+
+
+def _draw_films(axes: Axes, heard: Heard, slips: Stretches) -> None:
+    """A lane per film around its median, in the colours of the status; bursts may cross lanes."""
+    known = [v[np.isfinite(v)] for _, v in heard.films.values()]
+    lane_v = _lane_height([v for v in known if v.size])
+    middles = -lane_v * np.arange(len(heard.films))
+    lanes = zip(heard.films.values(), known, middles, strict=True)
+    for place, ((times, volts), v, middle) in enumerate(lanes):
+        shown = volts - (float(np.median(v)) if v.size else 0.0) + middle
+        is_slip = status_at(heard.is_slip, times)
+        for colour, own in ((REST, ~is_slip), (SLIP, is_slip)):
+            reaching = own.copy()
+            reaching[1:] |= own[:-1]  # to the first point of the other colour: no hole
+            line = np.where(reaching, shown, np.nan)
+            axes.plot(times, line, color=colour, linewidth=0.6, gid=f"film {place}")
+    for start, end in slips:
+        axes.axvspan(start, end, facecolor=_PALE_SLIP, edgecolor="none", zorder=0)
+    for onset in _seen(heard, heard.onsets_s):
+        axes.axvline(onset, **_ONSET)
+    for alarm in _seen(heard, [alarm for alarm, _ in heard.alarms]):
+        axes.axvline(alarm, **_ALARM)
+        axes.plot(alarm, 1.0, "v", color=ALARM, transform=axes.get_xaxis_transform(), clip_on=False)
+    axes.set_yticks(middles, list(heard.films), fontsize=7)
+    axes.set_ylim(middles[-1] - 0.8 * lane_v, 0.8 * lane_v)
+    axes.set_ylabel(f"films, lanes {lane_v:.2g} V apart", fontsize=8)
+
+
+def _lane_height(known: Sequence[Array]) -> float:
+    """Volts between lanes: room for what is usual, while a burst may cross its neighbours."""
+    usual = [float(np.subtract(*np.quantile(v, [0.95, 0.05]))) for v in known]
+    bursts = [float(np.ptp(v)) for v in known]
+    height_v = max([0.0, *(1.5 * v for v in usual), *(0.25 * v for v in bursts)])
+    return height_v if height_v > 0 else 1.0
+
+
+def _draw_status(axes: Axes, heard: Heard, slips: Stretches) -> None:
+    """The decided status as a bar, and the true one below it where it is known."""
+    known_s = heard.is_slip[0][0] if len(heard.is_slip[0]) else heard.view[1]
+    bars = [("decided", 1, max(known_s, heard.view[0]), slips)]
+    if heard.is_known:
+        bars.append(("truth", 0, heard.view[0], heard.sliding_s))
+    for _, level, start_s, stretches in bars:
+        axes.barh(level, heard.view[1] - start_s, 0.7, left=start_s, color=REST, linewidth=0)
+        for start, end in _clipped(heard, stretches):
+            axes.barh(level, end - start, 0.7, left=start, color=SLIP, linewidth=0)
+    axes.set_yticks([bar[1] for bar in bars], [bar[0] for bar in bars], fontsize=8)
+    axes.set_ylim(0.5 - 0.5 * len(bars) + 0.5 * (len(bars) == 1), 1.5)
+
+
+def _draw_probability(axes: Axes, heard: Heard) -> None:
+    times, probability = heard.probability
+    axes.plot(times, probability, color=_INK, linewidth=0.8, drawstyle="steps-post")
+    for onset in _seen(heard, heard.onsets_s):
+        axes.axvline(onset, **_ONSET)
+    for estimate in _seen(heard, [estimate for _, estimate in heard.alarms]):
+        axes.axvline(estimate, **_ESTIMATE)
+    axes.set_ylim(-0.04, 1.04)
+    axes.set_yticks([0, 0.5, 1])
+    axes.grid(axis="y", color="#E4E4E4", linewidth=0.6)
+    axes.set_ylabel("P(slip)", fontsize=8)
+
+
+def _legend(heard: Heard, has_invalid: bool) -> list[Any]:
+    handles: list[Any] = [
+        Line2D([], [], color=REST, linewidth=2, label="decided: no slip"),
+        Line2D([], [], color=SLIP, linewidth=2, label="decided: slip"),
+        Line2D([], [], marker="v", label="alarm", **_ALARM),
+        Line2D([], [], label="onset, detected", **_ESTIMATE),
+    ]
+    if heard.onsets_s:
+        handles.append(Line2D([], [], label="onset, true", **_ONSET))
+    if has_invalid:
+        handles.append(Patch(label="not to be relied on", **_INVALID))
+    return handles
+
+
+def _seen(heard: Heard, times: Sequence[float]) -> list[float]:
+    return [time for time in times if heard.view[0] <= time <= heard.view[1]]
+
+
+def _clipped(heard: Heard, stretches: Stretches) -> Stretches:
+    first, last = heard.view
+    cut = [(max(start, first), min(end, last)) for start, end in stretches]
+    return [(start, end) for start, end in cut if end > start]
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
