@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -118,6 +118,110 @@ def count_alarms(
     for step in _walk(steps, level, low, rearm, refractory, *latch_start(count), gaps):
         count += step[0]
     return count
+
+
+class Stretches(NamedTuple):
+    """Parts of recordings, of about one length, that no latch's memory links to the rest.
+
+    Attributes:
+        values: the decisions at or above a level, ``[S, E]``; where there are fewer, -inf behind.
+        skipped: how many lower ones were left out before each, ``[S, E]``.
+        recording: which recording each is of, ``[S]``.
+    """
+
+    values: Tensor
+    skipped: Tensor
+    recording: Tensor
+
+
+def stretches(
+    flat: Tensor, recording: Tensor, floor: Tensor, rearm: int, refractory: int
+) -> Iterator[Stretches]:
+    """What any threshold with a re-arm level of at least ``floor`` has to look at, by length.
+
+    Recordings are cut wherever so many decisions in a row lie below that a latch is as at its
+    start again. ``flat`` and ``recording`` are those of ``joined``.
+    """
+    where = (flat >= floor).nonzero().squeeze(-1)
+    if not len(where):
+        return
+    gaps = where.diff() - 1
+    owner = recording[where]
+    is_first = torch.ones_like(where, dtype=torch.bool)
+    is_first[1:] = (gaps >= max(rearm, 1, refractory - 1)) | (owner.diff() != 0)
+    skipped = torch.zeros_like(where)
+    skipped[1:] = gaps
+    skipped[is_first] = 0
+    first = is_first.nonzero().squeeze(-1)
+    sizes = torch.cat([first, first.new_tensor([len(where)])]).diff()
+    power = (sizes - 1).double().add(1).log2().ceil().long()
+    for exponent in power.unique().tolist():
+        begin, size = first[power == exponent], sizes[power == exponent]
+        steps = torch.arange(int(size.max()), device=flat.device)
+        is_real = steps < size[:, None]
+        index = (begin[:, None] + steps).clamp(max=len(where) - 1)
+        values = flat[where[index]].masked_fill(~is_real, -math.inf)
+        yield Stretches(values, skipped[index].masked_fill(~is_real, 0), owner[begin])
+
+
+def joined(statistics: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """All decisions of recordings ``[T_r]`` in one row, and the number of each one's recording.
+
+    Raises:
+        ValueError: if there is none, or a statistic is not a row of finite numbers.
+    """
+    if not sum(statistic.numel() for statistic in statistics):
+        raise ValueError("no decision to count alarms in; give at least one recording without slip")
+    for number, statistic in enumerate(statistics):
+        if statistic.ndim != 1 or not bool(statistic.isfinite().all()):
+            raise ValueError(
+                f"the statistic of recording {number} must be a row of finite numbers, "
+                f"got shape {tuple(statistic.shape)}; invalid decisions enter a rule as NEUTRAL"
+            )
+    flat = torch.cat([statistic.detach() for statistic in statistics])
+    sizes = torch.tensor([len(statistic) for statistic in statistics], device=flat.device)
+    return flat, torch.arange(len(sizes), device=flat.device).repeat_interleave(sizes)
+
+
+def alarm_counts(
+    statistics: Sequence[Tensor],
+    thresholds: Tensor | Sequence[float],
+    *,
+    margin: float,
+    rearm: int,
+    refractory: int,
+) -> Tensor:
+    """How many alarms each recording has at each threshold: ``[G, R]``, int64.
+
+    Exactly what ``latch`` raises from its start in each recording, made of the few decisions at or
+    above the re-arm level.
+
+    Args:
+        statistics: of each recording, ``[T_r]``, all of one dtype.
+        thresholds: ``[G]``.
+        margin: as for ``latch``.
+        rearm: as for ``latch``.
+        refractory: as for ``latch``.
+
+    Raises:
+        ValueError: if there is no decision, or a statistic is not a row of finite numbers.
+    """
+    flat, recording = joined(statistics)
+    counts = []
+    for threshold in torch.as_tensor(thresholds, dtype=flat.dtype, device=flat.device):
+        count = torch.zeros(len(statistics), dtype=torch.int64, device=flat.device)
+        for piece in stretches(flat, recording, threshold - margin, rearm, refractory):
+            alarms = count_alarms(
+                piece.values,
+                threshold,
+                margin=margin,
+                rearm=rearm,
+                refractory=refractory,
+                skipped=piece.skipped,
+            )
+            count.index_add_(0, piece.recording, alarms)
+        counts.append(count)
+    return torch.stack(counts) if counts else recording.new_zeros(0, len(statistics))
 
 
 def _levels(

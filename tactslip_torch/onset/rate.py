@@ -1,0 +1,292 @@
+"""The one number that sets a detector: how many false alarms an hour, and what was achieved.
+
+Neighbouring decisions are correlated and alarms come in clusters, so nothing is derived from
+single decisions: alarms are counted on whole recordings in which nothing slips, by the latch that
+a stream will meet, and recordings are what the bootstrap draws.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.onset.latch import alarm_counts, count_alarms, joined, stretches
+from tactslip_torch.onset.sequential import Rule
+
+_NUM_RESAMPLES = 4000
+_WORK = 2**26  # threshold times decision, at most, in one stage of the search
+_FEWEST = 32  # thresholds tried of a piece, whatever the work
+
+
+@dataclass(frozen=True)
+class AlarmRate:
+    """Alarms of some recordings, and where the rate they were drawn from may lie.
+
+    Attributes:
+        alarms: how many there were.
+        hours: in how many hours.
+        per_hour: their quotient.
+        low: lower end of the interval of the rate, an hour.
+        high: upper end; finite and positive even without an alarm.
+        level: how often such an interval is meant to hold the rate.
+    """
+
+    alarms: int
+    hours: float
+    per_hour: float
+    low: float
+    high: float
+    level: float
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A threshold for a target rate, and what it gave on the recordings it was chosen on.
+
+    Attributes:
+        value: at which the statistic raises an alarm.
+        target_per_hour: false alarms an hour that were asked for.
+        rate: what the calibration recordings had at ``value``.
+        reached: whether they had at most as many as asked for; False only if ``value`` is the
+            ceiling, and even that too low.
+    """
+
+    value: float
+    target_per_hour: float
+    rate: AlarmRate
+    reached: bool
+
+
+def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
+    """The exact central interval of a Poisson mean, given one count.
+
+    Raises:
+        ValueError: if the count is negative, or the level not between 0 and 1.
+
+    Reference:
+        Garwood (1936), Biometrika 28, 437-442: quantiles of chi-square with ``2 count`` and
+        ``2 count + 2`` degrees of freedom, halved.
+    """
+    if count < 0:
+        raise ValueError(f"a count must not be negative, got {count}")
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie between 0 and 1, got {level}")
+    tail = torch.tensor((1 - level) / 2, dtype=torch.float64)
+
+    def gamma(shape: int, tail_of: Callable[[Tensor, Tensor], Tensor]) -> Callable[[float], bool]:
+        a = torch.tensor(float(shape), dtype=torch.float64)
+        return lambda mean: bool(tail_of(a, torch.tensor(mean, dtype=torch.float64)) >= tail)
+
+    low = _first_true(gamma(count, torch.special.gammainc)) if count else 0.0
+    is_above = gamma(count + 1, torch.special.gammaincc)
+    return low, _first_true(lambda mean: not is_above(mean))
+
+
+def _first_true(predicate: Callable[[float], bool]) -> float:
+    """Where a predicate of positive numbers turns true, to the last bit."""
+    low, high = 0.0, 1.0
+    while not predicate(high):
+        low, high = high, 2 * high
+    while low < (middle := low + (high - low) / 2) < high:
+        low, high = (low, middle) if predicate(middle) else (middle, high)
+    return high
+
+
+def alarm_rate(
+    counts: Tensor | Sequence[int],
+    hours: Tensor | Sequence[float],
+    level: float = 0.95,
+    seed: int = 0,
+) -> AlarmRate:
+    """The rate of alarms over recordings, with an interval that knows of clusters.
+
+    Each end is the farther one of two intervals: percentiles of the rate over resampled recordings,
+    and the exact one of a Poisson count. The first is wide where alarms come in clusters, the
+    second where there are few; recordings that agree more than chance would do not narrow it.
+    Clusters are seen between recordings alone: of one recording only the second speaks.
+
+    Args:
+        counts: alarms of each recording.
+        hours: how long each was watched.
+        level: of the interval.
+        seed: of the resampling.
+
+    Shape:
+        - counts, hours: ``[R]``
+
+    Raises:
+        ValueError: if these are not two rows of equal length, none is longer than 0 hours, or a
+            count is negative.
+    """
+    alarms = torch.as_tensor(counts, dtype=torch.float64).cpu()
+    watched = torch.as_tensor(hours, dtype=torch.float64).cpu()
+    if alarms.ndim != 1 or alarms.shape != watched.shape:
+        raise ValueError(
+            "expected one count and one number of hours for each recording, "
+            f"got {tuple(alarms.shape)} and {tuple(watched.shape)}"
+        )
+    if bool((alarms < 0).any() | (watched < 0).any()) or not float(watched.sum()) > 0:
+        raise ValueError(
+            "counts and hours must not be negative and some time must have been watched, "
+            f"got {int(alarms.sum())} alarms in {float(watched.sum()):g} h"
+        )
+    total, length = int(alarms.sum()), float(watched.sum())
+    low, high = (end / length for end in poisson_interval(total, level))
+    if total and len(alarms) > 1:
+        rates = torch.cat(list(_resampled(alarms, watched, seed)))
+        ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
+        drawn_low, drawn_high = rates.quantile(ends).tolist()
+        low, high = min(low, drawn_low), max(high, drawn_high)
+    return AlarmRate(total, length, total / length, low, high, level)
+
+
+def _resampled(alarms: Tensor, watched: Tensor, seed: int) -> Iterator[Tensor]:
+    """Rates of recordings drawn with replacement, as many as there are; those watched at all."""
+    alarms, watched = alarms[watched > 0], watched[watched > 0]
+    generator = torch.Generator().manual_seed(seed)
+    size = len(alarms)
+    rows = max(1, 2**20 // size)
+    for first in range(0, _NUM_RESAMPLES, rows):
+        shape = (min(rows, _NUM_RESAMPLES - first), size)
+        drawn = torch.randint(size, shape, generator=generator)
+        yield alarms[drawn].sum(-1) / watched[drawn].sum(-1)
+
+
+def rate_curve(
+    statistics: Sequence[Tensor],
+    rule: Rule,
+    hop_s: float,
+    thresholds: Tensor | Sequence[float],
+    *,
+    rearm: int,
+    refractory: int,
+) -> Tensor:
+    """False alarms an hour at each threshold ``[G]``, float64: an operating curve's one axis.
+
+    Arguments and errors are those of ``alarm_counts`` and ``choose_threshold``.
+    """
+    counts = alarm_counts(
+        statistics, thresholds, margin=rule.margin, rearm=rearm, refractory=refractory
+    )
+    return counts.sum(-1).double() / float(_hours(statistics, hop_s).sum())
+
+
+def choose_threshold(
+    statistics: Sequence[Tensor],
+    rule: Rule,
+    hop_s: float,
+    false_alarms_per_hour: float,
+    *,
+    rearm: int,
+    refractory: int,
+    ceiling: float = math.inf,
+    level: float = 0.95,
+    seed: int = 0,
+) -> Threshold:
+    """The lowest threshold that keeps recordings without slip at or below a target rate.
+
+    It and every higher one tried raise at most ``floor(target * hours)`` alarms; fewer need not
+    follow from higher, as a lower threshold may join two alarms into one. Tried are the values at
+    which the count can change: those of the statistic and, with a margin, the same plus it. Of the
+    thresholds between two of them, which raise the same alarms, the upper one is taken: then fresh
+    recordings have as many as these in the mean, and not one more. Where none is allowed it is the
+    next number above all. Only where recordings are so busy that the work would grow without
+    bound, evenly spaced ranks are tried in place of all.
+
+    With too few hours for the target (less than one alarm allowed) none is allowed; ``rate.high``
+    tells what that proves.
+
+    Args:
+        statistics: of each recording ``[T_r]``, all of one dtype; nothing slips in them.
+        rule: that made them; its margin and ceiling count.
+        hop_s: distance of two decisions.
+        false_alarms_per_hour: the target.
+        rearm: decisions in a row below threshold and margin that re-arm.
+        refractory: shortest distance of two alarms, in decisions.
+        ceiling: what the statistic cannot exceed, where calibration bounds it but not the rule.
+        level: of the interval of the rate.
+        seed: of its resampling.
+
+    Raises:
+        ValueError: if there is no decision, a statistic is not a row of finite numbers, or the hop
+            or the target is not positive.
+    """
+    if not 0 < false_alarms_per_hour < math.inf:
+        raise ValueError(f"false_alarms_per_hour must be positive, got {false_alarms_per_hour}")
+    hours = _hours(statistics, hop_s)
+    flat, recording = joined(statistics)
+    allowed = math.floor(false_alarms_per_hour * float(hours.sum()) * (1 + 1e-9))
+    highest = float(torch.tensor(min(rule.ceiling, ceiling), dtype=flat.dtype))
+    for value in _candidates(flat, recording, rule.margin, rearm, refractory, allowed):
+        value = min(value, highest)
+        counts = alarm_counts(
+            statistics, [value], margin=rule.margin, rearm=rearm, refractory=refractory
+        )[0]
+        reached = int(counts.sum()) <= allowed
+        if reached or value == highest:
+            break
+    rate = alarm_rate(counts, hours, level, seed)
+    return Threshold(value, false_alarms_per_hour, rate, reached)
+
+
+def _candidates(
+    flat: Tensor, recording: Tensor, margin: float, rearm: int, refractory: int, allowed: int
+) -> Iterator[float]:
+    """The threshold sought, and all higher ones tried, upwards, should rounding have misled."""
+    num = max(1024, 64 * (allowed + 1))
+    while True:
+        floor = flat.new_tensor(-math.inf)
+        if num < len(flat):
+            floor = flat.kthvalue(len(flat) - num + 1).values
+        tried, alarms = _curve(flat, recording, floor, margin, rearm, refractory)  # downwards
+        too_many = (alarms > allowed).nonzero()
+        if len(too_many) or num >= len(flat):
+            break
+        num *= 4
+    num_fit = int(too_many[0]) if len(too_many) else len(tried)
+    yield from reversed(tried[:num_fit].tolist())
+    yield float(torch.nextafter(flat.max(), flat.new_tensor(math.inf)))
+
+
+def _curve(
+    flat: Tensor, recording: Tensor, floor: Tensor, margin: float, rearm: int, refractory: int
+) -> tuple[Tensor, Tensor]:
+    """Thresholds at which the count of alarms changes, downwards, and the count at each.
+
+    All thresholds whose re-arm level is not below ``floor``. The total changes with one piece at a
+    time, and that piece at its own values alone: so each is counted at these, and changes add up.
+    """
+    values, changes = [], []
+    pieces = list(stretches(flat, recording, floor, rearm, refractory))
+    work = sum(piece.values.numel() for piece in pieces)
+    for piece in pieces:
+        tried = piece.values if not margin else torch.cat([piece.values, piece.values + margin], -1)
+        tried = tried.sort(dim=-1, descending=True).values
+        tried = tried[:, :: math.ceil(tried.shape[-1] / max(_FEWEST, _WORK // work))]
+        alarms = count_alarms(
+            piece.values[:, None, :],
+            tried,
+            margin=margin,
+            rearm=rearm,
+            refractory=refractory,
+            skipped=piece.skipped[:, None, :],
+        )
+        is_meant = (tried - margin >= floor) & tried.isfinite()  # a row's first ones
+        values.append(tried[is_meant])
+        changes.append(alarms.diff(dim=-1, prepend=torch.zeros_like(alarms[:, :1]))[is_meant])
+    tried, order = torch.cat(values).sort(descending=True)
+    alarms = torch.cat(changes)[order].cumsum(0)
+    is_last = torch.ones_like(tried, dtype=torch.bool)
+    is_last[:-1] = tried[1:] < tried[:-1]
+    is_last &= tried <= flat.max()
+    return tried[is_last], alarms[is_last]
+
+
+def _hours(statistics: Sequence[Tensor], hop_s: float) -> Tensor:
+    if not 0 < hop_s < math.inf:
+        raise ValueError(f"hop_s must be positive, got {hop_s}")
+    return torch.tensor([s.numel() * hop_s / 3600 for s in statistics], dtype=torch.float64)
