@@ -1,0 +1,293 @@
+"""The methods that the paper argues against, as scores of a bin, and its own rule of transitions.
+
+What is thresholded: "filtered vibration amplitudes" (paper II-B, after Romeo and Zollo 2020), here
+the power of the films' band; and "the maximal discrete wavelet transform (DWT) detail coefficient"
+(after Liu et al. 2024), here of the films' detail branches. In both a sensor above the threshold
+suffices, so the largest film counts. A score is the natural log of an amplitude in volts: a
+threshold on it is one on the amplitude, and calibration and sequential rules take it like ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Generic, Literal, Protocol, TypeVar, get_args
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.features.guards import are_ordinary, is_nowhere, stretch
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
+from tactslip_torch.signals.wavelet import branch_matrix, branch_names
+
+BaselineName = Literal["film_band_power", "largest_detail"]
+VIBRATION_HZ = (5.0, 400.0)
+"""Where the fast-adapting afferents of a hand answer, FA-I 5 to 50 Hz and FA-II 40 to 400 Hz.
+
+The films are the paper's fast-adapting elements. Johansson and Flanagan (2009), Nature Reviews
+Neuroscience 10, 345-359.
+"""
+FLOOR_V = 1e-6
+"""Amplitudes below it count as it, so that a dead hand has a score (ours; 16 bits at +-5 V resolve
+150 times as much)."""
+_CHUNK_BINS = 256
+Said = TypeVar("Said", covariant=True)
+
+
+def film_band_power(
+    bins: Tensor,
+    films: Sequence[int] | Tensor,
+    sample_rate_hz: float = 2000.0,
+    band_hz: tuple[float, float] = VIBRATION_HZ,
+) -> Tensor:
+    """Log of the root of the power in a band, of the film that has most.
+
+    The power is the mean square of the bin's part in the band: its lines by ``rfft``, without a
+    window, the constant never among them. Filtering leaves little of it above 182 Hz, the first
+    zero of 11 samples.
+
+    Args:
+        bins: filtered, in volts.
+        films: positions of the PVDF channels, or a mask of them.
+        sample_rate_hz: of the bins.
+        band_hz: least and largest frequency, both in it.
+
+    Shape:
+        - bins: ``[*, C, n]``
+        - output: ``[*]``, log volts of at least ``FLOOR_V``; NaN where a film is not finite
+
+    Raises:
+        ValueError: if there is no film, or no line of a bin's spectrum lies in the band.
+    """
+    lines = _band_lines(bins.shape[-1], float(sample_rate_hz), tuple(band_hz))
+
+    def amplitude(x: Tensor) -> Tensor:
+        power = (x @ lines.to(x).T).square().sum(-1)
+        return power.clamp(min=torch.finfo(x.dtype).tiny).sqrt()
+
+    return _log_of_largest(bins, films, amplitude)
+
+
+def largest_detail(
+    bins: Tensor,
+    films: Sequence[int] | Tensor,
+    wavelet: str = "rbio2.2",
+    level: int = 4,
+    levels: Sequence[int] | None = None,
+) -> Tensor:
+    """Log of the largest magnitude that a film's detail branches reach within the bin.
+
+    Args:
+        bins: filtered, in volts.
+        films: positions of the PVDF channels, or a mask of them.
+        wavelet: of the branches, as features have it.
+        level: number of levels.
+        levels: whose details count; default all.
+
+    Shape:
+        - bins: ``[*, C, n]``
+        - output: ``[*]``, log volts of at least ``FLOOR_V``; NaN where a film is not finite
+
+    Raises:
+        ValueError: if there is no film, no such level, or bins are too short for them.
+    """
+    chosen = tuple(range(1, level + 1) if levels is None else levels)
+    details = _detail_rows(bins.shape[-1], wavelet, level, chosen)
+
+    def amplitude(x: Tensor) -> Tensor:
+        branches = x @ details.to(x).T  # all samples of all levels
+        return torch.maximum(branches.amax(-1), -branches.amin(-1))
+
+    return _log_of_largest(bins, films, amplitude)
+
+
+def first_transition(is_slip: Tensor) -> Tensor:
+    """The paper's rule: each change from non-slip to slip is an onset (section IV-B).
+
+    No debounce and no pause between alarms; before the first bin there was no slip.
+
+    Shape:
+        - is_slip, output: ``[*, T]``, bool; what a bin is called, and whether it raises an alarm
+    """
+    before = torch.cat([torch.zeros_like(is_slip[..., :1]), is_slip[..., :-1]], dim=-1)
+    return is_slip & ~before
+
+
+class _Hand(Protocol):
+    def indices(self, kind: Literal["SG", "PVDF"], /) -> tuple[int, ...]: ...
+
+
+class Bins(Protocol):
+    """What a baseline asks of a ``FeaturePool``: the channels, and which can be trusted."""
+
+    @property
+    def hand(self) -> _Hand:
+        """The channels, in the order of bins."""
+
+    @property
+    def bin_samples(self) -> int:
+        """Samples of a bin."""
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Of the samples."""
+
+    @property
+    def wavelet(self) -> str:
+        """Of the branches."""
+
+    @property
+    def level(self) -> int:
+        """Number of wavelet levels."""
+
+    def widen(self, x: Tensor) -> Tensor:
+        """Samples in the dtype that they are filtered in."""
+
+    def check(self, bins: Tensor) -> None:
+        """Refuse what are no bins of this hand."""
+
+    def is_missing(self, bins: Tensor) -> Tensor:
+        """Which channels hold a NaN or Inf, ``[*, C]``."""
+
+    def is_alive(self, bins: Tensor) -> Tensor:
+        """Which channels have a span the dtype can resolve, ``[*, C]``."""
+
+
+@dataclass(frozen=True)
+class BaselineDetector(Generic[Said]):
+    """A baseline where ``score_stream`` takes a ``SlipDetector``: the same hand, filter and bins.
+
+    Args:
+        name: which score.
+        pool: of the detector that it stands beside, a ``FeaturePool``.
+        channel_filter: of that detector.
+        judgement: what score, validity and missing channels are put in, ``Judgement``.
+
+    Raises:
+        ValueError: if there is no such baseline, or the hand has no film.
+    """
+
+    name: BaselineName
+    pool: Bins
+    channel_filter: ChannelFilter
+    judgement: Callable[[Tensor, Tensor, Tensor], Said]
+
+    def __post_init__(self) -> None:
+        if self.name not in get_args(BaselineName):
+            raise ValueError(
+                f"no baseline {self.name!r}; take one of {', '.join(get_args(BaselineName))}"
+            )
+        _places(self.needed_index, len(self.channel_filter.window_lengths))
+
+    @property
+    def needed_index(self) -> Tensor:
+        """Channels in use, ``[films]``."""
+        return torch.tensor(self.pool.hand.indices("PVDF"), dtype=torch.int64)
+
+    @property
+    def look_ahead(self) -> int:
+        """Samples behind a bin that the filter of the films takes in."""
+        reaches = self.channel_filter.reaches
+        return max(reaches[film][1] for film in self.pool.hand.indices("PVDF"))
+
+    def judge(self, bins: Tensor, *, given: torch.dtype | None = None) -> Said:
+        """Score filtered bins. A film that is missing counts as silent, and the score as not valid.
+
+        Args:
+            bins: in volts.
+            given: dtype of the samples that they were filtered from, and of the score; by default
+                theirs.
+
+        Shape:
+            - bins: ``[*, C, n]``; score and validity ``[*]``, missing channels ``[*, C]``
+
+        Raises:
+            ValueError: if the number of channels or samples is another.
+        """
+        self.pool.check(bins)
+        bins = bins.to(given or bins.dtype)
+        is_missing = self.pool.is_missing(bins)
+        is_trusted = self.pool.is_alive(bins) & ~is_missing
+        if not is_nowhere(is_missing):
+            bins = torch.where(is_missing[..., None], 0.0, bins)
+        films = self.needed_index
+        if self.name == "film_band_power":
+            score = film_band_power(bins, films, self.pool.sample_rate_hz)
+        else:
+            score = largest_detail(bins, films, self.pool.wavelet, self.pool.level)
+        is_valid = is_trusted.index_select(-1, films.to(bins.device)).all(-1)
+        return self.judgement(score, is_valid, is_missing)
+
+
+def _log_of_largest(
+    bins: Tensor, films: Sequence[int] | Tensor, amplitude: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Log of the largest amplitude among films, chunk by chunk so that a product stays in a cache.
+
+    Amplitudes pass over a constant and are in proportion to the signal, which is brought to where
+    squares neither overflow nor vanish.
+    """
+    places = _places(films, bins.shape[-2])
+
+    def of_chunk(chunk: Tensor) -> Tensor:
+        x = _taken(chunk, places)
+        magnitude = torch.maximum(x.amax(-1), -x.amin(-1)).detach()
+        if are_ordinary(magnitude):
+            largest = amplitude(x - x[..., :1].detach())  # exact on a large constant
+        else:
+            factor = stretch(magnitude)
+            x = x * factor[..., None]
+            largest = amplitude(x - x[..., :1].detach()) / factor
+            largest = torch.where(magnitude.isfinite(), largest, torch.nan)
+        return largest.amax(-1).clamp(min=FLOOR_V).log()
+
+    flat = bins.reshape(-1, *bins.shape[-2:])
+    scores = [of_chunk(chunk) for chunk in flat.split(_CHUNK_BINS)]
+    return torch.cat(scores).reshape(bins.shape[:-2])
+
+
+def _places(films: Sequence[int] | Tensor, num_channels: int) -> list[int]:
+    """Positions of the films, from positions or a mask."""
+    index = torch.as_tensor(films)
+    places: list[int] = torch.arange(num_channels)[index.cpu()].tolist() if index.numel() else []
+    if not places:
+        raise ValueError("a film's score needs a film; give positions of PVDF channels")
+    return places
+
+
+def _taken(bins: Tensor, places: Sequence[int]) -> Tensor:
+    """The channels of these places; neighbours without a copy."""
+    if list(places) == list(range(places[0], places[0] + len(places))):
+        return bins.narrow(-2, places[0], len(places))
+    return bins[..., list(places), :]
+
+
+@lru_cache(maxsize=16)
+def _band_lines(num_samples: int, sample_rate_hz: float, band_hz: tuple[float, ...]) -> Tensor:
+    """Rows whose products with a bin, squared and added up, are its mean square in the band."""
+    low, high = band_hz
+    frequency = frequency_axis_hz(num_samples, sample_rate_hz, "clean")
+    is_in = (frequency >= low) & (frequency <= high) & (frequency > 0)
+    if not bool(is_in.any()):
+        raise ValueError(
+            f"no line of {num_samples} samples at {sample_rate_hz:g} Hz lies in {low:g} to "
+            f"{high:g} Hz; widen the band or lengthen the bins"
+        )
+    with torch.inference_mode(False):  # it may be needed for a gradient later
+        rows = spectrum_matrix(num_samples, "clean")  # of amplitudes: a tone has half its square
+        is_tone = 2 * torch.arange(len(rows)) < num_samples  # but for half the sample rate
+        rows = torch.where(is_tone[:, None], rows / 2**0.5, rows)[is_in]
+        return torch.cat([rows.real, rows.imag])
+
+
+@lru_cache(maxsize=16)
+def _detail_rows(num_samples: int, wavelet: str, level: int, levels: tuple[int, ...]) -> Tensor:
+    """The detail branches of some levels, below each other, ``[levels * n, n]``."""
+    names = branch_names(level)
+    if not levels or not {f"D{m}" for m in levels} <= set(names):
+        raise ValueError(f"levels must lie in 1..{level}, got {list(levels)}")
+    with torch.inference_mode(False):
+        matrix = branch_matrix(num_samples, wavelet, level)
+        return matrix[[names.index(f"D{m}") for m in levels]].flatten(0, 1)
