@@ -99,9 +99,7 @@ def count_alarms(
     Args:
         statistic: what a rule made of the decisions.
         threshold: as for ``latch``.
-        margin: as for ``latch``.
-        rearm: as for ``latch``.
-        refractory: as for ``latch``.
+        margin, rearm, refractory: as for ``latch``.
         skipped: how many decisions were left out before each, all below ``threshold - margin``.
 
     Shape:
@@ -199,13 +197,13 @@ def alarm_counts(
     Args:
         statistics: of each recording, ``[T_r]``, all of one dtype.
         thresholds: ``[G]``.
-        margin: as for ``latch``.
-        rearm: as for ``latch``.
-        refractory: as for ``latch``.
+        margin, rearm, refractory: as for ``latch``.
 
     Raises:
-        ValueError: if there is no decision, or a statistic is not a row of finite numbers.
+        ValueError: if there is no decision, a statistic is not a row of finite numbers, or margin,
+            rearm or refractory is negative.
     """
+    _refuse_negative(margin, rearm, refractory)
     flat, recording = joined(statistics)
     counts = []
     for threshold in torch.as_tensor(thresholds, dtype=flat.dtype, device=flat.device):
@@ -233,13 +231,17 @@ def _levels(
     shape: torch.Size | tuple[int, ...] = (),
 ) -> tuple[Tensor, Tensor, torch.Size]:
     """Threshold and re-arm level in the statistic's dtype, and the shape all broadcast to."""
+    _refuse_negative(margin, rearm, refractory)
+    level = torch.as_tensor(threshold, dtype=statistic.dtype, device=statistic.device).detach()
+    return level, level - margin, torch.broadcast_shapes(statistic.shape[:-1], level.shape, shape)
+
+
+def _refuse_negative(margin: float, rearm: int, refractory: int) -> None:
     if not margin >= 0 or rearm < 0 or refractory < 0:
         raise ValueError(
             "margin, rearm and refractory must not be negative, "
             f"got {margin}, {rearm} and {refractory}"
         )
-    level = torch.as_tensor(threshold, dtype=statistic.dtype, device=statistic.device).detach()
-    return level, level - margin, torch.broadcast_shapes(statistic.shape[:-1], level.shape, shape)
 
 
 def _walk(
