@@ -96,15 +96,8 @@ def count_alarms(
 ) -> Tensor:
     """How many alarms ``latch`` raises from its start, without keeping which: ``[*]``, int64.
 
-    Args:
-        statistic: what a rule made of the decisions.
-        threshold: as for ``latch``.
-        margin, rearm, refractory: as for ``latch``.
-        skipped: how many decisions were left out before each, all below ``threshold - margin``.
-
-    Shape:
-        - statistic, skipped: ``[*, T]``; threshold broadcasts against ``[*]``
-        - output: ``[*]``
+    Takes what ``latch`` takes. ``skipped``, ``[*, T]``, is how many decisions were left out before
+    each, all below ``threshold - margin``.
 
     Raises:
         ValueError: if margin, rearm or refractory is negative.
@@ -191,13 +184,8 @@ def alarm_counts(
 ) -> Tensor:
     """How many alarms each recording has at each threshold: ``[G, R]``, int64.
 
-    Exactly what ``latch`` raises from its start in each recording, made of the few decisions at or
-    above the re-arm level.
-
-    Args:
-        statistics: of each recording, ``[T_r]``, all of one dtype.
-        thresholds: ``[G]``.
-        margin, rearm, refractory: as for ``latch``.
+    Exactly what ``latch`` raises from its start in recordings ``[T_r]``, all of one dtype, at
+    thresholds ``[G]``; made of the few decisions at or above the re-arm level.
 
     Raises:
         ValueError: if there is no decision, a statistic is not a row of finite numbers, or margin,
