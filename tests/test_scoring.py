@@ -7,7 +7,7 @@ import torch
 from small_detector import small_detector
 from streams import detector_of, signal
 
-from tactslip_torch.onset.scoring import Scores, available_samples, longest_frame, score_stream
+from tactslip_torch.onset.scoring import Scores, score_stream
 
 HOP = 20
 LENGTHS = (51, 51, 11, 11)
@@ -98,17 +98,6 @@ def test_every_bin_that_fits_has_a_score(num_samples, num_scores):
         assert found.score.shape == found.is_valid.shape == (num_scores,)
         assert found.is_missing.shape == (num_scores, 4)
         assert found.score.dtype == dtype
-
-
-def test_what_a_decision_waits_for():
-    number = torch.arange(4)
-    assert available_samples(detector_of(), number, HOP).tolist() == [125, 145, 165, 185]
-    assert available_samples(detector_of("PVDF"), number, HOP).tolist() == [105, 125, 145, 165]
-    assert longest_frame(detector_of()) == 51
-    causal = detector_of(align="causal")
-    assert available_samples(causal, number, HOP).tolist() == [100, 120, 140, 160]
-    causal.channel_filter.window_lengths = (151, 51, 11, 11)
-    assert available_samples(causal, number, HOP).tolist() == [151, 151, 151, 160]
 
 
 def test_errors_are_one_line():

@@ -83,12 +83,12 @@ def score_stream(detector: Scorer, samples: Tensor, hop_samples: int, chunk: int
     Raises:
         ValueError: if hop or chunk is no positive number, or samples are not of this hand.
     """
-    check_samples(detector, samples)
+    _check(detector, samples)
     if hop_samples < 1 or chunk < 1:
         raise ValueError(f"hop_samples and chunk must be positive, got {hop_samples} and {chunk}")
     with torch.no_grad():
         samples = samples.detach()
-        if samples.shape[-1] < longest_frame(detector):
+        if samples.shape[-1] < _longest_frame(detector):
             return score_filtered(detector, samples[:, :0], hop_samples, samples.dtype, chunk)
         wide = detector.pool.widen(samples)
         filtered = detector.channel_filter(wide, detector.needed_index.tolist())
@@ -116,23 +116,7 @@ def score_filtered(
     return Scores(*judged[0]) if len(judged) == 1 else Scores(*_together(judged))
 
 
-def longest_frame(detector: Scorer) -> int:
-    """Samples of the longest frame that a channel in use is filtered by."""
-    lengths = detector.channel_filter.window_lengths
-    return max(lengths[int(channel)] for channel in detector.needed_index)
-
-
-def available_samples(detector: Scorer, number: Tensor, hop_samples: int) -> Tensor:
-    """How many samples must have come before decisions of these numbers can be made, ``[*]``.
-
-    Those up to the bin's end and its look-ahead; and, should bins be shorter than a frame, those
-    of the first frame.
-    """
-    last = number * hop_samples + detector.pool.bin_samples + detector.look_ahead
-    return last.clamp(min=longest_frame(detector))
-
-
-def check_samples(detector: Scorer, samples: Tensor) -> None:
+def _check(detector: Scorer, samples: Tensor) -> None:
     """Refuse what is no recording of the detector's hand.
 
     Raises:
@@ -147,3 +131,9 @@ def check_samples(detector: Scorer, samples: Tensor) -> None:
 
 def _together(judged: Sequence[Judgement]) -> list[Tensor]:
     return [torch.cat(parts) for parts in zip(*judged, strict=True)]
+
+
+def _longest_frame(detector: Scorer) -> int:
+    """Samples of the longest frame that a channel in use is filtered by."""
+    lengths = detector.channel_filter.window_lengths
+    return max(lengths[int(channel)] for channel in detector.needed_index)

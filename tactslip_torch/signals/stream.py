@@ -1,18 +1,23 @@
-"""``ChannelFilter`` of a recording in pieces: the same samples, as soon as they are settled.
+"""Samples that come in pieces: ``ChannelFilter`` of them, and when they were taken.
 
-A sample is settled once what its frame takes in has come. Channels settle together, with the
-longest look-ahead of those in use, so that a piece handed on has all channels of an instant.
+A sample is settled, and handed on filtered, once what its frame takes in has come. Channels settle
+together, with the longest look-ahead of those in use, so a piece has all channels of an instant.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.savgol import convolve_valid, edge_matrices
+
+Array = NDArray[Any]
 
 
 class FilterStream:
@@ -152,3 +157,73 @@ class FilterStream:
         if stop > last:
             parts.append(held[:, -length:] @ tail[last - self.num_pushed + after :].T)
         return torch.cat(parts, dim=-1)
+
+
+class SampleClock:
+    """When the samples of a stream were taken, and how many never came.
+
+    Times are those of the last sample that had one and the samples counted since: nothing adds up,
+    so a clock that runs a little faster or slower than the nominal rate is followed.
+
+    Args:
+        sample_rate_hz: nominal.
+
+    Attributes:
+        num_samples: that came or were missing since the start.
+        is_timed: whether any had a time; if none, the first is at 0.
+    """
+
+    def __init__(self, sample_rate_hz: float) -> None:
+        self.sample_rate_hz = sample_rate_hz
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        self.num_samples = 0  # Python's integers: exact for ever
+        self.is_timed = False
+        self._places, self._times_s = np.zeros(1, np.int64), np.zeros(1)  # of those with a time
+
+    def missing(self, times_s: Array) -> Array:
+        """How many samples are missing before each of those that come next.
+
+        Shape:
+            - times_s: ``[k]``, float64, of the first ``k``, good to a quarter of a sample
+            - output: ``[k]``, whole float64; the first is 0 if no sample had a time before
+
+        Raises:
+            ValueError: if a time is earlier than the last sample's end.
+        """
+        ahead = np.diff(times_s, prepend=self._times_s[-1]) * self.sample_rate_hz
+        since = self.num_samples - self._places[-1]
+        ahead -= np.concatenate([[since if self.is_timed else ahead[0]], np.ones(len(ahead) - 1)])
+        missing: Array = np.rint(ahead) + 0.0
+        if (missing < 0).any():
+            first = int(np.argmax(missing < 0))
+            raise ValueError(
+                f"time_s goes back: sample {first} of these is at {times_s[first]:.6f} s, "
+                f"{-missing[first]:g} samples before its turn; leave out what came twice"
+            )
+        return missing
+
+    def take(self, num: int, places: Array, times_s: Array) -> None:
+        """Count samples, some of which have times.
+
+        Args:
+            num: how many.
+            places: which of them have times, ``[k]``, rising.
+            times_s: those, ``[k]``.
+        """
+        self._places = np.concatenate([self._places[-1:], self.num_samples + places])
+        self._times_s = np.concatenate([self._times_s[-1:], times_s])
+        self.num_samples += num
+        self.is_timed |= len(places) > 0
+
+    def end_s(self, num_samples: Array) -> Array:
+        """When so many samples had come: the end of the last of them, ``[m]``, float64.
+
+        It must be one of the samples that the last ``take`` counted, or a later one.
+        """
+        last = np.searchsorted(self._places, num_samples - 1, side="right") - 1
+        since = num_samples - self._places[last]
+        end_s: Array = self._times_s[last] + since / self.sample_rate_hz
+        return end_s
