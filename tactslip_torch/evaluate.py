@@ -36,6 +36,7 @@ from tactslip_torch.experiment import (
 )
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
+from tactslip_torch.judging import event_numbers, together
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report.results import print_results, write_results
@@ -65,6 +66,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     if is_first:
         save_config(config, folder)
     parts: dict[str, dict[str, Any]] = {}
+    events: list[dict[str, Any]] = []
     overlaps = {fold.name: overlap(detector, source, fold) for fold in folds}
     with feature_cache(config.cache) as cache:
         filters = detector.channel_filter
@@ -80,6 +82,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             data = SlipDataModule(maker, fold, config.num_workers)
             trainer.test(learner, datamodule=data, verbose=False)
             parts[fold.name] = learner.metrics["splits"]
+            events.append(learner.events)
     roles = list(dict.fromkeys(role for splits in parts.values() for role in splits))
     metrics = common_facts(source, detector.pool, config) | {
         "splits": {
@@ -87,6 +90,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             for role in roles
         },
         "baselines": learner.metrics["baselines"] if len(folds) == 1 else {},
+        "events": event_numbers(together(events)),
         "selected": [str(name) for name in detector.selected_names],
         "timing_s": {"total": time.perf_counter() - started},
         "overlap": overlaps,

@@ -26,14 +26,28 @@ from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
 
 
+class Stroke(NamedTuple):
+    """The exact truth about a stroke that slides."""
+
+    onset_s: float
+    slide_end_s: float
+    speed_mm_s: float
+
+
 class RecordingFeatures(NamedTuple):
     """What the learner sees of one recording.
+
+    Attributes:
+        strokes: in the order of their numbers; empty where nothing slides.
+        hop_s: distance of neighbouring bins.
 
     Shape:
         - features: ``[N, F]``, float32, the whole pool
         - is_slip: ``[N]``, bool
         - speed_mm_s: ``[N]``, steady speed of the stroke of each bin, 0 for bins of no stroke
-        - position: ``[N]``, place beside the onset, as ``LabelledBins`` has it
+        - position, stroke: ``[N]``, place beside the onset and number of the stroke, as
+          ``LabelledBins`` has them
+        - ends_s: ``[N]``, float64, when the last sample of each bin is in
         - roles: role to ``[N]``, bool
     """
 
@@ -42,6 +56,10 @@ class RecordingFeatures(NamedTuple):
     is_slip: Tensor
     speed_mm_s: Tensor
     position: Tensor
+    stroke: Tensor
+    ends_s: Tensor
+    strokes: tuple[Stroke, ...]
+    hop_s: float
     roles: dict[str, Tensor]
     seconds: dict[str, float]
 
@@ -115,9 +133,19 @@ class FeatureMaker:
             place = self.source.ids.index(recording)
             is_slip = shuffled(is_slip, self.rule.shuffle_seed, place)
         speeds = torch.tensor([*times.speeds_mm_s, 0.0])[bins.stroke]  # -1, of no stroke: the 0
-        roles = split.bin_roles(recording, len(is_slip))
+        slides = zip(times.onsets_s, times.sliding_s, times.speeds_mm_s, strict=True)
         return RecordingFeatures(
-            recording, features, is_slip, speeds, bins.position, roles, seconds
+            recording,
+            features,
+            is_slip,
+            speeds,
+            bins.position,
+            bins.stroke,
+            (bins.starts + bins.bin_samples).double() / self.source.sample_rate_hz,
+            tuple(Stroke(onset_s, end_s, speed) for onset_s, (_, end_s), speed in slides),
+            (self.rule.bin_ms if self.rule.hop_ms is None else self.rule.hop_ms) / 1000,
+            split.bin_roles(recording, len(is_slip)),
+            seconds,
         )
 
     def key(self, recording: RecordingId) -> str:

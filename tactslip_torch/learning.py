@@ -11,40 +11,34 @@ import json
 import time
 from collections import Counter
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import lightning as L
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from tactslip_torch.data.labels import NO_POSITION
-from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.feature_maker import RecordingFeatures
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.fitting import TrainingPass, solve_facts
+from tactslip_torch.judging import (
+    JudgedBins,
+    bin_scores,
+    event_numbers,
+    events_by_rule,
+    judged_bins,
+)
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import FeatureThreshold
+from tactslip_torch.onset.events import LatencyParts, RecordingEvents
 from tactslip_torch.planning import Plan, plan_detector
 from tactslip_torch.progress import bar
 from tactslip_torch.ranks import from_first_rank, of_all_ranks, sum_over_ranks
 from tactslip_torch.recipe import Recipe
-from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
 from tactslip_torch.signals.filtering import ChannelFilter
-
-
-class _Judged(NamedTuple):
-    """Decisions on bins of one recording, ``[N]`` each."""
-
-    recording: RecordingId
-    truth: Tensor
-    says_slip: Tensor
-    rival_says_slip: Tensor
-    speed_mm_s: Tensor
-    position: Tensor
 
 
 class SlipLearner(L.LightningModule):
@@ -59,7 +53,8 @@ class SlipLearner(L.LightningModule):
     Attributes:
         detector: the result, after the second epoch.
         facts: what the recipe found, such as the penalty.
-        metrics: ``{"splits": ..., "baselines": ...}`` after a test.
+        metrics: ``{"splits": ..., "baselines": ..., "events": ...}`` after a test.
+        events: what the test found in each recording, by role and rule; to be pooled with others.
         seconds: time of each stage of the fit.
         worker_seconds: what workers spent on each stage of making features, summed over them.
     """
@@ -83,6 +78,7 @@ class SlipLearner(L.LightningModule):
             self.threshold = FeatureThreshold(**detector.info["rival"])
         self.facts: dict[str, Any] = {}
         self.metrics: dict[str, Any] = {}
+        self.events: dict[str, dict[str, list[RecordingEvents]]] = {}
         self.seconds: dict[str, float] = {}
         self.worker_seconds: dict[str, float] = {}
         self._worked: dict[str, Counter[str]] = {}
@@ -91,7 +87,7 @@ class SlipLearner(L.LightningModule):
         self._survey = Survey(len(pool.names), self.recipe.sample_bins)
         self._plan: Plan | None = None
         self._second: TrainingPass | None = None
-        self._judged: dict[str, list[_Judged]] = {}
+        self._judged: dict[str, list[JudgedBins]] = {}
         # nothing is trained by it: torch's DistributedDataParallel refuses a module without one
         self._anchor = nn.Parameter(torch.zeros(()))
 
@@ -184,38 +180,34 @@ class SlipLearner(L.LightningModule):
         device = next(self.detector.buffers()).device  # Lightning may have moved it
         says_slip = self.detector.score_features(chosen.to(device)).cpu() >= 0
         rival = self.threshold(chosen) if self.threshold else torch.zeros_like(says_slip)
-        for role, mask in batch.roles.items():
-            if bool(mask.any()):
-                parts = (batch.is_slip, says_slip, rival, batch.speed_mm_s, batch.position)
-                decisions = (part[mask] for part in parts)
-                self._judged[role].append(_Judged(batch.recording, *decisions))
+        for role, part in judged_bins(batch, says_slip, rival).items():
+            self._judged[role].append(part)
 
     def on_test_epoch_end(self) -> None:
         """Turn decisions into metrics."""
+        assert self.detector is not None  # on_test_start
         torch.set_num_threads(self._num_threads)
         self.metrics = {"splits": {}, "baselines": {}}
+        self.events = {}
         rivals: dict[str, Any] = {}
+        rate_hz = self.detector.pool.sample_rate_hz
+        latency = LatencyParts(
+            self.detector.look_ahead / rate_hz, self.detector.pool.bin_samples / rate_hz
+        )
         shares = of_all_ranks(self._judged)
         for role in ROLES:
             parts = [part for share in shares for part in share[role]]
             parts.sort(key=lambda part: part.recording)
             if not parts:
                 continue
-            materials = [part.recording.material for part in parts for _ in part.truth]
-            scenes = [part.recording.scene for part in parts for _ in part.truth]
-            truth = torch.cat([part.truth for part in parts])
-            says_slip = torch.cat([part.says_slip for part in parts])
-            rival = torch.cat([part.rival_says_slip for part in parts])
-            speeds = torch.cat([part.speed_mm_s for part in parts]).tolist()
-            places = torch.cat([part.position for part in parts]).tolist()
-            positions = [None if place == NO_POSITION else place for place in places]
-            scores = bin_metrics(truth, says_slip, materials, speeds, scenes, positions)
+            scores, rivals[role] = bin_scores(parts)
             self.metrics["splits"][role] = scores
-            rivals[role] = split_metrics(confusion_matrix(truth, rival))
+            self.events[role] = events_by_rule(parts, latency)
             for name in ("accuracy", "balanced_accuracy"):
                 if scores[name] is not None:
                     self.log(f"{role}/{name}", scores[name], batch_size=1)
-        if self.threshold and self.detector:
+        self.metrics["events"] = event_numbers(self.events)
+        if self.threshold:
             feature = str(self.detector.selected_names[self.threshold.index])
             self.metrics["baselines"] = {
                 "best_single_feature": {"feature": feature, "splits": rivals}

@@ -42,6 +42,7 @@ from tactslip_torch.export import export_onnx, float32_error
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.files import whole_file
+from tactslip_torch.judging import event_numbers, together
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.recipe import Recipe
@@ -160,6 +161,7 @@ def _run_fold(
     seconds |= {"test_pass": tested - started, "save_export": time.perf_counter() - tested}
     return {
         **learner.metrics,
+        "recording_events": learner.events,  # for _combined
         **learner.facts,
         "selected": [str(name) for name in detector.selected_names],
         "onnx": onnx,
@@ -195,14 +197,19 @@ def _checkpoint(given: str | None, fold: Split) -> Path | None:
 
 
 def _combined(folds: dict[str, dict[str, Any]], of_rivals: bool) -> dict[str, Any]:
-    """One fold as it is; of several, confusions are summed and the shared selection is named.
+    """One fold as it is; of several, bins and events are pooled, and the shared selection named.
 
     Rivals are judged on the same bins, so theirs are not summed: ``splits`` then has each role of
     each fold, such as ``"protocol/unseen"``.
     """
+    found = {name: part.pop("recording_events") for name, part in folds.items()}
     if len(folds) == 1:
         return next(iter(folds.values()))
     parts = list(folds.values())
+    events = [
+        {f"{name}/{role}" if of_rivals else role: by_rule for role, by_rule in by_role.items()}
+        for name, by_role in found.items()
+    ]
     splits: dict[str, list[dict[str, Any]]] = {}
     singles: dict[str, list[dict[str, Any]]] = {}
     for name, part in folds.items():
@@ -220,6 +227,7 @@ def _combined(folds: dict[str, dict[str, Any]], of_rivals: bool) -> dict[str, An
                 "splits": {role: summed_metrics(scores) for role, scores in singles.items()},
             }
         },
+        "events": event_numbers(together(events)),
         "selected": [name for name in parts[0]["selected"] if name in shared],
         "timing_s": _summed([part.pop("timing_s") for part in parts]),
         "worker_s": _summed([part.pop("worker_s") for part in parts]),

@@ -9,6 +9,7 @@ from typing import Any
 
 from tactslip_torch.files import whole_file
 from tactslip_torch.report.confound import by_detector, confound_figure, confound_table
+from tactslip_torch.report.events import events_figure, events_table, has_events
 from tactslip_torch.report.figures import confusion_figure, selected_features_figure
 from tactslip_torch.report.tables import (
     materials_table,
@@ -25,7 +26,7 @@ def write_results(
 ) -> None:
     """Write ``metrics.json`` and the figures of a run into a folder.
 
-    Results on several kinds of scenes also get ``confound.png``.
+    Results on several kinds of scenes also get ``confound.png``, those with events ``events.png``.
 
     Args:
         folder: made if it is not there.
@@ -40,6 +41,8 @@ def write_results(
         selected_features_figure(selected, folder / "selected_features.png", simulated=simulated)
     if by_detector(metrics):
         confound_figure(metrics, folder / "confound.png")
+    if has_events(metrics):
+        events_figure(metrics, folder / "events.png")
     if metrics.get("validation"):
         validation_figure(metrics["validation"], folder / "validation.png", simulated=simulated)
 
@@ -47,6 +50,8 @@ def write_results(
 def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
     parts = [splits_table(metrics), materials_table(metrics)]
+    if metrics.get("events"):
+        parts.append(events_table(metrics))
     if by_detector(metrics):
         parts.append(confound_table(metrics))
     if selected:
