@@ -173,7 +173,7 @@ class SlipDetector(nn.Module):
         """
         self.pool.check(bins)
         check_nonfinite(nonfinite, bins, self.pool.hand.names)
-        return judged_in_parts(lambda part: self._judge(part, part.to(given or part.dtype)), bins)
+        return judged_in_parts(lambda part: self._judge(part, given or bins.dtype), bins)
 
     def judge_raw(self, samples: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
         """``judge`` for raw bins that come with their context.
@@ -219,14 +219,13 @@ class SlipDetector(nn.Module):
         return saturating(self._score(self._filter(samples)), samples.dtype)
 
     def _judge_raw(self, samples: Tensor) -> Judgement:
-        bins = self._filter(samples)
-        return self._judge(bins, bins.to(samples.dtype))  # sensors resolve no more than they give
+        return self._judge(self._filter(samples), samples.dtype)
 
-    def _judge(self, bins: Tensor, given: Tensor) -> Judgement:
+    def _judge(self, bins: Tensor, given: torch.dtype) -> Judgement:
         """Scores of filtered bins, valid by the dtype they were given in, which is the score's."""
         if (few := self._few_bins(bins)) is not None:
-            bins, given = bins.detach(), given.detach()
-            return few.judge(self._features, self.pool.widen(bins), given)
+            return few.judge(self._features, self.pool.widen(bins.detach()), given)
+        is_alive = self.pool.is_alive(bins.to(given))  # sensors resolve no more than they give
         bins = self.pool.widen(bins)
         is_missing = self.pool.is_missing(bins)
         is_whole = is_nowhere(is_missing)
@@ -236,9 +235,8 @@ class SlipDetector(nn.Module):
         if not is_whole:
             is_typical = is_missing.index_select(-1, self.channel_index)
             scaled = torch.where(is_typical, self.typical, scaled)
-        score = saturating(self.head(scaled), given.dtype)
-        is_trusted = self.pool.is_alive(given) & ~is_missing
-        is_valid = self._needed(is_trusted) & score.isfinite()
+        score = saturating(self.head(scaled), given)
+        is_valid = self._needed(is_alive & ~is_missing) & score.isfinite()
         return Judgement(score, is_valid, is_missing)
 
     def _few_bins(self, bins: Tensor) -> FewBins | None:

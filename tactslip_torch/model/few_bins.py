@@ -24,7 +24,7 @@ from tactslip_torch.model.scaling import FeatureScaler
 Array = np.ndarray[Any, Any]
 
 
-FEW_BINS = 4
+FEW_BINS = 16
 """Of so few, calls take longer than the arithmetic in them."""
 
 
@@ -86,7 +86,7 @@ class FewBins:
             return self._score(self._scaled(features), dtype)
 
     def judge(
-        self, features_of: Callable[[Tensor], Tensor], bins: Tensor, given: Tensor
+        self, features_of: Callable[[Tensor], Tensor], bins: Tensor, given: torch.dtype
     ) -> Judgement:
         """Scores of filtered bins ``[*, C, n]``, valid by the dtype they were ``given`` in."""
         with np.errstate(all="ignore"):
@@ -97,7 +97,7 @@ class FewBins:
             scaled = self._scaled(features_of(bins))
             if not is_whole:
                 scaled = np.where(is_missing[..., self._channel_of], self._typical, scaled)
-            score = self._score(scaled, given.dtype)
+            score = self._score(scaled, given)
             is_trusted = (is_alive & ~is_missing)[..., self._needed].all(-1)
             is_valid = np.asarray(is_trusted & np.isfinite(score.numpy()))
         return Judgement(score, torch.from_numpy(is_valid), torch.from_numpy(is_missing))
@@ -128,17 +128,14 @@ class FewBins:
             torch.from_numpy(np.asarray((pull * scaled).sum(-1) + self._constant)), dtype
         )
 
-    def _trust(self, bins: Tensor, given: Tensor) -> tuple[Array, Array]:
-        """Which channels are alive in ``given``, and which are missing in ``bins``, ``[*, C]``."""
-        x = bins.numpy()
-        high, low = x.max(-1), x.min(-1)
-        largest = min(LARGEST_SAMPLE, float(np.finfo(x.dtype).max))
-        is_missing = np.asarray(~(np.maximum(high, -low) <= largest))
-        if given is not bins:
-            seen = given.numpy()
-            high, low = seen.max(-1), seen.min(-1)
-        span = (high - low) * self._pool.inverse_span(given).numpy()
-        return np.asarray(span > np.maximum(high, -low)), is_missing
+    def _trust(self, bins: Tensor, given: torch.dtype) -> tuple[Array, Array]:
+        """Which channels are alive as ``given``, and which are missing in ``bins``, ``[*, C]``."""
+        high, low = bins.amax(-1), bins.amin(-1)
+        largest = min(LARGEST_SAMPLE, torch.finfo(bins.dtype).max)
+        is_missing = ~(torch.maximum(high, -low) <= largest)
+        high, low = high.to(given), low.to(given)  # rounding keeps the order
+        span = (high - low) * self._pool.inverse_span(high)
+        return (span > torch.maximum(high, -low)).numpy(), is_missing.numpy()
 
 
 def _held(parts: Parts) -> tuple[Any, ...]:

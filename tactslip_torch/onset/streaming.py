@@ -81,6 +81,7 @@ class StreamingDetector:
         wide = pool.widen(torch.empty(0, dtype=dtype)).dtype
         channels = detector.needed_index.tolist()
         self._filter = FilterStream(detector.channel_filter, wide, channels)
+        self._first = pool.bin_samples + detector.look_ahead
         parts = (pool.sample_rate_hz, pool.bin_samples, detector.look_ahead)
         self._decider = Decider(self.settings, *parts)
         self._start()
@@ -169,8 +170,7 @@ class StreamingDetector:
 
     def _samples_for(self, number: Array) -> Array:
         """Samples that must have come before decisions can be made, ``[m]``."""
-        first = self.detector.pool.bin_samples + self.detector.look_ahead
-        samples: Array = number * self.settings.hop_samples + first
+        samples: Array = number * self.settings.hop_samples + self._first
         return samples.clip(min=self._filter.frame)  # which may be longer than a bin
 
     def _read(self, samples: ArrayLike | Tensor) -> Tensor:

@@ -32,6 +32,7 @@ class ChannelFilter(nn.Module):
         context: half the longest frame; a bin comes with twice as many samples around it.
         context_before: samples needed before a bin to filter it exactly.
         context_after: and behind it; 0 unless centred.
+        reaches: samples before and after its own that each channel's frame takes in.
 
     Raises:
         ValueError: if a frame is even or does not exceed the order, or the alignment is unknown.
@@ -48,6 +49,7 @@ class ChannelFilter(nn.Module):
         self._kernels = {
             length: edge_matrices(length, polyorder, align)[1] for length in self.window_lengths
         }
+        self.reaches = tuple(reach(length, align) for length in self.window_lengths)
         self.context = max(self.window_lengths) // 2
         self.context_before, self.context_after = reach(max(self.window_lengths), align)
         self._matrices: dict[tuple[int, int, torch.dtype, torch.device], Tensor] = {}
@@ -56,11 +58,6 @@ class ChannelFilter(nn.Module):
             (length, [i for i, own in enumerate(self.window_lengths) if own == length])
             for length in dict.fromkeys(self.window_lengths)
         ]
-
-    @property
-    def reaches(self) -> tuple[tuple[int, int], ...]:
-        """Samples before and after its own that each channel's frame takes in."""
-        return tuple(reach(length, self.align) for length in self.window_lengths)
 
     def forward(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:
         """Filter whole recordings.

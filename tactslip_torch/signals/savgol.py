@@ -139,7 +139,8 @@ def convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
     the bits of a sample are the same in whatever piece of a signal it lies.
     """
     num_kept = x.shape[-1] - len(kernel) + 1
-    total = x[..., :num_kept] * kernel[0]
-    for shift in range(1, len(kernel)):
-        total = torch.addcmul(total, x[..., shift : shift + num_kept], kernel[shift])
+    first, *rest = kernel.tolist()
+    total: Tensor = x.narrow(-1, 0, num_kept) * first
+    for shift, weight in enumerate(rest, 1):
+        total.add_(x.narrow(-1, shift, num_kept), alpha=weight)
     return total

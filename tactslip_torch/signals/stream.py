@@ -58,7 +58,7 @@ class FilterStream:
         self.look_ahead = max(after for _, after in reaches)
         self._groups = [
             (
-                [channel for channel in wanted if lengths[channel] == length],
+                _as_slice([channel for channel in wanted if lengths[channel] == length]),
                 edge_matrices(length, channel_filter.polyorder, channel_filter.align),
             )
             for length in dict.fromkeys(lengths[channel] for channel in wanted)
@@ -159,6 +159,12 @@ class FilterStream:
         return torch.cat(parts, dim=-1)
 
 
+def _as_slice(channels: list[int]) -> slice | list[int]:
+    """The same channels, so that they are looked up without a copy if they are neighbours."""
+    first, last = channels[0], channels[-1]
+    return slice(first, last + 1) if last - first + 1 == len(channels) else channels
+
+
 class SampleClock:
     """When the samples of a stream were taken, and how many never came.
 
@@ -213,8 +219,9 @@ class SampleClock:
             places: which of them have times, ``[k]``, rising.
             times_s: those, ``[k]``.
         """
-        self._places = np.concatenate([self._places[-1:], self.num_samples + places])
-        self._times_s = np.concatenate([self._times_s[-1:], times_s])
+        if len(places) or len(self._places) > 1:
+            self._places = np.concatenate([self._places[-1:], self.num_samples + places])
+            self._times_s = np.concatenate([self._times_s[-1:], times_s])
         self.num_samples += num
         self.is_timed |= len(places) > 0
 
