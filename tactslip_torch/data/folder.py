@@ -54,6 +54,11 @@ def readers() -> dict[str, Opener]:
     return {ending: form.open for ending, form in FORMATS.items()} | ARRAYS
 
 
+def reader(path: Path) -> Opener:
+    """How a file is opened, by its ending; one of ``recording_files``."""
+    return readers()[_ending(path)]
+
+
 def recording_files(place: Path) -> list[Path]:
     """The file, or those of a folder that ``readers`` know, by name.
 
@@ -73,6 +78,46 @@ def recording_files(place: Path) -> list[Path]:
     if _ending(place) not in endings:
         raise ValueError(f"{place} must end in {known} to be read as a recording")
     return [place]
+
+
+def refuse_other_channels(
+    path: Path, opened: OpenRecording, rows: Sequence[Mapping[str, str]]
+) -> None:
+    """Raise if a recording is not of the hand with these channels, in this order.
+
+    Of samples alone only the number of channels is known.
+
+    Raises:
+        ValueError: if there are others, naming the first.
+    """
+    theirs = opened.archived.hand.to_rows() if opened.archived else rows
+    if opened.samples.num_channels != len(rows):
+        raise ValueError(f"{path} has {opened.samples.num_channels} channels, not {len(rows)}")
+    for place, (found, wanted) in enumerate(zip(theirs, rows, strict=True), 1):
+        if any(found[what] != wanted[what] for what in ("name", "kind")):
+            raise ValueError(
+                f"channel {place} of {path} is {found['name']} ({found['kind']}), not "
+                f"{wanted['name']} ({wanted['kind']}); give recordings of the detector's hand"
+            )
+
+
+def file_facts(path: Path, archived: Archived | None) -> dict[str, Any]:
+    """What a file says of itself, in plain values; of samples alone nothing is known."""
+    recording = archived.recording if archived else None
+    key = archived.key.get("recording") if archived else None
+    scene = str(key.get("name", "paper")) if isinstance(key, dict) else "paper"
+    return {
+        "file": path.name,
+        "material": recording.material if recording else None,
+        "scene": scene if recording else None,
+        "simulated": bool(recording.provenance.get("simulated")) if recording else None,
+    }
+
+
+def has_truth(recording: Recording) -> bool:
+    """Whether it says where slip is and where not; one that nobody annotated does not."""
+    is_told = recording.onsets_s or recording.non_slip_s
+    return bool(is_told or recording.provenance.get("simulated"))
 
 
 def _ending(path: Path) -> str:

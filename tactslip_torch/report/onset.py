@@ -1,4 +1,4 @@
-"""What a detector heard in a recording: a figure as the paper's last one, and a table of onsets.
+"""What a detector heard in a recording, as the paper's last figure.
 
 The films over time, blue where the status decided is no slip and yellow where it is slip
 (paper section V-D); below them the decided and the true status, and the probability of slip.
@@ -7,9 +7,7 @@ Everything stands at the time at which it was known, so the delay of a decision 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from tactslip_torch.files import whole_file
 from tactslip_torch.report.envelope import Array
-from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.report.onset_traces import Heard, Stretches, spans, status_at
 
 REST, SLIP, ALARM = "#0072B2", "#E69F00", "#C6361B"
 _PALE_SLIP = "#FFF0CC"
@@ -34,41 +31,10 @@ _INVALID: dict[str, Any] = {
     "linewidth": 0,
     "zorder": 0.5,
 }
-_ONSET: dict[str, Any] = {"color": _INK, "linestyle": "-.", "linewidth": 1.1}
-_ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-", "linewidth": 1.1}
-_ESTIMATE: dict[str, Any] = {"color": ALARM, "linestyle": ":", "linewidth": 1.3}
-_MOST_ROWS = 40
-
-Points = tuple[Array, Array]
-"""Times in seconds and values there."""
-Stretches = Sequence[tuple[float, float]]
-
-
-@dataclass(frozen=True, eq=False)
-class Heard:
-    """One recording and what was decided of it, as few points as a page can show.
-
-    Args:
-        view: start and end of what is drawn, in seconds.
-        films: volts of each film by its name; NaN is a gap.
-        probability: of slip.
-        is_slip: contact status after each decision, 0 or 1.
-        is_valid: whether the decision can be relied on, 0 or 1.
-        alarms: of each alarm, when it was raised and when its slip is thought to have begun.
-        onsets_s: exact onsets, where they are known.
-        sliding_s: start and end of each slide.
-        is_known: whether the truth is.
-    """
-
-    view: tuple[float, float]
-    films: Mapping[str, Points]
-    probability: Points
-    is_slip: Points
-    is_valid: Points
-    alarms: Stretches = ()
-    onsets_s: Sequence[float] = ()
-    sliding_s: Stretches = ()
-    is_known: bool = False
+_ONSET: dict[str, Any] = {"color": _INK, "linestyle": "-."}
+_ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-"}
+_ESTIMATE: dict[str, Any] = {"color": ALARM, "linestyle": ":"}
+_WIDTH, _ROOM = 1.2, 40  # of marks, in points, as long as there are no more of a kind
 
 
 def onset_figure(heard: Heard, path: str | Path, *, title: str) -> None:
@@ -94,8 +60,7 @@ def draw_onsets(heard: Heard, *, title: str) -> Figure:
     _draw_status(panels[1], heard, slips)
     _draw_probability(panels[2], heard)
     for axes in panels:
-        for start, end in invalid:
-            axes.axvspan(start, end, **_INVALID)
+        _shade(axes, invalid, "invalid", **_INVALID)
         axes.tick_params(color="#BBBBBB", labelsize=8)
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[:].set_color("#BBBBBB")
@@ -107,53 +72,6 @@ def draw_onsets(heard: Heard, *, title: str) -> Figure:
         handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=8
     )
     return figure
-
-
-def spans(status: Points, end_s: float) -> list[tuple[float, float]]:
-    """Stretches in which a status is on; it holds from its time to the next, at last to the end."""
-    times, values = status
-    is_on = np.concatenate([[False], np.asarray(values) >= 0.5, [False]])
-    edges = np.flatnonzero(is_on[1:] != is_on[:-1])
-    bounds = np.append(times, end_s)[edges].reshape(-1, 2)
-    return [(float(start), float(end)) for start, end in bounds if end > start]
-
-
-def status_at(status: Points, times: Array) -> NDArray[np.bool_]:
-    """Whether a status is on at other times: off before its first."""
-    known, values = status
-    place = np.searchsorted(known, times, side="right")
-    return np.concatenate([[False], np.asarray(values) >= 0.5])[place]
-
-
-def onsets_table(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
-    """Every alarm, and every onset that none found, one a line.
-
-    Args:
-        rows: each with ``file``, ``alarm_s``, ``onset_s``, ``probability``, ``is_valid``,
-            ``true_onset_s``, ``delay_ms`` and ``outcome``; ``None`` where there is none.
-        simulated: whether any recording is.
-    """
-    cells = []
-    for place, row in enumerate(rows[:_MOST_ROWS]):
-        is_first = place == 0 or rows[place - 1]["file"] != row["file"]
-        trust = {None: "-", True: "yes", False: "NO"}[row["is_valid"]]
-        cells.append(
-            [
-                row["file"] if is_first else "",
-                _number(row["alarm_s"], 3),
-                _number(row["onset_s"], 3),
-                _number(row["probability"], 2),
-                trust,
-                _number(row["true_onset_s"], 3),
-                _number(row["delay_ms"], 0),
-                row["outcome"] or "-",
-            ]
-        )
-    header = ["file", "alarm s", "onset s", "P(slip)", "valid", "true onset s", "delay ms"]
-    table = aligned([*header, "outcome"], cells)
-    rest = len(rows) - len(cells)
-    more = [f"and {rest} more, see onsets.csv"] if rest else []
-    return "\n".join([*([SIMULATED_LINE] if simulated else []), table, *more])
 
 
 def _draw_films(axes: Axes, heard: Heard, slips: Stretches) -> None:
@@ -170,13 +88,13 @@ def _draw_films(axes: Axes, heard: Heard, slips: Stretches) -> None:
             reaching[1:] |= own[:-1]  # to the first point of the other colour: no hole
             line = np.where(reaching, shown, np.nan)
             axes.plot(times, line, color=colour, linewidth=0.6, gid=f"film {place}")
-    for start, end in slips:
-        axes.axvspan(start, end, facecolor=_PALE_SLIP, edgecolor="none", zorder=0)
-    for onset in _seen(heard, heard.onsets_s):
-        axes.axvline(onset, **_ONSET)
-    for alarm in _seen(heard, [alarm for alarm, _ in heard.alarms]):
-        axes.axvline(alarm, **_ALARM)
-        axes.plot(alarm, 1.0, "v", color=ALARM, transform=axes.get_xaxis_transform(), clip_on=False)
+    _shade(axes, slips, "slip", facecolor=_PALE_SLIP, edgecolor="none", zorder=0)
+    _mark(axes, heard, heard.onsets_s, "onset", **_ONSET)
+    alarms = [alarm for alarm, _ in heard.alarms]
+    _mark(axes, heard, alarms, "alarm", **_ALARM)
+    seen = _seen(heard, alarms)
+    above = axes.get_xaxis_transform()
+    axes.plot(seen, [1.0] * len(seen), "v", color=ALARM, transform=above, clip_on=False)
     axes.set_yticks(middles, list(heard.films), fontsize=7)
     axes.set_ylim(middles[-1] - 0.8 * lane_v, 0.8 * lane_v)
     axes.set_ylabel(f"films, lanes {lane_v:.2g} V apart", fontsize=8)
@@ -196,10 +114,11 @@ def _draw_status(axes: Axes, heard: Heard, slips: Stretches) -> None:
     bars = [("decided", 1, max(known_s, heard.view[0]), slips)]
     if heard.is_known:
         bars.append(("truth", 0, heard.view[0], heard.sliding_s))
-    for _, level, start_s, stretches in bars:
-        axes.barh(level, heard.view[1] - start_s, 0.7, left=start_s, color=REST, linewidth=0)
-        for start, end in _clipped(heard, stretches):
-            axes.barh(level, end - start, 0.7, left=start, color=SLIP, linewidth=0)
+    for name, level, start_s, stretches in bars:
+        whole = [(start_s, heard.view[1])]
+        for colour, own in ((REST, whole), (SLIP, _clipped(heard, stretches))):
+            beams = [(start, end - start) for start, end in own]
+            axes.broken_barh(beams, (level - 0.35, 0.7), facecolor=colour, gid=f"{name} {colour}")
     axes.set_yticks([bar[1] for bar in bars], [bar[0] for bar in bars], fontsize=8)
     axes.set_ylim(0.5 - 0.5 * len(bars) + 0.5 * (len(bars) == 1), 1.5)
 
@@ -207,10 +126,8 @@ def _draw_status(axes: Axes, heard: Heard, slips: Stretches) -> None:
 def _draw_probability(axes: Axes, heard: Heard) -> None:
     times, probability = heard.probability
     axes.plot(times, probability, color=_INK, linewidth=0.8, drawstyle="steps-post")
-    for onset in _seen(heard, heard.onsets_s):
-        axes.axvline(onset, **_ONSET)
-    for estimate in _seen(heard, [estimate for _, estimate in heard.alarms]):
-        axes.axvline(estimate, **_ESTIMATE)
+    _mark(axes, heard, heard.onsets_s, "onset", **_ONSET)
+    _mark(axes, heard, [estimate for _, estimate in heard.alarms], "estimate", **_ESTIMATE)
     axes.set_ylim(-0.04, 1.04)
     axes.set_yticks([0, 0.5, 1])
     axes.grid(axis="y", color="#E4E4E4", linewidth=0.6)
@@ -231,6 +148,19 @@ def _legend(heard: Heard, has_invalid: bool) -> list[Any]:
     return handles
 
 
+def _mark(axes: Axes, heard: Heard, times: Sequence[float], name: str, **style: Any) -> None:
+    """Lines from top to bottom, the finer the more there are."""
+    seen = _seen(heard, times)
+    width = _WIDTH * min(1.0, _ROOM / max(len(seen), 1)) ** 0.5
+    through = axes.get_xaxis_transform()
+    axes.vlines(seen, 0, 1, transform=through, linewidth=max(width, 0.2), gid=name, **style)
+
+
+def _shade(axes: Axes, stretches: Stretches, name: str, **style: Any) -> None:
+    beams = [(start, end - start) for start, end in stretches]
+    axes.broken_barh(beams, (0, 1), transform=axes.get_xaxis_transform(), gid=name, **style)
+
+
 def _seen(heard: Heard, times: Sequence[float]) -> list[float]:
     return [time for time in times if heard.view[0] <= time <= heard.view[1]]
 
@@ -239,7 +169,3 @@ def _clipped(heard: Heard, stretches: Stretches) -> Stretches:
     first, last = heard.view
     cut = [(max(start, first), min(end, last)) for start, end in stretches]
     return [(start, end) for start, end in cut if end > start]
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
