@@ -1,0 +1,409 @@
+"""Alarms against onsets, held against a loop over milliseconds, and the numbers of many."""
+
+import json
+import math
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.onset.events import (
+    PAPER_SCENE,
+    EventRules,
+    LatencyParts,
+    Watched,
+    event_metrics,
+    pooled_metrics,
+    recording_events,
+)
+
+LATENCY = LatencyParts(look_ahead_s=0.0125, bin_s=0.05)
+RULES = EventRules(settle_s=0.1)
+QUICK = {"num_resamples": 50}
+
+
+def watched(alarms=(), onsets=(1.0,), slides=None, speeds=None, **more):
+    slides = slides or tuple((onset, onset + 2.0) for onset in onsets)
+    facts = {"recording": "a", "material": "M1", "scene": "paper", "duration_s": 10.0}
+    facts |= {"alarms_s": tuple(alarms), "onset_estimates_s": (), "onsets_s": tuple(onsets)}
+    facts |= {"sliding_s": slides, "speeds_mm_s": speeds or (20.0,) * len(onsets)}
+    return Watched(**(facts | more))
+
+
+def outcomes(*args, rules=RULES, **more):
+    events = recording_events(watched(*args, **more), rules, LATENCY)
+    return [onset.outcome for onset in events.onsets]
+
+
+def false_alarms(*args, rules=RULES, **more):
+    return recording_events(watched(*args, **more), rules, LATENCY).false_alarms_s
+
+
+# ------------------------------------------------------------------------------------ by loops
+def random_recording(rng, number=0):
+    """Everything in whole milliseconds: slides apart, alarms anywhere, stretches or the whole."""
+    duration = 4000
+    edges = np.sort(rng.choice(np.arange(100, duration - 100), 6, replace=False))
+    slides = [(int(a), int(b)) for a, b in edges.reshape(3, 2)][: rng.integers(0, 4)]
+    alarms = sorted(rng.choice(duration, rng.integers(0, 14), replace=False).tolist())
+    if slides and rng.random() < 0.5:
+        near = slides[0][0] + int(rng.integers(-250, 600))
+        alarms = sorted({*alarms, max(near, 0)})
+    ends = None
+    if rng.random() < 0.6:
+        later = [*alarms, 10**6][1:]
+        ends = [
+            int(rng.integers(a + 1, min(b, a + 900) + 1))
+            for a, b in zip(alarms, later, strict=True)
+        ]
+    stretches = None
+    if rng.random() < 0.5:
+        cuts = np.sort(rng.choice(duration, 4, replace=False)).tolist()
+        stretches = [(cuts[0], cuts[1]), (cuts[2], cuts[3])]
+    speeds = rng.choice([20.0, 40.0, 60.0], len(slides)).tolist()
+    made = {"alarms": alarms, "ends": ends, "slides": slides, "stretches": stretches}
+    return made | {"duration": duration, "speeds": speeds, "number": number}
+
+
+def as_watched(made, shift_s=0.0):
+    def s(times):
+        return tuple(time / 1000 + shift_s for time in times)
+
+    return Watched(
+        recording=f"{made['number']}",
+        material=f"M{made['number'] % 3}",
+        scene="paper",
+        duration_s=made["duration"] / 1000,
+        alarms_s=s(made["alarms"]),
+        onset_estimates_s=s(
+            [alarm - 7 * (place % 3) for place, alarm in enumerate(made["alarms"])]
+        ),
+        onsets_s=s([start for start, _ in made["slides"]]),
+        sliding_s=tuple(s(slide) for slide in made["slides"]),
+        speeds_mm_s=tuple(made["speeds"]),
+        watched_s=tuple(s(stretch) for stretch in made["stretches"] or ()),
+        alarm_ends_s=() if made["ends"] is None else s(made["ends"]),
+    )
+
+
+def by_loops(made, found=500, early=200, settle=100):
+    """The definitions, word by word, in whole milliseconds."""
+
+    def is_seen(t):
+        return made["stretches"] is None or any(a <= t <= b for a, b in made["stretches"])
+
+    windows = [(start - early, stop + settle) for start, stop in made["slides"]]
+    alarms = [
+        (alarm, None if made["ends"] is None else made["ends"][place])
+        for place, alarm in enumerate(made["alarms"])
+        if is_seen(alarm)
+    ]
+    of, false = Counter(), []
+    for alarm, _ in alarms:
+        holding = [i for i, (a, b) in enumerate(windows) if a <= alarm <= b]
+        if holding:
+            of[max(holding)] += 1
+        else:
+            false.append(alarm)
+    told = []
+    for i, (onset, _) in enumerate(made["slides"]):
+        if not is_seen(onset):
+            continue
+        before = [(alarm, end) for alarm, end in alarms if alarm < onset]
+        is_early = False
+        if before:
+            alarm, end = before[-1]
+            is_early = onset - alarm <= early and (end is None or end > onset)
+        hits = [
+            alarm
+            for alarm, _ in alarms
+            if onset <= alarm <= onset + found
+            and alarm <= windows[i][1]
+            and not any(onset < other <= alarm for other, _ in made["slides"])
+        ]
+        outcome = "early" if is_early else "found" if hits else "missed"
+        told.append((outcome, of[i], hits[0] - onset if outcome == "found" else None))
+    quiet = 0
+    for t in range(made["duration"]):  # the millisecond from t to t + 1
+        inside = made["stretches"] is None or any(a <= t < b for a, b in made["stretches"])
+        quiet += inside and not any(a <= t < b for a, b in windows)
+    return told, false, quiet
+
+
+@pytest.mark.parametrize("part", range(8))
+def test_every_onset_and_alarm_is_judged_as_the_loops_do(part, rng):
+    seen = Counter()
+    for number in range(40):
+        made = random_recording(rng, number)
+        told, false, quiet = by_loops(made)
+        events = recording_events(as_watched(made), RULES, LATENCY)
+        got = [(o.outcome, o.num_alarms) for o in events.onsets]
+        assert got == [(outcome, num) for outcome, num, _ in told], made
+        for onset, (_, _, delay) in zip(events.onsets, told, strict=True):
+            assert onset.delay_s == delay / 1000 if delay is not None else math.isnan(onset.delay_s)
+        assert [round(1000 * alarm) for alarm in events.false_alarms_s] == false, made
+        assert events.quiet_s == pytest.approx(quiet / 1000, abs=1e-9), made
+        seen.update(outcome for outcome, _, _ in told)
+    assert min(seen[outcome] for outcome in ("found", "early", "missed")) >= 3
+
+
+def test_numbers_of_many_are_sums_of_what_the_loops_count(rng):
+    made = [random_recording(rng, number) for number in range(60)]
+    told = [by_loops(one) for one in made]
+    metrics = event_metrics([as_watched(one) for one in made], RULES, LATENCY, **QUICK)
+    onsets = [onset for one, _, _ in told for onset in one]
+    counts = Counter(outcome for outcome, _, _ in onsets)
+    for outcome in ("found", "early", "missed"):
+        assert metrics[f"num_{outcome}"] == counts[outcome] > 0
+        assert metrics[outcome]["value"] == pytest.approx(counts[outcome] / len(onsets))
+    assert metrics["num_onsets"] == len(onsets) == sum(counts.values())
+    false, quiet_ms = sum(len(f) for _, f, _ in told), sum(q for _, _, q in told)
+    assert metrics["num_false_alarms"] == false
+    assert metrics["quiet_hours"] == pytest.approx(quiet_ms / 3.6e6)
+    assert metrics["false_alarms_per_minute"]["value"] == pytest.approx(false / (quiet_ms / 6e4))
+    per_hour = {end: 60 * v for end, v in metrics["false_alarms_per_minute"].items()}
+    assert metrics["false_alarms_per_hour"] == pytest.approx(per_hour)
+    alarms = sum(num for _, num, _ in onsets)
+    assert metrics["alarms_per_slip"]["value"] == pytest.approx(alarms / len(onsets))
+    delays = np.array([delay for _, _, delay in onsets if delay is not None])
+    assert metrics["delay_ms"]["median"]["value"] == pytest.approx(np.median(delays))
+    assert metrics["delay_ms"]["p95"]["value"] == pytest.approx(np.quantile(delays, 0.95))
+    steps = np.quantile(delays, np.arange(21) / 20)
+    np.testing.assert_allclose(metrics["delay_ms"]["quantiles"], steps, rtol=1e-12)
+    json.dumps(metrics, allow_nan=False)
+
+
+def test_order_and_shift_change_no_bit(rng):
+    made = [random_recording(rng, number) for number in range(20)]
+    for one in made:  # of the whole, a shift would add a time in front
+        one["stretches"] = one["stretches"] or [(0, one["duration"])]
+    before = event_metrics([as_watched(one) for one in made], RULES, LATENCY, **QUICK)
+    turned = event_metrics([as_watched(one) for one in made[::-1]], RULES, LATENCY, **QUICK)
+    shifted = [as_watched(one, shift_s=1234.5678) for one in made]
+    assert turned == before
+    assert list(turned["per_material"]) == list(before["per_material"])
+    assert event_metrics(shifted, RULES, LATENCY, **QUICK) == before
+
+
+# ---------------------------------------------------------------------------------------- edges
+EDGES = {
+    0.799: ("missed", True),
+    0.8: ("early", False),
+    0.999: ("early", False),
+    1.0: ("found", False),
+    1.5: ("found", False),
+    1.5000001: ("missed", False),
+    3.1: ("missed", False),
+    3.1000001: ("missed", True),
+}
+
+
+@pytest.mark.parametrize("alarm", EDGES)
+def test_an_alarm_at_an_edge(alarm):
+    outcome, is_false = EDGES[alarm]
+    assert outcomes([alarm]) == [outcome]
+    assert false_alarms([alarm]) == ((alarm,) if is_false else ())
+
+
+def test_rounding_moves_no_alarm_over_an_edge():
+    assert 0.9 < 1.1 - 0.2  # as floats see it
+    assert outcomes([0.9], [1.1]) == ["early"]
+    assert 0.18 + 0.5 < 0.68
+    assert outcomes([0.68], [0.18]) == ["found"]
+
+
+def test_an_early_alarm_counts_only_while_its_status_holds():
+    for ends, outcome in (((0.95,), "missed"), ((1.0,), "missed"), ((1.001,), "early")):
+        assert outcomes([0.9], alarm_ends_s=ends) == [outcome]
+        assert false_alarms([0.9], alarm_ends_s=ends) == ()  # nor is it false
+    assert outcomes([0.9, 1.1], alarm_ends_s=(0.95, math.inf)) == ["found"]
+    assert outcomes([0.9, 1.1], alarm_ends_s=(1.05, math.inf)) == ["early"]
+    assert outcomes([0.9, 1.1]) == ["early"]  # ends not known: until the next
+    assert outcomes([0.81, 0.9], alarm_ends_s=(0.85, 0.95)) == ["missed"]
+
+
+def test_a_status_that_always_stands_finds_nothing():
+    slips = (1.0, 4.0, 7.0)
+    assert outcomes([0.0], slips) == ["missed"] * 3
+    assert false_alarms([0.0], slips) == (0.0,)
+
+
+def test_alarms_between_slides_are_false_and_several_of_one_slip_are_not():
+    alarms = (1.1, 1.4, 2.9, 3.05, 3.5, 4.2, 5.1)
+    events = recording_events(watched(alarms, (1.0, 5.0)), RULES, LATENCY)
+    assert events.false_alarms_s == (3.5, 4.2)
+    assert [onset.num_alarms for onset in events.onsets] == [4, 1]
+    metrics = event_metrics([watched(alarms, (1.0, 5.0))], RULES, LATENCY, **QUICK)
+    assert metrics["alarms_per_slip"]["value"] == 2.5
+    # 10 s but 0.8 to 3.1 and 4.8 to 7.1
+    assert metrics["false_alarms_per_minute"]["value"] == pytest.approx(60 * 2 / 5.4)
+
+
+def test_a_short_slide_is_found_while_it_lasts_and_settles():
+    slides = ((1.0, 1.05),)
+    assert outcomes([1.15], slides=slides) == ["found"]
+    assert outcomes([1.16], slides=slides) == ["missed"]
+    assert false_alarms([1.16], slides=slides) == (1.16,)
+
+
+def test_an_alarm_behind_the_next_onset_does_not_find_the_slip_before():
+    onsets, slides = (1.0, 1.12), ((1.0, 1.1), (1.12, 2.0))
+    assert outcomes([1.15], onsets, slides) == ["missed", "found"]
+    assert outcomes([1.1], onsets, slides) == ["found", "early"]
+
+
+def test_the_settling_time_is_of_bin_and_look_ahead_unless_it_is_given():
+    last = 3.0 + 0.05 + 0.0125 + 0.05
+    for alarm, expected in ((last, ()), (last + 1e-6, (last + 1e-6,))):
+        assert false_alarms([alarm], rules=EventRules()) == expected
+    assert false_alarms([3.3], rules=EventRules(settle_s=0.4)) == ()
+
+
+def test_only_what_was_watched_counts():
+    stretches = ((0.9, 1.3), (5.0, 6.0))
+    alarms, onsets = (0.5, 1.2, 2.0, 4.05, 5.5), (1.0, 4.0)
+    slides = ((1.0, 2.0), (4.0, 4.5))
+    events = recording_events(watched(alarms, onsets, slides, watched_s=stretches), RULES, LATENCY)
+    assert [(onset.outcome, onset.num_alarms) for onset in events.onsets] == [("found", 1)]
+    assert events.false_alarms_s == (5.5,)
+    assert events.quiet_s == 1.0
+    reaching = watched((), onsets, slides, watched_s=((4.3, 5.0),))  # 4.3 to 4.6 is of a slip
+    assert recording_events(reaching, RULES, LATENCY).quiet_s == pytest.approx(0.4)
+
+
+# ----------------------------------------------------------------------------------- the numbers
+def test_nothing_to_say_is_none_and_never_a_quotient_of_zeros():
+    no_time = watched([1.1], watched_s=((0.9, 2.0),))
+    metrics = event_metrics([no_time], RULES, LATENCY, **QUICK)
+    assert metrics["false_alarms_per_minute"] is metrics["false_alarms_per_hour"] is None
+    assert metrics["found"]["value"] == 1.0
+    no_onset = watched([1.1, 2.2], ())
+    metrics = event_metrics([no_onset], RULES, LATENCY, **QUICK)
+    names = ("found", "early", "missed", "alarms_per_slip", "delay_ms", "latency_ms")
+    assert [metrics[name] for name in (*names, "onset_error_ms")] == [None] * 7
+    assert metrics["false_alarms_per_minute"]["value"] == pytest.approx(12.0)
+    assert metrics["per_speed"] == {}
+    missed = event_metrics([watched()], RULES, LATENCY, **QUICK)
+    assert missed["missed"]["value"] == 1.0
+    assert missed["delay_ms"] is missed["latency_ms"] is None
+    nothing = pooled_metrics([], **QUICK)
+    assert nothing["num_recordings"] == 0
+    assert nothing["found"] is nothing["false_alarms_per_hour"] is None
+    for one in (metrics, missed, nothing):
+        json.dumps(one, allow_nan=False)
+
+
+def test_a_delay_is_the_sum_of_its_parts(rng):
+    many = []
+    for number in range(30):
+        positive = 1 + rng.uniform(0.02, 0.2)
+        alarm = positive + rng.uniform(0, 0.1)
+        many.append(watched([alarm], first_positive_s=(positive,), recording=str(number)))
+    timed = replace(LATENCY, compute_s=0.002)
+    metrics = event_metrics(many, RULES, timed, **QUICK)
+    parts = metrics["latency_ms"]
+    alarms = np.array([one.alarms_s[0] for one in many])
+    positives = np.array([one.first_positive_s[0] for one in many])
+    assert parts["look_ahead"] == pytest.approx(12.5)
+    assert parts["bin_fill"] == pytest.approx(1000 * (positives - 1).mean() - 12.5)
+    assert parts["decision"] == pytest.approx(1000 * (alarms - positives).mean())
+    assert parts["delay"] == pytest.approx(1000 * (alarms - 1).mean())
+    assert parts["compute"] == pytest.approx(2.0)
+    assert event_metrics(many, RULES, LATENCY, **QUICK)["latency_ms"]["compute"] is None
+
+
+@pytest.mark.parametrize("positive", [(), (math.nan,), (1.4,)], ids=["unknown", "none", "later"])
+def test_without_a_decision_before_the_alarm_all_of_the_delay_is_bin_fill(positive):
+    one = watched([1.3], first_positive_s=positive)
+    (onset,) = recording_events(one, RULES, LATENCY).onsets
+    assert (onset.delay_s, onset.decision_s) == (0.3, 0.0)
+    assert onset.bin_fill_s == pytest.approx(0.3 - 0.0125)
+
+
+def test_estimates_are_held_against_the_onsets_found(rng):
+    away = rng.normal(0.004, 0.02, 40)
+    many = [
+        watched((0.1, 1.1), onset_estimates_s=(0.05, 1 + error), recording=str(number))
+        for number, error in enumerate(away)
+    ]
+    error = event_metrics(many, RULES, LATENCY, **QUICK)["onset_error_ms"]
+    expected = {"median": np.median(away), "sd": away.std(), "mean_abs": np.abs(away).mean()}
+    for name, value in expected.items():
+        assert error[name]["value"] == pytest.approx(1000 * value, rel=1e-5), name
+        assert error[name]["low"] < error[name]["value"] < error[name]["high"], name
+
+
+def test_groups_are_the_numbers_of_their_own_recordings(rng):
+    many = [as_watched(random_recording(rng, number)) for number in range(45)]
+    metrics = event_metrics(many, RULES, LATENCY, **QUICK)
+    groups = ("per_material", "per_speed", "per_scene")
+
+    def alone(own):
+        numbers = event_metrics(own, RULES, LATENCY, **QUICK)
+        return {name: of for name, of in numbers.items() if name not in (*groups, "level")}
+
+    assert list(metrics["per_material"]) == ["M0", "M1", "M2"]
+    for material, numbers in metrics["per_material"].items():
+        assert numbers == alone([one for one in many if one.material == material])
+    assert metrics["per_scene"] == {"paper": alone(many)}
+    speeds = metrics["per_speed"]
+    assert list(speeds) == ["20", "40", "60"]
+    for name in ("num_onsets", "num_found", "num_early", "num_missed"):
+        assert sum(numbers[name] for numbers in speeds.values()) == metrics[name]
+    for numbers in speeds.values():  # nobody slides at a false alarm
+        assert numbers["false_alarms_per_minute"] is None
+    delays = [
+        1000 * onset.delay_s
+        for one in many
+        for onset in recording_events(one, RULES, LATENCY).onsets
+        if onset.outcome == "found" and onset.speed_mm_s == 40.0
+    ]
+    assert speeds["40"]["delay_ms"]["median"]["value"] == pytest.approx(np.median(delays))
+
+
+def test_of_several_scenes_materials_and_speeds_are_of_the_papers():
+    many = [watched([1.1], recording="a"), watched([1.1, 9.0], recording="b")]
+    tapped = watched([2.0, 3.0, 9.5], (), scene="taps", material="M2", recording="c")
+    metrics = event_metrics([*many, tapped], RULES, LATENCY, **QUICK)
+    alone = event_metrics(many, RULES, LATENCY, **QUICK)
+    assert metrics["per_material"] == alone["per_material"]
+    assert metrics["per_speed"] == alone["per_speed"]
+    assert list(metrics["per_scene"]) == ["paper", "taps"]
+    assert metrics["per_scene"]["taps"]["num_false_alarms"] == 3
+    assert metrics["num_false_alarms"] == 4
+    assert RecordingId.scene == PAPER_SCENE
+
+
+def test_the_same_recording_of_two_detectors_is_drawn_as_one():
+    """Else pooling a recording with itself would make its intervals narrower."""
+    many = [watched([1.0 + 0.01 * n], recording=str(n)) for n in range(1, 12)]
+    events = [recording_events(one, RULES, LATENCY) for one in many]
+    once = pooled_metrics(events, **QUICK)
+    twice = pooled_metrics([*events, *events], **QUICK)
+    assert twice["num_recordings"] == once["num_recordings"] == 11
+    assert twice["num_onsets"] == 2 * once["num_onsets"]
+    median = twice["delay_ms"]["median"]
+    assert median == pytest.approx(once["delay_ms"]["median"])
+    assert twice["alarms_per_slip"] == pytest.approx(once["alarms_per_slip"])
+
+
+# ---------------------------------------------------------------------------------------- errors
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"speeds_mm_s": (20.0, 40.0)}, "speeds_mm_s has 2 entries for 1 onsets and 2 alarms"),
+        ({"sliding_s": ()}, "sliding_s has 0 entries"),
+        ({"onset_estimates_s": (1.0,)}, "onset_estimates_s has 1 entries"),
+        ({"alarm_ends_s": (1.0,)}, "alarm_ends_s has 1 entries"),
+        ({"first_positive_s": (1.0, 2.0)}, "first_positive_s has 2 entries"),
+        ({"alarms_s": (1.2, 1.1)}, "alarms_s must ascend"),
+        ({"alarms_s": (1.2, math.nan)}, "alarms_s must ascend"),
+        ({"watched_s": ((2.0, 1.0),)}, "watched_s must ascend"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(changes, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        replace(watched([1.1, 1.2]), **changes)
+    assert "\n" not in str(caught.value)
