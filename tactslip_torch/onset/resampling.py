@@ -39,8 +39,8 @@ class Draws(NamedTuple):
 class Resampled:
     """A set of recordings and its draws.
 
-    For shares and rates the score interval of independent events is taken where it reaches further:
-    no miss among a few slips is no proof of none.
+    An interval always holds its value. For shares and rates the score interval of independent
+    events is taken where it reaches further: no miss among a few slips is no proof of none.
 
     Args:
         num_recordings: in the set.
