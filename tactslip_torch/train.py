@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import hydra
 import lightning as L
@@ -19,6 +19,7 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig
 
+from tactslip_torch.alarming.stage import Alarming
 from tactslip_torch.config import (
     conf_dir,
     errors_in_one_line,
@@ -45,6 +46,9 @@ from tactslip_torch.files import whole_file
 from tactslip_torch.judging import event_numbers, together
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.judgement import Judgement
+from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
+from tactslip_torch.onset.scoring import Scorer
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.report.scores import merged_metrics, summed_metrics
@@ -96,6 +100,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
     recipe.check_pool(len(pool.names))
+    alarming: Alarming | None = instantiate(config.onset, _convert_="all") or None
     is_first = is_first_process()
     if is_first:
         save_config(config, folder)
@@ -106,7 +111,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             place = folder if len(folds) == 1 else folder / fold.name
             data = SlipDataModule(maker, fold, config.num_workers)
             learner = SlipLearner(pool, channel_filter, recipe)
-            fold_metrics[fold.name] = _run_fold(config, place, data, learner)
+            fold_metrics[fold.name] = _run_fold(config, place, data, learner, alarming)
     metrics = common_facts(source, pool, config) | _combined(fold_metrics, are_rivals(folds))
     metrics["timing_s"]["total"] = time.perf_counter() - started
     by_name = {str(name): name for name in pool.names}
@@ -127,9 +132,13 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
 
 
 def _run_fold(
-    config: DictConfig, folder: Path, data: SlipDataModule, learner: SlipLearner
+    config: DictConfig,
+    folder: Path,
+    data: SlipDataModule,
+    learner: SlipLearner,
+    alarming: Alarming | None,
 ) -> dict[str, Any]:
-    """Fit, test, save and export one fold; what it found."""
+    """Fit, test, set the alarm of, save and export one fold; what it found."""
     source = data.maker.source
     trainer = make_trainer(config.trainer, folder, [SaveAfterFirstPass(folder)])
     checkpoint = _checkpoint(config.ckpt_path, data.split)
@@ -154,19 +163,39 @@ def _run_fold(
         "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
     }
     onnx: dict[str, float] | str | None = None
+    alarm: dict[str, Any] = {}
+    if trainer.is_global_zero and alarming is not None:
+        alarm = alarming(detector, _rivals(detector), config.num_workers)
+    told = time.perf_counter()
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")
         onnx = _export(detector, folder / "model.onnx") if config.export else None
     seconds = dict(learner.seconds)
-    seconds |= {"test_pass": tested - started, "save_export": time.perf_counter() - tested}
+    seconds["test_pass"] = tested - started
+    if alarming is not None:
+        seconds["alarm"] = told - tested
+    seconds["save_export"] = time.perf_counter() - told
+    events = {**learner.metrics.get("events", {}), **alarm.pop("events", {})}
     return {
         **learner.metrics,
+        "events": events,
+        **({"alarm": alarm} if alarm else {}),
         "recording_events": learner.events,  # for _combined
         **learner.facts,
         "selected": [str(name) for name in detector.selected_names],
         "onnx": onnx,
         "timing_s": seconds,
         "worker_s": learner.worker_seconds,
+    }
+
+
+def _rivals(detector: SlipDetector) -> dict[str, Scorer]:
+    """The methods that the paper argues against, on the detector's hand, filter and bins."""
+    return {
+        name.replace("_", " "): BaselineDetector(
+            name, detector.pool, detector.channel_filter, Judgement
+        )
+        for name in get_args(BaselineName)
     }
 
 

@@ -43,7 +43,7 @@ class Decisions(NamedTuple):
         available_s: when it can be made, ``[m]``, float64.
         onset_s: when the slip began that it speaks of, as far as it can tell, ``[*, m]``, float64.
         score: at least 0 is slip, ``[*, m]``.
-        llr: log likelihood ratio; ``NEUTRAL`` where the decision is not valid, ``[*, m]``.
+        llr: log likelihood ratio; ``NEUTRAL`` where the score tells nothing, ``[*, m]``.
         probability: of slip, by the bin alone, ``[*, m]``.
         statistic: of the rule, ``[*, m]``.
         is_valid: whether every channel in use could be trusted, ``[*, m]``.
@@ -113,11 +113,17 @@ class Decider:
         self._number = 0  # Python's integers do not end
         self._state: tuple[Tensor, Latch, Tensor] | None = None
 
-    def decide(self, score: Tensor, is_valid: Tensor) -> Decisions:
+    def decide(self, score: Tensor, is_valid: Tensor, is_usable: Tensor | None = None) -> Decisions:
         """The next decisions.
 
+        Args:
+            score: of bins, in order.
+            is_valid: whether every channel in use could be trusted; handed on.
+            is_usable: whether the score tells anything (``is_usable``); where not, the evidence is
+                ``NEUTRAL``. By default ``is_valid``.
+
         Shape:
-            - score, is_valid: ``[*, m]``; m may be 0, the streams ``*`` are always the same
+            - all: ``[*, m]``; m may be 0, the streams ``*`` are always the same
         """
         settings = self.settings
         if self._state is None:
@@ -126,7 +132,8 @@ class Decider:
             self._state = settings.rule.start(like), latch_start(like), none
         of_rule, of_latch, run = self._state
         llr = settings.calibration.llr(score)
-        llr = torch.where(is_valid & llr.isfinite(), llr, NEUTRAL)
+        tells = is_valid if is_usable is None else is_usable
+        llr = torch.where(tells & llr.isfinite(), llr, NEUTRAL)
         statistic, of_rule = settings.rule.scan(llr, of_rule)
         is_alarm, is_on, of_latch = latch(
             statistic,
@@ -167,3 +174,17 @@ def _run_starts(llr: Tensor, number: Tensor, before: Tensor) -> Tensor:
     """
     starts = torch.where(llr > 0, before[..., None], number + 1)
     return starts.cummax(-1).values if len(number) else starts
+
+
+def is_usable(score: Tensor, is_missing: Tensor, needed_index: Tensor) -> Tensor:
+    """Whether a score tells anything: it is finite, and some channel in use was there.
+
+    A hand that lost a sensor goes on feeling with the others: typical features stand in, the
+    decision is flagged as not valid and still counts. One that lost them all feels nothing.
+
+    Shape:
+        - score, output: ``[*]``
+        - is_missing: ``[*, C]``
+        - needed_index: ``[channels in use]``
+    """
+    return score.isfinite() & ~is_missing.index_select(-1, needed_index).all(-1)

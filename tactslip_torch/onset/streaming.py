@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decider import Decider, Decisions
+from tactslip_torch.onset.decider import Decider, Decisions, is_usable
 from tactslip_torch.onset.scoring import score_filtered
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.signals.stream import FilterStream, SampleClock
@@ -228,7 +228,8 @@ class StreamingDetector:
         hop = self.settings.hop_samples
         with torch.no_grad():
             scores = score_filtered(self.detector, self._filtered, hop, self.dtype)
-            decisions = self._decider.decide(scores.score, scores.is_valid)
+            tells = is_usable(scores.score, scores.is_missing, self.detector.needed_index)
+            decisions = self._decider.decide(scores.score, scores.is_valid, tells)
         self._number += len(decisions.number)
         self._due = int(self._samples_for(np.array(self._number)))
         self._drop()

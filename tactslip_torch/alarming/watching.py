@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from tactslip_torch.data.recording import RecordingId, RecordingSource
+from tactslip_torch.onset.decider import Decider, Decisions, is_usable
+from tactslip_torch.onset.events import Watched
 from tactslip_torch.onset.scoring import Scorer, score_stream
+from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.workers import in_processes
 
 Array = NDArray[Any]
+
+_AT_ONCE = 256
+"""Streams decided together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +37,7 @@ class Stream:
         speeds_mm_s: of each stroke.
         score: of every detector by name, ``[N]``, float32.
         is_valid: whether that is to be relied on, ``[N]``.
+        is_usable: whether it tells anything: some channel in use was there, ``[N]``.
     """
 
     recording: RecordingId
@@ -38,6 +47,7 @@ class Stream:
     speeds_mm_s: tuple[float, ...]
     score: Mapping[str, Array]
     is_valid: Mapping[str, Array]
+    is_usable: Mapping[str, Array]
 
 
 @dataclass(frozen=True)
@@ -122,4 +132,71 @@ def _watched(
         loaded.speeds_mm_s,
         {name: scores.score.float().numpy() for name, scores in found.items()},
         {name: scores.is_valid.numpy() for name, scores in found.items()},
+        {
+            name: is_usable(scores.score, scores.is_missing, scorers[name].needed_index).numpy()
+            for name, scores in found.items()
+        },
+    )
+
+
+def slip_bins(stream: Stream, clock: Clock, num: int) -> tuple[Array, Array]:
+    """Which of the first decisions are wholly of one kind, and whether that is slip, ``[num]``.
+
+    A bin is slip if it lies in a slide, and non-slip if it meets none; what straddles is neither.
+    """
+    start = clock.starts_s(num)
+    end = start + clock.bin_s
+    slides = np.asarray(stream.sliding_s, dtype=np.float64).reshape(-1, 2)
+    is_slip = ((start[:, None] >= slides[:, 0]) & (end[:, None] <= slides[:, 1])).any(-1)
+    meets = ((end[:, None] > slides[:, 0]) & (start[:, None] < slides[:, 1])).any(-1)
+    return np.asarray(is_slip | ~meets), np.asarray(is_slip)
+
+
+def decide(
+    streams: Sequence[Stream], scorer: str, settings: AlarmSettings, clock: Clock
+) -> Iterator[tuple[Stream, Decisions]]:
+    """What a detector decides in each stream; those of one length are decided together.
+
+    ``settings.hop_samples`` may be a multiple of the clock's hop: so many decisions are left out.
+
+    Yields:
+        Every stream with its decisions, in order of length.
+    """
+    step = settings.hop_samples // clock.hop_samples
+    groups: dict[int, list[Stream]] = {}
+    for stream in streams:
+        groups.setdefault(len(stream.score[scorer][::step]), []).append(stream)
+    for _, group in sorted(groups.items()):
+        for start in range(0, len(group), _AT_ONCE):
+            part = group[start : start + _AT_ONCE]
+            rows = np.stack([stream.score[scorer][::step] for stream in part])
+            valid = np.stack([stream.is_valid[scorer][::step] for stream in part])
+            usable = np.stack([stream.is_usable[scorer][::step] for stream in part])
+            decider = Decider(settings, clock.sample_rate_hz, clock.bin_samples, clock.look_ahead)
+            made = decider.decide(*map(torch.from_numpy, (rows, valid, usable)))
+            for place, stream in enumerate(part):
+                own = (part[place] if part.ndim > 1 else part for part in made)
+                yield stream, Decisions(*own)
+
+
+def watched(stream: Stream, decisions: Decisions) -> Watched:
+    """The alarms of a stream beside what is true of it."""
+    available_s = decisions.available_s.numpy()
+    raised = np.flatnonzero(decisions.is_alarm.numpy())
+    off = np.append(np.flatnonzero(~decisions.is_on.numpy()), len(available_s))
+    ends = off[np.searchsorted(off, raised)]
+    speaks = available_s[np.flatnonzero(decisions.llr.numpy() > 0)]
+    following = np.append(speaks, math.nan)[np.searchsorted(speaks, stream.onsets_s)]
+    return Watched(
+        recording=str(stream.recording),
+        material=stream.recording.material,
+        scene=stream.recording.scene,
+        duration_s=stream.duration_s,
+        alarms_s=tuple(available_s[raised].tolist()),
+        onset_estimates_s=tuple(decisions.onset_s.numpy()[raised].tolist()),
+        onsets_s=stream.onsets_s,
+        sliding_s=stream.sliding_s,
+        speeds_mm_s=stream.speeds_mm_s,
+        first_positive_s=tuple(following.tolist()),
+        alarm_ends_s=tuple(np.append(available_s, math.inf)[ends].tolist()),
     )

@@ -1,0 +1,201 @@
+"""Ways to alarm, set on recordings that calibrate: calibration, threshold, lead."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tactslip_torch.alarming.watching import Clock, Stream, decide, slip_bins, watched
+from tactslip_torch.model.calibration import Calibration, fit_isotonic, fit_platt
+from tactslip_torch.onset.events import EventRules
+from tactslip_torch.onset.rate import Threshold, choose_threshold
+from tactslip_torch.onset.sequential import Cusum, KOfN, Rule
+from tactslip_torch.onset.settings import AlarmSettings
+
+CEILING = 1.5
+"""Largest sum of ``Cusum`` in thresholds: what lies above only takes time to come down."""
+
+FITS: Mapping[str, Callable[[Tensor, Tensor], Calibration]] = {
+    "platt": fit_platt,
+    "isotonic": fit_isotonic,
+}
+"""From scores to log likelihood ratios."""
+
+
+class Method(NamedTuple):
+    """A way to alarm: whose scores, by which settings, and how its threshold was found.
+
+    Attributes:
+        scorer: the name of the detector that scores.
+        settings: what makes alarms of scores.
+        threshold: None if nothing was set.
+    """
+
+    scorer: str
+    settings: AlarmSettings
+    threshold: Threshold | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The method as plain JSON types."""
+        calibrated = None if self.threshold is None else threshold_facts(self.threshold)
+        return {"scorer": self.scorer, "calibrated": calibrated, **self.settings.to_dict()}
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What thresholds are set for.
+
+    Args:
+        false_alarms_per_hour: at most.
+        slip_free: the scene to count them on.
+        slip_share: how much of a stream is slip, for probabilities.
+        rearm_s: how long a statistic must stay low before the next alarm.
+        refractory_s: shortest time between two alarms.
+        level: of intervals.
+    """
+
+    false_alarms_per_hour: float
+    slip_free: str
+    slip_share: float
+    rearm_s: float
+    refractory_s: float
+    level: float
+
+    def calibrated(
+        self,
+        scorer: str,
+        rule: Rule,
+        calibration: Calibration,
+        streams: Sequence[Stream],
+        clock: Clock,
+    ) -> Method:
+        """A rule with the threshold for the promise, and the lead of its onset estimates.
+
+        Args:
+            scorer: whose scores.
+            rule: what makes statistics of them; a ``Cusum`` without ceiling gets one.
+            calibration: what makes ratios of them.
+            streams: that calibrate, those of the scene without slip among them.
+            clock: of the scores.
+        """
+        settings = AlarmSettings(
+            clock.hop_samples,
+            calibration,
+            rule,
+            math.inf,
+            self.false_alarms_per_hour,
+            self.slip_share,
+            self.rearm_s,
+            self.refractory_s,
+        )
+        quiet = [stream for stream in streams if stream.recording.scene == self.slip_free]
+        threshold = choose_threshold(
+            [made.statistic for _, made in decide(quiet, scorer, settings, clock)],
+            rule,
+            clock.hop_s,
+            self.false_alarms_per_hour,
+            rearm=settings.decisions(self.rearm_s, clock.sample_rate_hz),
+            refractory=settings.decisions(self.refractory_s, clock.sample_rate_hz),
+            level=self.level,
+        )
+        if isinstance(rule, Cusum) and rule.ceiling == math.inf and threshold.value > 0:
+            rule = replace(rule, ceiling=CEILING * threshold.value)
+        settings = replace(settings, rule=rule, threshold=threshold.value)
+        facts = {"slip_free": self.slip_free, "calibrated": threshold_facts(threshold)}
+        lead_s = _lead_s(streams, scorer, settings, clock)
+        return Method(scorer, replace(settings, lead_s=lead_s, facts=facts), threshold)
+
+    def first_transition(self, scorer: str, calibration: Calibration, clock: Clock) -> Method:
+        """The paper's rule: every change of the score to slip is an alarm, one decision a bin.
+
+        There is no threshold but the score's own, and no memory beyond the bin before.
+        """
+        zero = float(calibration.llr(torch.zeros(1, dtype=torch.float32)))
+        is_multiple = clock.bin_samples % clock.hop_samples == 0
+        settings = AlarmSettings(
+            clock.bin_samples if is_multiple else clock.hop_samples,
+            calibration,
+            KOfN(1, 1),
+            zero,
+            self.false_alarms_per_hour,
+            self.slip_share,
+            rearm_s=0,
+            refractory_s=0,
+        )
+        return Method(scorer, settings, None)
+
+
+def methods_of(
+    promise: Promise,
+    rules: Mapping[str, Rule],
+    main: str,
+    fit: str,
+    streams: Sequence[Stream],
+    clocks: Mapping[str, Clock],
+    ours: str,
+    transition: str,
+) -> dict[str, Method]:
+    """Every rule on our scores, the main one on those of the others, and the paper's own.
+
+    Args:
+        promise: what thresholds are set for.
+        rules: by name.
+        main: the rule that the others get too; their methods have their own names.
+        fit: one of ``FITS``.
+        streams: that calibrate.
+        clocks: of every scorer, ours among them.
+        ours: its name.
+        transition: the name of the paper's rule.
+    """
+    methods = {}
+    for scorer, clock in clocks.items():
+        calibration = FITS[fit](*labelled(streams, scorer, clock))
+        for name, rule in rules.items() if scorer == ours else [(scorer, rules[main])]:
+            methods[name] = promise.calibrated(scorer, rule, calibration, streams, clock)
+        if scorer == ours:
+            methods[transition] = promise.first_transition(scorer, calibration, clock)
+    return methods
+
+
+def labelled(streams: Sequence[Stream], scorer: str, clock: Clock) -> tuple[Tensor, Tensor]:
+    """Scores of valid bins that are wholly slip or non-slip, ``[N]``, and which they are."""
+    scores, labels = [np.zeros(0, np.float32)], [np.zeros(0, bool)]
+    for stream in streams:
+        score = stream.score[scorer]
+        is_clear, is_slip = slip_bins(stream, clock, len(score))
+        kept = is_clear & stream.is_valid[scorer]
+        scores.append(score[kept])
+        labels.append(is_slip[kept])
+    return torch.from_numpy(np.concatenate(scores)), torch.from_numpy(np.concatenate(labels))
+
+
+def _lead_s(streams: Sequence[Stream], scorer: str, settings: AlarmSettings, clock: Clock) -> float:
+    """From an onset to where the run of ratios that found it began: the median."""
+    errors = []
+    for stream, decisions in decide(streams, scorer, settings, clock):
+        seen = watched(stream, decisions)
+        for onset_s in seen.onsets_s:
+            later = [
+                estimate - onset_s
+                for alarm, estimate in zip(seen.alarms_s, seen.onset_estimates_s, strict=True)
+                if onset_s <= alarm <= onset_s + EventRules().found_within_s
+            ]
+            errors += later[:1]
+    return statistics.median(errors) if errors else 0.0
+
+
+def threshold_facts(threshold: Threshold) -> dict[str, Any]:
+    """A threshold as JSON types."""
+    return {
+        "value": threshold.value,
+        "target_per_hour": threshold.target_per_hour,
+        "reached": threshold.reached,
+        "rate": dict(vars(threshold.rate)),
+    }
