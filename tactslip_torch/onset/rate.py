@@ -17,7 +17,7 @@ from torch import Tensor
 from tactslip_torch.onset.latch import alarm_counts, count_alarms, joined, stretches
 from tactslip_torch.onset.sequential import Rule
 
-_NUM_RESAMPLES = 4000
+_NUM_RESAMPLES = 2000
 _WORK = 2**26  # threshold times decision, at most, in one stage of the search
 _FEWEST = 32  # thresholds tried of a piece, whatever the work
 
@@ -61,7 +61,7 @@ class Threshold:
     reached: bool
 
 
-def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
+def poisson_interval(count: float, level: float = 0.95) -> tuple[float, float]:
     """The exact central interval of a Poisson mean, given one count.
 
     Raises:
@@ -69,21 +69,23 @@ def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
 
     Reference:
         Garwood (1936), Biometrika 28, 437-442: quantiles of chi-square with ``2 count`` and
-        ``2 count + 2`` degrees of freedom, halved.
+        ``2 count + 2`` degrees of freedom, halved. They make sense between whole counts too.
     """
-    if count < 0:
+    if not 0 <= count < math.inf:
         raise ValueError(f"a count must not be negative, got {count}")
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1, got {level}")
-    tail = torch.tensor((1 - level) / 2, dtype=torch.float64)
+    tail = (1 - level) / 2
 
-    def gamma(shape: int, tail_of: Callable[[Tensor, Tensor], Tensor]) -> Callable[[float], bool]:
-        a = torch.tensor(float(shape), dtype=torch.float64)
-        return lambda mean: bool(tail_of(a, torch.tensor(mean, dtype=torch.float64)) >= tail)
+    def is_past(mean: float, shape: float, tail_of: Callable[[Tensor, Tensor], Tensor]) -> bool:
+        number = torch.tensor([shape, mean], dtype=torch.float64)
+        return bool(tail_of(number[0], number[1]) >= tail)
 
-    low = _first_true(gamma(count, torch.special.gammainc)) if count else 0.0
-    is_above = gamma(count + 1, torch.special.gammaincc)
-    return low, _first_true(lambda mean: not is_above(mean))
+    low = 0.0
+    if count:
+        low = _first_true(lambda mean: is_past(mean, count, torch.special.gammainc))
+    upper = torch.special.gammaincc
+    return low, _first_true(lambda mean: not is_past(mean, count + 1, upper))
 
 
 def _first_true(predicate: Callable[[float], bool]) -> float:
@@ -104,10 +106,11 @@ def alarm_rate(
 ) -> AlarmRate:
     """The rate of alarms over recordings, with an interval that knows of clusters.
 
-    Each end is the farther one of two intervals: percentiles of the rate over resampled recordings,
-    and the exact one of a Poisson count. The first is wide where alarms come in clusters, the
-    second where there are few; recordings that agree more than chance would do not narrow it.
-    Clusters are seen between recordings alone: of one recording only the second speaks.
+    Each end is the farthest of three: the percentile of the rate over resampled recordings, the
+    end of the exact interval of a Poisson count, and that of the count of clusters, as many as
+    make the variance between recordings, times alarms a cluster. The bootstrap alone falls short
+    where few clusters were seen, the Poisson interval wherever there are clusters. Of clusters
+    within one recording nothing is seen, nor of those too rare to have occurred.
 
     Args:
         counts: alarms of each recording.
@@ -135,12 +138,17 @@ def alarm_rate(
             f"got {int(alarms.sum())} alarms in {float(watched.sum()):g} h"
         )
     total, length = int(alarms.sum()), float(watched.sum())
-    low, high = (end / length for end in poisson_interval(total, level))
+    ends = [poisson_interval(total, level)]
     if total and len(alarms) > 1:
+        surplus = (alarms - watched * (total / length)).square().sum() / total
+        size = max(1.0, float(surplus) * len(alarms) / (len(alarms) - 1))  # alarms a cluster
+        low, high = poisson_interval(total / size, level)
+        ends.append((low * size, high * size))
+        tails = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
         rates = torch.cat(list(_resampled(alarms, watched, seed)))
-        ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
-        drawn_low, drawn_high = rates.quantile(ends).tolist()
-        low, high = min(low, drawn_low), max(high, drawn_high)
+        low, high = (rates.quantile(tails) * length).tolist()
+        ends.append((low, high))
+    low, high = min(end[0] for end in ends) / length, max(end[1] for end in ends) / length
     return AlarmRate(total, length, total / length, low, high, level)
 
 
@@ -237,7 +245,7 @@ def _candidates(
     flat: Tensor, recording: Tensor, margin: float, rearm: int, refractory: int, allowed: int
 ) -> Iterator[float]:
     """The threshold sought, and all higher ones tried, upwards, should rounding have misled."""
-    num = max(1024, 64 * (allowed + 1))
+    num = max(1024, 8 * (allowed + 1))
     while True:
         floor = flat.new_tensor(-math.inf)
         if num < len(flat):
@@ -246,7 +254,7 @@ def _candidates(
         too_many = (alarms > allowed).nonzero()
         if len(too_many) or num >= len(flat):
             break
-        num *= 4
+        num *= 2
     num_fit = int(too_many[0]) if len(too_many) else len(tried)
     yield from reversed(tried[:num_fit].tolist())
     yield float(torch.nextafter(flat.max(), flat.new_tensor(math.inf)))
