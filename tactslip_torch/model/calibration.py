@@ -84,7 +84,7 @@ class Isotonic:
         x, y = _row(self.scores).to(score.device), _row(self.llrs).to(score.device)
         inside = score.double().clamp(self.scores[0], self.scores[-1])
         if len(x) == 1:
-            return (inside - x[0] + y[0]).to(score.dtype)
+            return (0 * inside + y[0]).to(score.dtype)
         right = torch.searchsorted(x, inside.detach().contiguous()).clamp(1, len(x) - 1)
         share = (inside - x[right - 1]) / (x[right] - x[right - 1])
         return torch.lerp(y[right - 1], y[right], share).to(score.dtype)
@@ -256,14 +256,14 @@ def _logistic(x: Tensor, target: Tensor, w: Tensor, offset: float) -> tuple[floa
         z = at[0] * x + at[1]
         return (w * (softplus(z) - target * z)).sum()
 
-    at = x.new_tensor([0.0, offset])
+    at, least = x.new_tensor([0.0, offset]), 1e-12 * w.sum()  # as Lin et al.: it never vanishes
     for _ in range(100):  # some ten are needed
-        p = torch.sigmoid(at[0] * x + at[1])
-        downhill, curvature = w * (target - p), w * p * (1 - p)
-        middle = (curvature * x).sum() / curvature.sum()  # around which slope and offset part
+        p, q = (torch.sigmoid(sign * (at[0] * x + at[1])) for sign in (1, -1))
+        downhill, curvature = w * (target - p), w * p * q
+        middle = (curvature * x).sum() / (curvature.sum() + least)  # slope and offset part there
         turn = (downhill * (x - middle)).sum()
-        by = turn / (curvature * (x - middle).square()).sum()
-        lift = downhill.sum() / curvature.sum()
+        by = turn / ((curvature * (x - middle).square()).sum() + least)
+        lift = downhill.sum() / (curvature.sum() + least)
         step = torch.stack([by, lift - by * middle])
         gain = turn * by + downhill.sum() * lift
         move = float((step[0] * x + step[1]).abs().max())

@@ -1,0 +1,430 @@
+"""Scores become log likelihood ratios; scikit-learn and SciPy say what the fits must be."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from oracles import assert_manners
+from scipy.special import expit, logit
+from sklearn.isotonic import IsotonicRegression
+from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import brier_score_loss, log_loss
+
+from tactslip_torch.model.calibration import (
+    LARGEST_LLR,
+    Isotonic,
+    Platt,
+    calibration_from_dict,
+    fit_isotonic,
+    fit_platt,
+    probability,
+    reliability,
+)
+
+FITS = {"platt": fit_platt, "isotonic": fit_isotonic}
+
+
+def logistic_bins(rng, num, slope, offset, share=0.5, spread=2.0):
+    """Scores and truth whose log likelihood ratio is ``slope * score + offset`` but for a constant.
+
+    The scores of both classes come from one law tilted by the ratio, so at any share of slip the
+    log odds are linear with this slope.
+    """
+    scores = rng.normal(0, spread, num)
+    is_slip = rng.uniform(size=num) < expit(slope * scores + offset + logit(share))
+    return scores, is_slip
+
+
+def tensors(*arrays):
+    return tuple(torch.from_numpy(np.asarray(array)) for array in arrays)
+
+
+def platt_targets(is_slip, weights):
+    n, m = weights[is_slip].sum(), weights[~is_slip].sum()
+    return np.where(is_slip, (n + 1) / (n + 2), 1 / (m + 2))
+
+
+# ------------------------------------------------------------------------------------- Platt
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize(("scale", "shift"), [(1.0, 0.0), (1e-6, 3.0), (1e4, -2e4)])
+def test_platt_is_sklearns_logistic_regression_towards_platts_targets(scale, shift, weighted, rng):
+    scores, is_slip = logistic_bins(rng, 400, 1.2, -0.7)
+    weights = rng.uniform(0.2, 3, 400) if weighted else np.ones(400)
+    target = platt_targets(is_slip, weights)
+    # a soft target is a bin of each class, weighted by it
+    both = np.concatenate([scores, scores])[:, None]
+    truth = np.repeat([1, 0], 400)
+    parts = np.concatenate([weights * target, weights * (1 - target)])
+    oracle = LogisticRegression(C=1e15, tol=1e-14, solver="newton-cholesky", max_iter=500)
+    oracle.fit(both, truth, sample_weight=parts)
+    balance = logit((weights * target).sum() / weights.sum())
+    fitted = fit_platt(*tensors(scale * scores + shift, is_slip, weights))
+    llr = fitted.llr(torch.from_numpy(scale * scores + shift)).numpy()
+    expected = oracle.coef_[0, 0] * scores + oracle.intercept_[0] - balance
+    np.testing.assert_allclose(llr, expected, atol=1e-6, rtol=1e-6)
+
+
+def test_the_line_is_the_best_one_for_scores_and_weights_of_all_sizes(rng):
+    """Where bare Newton steps would leave for infinity: the slopes of the log loss vanish."""
+    num_fitted = 0
+    for _ in range(150):
+        num = int(rng.integers(3, 50))
+        scores, weights = rng.standard_t(1, num), 10 ** rng.uniform(-3, 6, num)
+        is_slip = rng.permutation(num) < rng.integers(1, num)
+        if np.average(scores, weights=weights * is_slip) < np.average(
+            scores, weights=weights * ~is_slip
+        ):
+            continue
+        fitted = fit_platt(*tensors(scores, is_slip, weights))
+        target = platt_targets(is_slip, weights)
+        log_odds = (
+            fitted.slope * scores + fitted.offset + logit(np.average(target, weights=weights))
+        )
+        excess = weights * (expit(log_odds) - target)
+        for along in (np.ones(num), scores):
+            pull, rounding = np.abs(excess * along).sum(), (weights * np.abs(along)).sum()
+            assert abs((excess * along).sum()) < 1e-8 * pull + 1e-13 * rounding
+        num_fitted += 1
+    assert num_fitted > 30
+
+
+@pytest.mark.parametrize("share", [0.5, 0.1])
+def test_platt_finds_the_slope_and_the_balance_free_offset_of_a_known_model(share, rng):
+    """Gaussians of one spread: the ratio is known in closed form, whatever the balance."""
+    gap, slope, offset = [], 1.6, -0.4  # N(m, 1) against N(m - slope, 1)
+    middle = -offset / slope
+    for _ in range(60):
+        is_slip = rng.uniform(size=500) < share
+        scores = middle + slope * (is_slip - 0.5) + rng.normal(size=500)
+        fitted = fit_platt(*tensors(scores, is_slip))
+        gap.append([fitted.slope - slope, fitted.offset - offset])
+    gap = np.array(gap)
+    error = gap.std(axis=0, ddof=1) / math.sqrt(len(gap))
+    assert (np.abs(gap.mean(axis=0)) < 4 * error + 0.02).all()  # shrunk a little by the targets
+    assert (error < 0.05).all()
+
+
+def test_whole_weights_are_bins_given_several_times(rng):
+    scores, is_slip = logistic_bins(rng, 150, 1.0, 0.3)
+    times = rng.integers(0, 4, 150)
+    for fit in FITS.values():
+        once = fit(*tensors(scores, is_slip, times.astype(float)))
+        again = fit(*tensors(np.repeat(scores, times), np.repeat(is_slip, times)))
+        x = torch.linspace(-5, 5, 101, dtype=torch.float64)
+        torch.testing.assert_close(once.llr(x), again.llr(x), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1.0, 1e30, 1e250])
+@pytest.mark.parametrize("name", FITS)
+def test_separable_scores_get_a_finite_ratio(name, scale):
+    """The further from the other class, the surer, but n bins never say more than about n to 1."""
+    scores = torch.arange(-20, 20, dtype=torch.float64) * scale
+    fitted = FITS[name](scores, scores >= 0)
+    llr = fitted.llr(scores)
+    assert llr.isfinite().all()
+    assert (llr.diff() >= 0).all()
+    assert llr[0] < -2 < 2 < llr[-1]
+    assert llr.abs().max() < 2 * math.log(40)
+
+
+@pytest.mark.parametrize("name", FITS)
+def test_scores_that_tell_nothing_get_a_ratio_of_zero(name, rng):
+    is_slip = torch.arange(30) < 7
+    fitted = FITS[name](torch.full((30,), 2.5), is_slip)
+    assert (fitted.llr(torch.tensor([-1e30, 0.0, 2.5, 1e30])) == 0).all()
+    both = torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+    fitted = FITS[name](both, torch.tensor([True, False, False] * 2))
+    torch.testing.assert_close(fitted.llr(both), torch.zeros(6), atol=1e-6, rtol=0)
+
+
+def test_backward_scores_are_refused_by_the_line_and_flat_by_steps(rng):
+    scores, is_slip = tensors(*logistic_bins(rng, 300, -1.5, 0.0))
+    with pytest.raises(ValueError, match="slip has the lower scores; change their sign"):
+        fit_platt(scores, is_slip)
+    assert fit_platt(-scores, is_slip).slope > 1
+    falling = torch.arange(50.0)
+    assert fit_isotonic(falling, falling < 20).llrs == (0.0,)
+
+
+def test_one_score_of_1e30_leaves_both_fits_finite(rng):
+    scores, is_slip = logistic_bins(rng, 200, 2.0, 0.0)
+    scores[:2], is_slip[:2] = (1e30, -1e30), (True, False)
+    for fit in FITS.values():
+        fitted = fit(*tensors(scores, is_slip))
+        assert fitted.llr(torch.from_numpy(scores)).isfinite().all()
+    # steps mind the order alone: ordinary scores keep their ratios
+    clean = fit_isotonic(*tensors(scores[2:], is_slip[2:]))
+    x = torch.linspace(-1, 1, 21, dtype=torch.float64)
+    far = fit_isotonic(*tensors(scores, is_slip))
+    torch.testing.assert_close(far.llr(x), clean.llr(x), atol=0.4, rtol=0)
+
+
+# ---------------------------------------------------------------------------------- isotonic
+@pytest.mark.parametrize("levels", [None, 9])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_steps_are_sklearns_isotonic_regression(levels, weighted, rng):
+    """The two ends that tell nothing are given to the oracle as bins; ties as well."""
+    scores, is_slip = logistic_bins(rng, 300, 1.0, -1.0)
+    if levels:
+        scores = np.round(scores * levels / 8) / levels
+    weights = rng.uniform(0.2, 3, 300) if weighted else np.ones(300)
+    share = (weights * is_slip).sum() / weights.sum()
+    ends = np.repeat([scores.min(), scores.max()], 2)
+    x = np.concatenate([scores, ends])
+    y = np.concatenate([is_slip, [1, 0, 1, 0]]).astype(float)
+    w = np.concatenate([weights, np.tile([2 * share, 2 * (1 - share)], 2)])
+    steps = IsotonicRegression().fit(x, y, sample_weight=w).predict(scores)
+    expected = logit(steps) - logit(share)
+
+    fitted = fit_isotonic(*tensors(scores, is_slip, weights))
+    distinct = np.unique(np.round(expected, 10))
+    np.testing.assert_allclose(fitted.llrs, distinct, atol=1e-9)
+    for knot, llr in zip(fitted.scores, fitted.llrs, strict=True):
+        own = np.isclose(expected, llr, atol=1e-9, rtol=0)
+        assert scores[own].min() <= knot <= scores[own].max()
+        # the knot is the median by weight of its step
+        below, above = own & (scores < knot), own & (scores > knot)
+        assert max(weights[below].sum(), weights[above].sum()) <= weights[own].sum() / 2 + 1e-9
+
+
+def test_between_knots_a_line_and_outside_flat():
+    fitted = Isotonic((-1.0, 0.0, 2.0), (-3.0, 1.0, 2.0))
+    x = np.concatenate([np.linspace(-3, 4, 71), [-1e30, 1e30, np.inf, -np.inf]])
+    llr = fitted.llr(torch.from_numpy(x))
+    np.testing.assert_allclose(llr, np.interp(x, fitted.scores, fitted.llrs), atol=1e-14)
+
+
+def test_isotonic_finds_a_ratio_that_no_line_has(rng):
+    """Scores of a bend: its ratio saturates, which steps follow and a line cannot."""
+    x = rng.normal(0, 2, 40_000)
+    true = 3 * np.tanh(x)
+    is_slip = rng.uniform(size=len(x)) < expit(true)
+    at = torch.linspace(-3, 3, 25, dtype=torch.float64)
+    errors = {
+        name: float((fit(*tensors(x, is_slip)).llr(at) - 3 * at.tanh()).abs().mean())
+        for name, fit in FITS.items()
+    }
+    assert errors["isotonic"] < 0.3
+    assert errors["isotonic"] < 0.5 * errors["platt"]
+
+
+# ----------------------------------------------------------------------------- what all share
+CALIBRATIONS = {
+    "platt": Platt(1.7, -0.4),
+    "flat": Platt(0.0, 0.0),
+    "isotonic": Isotonic((-1.5, 0.25, 2.0), (-4.0, 0.5, 3.0)),
+    "one knot": Isotonic((1.0,), (0.0,)),
+}
+
+
+@pytest.mark.parametrize("name", CALIBRATIONS)
+def test_a_ratio_is_elementwise_and_keeps_dtype(name, rng):
+    assert_manners(CALIBRATIONS[name].llr, torch.from_numpy(rng.standard_normal((4, 5))))
+
+
+@pytest.mark.parametrize("name", CALIBRATIONS)
+def test_gradients_flow(name):
+    x = torch.tensor([-3.0, -1.0, 0.0, 1.0, 1.9, 2.5], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(CALIBRATIONS[name].llr, (x,))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", CALIBRATIONS)
+def test_huge_scores_give_finite_ratios_and_nan_stays(name, dtype):
+    most = torch.finfo(dtype).max
+    x = torch.tensor([-torch.inf, -most, -1e30, 1e30, most, torch.inf], dtype=dtype)
+    x.requires_grad_()
+    for calibration in (CALIBRATIONS[name], Platt(1e20, 3.0)):
+        llr = calibration.llr(x)
+        assert llr.dtype == dtype
+        assert llr.abs().max() <= torch.tensor(LARGEST_LLR, dtype=dtype)
+        assert (llr.diff() >= 0).all()
+        (gradient,) = torch.autograd.grad(llr.sum(), x)
+        assert gradient.isfinite().all()
+        assert calibration.llr(torch.tensor([torch.nan, 0.0])).isnan().tolist() == [True, False]
+
+
+def test_float32_scores_lose_nothing_to_a_large_offset():
+    """In float32 throughout, slope * score and the offset would cancel."""
+    scores = torch.tensor([1e6, 1e6 + 0.5, 1e6 + 1], dtype=torch.float32)
+    assert Platt(10.0, -1e7).llr(scores).tolist() == [0.0, 5.0, 10.0]
+
+
+@given(
+    values=st.lists(
+        st.tuples(st.floats(-1e30, 1e30), st.booleans(), st.floats(0.125, 8)),
+        min_size=2,
+        max_size=40,
+    )
+)
+def test_any_bins_give_a_finite_never_falling_ratio_and_a_round_trip(values):
+    columns = zip(*values, strict=True)
+    scores, is_slip, weights = (torch.from_numpy(np.array(column)) for column in columns)
+    if is_slip.all() or not is_slip.any():
+        return
+    means = [np.average(scores[own], weights=weights[own]) for own in (is_slip, ~is_slip)]
+    rise = (means[0] - means[1]) / max(scores.double().std(unbiased=False).item(), 1e-300)
+    for fit in FITS.values():
+        if fit is fit_platt and rise < 0:  # where the best line falls, and only there
+            if rise < -1e-6:
+                with pytest.raises(ValueError, match="slip has the lower scores"):
+                    fit(scores, is_slip, weights)
+            continue
+        fitted = fit(scores, is_slip, weights)
+        again = calibration_from_dict(json.loads(json.dumps(fitted.to_dict())))
+        assert again == fitted
+        x = scores.double().sort().values
+        llr = fitted.llr(x)
+        assert llr.isfinite().all()
+        assert (llr.diff() >= -1e-12 * llr.abs().max()).all()
+
+
+@pytest.mark.parametrize(
+    "plain",
+    [
+        {"kind": "platt", "slope": 1.0},
+        {"kind": "platt", "slope": -1.0, "offset": 0.0},
+        {"kind": "platt", "slope": math.inf, "offset": 0.0},
+        {"kind": "platt", "slope": 1.0, "offset": 0.0, "more": 1.0},
+        {"kind": "isotonic", "scores": [1.0, 0.0], "llrs": [0.0, 1.0]},
+        {"kind": "isotonic", "scores": [0.0, 1.0], "llrs": [1.0, 0.0]},
+        {"kind": "isotonic", "scores": [], "llrs": []},
+        {"kind": "isotonic", "scores": [0.0, 1.0], "llrs": [0.0]},
+        {"kind": "isotonic", "scores": [0.0], "llrs": [math.nan]},
+        {"kind": "isotonic", "scores": 3, "llrs": [0.0]},
+        {"kind": "beta"},
+        {},
+    ],
+)
+def test_what_is_no_calibration_is_refused_in_a_line(plain):
+    with pytest.raises(ValueError, match="no calibration of this version") as raised:
+        calibration_from_dict(plain)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", FITS)
+@pytest.mark.parametrize(
+    ("scores", "is_slip", "weights", "message"),
+    [
+        ([1.0, 2.0], [True, True], None, "needs slip and non-slip"),
+        ([1.0, 2.0], [False, False], None, "needs slip and non-slip"),
+        ([1.0, 2.0, 3.0], [True, False, True], [0.0, 1.0, 0.0], "needs slip and non-slip"),
+        ([1.0, math.nan], [True, False], None, "scores must lie in"),
+        ([1.0, math.inf], [True, False], None, "scores must lie in"),
+        ([1.0, 2.0], [True], None, "of one N"),
+        ([1.0, 2.0], [True, False], [1.0, -1.0], "weights must be finite"),
+        ([1.0, 2.0], [True, False], [0.0, 0.0], "weights must be finite"),
+        ([], [], None, "weights must be finite"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused_in_a_line(name, scores, is_slip, weights, message):
+    arguments = [torch.tensor(scores), torch.tensor(is_slip, dtype=torch.bool)]
+    with pytest.raises(ValueError, match=message) as raised:
+        FITS[name](*arguments, None if weights is None else torch.tensor(weights))
+    assert "\n" not in str(raised.value)
+
+
+def test_bins_without_weight_may_hold_anything():
+    scores = torch.tensor([0.0, 1.0, math.nan])
+    is_slip, weights = torch.tensor([False, True, True]), torch.tensor([1.0, 1.0, 0.0])
+    for fit in FITS.values():
+        assert fit(scores, is_slip, weights) == fit(scores[:2], is_slip[:2])
+
+
+# -------------------------------------------------------------------------------- probability
+@pytest.mark.parametrize("share", [0.001, 0.25, 0.5, 0.9])
+def test_probability_is_bayes_at_another_balance(share):
+    """Two known densities: the ratio from one balance gives the posterior at any other."""
+    slip, rest = np.exp(-np.array([0.1, 1.0, 5.0])), np.exp(-np.array([4.0, 1.0, 0.3]))
+    posterior = share * slip / (share * slip + (1 - share) * rest)
+    llr = torch.from_numpy(np.log(slip / rest))
+    np.testing.assert_allclose(probability(llr, share), posterior, rtol=1e-12)
+
+
+def test_a_fit_at_one_balance_is_right_at_another(rng):
+    """Fitted where half of the bins slip, judged where one in twenty does."""
+
+    def drawn(share):
+        is_slip = rng.uniform(size=40_000) < share
+        return tensors(2.0 * is_slip + rng.normal(size=40_000), is_slip)
+
+    fitted = [fit(*drawn(0.5)) for fit in FITS.values()]
+    scores, is_slip = drawn(0.05)
+    for calibration in fitted:
+        llr = calibration.llr(scores)
+        right = reliability(probability(llr, 0.05), is_slip)
+        wrong = reliability(probability(llr, 0.5), is_slip)
+        assert right.ece < 0.01 < 0.1 < wrong.ece
+
+
+def test_probability_of_huge_ratios_and_of_no_share():
+    llr = torch.tensor([-1e30, 0.0, 1e30])
+    assert probability(llr, 0.5).tolist() == [0.0, 0.5, 1.0]
+    for share in (0.0, 1.0, -0.1, math.nan):
+        with pytest.raises(ValueError, match="slip_share must lie between 0 and 1"):
+            probability(llr, share)
+
+
+# -------------------------------------------------------------------------------- reliability
+def plain_reliability(p, y, w, num_cells):
+    """Cells by where the middle of a probability's weight falls, tied ones together."""
+    total, done = w.sum(), 0.0
+    cells = {}
+    for value in np.unique(p):
+        own = p == value
+        middle = done + w[own].sum() / 2
+        done += w[own].sum()
+        cells.setdefault(min(int(num_cells * middle / total), num_cells - 1), []).append(own)
+    rows = []
+    for members in cells.values():
+        own = np.any(members, axis=0)
+        mean = np.average(p[own], weights=w[own])
+        rows.append((mean, np.average(y[own], weights=w[own]), w[own].sum()))
+    return np.array(rows).T
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("levels", [None, 5])
+def test_cells_and_errors_are_the_definitions(weighted, levels, rng):
+    p = rng.uniform(size=800) ** 2
+    if levels:
+        p = np.round(p * levels) / levels
+    y = rng.uniform(size=800) < p**1.5
+    w = rng.uniform(0.2, 3, 800) if weighted else np.ones(800)
+    found = reliability(*tensors(p, y), num_cells=10, weights=torch.from_numpy(w))
+    stated, happened, count = plain_reliability(p, y, w, 10)
+    np.testing.assert_allclose(found.probabilities, stated, rtol=1e-12)
+    np.testing.assert_allclose(found.slip_shares, happened, atol=1e-12)
+    np.testing.assert_allclose(found.counts, count, rtol=1e-12)
+    gap = np.abs(stated - happened)
+    assert found.ece == pytest.approx((gap * count).sum() / w.sum(), rel=1e-12)
+    assert found.mce == pytest.approx(gap.max(), rel=1e-12)
+    assert found.brier == pytest.approx(brier_score_loss(y, p, sample_weight=w), rel=1e-12)
+    inside = np.clip(p, 1e-9, 1 - 1e-9)
+    found = reliability(*tensors(inside, y), weights=torch.from_numpy(w))
+    assert found.log_loss == pytest.approx(log_loss(y, inside, sample_weight=w), rel=1e-9)
+
+
+def test_cells_hold_equal_numbers_where_no_two_are_equal():
+    p = torch.rand(1500, generator=torch.Generator().manual_seed(1)).double()
+    assert reliability(p, p > 0.5).counts == (100.0,) * 15
+
+
+def test_a_certain_detector_is_right_or_wrong():
+    p = torch.tensor([0.0, 0.0, 1.0, 1.0])
+    right, wrong = reliability(p, p > 0.5), reliability(p, p < 0.5)
+    assert (right.ece, right.mce, right.brier, right.log_loss) == (0, 0, 0, 0)
+    assert (wrong.ece, wrong.mce, wrong.brier, wrong.log_loss) == (1, 1, 1, 100)
+    assert json.loads(json.dumps(right.to_dict()))["counts"] == [2.0, 2.0]
+
+
+def test_reliability_of_no_probabilities_is_refused():
+    for p, message in ((1.1, "probability must lie in 0 to 1"), (math.nan, "must lie in 0 to 1")):
+        with pytest.raises(ValueError, match=message):
+            reliability(torch.tensor([0.5, p]), torch.tensor([True, False]))
+    with pytest.raises(ValueError, match="of one N"):
+        reliability(torch.tensor([0.5, 0.1]), torch.tensor([True]))
