@@ -17,7 +17,7 @@ from tactslip_torch.features.guards import is_nowhere
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool, saturating
 from tactslip_torch.model.detector_file import Head, damaged, read_detector, write_detector
-from tactslip_torch.model.few_bins import FEW_BINS, FewBins
+from tactslip_torch.model.few_bins import FEW_BINS, FEW_FILTERED, FewBins
 from tactslip_torch.model.judgement import Judgement, Nonfinite, check_nonfinite, judged_in_parts
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.plain import is_plain
@@ -136,7 +136,7 @@ class SlipDetector(nn.Module):
             ValueError: if the number of channels or samples is another.
         """
         self.pool.check(bins)
-        return judged_in_parts(self._score, bins)
+        return judged_in_parts(lambda part: self._score(part, FEW_FILTERED), bins)
 
     def score_raw(self, samples: Tensor) -> Tensor:
         """Filter and score raw bins that come with their context.
@@ -173,7 +173,8 @@ class SlipDetector(nn.Module):
         """
         self.pool.check(bins)
         check_nonfinite(nonfinite, bins, self.pool.hand.names)
-        return judged_in_parts(lambda part: self._judge(part, given or bins.dtype), bins)
+        dtype = given or bins.dtype
+        return judged_in_parts(lambda part: self._judge(part, dtype, FEW_FILTERED), bins)
 
     def judge_raw(self, samples: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
         """``judge`` for raw bins that come with their context.
@@ -210,8 +211,8 @@ class SlipDetector(nn.Module):
         score: Tensor = self.head(self._scale(features))
         return score
 
-    def _score(self, bins: Tensor) -> Tensor:
-        if (few := self._few_bins(bins)) is not None:
+    def _score(self, bins: Tensor, most: int = FEW_BINS) -> Tensor:
+        if (few := self._few_bins(bins, most)) is not None:
             return few.score(self._features(bins.detach()), bins.dtype)
         return saturating(self.score_features(self._features(bins)), bins.dtype)
 
@@ -221,9 +222,9 @@ class SlipDetector(nn.Module):
     def _judge_raw(self, samples: Tensor) -> Judgement:
         return self._judge(self._filter(samples), samples.dtype)
 
-    def _judge(self, bins: Tensor, given: torch.dtype) -> Judgement:
+    def _judge(self, bins: Tensor, given: torch.dtype, most: int = FEW_BINS) -> Judgement:
         """Scores of filtered bins, valid by the dtype they were given in, which is the score's."""
-        if (few := self._few_bins(bins)) is not None:
+        if (few := self._few_bins(bins, most)) is not None:
             return few.judge(self._features, self.pool.widen(bins.detach()), given)
         is_alive = self.pool.is_alive(bins.to(given))  # sensors resolve no more than they give
         bins = self.pool.widen(bins)
@@ -239,10 +240,10 @@ class SlipDetector(nn.Module):
         is_valid = self._needed(is_alive & ~is_missing) & score.isfinite()
         return Judgement(score, is_valid, is_missing)
 
-    def _few_bins(self, bins: Tensor) -> FewBins | None:
+    def _few_bins(self, bins: Tensor, most: int) -> FewBins | None:
         """The way for few bins and values alone, if this is one for it."""
         is_watched = any(m._forward_hooks or m._forward_pre_hooks for m in (self.scaler, self.head))
-        if is_watched or not is_plain(bins) or bins.shape[:-2].numel() > FEW_BINS:
+        if is_watched or not is_plain(bins) or bins.shape[:-2].numel() > most:
             return None
         if self._few is None or not self._few.is_of(self):
             self._few = FewBins(self) if FewBins.suits(self.scaler, self.head) else None

@@ -24,8 +24,10 @@ from tactslip_torch.model.scaling import FeatureScaler
 Array = np.ndarray[Any, Any]
 
 
-FEW_BINS = 16
-"""Of so few, calls take longer than the arithmetic in them."""
+FEW_BINS = 4
+"""Of so few raw bins, calls take longer than the arithmetic in them."""
+FEW_FILTERED = 16
+"""Of so few filtered bins: a push of a stream brings some ten."""
 
 
 class Parts(Protocol):
