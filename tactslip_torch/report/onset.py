@@ -92,9 +92,9 @@ def _draw_films(axes: Axes, heard: Heard, slips: Stretches) -> None:
     _mark(axes, heard, heard.onsets_s, "onset", **_ONSET)
     alarms = [alarm for alarm, _ in heard.alarms]
     _mark(axes, heard, alarms, "alarm", **_ALARM)
-    seen = _seen(heard, alarms)
-    above = axes.get_xaxis_transform()
-    axes.plot(seen, [1.0] * len(seen), "v", color=ALARM, transform=above, clip_on=False)
+    if seen := _seen(heard, alarms):
+        above = axes.get_xaxis_transform()
+        axes.plot(seen, [1.0] * len(seen), "v", color=ALARM, transform=above, clip_on=False)
     axes.set_yticks(middles, list(heard.films), fontsize=7)
     axes.set_ylim(middles[-1] - 0.8 * lane_v, 0.8 * lane_v)
     axes.set_ylabel(f"films, lanes {lane_v:.2g} V apart", fontsize=8)
@@ -117,8 +117,9 @@ def _draw_status(axes: Axes, heard: Heard, slips: Stretches) -> None:
     for name, level, start_s, stretches in bars:
         whole = [(start_s, heard.view[1])]
         for colour, own in ((REST, whole), (SLIP, _clipped(heard, stretches))):
-            beams = [(start, end - start) for start, end in own]
-            axes.broken_barh(beams, (level - 0.35, 0.7), facecolor=colour, gid=f"{name} {colour}")
+            if beams := [(start, end - start) for start, end in own]:
+                spot: dict[str, Any] = {"facecolor": colour, "gid": f"{name} {colour}"}
+                axes.broken_barh(beams, (level - 0.35, 0.7), **spot)
     axes.set_yticks([bar[1] for bar in bars], [bar[0] for bar in bars], fontsize=8)
     axes.set_ylim(0.5 - 0.5 * len(bars) + 0.5 * (len(bars) == 1), 1.5)
 
@@ -150,15 +151,16 @@ def _legend(heard: Heard, has_invalid: bool) -> list[Any]:
 
 def _mark(axes: Axes, heard: Heard, times: Sequence[float], name: str, **style: Any) -> None:
     """Lines from top to bottom, the finer the more there are."""
-    seen = _seen(heard, times)
-    width = _WIDTH * min(1.0, _ROOM / max(len(seen), 1)) ** 0.5
+    if not (seen := _seen(heard, times)):
+        return  # a collection of nothing has no layout
+    width = _WIDTH * min(1.0, _ROOM / len(seen)) ** 0.5
     through = axes.get_xaxis_transform()
     axes.vlines(seen, 0, 1, transform=through, linewidth=max(width, 0.2), gid=name, **style)
 
 
 def _shade(axes: Axes, stretches: Stretches, name: str, **style: Any) -> None:
-    beams = [(start, end - start) for start, end in stretches]
-    axes.broken_barh(beams, (0, 1), transform=axes.get_xaxis_transform(), gid=name, **style)
+    if beams := [(start, end - start) for start, end in stretches]:
+        axes.broken_barh(beams, (0, 1), transform=axes.get_xaxis_transform(), gid=name, **style)
 
 
 def _seen(heard: Heard, times: Sequence[float]) -> list[float]:
