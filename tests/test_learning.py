@@ -1,11 +1,13 @@
 """What the learner learns from, and that it learns from nothing else."""
 
+from collections import Counter
 from dataclasses import replace
 
 import lightning as L
+import numpy as np
 import pytest
 import torch
-from small_set import SmallSet, small_maker, small_recipe
+from small_set import RATE_HZ, SmallSet, small_maker, small_recipe
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import random_bins, seen6, unseen4
@@ -161,6 +163,65 @@ def test_bins_of_no_stroke_have_no_position_but_a_scene():
     assert "0" not in scores["per_speed"]
 
 
+def test_events_are_of_the_detectors_own_decisions_and_the_exact_onset():
+    """By hand: alarms of its decisions in order, at the end of their bin and the look-ahead."""
+
+    class Apart(SmallSet):
+        """A person marked the onset 20 ms late."""
+
+        def timeline(self, recording):
+            return replace(super().timeline(recording), annotated_onsets_s=(1.12,))
+
+    source = Apart()
+    learner = learn(source, unseen_c(source))
+    maker = small_maker(source)
+    ahead_s = learner.detector.look_ahead / RATE_HZ
+    for role in ("test", "unseen"):
+        outcomes, delays, false = Counter(), [], 0
+        for recording in unseen_c(source).having(role):
+            bins, labels = maker.filtered_bins(recording)
+            says_slip = (learner.detector(bins) >= 0).tolist()
+            ends_s = (labels.starts + 100) / RATE_HZ + ahead_s
+            alarms = [
+                (float(end), next((float(e) for e, s in after if not s), 9.0))
+                for i, end in enumerate(ends_s)
+                if says_slip[i] and not (i and says_slip[i - 1])
+                for after in [list(zip(ends_s[i:], says_slip[i:], strict=True))]
+            ]
+            false += sum(alarm < 0.9 for alarm, _ in alarms)
+            found = [alarm for alarm, _ in alarms if 1.1 <= alarm <= 1.6]
+            if any(0.9 <= alarm < 1.1 < end for alarm, end in alarms):
+                outcomes["early"] += 1
+            elif found:
+                outcomes["found"] += 1
+                delays.append(1000 * (found[0] - 1.1))
+            else:
+                outcomes["missed"] += 1
+        events = learner.metrics["events"][role]["first_transition"]
+        assert {name: events[f"num_{name}"] for name in ("found", "early", "missed")} == {
+            name: outcomes[name] for name in ("found", "early", "missed")
+        }
+        assert events["num_false_alarms"] == false
+        assert events["delay_ms"]["median"]["value"] == pytest.approx(float(np.median(delays)))
+        assert events["quiet_hours"] * 3600 == pytest.approx(
+            sum(outcomes.values()) * (0.9 - 0.11 - ahead_s)  # from 1.12 - 0.01 - 1 on
+        )
+        assert learner.metrics["events"][role]["two_of_three"]["num_onsets"] == sum(
+            outcomes.values()
+        )
+    assert len(learner.events["unseen"]["two_of_three"]) == 5
+
+
+def test_a_split_by_bin_says_why_it_has_no_events():
+    source = SmallSet()
+    events = learn(source, random_bins(source.ids, seen=["a", "b", "c"])[0]).metrics["events"]
+    assert list(events) == ["train", "test"]
+    for by_rule in events.values():
+        for numbers in by_rule.values():
+            assert numbers["found"] is None
+            assert "both sides" in numbers["reason"]
+
+
 def test_the_detector_judges_filtered_bins_as_the_test_did():
     source = SmallSet()
     learner = learn(source, unseen_c(source))
@@ -221,6 +282,9 @@ def test_shuffled_labels_are_not_learned():
     assert judged["num_bins"] == 18 * 37
     assert abs(judged["balanced_accuracy"] - 0.5) < 0.08
     assert honest > 0.75
+    events = shuffled.metrics["events"]["test"]["first_transition"]
+    assert events["num_onsets"] == 18
+    assert events["num_false_alarms"] > 18  # whatever comes: it decides by nothing
 
 
 @pytest.mark.slow
