@@ -1,0 +1,521 @@
+"""``detect`` as a command: what it hears, what it leaves, and what it says of bad input."""
+
+import csv
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from PIL import Image
+from small_detector import HAND, small_detector
+
+from tactslip_torch import HandLayout, Recording
+from tactslip_torch import detect as module
+from tactslip_torch.config import conf_dir
+from tactslip_torch.data import folder as folders
+from tactslip_torch.data.archive import StoredSamples, save_recording
+from tactslip_torch.detect import detect, main
+from tactslip_torch.model.calibration import Platt
+from tactslip_torch.onset.decider import Decider
+from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.report.onset_table import COLUMNS
+
+RATE_HZ = 2000.0
+SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0, lead_s=0.02)
+QUIET_V, LOUD_V = 0.02, 0.5
+SEED = 10  # of a small detector that calls loud films slip and quiet ones not
+
+
+def volts(duration_s=8.0, loud=((2.0, 3.0), (5.0, 5.6)), seed=0):
+    """Quiet noise, loud for some stretches, in float32."""
+    generator = torch.Generator().manual_seed(seed)
+    samples = torch.randn(4, round(duration_s * RATE_HZ), generator=generator)
+    size = torch.full((samples.shape[1],), QUIET_V)
+    for start, end in loud:
+        size[round(start * RATE_HZ) : round(end * RATE_HZ)] = LOUD_V
+    return samples * size + torch.tensor([1.0, 1.0, 0.0, 0.0])[:, None]
+
+
+def recording(samples=None, **changes):
+    values = {
+        "samples": volts() if samples is None else samples,
+        "sample_rate_hz": RATE_HZ,
+        "material": "M1",
+        "speeds_mm_s": (20.0, 40.0),
+        "onsets_s": (2.0, 5.0),
+        "sliding_s": ((2.0, 3.0), (5.0, 5.6)),
+        "provenance": {"simulated": True},
+    }
+    return Recording(**(values | changes))
+
+
+def quiet(duration_s=4.0, **changes):
+    nothing = {"speeds_mm_s": (), "onsets_s": (), "sliding_s": ()}
+    return recording(volts(duration_s, ()), **(nothing | changes))
+
+
+def save(path, content, hand=HAND):
+    save_recording(path, content, hand, {"recording": {"name": "taps"}})
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    detector = small_detector(SEED)
+    detector.info["alarm"] = SETTINGS.to_dict()
+    path = tmp_path_factory.mktemp("model") / "detector.pt"
+    detector.save(path)
+    return path
+
+
+def composed(*overrides):
+    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+        return compose("detect", ["engine=eager", *overrides])
+
+
+def heard(model, place, folder, *overrides):
+    """What ``detect`` returns, which is what it wrote."""
+    content = detect(composed(f"model={model}", f"input={place}", *overrides), folder)
+    assert json.loads((folder / "onsets.json").read_text()) == content
+    return content
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def run(model, tmp_path_factory):
+    """Two recordings, the second of which has no slip, and all that there can be written."""
+    place, folder = tmp_path_factory.mktemp("in"), tmp_path_factory.mktemp("out")
+    save(place / "a.npz", recording())
+    save(place / "b.npz", quiet())
+    return folder, heard(model, place, folder, "decisions=true")
+
+
+def offline(samples, settings=SETTINGS):
+    """The decisions on a recording that is known whole."""
+    detector = small_detector(SEED, engine="eager")
+    scores = score_stream(detector, samples, settings.hop_samples)
+    decider = Decider(settings, RATE_HZ, detector.pool.bin_samples, detector.look_ahead)
+    return decider.decide(scores.score, scores.is_valid)
+
+
+# What is heard -----------------------------------------------------------------------------------
+
+
+def test_alarms_are_those_of_the_whole_recording(run):
+    _, content = run
+    assert [entry["file"] for entry in content["recordings"]] == ["a.npz", "b.npz"]
+    for entry, samples in zip(content["recordings"], (volts(), volts(4.0, ())), strict=True):
+        decisions = offline(samples)
+        assert entry["decisions"] == {"number": len(decisions.number), "invalid": 0}
+        wanted = decisions.alarms
+        assert len(entry["alarms"]) == len(wanted)
+        for found, alarm in zip(entry["alarms"], wanted, strict=True):
+            assert found["alarm_s"] == alarm.alarm_s
+            assert found["onset_s"] == alarm.onset_s
+            assert found["is_valid"] is True
+            for name in ("score", "probability", "statistic"):
+                assert found[name] == pytest.approx(getattr(alarm, name), rel=1e-4)
+            is_off = (~decisions.is_on) & (decisions.available_s > alarm.alarm_s)
+            assert found["end_s"] == float(decisions.available_s[is_off][0])
+    assert len(content["recordings"][0]["alarms"]) >= 2
+
+
+def test_the_truth_stands_beside_them(run):
+    _, content = run
+    first, second = content["recordings"]
+    assert (first["material"], first["scene"], first["simulated"]) == ("M1", "taps", True)
+    truth = first["truth"]
+    assert [onset["outcome"] for onset in truth["onsets"]] == ["found", "found"]
+    for onset, slide in zip(truth["onsets"], ((2.0, 3.0), (5.0, 5.6)), strict=True):
+        own = [a for a in first["alarms"] if slide[0] <= a["alarm_s"] <= slide[1]]
+        assert onset["delay_s"] == pytest.approx(own[0]["alarm_s"] - onset["onset_s"], abs=1e-8)
+        assert own[0]["outcome"] == "found"
+        assert own[0]["true_onset_s"] == onset["onset_s"]
+        assert {alarm["outcome"] for alarm in own[1:]} <= {"repeated"}
+        assert onset["error_s"] == pytest.approx(own[0]["onset_s"] - onset["onset_s"], abs=1e-8)
+        assert 0.0 < onset["delay_s"] < 0.1
+    false = [a["alarm_s"] for e in (first, second) for a in e["alarms"] if a["outcome"] == "false"]
+    assert false == first["truth"]["false_alarms_s"] + second["truth"]["false_alarms_s"]
+    assert second["truth"]["onsets"] == []
+    events = content["events"]
+    assert (events["num_onsets"], events["num_found"]) == (2, 2)
+    assert events["num_false_alarms"] == len(false)
+
+
+def test_every_word_about_the_origin_is_there(run, model):
+    _, content = run
+    assert content["format"] == "tactslip_torch onsets 1"
+    assert content["simulated"] is True
+    assert content["detector"]["trained_on_simulated"] is True
+    assert content["settings"]["threshold"] == 2.0
+    assert content["settings"]["is_own_threshold"] is True
+    assert content["detector"]["bin_s"] == 0.05
+    assert content["detector"]["look_ahead_s"] == small_detector(SEED).look_ahead / RATE_HZ
+    assert set(content["versions"]) == {"tactslip_torch", "torch", "code"}
+    assert content["failed"] == []
+
+
+def test_the_files_agree_with_each_other(run):
+    folder, content = run
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *("a_decisions.csv", "a_onsets.png", "b_decisions.csv", "b_onsets.png"),
+        *("config.yaml", "onsets.csv", "onsets.json"),
+    ]
+    rows = rows_of(folder / "onsets.csv")
+    assert tuple(rows[0]) == COLUMNS
+    alarms = [a | {"file": e["file"]} for e in content["recordings"] for a in e["alarms"]]
+    assert [row["file"] for row in rows] == [alarm["file"] for alarm in alarms]
+    for row, alarm in zip(rows, alarms, strict=True):
+        for name in ("alarm_s", "onset_s", "end_s", "score", "probability"):
+            assert float(row[name]) == alarm[name]
+        assert row["outcome"] == alarm["outcome"]
+        assert row["simulated"] == "True"
+    decided = rows_of(folder / "a_decisions.csv")
+    wanted = offline(volts())
+    assert [int(row["number"]) for row in decided] == wanted.number.tolist()
+    for name in ("available_s", "score", "statistic"):
+        found = [float(row[name]) for row in decided]
+        np.testing.assert_allclose(found, getattr(wanted, name), rtol=1e-4, atol=1e-4)
+    assert [row["is_on"] == "True" for row in decided] == wanted.is_on.tolist()
+    with Image.open(folder / "a_onsets.png") as image:
+        assert image.format == "PNG"
+
+
+def test_the_terminal_shows_a_table_a_rate_and_one_bar(model, tmp_path, capsys):
+    save(tmp_path / "a.npz", recording())
+    content = heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert lines[1].startswith("SIMULATED data")
+    assert len([x for x in lines if " found" in x and x[0] in "a "]) == 2
+    assert f"{len(content['recordings'][0]['alarms'])} alarms in 8.0 s of 1 recordings" in out
+    assert "of 2 slips 2 found, median delay" in out
+    assert out.endswith(f"onsets in {tmp_path / 'out'}\n")
+    assert "onsets" in err
+    assert "8/8" in err
+    assert "s of signal/s" in err
+    assert not (tmp_path / "out" / "a_onsets.png").exists()
+
+
+def test_one_bar_counts_the_seconds_of_all_files(model, tmp_path, monkeypatch):
+    totals = []
+
+    def bar(items, what, unit, total):
+        done = 0
+        for item in items:
+            done += 1
+            yield item
+        totals.append((done, total, unit))
+
+    monkeypatch.setattr(module, "bar", bar)
+    save(tmp_path / "a.npz", recording())
+    save(tmp_path / "b.npz", quiet(4.3))
+    heard(model, tmp_path, tmp_path / "out", "figure=false")
+    assert totals == [(8 + 5, 13, "s of signal")]
+
+
+# What it is told ---------------------------------------------------------------------------------
+
+
+def test_another_threshold_can_be_given(model, tmp_path):
+    save(tmp_path / "a.npz", recording())
+    content = heard(model, tmp_path / "a.npz", tmp_path / "out", "threshold=1e6", "figure=false")
+    entry = content["recordings"][0]
+    assert entry["alarms"] == []
+    assert [onset["outcome"] for onset in entry["truth"]["onsets"]] == ["missed", "missed"]
+    assert content["settings"]["threshold"] == 1e6
+    assert content["settings"]["is_own_threshold"] is False
+    rows = rows_of(tmp_path / "out" / "onsets.csv")
+    assert [(row["outcome"], row["alarm_s"]) for row in rows] == [("missed", "")] * 2
+    assert [row["true_onset_s"] for row in rows] == ["2.0", "5.0"]
+
+
+def test_a_figure_may_show_a_stretch(model, tmp_path, monkeypatch):
+    views = []
+    monkeypatch.setattr(module, "onset_figure", lambda heard, *_, **__: views.append(heard.view))
+    save(tmp_path / "a.npz", recording())
+    heard(model, tmp_path / "a.npz", tmp_path / "out", "view=[1.5,20]")
+    assert views == [(1.5, 8.0)]
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz"])
+def test_volts_alone_are_heard_but_judged_by_nobody(model, tmp_path, kind, capsys):
+    samples = volts().numpy()
+    if kind == "npy":
+        np.save(tmp_path / "a.npy", samples.T)
+    else:
+        np.savez(tmp_path / "a.npz", samples=samples)
+    content = heard(
+        model, tmp_path / f"a.{kind}", tmp_path / "out", "sample_rate_hz=2000", "decisions=true"
+    )
+    (entry,) = content["recordings"]
+    assert [a["alarm_s"] for a in entry["alarms"]] == [a.alarm_s for a in offline(volts()).alarms]
+    assert (entry["truth"], entry["simulated"], content["events"]) == (None, None, None)
+    assert content["simulated"] is False
+    out = capsys.readouterr().out
+    assert "SIMULATED" not in out
+    assert "slips" not in out
+    assert rows_of(tmp_path / "out" / "onsets.csv")[0]["outcome"] == ""
+
+
+def test_a_recording_nobody_annotated_has_no_false_alarms(model, tmp_path):
+    """No onset and not simulated: nothing says that there was no slip."""
+    bare = recording(speeds_mm_s=(), onsets_s=(), sliding_s=(), provenance={})
+    save(tmp_path / "a.npz", bare)
+    content = heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+    assert content["recordings"][0]["truth"] is None
+    assert content["recordings"][0]["simulated"] is False
+    told = recording(speeds_mm_s=(), onsets_s=(), sliding_s=(), provenance={}, non_slip_s=((0, 8),))
+    save(tmp_path / "a.npz", told)
+    content = heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+    alarms = content["recordings"][0]["alarms"]
+    assert len(content["recordings"][0]["truth"]["false_alarms_s"]) == len(alarms) > 0
+
+
+def test_samples_in_float64_are_heard_in_float64(model, tmp_path):
+    save(tmp_path / "a.npz", recording(volts().double()))
+    (entry,) = heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")["recordings"]
+    for found, wanted in zip(entry["alarms"], offline(volts().double()).alarms, strict=True):
+        assert found["score"] == pytest.approx(wanted.score, rel=1e-9)
+
+
+def test_missing_samples_and_dead_channels_are_flagged(model, tmp_path, capsys):
+    lost, dead = volts(), volts()
+    lost[:, 12000:12400] = math.nan
+    dead[2] = 0.0
+    save(tmp_path / "dead.npz", recording(dead))
+    save(tmp_path / "lost.npz", recording(lost))
+    content = heard(model, tmp_path, tmp_path / "out")
+    of_dead, of_lost = content["recordings"]
+    wanted = [int((~offline(samples).is_valid).sum()) for samples in (dead, lost)]
+    assert [of_dead["decisions"]["invalid"], of_lost["decisions"]["invalid"]] == wanted
+    assert min(wanted) > 0
+    assert "of the decisions are not valid" in capsys.readouterr().out
+
+
+def test_a_further_format_is_a_further_line(model, tmp_path, monkeypatch):
+    monkeypatch.setitem(folders.FORMATS, "tac", folders.FORMATS["npz"])
+    save(tmp_path / "a.tac", recording())
+    assert len(heard(model, tmp_path, tmp_path / "out", "figure=false")["recordings"]) == 1
+
+
+def test_files_of_one_stem_keep_their_figures_apart(model, tmp_path):
+    save(tmp_path / "a.npz", quiet())
+    np.save(tmp_path / "a.npy", volts(2.0, ()).numpy().T)
+    heard(model, tmp_path, tmp_path / "out", "sample_rate_hz=2000")
+    pictures = sorted(path.name for path in (tmp_path / "out").glob("*.png"))
+    assert pictures == ["a.npy_onsets.png", "a.npz_onsets.png"]
+
+
+# Long recordings ---------------------------------------------------------------------------------
+
+
+def test_no_more_than_a_second_is_in_hand(model, tmp_path, monkeypatch):
+    asked, pushed = [], []
+    read, push = StoredSamples.read, module.StreamingDetector.push
+
+    def watched(samples, first, stop):
+        piece = read(samples, first, stop)
+        asked.append(piece.shape[1])
+        return piece
+
+    def pushing(stream, samples):
+        pushed.append(len(samples))
+        decisions = push(stream, samples)
+        held.append(stream.state_bytes)
+        return decisions
+
+    held = []
+    monkeypatch.setattr(StoredSamples, "read", watched)
+    monkeypatch.setattr(module.StreamingDetector, "push", pushing)
+    save(tmp_path / "a.npz", recording())
+    heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+    assert max(asked) == max(pushed) == 2000
+    assert sum(pushed) == 16000
+    assert max(held) < 2000 * 4 * 4  # what a stream keeps is less than what it is given
+
+
+# What goes wrong ---------------------------------------------------------------------------------
+
+
+def command(monkeypatch, capsys, tmp_path, *arguments):
+    """The command as a user runs it: exit status, what it printed, its error line."""
+    monkeypatch.chdir(tmp_path)
+    run_dir = f"hydra.run.dir={tmp_path / 'out'}"
+    monkeypatch.setattr(sys, "argv", ["detect", "engine=eager", run_dir, *map(str, arguments)])
+    status = 0
+    try:
+        main()
+    except SystemExit as stop:
+        status = stop.code
+    out, err = capsys.readouterr()
+    return status, out, [line for line in err.splitlines() if line.startswith("error")]
+
+
+def test_a_damaged_file_in_a_folder_costs_the_others_nothing(model, tmp_path, monkeypatch, capsys):
+    place = tmp_path / "in"
+    for name in "acd":
+        save(place / f"{name}.npz", quiet())
+    content = bytearray((place / "c.npz").read_bytes())
+    content[len(content) // 2] ^= 1
+    (place / "c.npz").write_bytes(content)
+    save(place / "b.npz", recording())
+    save(place / "e.npz", quiet(sample_rate_hz=1000.0))
+    status, out, lines = command(monkeypatch, capsys, tmp_path, f"model={model}", f"input={place}")
+    assert status == 2
+    (line,) = lines
+    assert "2 of 5 recordings failed, first: " in line
+    assert "c.npz is damaged or no recording of ours; the others are in" in line
+    assert "of 2 slips 2 found" in out
+    written = json.loads((tmp_path / "out" / "onsets.json").read_text())
+    assert [entry["file"] for entry in written["recordings"]] == ["a.npz", "b.npz", "d.npz"]
+    assert [entry["file"] for entry in written["failed"]] == ["c.npz", "e.npz"]
+    assert "1000.0 Hz, the detector of 2000 Hz; resample it" in written["failed"][1]["error"]
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"a_onsets.png", "b_onsets.png", "d_onsets.png", "onsets.csv"} <= names
+    assert not [name for name in names if "tmp" in name or name.startswith("c_")]
+
+
+def test_what_was_heard_before_an_interruption_stays(model, tmp_path, monkeypatch):
+    save(tmp_path / "a.npz", recording())
+    save(tmp_path / "b.npz", quiet())
+    push = module.StreamingDetector.push
+    count = []
+
+    def stopped(stream, samples):
+        count.append(1)
+        if len(count) == 8 + 2:
+            raise KeyboardInterrupt
+        return push(stream, samples)
+
+    monkeypatch.setattr(module.StreamingDetector, "push", stopped)
+    config = composed(f"model={model}", f"input={tmp_path}", "decisions=true")
+    with pytest.raises(KeyboardInterrupt):
+        detect(config, tmp_path / "out")
+    written = json.loads((tmp_path / "out" / "onsets.json").read_text())
+    assert [entry["file"] for entry in written["recordings"]] == ["a.npz"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        *("a_decisions.csv", "a_onsets.png", "config.yaml", "onsets.csv", "onsets.json")
+    ]
+
+
+def other_hand(*, kinds=("SG", "SG", "PVDF", "PVDF"), names=None):
+    names = HAND.names if names is None else names
+    return HandLayout.from_rows(
+        {"name": name, "kind": kind, "finger": "f", "segment": "distal"}
+        for name, kind in zip(names, kinds, strict=True)
+    )
+
+
+def of_other_names(place):
+    save(place / "a.npz", recording(), other_hand(names=("SG1", "PVDF1", "SG2", "PVDF2")))
+
+
+def of_other_kinds(place):
+    save(place / "a.npz", recording(), other_hand(kinds=("SG", "SG", "SG", "PVDF")))
+
+
+def of_fewer_channels(place):
+    save(place / "a.npz", recording(volts()[:3]), HandLayout(HAND.channels[:3]))
+
+
+def of_another_rate(place):
+    save(place / "a.npz", recording(sample_rate_hz=1999.5))
+
+
+def too_short(place):
+    save(place / "a.npz", quiet(0.049))
+
+
+def empty(place):
+    save(place / "a.npz", quiet(0.0))
+
+
+def arrays(place):
+    np.save(place / "a.npy", volts().numpy().T)
+
+
+def turned(place):
+    np.save(place / "a.npy", volts().numpy())
+
+
+def damaged(place):
+    (place / "a.npz").write_bytes(b"nothing")
+
+
+def whole(place):
+    save(place / "a.npz", recording())
+
+
+def nothing(place):
+    (place / "notes.txt").write_text("no recording")
+
+
+REFUSED = {
+    "no file": (nothing, ["input=nowhere.npz"], "no file or folder at nowhere.npz"),
+    "empty folder": (nothing, [], "no recording in {place}; give a folder of .npz or .npy files"),
+    "no recording": (nothing, ["input=in/notes.txt"], "in/notes.txt must end in .npz or .npy"),
+    "no input": (nothing, ["~input"], "input"),
+    "names": (of_other_names, [], "channel 2 of {place}/a.npz is PVDF1 (SG), not SG2 (SG); give"),
+    "kinds": (of_other_kinds, [], "channel 3 of {place}/a.npz is PVDF1 (SG), not PVDF1 (PVDF)"),
+    "channels": (of_fewer_channels, [], "{place}/a.npz has 3 channels, not 4"),
+    "rate": (of_another_rate, [], "a.npz is of 1999.5 Hz, the detector of 2000 Hz; resample it"),
+    "short": (too_short, [], "{place}/a.npz has 98 samples, too few for a decision"),
+    "empty": (empty, [], "{place}/a.npz has 0 samples, too few"),
+    "no rate": (arrays, [], "{place}/a.npy holds samples alone; say their rate, as sample_rate_hz"),
+    "other rate": (arrays, ["sample_rate_hz=500"], "is of 500 Hz, the detector of 2000 Hz"),
+    "turned": (turned, ["sample_rate_hz=2000"], "{place}/a.npy has 16000 channels, not 4"),
+    "damaged": (damaged, [], "{place}/a.npz is damaged or no recording of ours"),
+    "threshold": (whole, ["threshold=high"], "threshold must be a finite number, got 'high'"),
+    "infinite": (whole, ["threshold=inf"], "threshold must be a finite number, got inf"),
+    "view": (whole, ["view=3"], "view must be [start, end] in seconds, got 3"),
+    "view of nothing": (whole, ["view=[9,10]"], "shows nothing of 8 s"),
+    "engine": (whole, ["engine=steam"], "steam"),
+    "no detector": (whole, ["model=missing.pt"], "no detector at missing.pt"),
+    "another file": (whole, ["model=in/a.npz"], "in/a.npz is damaged or no file of ours"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_bad_input_is_one_line_and_exit_status_2(name, model, tmp_path, monkeypatch, capsys):
+    make, arguments, said = REFUSED[name]
+    place = tmp_path / "in"
+    place.mkdir()
+    make(place)
+    given = [f"model={model}", f"input={place}"]
+    if arguments == ["~input"]:
+        given, arguments = given[:1], []
+    status, _, lines = command(monkeypatch, capsys, tmp_path, *given, *arguments)
+    assert status == 2
+    (line,) = lines
+    assert said.format(place=place) in line
+    assert not (tmp_path / "out" / "onsets.json").exists()
+
+
+def test_a_detector_without_a_threshold_says_how_to_get_one(tmp_path, monkeypatch, capsys):
+    small_detector(SEED).save(tmp_path / "bare.pt")
+    save(tmp_path / "a.npz", recording())
+    given = (f"model={tmp_path / 'bare.pt'}", f"input={tmp_path / 'a.npz'}")
+    status, out, lines = command(monkeypatch, capsys, tmp_path, *given)
+    assert (status, out) == (2, "")
+    (line,) = lines
+    assert "no alarm threshold; train with +exp=onset" in line
+
+
+def test_an_error_of_ours_is_not_called_a_bad_recording(model, tmp_path, monkeypatch):
+    save(tmp_path / "a.npz", recording())
+
+    def broken(stream, samples):
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(module.StreamingDetector, "push", broken)
+    with pytest.raises(ZeroDivisionError):
+        detect(composed(f"model={model}", f"input={tmp_path}"), tmp_path / "out")
