@@ -166,6 +166,12 @@ def assert_results(folder, metrics, roles, num_pool):
             assert all(
                 set(part) == SCORES | {"confusion", "num_bins"} for part in scores[kind].values()
             )
+    assert list(metrics["events"]) == roles
+    for by_rule in metrics["events"].values():
+        assert list(by_rule) == ["first_transition", "two_of_three"]
+        for events in by_rule.values():
+            parts = (events["num_found"], events["num_early"], events["num_missed"])
+            assert events["num_onsets"] == sum(parts) > 0
     assert metrics["num_features_pool"] == num_pool
     detector = SlipDetector.load(folder / "detector.pt")
     assert metrics["selected"] == [str(name) for name in detector.selected_names]
@@ -176,7 +182,7 @@ def assert_results(folder, metrics, roles, num_pool):
 def assert_files(folder, *more):
     for name in ("metrics.json", "detector.pt", "config.yaml", "last.ckpt", *more):
         assert (folder / name).stat().st_size > 0, name
-    for name in ("confusion.png", "selected_features.png"):
+    for name in ("confusion.png", "selected_features.png", "events.png"):
         assert (folder / name).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert list(folder.rglob("events.out.tfevents.*"))
     assert not [path for path in folder.rglob("*") if ".tmp" in path.name]
@@ -320,6 +326,16 @@ def test_one_fold_per_material_leaves_a_folder_each(tmp_path):
     assert list(total["per_material"]) == ["A", "B", "C"]
     shared = set.intersection(*(set(fold["selected"]) for fold in metrics["folds"].values()))
     assert set(metrics["selected"]) == shared
+    for rule, events in metrics["events"]["unseen"].items():
+        own = [fold["events"]["unseen"][rule] for fold in metrics["folds"].values()]
+        for name in ("num_recordings", "num_onsets", "num_found", "num_false_alarms"):
+            assert events[name] == sum(part[name] for part in own), name
+        assert list(events["per_material"]) == ["A", "B", "C"]
+    trained = metrics["events"]["train"]["two_of_three"]  # each by two of the detectors
+    assert trained["num_onsets"] == sum(
+        fold["events"]["train"]["two_of_three"]["num_onsets"] for fold in metrics["folds"].values()
+    )
+    assert "recording_events" not in json.dumps(metrics)
 
 
 def test_the_checkpoint_of_a_fold_does_not_reach_another(tmp_path):
@@ -371,6 +387,8 @@ def test_random_bins_have_train_and_test_in_every_recording(tmp_path):
     splits = metrics["splits"]
     assert list(splits) == ["train", "test"]
     assert splits["train"]["num_bins"] + splits["test"]["num_bins"] == 2 * 4 * 72
+    assert "both sides" in metrics["events"]["test"]["first_transition"]["reason"]
+    assert not (tmp_path / "events.png").exists()
 
 
 # Evaluate --------------------------------------------------------------------------------------
@@ -380,6 +398,7 @@ def test_evaluate_gives_the_scores_of_the_run(tiny, tmp_path, capsys):
     overrides = (*TINY_EVALUATE, f"cache={tiny.cache}", f"model={tiny.folder / 'detector.pt'}")
     metrics = evaluate(composed(*overrides, name="evaluate"), tmp_path)
     assert metrics["splits"] == tiny.metrics["splits"]
+    assert metrics["events"] == tiny.metrics["events"]
     assert metrics == json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["simulated"] is False
     for name in ("confusion.png", "selected_features.png", "config.yaml"):

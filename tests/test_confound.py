@@ -327,6 +327,11 @@ def test_scores_of_rivals_are_each_ones_own_and_no_sums(ran):
         for role in roles
     }
     assert metrics["splits"] == expected
+    assert metrics["events"] == {
+        f"{fold}/{role}": metrics["folds"][fold]["events"][role]
+        for fold in ("protocol", "with_scenes")
+        for role in roles
+    }
     singles = metrics["baselines"]["best_single_feature"]["splits"]
     assert singles == {
         f"{fold}/{role}": of["baselines"]["best_single_feature"]["splits"][role]
