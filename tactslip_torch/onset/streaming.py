@@ -36,9 +36,10 @@ class StreamingDetector:
     the last one. Not for several threads at once.
 
     **Missing samples** are NaN; so are the samples of a gap of at most ``max_gap_s`` that the times
-    of samples show. Decisions that such a sample reaches are not valid and say nothing to the
-    rule. A longer gap ends the stream as ``flush`` does and begins another, from decision number 0;
-    ``num_gaps`` counts, and the log warns.
+    of samples show. A decision that one of them reaches is flagged as not valid. It still counts
+    as long as a channel in use is left (``is_usable``), else it says nothing to the rule. A longer
+    gap ends the stream as ``flush`` does and begins another, from decision number 0; ``num_gaps``
+    counts, and the log warns.
 
     Args:
         detector: fitted on this hand.
