@@ -73,8 +73,9 @@ def pooled_metrics(
       steps of 5 %. ``latency_ms``: means of its parts, which add up to ``delay``, and ``compute``
       (None where not measured). ``onset_error_ms``: ``median``, ``sd`` (of the population) and
       ``mean_abs`` of the estimates. None where there is nothing to say this of.
-    - ``per_material``, ``per_scene``, ``per_speed``: the same of groups, without groups; a false
-      alarm has no speed. Of several scenes, materials and speeds are of the paper's alone.
+    - ``per_material``, ``per_scene``, ``per_speed``: the same of groups, without groups, level and
+      quantiles; a false alarm has no speed. Of several scenes, materials and speeds are of the
+      paper's alone.
 
     A number with an interval is ``{"value", "low", "high"}``, by bootstrap over recordings
     (``resampling``); what bears one name is one recording.
@@ -94,11 +95,17 @@ def pooled_metrics(
     counted = [one for one in events if is_one or one.scene == PAPER_SCENE]
     speeds = sorted({onset.speed_mm_s for one in counted for onset in one.onsets})
 
+    def of_group(own: Sequence[RecordingEvents]) -> dict[str, Any]:
+        numbers = _summary(own, draws)
+        if numbers["delay_ms"]:
+            del numbers["delay_ms"]["quantiles"]
+        return numbers
+
     def by(name: str, among: Sequence[RecordingEvents]) -> dict[str, Any]:
         groups: dict[str, list[RecordingEvents]] = {}
         for one in among:
             groups.setdefault(getattr(one, name), []).append(one)
-        return {group: _summary(own, draws) for group, own in groups.items()}
+        return {group: of_group(own) for group, own in groups.items()}
 
     def at(speed: float) -> list[RecordingEvents]:
         own = (
@@ -111,7 +118,7 @@ def pooled_metrics(
         **_summary(events, draws),
         "level": level,
         "per_material": by("material", counted),
-        "per_speed": {f"{speed:g}": _summary(at(speed), draws) for speed in speeds},
+        "per_speed": {f"{speed:g}": of_group(at(speed)) for speed in speeds},
         "per_scene": by("scene", events),
     }
 
