@@ -325,6 +325,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
         "report.signals",
         "report.calibration",
         "report.events",
+        "report.alarm",
         "report.reliability",
         "report.onset",
     ),

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from tactslip_torch.files import whole_file
+from tactslip_torch.report.alarm import alarm_figure, alarm_table, scenes_table
 from tactslip_torch.report.confound import by_detector, confound_figure, confound_table
 from tactslip_torch.report.events import events_figure, events_table, has_events
 from tactslip_torch.report.figures import confusion_figure, selected_features_figure
+from tactslip_torch.report.reliability import reliability_figure, reliability_table
 from tactslip_torch.report.tables import (
     materials_table,
     selected_table,
@@ -26,7 +28,8 @@ def write_results(
 ) -> None:
     """Write ``metrics.json`` and the figures of a run into a folder.
 
-    Results on several kinds of scenes also get ``confound.png``, those with events ``events.png``.
+    Results on several kinds of scenes also get ``confound.png``, those with events ``events.png``,
+    those that set an alarm ``alarm.png`` and ``reliability.png``.
 
     Args:
         folder: made if it is not there.
@@ -43,6 +46,12 @@ def write_results(
         confound_figure(metrics, folder / "confound.png")
     if has_events(metrics):
         events_figure(metrics, folder / "events.png")
+    if alarm := metrics.get("alarm"):
+        alarm_figure(metrics, folder / "alarm.png")
+        if alarm["reliability"]:
+            reliability_figure(
+                alarm["reliability"], folder / "reliability.png", simulated=simulated
+            )
     if metrics.get("validation"):
         validation_figure(metrics["validation"], folder / "validation.png", simulated=simulated)
 
@@ -52,6 +61,9 @@ def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, st
     parts = [splits_table(metrics), materials_table(metrics)]
     if metrics.get("events"):
         parts.append(events_table(metrics))
+    if alarm := metrics.get("alarm"):
+        parts += [alarm_table(metrics), scenes_table(metrics)]
+        parts.append(reliability_table(alarm["reliability"], simulated=metrics["simulated"]))
     if by_detector(metrics):
         parts.append(confound_table(metrics))
     if selected:
