@@ -144,7 +144,7 @@ def clustered(source: np.random.Generator, num: int, total: float, size: float) 
 
 @pytest.mark.parametrize(
     ("total", "size", "at_least"),
-    # nominal 0.95; measured with 400 draws: 0.97, 0.95, 0.93, 0.88
+    # nominal 0.95; measured with 1000 draws of another seed: 0.96, 0.95, 0.94, 0.88
     [(60, 1, 0.93), (60, 3, 0.90), (60, 6, 0.88), (10, 3, 0.80)],
 )
 def test_coverage_on_clustered_streams(
@@ -367,8 +367,8 @@ HOW = {"rearm": 5, "refractory": 20}
 def test_fresh_streams_have_the_target_rate(rule: Rule, memory: int) -> None:
     # 30 recordings of 20 s to choose on and 30 fresh ones, 40 times over; a decision shares what it
     # saw with ``memory`` neighbours. Ten alarms are allowed, so the threshold as well as the fresh
-    # count have some 3 of noise: in 83 of 100 the interval of the second holds the target, and
-    # there is no bias.
+    # count have some 3 of noise: the interval of a fresh count need not hold the target in 95 of
+    # 100, and was seen to in 88 to 93, with means of 59 to 66 an hour.
     source = torch.Generator().manual_seed(memory)
     llr = 2 * smooth(torch.randn(40, 60, 1999 + memory, generator=source), memory) - 2
     statistics, _ = rule.scan(llr, rule.start(llr[..., 0]))
@@ -379,6 +379,6 @@ def test_fresh_streams_have_the_target_rate(rule: Rule, memory: int) -> None:
         assert found.rate.alarms <= 10
         counts = alarm_counts(list(others), [found.value], margin=rule.margin, **HOW)
         fresh.append(alarm_rate(counts[0], torch.full((30,), 20 / 3600)))
-    assert sum(one.low <= 60 <= one.high for one in fresh) >= 28
+    assert sum(one.low <= 60 <= one.high for one in fresh) >= 30
     mean = np.mean([one.per_hour for one in fresh])
-    assert mean == pytest.approx(60, abs=13)  # three standard errors of 60 sqrt(2 / 10 / 40)
+    assert mean == pytest.approx(60, abs=13)  # a standard error is 60 sqrt(2 / 10 / 40) = 4

@@ -113,13 +113,10 @@ def alarm_rate(
     within one recording nothing is seen, nor of those too rare to have occurred.
 
     Args:
-        counts: alarms of each recording.
-        hours: how long each was watched.
+        counts: alarms of each recording, ``[R]``.
+        hours: how long each was watched, ``[R]``.
         level: of the interval.
         seed: of the resampling.
-
-    Shape:
-        - counts, hours: ``[R]``
 
     Raises:
         ValueError: if these are not two rows of equal length, none is longer than 0 hours, or a
@@ -201,7 +198,7 @@ def choose_threshold(
     follow from higher, as a lower threshold may join two alarms into one. Tried are the values at
     which the count can change: those of the statistic and, with a margin, the same plus it. Of the
     thresholds between two of them, which raise the same alarms, the upper one is taken: then fresh
-    recordings have as many as these in the mean, and not one more. Where none is allowed it is the
+    recordings have about as many in the mean, and not one more. Where none is allowed it is the
     next number above all. Only where recordings are so busy that the work would grow without
     bound, evenly spaced ranks are tried in place of all.
 
@@ -244,7 +241,7 @@ def choose_threshold(
 def _candidates(
     flat: Tensor, recording: Tensor, margin: float, rearm: int, refractory: int, allowed: int
 ) -> Iterator[float]:
-    """The threshold sought, and all higher ones tried, upwards, should rounding have misled."""
+    """The threshold sought; should rounding or untried ones have misled, higher and higher ones."""
     num = max(1024, 8 * (allowed + 1))
     while True:
         floor = flat.new_tensor(-math.inf)
@@ -256,7 +253,10 @@ def _candidates(
             break
         num *= 2
     num_fit = int(too_many[0]) if len(too_many) else len(tried)
-    yield from reversed(tried[:num_fit].tolist())
+    step = 1
+    while num_fit > 0:
+        yield float(tried[num_fit - 1])
+        num_fit, step = num_fit - step, 2 * step
     yield float(torch.nextafter(flat.max(), flat.new_tensor(math.inf)))
 
 
