@@ -89,7 +89,7 @@ def pooled_metrics(
     Raises:
         ValueError: if the level is not between 0 and 1, or nothing is to be drawn.
     """
-    events = sorted(events, key=lambda one: (*_name(one), str(one)))
+    events = sorted(events, key=lambda one: (*_name(one), one.quiet_s, str(one.onsets)))
     draws = Draws(level, num_resamples, seed)
     is_one = len({one.scene for one in events}) < 2
     counted = [one for one in events if is_one or one.scene == PAPER_SCENE]

@@ -181,8 +181,9 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
         place = bisect_right(first, time) - 1
         return place if place >= 0 and time <= last[place] else None
 
-    seen = [number for number, time in enumerate(watched.alarms_s) if is_watched(_ns(time))]
-    alarms = [_ns(watched.alarms_s[number]) for number in seen]
+    raised = [_ns(alarm) for alarm in watched.alarms_s]
+    seen = [number for number, alarm in enumerate(raised) if is_watched(alarm)]
+    alarms = [raised[number] for number in seen]
     ends = [_ns(watched.alarm_ends_s[number]) if watched.alarm_ends_s else None for number in seen]
     belongs = [window_of(alarm) for alarm in alarms]
     of_slip = Counter(belongs)
