@@ -150,6 +150,18 @@ def test_the_truth_stands_beside_them(run):
     assert events["num_false_alarms"] == len(false)
 
 
+def test_an_alarm_that_stands_before_the_slip_and_to_the_end_is_early(model, tmp_path):
+    """Loud from before the onset to the end: one alarm, which never ends."""
+    samples = volts(4.0, ((1.9, 4.0),))
+    truth = {"onsets_s": (2.0,), "sliding_s": ((2.0, 4.0),), "speeds_mm_s": (20.0,)}
+    save(tmp_path / "a.npz", recording(samples, **truth))
+    (entry,) = heard(model, tmp_path, tmp_path / "out", "threshold=3", "figure=false")["recordings"]
+    last = entry["alarms"][-1]
+    assert 1.9 < last["alarm_s"] < 2.0
+    assert (last["end_s"], last["outcome"]) == (None, "early")
+    assert [onset["outcome"] for onset in entry["truth"]["onsets"]] == ["early"]
+
+
 def test_every_word_about_the_origin_is_there(run, model):
     _, content = run
     assert content["format"] == "tactslip_torch onsets 1"

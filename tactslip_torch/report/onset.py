@@ -35,6 +35,7 @@ _ONSET: dict[str, Any] = {"color": _INK, "linestyle": "-."}
 _ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-"}
 _ESTIMATE: dict[str, Any] = {"color": ALARM, "linestyle": ":"}
 _WIDTH, _ROOM = 1.2, 40  # of marks, in points, as long as there are no more of a kind
+_MOST_LINES = 250
 
 
 def onset_figure(heard: Heard, path: str | Path, *, title: str) -> None:
@@ -92,7 +93,7 @@ def _draw_films(axes: Axes, heard: Heard, slips: Stretches) -> None:
     _mark(axes, heard, heard.onsets_s, "onset", **_ONSET)
     alarms = [alarm for alarm, _ in heard.alarms]
     _mark(axes, heard, alarms, "alarm", **_ALARM)
-    if seen := _seen(heard, alarms):
+    if 0 < len(seen := _seen(heard, alarms)) <= _MOST_LINES:
         above = axes.get_xaxis_transform()
         axes.plot(seen, [1.0] * len(seen), "v", color=ALARM, transform=above, clip_on=False)
     axes.set_yticks(middles, list(heard.films), fontsize=7)
@@ -150,12 +151,13 @@ def _legend(heard: Heard, has_invalid: bool) -> list[Any]:
 
 
 def _mark(axes: Axes, heard: Heard, times: Sequence[float], name: str, **style: Any) -> None:
-    """Lines from top to bottom, the finer the more there are."""
+    """Lines from top to bottom, the finer the more there are; of too many their upper ends."""
     if not (seen := _seen(heard, times)):
         return  # a collection of nothing has no layout
     width = _WIDTH * min(1.0, _ROOM / len(seen)) ** 0.5
     through = axes.get_xaxis_transform()
-    axes.vlines(seen, 0, 1, transform=through, linewidth=max(width, 0.2), gid=name, **style)
+    bottom = 0.0 if len(seen) <= _MOST_LINES else 0.97
+    axes.vlines(seen, bottom, 1, transform=through, linewidth=max(width, 0.2), gid=name, **style)
 
 
 def _shade(axes: Axes, stretches: Stretches, name: str, **style: Any) -> None:
