@@ -28,6 +28,9 @@ from benchmarks.precision import report as precision
 from benchmarks.rates import NOT_MEASURED, not_measured
 from benchmarks.simulation import figure as simulation_figure
 from benchmarks.simulation import report as simulation
+from benchmarks.streaming import figure as streaming_figure
+from benchmarks.streaming import measure as streaming_measure
+from benchmarks.streaming import report as streaming
 from benchmarks.tables import Table, limits
 from benchmarks.throughput import figure as throughput_figure
 from benchmarks.throughput import measure as throughput_measure
@@ -92,6 +95,14 @@ SECTIONS = {
         throughput_figure.figure,
         throughput.about,
         needs=tuple(throughput_measure.SECTIONS),
+    ),
+    "streaming": Section(
+        "Streams",
+        streaming.tables,
+        streaming.report_text,
+        streaming_figure.figure,
+        streaming.about,
+        needs=streaming_measure.SECTIONS,
     ),
     "train": Section("Training", None, train.report_text, keys=("experiment", "stages", "wholes")),
     "model": Section(

@@ -1,0 +1,1 @@
+"""What a stream costs: ``python -m benchmarks.streaming``."""
