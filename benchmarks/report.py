@@ -23,6 +23,8 @@ from benchmarks.latency import figure as latency_figure
 from benchmarks.latency import report as latency
 from benchmarks.model import measure as model_measure
 from benchmarks.model import report as model
+from benchmarks.onset import figure as onset_figure
+from benchmarks.onset import report as onset
 from benchmarks.outcome import QUICK_LINE, RESULTS
 from benchmarks.precision import report as precision
 from benchmarks.rates import NOT_MEASURED, not_measured
@@ -103,6 +105,14 @@ SECTIONS = {
         streaming_figure.figure,
         streaming.about,
         needs=streaming_measure.SECTIONS,
+    ),
+    "onset": Section(
+        "Alarms",
+        onset.tables,
+        onset.report_text,
+        onset_figure.figure,
+        onset.about,
+        needs=onset.SECTIONS,
     ),
     "train": Section("Training", None, train.report_text, keys=("experiment", "stages", "wholes")),
     "model": Section(
