@@ -163,76 +163,114 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
     Reference:
         REFERENCE.md section 7.
     """
-    settle_s = rules.settle_s
-    if settle_s is None:
-        settle_s = latency.bin_s + latency.look_ahead_s + 0.05
-    onsets = [_ns(onset) for onset in watched.onsets_s]
-    first = [onset - _ns(rules.early_s) for onset in onsets]
-    last = [
-        max(_ns(end), onset) + _ns(settle_s)
-        for onset, (_, end) in zip(onsets, watched.sliding_s, strict=True)
-    ]
+    windows = _Windows.of(watched, rules, latency)
     stretches = [(_ns(start), _ns(end)) for start, end in watched.watched_s]
 
     def is_watched(time: int) -> bool:
         return not stretches or any(start <= time <= end for start, end in stretches)
 
-    def window_of(time: int) -> int | None:
-        place = bisect_right(first, time) - 1
-        return place if place >= 0 and time <= last[place] else None
-
-    raised = [_ns(alarm) for alarm in watched.alarms_s]
-    seen = [number for number, alarm in enumerate(raised) if is_watched(alarm)]
-    alarms = [raised[number] for number in seen]
-    ends = [_ns(watched.alarm_ends_s[number]) if watched.alarm_ends_s else None for number in seen]
-    belongs = [window_of(alarm) for alarm in alarms]
-    of_slip = Counter(belongs)
-    following = [*onsets[1:], _ns(_FOREVER_S)]
-
-    estimates = watched.onset_estimates_s
-
-    def judged(place: int) -> OnsetEvent:
-        onset, speed = watched.onsets_s[place], watched.speeds_mm_s[place]
-        after = bisect_left(alarms, onsets[place])
-        until = min(onsets[place] + _ns(rules.found_within_s), last[place])
-        outcome, parts = "missed", (math.nan,) * 4
-        end = ends[after - 1] if after else None
-        if after and alarms[after - 1] >= first[place] and (end is None or end > onsets[place]):
-            outcome = "early"
-        elif after < len(alarms) and alarms[after] <= until and alarms[after] < following[place]:
-            outcome = "found"
-            number = seen[after]
-            positive = watched.first_positive_s[place] if watched.first_positive_s else math.nan
-            spoke = alarms[after] if math.isnan(positive) else min(_ns(positive), alarms[after])
-            parts = (
-                (alarms[after] - onsets[place]) / 1e9,
-                (spoke - onsets[place]) / 1e9 - latency.look_ahead_s,
-                (alarms[after] - spoke) / 1e9,
-                (_ns(estimates[number]) - onsets[place]) / 1e9 if estimates else math.nan,
-            )
-        return OnsetEvent(onset, speed, outcome, of_slip[place], *parts)
-
+    ends = watched.alarm_ends_s or (math.inf,) * len(watched.alarms_s)
+    raised = (
+        _Alarm(at, _ns(end), number)
+        for number, (at, end) in enumerate(zip(map(_ns, watched.alarms_s), ends, strict=True))
+    )
+    alarms = [alarm for alarm in raised if is_watched(alarm.at)]
+    belongs = [windows.holding(alarm.at) for alarm in alarms]
+    num_alarms = Counter(belongs)
+    onsets = tuple(
+        _onset_event(watched, place, alarms, windows, latency)._replace(
+            num_alarms=num_alarms[place]
+        )
+        for place, onset in enumerate(windows.onset)
+        if is_watched(onset)
+    )
+    false = [a.number for a, place in zip(alarms, belongs, strict=True) if place is None]
     whole = stretches or [(0, _ns(watched.duration_s))]
-    quiet = sum(end - start - _overlap(start, end, first, last) for start, end in whole)
     return RecordingEvents(
         watched.recording,
         watched.material,
         watched.scene,
-        tuple(judged(place) for place, onset in enumerate(onsets) if is_watched(onset)),
-        tuple(watched.alarms_s[n] for n, w in zip(seen, belongs, strict=True) if w is None),
-        quiet / 1e9,
+        onsets,
+        tuple(watched.alarms_s[number] for number in false),
+        sum(end - start - windows.inside(start, end) for start, end in whole) / 1e9,
         latency,
+    )
+
+
+class _Alarm(NamedTuple):
+    """When it was raised, when its status ended, and which one it is."""
+
+    at: int
+    end: int
+    number: int
+
+
+class _Windows(NamedTuple):
+    """Onsets and the windows of their slips, ascending; ``until`` is how long each can be found."""
+
+    onset: list[int]
+    first: list[int]
+    last: list[int]
+    until: list[int]
+
+    @classmethod
+    def of(cls, watched: Watched, rules: EventRules, latency: LatencyParts) -> _Windows:
+        settle_s = rules.settle_s
+        if settle_s is None:
+            settle_s = latency.bin_s + latency.look_ahead_s + 0.05
+        onset = [_ns(time) for time in watched.onsets_s]
+        ends = [_ns(end) for _, end in watched.sliding_s]
+        last = [max(time, end) + _ns(settle_s) for time, end in zip(onset, ends, strict=True)]
+        following = [time - 1 for time in onset[1:]] + [_ns(_FOREVER_S)]
+        until = [
+            min(time + _ns(rules.found_within_s), stop, before_next)
+            for time, stop, before_next in zip(onset, last, following, strict=False)
+        ]
+        return cls(onset, [time - _ns(rules.early_s) for time in onset], last, until)
+
+    def holding(self, time: int) -> int | None:
+        """The last window that holds an instant."""
+        place = bisect_right(self.first, time) - 1
+        return place if place >= 0 and time <= self.last[place] else None
+
+    def inside(self, start: int, end: int) -> int:
+        """How much of a stretch lies inside windows, which may overlap."""
+        inside, reached = 0, start
+        for first, last in zip(self.first, self.last, strict=True):
+            inside += max(0, min(last, end) - max(first, reached))
+            reached = max(reached, last)
+        return inside
+
+
+def _onset_event(
+    watched: Watched,
+    place: int,
+    alarms: Sequence[_Alarm],
+    windows: _Windows,
+    latency: LatencyParts,
+) -> OnsetEvent:
+    """What became of one onset; alarms are not counted yet."""
+    onset = windows.onset[place]
+    event = OnsetEvent(
+        watched.onsets_s[place], watched.speeds_mm_s[place], "missed", 0, *(math.nan,) * 4
+    )
+    after = bisect_left(alarms, onset, key=lambda alarm: alarm.at)
+    if after and alarms[after - 1].at >= windows.first[place] and alarms[after - 1].end > onset:
+        return event._replace(outcome="early")
+    if after == len(alarms) or alarms[after].at > windows.until[place]:
+        return event
+    alarm = alarms[after]
+    positive = watched.first_positive_s[place] if watched.first_positive_s else math.nan
+    spoke = alarm.at if math.isnan(positive) else min(_ns(positive), alarm.at)
+    estimates = watched.onset_estimates_s
+    return event._replace(
+        outcome="found",
+        delay_s=(alarm.at - onset) / 1e9,
+        bin_fill_s=(spoke - onset) / 1e9 - latency.look_ahead_s,
+        decision_s=(alarm.at - spoke) / 1e9,
+        error_s=(_ns(estimates[alarm.number]) - onset) / 1e9 if estimates else math.nan,
     )
 
 
 def _ns(seconds: float) -> int:
     return round(min(seconds, _FOREVER_S) * 1e9)
-
-
-def _overlap(start: int, end: int, first: Sequence[int], last: Sequence[int]) -> int:
-    """How much of a stretch lies inside windows, which ascend and may overlap."""
-    inside, reached = 0, start
-    for begin, stop in zip(first, last, strict=True):
-        inside += max(0, min(stop, end) - max(begin, reached))
-        reached = max(reached, stop)
-    return inside
