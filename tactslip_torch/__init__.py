@@ -8,11 +8,14 @@ from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.judgement import Judgement
 from tactslip_torch.model.sufficient import SufficientStats
+from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.simulation import Scene, simulate
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "AlarmSettings",
     "Channel",
     "FeatureExtractor",
     "FeatureName",
@@ -22,6 +25,7 @@ __all__ = [
     "Recording",
     "Scene",
     "SlipDetector",
+    "StreamingDetector",
     "SufficientStats",
     "simulate",
 ]

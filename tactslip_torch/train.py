@@ -165,6 +165,7 @@ def _run_fold(
     onnx: dict[str, float] | str | None = None
     alarm: dict[str, Any] = {}
     if trainer.is_global_zero and alarming is not None:
+        detector.save(folder / "detector.pt")  # what was fitted stays, whatever comes
         alarm = alarming(detector, _rivals(detector), config.num_workers)
     told = time.perf_counter()
     if trainer.is_global_zero:

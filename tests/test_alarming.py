@@ -2,16 +2,22 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 from small_set import RATE_HZ, SMALL_HAND
 
+from benchmarks.alarms import text_of
+from benchmarks.outcome import RESULTS, ROOT, between_markers
 from tactslip_torch.alarming.methods import FITS, Promise, labelled
 from tactslip_torch.alarming.stage import FIRST_TRANSITION, OURS, Alarming
 from tactslip_torch.alarming.watching import Clock, Stream, decide, slip_bins, watch, watched
-from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.config import conf_dir
+from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.calibration import Platt
@@ -22,8 +28,10 @@ from tactslip_torch.onset.baselines import first_transition
 from tactslip_torch.onset.decider import Decider
 from tactslip_torch.onset.sequential import Cusum, KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
+from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.report.alarm import alarm_figure, alarm_table, scenes_table
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.train import train
 
 RULES = {
     "cusum": {"name": "cusum", "drift": 0.5, "evidence": 0.4},
@@ -223,6 +231,26 @@ def test_settings_go_with_the_detector_file(told, tmp_path):
         AlarmSettings.of(loudness_detector())
 
 
+class Backwards:
+    """A rival that is quiet in slips."""
+
+    def __init__(self, detector: SlipDetector) -> None:
+        self.pool, self.channel_filter = detector.pool, detector.channel_filter
+        self.needed_index, self.look_ahead = detector.needed_index, detector.look_ahead
+        self._detector = detector
+
+    def judge(self, bins, *, given=None):
+        found = self._detector.judge(bins, given=given)
+        return found._replace(score=-found.score)
+
+
+def test_a_rival_whose_scores_are_backwards_is_left_out(caplog):
+    detector = loudness_detector()
+    found = stage()(detector, {"quiet": Backwards(loudness_detector())}, num_workers=0)
+    assert "quiet" not in found["methods"]
+    assert "quiet is left out: slip has the lower scores" in caplog.text
+
+
 # ------------------------------------------------------------------------------------ watching
 CLOCK = Clock(RATE_HZ, 20, 100, 25)
 
@@ -327,3 +355,80 @@ def test_probabilities_are_fitted_to_clear_bins_alone(fit):
     assert kept.tolist() == score.astype(np.float32)[is_clear].tolist()
     assert is_slip.tolist() == truth[is_clear].tolist()
     assert FITS[fit](kept, is_slip).llr(torch.tensor([0.5])).isfinite().all()
+
+
+# --------------------------------------------------------------------------------- the experiment
+def composed(*overrides):
+    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+        return compose("train", list(overrides))
+
+
+def test_the_experiment_has_ten_hours_to_set_the_alarm_and_as_many_to_check_it():
+    config = composed("+exp=onset")
+    source: RecordingSource = instantiate(config.data, _convert_="all")
+    (fold,) = instantiate(config.split, _convert_="all")(source.ids)
+    trained = fold.having("train")
+    assert {r.scene for r in trained} == {"paper", "held", "knocked", "arm_motion"}
+    detector = SimpleNamespace(
+        info={
+            "train_materials": sorted({r.material for r in trained}),
+            "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
+        }
+    )
+    whole: Alarming = instantiate(config.onset, _convert_="all")
+    roles = whole.roles(detector)
+    assert {r.material for r in roles["unseen"]} == {"iron", "cloth", "copper", "wood"}
+    judged = {recording for own in roles.values() for recording in own}
+    assert len(judged) == sum(map(len, roles.values()))
+    for recording in trained:
+        if recording in judged:  # of the same name, but another recording
+            assert cache_key(whole.streams.key(recording)) != cache_key(source.key(recording))
+    for own in roles.values():
+        quiet = [r for r in own if r.scene == "held"]
+        assert sum(whole.streams.timeline(r).duration_s for r in quiet) >= 36_000
+    assert {"taps", "machine", "mains_bursts", "dead_channel"} <= {r.scene for r in roles["test"]}
+
+
+def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
+    dropped = ("taps", "grips", "machine", "mains_bursts", "pulled", "arm_motion")
+    config = composed(
+        "onset=alarms",
+        "data.cycles=2",
+        "data.materials=[M1,M6,iron]",
+        "split.seen=[M1,M6]",
+        "split.unseen=[iron]",
+        "split.train_share=0.5",
+        "recipe.num_features=20",
+        "recipe.penalties=[0.01]",
+        "recipe.sample_bins=60",
+        "onset.streams.cycles=4",
+        "onset.streams.others.held.cycles=2",
+        "onset.streams.others.held.tail_s=4.0",
+        "onset.streams.others.dead_channel.cycles=1",
+        "onset.hop_ms=25.0",
+        *(f"~onset.streams.others.{name}" for name in dropped),
+        "cache=off",
+        "num_workers=0",
+        "export=false",
+    )
+    train(config, tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    settings = AlarmSettings.of(SlipDetector.load(tmp_path / "detector.pt"))
+    assert metrics["alarm"]["settings"] == settings.to_dict()
+    assert settings.facts["simulated"] is True
+    assert {"test", "unseen", "test stream", "unseen stream"} <= set(metrics["events"])
+    assert metrics["alarm"]["scenes"]["dead_channel"]["test"]["cusum"]["num_onsets"] > 0
+    assert "asked for: 1 false alarms an hour of held" in capsys.readouterr().out
+    assert {"alarm.png", "events.png"} <= {path.name for path in tmp_path.iterdir()}
+    live = StreamingDetector(SlipDetector.load(tmp_path / "detector.pt"))
+    assert (
+        len(live.push(torch.randn(1000, 24)).number)
+        == (1000 - 100 - live.detector.look_ahead) // 50 + 1
+    )
+
+
+# ---------------------------------------------------------------------------------- what is stored
+def test_readme_says_what_the_stored_run_found():
+    stored = json.loads((RESULTS / "alarms.json").read_text())
+    readme = (ROOT / "README.md").read_text()
+    assert between_markers(readme, "onset", text_of(stored)) == readme

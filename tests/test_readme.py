@@ -8,18 +8,30 @@ import pytest
 from hydra._internal.utils import get_args_parser
 from test_detector import random_detector
 
+from tactslip_torch import AlarmSettings
+from tactslip_torch.model.calibration import Platt
+from tactslip_torch.onset.sequential import KOfN
+
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text()
 
 
 def test_the_programs_run(tmp_path, monkeypatch, capsys):
-    first, second, third = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    first, live, second, third = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     random_detector().save("detector.pt")
     exec(compile(first, "README.md", "exec"), {})
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("torch.Size([8, 2582])")
     assert re.fullmatch(r"tensor\(\[-?\d+\.\d+\]\) tensor\(\[True\]\)", lines[1])
+    detector = random_detector()
+    settings = AlarmSettings(20, Platt(2.0, 0.0), KOfN(1, 1), -1e9, 1.0)  # an alarm at once
+    detector.info["alarm"] = settings.to_dict()
+    detector.save("onset.pt")
+    exec(compile(live, "README.md", "exec"), {})
+    decided, alarm = capsys.readouterr().out.strip().rsplit("\n", 1)
+    assert decided.count("True") == 4  # 200 samples: a bin and its look-ahead, and 4 more hops
+    assert re.fullmatch(r"0\.0\d+ -?0\.0\d+ True", alarm)
     exec(compile(second, "README.md", "exec"), {})
     (line,) = capsys.readouterr().out.splitlines()
     scores, counts = re.fullmatch(r"tensor\((.*), dtype=.*\) tensor\((.*)\)", line).groups()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +19,8 @@ from tactslip_torch.onset.events import EventRules
 from tactslip_torch.onset.rate import Threshold, choose_threshold
 from tactslip_torch.onset.sequential import Cusum, KOfN, Rule
 from tactslip_torch.onset.settings import AlarmSettings
+
+log = logging.getLogger(__name__)
 
 CEILING = 1.5
 """Largest sum of ``Cusum`` in thresholds: what lies above only takes time to come down."""
@@ -153,10 +156,19 @@ def methods_of(
         clocks: of every scorer, ours among them.
         ours: its name.
         transition: the name of the paper's rule.
+
+    Raises:
+        ValueError: if our scores cannot be calibrated; others whose cannot are left out.
     """
     methods = {}
     for scorer, clock in clocks.items():
-        calibration = FITS[fit](*labelled(streams, scorer, clock))
+        try:
+            calibration = FITS[fit](*labelled(streams, scorer, clock))
+        except ValueError as error:
+            if scorer == ours:
+                raise
+            log.warning("%s is left out: %s", scorer, error)
+            continue
         for name, rule in rules.items() if scorer == ours else [(scorer, rules[main])]:
             methods[name] = promise.calibrated(scorer, rule, calibration, streams, clock)
         if scorer == ours:

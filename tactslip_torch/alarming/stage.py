@@ -155,10 +155,11 @@ class Alarming:
             num_workers: processes that watch.
 
         Returns:
-            JSON-able: ``"rule"``, ``"settings"`` of it; ``"streams"``, recordings, hours and slips
-            of each role and scene; ``"methods"``; ``"reliability"`` of each role; ``"events"`` of
-            the protocol and its quiet, by role and method; ``"scenes"``, the same of every other
-            scene by role, and whether it was ``"trained"`` on.
+            JSON-able: ``"rule"``, ``"settings"`` of it, ``"sample_rate_hz"``; ``"streams"``,
+            recordings, hours and slips of each role and scene; ``"methods"``; ``"reliability"`` of
+            each role; ``"events"`` of the protocol and its quiet, by role and method;
+            ``"scenes"``, the same of every other scene by role, and whether it was ``"trained"``
+            on.
 
         Raises:
             ValueError: if there is nothing to calibrate on.
@@ -199,6 +200,7 @@ class Alarming:
         }
         return {
             "rule": self.rule,
+            "sample_rate_hz": rate,
             "settings": settings.to_dict(),
             "streams": amounts,
             "methods": {name: method.to_dict() for name, method in methods.items()},

@@ -18,6 +18,8 @@ from tactslip_torch.report.tables import SIMULATED_LINE, aligned
 _ROLES = {"test stream": "#0072B2", "unseen stream": "#D55E00"}
 _NAMES = {"test stream": "seen materials", "unseen stream": "unseen materials"}
 _INK, _GREY, _GRID = "#222222", "#666666", "#DDDDDD"
+_HEADER = ["materials", "method", "false alarms an hour without slip", "kept", "slips"]
+_HEADER += ["found %", "early %", "missed %", "delay ms", "p95 ms"]
 _LEAST = 0.1  # an hour: where the figure's axis begins, and rates of 0 are drawn
 
 
@@ -31,53 +33,75 @@ class _Kept(NamedTuple):
     hours: float
 
 
-def alarm_table(metrics: Mapping[str, Any]) -> str:
-    """The promise, what thresholds gave where they were set, and on other recordings.
+def kept_rows(metrics: Mapping[str, Any]) -> list[list[str]]:
+    """What was kept of the promise: a header, and a row for seen and unseen of every method.
 
-    Rates are false alarms an hour on recordings without slip, in brackets their intervals; *kept*
-    where the target lies in the interval or above it.
+    Rates are false alarms an hour on recordings without slip, in brackets their intervals; the
+    target is *kept* where it lies in the interval or above it. Slips are those of the protocol.
 
     Args:
         metrics: the content of ``metrics.json``, with ``alarm``.
     """
+    target = metrics["alarm"]["settings"]["target_per_hour"]
+    quiet = {(one.role, one.method): one for one in _kept(metrics)}
+    rows = [_HEADER]
+    for role, name in _NAMES.items():
+        for place, (method, numbers) in enumerate(metrics["events"].get(role, {}).items()):
+            one = quiet.get((role, method))
+            delay = numbers["delay_ms"]
+            rows.append(
+                [
+                    "" if place else name,
+                    method.replace("_", " "),
+                    "-" if one is None else _rate(one.rate, "value", one.hours),
+                    "-" if one is None else _verdict(one.rate, target),
+                    str(numbers["num_onsets"]),
+                    *(_share(numbers[outcome]) for outcome in ("found", "early", "missed")),
+                    "-" if delay is None else f"{delay['median']['value']:.1f}",
+                    "-" if delay is None else f"{delay['p95']['value']:.1f}",
+                ]
+            )
+    return rows
+
+
+def promise_line(metrics: Mapping[str, Any]) -> str:
+    """What was asked for, on what it was set, and what that gave there."""
     alarm = metrics["alarm"]
-    settings = alarm["settings"]
-    target = settings["target_per_hour"]
-    kept = {(one.method, one.role): one for one in _kept(metrics)}
-    rows = []
-    for name, method in alarm["methods"].items():
-        own = method["calibrated"]
-        cells = ["-", "-"]
-        if own:
-            cells = [f"{own['value']:.3g}", _rate(own["rate"], "per_hour", own["rate"]["hours"])]
-        for role in _ROLES:
-            one = kept.get((name, role))
-            cells.append("-" if one is None else _rate(one.rate, "value", one.hours))
-            cells.append("-" if one is None else _verdict(one.rate, target))
-        rows.append([name.replace("_", " "), *cells])
-    header = ["method", "threshold", "set on", "seen", "kept", "unseen", "kept"]
-    lines = [SIMULATED_LINE] if metrics["simulated"] else []
-    lines.append(
-        f"asked for: {target:g} false alarms an hour of {settings['facts']['slip_free']}; the "
-        f"detector's file has {alarm['rule'].replace('_', ' ')}"
+    settings, set_on = alarm["settings"], alarm["settings"]["facts"]["calibrated"]["rate"]
+    return (
+        f"asked for: {settings['target_per_hour']:g} false alarms an hour of "
+        f"{settings['facts']['slip_free']}; {alarm['rule'].replace('_', ' ')}, which the "
+        f"detector's file has, was set on {set_on['hours']:.1f} h with {set_on['alarms']}"
     )
-    lines.append(aligned(header, rows, num_left=1))
-    return "\n".join(lines)
 
 
-def scenes_table(metrics: Mapping[str, Any]) -> str:
+def alarm_table(metrics: Mapping[str, Any]) -> str:
+    """``promise_line`` and ``kept_rows`` for the terminal.
+
+    Args:
+        metrics: the content of ``metrics.json``, with ``alarm``.
+    """
+    header, *rows = kept_rows(metrics)
+    lines = [SIMULATED_LINE] if metrics["simulated"] else []
+    return "\n".join([*lines, promise_line(metrics), aligned(header, rows, num_left=2)])
+
+
+def scene_rows(metrics: Mapping[str, Any]) -> list[list[str]]:
     """False alarms and slips found in scenes that fool, by the detector's own rule.
 
-    Behind it the false alarms of the paper's rule and of the other methods.
+    Behind it the false alarms of the paper's rule and of the other methods. A header and a row for
+    seen and unseen materials of every scene.
 
     Args:
         metrics: the content of ``metrics.json``, with ``alarm``.
     """
     alarm = metrics["alarm"]
     main = alarm["rule"]
-    beside = [name for name, one in alarm["methods"].items() if one["scorer"] != "detector"]
-    beside = [name for name, one in alarm["methods"].items() if not one["calibrated"]] + beside
-    rows = []
+    beside = [name for name, one in alarm["methods"].items() if not one["calibrated"]]
+    beside += [name for name, one in alarm["methods"].items() if one["scorer"] != "detector"]
+    header = ["scene", "materials", "trained on", "quiet min", f"{main.replace('_', ' ')} /h"]
+    header += ["slips", "found %", "missed %", "delay ms", *(f"{name} /h" for name in beside)]
+    rows = [header]
     for scene, found in alarm["scenes"].items():
         for role, by_method in found.items():
             if role == "trained":
@@ -94,12 +118,19 @@ def scenes_table(metrics: Mapping[str, Any]) -> str:
                 "-" if delay is None else f"{delay['median']['value']:.0f}",
             ]
             cells += [_bare(by_method[name]["false_alarms_per_hour"]) for name in beside]
-            rows.append([scene.replace("_", " "), _role(role), *cells])
-    header = ["scene", "materials", "trained on", "quiet min", f"{main} /h", "slips", "found %"]
-    header += ["missed %", "delay ms", *(f"{name} /h" for name in beside)]
-    return "\n".join(
-        [*([SIMULATED_LINE] if metrics["simulated"] else []), aligned(header, rows, num_left=2)]
-    )
+            rows.append([scene.replace("_", " "), {"test": "seen"}.get(role, role), *cells])
+    return rows
+
+
+def scenes_table(metrics: Mapping[str, Any]) -> str:
+    """``scene_rows`` for the terminal.
+
+    Args:
+        metrics: the content of ``metrics.json``, with ``alarm``.
+    """
+    header, *rows = scene_rows(metrics)
+    lines = [SIMULATED_LINE] if metrics["simulated"] else []
+    return "\n".join([*lines, aligned(header, rows, num_left=2)])
 
 
 def alarm_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
@@ -187,10 +218,6 @@ def _of_scene(alarm: Mapping[str, Any], scene: str, role: str) -> Mapping[str, f
         return None
     rate: Mapping[str, float] | None = by_method[alarm["rule"]]["false_alarms_per_hour"]
     return rate
-
-
-def _role(role: str) -> str:
-    return {"test": "seen"}.get(role, role)
 
 
 def _rate(rate: Mapping[str, float], value: str, hours: float) -> str:

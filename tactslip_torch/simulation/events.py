@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactslip_torch.simulation.grasp import Grasp, recording_key
-from tactslip_torch.simulation.motion import ArmStroke, end_s
+from tactslip_torch.simulation.motion import ArmStroke, last_stop_s
 from tactslip_torch.simulation.randomness import Array, generator, log_uniform, lognormal
 from tactslip_torch.simulation.scene import Scene
 
@@ -95,7 +95,7 @@ def draw_events(
     """Events at random times where nothing slides, in order of time."""
     if rate_hz == 0:
         return ()
-    quiet = quiet_stretches(plan, end_s(plan) + scene.tail_s)
+    quiet = quiet_stretches(plan, last_stop_s(plan) + scene.tail_s)
     if not any(end_s - start_s > lengths_s[1] + SETTLE_S for start_s, end_s in quiet):
         raise ValueError(
             f"no rest long enough for {purpose} of up to {lengths_s[1]:g} s, {SETTLE_S:g} s to "

@@ -95,7 +95,7 @@ def arm_strokes(strokes: tuple[Stroke, ...], acceleration_m_s2: float) -> tuple[
     return tuple(plan)
 
 
-def end_s(plan: tuple[ArmStroke, ...]) -> float:
+def last_stop_s(plan: tuple[ArmStroke, ...]) -> float:
     """When the last stroke is over; 0 if there is none."""
     return plan[-1].stop_s if plan else 0.0
 

@@ -52,7 +52,8 @@ class Scene:
         material: id in ``MATERIALS``.
         hand: the channels; elements are its distinct (finger, segment) pairs.
         name: of the kind of scene; scenes of other names are other draws of the same session.
-        strokes: none for a hand that only holds; those that slide are longer than 1.5 times the longest presliding travel.
+        strokes: none for a hand that only holds; those that slide are longer than 1.5 times the
+            longest presliding travel.
         contact: how the hand touches and slides.
         sensors: the sensing elements and their front end.
         disturbances: what is not slip.

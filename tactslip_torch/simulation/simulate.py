@@ -21,7 +21,7 @@ from tactslip_torch.simulation.grasp import Grasp, draw_grasp
 from tactslip_torch.simulation.grid import Grid, block_samples_for
 from tactslip_torch.simulation.handling import Handled
 from tactslip_torch.simulation.ladder import scene_contact
-from tactslip_torch.simulation.motion import ArmStroke, Motion, arm_strokes, end_s
+from tactslip_torch.simulation.motion import ArmStroke, Motion, arm_strokes, last_stop_s
 from tactslip_torch.simulation.randomness import Array
 from tactslip_torch.simulation.scene import SIMULATION_VERSION, Scene
 from tactslip_torch.simulation.sensors import (
@@ -110,7 +110,7 @@ def _volts(
     _, _, now = grid.history
     driven = Motion(tuple(stroke for stroke in plan if stroke.drives), grid)
     sliding = Motion(tuple(stroke for stroke in plan if stroke.slides), grid)
-    duration_s = end_s(plan) + scene.tail_s
+    duration_s = last_stop_s(plan) + scene.tail_s
     front, common = draw_front(scene), Common(scene, driven, duration_s)
     field = shared_field(scene, grasp, sliding)
     volts = {index: common.channel(index) for index in indices}

@@ -16,7 +16,7 @@ from tactslip_torch.simulation.contact import Slips
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp, recording_key
 from tactslip_torch.simulation.handling import Handled
 from tactslip_torch.simulation.ladder import scene_contact
-from tactslip_torch.simulation.motion import ArmStroke, arm_strokes, end_s
+from tactslip_torch.simulation.motion import ArmStroke, arm_strokes, last_stop_s
 from tactslip_torch.simulation.randomness import Array, generator
 from tactslip_torch.simulation.scene import Scene
 
@@ -76,7 +76,7 @@ def timeline_of(scene: Scene, plan: tuple[ArmStroke, ...], grasp: Grasp, slips: 
     onsets = [_weighted_median(row[down], grasp.load_n[down]) for row in slips.start_s]
     sticking = [np.nan_to_num(row[down], nan=-np.inf) for row in slips.end_s]  # never slid
     ends = [_weighted_median(row, grasp.load_n[down]) for row in sticking]
-    num_samples = math.ceil((end_s(plan) + scene.tail_s) * scene.sample_rate_hz - 1e-6)
+    num_samples = math.ceil((last_stop_s(plan) + scene.tail_s) * scene.sample_rate_hz - 1e-6)
     duration_s = num_samples / scene.sample_rate_hz
     return Timeline(
         duration_s=duration_s,
