@@ -251,6 +251,7 @@ def test_a_short_slide_is_found_while_it_lasts_and_settles():
 def test_an_alarm_behind_the_next_onset_does_not_find_the_slip_before():
     onsets, slides = (1.0, 1.12), ((1.0, 1.1), (1.12, 2.0))
     assert outcomes([1.15], onsets, slides) == ["missed", "found"]
+    assert outcomes([1.12], onsets, slides) == ["missed", "found"]
     assert outcomes([1.1], onsets, slides) == ["found", "early"]
 
 
