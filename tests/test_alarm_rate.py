@@ -212,10 +212,9 @@ def test_threshold_is_that_of_brute_force(recordings, margin, allowed, how) -> N
 
 @pytest.mark.parametrize("margin", [0.0, 0.3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("seed", range(2))
-def test_threshold_in_long_streams(seed: int, dtype: torch.dtype, margin: float) -> None:
+def test_threshold_in_long_streams(dtype: torch.dtype, margin: float) -> None:
     # alarms of some hundred decisions each, so that the search needs several passes
-    source = torch.Generator().manual_seed(seed)
+    source = torch.Generator().manual_seed(0)
     statistics = list(smooth(torch.randn(8, 4299, generator=source), 300).to(dtype))
     rule, how = Hysteresis(margin), {"rearm": 60, "refractory": 90}
     hop_s, target = 3600 / 32_000, 40
@@ -358,7 +357,6 @@ HOW = {"rearm": 5, "refractory": 20}
     [
         (RAW, 1),
         (RAW, 10),
-        (KOfN(2, 3), 10),
         (BayesFilter(0.1, 0.5, 0.01, 0.2), 10),
         (Cusum(0.0, 0.2, 40.0), 10),
     ],

@@ -266,6 +266,14 @@ def test_neutral_decisions_only_let_time_pass() -> None:
     )
 
 
+def test_slips_that_hardly_end_keep_their_digits_in_float32() -> None:
+    rule = BayesFilter(slips_per_s=1e-9, slip_s=1e9, hop_s=0.01)
+    llr = torch.cat([torch.full((30,), 2.0), torch.full((60,), -2.0)])
+    exact = torch.tensor(forward(rule, llr.tolist()))
+    assert float(exact.max()) > 20
+    torch.testing.assert_close(scan(rule, llr), exact, rtol=1e-5, atol=1e-3)
+
+
 def test_bayes_filter_is_calibrated_on_the_chain_it_assumes() -> None:
     # of decisions to which it gives odds of p, a share p is slip
     rule = BayesFilter(slips_per_s=2.0, slip_s=0.5, hop_s=0.02)
