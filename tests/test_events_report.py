@@ -153,6 +153,18 @@ def test_the_line_of_a_rule_rises_to_what_it_found(tmp_path, monkeypatch):
     assert (median, half) == (numbers["delay_ms"]["median"]["value"], found / 2)
 
 
+def test_a_rule_has_one_line_in_the_legend_however_it_is_written(tmp_path, monkeypatch):
+    labels = []
+    monkeypatch.setattr(
+        "matplotlib.figure.Figure.legend",
+        lambda self, handles, **_: labels.extend(handle.get_label() for handle in handles),
+    )
+    numbers = numbers_of()
+    events = {"test": {"k_of_n": numbers}, "stream": {"k of n": numbers, "cusum": numbers}}
+    events_figure(metrics_of(events), tmp_path / "events.png")
+    assert labels[:3] == ["k of n", "cusum", "median"]
+
+
 def test_nothing_to_draw_is_an_error_and_leaves_no_file(tmp_path):
     for metrics in (metrics_of({"train": {"a": nothing()}}), metrics_of({}), {"splits": {}}):
         assert not has_events(metrics)

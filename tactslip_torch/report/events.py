@@ -45,7 +45,7 @@ def events_table(metrics: Mapping[str, Any]) -> str:
     reasons: dict[str, None] = {}
     for role, by_rule in metrics["events"].items():
         for place, (rule, numbers) in enumerate(by_rule.items()):
-            first = [role if place == 0 else "", rule.replace("_", " ")]
+            first = [role if place == 0 else "", _words(rule)]
             rows.append([*first, *_cells(numbers)])
             parts.append([*first, *_latency_cells(numbers)])
             if reason := numbers.get("reason"):
@@ -73,7 +73,8 @@ def events_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
     """Write slips found by time since the onset, and what became of all, as a PNG.
 
     A row for each role: to the left the share of slips that were found so many ms behind the onset,
-    a line for each rule; to the right found, early and missed, with the false alarms.
+    a line for each rule, of which the latest 5 % may leave the picture; to the right found, early
+    and missed, with the false alarms.
 
     Args:
         metrics: the content of ``metrics.json``.
@@ -87,7 +88,7 @@ def events_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
     }
     if not events:
         raise ValueError("metrics has no events to draw")
-    rules = list(dict.fromkeys(rule for by_rule in events.values() for rule in by_rule))
+    rules = list(dict.fromkeys(_words(rule) for by_rule in events.values() for rule in by_rule))
     styles = {
         rule: {"color": _COLOURS[place % len(_COLOURS)], "ls": _LINES[place // len(_COLOURS) % 3]}
         for place, rule in enumerate(rules)
@@ -104,12 +105,22 @@ def events_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
         _delays(left, by_rule, styles)
         _bars(right, by_rule, styles)
         left.set_title(role, loc="left", fontsize=11, fontweight="bold")
-    panels[-1][0].set_xlim(left=0)
+    late = [
+        numbers["delay_ms"]["p95"]["value"]
+        for by_rule in events.values()
+        for numbers in by_rule.values()
+        if numbers["delay_ms"]
+    ]
+    panels[-1][0].set_xlim(0, 1.5 * max([_REFLEX_MS[1], *late]))  # the last 5 % may leave
     panels[-1][0].set_xlabel("time since the exact onset, ms (look-ahead within)", fontsize=9.5)
     panels[-1][1].set_xlabel("of all slips, %", fontsize=9.5)
     _legend(figure, styles)
     with whole_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=160, facecolor="white")
+
+
+def _words(rule: str) -> str:
+    return rule.replace("_", " ")
 
 
 def _drawn(by_rule: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
@@ -127,9 +138,9 @@ def _delays(
         quantiles = numbers["delay_ms"]["quantiles"]
         found = 100 * numbers["found"]["value"]
         shares = [found * place / (len(quantiles) - 1) for place in range(len(quantiles))]
-        axes.plot(quantiles, shares, lw=2, zorder=3, **styles[rule])
+        axes.plot(quantiles, shares, lw=2, zorder=3, **styles[_words(rule)])
         median = numbers["delay_ms"]["median"]["value"]
-        axes.plot(median, found / 2, "o", color=styles[rule]["color"], ms=6, zorder=4)
+        axes.plot(median, found / 2, "o", color=styles[_words(rule)]["color"], ms=6, zorder=4)
     axes.set_ylim(0, 102)
     axes.set_ylabel("slips found, %", fontsize=9.5)
     _tidy(axes)
@@ -154,10 +165,9 @@ def _bars(
         words = f"false alarms {_false_alarms(numbers)}"
         place_of = axes.get_yaxis_transform()
         axes.annotate(words, at, xycoords=place_of, va="center", fontsize=9, annotation_clip=False)
-    names = [rule.replace("_", " ") for rule in rules]
-    axes.set_yticks(range(len(names)), names, fontsize=9.5)
+    axes.set_yticks(range(len(rules)), map(_words, rules), fontsize=9.5)
     for label, rule in zip(axes.get_yticklabels(), rules, strict=True):
-        label.set_color(styles[rule]["color"])
+        label.set_color(styles[_words(rule)]["color"])
     axes.set_ylim(-0.6, max(2, len(rules)) - 0.4)
     axes.set_xlim(0, 100)
     _tidy(axes)
@@ -173,8 +183,7 @@ def _tidy(axes: Axes) -> None:
 
 def _legend(figure: Figure, styles: Mapping[str, Mapping[str, Any]]) -> None:
     handles: list[Any] = [
-        Line2D([], [], lw=2, label=rule.replace("_", " "), **style)
-        for rule, style in styles.items()
+        Line2D([], [], lw=2, label=rule, **style) for rule, style in styles.items()
     ]
     handles.append(Line2D([], [], color=_GREY, marker="o", ls="", label="median"))
     handles.append(Patch(color="#F0E6C8", label="grip reflex of people, 60 to 90 ms"))
