@@ -351,7 +351,7 @@ def entry(name="a.npz", *, truth=True, **changes):
     alarms = [
         {"alarm_s": t, "onset_s": t - 0.01, "end_s": t + 0.1, "score": 1.0}
         | {"probability": 0.9, "statistic": 2.0, "is_valid": t != 1.5}
-        for t in (0.3, 1.05, 1.5, 2.9)
+        for t in (0.3, 1.05, 1.5, 2.9, 5.7)
     ]
     if truth:
         alarms = [alarm | alarm_outcome(alarm["alarm_s"], known) for alarm in alarms]
@@ -374,9 +374,10 @@ def test_every_alarm_has_its_outcome():
         1.05: ("found", 1.0),
         1.5: ("repeated", 1.0),
         2.9: ("early", 3.0),
+        5.7: ("late", 5.0),
     }
     delays = [a["delay_s"] for a in entry()["alarms"]]
-    assert delays == [None, pytest.approx(0.05), pytest.approx(0.5), pytest.approx(-0.1)]
+    assert delays == [None, *map(pytest.approx, (0.05, 0.5, -0.1, 0.7))]
 
 
 def test_a_slip_found_shortly_before_the_next_is_found():
@@ -396,8 +397,8 @@ def test_a_slip_found_shortly_before_the_next_is_found():
 def test_rows_are_alarms_and_missed_onsets_in_order_of_time():
     rows = onset_rows({"recordings": [entry(), entry("b.npy", truth=False)]})
     assert [row["outcome"] for row in rows] == [
-        *("false", "found", "repeated", "early", "missed"),
-        *(None,) * 4,
+        *("false", "found", "repeated", "early", "missed", "late"),
+        *(None,) * 5,
     ]
     assert all(tuple(row) == COLUMNS for row in rows)
     assert rows[4]["true_onset_s"] == 5.0
@@ -415,14 +416,14 @@ def test_the_table_says_what_is_simulated_what_is_wrong_and_what_it_leaves_out()
     assert table[6].split() == ["-", "-", "-", "-", "5.000", "-", "missed"]
     assert "SIMULATED" not in onsets_table(rows, simulated=False)
     many = onsets_table(rows * 20, simulated=False).splitlines()
-    assert many[-1] == "and 60 more, see onsets.csv"
+    assert many[-1] == "and 80 more, see onsets.csv"
     assert onsets_table([], simulated=False) == "no alarm, and no slip missed"
 
 
 def test_the_summary_says_how_fast_how_well_and_what_cannot_be_relied_on():
     content = {"recordings": [entry()], "events": None}
     said = onsets_summary(content, 0.5)
-    assert "4 alarms in 6.0 s of 1 recordings; took 0.5 s, 12 times real time" in said
+    assert "5 alarms in 6.0 s of 1 recordings; took 0.5 s, 12 times real time" in said
     assert "0.5 % of the decisions are not valid" in said
     whole = entry(decisions={"number": 600, "invalid": 0})
     assert "not valid" not in onsets_summary(content | {"recordings": [whole]}, 0.5)
@@ -445,8 +446,8 @@ def test_the_summary_says_how_fast_how_well_and_what_cannot_be_relied_on():
 
 def test_titles_say_what_is_simulated():
     assert onsets_title(entry(), of_simulated=True) == (
-        "SIMULATED recording a.npz, material M1, 4 alarms, 1 of 3 slips found, 1 false, "
+        "SIMULATED recording a.npz, material M1, 5 alarms, 1 of 3 slips found, 1 false, "
         "detector trained on simulated data"
     )
     real = entry("b.npy", truth=False, simulated=None, material=None)
-    assert onsets_title(real, of_simulated=False) == "Recording b.npy, 4 alarms"
+    assert onsets_title(real, of_simulated=False) == "Recording b.npy, 5 alarms"

@@ -38,7 +38,8 @@ def alarm_outcome(alarm_s: float, truth: Mapping[str, Any]) -> dict[str, Any]:
         delay_s = alarm_s - onset["onset_s"]
         is_found = onset["outcome"] == "found" and abs(delay_s - onset["delay_s"]) < _SAME_S
         if is_found or delay_s > -truth["early_s"] - _SAME_S:
-            outcome = "found" if is_found else "early" if delay_s < 0 else "repeated"
+            behind = "late" if onset["outcome"] == "missed" else "repeated"
+            outcome = "found" if is_found else "early" if delay_s < 0 else behind
             own = {"outcome": outcome, "true_onset_s": onset["onset_s"], "delay_s": delay_s}
         if is_found:
             break
@@ -49,7 +50,8 @@ def onset_rows(content: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Every alarm, and every onset that was missed, in order of time; each with all ``COLUMNS``.
 
     ``outcome`` is that of the alarm: it ``found`` a slip, came ``early``, ``repeated`` the alarm of
-    a slip, or is ``false``; or ``missed``, of an onset. ``None`` where the truth is not known.
+    a slip, came too ``late`` for one that was missed, or is ``false``; or ``missed``, of an onset.
+    ``None`` where the truth is not known.
 
     Args:
         content: of ``onsets.json``.
