@@ -107,7 +107,7 @@ SECTIONS = {
         needs=streaming_measure.SECTIONS,
     ),
     "onset": Section(
-        "Alarms",
+        "Alarms: hops, filters and rivals",
         onset.tables,
         onset.report_text,
         onset_figure.figure,

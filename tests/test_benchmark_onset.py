@@ -74,8 +74,8 @@ def test_there_are_as_many_hours_as_promised_for_every_role() -> None:
 # ------------------------------------------------------------------------------------- longer hops
 def test_every_second_decision_is_what_watching_at_twice_the_hop_gives() -> None:
     detectors = {"centred": behind("centred"), "causal": behind("causal")}
-    fine = front.watched_by(stage(hop_ms=5.0), detectors, num_workers=0)
-    coarse = front.watched_by(stage(hop_ms=25.0), detectors, num_workers=0)
+    fine = front.watched_by(stage(Streams(cycles=3), hop_ms=5.0), detectors, num_workers=0)
+    coarse = front.watched_by(stage(Streams(cycles=3), hop_ms=25.0), detectors, num_workers=0)
     assert {role: len(own) for role, own in fine.items()} == {
         role: len(own) for role, own in coarse.items()
     }
@@ -154,8 +154,8 @@ def of_events(found: float, median: float | None = 40.0) -> dict[str, Any]:
     delay = None if median is None else {"median": around(median), "p95": around(2 * median)}
     return {
         "found": around(found),
-        "early": around(0.25 * (1 - found)),
-        "missed": around(0.75 * (1 - found)),
+        "early": around(0.2 * (1 - found)),
+        "missed": around(0.8 * (1 - found)),
         "false_alarms_per_hour": around(8.0),
         "delay_ms": delay,
     }
@@ -345,11 +345,11 @@ def test_the_report_is_shown_in_tables_a_figure_and_benchmarks_md(tmp_path: Any)
     figure(made, tmp_path / "o.png")
     assert (tmp_path / "o.png").stat().st_size > 30_000
     page = whole_report.markdown({"onset": made}, "results")
-    assert "![Alarms](results/onset.png)" in page
+    assert "![Alarms: hops, filters and rivals](results/onset.png)" in page
     cost = " | 400" * len(front.ENGINES)
     first = "| 5 | 25 (12 to 50) | 50 (25 to 100) | 99.0 | 0.2 | 0.8 | 8 (4 to 16)"
     assert f"| centred * + {first}{cost} |" in page
-    assert "| silent | seen | - | - | 0.0 | 25.0 | 75.0 | 8 (4 to 16) | 2 |" in page
+    assert "| silent | seen | - | - | 0.0 | 20.0 | 80.0 | 8 (4 to 16) | 2 |" in page
     assert "| trailing | 0 | 96.4 | 90.0 | 120 | 65,688 | 99 |" in page
     assert "onset: centred, hop 5 ms: false alarms an hour" in page
 

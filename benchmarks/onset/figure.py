@@ -8,7 +8,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from benchmarks.drawing import GREY, LIGHT, OURS, PEER, SECOND, THIRD, finish
 from benchmarks.onset.front import compute, median_ms, not_found
@@ -38,6 +38,7 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
         _points(places["compute"], rows, "test", "compute", costs)
         places["compute"].set_ylabel(f"compute, ms a second of stream\n(one thread, {engine})")
         places["compute"].set_yscale("log")
+        places["compute"].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         places["compute"].yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         places["compute"].yaxis.set_minor_formatter(NullFormatter())
         for role, name in _ROLES.items():
@@ -121,7 +122,7 @@ def _rivals(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
             )
     for role, color in (("test", OURS), ("unseen", SECOND)):
         axes.plot([], [], "o", color=color, label=f"{_ROLES[role]} materials")
-    axes.legend(loc="lower right", fontsize=8, frameon=False)
+    axes.legend(loc="lower right", bbox_to_anchor=(1, 0.98), ncols=2, fontsize=8, frameon=False)
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlim(0, 1.45 * max(axes.get_xlim()[1], 1.0))

@@ -40,7 +40,7 @@ def limit_rows(front: Rows, rivals: Rows) -> list[dict[str, Any]]:
     (ours,) = (row for row in rivals if row["method"] == OURS)
     others = [row for row in rivals if row["scorer"] != OURS]
     for role, what in ROLES.items():
-        most = max(row[role]["found"]["value"] for row in others)
+        most = max((row[role]["found"]["value"] for row in others), default=0.0)
         found = ours[role]["found"]["value"]
         rows.append(
             {
@@ -98,14 +98,15 @@ def about(report: Mapping[str, Any]) -> str:
 
 
 def hours_text(streams: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
-    """Hours without slip that each role has, and slips."""
-    parts = []
-    for role, name in (("calibrate", "set"), ("test", "checked, seen"), ("unseen", "unseen")):
-        scenes = streams[role].values()
-        quiet = sum(scene["hours"] for scene in scenes if not scene["slips"])
-        slips = sum(scene["slips"] for scene in scenes)
-        parts.append(f"{name} on {number(quiet)} h without slip and {slips:,} slips")
-    return ", ".join(parts)
+    """Hours without slip, and slips, that thresholds were set on and judged on."""
+
+    def amount(scenes: Mapping[str, Mapping[str, float]]) -> str:
+        quiet = sum(scene["hours"] for scene in scenes.values() if not scene["slips"])
+        slips = sum(scene["slips"] for scene in scenes.values())
+        return f"{number(quiet)} h without slip and {slips:,} slips"
+
+    setting, seen, unseen = (amount(streams[role]) for role in ("calibrate", *JUDGED))
+    return f"set on {setting}, checked on {seen} of seen and {unseen} of unseen materials"
 
 
 def percent(share: float) -> str:
