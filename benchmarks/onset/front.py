@@ -117,7 +117,7 @@ def judged(
     """
     calibrating = streams["calibrate"]
     calibration = FITS[stage.calibration](*labelled(calibrating, scorer, clock))
-    rule = stage.made_rules()[stage.rule]
+    rule = stage.made_rules(clock.bin_samples)[stage.rule]
     method = stage.promise().calibrated(scorer, rule, calibration, calibrating, clock)
     assert method.threshold is not None
     parts = {role: streams[role] for role in JUDGED}
