@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,7 +21,7 @@ from tactslip_torch.config import conf_dir
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.calibration import Platt
+from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -107,7 +108,7 @@ TRAINED = [RecordingId(m, 0, s) for m in ("a", "b") for s in ("paper", "held")]
 def stage(streams=None, **changes) -> Alarming:
     values = {
         "streams": streams or Streams(),
-        "hop_ms": 20.0,
+        "hop_ms": 25.0,
         "false_alarms_per_hour": 300.0,
         "hours": 10.0,
         "slip_free": "held",
@@ -161,6 +162,11 @@ def test_nothing_left_to_calibrate_on_is_said():
         ({"false_alarms_per_hour": -1.0}, r"onset\.false_alarms_per_hour must be positive"),
         ({"hours": math.inf}, r"onset\.hours must be positive"),
         ({"rules": {"cusum": {"name": "sum"}}}, "no sequential rule is called 'sum'"),
+        ({"rules": {"cusum": {"drift": 1.0}}}, "no sequential rule is called None"),
+        ({"level": 2.0}, r"onset\.level must lie between 0 and 1, got 2"),
+        ({"slip_share": 0.0}, "slip_share must lie between 0 and 1, got 0"),
+        ({"rearm_s": -1.0}, "rearm_s must not be negative, got -1"),
+        ({"slip_free": "heldd"}, "onset.slip_free must be a scene of .* held, paper, taps, got"),
     ],
 )
 def test_bad_settings_are_refused_in_one_line(changes, match):
@@ -175,16 +181,17 @@ def test_the_threshold_keeps_the_promise_where_it_was_set(told):
     settings = AlarmSettings.of(detector)
     roles = stage().roles(detector)
     quiet = [r for r in roles["calibrate"] if r.scene == "held"]
-    alarms, hours = 0, 0.0
-    for stream in watch(Streams(), quiet, {OURS: detector}, 40, 0):
+    alarms, hours, found_hours = 0, 0.0, 0.0
+    for stream in watch(Streams(), quiet, {OURS: detector}, 50, 0):
         decider = Decider(settings, RATE_HZ, 100, detector.look_ahead)
         score, valid = (torch.from_numpy(part[OURS]) for part in (stream.score, stream.is_valid))
         alarms += len(decider.decide(score, valid).alarms)
+        found_hours += len(score) * 0.025 / 3600
         hours += stream.duration_s / 3600
     assert alarms <= math.floor(300.0 * hours)
     assert found["streams"]["calibrate"]["held"]["hours"] == pytest.approx(hours)
-    lower = AlarmSettings.from_dict({**detector.info[KEY], "threshold": 0.0})
-    assert lower.threshold < settings.threshold  # and is no bound that everything meets
+    rate = found["settings"]["facts"]["calibrated"]["rate"]
+    assert (rate["alarms"], rate["hours"]) == (alarms, pytest.approx(found_hours))
 
 
 def test_judged_streams_set_nothing(told):
@@ -219,6 +226,66 @@ def test_slips_are_found_in_time_and_all_is_said_in_plain_json(told, tmp_path):
     assert row.split()[1:3] == ["seen", "no"]
     alarm_figure(metrics, tmp_path / "alarm.png")
     assert (tmp_path / "alarm.png").stat().st_size > 10_000
+
+
+def knocked(number: int) -> Stream:
+    """Quiet of 30 s with double knocks, which a sum without ceiling takes for one."""
+    rng = np.random.default_rng(number)
+    score = -1.0 + 0.2 * rng.standard_normal(3000)
+    for start in rng.integers(0, 2900, 6):
+        for knock in (start, start + 45):
+            score[knock : knock + 12] = rng.uniform(0.5, 3.0)
+    stream = stream_of(score, number=number, duration_s=30.0)
+    return replace(stream, recording=RecordingId("a", number, "held"))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_rule_of_the_file_keeps_the_rate_not_one_like_it(seed):
+    """A sum that gets its ceiling after its threshold was set re-arms sooner, and alarms more."""
+    streams = [knocked(20 * seed + number) for number in range(20)]
+    promise = Promise(100.0, "held", 0.5, 0.05, 0.0, 0.95)
+    method = promise.calibrated(OURS, Cusum(1.0, 0.2), Platt(2.0, 0.0), streams, CLOCK)
+    made = [made for _, made in decide(streams, OURS, method.settings, CLOCK)]
+    alarms = sum(int(one.is_alarm.sum()) for one in made)
+    allowed = math.floor(100.0 * sum(len(one.number) for one in made) * 0.01 / 3600)
+    assert method.threshold.rate.alarms == alarms <= allowed
+    lower = replace(method.settings, threshold=0.8 * method.settings.threshold)
+    more = sum(int(one.is_alarm.sum()) for _, one in decide(streams, OURS, lower, CLOCK))
+    assert more > allowed
+
+
+def test_a_calibration_that_ends_bounds_the_threshold():
+    streams = [knocked(number) for number in range(10)]
+    flat = Isotonic((-1.0, 0.4), (-3.0, 2.0))  # every knock is beyond its last knot
+    promise = Promise(1.0, "held", 0.5, 0.05, 0.0, 0.95)
+    method = promise.calibrated(OURS, KOfN(2, 3), flat, streams, CLOCK)
+    assert method.settings.threshold <= 2.0  # slips can still be found,
+    assert method.threshold.reached is False  # and it is said that the rate is not kept
+    assert method.threshold.rate.alarms > 0
+
+
+def test_a_threshold_that_is_never_reached_is_refused():
+    rule = Cusum(1.0, 0.2, 7.5)
+    assert settings_of(rule, threshold=7.5).threshold == 7.5
+    with pytest.raises(ValueError, match=r"threshold 7\.6 lies above 7\.5, .* lower it"):
+        settings_of(rule, threshold=7.6)
+
+
+def test_fewer_hours_than_asked_for_are_said(caplog):
+    stage(hours=1.0).roles(loudness_detector())
+    assert "calibrate has 0.01 h of held, onset.hours=1 were asked for" in caplog.text
+
+
+def test_the_papers_rule_is_left_out_where_its_hop_cannot_be():
+    found = stage(hop_ms=20.0)(loudness_detector(), {}, num_workers=0)
+    assert set(found["methods"]) == set(RULES)
+
+
+def test_evidence_left_open_is_hop_by_bin():
+    rules = {"cusum": {"name": "cusum", "evidence": None}, "bayes": {**RULES["bayes"]}}
+    made = stage(rules=rules).made_rules(100)
+    assert (made["cusum"].evidence, made["bayes"].evidence) == (0.5, 0.4)
+    assert made["bayes"].hop_s == 0.025
 
 
 def test_settings_go_with_the_detector_file(told, tmp_path):
@@ -339,7 +406,7 @@ def test_the_papers_rule_alarms_at_every_change_to_slip():
     score = np.random.default_rng(3).standard_normal(100)
     promise = Promise(1.0, "held", 0.5, 0.1, 0.2, 0.95)
     clock = Clock(RATE_HZ, 100, 100, 25)
-    method = promise.first_transition(OURS, Platt(3.0, -0.4), clock)
+    method = promise.first_transition(OURS, clock)
     ((_, made),) = decide([stream_of(score)], OURS, method.settings, clock)
     expected = first_transition(torch.from_numpy(score.astype(np.float32)) >= 0)
     assert made.is_alarm.tolist() == expected.tolist()
@@ -387,6 +454,12 @@ def test_the_experiment_has_ten_hours_to_set_the_alarm_and_as_many_to_check_it()
         quiet = [r for r in own if r.scene == "held"]
         assert sum(whole.streams.timeline(r).duration_s for r in quiet) >= 36_000
     assert {"taps", "machine", "mains_bursts", "dead_channel"} <= {r.scene for r in roles["test"]}
+
+
+def test_one_alarm_for_several_detectors_is_refused_before_the_fit(tmp_path):
+    config = composed("onset=alarms", "split=leave_one_material_out", "data.cycles=2")
+    with pytest.raises(ValueError, match="sets the alarm of one detector, this split makes 10"):
+        train(config, tmp_path)
 
 
 def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):

@@ -28,21 +28,21 @@ class Sizes:
     """
 
     training: tuple[str, ...] = (
-        "data.cycles=10",
+        "data.cycles=8",
         "others.held.cycles=2",
-        "others.knocked.cycles=3",
-        "others.arm_motion.cycles=6",
+        "others.knocked.cycles=2",
+        "others.arm_motion.cycles=4",
         "recipe.penalties=[0.001,0.003,0.01]",
     )
-    streams: tuple[str, ...] = ("onset.streams.cycles=28", "onset.streams.others.held.cycles=32")
+    streams: tuple[str, ...] = ("onset.streams.cycles=20", "onset.streams.others.held.cycles=14")
     aligns: tuple[Align, ...] = ("centred", "causal", "trailing")
     hop_ms: tuple[float, ...] = (5.0, 10.0, 25.0, 50.0)
-    hours: float = 1.5
-    target_per_hour: float = 10.0
+    hours: float = 0.5
+    target_per_hour: float = 20.0
     rival_align: Align = "centred"
     rival_hop_ms: float = 50.0
-    rival_hours: float = 1.0
-    rival_bins: int = 2500
+    rival_hours: float = 0.5
+    rival_bins: int = 1500
     num_kernels: int = 10_000
     rounds: int = 60
     seed: int = 0

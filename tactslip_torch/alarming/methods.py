@@ -14,16 +14,25 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.alarming.watching import Clock, Stream, decide, slip_bins, watched
-from tactslip_torch.model.calibration import Calibration, fit_isotonic, fit_platt
+from tactslip_torch.model.calibration import (
+    Calibration,
+    Isotonic,
+    Platt,
+    fit_isotonic,
+    fit_platt,
+)
 from tactslip_torch.onset.events import EventRules
-from tactslip_torch.onset.rate import Threshold, choose_threshold
-from tactslip_torch.onset.sequential import Cusum, KOfN, Rule
+from tactslip_torch.onset.rate import Threshold, alarm_rate, choose_threshold
+from tactslip_torch.onset.sequential import Cusum, Hysteresis, KOfN, Rule
 from tactslip_torch.onset.settings import AlarmSettings
 
 log = logging.getLogger(__name__)
 
 CEILING = 1.5
 """Largest sum of ``Cusum`` in thresholds: what lies above only takes time to come down."""
+
+_STEP = 1.01  # by which a threshold is raised that a capped sum does not keep
+_ABOVE_NEUTRAL = 1e-30  # a score of slip, and no decision that tells nothing
 
 FITS: Mapping[str, Callable[[Tensor, Tensor], Calibration]] = {
     "platt": fit_platt,
@@ -106,27 +115,57 @@ class Promise:
             self.false_alarms_per_hour,
             rearm=settings.decisions(self.rearm_s, clock.sample_rate_hz),
             refractory=settings.decisions(self.refractory_s, clock.sample_rate_hz),
+            ceiling=_largest(rule, calibration),
             level=self.level,
         )
         if isinstance(rule, Cusum) and rule.ceiling == math.inf and threshold.value > 0:
-            rule = replace(rule, ceiling=CEILING * threshold.value)
-        settings = replace(settings, rule=rule, threshold=threshold.value)
+            settings, threshold = self._capped(rule, settings, threshold, quiet, scorer, clock)
+        else:
+            settings = replace(settings, threshold=threshold.value)
         facts = {"slip_free": self.slip_free, "calibrated": threshold_facts(threshold)}
         lead_s = _lead_s(streams, scorer, settings, clock)
         return Method(scorer, replace(settings, lead_s=lead_s, facts=facts), threshold)
 
-    def first_transition(self, scorer: str, calibration: Calibration, clock: Clock) -> Method:
+    def _capped(
+        self,
+        rule: Cusum,
+        settings: AlarmSettings,
+        threshold: Threshold,
+        quiet: Sequence[Stream],
+        scorer: str,
+        clock: Clock,
+    ) -> tuple[AlarmSettings, Threshold]:
+        """The same sum with a ceiling above its threshold, which is raised until it keeps the rate.
+
+        A sum that is capped is sooner low again, so what was one alarm can be two: it is counted
+        anew, by the rule that goes into the file.
+        """
+        value, allowed = (
+            threshold.value,
+            math.floor(self.false_alarms_per_hour * threshold.rate.hours),
+        )
+        while True:
+            capped = replace(rule, ceiling=CEILING * value)
+            settings = replace(settings, rule=capped, threshold=value)
+            made = [decisions for _, decisions in decide(quiet, scorer, settings, clock)]
+            counts = [int(decisions.is_alarm.sum()) for decisions in made]
+            if sum(counts) <= allowed:
+                hours = [len(decisions.number) * clock.hop_s / 3600 for decisions in made]
+                rate = alarm_rate(counts, hours, self.level)
+                return settings, replace(threshold, value=value, rate=rate)
+            value *= _STEP
+
+    def first_transition(self, scorer: str, clock: Clock) -> Method:
         """The paper's rule: every change of the score to slip is an alarm, one decision a bin.
 
-        There is no threshold but the score's own, and no memory beyond the bin before.
+        There is no threshold but the score's own, and no memory beyond the bin before. The clock's
+        hop must divide the bin.
         """
-        zero = float(calibration.llr(torch.zeros(1, dtype=torch.float32)))
-        is_multiple = clock.bin_samples % clock.hop_samples == 0
         settings = AlarmSettings(
-            clock.bin_samples if is_multiple else clock.hop_samples,
-            calibration,
+            clock.bin_samples,
+            Platt(1.0, 0.0),
             KOfN(1, 1),
-            zero,
+            _ABOVE_NEUTRAL,
             self.false_alarms_per_hour,
             self.slip_share,
             rearm_s=0,
@@ -155,7 +194,8 @@ def methods_of(
         streams: that calibrate.
         clocks: of every scorer, ours among them.
         ours: its name.
-        transition: the name of the paper's rule.
+        transition: the name of the paper's rule, which is left out where the hop does not divide
+            the bin.
 
     Raises:
         ValueError: if our scores cannot be calibrated; others whose cannot are left out.
@@ -171,8 +211,8 @@ def methods_of(
             continue
         for name, rule in rules.items() if scorer == ours else [(scorer, rules[main])]:
             methods[name] = promise.calibrated(scorer, rule, calibration, streams, clock)
-        if scorer == ours:
-            methods[transition] = promise.first_transition(scorer, calibration, clock)
+        if scorer == ours and clock.bin_samples % clock.hop_samples == 0:
+            methods[transition] = promise.first_transition(scorer, clock)
     return methods
 
 
@@ -211,3 +251,10 @@ def threshold_facts(threshold: Threshold) -> dict[str, Any]:
         "reached": threshold.reached,
         "rate": dict(vars(threshold.rate)),
     }
+
+
+def _largest(rule: Rule, calibration: Calibration) -> float:
+    """What the statistic of a rule that hands ratios on cannot exceed, by their calibration."""
+    if isinstance(rule, KOfN | Hysteresis) and isinstance(calibration, Isotonic):
+        return max(calibration.llrs)
+    return math.inf

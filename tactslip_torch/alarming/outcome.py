@@ -79,6 +79,7 @@ def push_seconds(detector: SlipDetector, settings: AlarmSettings, pushes: int = 
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
+        live.push(hop.repeat(-(-2 * detector.pool.bin_samples // settings.hop_samples), 1))  # full
         for _ in range(pushes):
             started = time.perf_counter()
             live.push(hop)

@@ -7,6 +7,7 @@ The other half and the unseen materials say what became of it. Nothing of them s
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,10 +19,13 @@ from tactslip_torch.alarming.watching import Clock, Stream, watch
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.cache import cache_key
+from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.scoring import Scorer
 from tactslip_torch.onset.sequential import Rule, rule_from_dict
-from tactslip_torch.onset.settings import KEY
+from tactslip_torch.onset.settings import KEY, AlarmSettings
+
+log = logging.getLogger(__name__)
 
 OURS = "detector"
 """The name of the detector among those that watch."""
@@ -51,8 +55,8 @@ class Alarming:
         level: of intervals.
 
     Raises:
-        ValueError: for a rule or calibration that is not there, a hop that is no whole number of
-            samples, or a number that is not positive.
+        ValueError: for a rule, calibration or scene that is not there, a hop that is no whole
+            number of samples, or a number out of range.
     """
 
     streams: RecordingSource
@@ -86,22 +90,42 @@ class Alarming:
                 f"onset.hop_ms={self.hop_ms:g} is {hop:g} samples at "
                 f"{self.streams.sample_rate_hz:g} Hz; choose a whole number of samples"
             )
-        self.made_rules()
+        if not 0 < self.level < 1:
+            raise ValueError(f"onset.level must lie between 0 and 1, got {self.level}")
+        scenes = {recording.scene for recording in self.streams.ids}
+        if self.slip_free not in scenes:
+            raise ValueError(
+                f"onset.slip_free must be a scene of onset.streams, {', '.join(sorted(scenes))}, "
+                f"got {self.slip_free!r}"
+            )
+        for rule in self.made_rules(self.hop_samples).values():  # bad numbers are refused now
+            AlarmSettings(
+                self.hop_samples,
+                Platt(1.0, 0.0),
+                rule,
+                math.inf,
+                self.false_alarms_per_hour,
+                self.slip_share,
+                self.rearm_s,
+                self.refractory_s,
+            )
 
     @property
     def hop_samples(self) -> int:
         """Distance of two decisions."""
         return round(self.hop_ms * self.streams.sample_rate_hz / 1000)
 
-    def made_rules(self) -> dict[str, Rule]:
-        """The rules; one that needs the hop gets it."""
-        hop_s = self.hop_samples / self.streams.sample_rate_hz
-        return {
-            name: rule_from_dict(
-                {**numbers, "hop_s": hop_s} if numbers["name"] == "bayes" else numbers
-            )
-            for name, numbers in self.rules.items()
-        }
+    def made_rules(self, bin_samples: int) -> dict[str, Rule]:
+        """The rules; where they leave it open, evidence is hop / bin and the hop is ours."""
+        made = {}
+        for name, given in self.rules.items():
+            numbers = dict(given)
+            if numbers.get("evidence", 1) is None:
+                numbers["evidence"] = min(1.0, self.hop_samples / bin_samples)
+            if numbers.get("name") == "bayes":
+                numbers["hop_s"] = self.hop_samples / self.streams.sample_rate_hz
+            made[name] = rule_from_dict(numbers)
+        return made
 
     def roles(self, detector: SlipDetector) -> dict[str, list[RecordingId]]:
         """Which recordings calibrate, and which are judged, seen and unseen.
@@ -133,6 +157,15 @@ class Alarming:
                     continue
                 hours[role] += self.streams.timeline(recording).duration_s / 3600
             roles[role].append(recording)
+        for role, found in hours.items():
+            if 0 < found < self.hours:
+                log.warning(
+                    "%s has %.2f h of %s, onset.hours=%g were asked for: give onset.streams more",
+                    role,
+                    found,
+                    self.slip_free,
+                    self.hours,
+                )
         for scene in (PAPER_SCENE, self.slip_free):
             if not any(recording.scene == scene for recording in roles["calibrate"]):
                 raise ValueError(
@@ -178,7 +211,7 @@ class Alarming:
         calibrating = streams.pop("calibrate")
         methods = methods_of(
             self.promise(),
-            self.made_rules(),
+            self.made_rules(detector.pool.bin_samples),
             self.rule,
             self.calibration,
             calibrating,

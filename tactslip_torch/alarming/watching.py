@@ -108,7 +108,7 @@ def watch(
         num_workers: processes; ``None`` for as many as there are processors, at most 8.
 
     Raises:
-        ValueError: if a recording is shorter than a bin or has other channels than a detector.
+        ValueError: if a recording has other channels than a detector.
     """
     watched = partial(_watched, source, scorers, hop_samples)
     return in_processes(watched, recordings, "watch streams", "recording", num_workers)

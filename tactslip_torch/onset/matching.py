@@ -262,12 +262,14 @@ def _onset_event(
     alarm = alarms[after]
     positive = watched.first_positive_s[place] if watched.first_positive_s else math.nan
     spoke = alarm.at if math.isnan(positive) else min(_ns(positive), alarm.at)
+    look_ahead = _ns(latency.look_ahead_s)
+    bin_fill = max(0, spoke - onset - look_ahead)  # one that spoke before had no need of it
     estimates = watched.onset_estimates_s
     return event._replace(
         outcome="found",
         delay_s=(alarm.at - onset) / 1e9,
-        bin_fill_s=(spoke - onset) / 1e9 - latency.look_ahead_s,
-        decision_s=(alarm.at - spoke) / 1e9,
+        bin_fill_s=bin_fill / 1e9,
+        decision_s=(alarm.at - onset - look_ahead - bin_fill) / 1e9,
         error_s=(_ns(estimates[alarm.number]) - onset) / 1e9 if estimates else math.nan,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -32,7 +33,8 @@ class AlarmSettings:
         facts: on what the threshold was set, JSON-able: recordings, hours, achieved rate.
 
     Raises:
-        ValueError: if a time or the hop is negative, or the share lies outside 0 to 1.
+        ValueError: if a time or the hop is negative, the share lies outside 0 to 1, or the statistic
+            cannot reach the threshold.
     """
 
     hop_samples: int
@@ -53,6 +55,11 @@ class AlarmSettings:
             raise ValueError(f"slip_share must lie between 0 and 1, got {self.slip_share}")
         if not self.target_per_hour > 0:
             raise ValueError(f"target_per_hour must be positive, got {self.target_per_hour}")
+        if math.isfinite(self.threshold) and self.threshold > self.rule.ceiling:
+            raise ValueError(
+                f"threshold {self.threshold:g} lies above {self.rule.ceiling:g}, the most that the "
+                f"statistic of {self.rule.name} can be: no alarm would ever come; lower it"
+            )
         for name in ("rearm_s", "refractory_s"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")

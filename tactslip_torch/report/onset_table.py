@@ -137,7 +137,7 @@ def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
     if invalid:
         lines.append(
             f"NOTE: {100 * invalid / number:.1f} % of the decisions are not valid: a channel in "
-            "use is missing or dead; they count as no evidence"
+            "use is missing or dead; they count as long as another is left"
         )
     if events := content["events"]:
         delay = events["delay_ms"]
