@@ -137,7 +137,7 @@ def test_every_filter_at_every_hop_is_a_row(monkeypatch: pytest.MonkeyPatch, tmp
     )
     assert {row["align"]: row["look_ahead_ms"] for row in rows} == {"centred": 2.5, "trailing": 0.0}
     for row in rows:
-        assert row["threshold"]["target_per_hour"] == 10.0
+        assert row["threshold"]["target_per_hour"] == SIZES.target_per_hour
         assert row["test"]["num_onsets"] == 2
         assert row["push_s"]["eager"] > 0
         assert front.compute(row, "eager") == pytest.approx(
