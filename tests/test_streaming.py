@@ -18,6 +18,7 @@ from tactslip_torch.onset.scoring import score_stream
 from tactslip_torch.onset.sequential import BayesFilter, Cusum, Hysteresis, KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.signals.filtering import ChannelFilter
 
 HOP = 20
 RATE = 2000.0
@@ -120,14 +121,17 @@ def test_a_decision_comes_with_the_last_sample_of_its_look_ahead(kind, hop):
         assert found.available_s.tolist() == [num / RATE] * len(found.number)
 
 
-def test_bins_shorter_than_a_frame_wait_for_the_first_frame():
+@pytest.mark.parametrize("start_s", [None, 7.0])
+def test_bins_shorter_than_a_frame_wait_for_the_first_frame(start_s):
     detector = copy.deepcopy(DETECTORS["all", "causal"])
-    detector.channel_filter = type(detector.channel_filter)([151, 51, 11, 11], align="causal")
-    stream, available = stream_of(detector), []
+    detector.channel_filter = ChannelFilter([151, 51, 11, 11], align="causal")
+    stream, came, said = stream_of(detector), [], []
     for num, sample in enumerate(signal(200, 4).T, 1):
-        found = stream.push(sample[None])
-        available += [num] * len(found.number)
-    assert available == [151, 151, 151, 160, 180, 200]
+        found = stream.push(sample[None], None if start_s is None else start_s + (num - 1) / RATE)
+        came += [num] * len(found.number)
+        said += found.available_s.tolist()
+    assert came == [151, 151, 151, 160, 180, 200]
+    assert said == pytest.approx([(start_s or 0.0) + num / RATE for num in came], abs=1e-12)
 
 
 def test_samples_to_come_change_no_decision():

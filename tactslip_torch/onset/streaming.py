@@ -245,8 +245,8 @@ class StreamingDetector:
             self._dropped += surplus
 
     def _timed(self, decisions: Decisions) -> Decisions:
-        """The same by the times of the samples."""
-        if not self._clock.is_timed:
+        """The same by the times of the samples, and no earlier than the first frame."""
+        if not self._clock.is_timed and self._filter.frame <= self._first:
             return decisions
         samples = self._samples_for(decisions.number.numpy())
         available_s = torch.from_numpy(self._clock.end_s(samples))
