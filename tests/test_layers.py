@@ -203,6 +203,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "alarming.*",
         "onset.*",
         "model.detector",
+        "model.calibration",
         "features.cache",
         "data.*",
     ),

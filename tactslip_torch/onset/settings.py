@@ -33,8 +33,8 @@ class AlarmSettings:
         facts: on what the threshold was set, JSON-able: recordings, hours, achieved rate.
 
     Raises:
-        ValueError: if a time or the hop is negative, the share lies outside 0 to 1, or the statistic
-            cannot reach the threshold.
+        ValueError: if a time or the hop is negative, the share lies outside 0 to 1, or the
+            statistic cannot reach the threshold.
     """
 
     hop_samples: int
