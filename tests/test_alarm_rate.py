@@ -7,8 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.stats import chi2
 from test_latch import by_hand
 from torch import Tensor
@@ -113,9 +111,11 @@ def test_interval_by_seed_level_and_unit() -> None:
     assert (halved.per_hour, halved.low, halved.high) == pytest.approx(
         (found.per_hour / 2, found.low / 2, found.high / 2)
     )
-    unwatched = alarm_rate([*counts, 0], [*hours, 0.0], seed=3)  # no time, no part in anything
-    assert unwatched.per_hour == found.per_hour
-    assert unwatched.high == pytest.approx(found.high, rel=0.1)
+
+
+def test_recordings_not_watched_at_all_are_not_drawn() -> None:
+    found = alarm_rate([40, 40, 0, 0, 0], [0.001, 0.001, 1.0, 1.0, 0.0])
+    assert found.high == pytest.approx(40_000)  # drawn alone it would have no rate
 
 
 @pytest.mark.parametrize(
@@ -191,18 +191,16 @@ def brute(
     return best, alarms
 
 
-rows = st.lists(st.integers(-3, 6), min_size=1, max_size=25)
-
-
-@given(
-    recordings=st.lists(rows, min_size=1, max_size=4),
-    margin=st.integers(0, 3),
-    allowed=st.integers(0, 8),
-    how=st.fixed_dictionaries({"rearm": st.integers(0, 4), "refractory": st.integers(0, 6)}),
-)
-def test_threshold_is_that_of_brute_force(recordings, margin, allowed, how) -> None:
+@pytest.mark.parametrize("seed", range(100))
+def test_threshold_is_that_of_brute_force(seed: int) -> None:
+    # whole numbers, so that many values are equal; margins between them too
+    source = np.random.default_rng(seed)
+    lengths = source.integers(1, 26, size=source.integers(1, 5))
+    recordings = [source.integers(-3, 7, size=length).tolist() for length in lengths]
+    margin, allowed = source.integers(0, 7) / 2, int(source.integers(0, 9))
+    how = {"rearm": int(source.integers(0, 5)), "refractory": int(source.integers(0, 7))}
     statistics = [torch.tensor(row, dtype=torch.float32) for row in recordings]
-    hop_s = 3600 / sum(len(row) for row in recordings)  # an hour in all
+    hop_s = 3600 / sum(lengths)  # an hour in all
     found = choose_threshold(statistics, Hysteresis(margin), hop_s, allowed + 0.5, **how)
     assert (found.value, found.rate.alarms) == brute(recordings, margin, allowed, how)
     assert found.reached
@@ -228,6 +226,12 @@ def test_threshold_in_long_streams(dtype: torch.dtype, margin: float) -> None:
     assert found.rate.per_hour <= target
     below = every[every < found.value][-1:]
     assert rate_curve(statistics, rule, hop_s, below, **how).item() > target
+
+
+def test_equal_values_are_one_threshold() -> None:
+    statistics = [torch.tensor([0.0, 5.0])] + [torch.tensor([0.0, 1.0])] * 11
+    found = choose_threshold(statistics, RAW, 150.0, 6, **PLAIN)
+    assert (found.value, found.rate.alarms) == (5, 1)
 
 
 def test_a_lower_threshold_with_fewer_alarms_is_not_taken() -> None:
@@ -294,13 +298,12 @@ def test_calibration_may_set_a_ceiling_that_the_rule_does_not_know() -> None:
     assert found.reached
 
 
-@pytest.mark.parametrize("margin", [0.0, 1.0])
-def test_busy_streams_of_which_not_all_is_tried(
-    margin: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = torch.Generator().manual_seed(2)
+@pytest.mark.parametrize("seed", range(8))
+def test_busy_streams_of_which_not_all_is_tried(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    # in one of the eight what was tried misleads, and the count at the value found mends it
+    source = torch.Generator().manual_seed(seed)
     statistics = list(torch.randn(6, 500, generator=source).cumsum(-1))
-    args = (statistics, Hysteresis(margin), 3600 / 3000, 40)
+    args = (statistics, RAW, 3600 / 3000, 40)
     exact = choose_threshold(*args, rearm=2, refractory=3)
     monkeypatch.setattr(rate, "_WORK", 1)
     monkeypatch.setattr(rate, "_FEWEST", 64)

@@ -36,7 +36,7 @@ class _Scored(NamedTuple):
 
 
 def by_detector(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """The splits of each fold, or of the one detector, if some hold several kinds of scenes.
+    """The splits of each fold, or of the one detector, if some held out are of several scenes.
 
     Empty otherwise, so that it also says whether there is anything to compare.
 
@@ -48,7 +48,8 @@ def by_detector(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     several = any(
         len(split.get("per_scene", {})) > 1
         for splits in found.values()
-        for split in splits.values()
+        for role, split in splits.items()
+        if role != "train"
     )
     return found if several else {}
 
