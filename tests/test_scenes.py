@@ -124,7 +124,12 @@ def test_handling_keeps_clear_of_slides_on_every_rung(rung):
 
 def test_scenes_that_handle_the_hand_say_where_and_the_others_do_not():
     handled = {name for name in NAMES if timeline(scene_of(name, "M3")).non_slip_s}
-    assert handled == {"arm_motion", "taps", "grips"}
+    without_strokes = {"held", "knocked"}
+    assert handled == {"arm_motion", "taps", "grips"} | without_strokes
+    for name in without_strokes:  # nothing slips in them, from end to end
+        truth = timeline(scene_of(name, "M3"))
+        assert truth.onsets_s == truth.arm_s == truth.sliding_s == ()
+        assert truth.non_slip_s == ((0.0, truth.duration_s),)
     assert timeline(scene_of("arm_motion", "M3")).onsets_s == ()
     assert timeline(scene_of("pulled", "M3")).arm_s == ()
 
