@@ -19,6 +19,18 @@ RESULTS = ROOT / "benchmarks" / "results"
 EXIT_INTERRUPTED = 130
 
 
+def add_paths(parser: argparse.ArgumentParser, when: str = "unless --quick") -> None:
+    """The options ``--json`` and ``--figure``.
+
+    Args:
+        parser: that gets them.
+        when: they go to ``benchmarks/results`` by themselves, for the help.
+    """
+    for name, what in (("json", "numbers"), ("figure", "figure")):
+        text = f"where the {what} go (benchmarks/results, {when})"
+        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
+
+
 def refuse_paths(parser: argparse.ArgumentParser, parsed: argparse.Namespace, *names: str) -> None:
     """End the program with the parser's error if one of these options names no file to write.
 
@@ -95,3 +107,16 @@ def keep_figure(
         return
     draw(report, path)
     print(f"figure in {path}")
+
+
+def told(
+    report: Mapping[str, Any],
+    text: Callable[[Mapping[str, Any]], str],
+    draw: Callable[[Mapping[str, Any], Path], None],
+    parsed: argparse.Namespace,
+) -> int:
+    """Print a report, and keep its numbers and figure where the options say; exit status 0."""
+    print(text(report))
+    keep_numbers(report, parsed.json)
+    keep_figure(draw, report, parsed.figure)
+    return 0

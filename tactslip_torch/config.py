@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -60,6 +61,24 @@ def unknown_choice(arguments: Sequence[str]) -> str | None:
         if key == "exp" and not argument.startswith("+"):
             return f"write +exp={value}: experiments are added to the configuration"
     return None
+
+
+def folder_problem(arguments: Sequence[str]) -> str | None:
+    """One line about a results folder that cannot be made; Hydra alone would show a trace.
+
+    Example:
+        >>> folder_problem(["hydra.run.dir=/dev/null/recordings"])
+        'cannot write to hydra.run.dir=/dev/null/recordings: Not a directory at /dev/null'
+    """
+    given = {key.lstrip("+"): value for key, _, value in (a.partition("=") for a in arguments)}
+    name = "hydra.sweep.dir" if {"-m", "--multirun"} & set(arguments) else "hydra.run.dir"
+    folder = Path(given.get(name, "outputs").strip("'\"")).absolute()
+    nearest = next(place for place in (folder, *folder.parents) if place.exists())
+    try:
+        with tempfile.TemporaryDirectory(dir=nearest):
+            return None
+    except OSError as error:
+        return f"cannot write to {name}={folder}: {error.strerror} at {nearest}"
 
 
 def run_entry_point(main: Callable[[], Any]) -> None:

@@ -18,12 +18,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-import tactslip_torch
-from tactslip_torch.config import conf_dir, errors_in_one_line, fail, one_line, run_entry_point
+from tactslip_torch.config import (
+    conf_dir,
+    errors_in_one_line,
+    fail,
+    folder_problem,
+    one_line,
+    run_entry_point,
+)
 from tactslip_torch.data.archive import OpenRecording
 from tactslip_torch.data.folder import (
     file_facts,
@@ -33,9 +38,7 @@ from tactslip_torch.data.folder import (
     refuse_other_channels,
 )
 from tactslip_torch.data.recording import Recording
-from tactslip_torch.experiment import save_config
-from tactslip_torch.features.cache import source_digest
-from tactslip_torch.generate import folder_problem
+from tactslip_torch.experiment import save_config, versions
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decider import Decisions
@@ -269,11 +272,7 @@ def _origin(listener: Listener) -> dict[str, Any]:
             "bin_s": pool.bin_samples / rate,
         },
         "settings": settings.to_dict() | {"is_own_threshold": config.threshold is None},
-        "versions": {
-            "tactslip_torch": tactslip_torch.__version__,
-            "torch": torch.__version__,
-            "code": source_digest(Path(tactslip_torch.__file__).parent),
-        },
+        "versions": versions(),
     }
     return dict(plain(facts))
 

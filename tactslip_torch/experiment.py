@@ -144,6 +144,15 @@ def feature_rows(names: Sequence[FeatureName], hand: HandLayout) -> list[dict[st
     return rows
 
 
+def versions() -> dict[str, str]:
+    """What made a result, for files that say so."""
+    return {
+        "tactslip_torch": tactslip_torch.__version__,
+        "torch": torch.__version__,
+        "code": source_digest(Path(tactslip_torch.__file__).parent),
+    }
+
+
 def common_facts(source: RecordingSource, pool: FeaturePool, config: DictConfig) -> dict[str, Any]:
     """What every ``metrics.json`` says of its origin."""
     return {
@@ -152,9 +161,5 @@ def common_facts(source: RecordingSource, pool: FeaturePool, config: DictConfig)
         "seed": config.seed,
         "labels": OmegaConf.to_container(config.labels, resolve=True),
         "num_features_pool": len(pool.names),
-        "versions": {
-            "tactslip_torch": tactslip_torch.__version__,
-            "torch": torch.__version__,
-            "code": source_digest(Path(tactslip_torch.__file__).parent),
-        },
+        "versions": versions(),
     }

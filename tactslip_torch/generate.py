@@ -11,7 +11,6 @@ around an onset as in the paper's signal figure.
 from __future__ import annotations
 
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +23,13 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig
 
 import tactslip_torch
-from tactslip_torch.config import conf_dir, errors_in_one_line, fail, run_entry_point
+from tactslip_torch.config import (
+    conf_dir,
+    errors_in_one_line,
+    fail,
+    folder_problem,
+    run_entry_point,
+)
 from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.experiment import save_config
@@ -142,24 +147,6 @@ def _draw(
     views = [row.around(stroke, BEFORE_S, AFTER_S) for row in rows]
     for name, seen in ((f"recordings_{scene}.png", None), (f"onset_{scene}.png", views)):
         signals_figure(rows, hand.to_rows(), files.folder / name, title=title, views=seen)
-
-
-def folder_problem(arguments: Sequence[str]) -> str | None:
-    """One line about a results folder that cannot be made; Hydra alone would show a trace.
-
-    Example:
-        >>> folder_problem(["hydra.run.dir=/dev/null/recordings"])
-        'cannot write to hydra.run.dir=/dev/null/recordings: Not a directory at /dev/null'
-    """
-    given = {key.lstrip("+"): value for key, _, value in (a.partition("=") for a in arguments)}
-    name = "hydra.sweep.dir" if {"-m", "--multirun"} & set(arguments) else "hydra.run.dir"
-    folder = Path(given.get(name, "outputs").strip("'\"")).absolute()
-    nearest = next(place for place in (folder, *folder.parents) if place.exists())
-    try:
-        with tempfile.TemporaryDirectory(dir=nearest):
-            return None
-    except OSError as error:
-        return f"cannot write to {name}={folder}: {error.strerror} at {nearest}"
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="generate")

@@ -46,7 +46,6 @@ from tactslip_torch.files import whole_file
 from tactslip_torch.judging import event_numbers, together
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.judgement import Judgement
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.scoring import Scorer
 from tactslip_torch.recipe import Recipe
@@ -202,9 +201,7 @@ def _rivals(detector: SlipDetector) -> dict[str, Scorer]:
     if not detector.pool.hand.indices("PVDF"):
         return {}
     return {
-        name.replace("_", " "): BaselineDetector(
-            name, detector.pool, detector.channel_filter, Judgement
-        )
+        name.replace("_", " "): BaselineDetector(name, detector.pool, detector.channel_filter)
         for name in get_args(BaselineName)
     }
 

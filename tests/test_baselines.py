@@ -12,7 +12,6 @@ from small_detector import HAND, raw_bins, small_detector
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.judgement import Judgement
 from tactslip_torch.onset.baselines import (
     FLOOR_V,
     VIBRATION_HZ,
@@ -233,7 +232,7 @@ def test_it_is_the_latch_without_debounce_and_pause(rng):
 def rival(name, **change):
     detector = small_detector()
     parts = {"pool": detector.pool, "channel_filter": detector.channel_filter} | change
-    return BaselineDetector(name, parts["pool"], parts["channel_filter"], Judgement)
+    return BaselineDetector(name, parts["pool"], parts["channel_filter"])
 
 
 @pytest.mark.parametrize("name", SCORES)

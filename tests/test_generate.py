@@ -16,11 +16,11 @@ from test_commands import BAD_INPUT, TinyRecordings, composed
 
 from tactslip_torch import HandLayout, simulate
 from tactslip_torch import generate as module
-from tactslip_torch.config import one_line
+from tactslip_torch.config import folder_problem, one_line
 from tactslip_torch.data.archive import load_recording, save_recording
 from tactslip_torch.data.folder import FORMATS, RecordingFolder, Written, manifest_line
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.generate import folder_problem, generate, written_table
+from tactslip_torch.generate import generate, written_table
 from tactslip_torch.simulation.scene import Scene
 from tactslip_torch.simulation.source import SimulatedRecordings
 

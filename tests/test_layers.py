@@ -183,7 +183,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "onset.matching": (),
     "onset.resampling": (),
     "onset.events": ("onset.matching", "onset.resampling"),
-    "onset.baselines": ("signals.*", "features.guards", "features.linear_maps", "onset.latch"),
+    "onset.baselines": ("signals.*", "features.guards", "features.pool", "model.judgement"),
     "onset.scoring": ("model.*", "signals.*"),
     "onset.decider": ("onset.latch", "onset.sequential", "onset.settings", "model.calibration"),
     "onset.settings": ("onset.sequential", "model.*"),

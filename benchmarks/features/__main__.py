@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from benchmarks.features.figure import figure
@@ -27,9 +26,9 @@ from benchmarks.machine import PEERS, machine_facts, versions
 from benchmarks.outcome import (
     EXIT_INTERRUPTED,
     RESULTS,
-    keep_figure,
-    keep_numbers,
+    add_paths,
     refuse_paths,
+    told,
 )
 
 SECTIONS: dict[str, Callable[[Sizes], dict[str, Any]]] = {
@@ -71,9 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--only", nargs="+", choices=SECTIONS, metavar="SECTION", help="of %(choices)s"
     )
-    for name, what in (("json", "numbers"), ("figure", "figure")):
-        text = f"where the {what} go (benchmarks/results, if all is measured in full)"
-        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
+    add_paths(parser, "if all is measured in full")
     parsed = parser.parse_args(arguments)
     refuse_paths(parser, parsed, "json", "figure")
     if parsed.figure and parsed.only and "pool" not in parsed.only:
@@ -86,10 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         report = measure(QUICK if parsed.quick else Sizes(), names, parsed.quick)
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    print(report_text(report))
-    keep_numbers(report, parsed.json)
-    keep_figure(figure, report, parsed.figure)
-    return 0
+    return told(report, report_text, figure, parsed)
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ from benchmarks.machine import PEERS, machine_facts, versions
 from benchmarks.outcome import (
     EXIT_INTERRUPTED,
     RESULTS,
-    keep_figure,
-    keep_numbers,
+    add_paths,
     refuse_paths,
+    told,
 )
 
 
@@ -63,9 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--quick", action="store_true", help="a few calls, to see that it runs")
     parser.add_argument("--model", type=Path, metavar="FILE", help="take a trained one's selection")
-    for name, what in (("json", "numbers"), ("figure", "figure")):
-        text = f"where the {what} go (benchmarks/results, unless --quick)"
-        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
+    add_paths(parser)
     parsed = parser.parse_args(arguments)
     refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
@@ -80,10 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    print(report_text(report))
-    keep_numbers(report, parsed.json)
-    keep_figure(figure, report, parsed.figure)
-    return 0
+    return told(report, report_text, figure, parsed)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -26,7 +25,7 @@ from benchmarks.model.measure import SECTIONS
 from benchmarks.model.report import limit_rows, ratios, report_text
 from benchmarks.model.sizes import QUICK, Sizes
 from benchmarks.model.worker import WorkerFailedError
-from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, keep_numbers, refuse_paths
+from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, add_paths, keep_numbers, refuse_paths
 
 EXIT_FAILED = 1
 
@@ -69,9 +68,7 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--bins", type=int, metavar="N", help="of any_size")
     parser.add_argument("--repeat", type=int, metavar="N", help="of what takes seconds")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), metavar="N")
-    for name, suffix in (("json", "numbers"), ("figure", "figure")):
-        text = f"where the {suffix} go (benchmarks/results, if all is measured in full)"
-        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
+    add_paths(parser, "if all is measured in full")
     parsed = parser.parse_args(arguments)
     for name in ("bins", "repeat", "threads"):
         value = getattr(parsed, name)

@@ -29,9 +29,9 @@ from benchmarks.outcome import (
     EXIT_INTERRUPTED,
     RESULTS,
     ROOT,
-    keep_figure,
-    keep_numbers,
+    add_paths,
     refuse_paths,
+    told,
 )
 
 
@@ -78,9 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--quick", action="store_true", help="very little, to see that it runs")
     parser.add_argument("--runs", type=Path, metavar="FOLDER", help="of trainings (outputs/onset)")
-    for name, what in (("json", "numbers"), ("figure", "figure")):
-        text = f"where the {what} go (benchmarks/results, unless --quick)"
-        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
+    add_paths(parser)
     parsed = parser.parse_args(arguments)
     refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
@@ -101,10 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         report = measure(sizes, trained, machine, parsed.quick)
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    print(report_text(report))
-    keep_numbers(report, parsed.json)
-    keep_figure(figure, report, parsed.figure)
-    return 0
+    return told(report, report_text, figure, parsed)
 
 
 if __name__ == "__main__":

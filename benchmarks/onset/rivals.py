@@ -99,7 +99,7 @@ def rivals_of(sizes: Sizes, trained: Mapping[str, Mapping[str, Any]]) -> dict[st
     fit_s, scores = timed(partial(mini_rocket_ridge, windows, targets, 1, sizes.num_kernels))
     parts = (detector.pool, detector.channel_filter)
     rivals: dict[str, Scorer] = {
-        **{name: BaselineDetector(key, *parts, Judgement) for name, key in BASELINES.items()},
+        **{name: BaselineDetector(key, *parts) for name, key in BASELINES.items()},
         MINI_ROCKET: MiniRocketDetector(*parts, scores),
     }
     stage = alarming_of(config, sizes.rival_hop_ms, sizes.rival_hours, sizes.target_per_hour)

@@ -11,14 +11,19 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from benchmarks.clocks import on_threads
 from benchmarks.machine import machine_facts, versions
-from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, keep_numbers, refuse_paths
+from benchmarks.outcome import (
+    EXIT_INTERRUPTED,
+    RESULTS,
+    add_paths,
+    keep_numbers,
+    refuse_paths,
+)
 from benchmarks.precision.data import load_experiment
 from benchmarks.precision.figure import figure
 from benchmarks.precision.measure import measure_variants
@@ -60,9 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--quick", action="store_true", help="few bins, to see that it runs")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), metavar="N")
-    for name, what in (("json", "numbers"), ("figure", "figure")):
-        text = f"where the {what} go (benchmarks/results, unless --quick)"
-        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
+    add_paths(parser)
     parsed = parser.parse_args(arguments)
     if parsed.threads < 1:
         parser.error(f"--threads must be at least 1, got {parsed.threads}")

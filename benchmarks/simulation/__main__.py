@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from benchmarks.clocks import on_threads
@@ -20,9 +19,9 @@ from benchmarks.machine import machine_facts, versions
 from benchmarks.outcome import (
     EXIT_INTERRUPTED,
     RESULTS,
-    keep_figure,
-    keep_numbers,
+    add_paths,
     refuse_paths,
+    told,
 )
 from benchmarks.simulation.accuracy import accuracies
 from benchmarks.simulation.cost import RUNGS, minute_costs, needed_seconds, parts
@@ -70,9 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Cost, error and downstream accuracy of each rung of the simulated hand.",
     )
     parser.add_argument("--quick", action="store_true", help="very little, to see that it runs")
-    for name, what in (("json", "numbers"), ("figure", "figure")):
-        text = f"where the {what} go (benchmarks/results, unless --quick)"
-        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
+    add_paths(parser)
     parsed = parser.parse_args(arguments)
     refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
@@ -82,10 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         report = measure(QUICK if parsed.quick else Sizes(), parsed.quick)
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    print(report_text(report))
-    keep_numbers(report, parsed.json)
-    keep_figure(figure, report, parsed.figure)
-    return 0
+    return told(report, report_text, figure, parsed)
 
 
 if __name__ == "__main__":

@@ -21,9 +21,9 @@ from benchmarks.model.worker import WorkerFailedError
 from benchmarks.outcome import (
     EXIT_INTERRUPTED,
     RESULTS,
-    keep_figure,
-    keep_numbers,
+    add_paths,
     refuse_paths,
+    told,
 )
 from benchmarks.throughput.figure import PANELS, figure
 from benchmarks.throughput.measure import SECTIONS
@@ -67,9 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--only", nargs="+", choices=SECTIONS, metavar="SECTION", help="of %(choices)s"
     )
     parser.add_argument("--model", type=Path, metavar="FILE", help="take a trained one's selection")
-    for name, what in (("json", "numbers"), ("figure", "figure")):
-        text = f"where the {what} go (benchmarks/results, if all is measured in full)"
-        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help=text)
+    add_paths(parser, "if all is measured in full")
     parsed = parser.parse_args(arguments)
     refuse_paths(parser, parsed, "json", "figure")
     if parsed.figure and parsed.only and not set(parsed.only) & set(PANELS):
@@ -90,10 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    print(report_text(report))
-    keep_numbers(report, parsed.json)
-    keep_figure(figure, report, parsed.figure)
-    return 0
+    return told(report, report_text, figure, parsed)
 
 
 if __name__ == "__main__":

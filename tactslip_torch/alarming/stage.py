@@ -16,6 +16,7 @@ from typing import Any
 from tactslip_torch.alarming.methods import FITS, Promise, methods_of
 from tactslip_torch.alarming.outcome import amounts_of, events_of, push_seconds, reliability_of
 from tactslip_torch.alarming.watching import Clock, Stream, watch
+from tactslip_torch.data.labels import whole_samples
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.cache import cache_key
@@ -84,12 +85,6 @@ class Alarming:
         for name in ("hop_ms", "false_alarms_per_hour", "hours"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"onset.{name} must be positive, got {getattr(self, name)}")
-        hop = self.hop_ms * self.streams.sample_rate_hz / 1000
-        if abs(hop - round(hop)) > 1e-6 or round(hop) < 1:
-            raise ValueError(
-                f"onset.hop_ms={self.hop_ms:g} is {hop:g} samples at "
-                f"{self.streams.sample_rate_hz:g} Hz; choose a whole number of samples"
-            )
         if not 0 < self.level < 1:
             raise ValueError(f"onset.level must lie between 0 and 1, got {self.level}")
         scenes = {recording.scene for recording in self.streams.ids}
@@ -113,7 +108,7 @@ class Alarming:
     @property
     def hop_samples(self) -> int:
         """Distance of two decisions."""
-        return round(self.hop_ms * self.streams.sample_rate_hz / 1000)
+        return whole_samples(self.hop_ms, self.streams.sample_rate_hz, "onset.hop_ms")
 
     def made_rules(self, bin_samples: int) -> dict[str, Rule]:
         """The rules; where they leave it open, evidence is hop / bin and the hop is ours."""
@@ -229,7 +224,9 @@ class Alarming:
         parts = {**usual, **{f"{role}/{scene}": own for (role, scene), own in scenes.items()}}
         events = events_of(parts, methods, clocks, compute_s, self.level)
         trained = {
-            name.split("/")[2] for name in detector.info["train_recordings"] if name.count("/") > 1
+            name.split("/")[2]
+            for name in detector.info.get("train_recordings", {})
+            if name.count("/") > 1
         }
         return {
             "rule": self.rule,

@@ -106,10 +106,10 @@ def label_bins(
         ValueError: if a bin would lie outside the recording, a stretch does, or a bin is no whole
             number of samples.
     """
-    bin_samples = _whole_samples(rule.bin_ms, sample_rate_hz, "bin_ms")
+    bin_samples = whole_samples(rule.bin_ms, sample_rate_hz, "labels.bin_ms")
     hop = bin_samples
     if rule.hop_ms is not None:
-        hop = _whole_samples(rule.hop_ms, sample_rate_hz, "hop_ms")
+        hop = whole_samples(rule.hop_ms, sample_rate_hz, "labels.hop_ms")
     lead_s, shift_s = (1.0, 0.010) if rule.layout == "whole_slide" else (0.5, 0.0)
     parts: list[_Part] = []
     is_taken = torch.zeros(round(duration_s * sample_rate_hz), dtype=torch.bool)  # by bin or slide
@@ -218,11 +218,21 @@ def shuffled(is_slip: Tensor, seed: int, place: int) -> Tensor:
     return is_slip[torch.randperm(len(is_slip), generator=generator)]
 
 
-def _whole_samples(length_ms: float, sample_rate_hz: float, name: str) -> int:
+def whole_samples(length_ms: float, sample_rate_hz: float, name: str) -> int:
+    """A length in samples.
+
+    Args:
+        length_ms: the length.
+        sample_rate_hz: of the samples.
+        name: of the setting, for the error.
+
+    Raises:
+        ValueError: if it is no whole number of samples, or none.
+    """
     samples = length_ms * sample_rate_hz / 1000
     if abs(samples - round(samples)) > 1e-6 or round(samples) < 1:
         raise ValueError(
-            f"labels.{name}={length_ms:g} is {samples:g} samples at {sample_rate_hz:g} Hz; "
+            f"{name}={length_ms:g} is {samples:g} samples at {sample_rate_hz:g} Hz; "
             "choose a whole number of samples"
         )
     return round(samples)

@@ -12,12 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Generic, Literal, Protocol, TypeVar, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
 from tactslip_torch.features.guards import are_ordinary, is_nowhere, stretch
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.model.judgement import Judgement
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names
@@ -33,7 +35,6 @@ FLOOR_V = 1e-6
 """Amplitudes below it count as it, so that a dead hand has a score (ours; 16 bits at +-5 V resolve
 150 times as much)."""
 _CHUNK_BINS = 256
-Said = TypeVar("Said", covariant=True)
 
 
 def film_band_power(
@@ -115,64 +116,22 @@ def first_transition(is_slip: Tensor) -> Tensor:
     return is_slip & ~before
 
 
-class _Hand(Protocol):
-    def indices(self, kind: Literal["SG", "PVDF"], /) -> tuple[int, ...]: ...
-
-
-class Bins(Protocol):
-    """What a baseline asks of a ``FeaturePool``: the channels, and which can be trusted."""
-
-    @property
-    def hand(self) -> _Hand:
-        """The channels, in the order of bins."""
-
-    @property
-    def bin_samples(self) -> int:
-        """Samples of a bin."""
-
-    @property
-    def sample_rate_hz(self) -> float:
-        """Of the samples."""
-
-    @property
-    def wavelet(self) -> str:
-        """Of the branches."""
-
-    @property
-    def level(self) -> int:
-        """Number of wavelet levels."""
-
-    def widen(self, x: Tensor) -> Tensor:
-        """Samples in the dtype that they are filtered in."""
-
-    def check(self, bins: Tensor) -> None:
-        """Refuse what are no bins of this hand."""
-
-    def is_missing(self, bins: Tensor) -> Tensor:
-        """Which channels hold a NaN or Inf, ``[*, C]``."""
-
-    def is_alive(self, bins: Tensor) -> Tensor:
-        """Which channels have a span the dtype can resolve, ``[*, C]``."""
-
-
 @dataclass(frozen=True)
-class BaselineDetector(Generic[Said]):
+class BaselineDetector:
     """A baseline where ``score_stream`` takes a ``SlipDetector``: the same hand, filter and bins.
 
     Args:
         name: which score.
-        pool: of the detector that it stands beside, a ``FeaturePool``.
+        pool: of the detector that it stands beside.
         channel_filter: of that detector.
-        judgement: what score, validity and missing channels are put in, ``Judgement``.
 
     Raises:
         ValueError: if there is no such baseline, or the hand has no film.
     """
 
     name: BaselineName
-    pool: Bins
+    pool: FeaturePool
     channel_filter: ChannelFilter
-    judgement: Callable[[Tensor, Tensor, Tensor], Said]
 
     def __post_init__(self) -> None:
         if self.name not in get_args(BaselineName):
@@ -192,7 +151,7 @@ class BaselineDetector(Generic[Said]):
         reaches = self.channel_filter.reaches
         return max(reaches[film][1] for film in self.pool.hand.indices("PVDF"))
 
-    def judge(self, bins: Tensor, *, given: torch.dtype | None = None) -> Said:
+    def judge(self, bins: Tensor, *, given: torch.dtype | None = None) -> Judgement:
         """Score filtered bins. A film that is missing counts as silent, and the score as not valid.
 
         Args:
@@ -218,7 +177,7 @@ class BaselineDetector(Generic[Said]):
         else:
             score = largest_detail(bins, films, self.pool.wavelet, self.pool.level)
         is_valid = is_trusted.index_select(-1, films.to(bins.device)).all(-1)
-        return self.judgement(score, is_valid, is_missing)
+        return Judgement(score, is_valid, is_missing)
 
 
 def _log_of_largest(

@@ -107,9 +107,8 @@ class Decider:
         self._refractory = settings.decisions(settings.refractory_s, sample_rate_hz)
         self.reset()
 
-    def reset(self, origin_s: float = 0.0) -> None:
-        """Forget everything; the next decision is number 0 of a stream that begins at a time."""
-        self._origin_s = origin_s
+    def reset(self) -> None:
+        """Forget everything; the next decision is number 0 of a stream that begins at 0."""
         self._number = 0  # Python's integers do not end
         self._state: tuple[Tensor, Latch, Tensor] | None = None
 
@@ -164,7 +163,7 @@ class Decider:
 
     def _available_s(self, number: Tensor) -> Tensor:
         samples = number * self.settings.hop_samples + self._first
-        return self._origin_s + samples.double() / self._rate
+        return samples.double() / self._rate
 
 
 def _run_starts(llr: Tensor, number: Tensor, before: Tensor) -> Tensor:

@@ -29,7 +29,6 @@ class _Kept(NamedTuple):
     method: str
     role: str
     rate: Mapping[str, float]
-    num_alarms: int
     hours: float
 
 
@@ -215,7 +214,7 @@ def _kept(metrics: Mapping[str, Any]) -> Iterator[_Kept]:
             own = numbers["per_scene"].get(quiet)
             if own and own["false_alarms_per_hour"]:
                 rate = own["false_alarms_per_hour"]
-                yield _Kept(method, role, rate, own["num_false_alarms"], own["quiet_hours"])
+                yield _Kept(method, role, rate, own["quiet_hours"])
 
 
 def _of_scene(alarm: Mapping[str, Any], scene: str, role: str) -> Mapping[str, float] | None:
