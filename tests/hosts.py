@@ -1,0 +1,313 @@
+"""What every host of an exported stream is held to: the truth, and words for what is wrong.
+
+A host is a command, ``[*host, model, recording, *options]``. It is run, its JSON lines are read,
+and what they say is held against ``StreamingDetector`` in float64.
+"""
+
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from test_detector import random_detector
+
+from tactslip_torch import Scene, SlipDetector, simulate
+from tactslip_torch.model.calibration import Platt
+from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.sequential import Cusum
+from tactslip_torch.onset.settings import KEY, AlarmSettings
+from tactslip_torch.onset.streaming import StreamingDetector
+
+RATE = 2000.0
+NUM_CHANNELS = 24
+HOP = 20
+
+
+# Input -----------------------------------------------------------------------------------------
+
+
+@cache
+def slipping_stream() -> np.ndarray:
+    """Three simulated seconds around an onset, volts ``[T, C]``, float32; not to be written to."""
+    scene = Scene("M1", seed=1)
+    onset_s = simulate(scene, windows=[]).onsets_s[0]
+    recording = simulate(scene, windows=[(onset_s - 2.0, onset_s + 1.0)])
+    first = round((onset_s - 2.0) * RATE) + 2  # outside the window there is NaN
+    samples = recording.samples[:, first : first + 5990].T.contiguous().numpy()
+    assert np.isfinite(samples).all()
+    samples.flags.writeable = False
+    return samples
+
+
+@cache
+def alarming_detector() -> SlipDetector:
+    """A detector nobody trained, of a seed and settings by which the stream raises some alarms."""
+    detector = random_detector(seed=6)
+    samples = torch.from_numpy(slipping_stream().T.copy()).double()
+    scores = score_stream(detector, samples, HOP).score
+    rise = 2.0 / float(scores.std())
+    settings = AlarmSettings(
+        HOP,
+        Platt(rise, -rise * float(scores.mean())),
+        Cusum(0.5, 0.4, 8.0),
+        threshold=2.0,
+        target_per_hour=1.0,
+        rearm_s=0.03,
+        refractory_s=0.1,
+        lead_s=0.02,
+    )
+    detector.info[KEY] = settings.to_dict()
+    return detector
+
+
+@cache
+def score_std() -> float:
+    """Of the detector's scores on the stream."""
+    return float(np.std([row["score"] for row in truth(slipping_stream())]))
+
+
+def saved(path: Path, samples: np.ndarray) -> Path:
+    """A recording as ``.npy``."""
+    np.save(path, samples)
+    return path
+
+
+@cache
+def exported(folder_factory: Any, precision: str = "float32") -> Path:
+    """A folder with ``model.onnx``, ``stream.onnx`` and their sidecars, made once in a session.
+
+    Args:
+        folder_factory: pytest's ``tmp_path_factory``.
+        precision: of the graphs.
+    """
+    from tactslip_torch.export import export_detector
+
+    folder: Path = folder_factory.mktemp(f"exported_{precision}")
+    export_detector(alarming_detector(), folder, graphs=("bin", "stream"), precision=precision)
+    return folder
+
+
+def copied(model: Path, folder: Path) -> Path:
+    """A model with its sidecar in another folder."""
+    for path in (model, sidecar_of(model)):
+        shutil.copy(path, folder)
+    return folder / model.name
+
+
+def sidecar_of(model: Path) -> Path:
+    return model.with_name(f"{model.name}.json")
+
+
+def truncated(path: Path, share: float = 0.5) -> Path:
+    """The same file, cut off."""
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    return path
+
+
+def altered(path: Path) -> Path:
+    """The same file with one bit of its middle byte flipped."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    return path
+
+
+# Running a host --------------------------------------------------------------------------------
+
+
+class Ran(NamedTuple):
+    """What a host said: its lines, the last of them apart, what stands on stderr, exit status."""
+
+    lines: list[dict[str, Any]]
+    summary: dict[str, Any]
+    stderr: str
+    status: int
+
+
+def run_host(host: Sequence[object], *arguments: object) -> Ran:
+    """Run a host to its end; JSON as the standard has it, so no NaN."""
+    command = [str(part) for part in (*host, *arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    lines = [json.loads(line, parse_constant=_refuse) for line in done.stdout.splitlines()]
+    summary = lines.pop() if done.returncode == 0 else {}
+    return Ran(lines, summary, done.stderr, done.returncode)
+
+
+def _refuse(word: str) -> None:
+    raise ValueError(f"{word} is no JSON")
+
+
+# The truth -------------------------------------------------------------------------------------
+
+
+def truth(samples: np.ndarray, threshold: float | None = None) -> list[dict[str, Any]]:
+    """Every decision of the detector on samples ``[T, C]``, as a host is to print it."""
+    detector = alarming_detector()
+    settings = AlarmSettings.of(detector)
+    if threshold is not None:
+        settings = AlarmSettings.from_dict(settings.to_dict() | {"threshold": threshold})
+    decisions = StreamingDetector(detector, settings, dtype=torch.float64).push(samples)
+    columns = {
+        "time_s": decisions.available_s,
+        "onset_s": decisions.onset_s,
+        "score": decisions.score,
+        "probability": decisions.probability,
+        "valid": decisions.is_valid,
+        "statistic": decisions.statistic,
+        "alarm": decisions.is_alarm,
+        "on": decisions.is_on,
+    }
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
+
+
+ALARM_KEYS = ("time_s", "onset_s", "score", "probability", "valid")
+
+
+def assert_same(ran: Ran, expected: list[dict[str, Any]], *, exact: bool = False) -> None:
+    """A host ran with ``--decisions`` and said what is expected.
+
+    Times and flags are the same; scores, statistics and probabilities to 1e-3 of a score standard
+    deviation (float32), or 1e-9 (``exact``: a model in float64).
+    """
+    close = 1e-9 if exact else 1e-3
+    bounds = {"score": close * score_std(), "probability": close, "statistic": close * 8.0}
+    assert ran.status == 0, ran.stderr
+    assert len(ran.lines) == len(expected)
+    for line, row in zip(ran.lines, expected, strict=True):
+        assert line.keys() == row.keys()
+        for name in ("valid", "alarm", "on"):
+            assert line[name] is row[name], (name, line, row)
+        for name in ("time_s", "onset_s"):
+            assert abs(line[name] - row[name]) < 1e-9, (name, line, row)
+        for name, bound in bounds.items():
+            assert abs(line[name] - row[name]) <= bound, (name, line, row)
+    assert ran.summary["decisions"] == len(expected)
+    assert ran.summary["alarms"] == sum(row["alarm"] for row in expected)
+
+
+# What is wrong ---------------------------------------------------------------------------------
+
+
+class Case(NamedTuple):
+    """Something wrong, and what a host is to say of it.
+
+    Attributes:
+        arguments: made of a fresh folder and a whole ``stream.onnx``.
+        says: all of them stand in the one line on stderr.
+        status: of the exit.
+    """
+
+    arguments: Callable[[Path, Path], list[object]]
+    says: tuple[str, ...]
+    status: int = 1
+
+
+def _recording(folder: Path) -> Path:
+    return saved(folder / "recording.npy", slipping_stream()[:600])
+
+
+def _with_model(change: Callable[[Path], object]) -> Callable[[Path, Path], list[object]]:
+    """Arguments with a model that was changed behind its export."""
+
+    def arguments(folder: Path, model: Path) -> list[object]:
+        mine = copied(model, folder)
+        change(mine)
+        return [mine, _recording(folder)]
+
+    return arguments
+
+
+def _with_array(make: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path, Path], list[object]]:
+    """Arguments with another array in the recording's file."""
+
+    def arguments(folder: Path, model: Path) -> list[object]:
+        return [model, saved(folder / "recording.npy", make(slipping_stream()[:600]))]
+
+    return arguments
+
+
+def _with_file(change: Callable[[Path], object]) -> Callable[[Path, Path], list[object]]:
+    """Arguments with a recording whose file was changed."""
+
+    def arguments(folder: Path, model: Path) -> list[object]:
+        path = _recording(folder)
+        change(path)
+        return [model, path]
+
+    return arguments
+
+
+def _with_options(*options: object) -> Callable[[Path, Path], list[object]]:
+    return lambda folder, model: [model, _recording(folder), *options]
+
+
+CASES = {
+    "no model": Case(_with_model(Path.unlink), ("stream.onnx",)),
+    "truncated model": Case(_with_model(truncated), ("stream.onnx.json", "again")),
+    "altered model": Case(_with_model(altered), ("stream.onnx.json", "again")),
+    "no sidecar": Case(
+        _with_model(lambda path: sidecar_of(path).unlink()), ("stream.onnx.json", "beside")
+    ),
+    "truncated sidecar": Case(
+        _with_model(lambda path: truncated(sidecar_of(path))), ("stream.onnx.json",)
+    ),
+    "bin graph": Case(
+        lambda folder, model: [model.with_name("model.onnx"), _recording(folder)],
+        ("model.onnx", "bin", "stream"),
+    ),
+    "no recording": Case(_with_file(Path.unlink), ("recording.npy",)),
+    "truncated recording": Case(_with_file(truncated), ("recording.npy", "cut")),
+    "truncated header": Case(_with_file(lambda path: truncated(path, 0.001)), ("recording.npy",)),
+    "text": Case(_with_file(lambda path: path.write_text("volts\n")), ("recording.npy", ".npy")),
+    "Fortran order": Case(_with_array(np.asfortranarray), ("Fortran",)),
+    "integers": Case(
+        _with_array(lambda x: (1000 * x).astype("<i2")), ("recording.npy", "<i2", "float32")
+    ),
+    "big-endian": Case(_with_array(lambda x: x.astype(">f4")), (">f4", "little-endian")),
+    "one axis": Case(_with_array(np.ravel), ("14400", "24")),
+    "three axes": Case(_with_array(lambda x: x[None]), ("600", "24")),
+    "seven channels": Case(_with_array(lambda x: x[:, :7].copy()), ("7", "24")),
+    "channels first": Case(_with_array(lambda x: x.T.copy()), ("600", "24")),
+    "another rate": Case(_with_options("--rate", 1000), ("1000", "2000")),
+    "no chunk": Case(_with_options("--chunk", 0), ("--chunk", "0"), 2),
+    "too large a chunk": Case(_with_options("--chunk", 5000), ("--chunk", "5000", "2000"), 2),
+    "half a chunk": Case(_with_options("--chunk", 2.5), ("--chunk", "2.5"), 2),
+    "no number": Case(_with_options("--threshold", "high"), ("--threshold", "high"), 2),
+    "unknown option": Case(_with_options("--verbose"), ("--verbose",), 2),
+    "no arguments": Case(lambda folder, model: [], ("recording.npy",), 2),
+}
+"""By name; ``pytest.mark.parametrize("case", CASES)``."""
+
+
+def assert_refused(host: Sequence[object], case: str, folder: Path, model: Path) -> None:
+    """A host says in one line what is wrong, prints nothing else, and ends as it should."""
+    ran = run_host(host, *CASES[case].arguments(folder, model))
+    assert ran.status == CASES[case].status, ran.stderr
+    (line,) = ran.stderr.splitlines()
+    assert line.startswith("error: ")
+    for words in CASES[case].says:
+        assert words in line
+    assert ran.lines == []
+
+
+def assert_warned(ran: Ran, expected: list[dict[str, Any]]) -> None:
+    """A host went on where decisions are not valid, and said so in one line at the end."""
+    times_s = [row["time_s"] for row in expected if not row["valid"]]
+    assert times_s
+    (line,) = ran.stderr.splitlines()
+    found = re.fullmatch(
+        r"warning: (\d+) of (\d+) decisions are not valid, the first at ([\d.]+) s: "
+        r"a channel in use is dead or broken",
+        line,
+    )
+    assert found, line
+    assert [int(found[1]), int(found[2])] == [len(times_s), len(expected)]
+    assert abs(float(found[3]) - times_s[0]) <= 1e-3
