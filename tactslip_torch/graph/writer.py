@@ -1,0 +1,182 @@
+"""ONNX graphs, written node by node.
+
+What is written is what the file holds: no tracer and no optimiser in between, which would delete
+a guard. ``Value`` has the arithmetic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import ArrayLike
+from onnx import helper, numpy_helper
+
+from tactslip_torch.graph.value import F64, I64, Value
+
+OPSET = 20
+IR_VERSION = 10  # the oldest that has the opset; newer ones are refused by older runtimes
+Shape = Sequence[int | str]
+
+
+class Graph:
+    """Nodes, constants, inputs and outputs that become a model, or the body of an ``if_``.
+
+    Args:
+        parent: of a body: where its constants go, whose values it may use and whose names it
+            avoids.
+    """
+
+    def __init__(self, parent: Graph | None = None) -> None:
+        self._top: Graph = self if parent is None else parent._top
+        self._nodes: list[onnx.NodeProto] = []
+        self._inputs: list[onnx.ValueInfoProto] = []
+        self._outputs: list[onnx.ValueInfoProto] = []
+        self._constants: dict[tuple[str, tuple[int, ...], bytes], Value] = {}
+        self._tensors: list[onnx.TensorProto] = []
+        self._count = 0
+
+    def input(self, name: str, dtype: np.dtype[Any], shape: Shape) -> Value:
+        """An input; axes that are named may have any length."""
+        self._inputs.append(_info(name, dtype, shape))
+        return Value(self, name, dtype)
+
+    def output(self, name: str, value: Value, shape: Shape | None) -> None:
+        """Hand a value out under a name; without a shape nothing is said of it."""
+        named = self.op("Identity", value, name=name)
+        self._outputs.append(_info(name, named.dtype, shape))
+
+    def constant(self, value: ArrayLike, dtype: np.dtype[Any]) -> Value:
+        """A tensor kept in the file, once however often it is asked for."""
+        if self._top is not self:
+            return Value(self, self._top.constant(value, dtype).name, dtype)
+        array = np.ascontiguousarray(np.asarray(value, dtype)).reshape(np.shape(value))
+        key = (array.dtype.name, array.shape, array.tobytes())
+        if key not in self._constants:
+            name = f"c{len(self._constants)}"
+            self._tensors.append(numpy_helper.from_array(array, name))
+            self._constants[key] = Value(self, name, dtype)
+        return self._constants[key]
+
+    def axes(self, *numbers: int) -> Value:
+        """Axes, lengths or places, as operators take them."""
+        return self.constant(list(numbers), I64)
+
+    def op(
+        self,
+        kind: str,
+        *inputs: Value | None,
+        dtype: np.dtype[Any] | None = None,
+        name: str | None = None,
+        **attributes: Any,
+    ) -> Value:
+        """The only output of a node; its dtype is that of the first input if not said."""
+        return self.ops(kind, *inputs, dtypes=(dtype,), names=(name,), **attributes)[0]
+
+    def ops(
+        self,
+        kind: str,
+        *inputs: Value | None,
+        dtypes: Sequence[np.dtype[Any] | None],
+        names: Sequence[str | None] | None = None,
+        **attributes: Any,
+    ) -> tuple[Value, ...]:
+        """The outputs of a node that has as many as there are dtypes."""
+        outputs = [given or self._name() for given in names or [None] * len(dtypes)]
+        fed = [each.name if each is not None else "" for each in inputs]
+        self._nodes.append(helper.make_node(kind, fed, outputs, **attributes))
+        first = inputs[0].dtype if inputs and inputs[0] is not None else F64
+        return tuple(
+            Value(self, output, dtype or first)
+            for output, dtype in zip(outputs, dtypes, strict=True)
+        )
+
+    def concat(self, *parts: Value, axis: int) -> Value:
+        """Values one behind the other along an axis; one alone as it is."""
+        return parts[0] if len(parts) == 1 else self.op("Concat", *parts, axis=axis)
+
+    def where(self, mask: Value, yes: Value | float, no: Value | float) -> Value:
+        """Values of ``yes`` where the mask holds and of ``no`` elsewhere; one must be a value."""
+        like = yes if isinstance(yes, Value) else no
+        if not isinstance(like, Value):
+            raise TypeError("where needs a value on one side, got two numbers")
+        sides = (like._operand(side) for side in (yes, no))
+        return self.op("Where", mask, *sides, dtype=like.dtype)
+
+    def if_(
+        self,
+        condition: Value,
+        then: Callable[[Graph], Sequence[Value]],
+        otherwise: Callable[[Graph], Sequence[Value]],
+    ) -> tuple[Value, ...]:
+        """One of two ways to make values, of which only the one that is needed is run."""
+        bodies, dtypes = [], list[np.dtype[Any]]()
+        for make in (then, otherwise):
+            body = Graph(self)
+            values = [Value(body, value.name, value.dtype) for value in make(body)]
+            for value in values:
+                body.output(self._name(), value, None)
+            dtypes = [value.dtype for value in values]
+            bodies.append(body.proto())
+        branches = {"then_branch": bodies[0], "else_branch": bodies[1]}
+        return self.ops("If", condition, dtypes=dtypes, **branches)
+
+    def scan(
+        self,
+        body: Callable[[Graph, Sequence[Value], Sequence[Value]], tuple[list[Value], list[Value]]],
+        state: Sequence[Value],
+        rows: Sequence[Value],
+    ) -> tuple[list[Value], list[Value]]:
+        """Walk along the first axis of ``rows``: a state goes on, and results are put together.
+
+        Args:
+            body: of a graph, the state ``[]`` and an entry ``[]`` of each row makes the state after
+                it and its results.
+            state: scalars before the first entry.
+            rows: ``[k]`` each; k may be 0.
+
+        Returns:
+            The state after the last entry, and results ``[k]``.
+        """
+        inner = Graph(self)
+        taken = [inner.input(self._name(), value.dtype, ()) for value in (*state, *rows)]
+        after, results = body(inner, taken[: len(state)], taken[len(state) :])
+        for value in (*after, *results):
+            inner.output(self._name(), value, ())
+        dtypes = [value.dtype for value in (*after, *results)]
+        made = self.ops(
+            "Scan", *state, *rows, dtypes=dtypes, body=inner.proto(), num_scan_inputs=len(rows)
+        )
+        return list(made[: len(state)]), list(made[len(state) :])
+
+    def proto(self) -> onnx.GraphProto:
+        """The graph as it stands."""
+        return helper.make_graph(
+            self._nodes, "tactslip_torch", self._inputs, self._outputs, self._tensors
+        )
+
+    def model(self, metadata: Mapping[str, str]) -> onnx.ModelProto:
+        """The model, checked by onnx.
+
+        Raises:
+            onnx.checker.ValidationError: if the graph is not well formed.
+        """
+        model = helper.make_model(
+            self.proto(),
+            opset_imports=[helper.make_opsetid("", OPSET)],
+            ir_version=IR_VERSION,
+            producer_name="tactslip_torch",
+        )
+        helper.set_model_props(model, dict(metadata))
+        onnx.checker.check_model(model)
+        return model
+
+    def _name(self) -> str:
+        self._top._count += 1
+        return f"v{self._top._count}"
+
+
+def _info(name: str, dtype: np.dtype[Any], shape: Shape | None) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(dtype), shape)
