@@ -1,0 +1,28 @@
+// Decisions as JSON lines, the same from every host.
+
+const DIGITS = { float32: 9, float64: 17 }; // read back as the same number
+
+/**
+ * One decision, without newline.
+ *
+ * @param {object} decision as `StreamGraph.push` gives it
+ * @param {string} precision of the model
+ * @param {boolean} isWhole with statistic, alarm and on
+ */
+export function decisionLine(decision, precision, isWhole) {
+  const shown = (value) => Number(value.toPrecision(DIGITS[precision]));
+  const { time_s, onset_s, score, probability, valid, statistic, alarm, on } = decision;
+  const line = {
+    time_s,
+    onset_s,
+    score: shown(score),
+    probability: shown(probability),
+    valid,
+  };
+  return JSON.stringify(isWhole ? { ...line, statistic: shown(statistic), alarm, on } : line);
+}
+
+/** The last line. */
+export function summaryLine(decisions, alarms, seconds) {
+  return JSON.stringify({ decisions, alarms, seconds });
+}

@@ -1,0 +1,83 @@
+// Recordings as NumPy keeps them: volts [samples, channels] in a .npy file.
+
+const MAGIC = "\x93NUMPY";
+const TYPES = { "<f4": Float32Array, "<f8": Float64Array };
+const CUT = (name) => `${name} is cut off within its header: copy it again`;
+export const HEADER_BYTES = 4096; // enough for any array of numbers
+
+/**
+ * What stands in the file, read from its first bytes.
+ *
+ * @param {Uint8Array} head the first `HEADER_BYTES`, or all there are
+ * @param {number} bytes length of the file
+ * @param {string} name of the file, for errors
+ * @param {string[]} channels that the detector wants
+ * @returns {{Type: Function, rows: number, offset: number}} of the numbers, row by row
+ * @throws {Error} if it is no .npy, cut off, of another type or order, or of another hand
+ */
+export function npyHeader(head, bytes, name, channels) {
+  const { text, offset } = headerText(head, name);
+  const type = /'descr': *'([^']*)'/.exec(text)?.[1];
+  const order = /'fortran_order': *(True|False)/.exec(text)?.[1];
+  const shape = /'shape': *\(([\d, ]*)\)/.exec(text)?.[1];
+  if (order === undefined || shape === undefined) {
+    throw new Error(`${name} has a .npy header of no known form: save it again with numpy.save`);
+  }
+  const Type = TYPES[type];
+  if (!Type) {
+    throw new Error(
+      `${name} holds ${type ?? "records"}, wanted volts in little-endian float32 or float64: ` +
+        "save it with .astype('<f4')",
+    );
+  }
+  const size = shape
+    .split(",")
+    .filter((part) => part.trim())
+    .map(Number);
+  if (size.length !== 2 || size[1] !== channels.length) {
+    throw new Error(
+      `${name} has shape (${shape.trim()}), wanted (samples, ${channels.length}): a row an ` +
+        `instant, channels ${channels[0]} to ${channels.at(-1)}`,
+    );
+  }
+  if (order === "True" && size[0] > 1) {
+    throw new Error(`${name} is in Fortran order, wanted C order: numpy.ascontiguousarray`);
+  }
+  const wanted = offset + size[0] * size[1] * Type.BYTES_PER_ELEMENT;
+  if (bytes < wanted) {
+    throw new Error(`${name} is cut off: ${bytes} bytes of ${wanted}; copy it again`);
+  }
+  return { Type, rows: size[0], offset };
+}
+
+function headerText(head, name) {
+  const isNpy = latin1(head.subarray(0, MAGIC.length)) === MAGIC;
+  if (!isNpy) throw new Error(`${name} is no .npy file: write it with numpy.save`);
+  const isLong = head[6] !== 1; // of version 2, with four bytes for the length of the header
+  const start = isLong ? 12 : 10;
+  if (head.length < start) throw new Error(CUT(name));
+  if (head[6] !== 1 && head[6] !== 2) {
+    throw new Error(`${name} has .npy version ${head[6]}, wanted 1 or 2: save it with numpy.save`);
+  }
+  const view = new DataView(head.buffer, head.byteOffset, head.byteLength);
+  const end = start + (isLong ? view.getUint32(8, true) : view.getUint16(8, true));
+  if (end > head.length) throw new Error(CUT(name));
+  return { text: latin1(head.subarray(start, end)), offset: end };
+}
+
+function latin1(bytes) {
+  return String.fromCharCode(...bytes);
+}
+
+/**
+ * All volts of a file in memory, `rows` times channels.
+ *
+ * @param {ArrayBuffer} content of the file
+ * @throws {Error} as `npyHeader`
+ */
+export function npyVolts(content, name, channels) {
+  const head = new Uint8Array(content, 0, Math.min(HEADER_BYTES, content.byteLength));
+  const { Type, rows, offset } = npyHeader(head, content.byteLength, name, channels);
+  const end = offset + rows * channels.length * Type.BYTES_PER_ELEMENT;
+  return new Type(content.slice(offset, end)); // a copy, for alignment is not promised
+}
