@@ -259,12 +259,15 @@ CASES = {
     "truncated sidecar": Case(
         _with_model(lambda path: truncated(sidecar_of(path))), ("stream.onnx.json",)
     ),
+    "sidecar of something else": Case(
+        _with_model(lambda path: sidecar_of(path).write_text("{}")), ("stream.onnx.json", "format")
+    ),
     "bin graph": Case(
         lambda folder, model: [model.with_name("model.onnx"), _recording(folder)],
         ("model.onnx", "bin", "stream"),
     ),
     "no recording": Case(_with_file(Path.unlink), ("recording.npy",)),
-    "truncated recording": Case(_with_file(truncated), ("recording.npy", "cut")),
+    "truncated recording": Case(_with_file(truncated), ("recording.npy", "cut off")),
     "truncated header": Case(_with_file(lambda path: truncated(path, 0.001)), ("recording.npy",)),
     "text": Case(_with_file(lambda path: path.write_text("volts\n")), ("recording.npy", ".npy")),
     "Fortran order": Case(_with_array(np.asfortranarray), ("Fortran",)),
@@ -281,6 +284,7 @@ CASES = {
     "too large a chunk": Case(_with_options("--chunk", 5000), ("--chunk", "5000", "2000"), 2),
     "half a chunk": Case(_with_options("--chunk", 2.5), ("--chunk", "2.5"), 2),
     "no number": Case(_with_options("--threshold", "high"), ("--threshold", "high"), 2),
+    "threshold that is NaN": Case(_with_options("--threshold", "nan"), ("--threshold", "nan"), 2),
     "unknown option": Case(_with_options("--verbose"), ("--verbose",), 2),
     "no arguments": Case(lambda folder, model: [], ("recording.npy",), 2),
 }

@@ -1,0 +1,168 @@
+/* Watches a recording with an exported stream graph:
+ *
+ *     detect stream.onnx recording.npy [--rate HZ] [--chunk N] [--threshold T] [--decisions]
+ *
+ * Prints JSON lines: one an alarm, or with --decisions one a decision, and a summary. */
+#include <math.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "npy.h"
+#include "slip.h"
+
+#define USAGE \
+    "usage: detect [--rate HZ] [--chunk N] [--threshold T] [--decisions] stream.onnx recording.npy"
+enum { LARGEST_CHUNK = 2000, WRONG = 1, WRONG_USAGE = 2 };
+
+struct options {
+    const char *model, *recording;
+    double rate, threshold; /* NaN: not given */
+    size_t chunk;
+    bool all_decisions;
+};
+
+struct tally {
+    size_t decisions, alarms, not_valid;
+    double first_not_valid_s;
+};
+
+static int refuse(int status, const char *format, ...) {
+    va_list arguments;
+    va_start(arguments, format);
+    fputs("error: ", stderr);
+    vfprintf(stderr, format, arguments);
+    fputs(status == WRONG_USAGE ? "; " USAGE "\n" : "\n", stderr);
+    va_end(arguments);
+    return status;
+}
+
+/* 0, or the exit status once it has said what is wrong. */
+static int read_options(int count, char **words, struct options *options) {
+    *options = (struct options){.rate = NAN, .threshold = NAN, .chunk = 200};
+    for (int i = 1; i < count; i++) {
+        const char *name = words[i];
+        if (strncmp(name, "--", 2)) {
+            const char **place = options->model ? &options->recording : &options->model;
+            if (*place) return refuse(WRONG_USAGE, "one argument too many, %s", name);
+            *place = name;
+            continue;
+        }
+        if (!strcmp(name, "--decisions")) {
+            options->all_decisions = true;
+            continue;
+        }
+        bool is_rate = !strcmp(name, "--rate"), is_chunk = !strcmp(name, "--chunk");
+        if (!is_rate && !is_chunk && strcmp(name, "--threshold"))
+            return refuse(WRONG_USAGE, "no option %s", name);
+        if (++i == count) return refuse(WRONG_USAGE, "%s needs a number", name);
+        char *end;
+        double value = strtod(words[i], &end);
+        if (end == words[i] || *end || !isfinite(value))
+            return refuse(WRONG_USAGE, "%s: expected a number, got %s", name, words[i]);
+        if (is_chunk && !(value >= 1 && value <= LARGEST_CHUNK && value == floor(value)))
+            return refuse(WRONG_USAGE, "%s: expected 1 to %d samples, got %s", name, LARGEST_CHUNK,
+                          words[i]);
+        if (is_chunk) options->chunk = (size_t)value;
+        else *(is_rate ? &options->rate : &options->threshold) = value;
+    }
+    if (!options->recording) return refuse(WRONG_USAGE, "stream.onnx and recording.npy are needed");
+    return 0;
+}
+
+/* As few digits as read back to the same number, which is a float where is_single. */
+static void print_number(const char *before, const char *name, double value, bool is_single) {
+    char text[32];
+    int most = is_single ? 9 : 17;
+    for (int digits = most - 3; digits <= most; digits++) {
+        snprintf(text, sizeof text, "%.*g", digits, value);
+        if (is_single ? strtof(text, NULL) == (float)value : strtod(text, NULL) == value) break;
+    }
+    printf("%s\"%s\": %s", before, name, text);
+}
+
+static void print_flag(const char *before, const char *name, bool flag) {
+    printf("%s\"%s\": %s", before, name, flag ? "true" : "false");
+}
+
+static void print_decision(const struct slip_decision *decision, bool is_single, bool is_whole) {
+    print_number("{", "time_s", decision->time_s, false);
+    print_number(", ", "onset_s", decision->onset_s, false);
+    print_number(", ", "score", decision->score, is_single);
+    print_number(", ", "probability", decision->probability, is_single);
+    print_flag(", ", "valid", decision->valid);
+    if (is_whole) {
+        print_number(", ", "statistic", decision->statistic, is_single);
+        print_flag(", ", "alarm", decision->alarm);
+        print_flag(", ", "on", decision->on);
+    }
+    puts("}");
+}
+
+static void take(const struct slip_decision *decision, const struct options *options,
+                 bool is_single, struct tally *tally) {
+    tally->decisions++;
+    tally->alarms += decision->alarm;
+    if (!decision->valid && !tally->not_valid++) tally->first_not_valid_s = decision->time_s;
+    if (options->all_decisions || decision->alarm)
+        print_decision(decision, is_single, options->all_decisions);
+}
+
+static int watch(struct slip *slip, struct npy *recording, const struct options *options) {
+    const struct slip_facts *facts = slip_facts(slip);
+    size_t width = recording->is_double ? sizeof(double) : sizeof(float);
+    void *samples = malloc(options->chunk * facts->num_channels * width);
+    struct slip_decision *decisions = malloc((facts->max_decisions + 1) * sizeof *decisions);
+    struct tally tally = {0};
+    int status = 0;
+    if (!samples || !decisions) status = refuse(WRONG, "no memory for a chunk; give a smaller one");
+    for (size_t at = 0, n; !status && at < recording->num_samples; at += n) {
+        size_t rest = recording->num_samples - at;
+        n = rest < options->chunk ? rest : options->chunk;
+        if (!npy_read(recording, samples, n)) {
+            status = refuse(WRONG, "%s was cut while it was read; save it again",
+                            options->recording);
+            break;
+        }
+        int num = recording->is_double ? slip_push_double(slip, samples, n, decisions)
+                                       : slip_push(slip, samples, n, decisions);
+        if (num < 0) status = refuse(WRONG, "%s: %s", options->model, slip_error(slip));
+        for (int i = 0; i < num; i++) take(decisions + i, options, !facts->is_double, &tally);
+    }
+    free(samples);
+    free(decisions);
+    if (status) return status;
+    printf("{\"decisions\": %zu, \"alarms\": %zu", tally.decisions, tally.alarms);
+    print_number(", ", "seconds", (double)recording->num_samples / facts->sample_rate_hz, false);
+    puts("}");
+    fflush(stdout);
+    if (tally.not_valid)
+        fprintf(stderr,
+                "warning: %zu of %zu decisions are not valid, the first at %.3f s: a channel in "
+                "use is dead or broken\n",
+                tally.not_valid, tally.decisions, tally.first_not_valid_s);
+    return 0;
+}
+
+int main(int count, char **words) {
+    struct options options;
+    char error[SLIP_ERROR];
+    int status = read_options(count, words, &options);
+    if (status) return status;
+    struct slip *slip = slip_open(options.model, options.chunk, error);
+    if (!slip) return refuse(WRONG, "%s", error);
+    const struct slip_facts *facts = slip_facts(slip);
+    struct npy recording = {0};
+    if (!isnan(options.threshold)) slip_set_threshold(slip, options.threshold);
+    if (!isnan(options.rate) && options.rate != facts->sample_rate_hz)
+        status = refuse(WRONG, "%s is at %g Hz, the model at %g; resample it", options.recording,
+                        options.rate, facts->sample_rate_hz);
+    else if (!npy_open(&recording, options.recording, facts->num_channels, error, sizeof error))
+        status = refuse(WRONG, "%s", error);
+    else
+        status = watch(slip, &recording, &options);
+    npy_close(&recording);
+    slip_close(slip);
+    return status;
+}

@@ -1,0 +1,80 @@
+/* Finds a key by walking over the object, past every value that is not wanted. It reads what
+ * json.dumps writes; of a text that is no JSON it finds what comes before the fault, or nothing. */
+#include "sidecar.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+static const char *past_space(const char *at) { return at + strspn(at, " \t\r\n"); }
+
+/* From an opening quote to behind the closing one, or NULL. */
+static const char *past_text(const char *at) {
+    for (at++; *at != '"'; at++) {
+        if (*at == '\\') at++;
+        if (!*at) return NULL;
+    }
+    return at + 1;
+}
+
+/* From the start of a value to the comma or bracket behind it, or NULL; commas are counted. */
+static const char *past_value(const char *at, size_t *commas) {
+    int depth = 0;
+    *commas = 0;
+    while (*at) {
+        if (*at == '"') {
+            if (!(at = past_text(at))) return NULL;
+            continue;
+        }
+        if (depth == 0 && (*at == ',' || *at == '}' || *at == ']')) return at;
+        if (*at == '[' || *at == '{') depth++;
+        if (*at == ']' || *at == '}') depth--;
+        if (*at == ',' && depth == 1) (*commas)++;
+        at++;
+    }
+    return NULL;
+}
+
+/* Where the value of a key begins, or NULL. */
+static const char *value_of(const char *json, const char *key) {
+    size_t length = strlen(key), commas;
+    const char *at = past_space(json);
+    if (*at != '{') return NULL;
+    do {
+        const char *name = past_space(at + 1), *behind;
+        if (*name != '"' || !(behind = past_text(name))) return NULL;
+        at = past_space(behind);
+        if (*at != ':') return NULL;
+        at = past_space(at + 1);
+        bool is_it = (size_t)(behind - name) == length + 2 && !memcmp(name + 1, key, length);
+        if (is_it) return at;
+        at = past_value(at, &commas);
+    } while (at && *at == ',');
+    return NULL;
+}
+
+bool sidecar_number(const char *json, const char *key, double *value) {
+    const char *at = value_of(json, key);
+    if (!at || !strchr("-0123456789", *at)) return false;
+    char *end;
+    *value = strtod(at, &end);
+    return *(end = (char *)past_space(end)) == ',' || *end == '}';
+}
+
+bool sidecar_text(const char *json, const char *key, char *text, size_t size) {
+    const char *at = value_of(json, key), *end;
+    if (!at || *at != '"' || !(end = past_text(at))) return false;
+    size_t length = (size_t)(end - at) - 2;
+    if (length >= size || memchr(at + 1, '\\', length)) return false;
+    memcpy(text, at + 1, length);
+    text[length] = '\0';
+    return true;
+}
+
+bool sidecar_entries(const char *json, const char *key, size_t *count) {
+    const char *at = value_of(json, key);
+    if (!at || *at != '[') return false;
+    bool is_empty = *past_space(at + 1) == ']';
+    if (!past_value(at, count)) return false;
+    *count = is_empty ? 0 : *count + 1;
+    return true;
+}

@@ -1,0 +1,13 @@
+/* What stands in a model's sidecar: one flat JSON object of scalars and lists. */
+#ifndef SIDECAR_H
+#define SIDECAR_H
+
+#include <stdbool.h>
+#include <stddef.h>
+
+/* Each reads the value of a key of the outermost object; false if there is none of that type. */
+bool sidecar_number(const char *json, const char *key, double *value);
+bool sidecar_text(const char *json, const char *key, char *text, size_t size);
+bool sidecar_entries(const char *json, const char *key, size_t *count); /* of a list */
+
+#endif

@@ -1,0 +1,52 @@
+"""Watch a recording with an exported stream graph.
+
+    python detect.py stream.onnx recording.npy [--rate HZ] [--chunk N] [--threshold T] [--decisions]
+
+``recording.npy`` holds volts ``[T, C]``, the channels in the model's order. Prints JSON lines: one
+an alarm, or with ``--decisions`` one a decision, and a summary.
+"""
+
+import json
+import sys
+
+from arguments import Parser, chunk, number
+from files import load_recording
+from stream import KEYS, Stream
+
+
+def main(options):
+    """Push the recording chunk by chunk and print what comes."""
+    stream = Stream(options.model, options.threshold)
+    recording = load_recording(options.recording, stream.facts, options.rate)
+    num_decisions, num_alarms, not_valid_s = 0, 0, []
+    for start in range(0, len(recording), options.chunk):
+        decisions = stream.push(recording[start : start + options.chunk])
+        alarms = [decision for decision in decisions if decision["alarm"]]
+        num_decisions, num_alarms = num_decisions + len(decisions), num_alarms + len(alarms)
+        not_valid_s += [decision["time_s"] for decision in decisions if not decision["valid"]]
+        for decision in decisions if options.decisions else alarms:
+            print(
+                json.dumps({key: decision[key] for key in KEYS[: None if options.decisions else 5]})
+            )
+    seconds = len(recording) / stream.facts["sample_rate_hz"]
+    print(json.dumps({"decisions": num_decisions, "alarms": num_alarms, "seconds": seconds}))
+    if not_valid_s:
+        print(
+            f"warning: {len(not_valid_s)} of {num_decisions} decisions are not valid, the first at "
+            f"{not_valid_s[0]:.3f} s: a channel in use is dead or broken",
+            file=sys.stderr,
+        )
+
+
+if __name__ == "__main__":
+    parser = Parser()
+    parser.add_argument("model", metavar="stream.onnx")
+    parser.add_argument("recording", metavar="recording.npy")
+    parser.add_argument("--rate", type=number, metavar="HZ")
+    parser.add_argument("--chunk", type=chunk, default=200, metavar="N")
+    parser.add_argument("--threshold", type=number, metavar="T")
+    parser.add_argument("--decisions", action="store_true")
+    try:
+        main(parser.parse_args())
+    except Exception as error:  # onnxruntime's errors share no other base
+        sys.exit(f"error: {' '.join(str(error).split())}")
