@@ -45,7 +45,7 @@ static bool read_header(FILE *file, struct header *header) {
     const char *dtype = value_of(header, "'descr'"), *order = value_of(header, "'fortran_order'");
     const char *shape = value_of(header, "'shape'");
     if (!dtype || !order || !shape || *shape != '(') return false;
-    if (sscanf(dtype, "'%15[^']'", header->dtype) != 1) strcpy(header->dtype, "a record");
+    if (sscanf(dtype, "'%15[a-zA-Z0-9<>|=]'", header->dtype) != 1) strcpy(header->dtype, "a record");
     header->is_fortran = !strncmp(order, "True", 4);
     for (header->num_axes = 0, shape++; header->num_axes < MOST_AXES; header->num_axes++) {
         char *end;
