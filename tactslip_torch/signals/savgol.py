@@ -72,6 +72,36 @@ def edge_matrices(
     return fit[place[:before]], fit[place[before]], fit[window_length - after :]
 
 
+def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
+    """Samples before a signal that make its filter one thing from end to end.
+
+    The first samples of a signal take the polynomial of its first frame. The plain filter makes
+    the same of them if it is given these in front: ``x[0] + past @ (x[:window_length] - x[0])``,
+    the last one next to ``x[0]``. A NaN or Inf in the first frame makes all of them NaN.
+
+    Shape:
+        - output: ``[before, window_length]``, float64, with ``before, after`` of ``reach``; its
+          rows sum to 1
+
+    Raises:
+        ValueError: as ``edge_matrices``.
+
+    Example:
+        >>> x = torch.tensor([0.0, 2.0, 4.0], dtype=torch.float64)
+        >>> x[0] + past_matrix(3, 1, "centred") @ (x - x[0])  # a line goes on
+        tensor([-2.], dtype=torch.float64)
+    """
+    head, kernel, _ = edge_matrices(window_length, polyorder, align)
+    before = len(head)
+    if polyorder == window_length - 1:  # goes through all samples: nothing is smoothed
+        return torch.eye(window_length, dtype=torch.float64)[:1].repeat(before, 1)
+    rows = torch.zeros(before, before + window_length, dtype=torch.float64)
+    for i, row in enumerate(rows):
+        row[i : i + window_length] = kernel
+    past, known = rows[:, :before], rows[:, before:]
+    return torch.linalg.lstsq(past, head - known, driver="gelsd").solution
+
+
 def savgol_filter(
     x: Tensor, window_length: int, polyorder: int = 1, align: Align = "centred"
 ) -> Tensor:

@@ -1,0 +1,258 @@
+"""From scores to alarms, as a graph: what ``Decider`` does.
+
+What one decision hands to the next, and no more, is walked by a ``Scan``; its iterations cost ten
+times what an entry of a vector does. So a rule's walk is its recurrence alone, and the latch's only
+where an alarm is raised.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from tactslip_torch.graph.value import F64, I64, Value
+from tactslip_torch.graph.writer import Graph
+from tactslip_torch.model.calibration import (
+    LARGEST_LLR,
+    LARGEST_SCORE,
+    Calibration,
+    Isotonic,
+    Platt,
+)
+from tactslip_torch.onset.sequential import NOTHING_YET, BayesFilter, Cusum, Hysteresis, KOfN, Rule
+
+LONG_AGO = 2.0**52
+"""Decisions since an alarm that never was; counts on exactly in float64."""
+_LARGEST_EXPONENT = 600.0  # beyond it odds are all or nothing, and their products still finite
+
+END = int(np.iinfo(np.int64).max)
+"""Of an axis, in a slice."""
+
+Walk = tuple[Value, Value]
+"""What is made of ``k`` decisions, ``[k]``, and what is remembered of them, float64."""
+
+Steps = tuple[list[Value], list[Value]]
+"""What the body of a ``scan`` gives."""
+
+
+def llr_of(score: Value, calibration: Calibration) -> Value:
+    """Log likelihood ratios of finite scores: ``[*] -> [*]``, in float64 and rounded once.
+
+    Raises:
+        ValueError: for a calibration other than ``Platt`` and ``Isotonic``.
+    """
+    wide = score.cast(F64)
+    match calibration:
+        case Platt(slope, offset):
+            line = wide.clip(-LARGEST_SCORE, LARGEST_SCORE) * slope + offset
+            return line.clip(-LARGEST_LLR, LARGEST_LLR).cast(score.dtype)
+        case Isotonic(scores, llrs):
+            return _between_knots(wide, scores, llrs).cast(score.dtype)
+    raise ValueError(f"expected a calibration Platt or Isotonic, got {calibration!r}")
+
+
+def probability_of(llr: Value, slip_share: float) -> Value:
+    """How probable slip is where this share of all bins is slip: ``[*] -> [*]``."""
+    odds = math.log(slip_share) - math.log1p(-slip_share)
+    return (llr + odds if odds else llr).sigmoid()
+
+
+def count_up(num: Value) -> Value:
+    """The whole numbers from 0 to before ``num`` ``[1]``, int64."""
+    graph = num.graph
+    return graph.op("Range", graph.constant(0, I64), num.squeeze(0), graph.constant(1, I64))
+
+
+def latest(mask: Value, start: Value, values: Value) -> Value:
+    """The value where the mask held last, ``start`` where it did not yet.
+
+    Shape:
+        - mask, values, output: ``[k]``, k at least 1
+        - start: ``[1]``
+    """
+    graph = values.graph
+    held = graph.concat(start, graph.op("Compress", values, mask, axis=0), axis=0)
+    count = graph.op("CumSum", mask.cast(I64), graph.constant(0, I64))
+    return graph.op("Gather", held, count, axis=0)
+
+
+def rule_start(rule: Rule) -> list[float]:
+    """What is remembered before the first decision; of ``BayesFilter`` the odds against slip.
+
+    Raises:
+        ValueError: for a rule that no graph is written for.
+    """
+    match rule:
+        case KOfN():
+            return [NOTHING_YET] * (rule.n - 1)
+        case Hysteresis():
+            return []
+        case BayesFilter():
+            return [1 / (rule.slips_per_s * rule.slip_s)]
+        case Cusum():
+            return [0.0]
+    raise ValueError(f"no graph is written for the rule {rule!r}")
+
+
+def statistic_of(rule: Rule, llr: Value, memory: Value) -> Walk:
+    """The statistic of each decision, in the dtype of the ratios, and the memory behind the last.
+
+    To the bit what the rule's ``scan`` makes of them; ``BayesFilter`` to rounding of the ratios.
+
+    Args:
+        rule: whose statistic.
+        llr: finite ratios.
+        memory: of ``rule_start`` or the call before.
+
+    Shape:
+        - llr, statistic: ``[k]``, k at least 1
+        - memory: as many as ``rule_start`` gives, float64
+
+    Raises:
+        ValueError: as ``rule_start``.
+    """
+    match rule:
+        case KOfN():
+            return _k_th_largest(rule, llr, memory)
+        case Hysteresis():
+            return llr, memory
+        case BayesFilter():
+            return _odds(rule, llr, memory)
+        case Cusum():
+            return _sum(rule, llr, memory)
+    raise ValueError(f"no graph is written for the rule {rule!r}")
+
+
+class Latched(NamedTuple):
+    """Which decisions raise an alarm.
+
+    Attributes:
+        alarm: whether it raises one, ``[k]``, bool.
+        on: whether one stands after it, ``[k]``, bool.
+        memory: what ``latched`` is given for the next decisions, ``[1]`` each.
+    """
+
+    alarm: Value
+    on: Value
+    memory: tuple[Value, Value, Value]
+
+
+def latched(
+    statistic: Value,
+    level: Value,
+    low: Value,
+    number: Value,
+    memory: tuple[Value, Value, Value],
+    *,
+    rearm: int,
+    refractory: int,
+) -> Latched:
+    """Alarms as ``onset.latch`` raises them.
+
+    An alarm may be raised where the last one is no later than the last re-arming and than
+    ``refractory`` decisions back. Both are known beforehand; so only the number of the last alarm
+    is walked, and only if there is one.
+
+    Args:
+        statistic: finite.
+        level: from which on an alarm is raised.
+        low: below which it counts towards re-arming; not above ``level``.
+        number: of the decisions in their stream, float64.
+        memory: whether an alarm stands, decisions in a row below ``low``, and decisions since the
+            last alarm; float64.
+        rearm: decisions in a row that must be low.
+        refractory: shortest distance of two alarms, in decisions.
+
+    Shape:
+        - statistic, number: ``[k]``, k at least 1
+        - level, low, memory: ``[1]``
+    """
+    graph = statistic.graph
+    on, below, since = memory
+    before = number.slice(0, 1, 0) - 1.0
+    last = before - since
+    high = latest(statistic >= low, before - below, number)  # the last one that was not low
+    rearmed = latest(number - high >= float(max(rearm, 1)), last - on, number)
+    allowed = rearmed.min(number - float(refractory))
+    latest_allowed = graph.where(statistic >= level, allowed, -math.inf)
+
+    def walk(body: Graph) -> list[Value]:
+        rows = [latest_allowed.at(body), number.at(body)]
+        return body.scan(_raise, [last.at(body).squeeze(0)], rows)[1]
+
+    is_any = latest_allowed.amax(0, keep=True) >= last
+    alarms = graph.if_(is_any, walk, lambda body: [last.at(body)])[0]  # [k], or none and [1]
+    is_on = alarms > rearmed
+    end = _last(number)
+    after = (_last(is_on).cast(F64), end - _last(high), end - _last(alarms))
+    return Latched(alarms.equals(number), is_on, after)
+
+
+def _raise(body: Graph, state: Sequence[Value], rows: Sequence[Value]) -> Steps:
+    (last,), (allowed, number) = state, rows
+    last = body.where(last <= allowed, number, last)
+    return [last], [last]
+
+
+def _k_th_largest(rule: KOfN, llr: Value, memory: Value) -> Walk:
+    if rule.n == 1:
+        return llr, memory
+    graph = llr.graph
+    known = graph.concat(memory.cast(llr.dtype), llr, axis=0)  # [n - 1 + k]
+    places = count_up(llr.length(0)).expand(1) + graph.axes(*range(rule.n))
+    window = graph.op("Gather", known, places, axis=0)  # [k, n]
+    largest, _ = graph.ops("TopK", window, graph.axes(rule.k), dtypes=(llr.dtype, I64))
+    kept = known.slice(1 - rule.n, END, 0).cast(F64)
+    return largest.slice(rule.k - 1, rule.k, 1).squeeze(1), kept
+
+
+def _sum(rule: Cusum, llr: Value, memory: Value) -> Walk:
+    step = llr - rule.drift if rule.drift else llr
+    step = step * rule.evidence if rule.evidence != 1 else step
+
+    def add(body: Graph, state: Sequence[Value], rows: Sequence[Value]) -> Steps:
+        total = (state[0] + rows[0]).clip(0.0, rule.ceiling)
+        return [total], [total]
+
+    start = memory.cast(llr.dtype).squeeze(0)
+    _, (statistic,) = llr.graph.scan(add, [start], [step])
+    return statistic, _last(statistic).cast(F64)
+
+
+def _odds(rule: BayesFilter, llr: Value, memory: Value) -> Walk:
+    """By the odds against slip, ``e``: ``(b + (1 - a) e) / (1 - b + a e)`` before the evidence."""
+    graph, rate = llr.graph, rule.slips_per_s + 1 / rule.slip_s
+    change = -math.expm1(-rate * rule.hop_s)
+    begin, end = change * rule.slips_per_s / rate, change / (rule.slip_s * rate)
+    evidence = llr.cast(F64) * rule.evidence
+    weight = (-evidence.clip(-_LARGEST_EXPONENT, _LARGEST_EXPONENT)).exp()
+
+    def turn(body: Graph, state: Sequence[Value], rows: Sequence[Value]) -> Steps:
+        against = state[0]
+        ahead = (against * (1 - begin) + end) / (against * begin + (1 - end))
+        return [ahead * rows[0]], [ahead]
+
+    (after,), (ahead,) = graph.scan(turn, [memory.squeeze(0)], [weight])
+    return (evidence - ahead.log()).cast(llr.dtype), after.expand(0)
+
+
+def _between_knots(score: Value, scores: Sequence[float], llrs: Sequence[float]) -> Value:
+    graph, num = score.graph, len(scores)
+    inside = score.clip(scores[0], scores[-1])
+    if num == 1:
+        return inside * 0.0 + llrs[0]
+    is_right = inside.expand(-1) > graph.constant(scores, F64)  # [k, knots]
+    place = (is_right.cast(I64).sum(-1) - 1).clip(0, num - 2)  # of the knot to the left
+    tables = scores[:-1], np.diff(scores), llrs[:-1], llrs[1:]
+    x, width, left, right = (
+        graph.op("Gather", graph.constant(table, F64), place, axis=0) for table in tables
+    )
+    share, rise = (inside - x) / width, right - left
+    return graph.where(share < 0.5, left + share * rise, right - rise * (1.0 - share))
+
+
+def _last(value: Value) -> Value:
+    return value.slice(-1, END, 0)

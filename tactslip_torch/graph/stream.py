@@ -1,0 +1,242 @@
+"""The detector that watches a stream, as a graph: ``StreamingDetector.push`` without times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tactslip_torch.graph.bins import Judged, judge_bins
+from tactslip_torch.graph.form import Form, Window
+from tactslip_torch.graph.sequence import (
+    END,
+    LONG_AGO,
+    count_up,
+    latched,
+    latest,
+    llr_of,
+    probability_of,
+    rule_start,
+    statistic_of,
+)
+from tactslip_torch.graph.value import BOOL, F64, I64, Value
+from tactslip_torch.graph.writer import Graph
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.sequential import NEUTRAL
+from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.signals.savgol import past_matrix
+
+Judge = Callable[[Graph, SlipDetector, Value, Form], Judged]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When decisions are made, and how much is kept until then; lengths in samples.
+
+    Attributes:
+        window: of a bin.
+        hop: distance of two decisions.
+        first: that must have come before the first decision, but for long frames.
+        frame: that must have come before any.
+        tail: that are kept.
+        state_size: numbers that are kept.
+    """
+
+    window: Window
+    hop: int
+    first: int
+    frame: int
+    tail: int
+    state_size: int
+
+    @classmethod
+    def of(cls, detector: SlipDetector, settings: AlarmSettings) -> Timing:
+        """That of a detector with these settings."""
+        window = Window.of(detector)
+        frame = max(detector.channel_filter.window_lengths[i] for i in window.channels)
+        first = window.bin + window.after
+        state_size = 6 + len(rule_start(settings.rule))
+        return cls(window, settings.hop_samples, first, frame, window.length - 1, state_size)
+
+
+def stream_graph(
+    detector: SlipDetector, settings: AlarmSettings, form: Form, judge: Judge = judge_bins
+) -> Graph:
+    """The graph of a stream: what comes next, and what was kept, to decisions and what is kept.
+
+    Inputs ``samples [n, C]``, ``tail [r, C]``, ``state [s]`` and ``threshold [t]``; outputs
+    ``score``, ``probability``, ``statistic``, ``valid``, ``alarm``, ``on``, ``time_s``,
+    ``onset_s``, ``[k]`` each, ``next_tail [Timing.tail, C]`` and ``next_state
+    [Timing.state_size]``. A stream begins with an empty tail and state; without a threshold that of
+    the settings counts. Where nothing can be decided, next to nothing is computed.
+
+    State, in float64: samples and decisions so far, where the run of positive ratios began, whether
+    an alarm stands, decisions in a row that were low, decisions since the last alarm, and the
+    memory of the rule.
+
+    Args:
+        detector: whose judgement.
+        settings: hop, calibration, rule and threshold.
+        form: precision and layout.
+        judge: what makes scores of windows.
+
+    Raises:
+        ValueError: for a calibration or rule that no graph is written for.
+    """
+    timing = Timing.of(detector, settings)
+    graph, num_channels = Graph(), len(detector.pool.hand)
+    samples = graph.input("samples", form.dtype, ("n", num_channels))
+    tail = graph.input("tail", form.dtype, ("r", num_channels))
+    state = graph.input("state", F64, ("s",))
+    threshold = graph.input("threshold", F64, ("t",))
+
+    nothing = graph.constant([[0.0] * num_channels] * timing.tail, form.dtype)
+    held = graph.concat(nothing, tail, samples, axis=0)
+    start = graph.constant([0, 0, 0, 0, 0, LONG_AGO, *rule_start(settings.rule)], F64)
+    state = graph.concat(state, start, axis=0).slice(0, timing.state_size, 0)
+    own = graph.constant([settings.threshold], F64)
+    threshold = graph.concat(threshold, own, axis=0).slice(0, 1, 0)
+    seen = state.slice(0, 1, 0) + samples.length(0).cast(F64)
+    decided = ((seen + float(timing.hop - timing.first)) / float(timing.hop)).floor().max(0.0)
+    if timing.frame > timing.first:
+        decided = graph.where(seen >= float(timing.frame), decided, 0.0)
+    deciding = _Deciding(detector, settings, form, judge, timing)
+    made = graph.if_(
+        decided > state.slice(1, 2, 0),
+        lambda body: deciding(*(x.at(body) for x in (held, state, threshold, seen, decided))),
+        lambda body: _none(seen.at(body), state.at(body), form),
+    )
+    for (name, _), value in zip(_outputs(form), made[:-1], strict=True):
+        graph.output(name, value, ("k",))
+    graph.output("next_tail", held.slice(-timing.tail, END, 0), (timing.tail, num_channels))
+    graph.output("next_state", made[-1], (timing.state_size,))
+    return graph
+
+
+def _outputs(form: Form) -> list[tuple[str, np.dtype[Any]]]:
+    """Names and dtypes of what there is one of per decision."""
+    of_score = [(name, form.dtype) for name in ("score", "probability", "statistic")]
+    flags = [(name, BOOL) for name in ("valid", "alarm", "on")]
+    return [*of_score, *flags, ("time_s", F64), ("onset_s", F64)]
+
+
+def _none(seen: Value, state: Value, form: Form) -> list[Value]:
+    """No decision."""
+    graph = seen.graph
+    empty = [graph.constant([], dtype) for _, dtype in _outputs(form)]
+    return [*empty, graph.concat(seen, state.slice(1, END, 0), axis=0)]
+
+
+@dataclass(frozen=True)
+class _Deciding:
+    """What is done where there is at least one decision."""
+
+    detector: SlipDetector
+    settings: AlarmSettings
+    form: Form
+    judge: Judge
+    timing: Timing
+
+    def __call__(
+        self, held: Value, state: Value, threshold: Value, seen: Value, decided: Value
+    ) -> list[Value]:
+        """All outputs but the tail, the state last."""
+        graph, settings, pool = held.graph, self.settings, self.detector.pool
+        _, made, run, on, low, since = (state.slice(i, i + 1, 0) for i in range(6))
+        places = count_up((decided - made).cast(I64))
+        number = places.cast(F64) + made
+        windows = self._windows(held, seen, made, places)
+        judged = self.judge(graph, self.detector, windows, self.form)
+
+        llr = graph.where(judged.is_usable, llr_of(judged.score, settings.calibration), NEUTRAL)
+        statistic, memory = statistic_of(settings.rule, llr, state.slice(6, END, 0))
+        level = threshold.cast(self.form.dtype)
+        raised = latched(
+            statistic,
+            level,
+            level - settings.rule.margin if settings.rule.margin else level,
+            number,
+            (on, low, since),
+            rearm=settings.decisions(settings.rearm_s, pool.sample_rate_hz),
+            refractory=settings.decisions(settings.refractory_s, pool.sample_rate_hz),
+        )
+        run = latest(llr <= 0.0, run, number + 1.0)
+        last_run = run.slice(-1, END, 0)
+        return [
+            judged.score,
+            probability_of(llr, settings.slip_share),
+            statistic,
+            judged.is_valid,
+            raised.alarm,
+            raised.on,
+            *self._times_s(number, run),
+            graph.concat(seen, decided, last_run, *raised.memory, memory, axis=0),
+        ]
+
+    def _windows(self, held: Value, seen: Value, made: Value, places: Value) -> Value:
+        """The samples of each decision, float64, ``[k, channels in use, Window.length]``.
+
+        ``held`` ends with sample number ``seen``.
+        """
+        graph, timing, window = held.graph, self.timing, self.timing.window
+        first = made * float(timing.hop)  # sample of the first bin
+        origin = held.length(0) + (first - seen).cast(I64) - window.before
+        x = held.slice(origin, END, 0)
+        if window.channels != tuple(range(len(self.detector.pool.hand))):
+            x = x.take(window.channels, 1)
+        x = x.cast(F64)
+        if window.before:
+            whole, bin_start = x, first.cast(I64)
+            x = graph.if_(
+                first < float(window.before),
+                lambda body: [self._with_past(whole.at(body), bin_start.at(body))],
+                lambda body: [whole.at(body)],
+            )[0]
+        starts = (places * timing.hop).expand(1)  # [k, 1]
+        index = starts + graph.axes(*range(window.length))
+        return graph.op("Gather", x, index, axis=0).transpose(0, 2, 1)
+
+    def _with_past(self, x: Value, bin_start: Value) -> Value:
+        """The first window and what follows, with a made-up past before the stream's start.
+
+        Args:
+            x: ``[m, channels in use]``, from ``Window.before`` samples before ``bin_start``.
+            bin_start: sample of the stream at which the first bin starts, ``[1]``.
+        """
+        graph, window = x.graph, self.timing.window
+        known = x.slice(-bin_start + window.before, END, 0)
+        of_channel = self.detector.channel_filter.window_lengths
+        pasts, order = list[Value](), list[int]()
+        for length in dict.fromkeys(of_channel[channel] for channel in window.channels):
+            chosen = [i for i, c in enumerate(window.channels) if of_channel[c] == length]
+            frame = known.slice(0, length, 0).take(chosen, 1)
+            sample = frame.slice(0, 1, 0)
+            pasts.append(graph.constant(self._past(length), F64) @ (frame - sample) + sample)
+            order += chosen
+        past = graph.concat(*pasts, axis=1)
+        if order != sorted(order):
+            past = past.take(sorted(range(len(order)), key=order.__getitem__), 1)
+        return graph.concat(past.slice(bin_start, END, 0), known, axis=0)
+
+    def _past(self, length: int) -> Tensor:
+        """``past_matrix`` of a frame, with rows of 0 for what lies beyond its reach."""
+        layer = self.detector.channel_filter
+        past = past_matrix(length, layer.polyorder, layer.align)
+        beyond = past.new_zeros(self.timing.window.before - len(past), length)
+        return torch.cat([beyond, past])
+
+    def _times_s(self, number: Value, run: Value) -> tuple[Value, Value]:
+        """When decisions could be made, and when the slip began that they speak of."""
+        timing, rate = self.timing, self.detector.pool.sample_rate_hz
+        samples = number * float(timing.hop) + float(timing.first)
+        time_s = samples / rate
+        began_s = (run.min(number) * float(timing.hop) + float(timing.first)) / rate
+        onset_s = (began_s - self.settings.lead_s).min(time_s)
+        if timing.frame <= timing.first:
+            return time_s, onset_s
+        waited_s = samples.max(float(timing.frame)) / rate
+        return waited_s, waited_s - (time_s - onset_s)
