@@ -255,6 +255,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "graph.value": (),
     "graph.writer": ("graph.value",),
     "graph.form": ("model.detector",),
+    "graph.maps": ("features.*", "signals.filtering"),
+    "graph.shared": ("graph.*", "features.descriptors"),
     "graph.rows": ("graph.*", "features.*", "signals.*", "model.detector"),
     "graph.descriptors": ("graph.*", "features.*"),
     "graph.order": ("graph.*", "features.*"),

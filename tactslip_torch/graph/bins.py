@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from tactslip_torch.graph.form import Form
-from tactslip_torch.graph.value import Value
+from tactslip_torch.features.linear_maps import LinearMaps
+from tactslip_torch.features.plan import Plan, Row
+from tactslip_torch.graph.descriptors import DESCRIPTORS
+from tactslip_torch.graph.form import Form, Window
+from tactslip_torch.graph.head import machine, scaled, with_typical
+from tactslip_torch.graph.rows import EXACT, Front
+from tactslip_torch.graph.shared import Shared
+from tactslip_torch.graph.value import BOOL, F64, I64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
 
@@ -14,7 +21,7 @@ class Judged(NamedTuple):
     """What a graph makes of ``B`` bins.
 
     Attributes:
-        score: ``[B]``, in the precision of the form; finite, at least 0 is slip.
+        score: ``[B]``, in the precision of the form; at least 0 is slip.
         is_valid: ``[B]``, bool: every channel in use can be trusted.
         is_usable: ``[B]``, bool: the score tells something (``onset.decider.is_usable``).
     """
@@ -34,6 +41,87 @@ def judge_bins(graph: Graph, detector: SlipDetector, windows: Value, form: Form)
         form: precision and layout.
 
     Shape:
-        - windows: ``[B, channels, Window.length]``; B may be 0 only if it is so at run time
+        - windows: ``[B, channels, Window.length]``
     """
-    raise NotImplementedError
+    front = Front(graph, detector, windows, form)
+    features = _features(graph, detector, front, form)
+    z = with_typical(graph, scaled(graph, features, detector.scaler), front.is_missing, detector)
+    score = machine(graph, z, detector.head, form)
+    is_finite = score.is_finite()
+    all_of = _all(front.is_trusted)
+    return Judged(score, all_of & is_finite, is_finite & ~_all(front.is_missing))
+
+
+def bin_graph(detector: SlipDetector, form: Form) -> Graph:
+    """A graph of independent bins.
+
+    Args:
+        detector: whose judgement.
+        form: precision and layout.
+
+    Shape:
+        - in ``samples``: ``[batch, C, Window.length]``, volts, in the precision of the form
+        - out ``score``: ``[batch]``; ``valid``: ``[batch]``, bool
+    """
+    graph, window = Graph(), Window.of(detector)
+    shape = ("batch", len(detector.pool.hand), window.length)
+    samples = graph.input("samples", form.dtype, shape)
+    judged = judge_bins(graph, detector, samples.take(window.channels, 1), form)
+    graph.output("score", judged.score, ("batch",))
+    graph.output("valid", judged.is_valid, ("batch",))
+    return graph
+
+
+def _features(graph: Graph, detector: SlipDetector, front: Front, form: Form) -> Value:
+    """Selected features in their order, ``[B, K]``, float64."""
+    plan, axis_hz = detector.extractor.plan, LinearMaps.of(detector.pool).frequency_hz
+    pieces, column_of, width = list[Value](), dict[int, int](), 0
+    for rows, exact in _batches(plan, form):
+        wanted = [w for w in plan.wanted if plan.rows[w.row] in rows]
+        names = {w.descriptor for w in wanted}
+        made = front.of(
+            rows,
+            exact=exact,
+            with_scale="mode" in names,
+            with_film="correlation" in names,
+        )
+        place = {row: index for index, row in enumerate(made.rows)}
+        places = {
+            name: sorted({place[plan.rows[w.row]] for w in wanted if w.descriptor == name})
+            for name in sorted(names)
+        }
+        axis = axis_hz if rows[0].kind == "freq" else axis_hz.new_zeros(front.window.bin)
+        shared = Shared(graph, made, places, frugal=form.layout == "bulk", frequency_hz=axis)
+        for name in places:
+            part = DESCRIPTORS[name](shared)
+            for w in wanted:
+                if w.descriptor == name:
+                    column_of[w.place] = width + part.places.index(place[plan.rows[w.row]])
+            pieces.append(part.value)
+            width += len(part.places)
+    for channel in plan.share_channels:
+        branches = sorted({share.branch for share in plan.shares if share.channel == channel})
+        pieces.append(front.shares(channel, branches))
+        for share in plan.shares:
+            if share.channel == channel:
+                column_of[share.place] = width + branches.index(share.branch)
+        width += len(branches)
+    columns = [column_of[place] for place in range(plan.num_features)]
+    return graph.concat(*pieces, axis=1).take(columns, 1)
+
+
+def _batches(plan: Plan, form: Form) -> list[tuple[Sequence[Row], bool]]:
+    """Rows that are described together, and whether in float64 whatever the form."""
+    stepping = {plan.rows[row] for row in plan.rows_for(*EXACT)} if form.dtype != F64 else set()
+    batches = list[tuple[Sequence[Row], bool]]()
+    for is_freq in (False, True):
+        own = [row for row in plan.rows if (row.kind == "freq") == is_freq]
+        for exact in (False, True):
+            if rows := [row for row in own if (row in stepping) == exact]:
+                batches.append((rows, exact))
+    return batches
+
+
+def _all(mask: Value) -> Value:
+    """Whether it holds in every channel: ``[B, channels] -> [B]``."""
+    return mask.cast(I64).amin(1).cast(BOOL)

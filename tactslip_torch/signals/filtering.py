@@ -149,6 +149,10 @@ class ChannelFilter(nn.Module):
             self._wanted = {key: groups}  # the last one asked for, whole: other threads may look
         return groups
 
+    def kernel(self, channel: int) -> Tensor:
+        """Weights of the frame that a channel is filtered by, ``[W]``, float64."""
+        return self._kernels[self.window_lengths[channel]]
+
     def check(self, samples: Tensor) -> None:
         """Refuse what are no samples of this hand.
 

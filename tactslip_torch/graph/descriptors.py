@@ -1,0 +1,157 @@
+"""The descriptors of rows, as nodes: ``features.descriptors`` on values of order one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from tactslip_torch.features.descriptors import CV_FLOOR
+from tactslip_torch.graph.order import entropy as level_entropy
+from tactslip_torch.graph.order import interquartile, medians, modes
+from tactslip_torch.graph.shared import Part, Shared
+from tactslip_torch.graph.value import F64
+
+# Each of these is a number for each row it is wanted of, [B, R'], float64, in its unit.
+
+
+def mean(x: Shared) -> Part:
+    """Arithmetic mean."""
+    places = x.of_rows(("mean",))
+    return x.in_volts(x.mean(places), places)
+
+
+def std(x: Shared) -> Part:
+    """Standard deviation with ``n - 1``."""
+    places = x.of_rows(("std",))
+    square = x.variance().of(places) * (x.num / (x.num - 1))
+    return x.in_volts(square.sqrt(), places)
+
+
+def cv(x: Shared) -> Part:
+    """Standard deviation over the mean, whose magnitude counts as at least 1e-6 of the rms."""
+    places = x.of_rows(("cv",))
+    mean = x.mean(places)
+    floor = mean.abs().max(x.rms(places) * CV_FLOOR)
+    signed = x.graph.where(mean < 0.0, -floor, floor)
+    square = x.variance().of(places) * (x.num / (x.num - 1))
+    return Part(square.sqrt() / signed, places)
+
+
+def range_(x: Shared) -> Part:
+    """Largest minus smallest."""
+    places = x.of_rows(("range",))
+    values = x.values(places)
+    return x.in_volts((values.amax() - values.amin()).cast(F64), places)
+
+
+def mean_deviation(x: Shared) -> Part:
+    """Mean absolute deviation."""
+    places = x.of_rows(("mean_deviation",))
+    return x.in_volts(x.centred().of(places).abs().mean().cast(F64), places)
+
+
+def skewness(x: Shared) -> Part:
+    """Third moment over the 3/2 power of the second; 0 if flat."""
+    third = x.third()
+    variance, _ = x.safe_variance(third.places)
+    return Part(third.value / (variance * variance.sqrt()), third.places)
+
+
+def kurtosis(x: Shared) -> Part:
+    """Fourth moment over the squared second; 3 if flat."""
+    fourth = x.fourth()
+    variance, is_flat = x.safe_variance(fourth.places)
+    ratio = fourth.value / (variance * variance)
+    return Part(x.graph.where(is_flat, 3.0, ratio), fourth.places)
+
+
+def energy(x: Shared) -> Part:
+    """Sum of squares."""
+    places = x.of_rows(("energy",))
+    mean, unit = x.mean(places), x.unit(places)
+    square = mean * mean + x.variance().of(places)
+    return Part(square * unit * unit * float(x.num), places)
+
+
+def peak_factor(x: Shared) -> Part:
+    """Maximum over rms."""
+    places = x.of_rows(("peak_factor",))
+    largest = x.values(places).amax().cast(F64)
+    if x.rows.mean is not None:
+        largest = largest + x.mean(places)
+    return Part(largest / x.rms(places), places)
+
+
+def correlation(x: Shared) -> Part:
+    """Correlation with the filtered bin; 0 if either is flat."""
+    places = x.of_rows(("correlation",), always=True)
+    film = x.rows.film
+    if film is None:
+        raise ValueError("correlation needs the film that rows are branches of")
+    other = Part(film, range(len(x.rows.rows))).of(places)
+    own, _ = x.safe_variance(places)
+    covariance = (x.centred().of(places) * other).mean().cast(F64)
+    theirs = (other * other).mean().cast(F64)
+    theirs = x.graph.where(theirs > 0.0, theirs, 1.0)
+    return Part(covariance / (own.sqrt() * theirs.sqrt()), places)
+
+
+def spectral_centroid(x: Shared) -> Part:
+    """Mean frequency."""
+    places = x.of_rows(("spectral_centroid",), always=True)
+    return Part(x.weighted().of(places).slice(0, 1, 2).squeeze(2), places)
+
+
+def spectral_spread(x: Shared) -> Part:
+    """Root mean squared distance from it."""
+    places = x.of_rows(("spectral_spread",), always=True)
+    return Part(x.weighted().of(places).slice(1, 2, 2).squeeze(2), places)
+
+
+def median(x: Shared) -> Part:
+    """Middle value."""
+    places = x.of_rows(("median",), always=True)
+    value = medians(x.values(places), x.num).cast(F64)
+    return x.in_volts(x.with_mean(value, places), places)
+
+
+def iqr(x: Shared) -> Part:
+    """Interquartile range."""
+    places = x.of_rows(("iqr",), always=True)
+    return x.in_volts(interquartile(x.values(places), x.num).cast(F64), places)
+
+
+def mode(x: Shared) -> Part:
+    """Most frequent value."""
+    places = x.of_rows(("mode",), always=True)
+    if x.rows.scale is None:
+        raise ValueError("mode needs the scale of the bins that rows are of")
+    scale = Part(x.rows.scale, range(len(x.rows.rows))).of(places)
+    value = modes(x.graph, x.values(places), scale, x.num)
+    return x.in_volts(x.with_mean(value, places), places)
+
+
+def entropy(x: Shared) -> Part:
+    """Entropy of the amplitude histogram."""
+    places = x.of_rows(("entropy",), always=True)
+    return Part(level_entropy(x.graph, x.values(places), x.num), places)
+
+
+DESCRIPTORS: dict[str, Callable[[Shared], Part]] = {
+    "mean": mean,
+    "std": std,
+    "cv": cv,
+    "range": range_,
+    "mean_deviation": mean_deviation,
+    "skewness": skewness,
+    "kurtosis": kurtosis,
+    "energy": energy,
+    "peak_factor": peak_factor,
+    "correlation": correlation,
+    "spectral_centroid": spectral_centroid,
+    "spectral_spread": spectral_spread,
+    "median": median,
+    "iqr": iqr,
+    "mode": mode,
+    "entropy": entropy,
+}
+"""Every descriptor by its name."""

@@ -1,0 +1,90 @@
+"""From features to a score, as nodes: scaling, missing channels, and the machine."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+from tactslip_torch.graph.form import Form
+from tactslip_torch.graph.value import F64, Value
+from tactslip_torch.graph.writer import Graph
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.detector_file import Head
+from tactslip_torch.model.kernel_sum import KernelSum
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.scaling import FeatureScaler
+
+_LARGEST = float(np.finfo(np.float64).max)
+
+
+def scaled(graph: Graph, features: Value, scaler: FeatureScaler) -> Value:
+    """Features in [-1, 1], ``[B, K]``, float64: ``FeatureScaler``.
+
+    ONNX has no ``log1p``: the knee becomes ``Log(1 + x)``, off by some eps of the knee.
+    """
+    x = features.clip(-_LARGEST, _LARGEST)  # what is beyond float64 saturates
+    if scaler.knee is not None:
+        knee = graph.constant(scaler.knee.double().numpy(), F64)
+        bent = (x.abs() / knee + 1.0).log() * knee
+        x = graph.where(x < 0.0, -bent, bent)
+    least, most = scaler.minimum.double(), scaler.maximum.double()
+    width = most - least
+    is_point = width == 0
+    relative = (x - graph.constant(least.numpy(), F64)) / graph.constant(
+        width.masked_fill(is_point, 1.0).numpy(), F64
+    )
+    inside = (relative * 2.0 - 1.0).clip(-1.0, 1.0)
+    if not bool(is_point.any()):
+        return inside
+    return graph.where(graph.constant(is_point.numpy(), np.dtype(bool)), 0.0, inside)
+
+
+def with_typical(graph: Graph, z: Value, is_missing: Value, detector: SlipDetector) -> Value:
+    """Scaled features, those of missing channels replaced by typical ones.
+
+    Args:
+        graph: to which nodes are added.
+        z: scaled features, ``[B, K]``.
+        is_missing: of the channels in use, ``[B, channels]``.
+        detector: whose typical features.
+    """
+    used = detector.extractor.plan.channels
+    places = [used.index(int(channel)) for channel in detector.channel_index]
+    typical = graph.constant(detector.typical.double().numpy(), F64)
+    return graph.where(is_missing.take(places, 1), typical, z)
+
+
+def machine(graph: Graph, z: Value, head: Head, form: Form) -> Value:
+    """The score of scaled features: ``[B, K] -> [B]``, in the precision of the form.
+
+    A quadratic form is computed in that precision. The sum over training bins of a kernel that does
+    not fold cancels, so it is float64 in either.
+    """
+    if isinstance(head, KernelSum):
+        score = _kernel_sum(graph, z, head)
+    else:
+        z = z.cast(form.dtype)
+        pull = z @ _of(head.quadratic) + graph.constant(_of(head.linear), form.dtype)
+        score = (pull * z).sum(1) + float(head.constant)
+    largest = float(np.finfo(form.dtype).max)
+    return score.clip(-largest, largest).cast(form.dtype)
+
+
+def _kernel_sum(graph: Graph, z: Value, head: KernelSum) -> Value:
+    support = head.support.double()
+    kernel = head.kernel
+    gram = z @ _of(support.T)
+    if isinstance(kernel, Polynomial):
+        base = gram + kernel.offset
+        values = base
+        for _ in range(kernel.degree - 1):
+            values = values * base
+    else:
+        norms = graph.constant(_of(support.square().sum(-1)), F64)
+        squares = (z * z).sum(1, keep=True) + norms - gram * 2.0
+        values = (squares.max(0.0) * -kernel.gamma).exp()
+    return (values @ _of(head.beta[:, None])).squeeze(1)
+
+
+def _of(x: Tensor) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    return np.ascontiguousarray(x.double().numpy())

@@ -1,0 +1,289 @@
+"""From raw windows to rows of order one: gauges, branches and spectra, as nodes of a graph."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from tactslip_torch.features.linear_maps import LinearMaps
+from tactslip_torch.features.plan import Row
+from tactslip_torch.features.pool import LARGEST_SAMPLE
+from tactslip_torch.graph.form import Form, Window
+from tactslip_torch.graph.maps import (
+    Block,
+    BlockKind,
+    Matrix,
+    block_kind,
+    blocks,
+    energy_matrix,
+    filter_matrix,
+)
+from tactslip_torch.graph.value import BOOL, F64, Value
+from tactslip_torch.graph.writer import Graph
+from tactslip_torch.model.detector import SlipDetector
+
+EXACT = frozenset({"mode", "entropy"})
+"""Descriptors that step: two roundings of one value may differ by a whole step."""
+SPAN_OF_LENGTH = 0.35  # span of 100 centred values of length 1: from .2 (two levels) to 1.41
+Key = tuple[BlockKind, int]
+_LEAST_SPAN = 16 * float(np.finfo(np.float64).eps)  # guards.is_constant
+
+
+class Rows(NamedTuple):
+    """Rows of one length and dtype.
+
+    Attributes:
+        rows: which, in order; ``R`` of them.
+        values: less their mean; of spectra as they are; of order one, ``[B, R, n]``.
+        mean: in the unit, ``[B, R]``, float64; None for spectra.
+        unit: by which values and mean are multiplied to be volts, ``[B, R]``, float64.
+        scale: largest magnitude of the filtered bin, in the unit, ``[B, R]``, float64; or None.
+        film: the filtered bin less its mean, of order one, ``[B, R, n]``; None for spectra.
+    """
+
+    rows: tuple[Row, ...]
+    values: Value
+    mean: Value | None
+    unit: Value
+    scale: Value | None
+    film: Value | None
+
+
+@dataclass(frozen=True)
+class _Channels:
+    """Channels that share a frame and a kind, and their nodes, in volts."""
+
+    channels: tuple[int, ...]
+    blocks: dict[Key, Block]
+    shifted: Value  # [B, c, W + 1]
+    smooth: torch.Tensor
+    filtered: Value  # [B, c, n]
+    scale: Value  # [B, c]
+    coordinates: Mapping[Key, Value]  # of length one, [B, c, r]
+    length: Value | None  # [B, c, blocks]
+    mean: Value | None  # [B, c, blocks]
+
+
+_Settled = tuple[dict[Key, Value], Value | None, Value | None]
+
+
+class Front:
+    """The part of a graph that is linear: filter, branches, and spectra before their modulus.
+
+    Args:
+        graph: to which nodes are added.
+        detector: whose plan.
+        windows: raw samples of the channels in use, ``[B, channels, Window.length]``.
+        form: precision and layout.
+
+    Attributes:
+        is_missing: ``[B, channels]``, bool: a NaN or Inf is within the frame of the filter.
+        is_trusted: ``[B, channels]``, bool: neither missing nor dead (``FeaturePool.validity``).
+    """
+
+    def __init__(self, graph: Graph, detector: SlipDetector, windows: Value, form: Form) -> None:
+        self._graph = graph
+        self._form = form
+        self._plan = detector.extractor.plan
+        self._maps = LinearMaps.of(detector.pool)
+        self._detector = detector
+        self.window = Window.of(detector)
+        self._missing: list[Value] = []
+        self._trusted: list[Value] = []
+        frames: dict[tuple[int, bool], list[int]] = {}
+        films = set(detector.pool.hand.indices("PVDF"))
+        lengths = detector.channel_filter.window_lengths
+        for channel in self.window.channels:
+            frames.setdefault((lengths[channel], channel in films), []).append(channel)
+        wide = windows.cast(F64)
+        self._groups = [self._make(tuple(channels), wide) for channels in frames.values()]
+        self._of = {channel: group for group in self._groups for channel in group.channels}
+        self._order = [channel for group in self._groups for channel in group.channels]
+        places = [self._order.index(channel) for channel in self.window.channels]
+        self.is_missing, self.is_trusted = (
+            _taken(graph.concat(*parts, axis=1), places, len(places))
+            for parts in (self._missing, self._trusted)
+        )
+
+    def of(
+        self, rows: Sequence[Row], *, exact: bool, with_scale: bool = False, with_film: bool = False
+    ) -> Rows:
+        """Rows of one length: gauges and branches, or spectra; in an order of their own.
+
+        Args:
+            rows: which.
+            exact: in float64 whatever the form.
+            with_scale: whether ``scale`` is wanted.
+            with_film: whether ``film`` is wanted.
+        """
+        graph, is_freq = self._graph, rows[0].kind == "freq"
+        dtype = F64 if exact else self._form.dtype
+        ordered = sorted(rows, key=lambda row: (self._place(row), row.channel))
+        parts = [list(own) for _, own in itertools.groupby(ordered, self._place)]
+        values = [self._values(own, dtype) for own in parts]
+        made = [graph.concat(*each, axis=1) for each in zip(*values, strict=True)]
+        if is_freq:
+            real, imaginary = made
+            made = [(real * real + imaginary * imaginary).sqrt()]
+        unit = self._cells(ordered, "length")
+        scale = film = None
+        if with_scale:
+            scales = graph.concat(*(group.scale for group in self._groups), axis=1)
+            scale = scales.take([self._order.index(row.channel) for row in ordered], 1) / unit
+        if with_film and not is_freq:
+            film = self._films(parts, dtype)
+        mean = None if is_freq else self._cells(ordered, "mean") / unit
+        return Rows(tuple(ordered), made[0], mean, unit, scale, film)
+
+    def shares(self, channel: int, branches: Sequence[int]) -> Value:
+        """Shares of branches in the energy of all spectra of a film, ``[B, branches]``."""
+        group = self._of[channel]
+        matrix, ranks = energy_matrix(self._maps, group.smooth, branches)
+        place = group.channels.index(channel)
+        parts = group.shifted.slice(place, place + 1, 1).squeeze(1) @ matrix
+        of_branch: Matrix = np.repeat(np.eye(len(ranks)), ranks, axis=0)
+        energies = (parts * parts) @ of_branch
+        total = energies.slice(0, 1, 1)
+        total = self._graph.where(total > 0.0, total, 1.0)
+        return energies.slice(1, len(ranks), 1) / total
+
+    def _key(self, row: Row) -> Key:
+        return block_kind(row, self._maps), row.branch
+
+    def _place(self, row: Row) -> tuple[int, Key]:
+        """Of a row's block among all."""
+        return self._groups.index(self._of[row.channel]), self._key(row)
+
+    def _values(self, rows: Sequence[Row], dtype: np.dtype[Any]) -> tuple[Value, ...]:
+        """Of rows of one block: values, or the two parts of spectra."""
+        group, shape = (
+            self._of[rows[0].channel],
+            self._of[rows[0].channel].blocks[self._key(rows[0])],
+        )
+        places = [group.channels.index(row.channel) for row in rows]
+        chosen = _taken(group.coordinates[self._key(rows[0])], places, len(group.channels))
+        chosen = chosen.cast(dtype)
+        if rows[0].kind == "freq":
+            return chosen @ shape.cosine, chosen @ shape.sine
+        return (chosen if shape.out is None else chosen @ shape.out,)
+
+    def _cells(self, rows: Sequence[Row], what: Literal["length", "mean"]) -> Value:
+        """The length or mean of each row's block, ``[B, R]``."""
+        tables, cells = list[Value](), list[tuple[int, Key]]()
+        for group in self._groups:
+            table = getattr(group, what)
+            if table is not None:
+                cells += [(channel, key) for channel in group.channels for key in group.blocks]
+                tables.append(table.reshape(0, len(group.channels) * len(group.blocks)))
+        places = [cells.index((row.channel, self._key(row))) for row in rows]
+        return _taken(self._graph.concat(*tables, axis=1), places, len(cells))
+
+    def _films(self, parts: Sequence[Sequence[Row]], dtype: np.dtype[Any]) -> Value:
+        """Filtered bins of rows less their mean, of order one; 0 where that is rounding."""
+        films = []
+        for rows in parts:
+            group = self._of[rows[0].channel]
+            places = [group.channels.index(row.channel) for row in rows]
+            films.append(_taken(group.filtered, places, len(group.channels)))
+        film = self._graph.concat(*films, axis=1)
+        centred = film - film.mean(2, keep=True)
+        size, scale = centred.abs().amax(2, keep=True), film.abs().amax(2, keep=True)
+        is_kept = (size * (2 / _LEAST_SPAN) >= scale) & (size > 0.0)
+        kept = self._graph.where(is_kept, 1.0 / size, 0.0)
+        return (centred * kept).cast(dtype)
+
+    def _make(self, channels: tuple[int, ...], windows: Value) -> _Channels:
+        """The nodes of channels that share a frame."""
+        graph, num, used = self._graph, self.window.bin, self.window.channels
+        before, after = self._detector.channel_filter.reaches[channels[0]]
+        x = _taken(windows, [used.index(channel) for channel in channels], len(used))
+        if (before, after) != (self.window.before, self.window.after):
+            start = self.window.before - before
+            x = x.slice(start, start + before + num + after, 2)
+        unit = None
+        if self._form.dtype == F64:  # whose squares float64 does not hold
+            unit = x.abs().amax(2, keep=True)
+            unit = graph.where(unit > 0.0, unit, 1.0)
+            x = x / unit
+        first = x.slice(before, before + 1, 2)
+        shifted = graph.concat(x - first, first, axis=2)
+        smooth = filter_matrix(self._detector.channel_filter, channels[0], num)
+        own = blocks(
+            (row for row in self._plan.rows if row.channel in channels), self._maps, smooth
+        )
+        maps = [np.concatenate([smooth.T.numpy(), np.ones((1, num))])]
+        maps += [each.into for each in own.values()]
+        maps += [np.stack([each.mean for each in own.values()], axis=1)] if own else []
+        made = shifted @ np.concatenate(maps, axis=1)
+        filtered = made.slice(0, num, 2)
+        scale = self._judge(channels, filtered, unit)
+        nodes: _Settled = ({}, None, None)
+        if own:
+            end = num + sum(each.rank for each in own.values())
+            parts = made.slice(num, end, 2), made.slice(end, end + len(own), 2)
+            nodes = self._settle(channels, own, *parts, scale)
+        coordinates, length, mean = nodes
+        if unit is not None:
+            scale = scale * unit.squeeze(2)
+            length, mean = (None if x is None else x * unit for x in (length, mean))
+        return _Channels(channels, own, shifted, smooth, filtered, scale, coordinates, length, mean)
+
+    def _judge(self, channels: tuple[int, ...], filtered: Value, unit: Value | None) -> Value:
+        """Which channels can be trusted; and the largest magnitude of each, ``[B, c]``."""
+        graph, dtype = self._graph, self._form.dtype
+        high, low = filtered.amax(2), filtered.amin(2)
+        scale = high.max(-low)
+        probe = filtered.slice(0, 1, 2).squeeze(2)  # NaN if anything in the window is no number
+        probe = scale + (probe - probe)
+        is_known = (probe if unit is None else probe * unit.squeeze(2)) <= LARGEST_SAMPLE
+        high, low = high.cast(dtype), low.cast(dtype)  # sensors resolve no more than they give
+        like = torch.empty(0, dtype=torch.float64 if dtype == F64 else torch.float32)
+        inverse = self._detector.pool.inverse_span(like)[list(channels)].numpy()
+        is_alive = (high - low) * graph.constant(inverse, dtype) > high.max(-low)
+        self._missing.append(~is_known)
+        self._trusted.append(is_alive & is_known)
+        return scale
+
+    def _settle(
+        self,
+        channels: Sequence[int],
+        own: Mapping[Key, Block],
+        coordinates: Value,
+        mean: Value,
+        scale: Value,
+    ) -> _Settled:
+        """Coordinates of length one, 0 of rows that are rounding beside their bin; their lengths.
+
+        Means are of all blocks, those of details 0 where the rest is.
+        """
+        graph = self._graph
+        ranks = [each.rank for each in own.values()]
+        of_block = np.repeat(np.eye(len(own)), ranks, axis=0)  # [sum of ranks, blocks]
+        length = ((coordinates * coordinates) @ of_block).sqrt()  # [B, c, blocks]
+        is_kept = length * (SPAN_OF_LENGTH / _LEAST_SPAN) >= scale.expand(2)
+        is_kept = is_kept & (length > 0.0)
+        length = graph.where(is_kept, length, 1.0)
+        kept = graph.where(is_kept, 1.0 / length, 0.0)
+        coordinates = coordinates * (kept @ of_block.T)
+        if any(each.is_detail for each in own.values()):
+            stays = np.array([not each.is_detail for each in own.values()])
+            mean = graph.where(is_kept | graph.constant(stays, BOOL), mean, 0.0)
+        narrow = coordinates.cast(self._form.dtype)
+        exact = {self._plan.rows[row] for row in self._plan.rows_for(*EXACT)}
+        in_double = {self._key(row) for row in exact if row.channel in channels}
+        parts, start = dict[Key, Value](), 0
+        for key, rank in zip(own, ranks, strict=True):
+            source = coordinates if key in in_double else narrow
+            parts[key] = source.slice(start, start + rank, 2)
+            start += rank
+        return parts, length, mean
+
+
+def _taken(value: Value, places: Sequence[int], num: int) -> Value:
+    """Entries of the second axis, which has ``num``; all of them in order as they are."""
+    return value if list(places) == list(range(num)) else value.take(places, 1)

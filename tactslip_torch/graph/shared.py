@@ -1,0 +1,194 @@
+"""What descriptors of rows share, as nodes, each made when first asked for.
+
+All there is one of per sample is in the dtype of the rows; all there is one of per row (moments,
+means, units) is float64, where no square of a float32 leaves the range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import torch
+
+from tactslip_torch.graph.rows import Rows
+from tactslip_torch.graph.value import F64, Value
+from tactslip_torch.graph.writer import Graph
+
+_MOMENTS = (
+    "mean",
+    "std",
+    "cv",
+    "mean_deviation",
+    "skewness",
+    "kurtosis",
+    "energy",
+    "peak_factor",
+    "correlation",
+)
+
+
+class Part:
+    """A quantity of some rows: ``value [B, R', ...]`` of the rows at ``places``."""
+
+    def __init__(self, value: Value, places: Sequence[int]) -> None:
+        self.value = value
+        self.places = tuple(places)
+
+    def of(self, places: Sequence[int]) -> Value:
+        """That of fewer rows, in their order."""
+        if tuple(places) == self.places:
+            return self.value
+        return self.value.take([self.places.index(place) for place in places], 1)
+
+
+class Shared:
+    """Descriptors of rows of one length and dtype, what they share made once.
+
+    Args:
+        graph: to which nodes are added.
+        rows: the rows.
+        wanted: descriptors, each with the places of the rows it is wanted of, ascending.
+        frugal: make a part for the rows that want it alone, even if that takes another node.
+        frequency_hz: of the lines, if rows are spectra.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        rows: Rows,
+        wanted: Mapping[str, Sequence[int]],
+        *,
+        frugal: bool,
+        frequency_hz: torch.Tensor,
+    ) -> None:
+        self.graph = graph
+        self.rows = rows
+        self._wanted = wanted
+        self._frugal = frugal
+        self._axis_hz = frequency_hz
+        self._made: dict[str, Part] = {}
+
+    def of_rows(self, names: Iterable[str], always: bool = False) -> tuple[int, ...]:
+        """Places of the rows for which these descriptors have to be made."""
+        if not (self._frugal or always):
+            return tuple(range(len(self.rows.rows)))
+        return tuple(sorted({place for name in names for place in self._wanted.get(name, ())}))
+
+    def once(self, name: str, make: Callable[[], Part]) -> Part:
+        """A shared part, made when first asked for."""
+        if name not in self._made:
+            self._made[name] = make()
+        return self._made[name]
+
+    @property
+    def num(self) -> int:
+        """Values of a row."""
+        return len(self._axis_hz)
+
+    # Values [B, R', n] -------------------------------------------------------------------------
+
+    def values(self, places: Sequence[int]) -> Value:
+        """Values as they are: branches less their mean, spectra in full."""
+        whole = Part(self.rows.values, range(len(self.rows.rows)))
+        return self.once(f"values {tuple(places)}", lambda: Part(whole.of(places), places)).value
+
+    def centred(self) -> Part:
+        """Values less their mean, of all rows that have a moment."""
+
+        def make() -> Part:
+            places = self.of_rows(_MOMENTS)
+            values = self.values(places)
+            if self.rows.mean is not None:
+                return Part(values, places)
+            return Part(values - self.plain_mean().of(places).expand(2), places)
+
+        return self.once("centred", make)
+
+    def plain_mean(self) -> Part:
+        """Mean of a spectrum, in its dtype."""
+        places = self.of_rows(_MOMENTS)
+        return self.once("plain mean", lambda: Part(self.values(places).mean(), places))
+
+    def squares(self) -> Part:
+        """Squared centred values."""
+
+        def make() -> Part:
+            centred = self.centred()
+            return Part(centred.value * centred.value, centred.places)
+
+        return self.once("squares", make)
+
+    # One of each row, float64 ------------------------------------------------------------------
+
+    def unit(self, places: Sequence[int]) -> Value:
+        """By which values are volts."""
+        return Part(self.rows.unit, range(len(self.rows.rows))).of(places)
+
+    def mean(self, places: Sequence[int]) -> Value:
+        """In the unit."""
+        if self.rows.mean is not None:
+            return Part(self.rows.mean, range(len(self.rows.rows))).of(places)
+        return self.once(
+            "mean", lambda: Part(self.plain_mean().value.cast(F64), self.plain_mean().places)
+        ).of(places)
+
+    def variance(self) -> Part:
+        """Mean square of centred values."""
+        return self.once(
+            "variance", lambda: Part(self.squares().value.mean().cast(F64), self.squares().places)
+        )
+
+    def third(self) -> Part:
+        """Mean cube."""
+        places = self.of_rows(("skewness",))
+        cubes = self.squares().of(places) * self.centred().of(places)
+        return Part(cubes.mean().cast(F64), places)
+
+    def fourth(self) -> Part:
+        """Mean fourth power."""
+        places = self.of_rows(("kurtosis",))
+        squares = self.squares().of(places)
+        return Part((squares * squares).mean().cast(F64), places)
+
+    def safe_variance(self, places: Sequence[int]) -> tuple[Value, Value]:
+        """The variance, 1 where all values are equal, and where that is."""
+        variance = self.variance().of(places)
+        is_flat = variance.equals(0.0)
+        return self.graph.where(is_flat, 1.0, variance), is_flat
+
+    def rms(self, places: Sequence[int]) -> Value:
+        """Root mean square, in the unit; 1 for a zero row, over which all is 0."""
+        mean = self.mean(places)
+        square = mean * mean + self.variance().of(places)
+        return self.graph.where(square > 0.0, square, 1.0).sqrt()
+
+    def in_volts(self, value: Value, places: Sequence[int]) -> Part:
+        """A quantity of the unit."""
+        return Part(value * self.unit(places), places)
+
+    def weighted(self) -> Part:
+        """Centroid and spread in hertz, ``[B, R', 2]``.
+
+        About the middle of the band, beside which neither is small, so that little cancels.
+        """
+
+        def make() -> Part:
+            places = self.of_rows(("spectral_centroid", "spectral_spread"), always=True)
+            middle = float(self._axis_hz.mean())
+            half = max(float((self._axis_hz - middle).abs().max()), 1.0)
+            place = (self._axis_hz - middle) / half
+            sums = torch.stack([torch.ones_like(place), place, place.square()], dim=-1).numpy()
+            made = (self.values(places) @ sums).cast(F64)  # [B, R', 3]
+            total, first, second = (made.slice(k, k + 1, 2) for k in range(3))
+            is_some = total > 0.0
+            total = self.graph.where(is_some, total, 1.0)
+            centre = first / total
+            spread = (second / total - centre * centre).max(0.0).sqrt() * half
+            centroid = self.graph.where(is_some, centre * half + middle, 0.0)
+            return Part(self.graph.concat(centroid, spread, axis=2), places)
+
+        return self.once("weighted", make)
+
+    def with_mean(self, value: Value, places: Sequence[int]) -> Value:
+        """Values less their mean, one of each row, with it again."""
+        return value if self.rows.mean is None else value + self.mean(places)
