@@ -1,0 +1,72 @@
+// From a slider to a threshold: by false alarms an hour where the model says what they cost.
+
+/**
+ * The scale of the slider, from 0 (left) to 1.
+ *
+ * Where the sidecar has a `threshold_curve` it runs over false alarms an hour, by their logarithm,
+ * from few to many; else over the statistic itself, from low to high.
+ *
+ * @param {object} facts of the sidecar
+ * @returns {{title: string, note: string, own: number, toThreshold: (share: number) => number,
+ *   text: (share: number) => string}} `own` is where the file's threshold stands
+ */
+export function thresholdScale(facts) {
+  const curve = risingRates(facts.threshold_curve ?? []);
+  return curve.length < 2 ? byStatistic(facts) : byRate(facts, curve);
+}
+
+/** [threshold, log10 of the rate], rates strictly rising and positive. */
+function risingRates(curve) {
+  const rising = [];
+  const byThreshold = curve.filter(([, rate]) => rate > 0).sort(([a], [b]) => b - a);
+  for (const [threshold, rate] of byThreshold) {
+    const level = Math.log10(rate);
+    if (rising.length === 0 || level > rising.at(-1)[1]) rising.push([threshold, level]);
+  }
+  return rising;
+}
+
+function byRate(facts, curve) {
+  const [thresholds, levels] = [0, 1].map((part) => curve.map((point) => point[part]));
+  const [first, last] = [levels[0], levels.at(-1)];
+  const level = (share) => first + share * (last - first);
+  const toThreshold = (share) => interpolated(level(share), levels, thresholds);
+  const falling = thresholds.map((threshold) => -threshold);
+  const ownLevel = interpolated(-facts.threshold, falling, levels);
+  return {
+    title: "False alarms allowed",
+    note: facts.simulated ? "as counted on simulated recordings" : "as counted on recordings",
+    own: (ownLevel - first) / (last - first),
+    toThreshold,
+    text: (share) => `${rounded(10 ** level(share))} an hour`,
+  };
+}
+
+function byStatistic(facts) {
+  const { threshold, rule } = facts;
+  const ceiling = rule?.ceiling ?? Infinity;
+  const high = Number.isFinite(ceiling) ? ceiling : threshold + Math.max(5, Math.abs(threshold));
+  const low = Math.min(0, threshold - Math.max(5, Math.abs(threshold)));
+  const toThreshold = (share) => low + share * (high - low);
+  return {
+    title: "Alarm threshold",
+    note: `of the ${rule?.name ?? "alarm"} statistic; this file has no curve of false alarms`,
+    own: (threshold - low) / (high - low),
+    toThreshold,
+    text: (share) => rounded(toThreshold(share)),
+  };
+}
+
+/** Piecewise linear, held beyond the ends. `xs` rise. */
+function interpolated(x, xs, ys) {
+  const right = xs.findIndex((each) => each >= x);
+  if (right === 0) return ys[0];
+  if (right < 0) return ys.at(-1);
+  const share = (x - xs[right - 1]) / (xs[right] - xs[right - 1]);
+  return ys[right - 1] + share * (ys[right] - ys[right - 1]);
+}
+
+/** Two digits, for people. */
+export function rounded(value) {
+  return Number(value.toPrecision(2)).toLocaleString("en", { maximumFractionDigits: 4 });
+}
