@@ -78,7 +78,9 @@ def saved(path: Path, samples: np.ndarray) -> Path:
     return path
 
 
-@cache
+_EXPORTED: dict[str, Path] = {}
+
+
 def exported(folder_factory: Any, precision: str = "float32") -> Path:
     """A folder with ``model.onnx``, ``stream.onnx`` and their sidecars, made once in a session.
 
@@ -88,9 +90,11 @@ def exported(folder_factory: Any, precision: str = "float32") -> Path:
     """
     from tactslip_torch.export import export_detector
 
-    folder: Path = folder_factory.mktemp(f"exported_{precision}")
-    export_detector(alarming_detector(), folder, graphs=("bin", "stream"), precision=precision)
-    return folder
+    if precision not in _EXPORTED:
+        folder: Path = folder_factory.mktemp(f"exported_{precision}")
+        export_detector(alarming_detector(), folder, graphs=("bin", "stream"), precision=precision)
+        _EXPORTED[precision] = folder
+    return _EXPORTED[precision]
 
 
 def copied(model: Path, folder: Path) -> Path:
