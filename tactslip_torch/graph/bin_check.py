@@ -1,0 +1,194 @@
+"""A bin graph against the detector in float64: scores, validity, probabilities, broken bins too."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import pad
+
+from tactslip_torch.graph.form import Form, Window
+from tactslip_torch.graph.runs import Run
+from tactslip_torch.graph.trials import KINDS, degenerate_bins, noise_bins, simulated_bins
+from tactslip_torch.model.calibration import probability
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.judgement import Judgement
+from tactslip_torch.onset.settings import KEY, AlarmSettings
+
+BATCHES = (1, 7, 0, 56)
+WORST_SD = {"float32": 1e-3, "float64": 1e-9}
+"""Largest score error allowed on noise and on simulated bins, in standard deviations of the score
+on simulated bins."""
+WORST_DEGENERATE_SD = {"float32": 1e-2, "float64": 1e-6}
+"""The same on degenerate bins but those ``ALL_ROUNDING``, whose errors are reported."""
+ALL_ROUNDING = ("offset 1e6, vibration 1e-6",)
+"""Kinds that hold so few digits that a step in a descriptor may fall between any two sums."""
+WORST_PROBABILITY = {"float32": 1e-5, "float64": 1e-9}
+"""By which a probability may differ from that of the score beside it."""
+_EACH = 16  # degenerate bins of a kind
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What a graph said of bins, beside what the detector says.
+
+    Attributes:
+        error: ``[N]``, size of the difference of scores.
+        unstated: ``[N]``, how far the probability is off that of its score; 0 if there is none.
+        flips: ``[N]``, bool: it decides otherwise.
+        exact: ``[N]``, scores in float64.
+        is_valid: ``[N]``, bool, as the detector has it.
+    """
+
+    error: NDArray[np.float64]
+    unstated: NDArray[np.float64]
+    flips: NDArray[np.bool_]
+    exact: NDArray[np.float64]
+    is_valid: NDArray[np.bool_]
+
+    def of(self, some: slice | NDArray[np.bool_]) -> Compared:
+        """Some of the bins."""
+        return Compared(
+            self.error[some],
+            self.unstated[some],
+            self.flips[some],
+            self.exact[some],
+            self.is_valid[some],
+        )
+
+
+def check_bins(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
+    """Hold a bin graph against its detector.
+
+    Args:
+        run: the graph.
+        detector: that it was made of; judged by in float64, on the samples that the graph is given.
+        form: of the graph.
+
+    Returns:
+        What was measured, in JSON types.
+
+    Raises:
+        ValueError: for the first thing that is wrong, in one line.
+    """
+    judged = _Judged(run, detector, form)
+    hand, rate = detector.pool.hand, detector.pool.sample_rate_hz
+    length, dtype = judged.window.length, judged.dtype
+    simulated = simulated_bins(hand, rate, BATCHES[-1], length, dtype)
+    recorded = judged.compare([simulated], "simulated bins")
+    drawn = [noise_bins(hand, batch, length, seed, dtype) for seed, batch in enumerate(BATCHES)]
+    noise = judged.compare(drawn, "noise")
+    # the latter of a detector for which nothing happens in a simulation
+    sd = float(recorded.exact.std()) or float(noise.exact.std()) or 1.0
+    worst = WORST_SD[form.precision]
+    facts: dict[str, Any] = {"score_sd": sd, "simulated": True}
+    for name, compared in (("noise", noise), ("recorded", recorded)):
+        facts[name] = _set_facts(compared, sd)
+        judged.refuse_errors(compared, sd, worst, name)
+    facts["degenerate"] = {}
+    first = []
+    for kind in KINDS:
+        bins = degenerate_bins(hand, kind, _EACH, length, dtype)
+        compared = judged.compare([bins], f"degenerate bins ({kind})")
+        facts["degenerate"][kind] = _set_facts(compared, sd)
+        most = np.inf if kind in ALL_ROUNDING else WORST_DEGENERATE_SD[form.precision]
+        judged.refuse_errors(compared, sd, most, kind)
+        first.append(bins[:1])
+    # in one batch with whole ones, where a graph may go another way
+    mixed = torch.cat([*first, simulated])
+    behind = judged.compare([mixed], "degenerate among simulated bins").of(slice(len(first), None))
+    judged.refuse_errors(behind, sd, worst, "simulated bins behind degenerate ones")
+    return facts
+
+
+class _Judged:
+    """Bins as the graph and as the detector in float64 judge them."""
+
+    def __init__(self, run: Run, detector: SlipDetector, form: Form) -> None:
+        self.run = run
+        self.detector = copy.deepcopy(detector).double()
+        self.window = Window.of(detector)
+        self.form = form
+        self.dtype = torch.float32 if form.precision == "float32" else torch.float64
+        self.settings = AlarmSettings.of(detector) if KEY in detector.info else None
+        self.unstated = WORST_PROBABILITY[form.precision]
+
+    def judge(self, samples: Tensor) -> Judgement:
+        """By torch, scores in float64; samples that no filter in use takes in are 0."""
+        before = self.detector.context_before - self.window.before
+        after = self.detector.context_after - self.window.after
+        samples = pad(samples, (before, after))
+        with torch.no_grad():
+            score = self.detector.judge_raw(samples.double()).score
+            # a sensor is trusted by what its samples resolve in the precision they come in
+            return self.detector.judge_raw(samples)._replace(score=score)
+
+    def compare(self, batches: Sequence[Tensor], what: str) -> Compared:
+        """Errors, where shapes and validity are right and scores finite.
+
+        Raises:
+            ValueError: where one is not.
+        """
+        expected = [self.judge(samples) for samples in batches]
+        try:
+            runs = [self.run({"samples": samples.numpy()}) for samples in batches]
+        except ValueError as error:
+            raise ValueError(f"{what}: {error}") from error
+        for samples, given in zip(batches, runs, strict=True):
+            self._check_form(given, len(samples), what)
+        got = {name: np.concatenate([given[name] for given in runs]) for name in runs[0]}
+        score = got["score"].astype(np.float64)
+        exact = torch.cat([judged.score for judged in expected]).numpy()
+        is_valid = torch.cat([judged.is_valid for judged in expected]).numpy()
+        if not np.isfinite(score).all():
+            raise ValueError(f"{what}: {(~np.isfinite(score)).sum()} scores are not finite")
+        if wrong := int((got["valid"] != is_valid).sum()):
+            raise ValueError(f"{what}: valid differs from torch on {wrong} of {len(score)} bins")
+        unstated = np.zeros(len(score))
+        if self.settings is not None:
+            llr = self.settings.calibration.llr(torch.from_numpy(score))
+            stated = probability(llr, self.settings.slip_share).numpy()
+            unstated = np.abs(got["probability"] - stated)
+        flips = (score >= 0) != (exact >= 0)
+        return Compared(np.abs(score - exact), unstated, flips, exact, is_valid)
+
+    def refuse_errors(self, compared: Compared, sd: float, worst: float, what: str) -> None:
+        """Raise if a score is further off than it may be, or a probability than that allows."""
+        if not (found := float(compared.error.max(initial=0.0)) / sd) <= worst:
+            raise ValueError(
+                f"{what}: scores differ from torch in float64 by {found:.1e} of their standard "
+                f"deviation, more than {worst:g}"
+            )
+        if not (found := compared.unstated.max(initial=0.0)) <= self.unstated:
+            raise ValueError(
+                f"{what}: probability is {found:.1e} off that of its score, more than "
+                f"{self.unstated:g}"
+            )
+
+    def _check_form(self, got: dict[str, NDArray[Any]], num: int, what: str) -> None:
+        wanted = {"score": self.form.dtype, "valid": np.dtype(bool)}
+        if self.settings is not None:
+            wanted["probability"] = self.form.dtype
+        found = {name: f"{array.dtype}{list(array.shape)}" for name, array in got.items()}
+        expected = {name: f"{dtype}[{num}]" for name, dtype in wanted.items()}
+        if found != expected:
+            raise ValueError(f"{what}: it gives {_listed(found)}, expected {_listed(expected)}")
+
+
+def _listed(arrays: dict[str, str]) -> str:
+    return ", ".join(f"{name} {arrays[name]}" for name in sorted(arrays))
+
+
+def _set_facts(compared: Compared, sd: float) -> dict[str, Any]:
+    return {
+        "bins": len(compared.error),
+        "valid": int(compared.is_valid.sum()),
+        "worst_sd": float(compared.error.max(initial=0.0)) / sd,
+        "flips": int(compared.flips.sum()),
+    }

@@ -1,0 +1,174 @@
+"""What a host must know of a model: in the file as metadata, and beside it as a sidecar."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from tactslip_torch.graph.form import Form, Window
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.settings import KEY, AlarmSettings
+
+FORMAT = "tactslip_torch onnx 1"
+GraphKind = Literal["bin", "stream"]
+
+
+class Origin(NamedTuple):
+    """Where a model comes from.
+
+    Attributes:
+        version: of this package.
+        detector_sha256: of the detector's file.
+        certificate: what a host is told of its numeric certificate, ``None`` if there is none.
+    """
+
+    version: str
+    detector_sha256: str
+    certificate: Mapping[str, Any] | None = None
+
+
+class Memory(NamedTuple):
+    """What a host keeps between two pushes to a stream graph.
+
+    Attributes:
+        tail_samples: length of ``next_tail``.
+        state_size: length of ``next_state``.
+    """
+
+    tail_samples: int
+    state_size: int
+
+
+def model_facts(
+    detector: SlipDetector, form: Form, origin: Origin, memory: Memory | None = None
+) -> dict[str, Any]:
+    """All that a host must know, in JSON types; ``null`` for what is not known or not finite.
+
+    Args:
+        detector: that was exported.
+        form: of its graph.
+        origin: where it comes from.
+        memory: of a stream graph; without, it is a bin graph.
+    """
+    hand, info = detector.pool.hand, detector.info
+    window = Window.of(detector)
+    settings = AlarmSettings.of(detector) if KEY in info else None
+    facts: dict[str, Any] = {
+        "format": FORMAT,
+        "version": origin.version,
+        "graph": "bin" if memory is None else "stream",
+        "precision": form.precision,
+        "layout": form.layout,
+        "channels": list(hand.names),
+        "kinds": [channel.kind for channel in hand.channels],
+        "unit": "V",
+        "sample_rate_hz": detector.pool.sample_rate_hz,
+        "bin_samples": window.bin,
+        "context_before_samples": window.before,
+        "context_after_samples": window.after,
+        "features": [str(name) for name in detector.selected_names],
+        "slip_if_score_at_least": 0.0,
+        "calibration": settings and settings.calibration.to_dict(),
+        "slip_share": settings and settings.slip_share,
+        "experiment": info.get("experiment"),
+        "train_materials": list(info.get("train_materials", ())),
+        "simulated": info.get("simulated"),
+        "detector_sha256": origin.detector_sha256,
+        "certificate": origin.certificate,
+    }
+    if memory is not None:
+        facts |= _stream_facts(detector, AlarmSettings.of(detector), window, memory)
+    plain: dict[str, Any] = _plain(facts)
+    return plain
+
+
+def in_file(facts: Mapping[str, Any]) -> dict[str, str]:
+    """The facts as a file's metadata holds them: JSON text by name."""
+    return {name: json.dumps(value, allow_nan=False) for name, value in facts.items()}
+
+
+def sidecar_path(model: Path) -> Path:
+    """Where the facts of a model stand for hosts that do not read its metadata."""
+    return model.with_name(f"{model.name}.json")
+
+
+def sidecar_text(facts: Mapping[str, Any], name: str, content: bytes) -> str:
+    """The facts with name, digest and length of the file: one JSON object, a line for each scalar.
+
+    Args:
+        facts: of the model.
+        name: of its file.
+        content: of it.
+    """
+    of_file = {
+        "file": name,
+        "onnx_sha256": hashlib.sha256(content).hexdigest(),
+        "onnx_bytes": len(content),
+    }
+    return json.dumps({**facts, **of_file}, indent=1, allow_nan=False) + "\n"
+
+
+def detector_sha256(detector: SlipDetector) -> str:
+    """SHA-256 of the file that the detector is saved to: the same detector gives the same."""
+    with tempfile.TemporaryDirectory(prefix="tactslip-") as folder:
+        path = Path(folder) / "detector.pt"
+        detector.save(path)
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def certificate_facts(content: Mapping[str, Any]) -> dict[str, Any]:
+    """What a host is told of a ``certificate.json``: margin, and what the bins judged show of it.
+
+    Raises:
+        KeyError, TypeError: if it is no certificate.
+    """
+    margin = content["margin"]
+    return {
+        "holds": content["holds"],
+        "simulated": content["simulated"],
+        "score_sd": content["score_sd"],
+        "margin": margin["score"],
+        "margin_sd": margin["sd"],
+        "rule": margin["rule"],
+        "head_bound": content["head"]["bound"],
+        "sets": {
+            name: {
+                "bins": found["bins"],
+                "worst_sd": found["error"]["worst_sd"],
+                "share_inside_margin": found["inside_margin"]["share"],
+                "flips_outside_margin": found["flips"]["outside_margin"],
+            }
+            for name, found in content["sets"].items()
+        },
+    }
+
+
+def _stream_facts(
+    detector: SlipDetector, settings: AlarmSettings, window: Window, memory: Memory
+) -> dict[str, Any]:
+    lengths = detector.channel_filter.window_lengths
+    return {
+        "hop_samples": settings.hop_samples,
+        "first_samples": window.bin + window.after,
+        "frame_samples": max(lengths[channel] for channel in window.channels),
+        "tail_samples": memory.tail_samples,
+        "state_size": memory.state_size,
+        "rule": settings.rule.to_dict(),
+        "threshold": settings.threshold,
+        "target_false_alarms_per_hour": settings.target_per_hour,
+        "threshold_curve": settings.facts.get("threshold_curve", []),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """The same with ``None`` for every number that JSON does not have."""
+    if isinstance(value, Mapping):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

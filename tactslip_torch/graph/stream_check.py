@@ -1,0 +1,257 @@
+"""A stream graph against ``StreamingDetector`` in float64, in whatever pieces samples come."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tactslip_torch.graph.bin_check import WORST_DEGENERATE_SD, WORST_PROBABILITY, WORST_SD
+from tactslip_torch.graph.facts import Memory
+from tactslip_torch.graph.form import Form
+from tactslip_torch.graph.runs import Run
+from tactslip_torch.graph.trials import simulated_stream
+from tactslip_torch.model.calibration import probability
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.onset.streaming import StreamingDetector
+
+Columns = dict[str, NDArray[Any]]
+
+FLAGS = ("valid", "alarm", "on")
+TIMES = ("time_s", "onset_s")
+NUMBERS = ("score", "probability", "statistic")
+_LATE_S = 1e-9  # by which times may differ
+_STATISTIC = {"float32": 1e-3, "float64": 1e-8}  # share of its range by which one may differ
+
+
+def memory_of(run: Run, num_channels: int, form: Form) -> Memory:
+    """What a host keeps between two pushes, as a first push of nothing gives it.
+
+    Raises:
+        ValueError: if it is not a tail of all channels and a row of float64.
+    """
+    made = _Host(run, num_channels, form)
+    made.push(np.empty((0, num_channels), form.dtype))
+    tail, state = made.tail, made.state
+    if tail.ndim != 2 or tail.shape[1] != num_channels or tail.dtype != form.dtype:
+        raise ValueError(
+            f"next_tail is {tail.dtype}{list(tail.shape)}, expected [R, {num_channels}]"
+        )
+    if state.ndim != 1 or state.dtype != np.float64:
+        raise ValueError(f"next_state is {state.dtype}{list(state.shape)}, expected float64 [S]")
+    return Memory(len(tail), len(state))
+
+
+def check_stream(run: Run, detector: SlipDetector, form: Form, memory: Memory) -> dict[str, Any]:
+    """Hold a stream graph against the detector on a simulated slip, whole and broken.
+
+    Args:
+        run: the graph.
+        detector: that it was made of, with alarm settings.
+        form: of the graph.
+        memory: lengths that every push must give.
+
+    Returns:
+        What was measured, in JSON types.
+
+    Raises:
+        ValueError: for the first thing that is wrong, in one line.
+    """
+    double = copy.deepcopy(detector).double()
+    settings = AlarmSettings.of(detector)
+    dtype = torch.float32 if form.precision == "float32" else torch.float64
+    whole = simulated_stream(detector.pool.hand, detector.pool.sample_rate_hz, dtype).T
+    expected = _columns(double, settings, whole)
+    sd = float(expected["score"].std()) or 1.0
+    worst = WORST_SD[form.precision]
+    samples = whole.numpy()
+    host = _Host(run, samples.shape[1], form, memory)
+    found = 0.0
+    for name, sizes in cuts(len(samples), settings.hop_samples).items():
+        got = host.watch(samples, sizes)
+        found = max(found, _compare(got, expected, settings, sd, worst, form, f"cut {name}"))
+    middling = replace(settings, threshold=middle_threshold(expected["statistic"]))
+    at_middle = _columns(double, middling, whole)
+    every = [settings.hop_samples] * (len(samples) // settings.hop_samples)
+    got = host.watch(samples, every, middling.threshold)
+    _compare(got, at_middle, middling, sd, worst, form, "another threshold")
+    broken = broken_stream(whole, detector.needed_index.tolist())
+    of_broken = _columns(double, settings, broken)
+    got = host.watch(broken.numpy(), every)
+    worst = WORST_DEGENERATE_SD[form.precision]
+    lost = _compare(got, of_broken, settings, sd, worst, form, "broken sensors")
+    return {
+        "score_sd": sd,
+        "simulated": True,
+        "decisions": len(expected["score"]),
+        "alarms": int(expected["alarm"].sum()),
+        "alarms_at_another_threshold": int(at_middle["alarm"].sum()),
+        "worst_sd": found,
+        "broken": {"not_valid": int((~of_broken["valid"]).sum()), "worst_sd": lost},
+    }
+
+
+def cuts(num: int, hop: int) -> dict[str, list[int]]:
+    """Ways to cut a stream into pieces, by name: lengths, which may be 0."""
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.randint(0, 400, (num,), generator=generator).tolist()
+    drawn[1::5] = [0] * len(drawn[1::5])
+    singles = [1] * min(num, 300)
+    ways = {
+        "whole": [num],
+        "by hop": [hop] * (num // hop),
+        "by sample": singles,
+        "anyhow": [int(size) for size in drawn],
+    }
+    return {name: _ending_at(num, sizes) for name, sizes in ways.items()}
+
+
+def _ending_at(num: int, sizes: Sequence[int]) -> list[int]:
+    """The first of them up to a total, with a last one that reaches it."""
+    ends = np.minimum(np.cumsum([0, *sizes]), num)
+    kept = [int(last - first) for first, last in pairwise(ends) if first < num]
+    return kept + [num - sum(kept)] * (sum(kept) < num)
+
+
+def middle_threshold(statistic: NDArray[Any]) -> float:
+    """A threshold that the statistic crosses, in the widest gap between its middling values."""
+    low, high = np.quantile(statistic, [0.5, 0.95])
+    values = np.unique(statistic[(low <= statistic) & (statistic <= high)])
+    if len(values) < 2:
+        return float(low)
+    widest = int(np.diff(values).argmax())
+    return float(values[widest : widest + 2].mean())
+
+
+def broken_stream(samples: Tensor, needed: Sequence[int]) -> Tensor:
+    """The same with a channel that dies, one that tears off and instants that never came.
+
+    Args:
+        samples: ``[T, C]``, volts.
+        needed: channels in use.
+    """
+    broken = samples.clone()
+    sixth = len(samples) // 6
+    broken[sixth : 2 * sixth, needed[0]] = broken[sixth, needed[0]]
+    broken[3 * sixth : 4 * sixth, needed[-1]] = torch.inf
+    broken[5 * sixth : 5 * sixth + 30] = torch.nan
+    return broken
+
+
+class _Host:
+    """A graph and what it remembers, as every host has them."""
+
+    def __init__(
+        self, run: Run, num_channels: int, form: Form, memory: Memory | None = None
+    ) -> None:
+        self.run, self.form, self.memory = run, form, memory
+        self.num_channels = num_channels
+        self.reset()
+
+    def reset(self) -> None:
+        self.tail: NDArray[Any] = np.empty((0, self.num_channels), self.form.dtype)
+        self.state: NDArray[Any] = np.empty(0, np.float64)
+
+    def push(self, samples: NDArray[Any], threshold: float | None = None) -> Columns:
+        given = np.array([] if threshold is None else [threshold], np.float64)
+        feeds = {"samples": samples, "tail": self.tail, "state": self.state, "threshold": given}
+        columns = self.run(feeds)
+        wanted = {*FLAGS, *TIMES, *NUMBERS, "next_tail", "next_state"}
+        if columns.keys() != wanted:
+            found = ", ".join(sorted(columns.keys() ^ wanted))
+            raise ValueError(f"its outputs are not those of a stream graph: {found}")
+        self.tail, self.state = columns.pop("next_tail"), columns.pop("next_state")
+        if self.memory is not None and (len(self.tail), len(self.state)) != self.memory:
+            raise ValueError(
+                f"it hands on {len(self.tail)} samples and a state of {len(self.state)} after a "
+                f"push of {len(samples)}, expected {self.memory[0]} and {self.memory[1]} always"
+            )
+        return columns
+
+    def watch(
+        self, samples: NDArray[Any], sizes: Sequence[int], threshold: float | None = None
+    ) -> Columns:
+        """A whole stream, from the start, in pieces."""
+        self.reset()
+        parts = [self.push(piece, threshold) for piece in _pieces(samples, sizes)]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _pieces(samples: NDArray[Any], sizes: Sequence[int]) -> Iterator[NDArray[Any]]:
+    for first, last in pairwise(np.cumsum([0, *sizes])):
+        yield samples[first:last]
+
+
+def _columns(detector: SlipDetector, settings: AlarmSettings, samples: Tensor) -> Columns:
+    """What the streaming detector says of samples ``[T, C]``, under the graph's names."""
+    decisions = StreamingDetector(detector, settings, dtype=torch.float64).push(samples)
+    # a sensor is trusted by what its samples resolve in the precision they come in
+    trusted = StreamingDetector(detector, settings, dtype=samples.dtype).push(samples).is_valid
+    named = {
+        "score": decisions.score,
+        "probability": decisions.probability,
+        "statistic": decisions.statistic,
+        "valid": trusted,
+        "alarm": decisions.is_alarm,
+        "on": decisions.is_on,
+        "time_s": decisions.available_s,
+        "onset_s": decisions.onset_s,
+    }
+    return {name: column.numpy() for name, column in named.items()}
+
+
+def _compare(
+    got: Columns,
+    expected: Columns,
+    settings: AlarmSettings,
+    sd: float,
+    worst: float,
+    form: Form,
+    what: str,
+) -> float:
+    """The worst score error, in standard deviations.
+
+    Raises:
+        ValueError: if anything differs by more than it may.
+    """
+    num = len(expected["score"])
+    for name, column in got.items():
+        wanted = bool if name in FLAGS else np.float64 if name in TIMES else form.dtype
+        if column.dtype != wanted or column.shape != (num,):
+            raise ValueError(
+                f"{what}: {name} is {column.dtype}{list(column.shape)}, expected "
+                f"{np.dtype(wanted)}[{num}]"
+            )
+    for name in FLAGS:
+        if places := np.flatnonzero(got[name] != expected[name]).tolist():
+            raise ValueError(
+                f"{what}: {name} differs from torch at {len(places)} of {num} decisions, the "
+                f"first at {expected['time_s'][places[0]]:.3f} s"
+            )
+    for name in TIMES:
+        _refuse(np.abs(got[name] - expected[name]), _LATE_S, "s", f"{what}: {name}")
+    error = np.abs(got["score"].astype(np.float64) - expected["score"]) / sd
+    _refuse(error, worst, "standard deviations", f"{what}: score")
+    tells = got["statistic"] > -1e30  # before that a rule has seen too few decisions
+    statistic = expected["statistic"][tells]
+    span = float(np.ptp(statistic)) if len(statistic) else 0.0
+    off = np.abs(got["statistic"][tells] - statistic) / (span or 1.0)
+    _refuse(off, _STATISTIC[form.precision], "of its range", f"{what}: statistic")
+    llr = settings.calibration.llr(torch.from_numpy(got["score"].astype(np.float64)))
+    stated = probability(llr, settings.slip_share).numpy()
+    off = np.abs(got["probability"] - stated)[got["valid"]]
+    _refuse(off, WORST_PROBABILITY[form.precision], "", f"{what}: probability")
+    return float(error.max(initial=0.0))
+
+
+def _refuse(off: NDArray[Any], most: float, unit: str, what: str) -> None:
+    if not (found := float(off.max(initial=0.0))) <= most:
+        raise ValueError(f"{what} differs from torch by {found:.1e} {unit}, more than {most:g}")

@@ -1,0 +1,82 @@
+"""What a model is tried on before it is left: noise, broken sensors, and a simulated slip."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import cycle
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.simulation.extremes import EXTREMES, RAIL_V, extreme_bins
+from tactslip_torch.simulation.scene import Scene
+from tactslip_torch.simulation.simulate import simulate
+
+BROKEN = ("step", "nan", "inf", "-inf", "all nan")
+KINDS: tuple[str, ...] = (*EXTREMES, *BROKEN)
+"""Degenerate bins by name."""
+
+_BEFORE_S, _AFTER_S = 1.0, 0.5  # of the simulated onset
+
+
+def noise_bins(hand: HandLayout, num: int, length: int, seed: int, dtype: torch.dtype) -> Tensor:
+    """Noise of sizes from 1 V to 1 mV, the gauges on an offset: ``[num, C, length]``, volts."""
+    generator = torch.Generator().manual_seed(seed)
+    size = 10 ** torch.linspace(0, -3, num, dtype=torch.float64)[:, None, None]
+    noise = torch.randn(num, len(hand), length, generator=generator, dtype=torch.float64)
+    samples = size * noise
+    samples[:, list(hand.indices("SG"))] += 1.0
+    return samples.to(dtype)
+
+
+def degenerate_bins(
+    hand: HandLayout, kind: str, num: int, length: int, dtype: torch.dtype
+) -> Tensor:
+    """Bins of one of ``KINDS``, ``[num, C, length]``, volts.
+
+    ``"nan"`` and the infinities are one sample of one channel of noise, wandering from bin to bin.
+    """
+    generator = torch.Generator().manual_seed(KINDS.index(kind))
+    if kind in EXTREMES:
+        return extreme_bins(kind, (num, len(hand), length), generator, dtype)
+    samples = noise_bins(hand, num, length, KINDS.index(kind), dtype)
+    rows = torch.arange(num)
+    if kind == "step":
+        edge = torch.randint(length, (num, len(hand), 1), generator=generator)
+        return torch.where(torch.arange(length) < edge, 0.0, RAIL_V).to(dtype)
+    if kind == "all nan":
+        return samples.fill_(torch.nan)
+    channels = torch.randint(len(hand), (num,), generator=generator)
+    samples[rows, channels, torch.randint(length, (num,), generator=generator)] = float(kind)
+    return samples
+
+
+def simulated_stream(hand: HandLayout, sample_rate_hz: float, dtype: torch.dtype) -> Tensor:
+    """A slip as the simulator records it, ``[C, T]``, volts; 1 s before its onset, .5 s behind.
+
+    Of another hand than the simulated one, each channel is the next of its kind.
+    """
+    simulated = HandLayout.paper24()
+    places = {kind: cycle(simulated.indices(kind)) for kind in ("SG", "PVDF")}
+    rows = [next(places[channel.kind]) for channel in hand.channels]
+    return _simulated(sample_rate_hz)[rows].to(dtype)
+
+
+def simulated_bins(
+    hand: HandLayout, sample_rate_hz: float, num: int, length: int, dtype: torch.dtype
+) -> Tensor:
+    """Bins of the simulated slip, evenly spread over it: ``[num, C, length]``, volts."""
+    samples = simulated_stream(hand, sample_rate_hz, dtype)
+    starts = torch.linspace(0, samples.shape[-1] - length, num).long()
+    return samples.unfold(-1, length, 1)[:, starts].movedim(1, 0).contiguous()
+
+
+@lru_cache(maxsize=1)
+def _simulated(sample_rate_hz: float) -> Tensor:
+    """Of the whole hand, float64; not to be written to."""
+    scene = Scene("M1", seed=1, sample_rate_hz=sample_rate_hz)
+    onset_s = simulate(scene, windows=[]).onsets_s[0]
+    window = (onset_s - _BEFORE_S, onset_s + _AFTER_S)
+    samples = simulate(scene, windows=[window], dtype=torch.float64).samples
+    return samples[:, samples.isfinite().all(0)]
