@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from tactslip_torch.features.linear_maps import LinearMaps
-from tactslip_torch.features.plan import Plan, Row
+from tactslip_torch.features.plan import Plan, Wanted
 from tactslip_torch.graph.descriptors import DESCRIPTORS
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.head import machine, scaled, with_typical
@@ -76,9 +75,9 @@ def _features(graph: Graph, detector: SlipDetector, front: Front, form: Form) ->
     """Selected features in their order, ``[B, K]``, float64."""
     plan, axis_hz = detector.extractor.plan, LinearMaps.of(detector.pool).frequency_hz
     pieces, column_of, width = list[Value](), dict[int, int](), 0
-    for rows, exact in _batches(plan, form):
-        wanted = [w for w in plan.wanted if plan.rows[w.row] in rows]
+    for wanted, exact in _batches(plan, form):
         names = {w.descriptor for w in wanted}
+        rows = sorted({plan.rows[w.row] for w in wanted})
         made = front.of(
             rows,
             exact=exact,
@@ -91,7 +90,14 @@ def _features(graph: Graph, detector: SlipDetector, front: Front, form: Form) ->
             for name in sorted(names)
         }
         axis = axis_hz if rows[0].kind == "freq" else axis_hz.new_zeros(front.window.bin)
-        shared = Shared(graph, made, places, frugal=form.layout == "bulk", frequency_hz=axis)
+        shared = Shared(
+            graph,
+            made,
+            places,
+            dtype=form.dtype,
+            frugal=form.layout == "bulk",
+            frequency_hz=axis,
+        )
         for name in places:
             part = DESCRIPTORS[name](shared)
             for w in wanted:
@@ -110,15 +116,19 @@ def _features(graph: Graph, detector: SlipDetector, front: Front, form: Form) ->
     return graph.concat(*pieces, axis=1).take(columns, 1)
 
 
-def _batches(plan: Plan, form: Form) -> list[tuple[Sequence[Row], bool]]:
-    """Rows that are described together, and whether in float64 whatever the form."""
-    stepping = {plan.rows[row] for row in plan.rows_for(*EXACT)} if form.dtype != F64 else set()
-    batches = list[tuple[Sequence[Row], bool]]()
+def _batches(plan: Plan, form: Form) -> list[tuple[list[Wanted], bool]]:
+    """Descriptors of rows that are made together, and whether in float64 whatever the form."""
+    batches = []
     for is_freq in (False, True):
-        own = [row for row in plan.rows if (row.kind == "freq") == is_freq]
         for exact in (False, True):
-            if rows := [row for row in own if (row in stepping) == exact]:
-                batches.append((rows, exact))
+            own = [
+                wanted
+                for wanted in plan.wanted
+                if (plan.rows[wanted.row].kind == "freq") == is_freq
+                and (wanted.descriptor in EXACT and form.dtype != F64) == exact
+            ]
+            if own:
+                batches.append((own, exact))
     return batches
 
 

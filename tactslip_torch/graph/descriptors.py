@@ -52,16 +52,16 @@ def mean_deviation(x: Shared) -> Part:
 def skewness(x: Shared) -> Part:
     """Third moment over the 3/2 power of the second; 0 if flat."""
     third = x.third()
-    variance, _ = x.safe_variance(third.places)
+    variance = x.safe_variance(third.places)
     return Part(third.value / (variance * variance.sqrt()), third.places)
 
 
 def kurtosis(x: Shared) -> Part:
     """Fourth moment over the squared second; 3 if flat."""
     fourth = x.fourth()
-    variance, is_flat = x.safe_variance(fourth.places)
-    ratio = fourth.value / (variance * variance)
-    return Part(x.graph.where(is_flat, 3.0, ratio), fourth.places)
+    variance = x.safe_variance(fourth.places)
+    is_flat = x.variance().of(fourth.places).equals(0.0).cast(F64)
+    return Part(fourth.value / (variance * variance) + is_flat * 3.0, fourth.places)
 
 
 def energy(x: Shared) -> Part:
@@ -88,23 +88,20 @@ def correlation(x: Shared) -> Part:
     if film is None:
         raise ValueError("correlation needs the film that rows are branches of")
     other = Part(film, range(len(x.rows.rows))).of(places)
-    own, _ = x.safe_variance(places)
+    own = x.safe_variance(places)
     covariance = (x.centred().of(places) * other).mean().cast(F64)
     theirs = (other * other).mean().cast(F64)
-    theirs = x.graph.where(theirs > 0.0, theirs, 1.0)
-    return Part(covariance / (own.sqrt() * theirs.sqrt()), places)
+    return Part(covariance / (own * theirs.max(1e-60)).sqrt(), places)
 
 
 def spectral_centroid(x: Shared) -> Part:
     """Mean frequency."""
-    places = x.of_rows(("spectral_centroid",), always=True)
-    return Part(x.weighted().of(places).slice(0, 1, 2).squeeze(2), places)
+    return x.centroid_and_spread()[0]
 
 
 def spectral_spread(x: Shared) -> Part:
     """Root mean squared distance from it."""
-    places = x.of_rows(("spectral_spread",), always=True)
-    return Part(x.weighted().of(places).slice(1, 2, 2).squeeze(2), places)
+    return x.centroid_and_spread()[1]
 
 
 def median(x: Shared) -> Part:
@@ -133,7 +130,7 @@ def mode(x: Shared) -> Part:
 def entropy(x: Shared) -> Part:
     """Entropy of the amplitude histogram."""
     places = x.of_rows(("entropy",), always=True)
-    return Part(level_entropy(x.graph, x.values(places), x.num), places)
+    return Part(level_entropy(x.values(places), x.num, x.dtype), places)
 
 
 DESCRIPTORS: dict[str, Callable[[Shared], Part]] = {

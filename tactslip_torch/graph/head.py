@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from tactslip_torch.graph.form import Form
@@ -22,21 +23,19 @@ def scaled(graph: Graph, features: Value, scaler: FeatureScaler) -> Value:
 
     ONNX has no ``log1p``: the knee becomes ``Log(1 + x)``, off by some eps of the knee.
     """
-    x = features.clip(-_LARGEST, _LARGEST)  # what is beyond float64 saturates
-    if scaler.knee is not None:
-        knee = graph.constant(scaler.knee.double().numpy(), F64)
-        bent = (x.abs() / knee + 1.0).log() * knee
-        x = graph.where(x < 0.0, -bent, bent)
-    least, most = scaler.minimum.double(), scaler.maximum.double()
-    width = most - least
+    least, width = scaler.minimum.double(), (scaler.maximum - scaler.minimum).double()
     is_point = width == 0
-    relative = (x - graph.constant(least.numpy(), F64)) / graph.constant(
-        width.masked_fill(is_point, 1.0).numpy(), F64
-    )
-    inside = (relative * 2.0 - 1.0).clip(-1.0, 1.0)
-    if not bool(is_point.any()):
-        return inside
-    return graph.where(graph.constant(is_point.numpy(), np.dtype(bool)), 0.0, inside)
+    slope = torch.where(is_point, 0.0, 2 / width.masked_fill(is_point, 1.0))
+    offset = torch.where(is_point, 0.0, -1 - slope * least)
+    if bool(is_point.any()):  # 0 times Inf
+        features = features.clip(-_LARGEST, _LARGEST)
+    if scaler.knee is not None:
+        knee = scaler.knee.double()
+        slope = slope * knee
+        bent = (features.abs() * graph.constant(_of(1 / knee), F64) + 1.0).log()
+        features = bent * graph.op("Sign", features)
+    z = features * graph.constant(_of(slope), F64) + graph.constant(_of(offset), F64)
+    return z.clip(-1.0, 1.0)
 
 
 def with_typical(graph: Graph, z: Value, is_missing: Value, detector: SlipDetector) -> Value:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 
 from tactslip_torch.features.descriptors import ENTROPY_LEVELS, HALF_SLACK, RUN_TOLERANCE
-from tactslip_torch.features.runs import entropy_growth
+from tactslip_torch.features.runs import EPS64
 from tactslip_torch.graph.value import F64, I64, Value
 from tactslip_torch.graph.writer import Graph
+
+_TINY = 1e-300  # instead of 0, where a quotient of 0 is to be 0
 
 
 def medians(values: Value, num: int) -> Value:
@@ -58,32 +62,33 @@ def modes(graph: Graph, values: Value, scale: Value, num: int) -> Value:
     return graph.if_(has_runs, counted, lambda body: [smallest.at(body)])[0].squeeze(2)
 
 
-def entropy(graph: Graph, values: Value, num: int) -> Value:
+def entropy(values: Value, num: int, dtype: np.dtype[Any]) -> Value:
     """Shannon entropy of the amplitude histogram in bits: ``[B, R, n] -> [B, R]``, float64.
 
     Values are counted by their level, 0 to 255; the two highest levels in use share a cell.
+
+    Args:
+        values: float64, so that no rounding moves one to another level.
+        num: of values in a row.
+        dtype: of counts and logarithms.
     """
-    values = values.cast(F64)
+    graph = values.graph
     least = values.amin(2, keep=True)
     span = values.amax(2, keep=True) - least
-    is_flat = span.equals(0.0)
-    levels = ENTROPY_LEVELS / graph.where(is_flat, 1.0, span)
+    levels = ENTROPY_LEVELS / span.max(_TINY)
     level = ((values - least) * levels + (0.5 + HALF_SLACK[torch.float64])).floor()
-    level = level.clip(0, ENTROPY_LEVELS).cast(I64)
-    empty = values.slice(0, 1, 2) * 0.0 + graph.constant(np.zeros(ENTROPY_LEVELS + 1), F64)
-    ones = values * 0.0 + 1.0
-    count = graph.op("ScatterElements", empty, level, ones, axis=2, reduction="add")
+    ones = (values * 0.0 + 1.0).cast(dtype)
+    none = (span * 0.0).cast(dtype) + graph.constant(np.zeros(ENTROPY_LEVELS + 1), dtype)
+    count = graph.op("ScatterElements", none, level.cast(I64), ones, axis=2, reduction="add")
     below = count.slice(0, ENTROPY_LEVELS, 2)
     top = count.slice(ENTROPY_LEVELS, ENTROPY_LEVELS + 1, 2)
-    numbers = graph.constant(np.arange(1, ENTROPY_LEVELS + 1), F64)
-    second = graph.where(below > 0.0, numbers, 0.0).amax(2, keep=True)  # 1 + level, 0 for none
-    is_second = numbers.equals(second)
-    shared = graph.where(is_second, below, 0.0).sum(2, keep=True) + top
-    counts = graph.concat(graph.where(is_second, 0.0, below), shared, axis=2).cast(I64)
-    of_count = torch.cat([torch.zeros(1, dtype=torch.float64), entropy_growth(num).cumsum(0)])
-    table = graph.constant(of_count.numpy(), F64)
-    bits = graph.op("Gather", table, counts, dtype=F64, axis=0).sum(2)
-    return graph.where(is_flat.squeeze(2), 0.0, bits)
+    numbers = graph.constant(np.arange(1, ENTROPY_LEVELS + 1), dtype)
+    second = (numbers * below.min(1.0)).amax(2, keep=True)  # 1 + level, 0 for none
+    moved = below * numbers.equals(second).cast(dtype)
+    counts = graph.concat(below - moved, top + moved.sum(2, keep=True), axis=2)
+    share = counts * (1.0 / num)
+    bits = -(share * (share + EPS64).log()).sum(2).cast(F64) * (1.0 / math.log(2.0))
+    return bits * (span.squeeze(2) > 0.0).cast(F64)
 
 
 def _largest(values: Value, count: int) -> Value:

@@ -23,7 +23,7 @@ from tactslip_torch.graph.maps import (
     energy_matrix,
     filter_matrix,
 )
-from tactslip_torch.graph.value import BOOL, F64, Value
+from tactslip_torch.graph.value import F64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
 
@@ -31,6 +31,7 @@ EXACT = frozenset({"mode", "entropy"})
 """Descriptors that step: two roundings of one value may differ by a whole step."""
 SPAN_OF_LENGTH = 0.35  # span of 100 centred values of length 1: from .2 (two levels) to 1.41
 Key = tuple[BlockKind, int]
+_TINY = 1e-300  # instead of 0, where a quotient of 0 is to be 0
 _LEAST_SPAN = 16 * float(np.finfo(np.float64).eps)  # guards.is_constant
 
 
@@ -65,11 +66,12 @@ class _Channels:
     filtered: Value  # [B, c, n]
     scale: Value  # [B, c]
     coordinates: Mapping[Key, Value]  # of length one, [B, c, r]
+    exact: Mapping[Key, Value]  # the same in float64
     length: Value | None  # [B, c, blocks]
     mean: Value | None  # [B, c, blocks]
 
 
-_Settled = tuple[dict[Key, Value], Value | None, Value | None]
+_Settled = tuple[dict[Key, Value], dict[Key, Value], Value | None, Value | None]
 
 
 class Front:
@@ -100,8 +102,7 @@ class Front:
         lengths = detector.channel_filter.window_lengths
         for channel in self.window.channels:
             frames.setdefault((lengths[channel], channel in films), []).append(channel)
-        wide = windows.cast(F64)
-        self._groups = [self._make(tuple(channels), wide) for channels in frames.values()]
+        self._groups = [self._make(tuple(channels), windows) for channels in frames.values()]
         self._of = {channel: group for group in self._groups for channel in group.channels}
         self._order = [channel for group in self._groups for channel in group.channels]
         places = [self._order.index(channel) for channel in self.window.channels]
@@ -148,8 +149,7 @@ class Front:
         parts = group.shifted.slice(place, place + 1, 1).squeeze(1) @ matrix
         of_branch: Matrix = np.repeat(np.eye(len(ranks)), ranks, axis=0)
         energies = (parts * parts) @ of_branch
-        total = energies.slice(0, 1, 1)
-        total = self._graph.where(total > 0.0, total, 1.0)
+        total = energies.slice(0, 1, 1).max(_TINY)
         return energies.slice(1, len(ranks), 1) / total
 
     def _key(self, row: Row) -> Key:
@@ -190,11 +190,11 @@ class Front:
             group = self._of[rows[0].channel]
             places = [group.channels.index(row.channel) for row in rows]
             films.append(_taken(group.filtered, places, len(group.channels)))
-        film = self._graph.concat(*films, axis=1)
+        film = self._graph.concat(*films, axis=1).cast(F64)
         centred = film - film.mean(2, keep=True)
         size, scale = centred.abs().amax(2, keep=True), film.abs().amax(2, keep=True)
-        is_kept = (size * (2 / _LEAST_SPAN) >= scale) & (size > 0.0)
-        kept = self._graph.where(is_kept, 1.0 / size, 0.0)
+        least = scale * (_LEAST_SPAN / 2) + _TINY
+        kept = (size >= least).cast(F64) / size.max(least)
         return (centred * kept).cast(dtype)
 
     def _make(self, channels: tuple[int, ...], windows: Value) -> _Channels:
@@ -207,81 +207,81 @@ class Front:
             x = x.slice(start, start + before + num + after, 2)
         unit = None
         if self._form.dtype == F64:  # whose squares float64 does not hold
-            unit = x.abs().amax(2, keep=True)
-            unit = graph.where(unit > 0.0, unit, 1.0)
+            unit = x.abs().amax(2, keep=True).max(_TINY)
             x = x / unit
-        first = x.slice(before, before + 1, 2)
-        shifted = graph.concat(x - first, first, axis=2)
         smooth = filter_matrix(self._detector.channel_filter, channels[0], num)
-        own = blocks(
-            (row for row in self._plan.rows if row.channel in channels), self._maps, smooth
+        first = x.slice(before, before + 1, 2)
+        filtered = (x - first).cast(self._form.dtype) @ smooth.T.numpy() + first.cast(
+            self._form.dtype
         )
-        maps = [np.concatenate([smooth.T.numpy(), np.ones((1, num))])]
-        maps += [each.into for each in own.values()]
-        maps += [np.stack([each.mean for each in own.values()], axis=1)] if own else []
-        made = shifted @ np.concatenate(maps, axis=1)
-        filtered = made.slice(0, num, 2)
         scale = self._judge(channels, filtered, unit)
-        nodes: _Settled = ({}, None, None)
+        first = first.cast(F64)
+        shifted = graph.concat(x.cast(F64) - first, first, axis=2)
+        rows = [row for row in self._plan.rows if row.channel in channels]
+        own = blocks(rows, self._maps, smooth)
+        nodes: _Settled = ({}, {}, None, None)
         if own:
-            end = num + sum(each.rank for each in own.values())
-            parts = made.slice(num, end, 2), made.slice(end, end + len(own), 2)
-            nodes = self._settle(channels, own, *parts, scale)
-        coordinates, length, mean = nodes
+            maps = [each.into for each in own.values()]
+            means = np.stack([each.mean for each in own.values()], axis=1)
+            nodes = self._settle(channels, own, shifted, np.concatenate(maps, axis=1), means, scale)
+        coordinates, exact, length, mean = nodes
         if unit is not None:
             scale = scale * unit.squeeze(2)
-            length, mean = (None if x is None else x * unit for x in (length, mean))
-        return _Channels(channels, own, shifted, smooth, filtered, scale, coordinates, length, mean)
+            length, mean = (None if each is None else each * unit for each in (length, mean))
+        return _Channels(
+            channels, own, shifted, smooth, filtered, scale, coordinates, exact, length, mean
+        )
 
     def _judge(self, channels: tuple[int, ...], filtered: Value, unit: Value | None) -> Value:
-        """Which channels can be trusted; and the largest magnitude of each, ``[B, c]``."""
-        graph, dtype = self._graph, self._form.dtype
+        """Which channels can be trusted; and the largest magnitude of each, ``[B, c]``, float64.
+
+        In the precision of the form: sensors resolve no more than they give.
+        """
         high, low = filtered.amax(2), filtered.amin(2)
         scale = high.max(-low)
         probe = filtered.slice(0, 1, 2).squeeze(2)  # NaN if anything in the window is no number
         probe = scale + (probe - probe)
-        is_known = (probe if unit is None else probe * unit.squeeze(2)) <= LARGEST_SAMPLE
-        high, low = high.cast(dtype), low.cast(dtype)  # sensors resolve no more than they give
-        like = torch.empty(0, dtype=torch.float64 if dtype == F64 else torch.float32)
+        largest = min(LARGEST_SAMPLE, float(np.finfo(self._form.dtype).max))
+        is_known = (probe if unit is None else probe * unit.squeeze(2)) <= largest
+        like = torch.empty(0, dtype=torch.float64 if self._form.dtype == F64 else torch.float32)
         inverse = self._detector.pool.inverse_span(like)[list(channels)].numpy()
-        is_alive = (high - low) * graph.constant(inverse, dtype) > high.max(-low)
+        is_alive = (high - low) * self._graph.constant(inverse, self._form.dtype) > scale
         self._missing.append(~is_known)
         self._trusted.append(is_alive & is_known)
-        return scale
+        return scale.cast(F64)
 
     def _settle(
         self,
         channels: Sequence[int],
         own: Mapping[Key, Block],
-        coordinates: Value,
-        mean: Value,
+        shifted: Value,
+        into: Matrix,
+        means: Matrix,
         scale: Value,
     ) -> _Settled:
         """Coordinates of length one, 0 of rows that are rounding beside their bin; their lengths.
 
         Means are of all blocks, those of details 0 where the rest is.
         """
-        graph = self._graph
+        coordinates = shifted @ into
         ranks = [each.rank for each in own.values()]
         of_block = np.repeat(np.eye(len(own)), ranks, axis=0)  # [sum of ranks, blocks]
         length = ((coordinates * coordinates) @ of_block).sqrt()  # [B, c, blocks]
-        is_kept = length * (SPAN_OF_LENGTH / _LEAST_SPAN) >= scale.expand(2)
-        is_kept = is_kept & (length > 0.0)
-        length = graph.where(is_kept, length, 1.0)
-        kept = graph.where(is_kept, 1.0 / length, 0.0)
-        coordinates = coordinates * (kept @ of_block.T)
+        least = (scale * (_LEAST_SPAN / SPAN_OF_LENGTH)).max(_TINY).expand(2)
+        is_kept = (length >= least).cast(F64)
+        length = length.max(least)
+        coordinates = coordinates * ((is_kept / length) @ of_block.T)
+        mean = shifted @ means
         if any(each.is_detail for each in own.values()):
-            stays = np.array([not each.is_detail for each in own.values()])
-            mean = graph.where(is_kept | graph.constant(stays, BOOL), mean, 0.0)
+            stays = np.array([float(not each.is_detail) for each in own.values()])
+            mean = mean * is_kept.max(self._graph.constant(stays, F64))
+        edges = np.cumsum([0, *ranks]).tolist()
         narrow = coordinates.cast(self._form.dtype)
-        exact = {self._plan.rows[row] for row in self._plan.rows_for(*EXACT)}
-        in_double = {self._key(row) for row in exact if row.channel in channels}
-        parts, start = dict[Key, Value](), 0
-        for key, rank in zip(own, ranks, strict=True):
-            source = coordinates if key in in_double else narrow
-            parts[key] = source.slice(start, start + rank, 2)
-            start += rank
-        return parts, length, mean
+        parts, exact = (
+            {key: each.slice(edges[place], edges[place + 1], 2) for place, key in enumerate(own)}
+            for each in (narrow, coordinates)
+        )
+        return parts, exact, length, mean
 
 
 def _taken(value: Value, places: Sequence[int], num: int) -> Value:

@@ -7,13 +7,16 @@ means, units) is float64, where no square of a float32 leaves the range.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 import torch
 
 from tactslip_torch.graph.rows import Rows
 from tactslip_torch.graph.value import F64, Value
 from tactslip_torch.graph.writer import Graph
 
+_NEXT_TO_NOTHING = 1e-60  # variances of rows of order one are 0 or far above
 _MOMENTS = (
     "mean",
     "std",
@@ -48,6 +51,7 @@ class Shared:
         graph: to which nodes are added.
         rows: the rows.
         wanted: descriptors, each with the places of the rows it is wanted of, ascending.
+        dtype: of the form; rows may be more exact.
         frugal: make a part for the rows that want it alone, even if that takes another node.
         frequency_hz: of the lines, if rows are spectra.
     """
@@ -58,11 +62,13 @@ class Shared:
         rows: Rows,
         wanted: Mapping[str, Sequence[int]],
         *,
+        dtype: np.dtype[Any],
         frugal: bool,
         frequency_hz: torch.Tensor,
     ) -> None:
         self.graph = graph
         self.rows = rows
+        self.dtype = dtype
         self._wanted = wanted
         self._frugal = frugal
         self._axis_hz = frequency_hz
@@ -100,14 +106,14 @@ class Shared:
             values = self.values(places)
             if self.rows.mean is not None:
                 return Part(values, places)
-            return Part(values - self.plain_mean().of(places).expand(2), places)
+            return Part(values - self.plain_mean().of(places), places)
 
         return self.once("centred", make)
 
     def plain_mean(self) -> Part:
-        """Mean of a spectrum, in its dtype."""
+        """Mean of a spectrum, in its dtype, ``[B, R', 1]``."""
         places = self.of_rows(_MOMENTS)
-        return self.once("plain mean", lambda: Part(self.values(places).mean(), places))
+        return self.once("plain mean", lambda: Part(self.values(places).mean(keep=True), places))
 
     def squares(self) -> Part:
         """Squared centred values."""
@@ -129,7 +135,8 @@ class Shared:
         if self.rows.mean is not None:
             return Part(self.rows.mean, range(len(self.rows.rows))).of(places)
         return self.once(
-            "mean", lambda: Part(self.plain_mean().value.cast(F64), self.plain_mean().places)
+            "mean",
+            lambda: Part(self.plain_mean().value.squeeze(2).cast(F64), self.plain_mean().places),
         ).of(places)
 
     def variance(self) -> Part:
@@ -150,44 +157,39 @@ class Shared:
         squares = self.squares().of(places)
         return Part((squares * squares).mean().cast(F64), places)
 
-    def safe_variance(self, places: Sequence[int]) -> tuple[Value, Value]:
-        """The variance, 1 where all values are equal, and where that is."""
-        variance = self.variance().of(places)
-        is_flat = variance.equals(0.0)
-        return self.graph.where(is_flat, 1.0, variance), is_flat
+    def safe_variance(self, places: Sequence[int]) -> Value:
+        """The variance; next to nothing where all values are equal, and all moments 0."""
+        return self.variance().of(places).max(_NEXT_TO_NOTHING)
 
     def rms(self, places: Sequence[int]) -> Value:
-        """Root mean square, in the unit; 1 for a zero row, over which all is 0."""
+        """Root mean square, in the unit; next to nothing for a zero row, over which all is 0."""
         mean = self.mean(places)
         square = mean * mean + self.variance().of(places)
-        return self.graph.where(square > 0.0, square, 1.0).sqrt()
+        return square.max(_NEXT_TO_NOTHING).sqrt()
 
     def in_volts(self, value: Value, places: Sequence[int]) -> Part:
         """A quantity of the unit."""
         return Part(value * self.unit(places), places)
 
-    def weighted(self) -> Part:
-        """Centroid and spread in hertz, ``[B, R', 2]``.
+    def centroid_and_spread(self) -> tuple[Part, Part]:
+        """Of spectra, in hertz.
 
         About the middle of the band, beside which neither is small, so that little cancels.
         """
-
-        def make() -> Part:
-            places = self.of_rows(("spectral_centroid", "spectral_spread"), always=True)
-            middle = float(self._axis_hz.mean())
-            half = max(float((self._axis_hz - middle).abs().max()), 1.0)
-            place = (self._axis_hz - middle) / half
-            sums = torch.stack([torch.ones_like(place), place, place.square()], dim=-1).numpy()
-            made = (self.values(places) @ sums).cast(F64)  # [B, R', 3]
-            total, first, second = (made.slice(k, k + 1, 2) for k in range(3))
-            is_some = total > 0.0
-            total = self.graph.where(is_some, total, 1.0)
-            centre = first / total
-            spread = (second / total - centre * centre).max(0.0).sqrt() * half
-            centroid = self.graph.where(is_some, centre * half + middle, 0.0)
-            return Part(self.graph.concat(centroid, spread, axis=2), places)
-
-        return self.once("weighted", make)
+        places = self.of_rows(("spectral_centroid", "spectral_spread"), always=True)
+        middle = float(self._axis_hz.mean())
+        half = max(float((self._axis_hz - middle).abs().max()), 1.0)
+        place = (self._axis_hz - middle) / half
+        powers = torch.stack([torch.ones_like(place), place, place.square()], dim=-1).numpy()
+        sums = self.once(
+            "sums", lambda: Part((self.values(places) @ powers).cast(F64), places)
+        ).value
+        total, first, second = (sums.slice(k, k + 1, 2).squeeze(2) for k in range(3))
+        is_some = (total > 0.0).cast(F64)
+        total = total.max(_NEXT_TO_NOTHING)
+        centre = first / total
+        spread = (second / total - centre * centre).max(0.0).sqrt() * half
+        return Part((centre * half + middle) * is_some, places), Part(spread, places)
 
     def with_mean(self, value: Value, places: Sequence[int]) -> Value:
         """Values less their mean, one of each row, with it again."""

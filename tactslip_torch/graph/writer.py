@@ -116,8 +116,7 @@ class Graph:
         for make in (then, otherwise):
             body = Graph(self)
             values = [Value(body, value.name, value.dtype) for value in make(body)]
-            for value in values:
-                body.output(self._name(), value, None)
+            body._hand_out(values, None)
             dtypes = [value.dtype for value in values]
             bodies.append(body.proto())
         branches = {"then_branch": bodies[0], "else_branch": bodies[1]}
@@ -135,7 +134,7 @@ class Graph:
             body: of a graph, the state ``[]`` and an entry ``[]`` of each row makes the state after
                 it and its results.
             state: scalars before the first entry.
-            rows: ``[k]`` each; k may be 0.
+            rows: ``[k]`` each; onnxruntime refuses k = 0, so leave an empty walk out by ``if_``.
 
         Returns:
             The state after the last entry, and results ``[k]``.
@@ -143,8 +142,7 @@ class Graph:
         inner = Graph(self)
         taken = [inner.input(self._name(), value.dtype, ()) for value in (*state, *rows)]
         after, results = body(inner, taken[: len(state)], taken[len(state) :])
-        for value in (*after, *results):
-            inner.output(self._name(), value, ())
+        inner._hand_out((*after, *results), ())
         dtypes = [value.dtype for value in (*after, *results)]
         made = self.ops(
             "Scan", *state, *rows, dtypes=dtypes, body=inner.proto(), num_scan_inputs=len(rows)
@@ -152,10 +150,15 @@ class Graph:
         return list(made[: len(state)]), list(made[len(state) :])
 
     def proto(self) -> onnx.GraphProto:
-        """The graph as it stands."""
-        return helper.make_graph(
-            self._nodes, "tactslip_torch", self._inputs, self._outputs, self._tensors
-        )
+        """The graph as it stands, without what no output needs."""
+        needed = {output.name for output in self._outputs}
+        nodes = list[onnx.NodeProto]()
+        for node in reversed(self._nodes):
+            if needed.intersection(node.output):
+                needed.update(_read_by(node))
+                nodes.insert(0, node)
+        tensors = [tensor for tensor in self._tensors if tensor.name in needed]
+        return helper.make_graph(nodes, "tactslip_torch", self._inputs, self._outputs, tensors)
 
     def model(self, metadata: Mapping[str, str]) -> onnx.ModelProto:
         """The model, checked by onnx.
@@ -173,6 +176,14 @@ class Graph:
         onnx.checker.check_model(model)
         return model
 
+    def _hand_out(self, values: Sequence[Value], shape: Shape | None) -> None:
+        """Make values the results of a body: as they are if it made them, once each."""
+        made = {name for node in self._nodes for name in node.output}
+        for value in values:
+            handed = value if value.name in made else self.op("Identity", value)
+            made.discard(handed.name)
+            self._outputs.append(_info(handed.name, handed.dtype, shape))
+
     def _name(self) -> str:
         self._top._count += 1
         return f"v{self._top._count}"
@@ -180,3 +191,13 @@ class Graph:
 
 def _info(name: str, dtype: np.dtype[Any], shape: Shape | None) -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(dtype), shape)
+
+
+def _read_by(node: onnx.NodeProto) -> set[str]:
+    """Names of the values that a node takes, in its bodies too."""
+    names = set(node.input)
+    for attribute in node.attribute:
+        if attribute.type == onnx.AttributeProto.GRAPH:
+            names.update(name for inner in attribute.g.node for name in _read_by(inner))
+            names.update(output.name for output in attribute.g.output)
+    return names
