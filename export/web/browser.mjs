@@ -56,13 +56,15 @@ export async function ready(page) {
   if (problem) throw new Error(problem);
 }
 
-/** Play to the end as fast as the page can. */
+/** Play from the start to the end, as fast as the page can. */
 export async function playAll(page) {
+  const shows = (wanted) =>
+    page.waitForFunction((t) => document.getElementById("play-label").textContent === t, wanted);
+  await page.locator("#restart").click();
+  await shows("Play");
   await page.locator("input[name=speed][value=Infinity]").check({ force: true });
   await page.locator("#play").click();
-  await page.waitForFunction(
-    () => document.getElementById("play-label").textContent === "Play again",
-  );
+  await shows("Play again");
 }
 
 /** Lines as the other hosts print them with --decisions. */

@@ -86,7 +86,6 @@ async function dropped(page, path) {
     basename(path),
   );
   const said = await alert(page);
-  await page.locator("#restart").click();
   await playAll(page);
   return { said, lines: await decisionLines(page), invalid: await count(page, "invalid") };
 }
@@ -97,38 +96,49 @@ async function wrongRate(page) {
   const own = await rate.inputValue();
   await rate.fill("1000");
   await page.locator("#play").click();
-  const said = await alert(page);
-  const label = await text(page, "play-label");
+  const [said, label] = [await alert(page), await text(page, "play-label")];
   await rate.fill(own);
-  await page.locator("#play").click();
-  await shows(page, "play-label", "Pause");
-  return { said, label, saidAfter: await alert(page) };
+  const saidAfter = await alert(page);
+  await playAll(page);
+  return { said, label, saidAfter, lines: await decisionLines(page) };
+}
+
+/** What the page says of models that are not what they should be. */
+async function altered(page, servers) {
+  const said = [];
+  for (const { address } of servers) {
+    await page.goto(address);
+    await page.waitForFunction(() => !document.getElementById("alert").hidden);
+    said.push(await alert(page));
+  }
+  return said;
 }
 
 await run(async () => {
   const asked = given(process.argv.slice(2), OPTIONS);
   const servers = [await serve(asked)];
   for (const model of asked.altered) servers.push(await serve({ ...asked, model }));
-  const seen = { requests: [], errors: [], dropped: {}, altered: [] };
+  const seen = { requests: [], errors: [] };
   try {
     await withPage({}, async (page) => {
       page.on("request", (request) => seen.requests.push(request.url()));
       page.on("pageerror", (error) => seen.errors.push(error.message));
       await page.goto(servers[0].address);
       await ready(page);
-      seen.simulated = await text(page, "simulated");
-      seen.tabbed = await tabbed(page);
-      seen.keyboard = await keyboard(page);
-      await playAll(page);
-      seen.lines = await decisionLines(page);
-      seen.slider = await slider(page);
-      for (const path of asked.drop) seen.dropped[basename(path)] = await dropped(page, path);
-      seen.rate = await wrongRate(page);
-      for (const { address } of servers.slice(1)) {
-        await page.goto(address);
-        await page.waitForFunction(() => !document.getElementById("alert").hidden);
-        seen.altered.push(await alert(page));
-      }
+      const step = async (name, work) => {
+        seen[name] = await work(page).catch((error) => {
+          throw new Error(`${name}: ${error.message}`);
+        });
+      };
+      await step("simulated", () => text(page, "simulated"));
+      await step("tabbed", tabbed);
+      await step("keyboard", keyboard);
+      await step("played", playAll);
+      await step("lines", decisionLines);
+      await step("slider", slider);
+      for (const path of asked.drop) await step(basename(path), () => dropped(page, path));
+      await step("rate", wrongRate);
+      await step("altered", () => altered(page, servers.slice(1)));
     });
   } finally {
     for (const { close } of servers) close();

@@ -53,20 +53,18 @@ async function take(content, name, isSimulated, scope) {
   say(null);
 }
 
+function isRateRight() {
+  return Number(element("rate").value) === player.stream.facts.sample_rate_hz;
+}
+
 /** Play where the rate is the detector's, else say so. */
 function play() {
+  player.isPlaying = isRateRight();
   const wanted = player.stream.facts.sample_rate_hz;
-  const rate = Number(element("rate").value);
-  if (rate !== wanted) {
-    player.isPlaying = false;
-    say(
-      `the recording has ${element("rate").value || "no"} samples a second, the detector wants ` +
-        `${wanted}: resample it, or train a detector for that rate`,
-    );
-    return;
-  }
-  say(null);
-  player.isPlaying = true;
+  const problem =
+    `the recording has ${element("rate").value || "no"} samples a second, the detector wants ` +
+    `${wanted}: resample it, or train a detector for that rate`;
+  say(player.isPlaying ? null : problem);
 }
 
 async function toggle() {
@@ -86,7 +84,8 @@ function connectPlayback() {
     radio.addEventListener("change", () => (player.speed = Number(radio.value)));
   }
   element("rate").addEventListener("input", () => {
-    if (player.isPlaying || !element("alert").hidden) play();
+    if (isRateRight()) say(null);
+    else if (player.isPlaying) play();
   });
   document.addEventListener("keydown", (event) => {
     const isTaken = event.target.closest("button, input:not([type=range])");

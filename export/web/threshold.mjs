@@ -45,8 +45,9 @@ function byRate(facts, curve) {
 function byStatistic(facts) {
   const { threshold, rule } = facts;
   const ceiling = rule?.ceiling ?? Infinity;
-  const high = Number.isFinite(ceiling) ? ceiling : threshold + Math.max(5, Math.abs(threshold));
-  const low = Math.min(0, threshold - Math.max(5, Math.abs(threshold)));
+  const reach = Math.max(5, Math.abs(threshold));
+  const isBounded = Number.isFinite(ceiling); // then by 0 from below
+  const [low, high] = isBounded ? [0, ceiling] : [threshold - reach, threshold + reach];
   const toThreshold = (share) => low + share * (high - low);
   return {
     title: "Alarm threshold",

@@ -1,0 +1,259 @@
+"""The exported detector in a browser, export/web: what a user of the page sees, in a real one."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from hosts import (
+    Ran,
+    alarming_detector,
+    altered,
+    assert_same,
+    copied,
+    exported,
+    saved,
+    sidecar_of,
+    slipping_stream,
+    truncated,
+    truth,
+)
+from test_host_node import EXPORT, installed
+
+from tactslip_torch.onset.settings import KEY
+
+WEB = EXPORT / "web"
+BROWSER = Path(os.environ.get("CHROMIUM", "/usr/bin/chromium"))
+
+
+def ran(lines: list[str]) -> Ran:
+    """What the page decided, as if a host had printed it."""
+    *decisions, summary = [json.loads(line) for line in lines]
+    return Ran(decisions, summary, "", 0)
+
+
+def broken_stream() -> np.ndarray:
+    broken = slipping_stream()[:2000].copy()
+    broken[700:740] = np.nan
+    return broken
+
+
+@pytest.fixture(scope="module")
+def script():
+    """Runs a script of the page, gives what it prints."""
+    if not BROWSER.exists():
+        pytest.skip(f"no browser {BROWSER}: apt-get install chromium, or set CHROMIUM")
+    installed(WEB)
+
+    def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+        command = ["node", WEB / name, *arguments]
+        return subprocess.run(
+            [str(part) for part in command],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
+        )
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    return exported(tmp_path_factory) / "stream.onnx"
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return saved(tmp_path_factory.mktemp("recording") / "recording.npy", slipping_stream())
+
+
+@pytest.fixture(scope="module")
+def seen(script, model, recording, tmp_path_factory):
+    """What ``check.mjs`` saw: one browser for all that is asked below."""
+    folder = tmp_path_factory.mktemp("dropped")
+    (folder / "notes.npy").write_text("volts\n")
+    seven = saved(folder / "seven.npy", slipping_stream()[:600, :7].copy())
+    broken = saved(folder / "broken.npy", broken_stream())
+    changed = []
+    for name, change in {
+        "altered": altered,
+        "truncated": truncated,
+        "lone": lambda path: sidecar_of(path).unlink(),
+        "slower": lambda path: _says(path, sample_rate_hz="1 kHz"),
+        "bin": lambda path: _says(path, graph="bin"),
+    }.items():
+        changed.append(copied(model, tmp_path_factory.mktemp(name)))
+        change(changed[-1])
+    files = ["--simulated", "--model", model, "--recording", recording]
+    dropped = [f"--drop={path}" for path in (folder / "notes.npy", seven, broken)]
+    done = script("check.mjs", *files, *dropped, *[f"--altered={path}" for path in changed])
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def _says(model: Path, **facts: object) -> None:
+    """Change what a sidecar says."""
+    sidecar = sidecar_of(model)
+    sidecar.write_text(json.dumps(json.loads(sidecar.read_text()) | facts))
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_the_page_decides_what_the_package_decides(seen):
+    assert_same(ran(seen["lines"]), truth(slipping_stream()))
+    assert seen["errors"] == []
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_nothing_leaves_this_machine(seen):
+    assert any(url.endswith("/model") for url in seen["requests"])
+    assert {urlsplit(url).hostname for url in seen["requests"]} == {"127.0.0.1"}
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_it_is_used_by_keyboard_alone(seen):
+    assert seen["keyboard"]["playing"] == "Pause"
+    assert seen["keyboard"]["paused"] == seen["keyboard"]["after"] > 0
+    controls = {each["id"]: each for each in seen["tabbed"]}
+    assert set(controls) == {"play", "restart", "speed", "rate", "file", "threshold", "reset"}
+    assert all(each["label"] and each["isRinged"] for each in controls.values())
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_the_slider_judges_again_by_another_threshold(seen):
+    slider = {name: ran(told["lines"]) for name, told in seen["slider"].items()}
+    assert slider["own"] == ran(seen["lines"])
+    alarms = {name: told.summary["alarms"] for name, told in slider.items()}
+    own = alarming_detector().info[KEY]["threshold"]
+    standing = {name: sum(line["on"] for line in told.lines) for name, told in slider.items()}
+    low, high = ("least", "most") if standing["least"] > standing["most"] else ("most", "least")
+    assert standing[low] > standing["own"] > standing[high]
+    assert alarms[high] < alarms["own"]
+    assert own not in (0.0, 8.0)  # the ends of the slider are others
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_a_file_that_is_no_recording_is_one_line_and_the_page_goes_on(seen):
+    for name, words in {"notes.npy": ("no .npy",), "seven.npy": ("7", "24")}.items():
+        told = seen[name]
+        assert name in told["said"]
+        assert all(word in told["said"] for word in words)
+        assert len(told["said"].splitlines()) == 1
+        assert told["lines"] == seen["lines"]
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_missing_samples_are_flagged_and_the_page_goes_on(seen):
+    told = seen["broken.npy"]
+    expected = truth(broken_stream())
+    assert [line["valid"] for line in ran(told["lines"]).lines] == [
+        row["valid"] for row in expected
+    ]
+    assert told["invalid"] == sum(not row["valid"] for row in expected) > 0
+    assert told["said"] == ""
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_a_recording_of_another_rate_is_not_played(seen):
+    assert all(rate in seen["rate"]["said"] for rate in ("1000", "2000"))
+    assert seen["rate"]["label"] != "Pause"
+    assert seen["rate"]["saidAfter"] == ""
+    assert seen["rate"]["lines"] == seen["broken.npy"]["lines"]  # what was dropped last
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_a_model_that_is_not_what_it_should_be_is_one_line(seen):
+    changed, cut, lone, slower, of_bins = seen["altered"]
+    assert "stream.onnx.json" in changed
+    assert "stream.onnx.json" in cut
+    assert "stream.onnx.json" in lone
+    assert "sample_rate_hz" in slower
+    assert "1 kHz" in slower
+    assert "bin graph" in of_bins
+    assert all(len(line.splitlines()) == 1 for line in seen["altered"])
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_the_page_says_what_is_simulated(seen):
+    assert "recording" in seen["simulated"]
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
+def test_a_shot_leaves_a_picture_and_the_decisions(script, model, recording, tmp_path):
+    picture = tmp_path / "page.png"
+    done = script(
+        "shot.mjs", "--model", model, "--recording", recording, "--output", picture, "--scheme=dark"
+    )
+    assert done.returncode == 0, done.stderr
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.png"]
+    assert_same(ran(done.stdout.splitlines()), truth(slipping_stream()))
+
+
+SCALE = """
+import { thresholdScale } from "./threshold.mjs";
+const scale = thresholdScale(JSON.parse(process.argv[1]));
+const shares = Array.from({ length: 101 }, (_, i) => i / 100);
+const own = scale.toThreshold(scale.own);
+console.log(JSON.stringify({ thresholds: shares.map(scale.toThreshold), own, title: scale.title }));
+"""
+
+
+def scale_of(facts):
+    """Thresholds from the left end of the slider to its right end, and at the file's own mark."""
+    installed(WEB)
+    command = ["node", "--input-type=module", "-e", SCALE, json.dumps(facts)]
+    done = subprocess.run(command, cwd=WEB, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def test_the_slider_goes_by_false_alarms_where_the_model_knows_them():
+    curve = [[9.0, 0.0], [8.0, 0.5], [7.0, 0.5], [6.0, 2.0], [3.0, 90.0], [1.0, 700.0]]
+    cusum = {"name": "cusum", "ceiling": 10.0}
+    told = scale_of({"threshold_curve": curve, "threshold": 5.0, "rule": cusum})
+    assert told["title"] == "False alarms allowed"
+    assert told["thresholds"] == sorted(told["thresholds"], reverse=True)
+    assert told["thresholds"][0] == 8.0  # a rate of 0 has no logarithm
+    assert told["thresholds"][-1] == 1.0
+    assert told["own"] == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(
+    ("ceiling", "low", "high"), [(8.0, 0.0, 8.0), (None, -3.0, 7.0)], ids=["bounded", "free"]
+)
+def test_the_slider_goes_by_the_statistic_where_no_rates_are_known(ceiling, low, high):
+    rule = {"name": "hysteresis", "ceiling": ceiling}
+    told = scale_of({"threshold_curve": [], "threshold": 2.0, "rule": rule})
+    assert told["title"] == "Alarm threshold"
+    assert (told["thresholds"][0], told["thresholds"][-1]) == (low, high)
+    assert told["thresholds"] == sorted(told["thresholds"])
+    assert told["own"] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says", "status"),
+    [
+        ([], "--model", 2),
+        (["--model", "no.onnx", "--recording", "no.npy"], "no.onnx", 1),
+        (["--model", "no.onnx", "--port", "many"], "many", 1),
+    ],
+)
+def test_the_server_says_in_one_line_what_is_wrong(script, arguments, says, status):
+    done = script("serve.mjs", *arguments)
+    assert done.returncode == status
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert says in line
