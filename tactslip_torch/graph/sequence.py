@@ -1,8 +1,8 @@
 """From scores to alarms, as a graph: what ``Decider`` does.
 
-What one decision hands to the next, and no more, is walked by a ``Scan``; its iterations cost ten
-times what an entry of a vector does. So a rule's walk is its recurrence alone, and the latch's only
-where an alarm is raised.
+What one decision hands to the next, and no more, is walked by a ``Scan``, an iteration of which
+costs as much as several nodes do on all decisions together. While nothing speaks for slip, nothing
+is walked.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from tactslip_torch.model.calibration import (
 )
 from tactslip_torch.onset.sequential import NOTHING_YET, BayesFilter, Cusum, Hysteresis, KOfN, Rule
 
-LONG_AGO = 2.0**52
-"""Decisions since an alarm that never was; counts on exactly in float64."""
+LATCH_START = (0.0, 0.0, 2.0**52)
+"""Armed, with no alarm before; the last number counts on exactly in float64."""
 _LARGEST_EXPONENT = 600.0  # beyond it odds are all or nothing, and their products still finite
 
 END = int(np.iinfo(np.int64).max)
@@ -132,12 +132,12 @@ class Latched(NamedTuple):
     Attributes:
         alarm: whether it raises one, ``[k]``, bool.
         on: whether one stands after it, ``[k]``, bool.
-        memory: what ``latched`` is given for the next decisions, ``[1]`` each.
+        memory: what ``latched`` is given for the next decisions, ``[3]``.
     """
 
     alarm: Value
     on: Value
-    memory: tuple[Value, Value, Value]
+    memory: Value
 
 
 def latched(
@@ -145,50 +145,71 @@ def latched(
     level: Value,
     low: Value,
     number: Value,
-    memory: tuple[Value, Value, Value],
+    memory: Value,
     *,
     rearm: int,
     refractory: int,
 ) -> Latched:
     """Alarms as ``onset.latch`` raises them.
 
-    An alarm may be raised where the last one is no later than the last re-arming and than
-    ``refractory`` decisions back. Both are known beforehand; so only the number of the last alarm
-    is walked, and only if there is one.
-
     Args:
         statistic: finite.
         level: from which on an alarm is raised.
         low: below which it counts towards re-arming; not above ``level``.
         number: of the decisions in their stream, float64.
-        memory: whether an alarm stands, decisions in a row below ``low``, and decisions since the
-            last alarm; float64.
+        memory: whether an alarm stands, for how many decisions then the statistic was low, and
+            decisions since the last alarm (``LATCH_START``); float64.
         rearm: decisions in a row that must be low.
         refractory: shortest distance of two alarms, in decisions.
 
     Shape:
         - statistic, number: ``[k]``, k at least 1
-        - level, low, memory: ``[1]``
+        - level, low: ``[1]``
+        - memory: ``[3]``
     """
     graph = statistic.graph
-    on, below, since = memory
+    is_awake = (statistic.amax(0, keep=True) >= level) | (memory.slice(0, 1, 0) > 0.0)
+
+    def watch(body: Graph) -> Latched:
+        given = (x.at(body) for x in (statistic, level, low, number, memory))
+        return _watched(*given, rearm=rearm, refractory=refractory)
+
+    def sleep(body: Graph) -> Latched:
+        is_high = statistic.at(body) >= level.at(body)  # nowhere
+        num = number.at(body).length(0).cast(F64)
+        return Latched(is_high, is_high, (memory.at(body) + num) * body.constant([0, 0, 1], F64))
+
+    return Latched(*graph.if_(is_awake, watch, sleep))
+
+
+def _watched(
+    statistic: Value,
+    level: Value,
+    low: Value,
+    number: Value,
+    memory: Value,
+    *,
+    rearm: int,
+    refractory: int,
+) -> Latched:
+    """Where the statistic is high, or an alarm stands.
+
+    One is raised where it is high and the last alarm is no later than the last re-arming, and than
+    ``refractory`` decisions back. So only the number of the last alarm is walked.
+    """
+    graph = statistic.graph
+    on, below, since = graph.ops("Split", memory, dtypes=(F64,) * 3, axis=0, num_outputs=3)
     before = number.slice(0, 1, 0) - 1.0
     last = before - since
     high = latest(statistic >= low, before - below, number)  # the last one that was not low
     rearmed = latest(number - high >= float(max(rearm, 1)), last - on, number)
     allowed = rearmed.min(number - float(refractory))
-    latest_allowed = graph.where(statistic >= level, allowed, -math.inf)
-
-    def walk(body: Graph) -> list[Value]:
-        rows = [latest_allowed.at(body), number.at(body)]
-        return body.scan(_raise, [last.at(body).squeeze(0)], rows)[1]
-
-    is_any = latest_allowed.amax(0, keep=True) >= last
-    alarms = graph.if_(is_any, walk, lambda body: [last.at(body)])[0]  # [k], or none and [1]
+    allowed = graph.where(statistic >= level, allowed, -math.inf)
+    (end,), (alarms,) = graph.scan(_raise, [last.squeeze(0)], [allowed, number])
     is_on = alarms > rearmed
-    end = _last(number)
-    after = (_last(is_on).cast(F64), end - _last(high), end - _last(alarms))
-    return Latched(alarms.equals(number), is_on, after)
+    now = _last(number)
+    after = _last(is_on).cast(F64), now - _last(high), now - end
+    return Latched(alarms.equals(number), is_on, graph.concat(*after, axis=0))
 
 
 def _raise(body: Graph, state: Sequence[Value], rows: Sequence[Value]) -> Steps:
@@ -210,16 +231,22 @@ def _k_th_largest(rule: KOfN, llr: Value, memory: Value) -> Walk:
 
 
 def _sum(rule: Cusum, llr: Value, memory: Value) -> Walk:
+    graph = llr.graph
     step = llr - rule.drift if rule.drift else llr
     step = step * rule.evidence if rule.evidence != 1 else step
+    start = memory.cast(llr.dtype)
 
     def add(body: Graph, state: Sequence[Value], rows: Sequence[Value]) -> Steps:
-        total = (state[0] + rows[0]).clip(0.0, rule.ceiling)
-        return [total], [total]
+        total = state[0] + rows[0]
+        return [total.clip(0.0, rule.ceiling)], [total]
 
-    start = memory.cast(llr.dtype).squeeze(0)
-    _, (statistic,) = llr.graph.scan(add, [start], [step])
-    return statistic, _last(statistic).cast(F64)
+    def walk(body: Graph) -> list[Value]:
+        return body.scan(add, [start.at(body).squeeze(0)], [step.at(body)])[1]
+
+    # Where every step takes away at least what is there, the sum is 0 without a walk.
+    is_quiet = start + step.amax(0, keep=True) <= 0.0
+    total = graph.if_(is_quiet, lambda body: [step.at(body)], walk)[0].clip(0.0, rule.ceiling)
+    return total, _last(total).cast(F64)
 
 
 def _odds(rule: BayesFilter, llr: Value, memory: Value) -> Walk:

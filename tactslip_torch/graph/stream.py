@@ -14,7 +14,7 @@ from tactslip_torch.graph.bins import Judged, judge_bins
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.sequence import (
     END,
-    LONG_AGO,
+    LATCH_START,
     count_up,
     latched,
     latest,
@@ -96,10 +96,8 @@ def stream_graph(
 
     nothing = graph.constant([[0.0] * num_channels] * timing.tail, form.dtype)
     held = graph.concat(nothing, tail, samples, axis=0)
-    start = graph.constant([0, 0, 0, 0, 0, LONG_AGO, *rule_start(settings.rule)], F64)
+    start = graph.constant([0, 0, 0, *LATCH_START, *rule_start(settings.rule)], F64)
     state = graph.concat(state, start, axis=0).slice(0, timing.state_size, 0)
-    own = graph.constant([settings.threshold], F64)
-    threshold = graph.concat(threshold, own, axis=0).slice(0, 1, 0)
     seen = state.slice(0, 1, 0) + samples.length(0).cast(F64)
     decided = ((seen + float(timing.hop - timing.first)) / float(timing.hop)).floor().max(0.0)
     if timing.frame > timing.first:
@@ -146,21 +144,24 @@ class _Deciding:
     ) -> list[Value]:
         """All outputs but the tail, the state last."""
         graph, settings, pool = held.graph, self.settings, self.detector.pool
-        _, made, run, on, low, since = (state.slice(i, i + 1, 0) for i in range(6))
+        sizes = graph.axes(1, 1, 1, 3, self.timing.state_size - 6)
+        parts = graph.ops("Split", state, sizes, dtypes=(F64,) * 5, axis=0)
+        _, made, run, of_latch, of_rule = parts
         places = count_up((decided - made).cast(I64))
         number = places.cast(F64) + made
         windows = self._windows(held, seen, made, places)
         judged = self.judge(graph, self.detector, windows, self.form)
 
         llr = graph.where(judged.is_usable, llr_of(judged.score, settings.calibration), NEUTRAL)
-        statistic, memory = statistic_of(settings.rule, llr, state.slice(6, END, 0))
-        level = threshold.cast(self.form.dtype)
+        statistic, of_rule = statistic_of(settings.rule, llr, of_rule)
+        own = graph.constant([settings.threshold], F64)
+        level = graph.concat(threshold, own, axis=0).slice(0, 1, 0).cast(self.form.dtype)
         raised = latched(
             statistic,
             level,
             level - settings.rule.margin if settings.rule.margin else level,
             number,
-            (on, low, since),
+            of_latch,
             rearm=settings.decisions(settings.rearm_s, pool.sample_rate_hz),
             refractory=settings.decisions(settings.refractory_s, pool.sample_rate_hz),
         )
@@ -174,45 +175,57 @@ class _Deciding:
             raised.alarm,
             raised.on,
             *self._times_s(number, run),
-            graph.concat(seen, decided, last_run, *raised.memory, memory, axis=0),
+            graph.concat(seen, decided, last_run, raised.memory, of_rule, axis=0),
         ]
 
     def _windows(self, held: Value, seen: Value, made: Value, places: Value) -> Value:
         """The samples of each decision, float64, ``[k, channels in use, Window.length]``.
 
-        ``held`` ends with sample number ``seen``.
+        ``held`` ends with sample number ``seen``. Channels in between that are not in use go along,
+        as columns are costly to pick and rows are not.
         """
         graph, timing, window = held.graph, self.timing, self.timing.window
-        first = made * float(timing.hop)  # sample of the first bin
-        origin = held.length(0) + (first - seen).cast(I64) - window.before
-        x = held.slice(origin, END, 0)
-        if window.channels != tuple(range(len(self.detector.pool.hand))):
-            x = x.take(window.channels, 1)
+        start = made * float(timing.hop)  # of the first bin
+        origin = start - seen - float(window.before)  # negative: counted from the end
+        x = held.slice(origin.cast(I64), END, 0)
+        columns = self._columns
+        if len(columns) < len(self.detector.pool.hand):
+            x = x.slice(columns.start, columns.stop, 1)
         x = x.cast(F64)
         if window.before:
-            whole, bin_start = x, first.cast(I64)
+            whole, of_stream = x, start.cast(I64)
             x = graph.if_(
-                first < float(window.before),
-                lambda body: [self._with_past(whole.at(body), bin_start.at(body))],
+                start < float(window.before),
+                lambda body: [self._with_past(whole.at(body), of_stream.at(body))],
                 lambda body: [whole.at(body)],
             )[0]
-        starts = (places * timing.hop).expand(1)  # [k, 1]
-        index = starts + graph.axes(*range(window.length))
-        return graph.op("Gather", x, index, axis=0).transpose(0, 2, 1)
+        index = (places * timing.hop).expand(1) + graph.axes(*range(window.length))
+        windows = graph.op("Gather", x, index, axis=0).transpose(0, 2, 1)
+        if len(columns) == len(window.channels):
+            return windows
+        return windows.take([columns.index(channel) for channel in window.channels], 1)
 
-    def _with_past(self, x: Value, bin_start: Value) -> Value:
+    @property
+    def _columns(self) -> range:
+        """The channels from the first in use to the last."""
+        channels = self.timing.window.channels
+        return range(channels[0], channels[-1] + 1)
+
+    def _with_past(self, x: Value, start: Value) -> Value:
         """The first window and what follows, with a made-up past before the stream's start.
 
         Args:
-            x: ``[m, channels in use]``, from ``Window.before`` samples before ``bin_start``.
-            bin_start: sample of the stream at which the first bin starts, ``[1]``.
+            x: ``[m, columns]``, from ``Window.before`` samples before ``start``.
+            start: of the first bin, a sample of the stream, ``[1]``.
         """
         graph, window = x.graph, self.timing.window
-        known = x.slice(-bin_start + window.before, END, 0)
-        of_channel = self.detector.channel_filter.window_lengths
+        known = x.slice(-start + window.before, END, 0)
+        lengths = self.detector.channel_filter.window_lengths
+        shortest = min(lengths[channel] for channel in window.channels)
+        of_column = [lengths[c] if c in window.channels else shortest for c in self._columns]
         pasts, order = list[Value](), list[int]()
-        for length in dict.fromkeys(of_channel[channel] for channel in window.channels):
-            chosen = [i for i, c in enumerate(window.channels) if of_channel[c] == length]
+        for length in dict.fromkeys(of_column):
+            chosen = [i for i, own in enumerate(of_column) if own == length]
             frame = known.slice(0, length, 0).take(chosen, 1)
             sample = frame.slice(0, 1, 0)
             pasts.append(graph.constant(self._past(length), F64) @ (frame - sample) + sample)
@@ -220,7 +233,7 @@ class _Deciding:
         past = graph.concat(*pasts, axis=1)
         if order != sorted(order):
             past = past.take(sorted(range(len(order)), key=order.__getitem__), 1)
-        return graph.concat(past.slice(bin_start, END, 0), known, axis=0)
+        return graph.concat(past.slice(start, END, 0), known, axis=0)
 
     def _past(self, length: int) -> Tensor:
         """``past_matrix`` of a frame, with rows of 0 for what lies beyond its reach."""
