@@ -86,7 +86,7 @@ def test_a_right_bin_graph_passes_and_is_measured(detector):
     facts = check_bins(bin_run(detector), detector, SINGLE)
     assert facts["simulated"] is True
     assert facts["score_sd"] > 0
-    assert (facts["noise"]["bins"], facts["recorded"]["bins"]) == (64, 56)
+    assert (facts["noise"]["bins"], facts["recorded"]["bins"]) == (64, 256)
     for name in ("noise", "recorded"):
         assert 0 < facts[name]["worst_sd"] < 1e-3
     assert set(facts["degenerate"]) == set(KINDS)
@@ -147,12 +147,12 @@ def mixed_up(samples, out):
 
 
 WRONG_BINS = {
-    "another name": (renamed, r"it gives .*scores float32\[56\].*, expected .*score float32\[56\]"),
+    "another name": (renamed, r"it gives .*scores float32\[256\].*, expected .*score float32\[256\]"),
     "another dtype": (widened, r"it gives .*score float64.*, expected .*score float32"),
-    "frozen batch": (frozen, r"it gives .*\[7\].*, expected .*\[56\]"),
+    "frozen batch": (frozen, r"it gives .*\[7\].*, expected .*\[256\]"),
     "rows mixed up": (mixed_up, "scores differ from torch in float64"),
     "one score off": (at(one_bin, score=0.123), "scores differ from torch in float64"),
-    "one flag wrong": (at(one_bin, valid=False), "valid differs from torch on 1 of 56 bins"),
+    "one flag wrong": (at(one_bin, valid=False), "valid differs from torch on 1 of 256 bins"),
     "one probability": (at(one_bin, probability=2.0), "probability is .* off that of its score"),
     "trusts the dead": (at(constant, valid=True), r"\(constant\): valid differs from torch on 16"),
     "nan of constants": (at(constant, score=np.nan), r"\(constant\): 16 scores are not finite"),

@@ -31,7 +31,7 @@ ALL_ROUNDING = ("offset 1e6, vibration 1e-6",)
 """Kinds that hold so few digits that a step in a descriptor may fall between any two sums."""
 WORST_PROBABILITY = {"float32": 1e-5, "float64": 1e-9}
 """By which a probability may differ from that of the score beside it."""
-_EACH = 16  # degenerate bins of a kind
+_SIMULATED, _EACH = 256, 16  # bins, and of each degenerate kind
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def check_bins(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
     judged = _Judged(run, detector, form)
     hand, rate = detector.pool.hand, detector.pool.sample_rate_hz
     length, dtype = judged.window.length, judged.dtype
-    simulated = simulated_bins(hand, rate, BATCHES[-1], length, dtype)
+    simulated = simulated_bins(hand, rate, _SIMULATED, length, dtype)
     recorded = judged.compare([simulated], "simulated bins")
     drawn = [noise_bins(hand, batch, length, seed, dtype) for seed, batch in enumerate(BATCHES)]
     noise = judged.compare(drawn, "noise")
