@@ -48,10 +48,7 @@ def modes(graph: Graph, values: Value, scale: Value, num: int) -> Value:
     ordered = _sorted(values, num)
     tolerance = scale * RUN_TOLERANCE[torch.float64]
     is_new = ordered.slice(1, num, 2) - ordered.slice(0, num - 1, 2) > tolerance.expand(2)
-    smallest = ordered.slice(0, 1, 2)
     has_runs = (~is_new).cast(I64).amax(2).amax(1).amax(0) > 0
-    if num == 2:
-        return smallest.squeeze(2)
 
     def counted(body: Graph) -> Sequence[Value]:
         rank = _rank_in_run(is_new.at(body), num)  # [B, R, n]
@@ -59,7 +56,10 @@ def modes(graph: Graph, values: Value, scale: Value, num: int) -> Value:
         length = body.op("GatherElements", rank, last, axis=2)
         return [body.op("GatherElements", ordered.at(body), last - length, axis=2)]
 
-    return graph.if_(has_runs, counted, lambda body: [smallest.at(body)])[0].squeeze(2)
+    def smallest(body: Graph) -> Sequence[Value]:
+        return [ordered.at(body).slice(0, 1, 2)]
+
+    return graph.if_(has_runs, counted, smallest)[0].squeeze(2)
 
 
 def entropy(values: Value, num: int, dtype: np.dtype[Any]) -> Value:

@@ -25,8 +25,7 @@ class Graph:
     """Nodes, constants, inputs and outputs that become a model, or the body of an ``if_``.
 
     Args:
-        parent: of a body: where its constants go, whose values it may use and whose names it
-            avoids.
+        parent: of a body: whose values it may use and whose names it avoids.
     """
 
     def __init__(self, parent: Graph | None = None) -> None:
@@ -49,13 +48,15 @@ class Graph:
         self._outputs.append(_info(name, named.dtype, shape))
 
     def constant(self, value: ArrayLike, dtype: np.dtype[Any]) -> Value:
-        """A tensor kept in the file, once however often it is asked for."""
-        if self._top is not self:
-            return Value(self, self._top.constant(value, dtype).name, dtype)
+        """A tensor kept in the file, once however often it is asked for.
+
+        A body has its own: onnxruntime prepares a constant for a node only where both are in one
+        graph, and hands every value from around a body over at each run.
+        """
         array = np.ascontiguousarray(np.asarray(value, dtype)).reshape(np.shape(value))
         key = (array.dtype.name, array.shape, array.tobytes())
         if key not in self._constants:
-            name = f"c{len(self._constants)}"
+            name = self._name("c")
             self._tensors.append(numpy_helper.from_array(array, name))
             self._constants[key] = Value(self, name, dtype)
         return self._constants[key]
@@ -184,9 +185,9 @@ class Graph:
             made.discard(handed.name)
             self._outputs.append(_info(handed.name, handed.dtype, shape))
 
-    def _name(self) -> str:
+    def _name(self, prefix: str = "v") -> str:
         self._top._count += 1
-        return f"v{self._top._count}"
+        return f"{prefix}{self._top._count}"
 
 
 def _info(name: str, dtype: np.dtype[Any], shape: Shape | None) -> onnx.ValueInfoProto:
