@@ -8,8 +8,9 @@ const FILM_SHARE = 2; // a film's lane is so much higher than a gauge's
 export const GUTTER = 62;
 
 /**
- * Middle of each channel, and volts from lane to lane of each kind: room for what is usual in the
- * channel in the middle, while a burst or a wide channel may cross its neighbours.
+ * Middle of each channel, and volts from lane to lane of each kind, by its channel in the middle.
+ * Gauges rest and now and then move far: room for four times the range of half of their samples.
+ * Films burst: room for nearly all of them. What is larger crosses the neighbours' lanes.
  *
  * @param {Float32Array|Float64Array} volts row by row
  * @param {string[]} kinds of the channels
@@ -29,7 +30,7 @@ export function laneScales(volts, kinds) {
     const sorted = Float64Array.from(known).sort();
     const at = (share) => sorted[Math.floor(share * (sorted.length - 1))] ?? 0;
     middle.push(at(0.5));
-    const width = Math.max(1.5 * (at(0.95) - at(0.05)), 0.25 * (at(1) - at(0)));
+    const width = kind === "PVDF" ? 1.1 * (at(0.995) - at(0.005)) : 4 * (at(0.75) - at(0.25));
     (widths[kind] ??= []).push(width);
   });
   const typical = ([kind, all]) => {
