@@ -161,13 +161,10 @@ class Front:
 
     def _values(self, rows: Sequence[Row], dtype: np.dtype[Any]) -> tuple[Value, ...]:
         """Of rows of one block: values, or the two parts of spectra."""
-        group, shape = (
-            self._of[rows[0].channel],
-            self._of[rows[0].channel].blocks[self._key(rows[0])],
-        )
+        group, key = self._of[rows[0].channel], self._key(rows[0])
+        shape, known = group.blocks[key], group.exact if dtype == F64 else group.coordinates
         places = [group.channels.index(row.channel) for row in rows]
-        chosen = _taken(group.coordinates[self._key(rows[0])], places, len(group.channels))
-        chosen = chosen.cast(dtype)
+        chosen = _taken(known[key], places, len(group.channels))
         if rows[0].kind == "freq":
             return chosen @ shape.cosine, chosen @ shape.sine
         return (chosen if shape.out is None else chosen @ shape.out,)
