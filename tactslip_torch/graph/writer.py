@@ -18,6 +18,7 @@ from tactslip_torch.graph.value import F64, I64, Value
 
 OPSET = 20
 IR_VERSION = 10  # the oldest that has the opset; newer ones are refused by older runtimes
+_FEW = 64  # ones and zeros that are not worth a node
 Shape = Sequence[int | str]
 
 
@@ -48,10 +49,9 @@ class Graph:
         self._outputs.append(_info(name, named.dtype, shape))
 
     def constant(self, value: ArrayLike, dtype: np.dtype[Any]) -> Value:
-        """A tensor kept in the file, once however often it is asked for.
+        """A tensor, kept once in its graph however often it is asked for.
 
-        A body has its own: onnxruntime prepares a constant for a node only where both are in one
-        graph, and hands every value from around a body over at each run.
+        A body has its own: what is around a body is handed over to it anew at each run.
         """
         array = np.ascontiguousarray(np.asarray(value, dtype)).reshape(np.shape(value))
         key = (array.dtype.name, array.shape, array.tobytes())
