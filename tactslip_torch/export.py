@@ -1,242 +1,203 @@
 """Write a detector as ONNX: ``python -m tactslip_torch.export model=detector.pt``.
 
-The graph takes raw bins with their filter context, in float32, and gives for each a score and
-whether it is valid, as ``SlipDetector.judge_raw``: a channel with a NaN or Inf counts as missing.
-It holds the whole pool, matrices for every linear map, and no operator that is slow or missing in
-onnxruntime. A file is left only if onnxruntime gives torch's scores and flags at batch sizes the
-graph was not traced with, on dead and broken channels too.
-
-ONNX has no ``log1p``: a scaler's knee becomes ``Log(1 + x)``, off by some float64 eps of the knee.
+``model.onnx`` judges bins; ``stream.onnx``, of a detector with alarm settings, takes samples as
+they come and raises alarms. Both hold no more than the selected features need, and facts for a
+host, which stand in a sidecar ``<file>.json`` too. A file is left only if it passes the self-check
+(``graph.check``).
 """
 
 from __future__ import annotations
 
-import contextlib
-import copy
-import io
-import logging
+import hashlib
+import json
 import os
-import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any, get_args
 
 import hydra
-import numpy as np
 import onnx
-import onnxruntime
-import torch
 from omegaconf import DictConfig
-from torch import Tensor, nn
 
 import tactslip_torch
+from tactslip_torch.certify import FORMAT as CERTIFICATE_FORMAT
 from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.files import whole_file
+from tactslip_torch.graph.bins import bin_graph
+from tactslip_torch.graph.check import check_file, check_model
+from tactslip_torch.graph.facts import (
+    GraphKind,
+    Origin,
+    certificate_facts,
+    detector_sha256,
+    in_file,
+    model_facts,
+    sidecar_path,
+    sidecar_text,
+)
+from tactslip_torch.graph.form import Form, Layout, Precision
+from tactslip_torch.graph.stream import stream_graph
+from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
+from tactslip_torch.onset.settings import KEY, AlarmSettings
 
-OPSET = 20
-CHECKED_BATCHES = (1, 7, 56)
-WORST_ERROR = 1e-3
-"""Largest allowed ``onnx_error``."""
-CHECKED_SHARE = 0.9
-"""Share of bins that it speaks of where the pool computes in float32 (``arithmetic="native"``):
-mode and entropy step, and a step may fall between two sums. It speaks of all where it does not."""
+FILES: dict[GraphKind, str] = {"bin": "model.onnx", "stream": "stream.onnx"}
+"""What the file of each graph is called."""
 
 
-class _RawJudgement(nn.Module):
-    """``judge_raw`` as ``forward``, which is what gets exported."""
+def export_detector(
+    detector: SlipDetector,
+    folder: str | os.PathLike[str],
+    graphs: Sequence[GraphKind] = ("bin", "stream"),
+    precision: Precision = "float32",
+    layout: Layout = "latency",
+    *,
+    source: str | os.PathLike[str] | None = None,
+    alone: bool = True,
+) -> tuple[Path, ...]:
+    """Write graphs of a detector, checked, each with its sidecar; all of them or none.
 
-    def __init__(self, detector: SlipDetector) -> None:
-        super().__init__()
-        self.detector = detector
-
-    def forward(self, samples: Tensor) -> tuple[Tensor, Tensor]:
-        score, is_valid, _ = self.detector.judge_raw(samples)
-        return score, is_valid
-
-
-def export_onnx(detector: SlipDetector, path: str | os.PathLike[str]) -> float:
-    """Write ``samples [B, C, before + n + after] -> score [B], valid [B]``, float32, and check it.
-
-    Returns:
-        ``onnx_error`` of the file.
-
-    Raises:
-        ValueError: if onnxruntime's scores differ by more than ``WORST_ERROR``, or its flags at
-            all; no file is left.
-    """
-    single = copy.deepcopy(detector).float().eval()
-    with whole_file(path) as temporary:
-        traced = torch.randn(3, *_input_shape(detector))
-        _write_graph(_RawJudgement(single), traced, temporary, ("score", "valid"))
-        _describe_in_file(detector, temporary)
-        worst = onnx_error(detector, temporary)
-        if not worst <= WORST_ERROR:
-            raise ValueError(
-                f"onnxruntime and torch differ by {worst:.2e} standard deviations of the score, "
-                f"more than {WORST_ERROR:g}: {os.fspath(path)} was not written"
-            )
-        if wrong := _wrong_flags(detector, temporary):
-            raise ValueError(
-                f"onnxruntime and torch disagree on which bins are valid (kinds {wrong}): "
-                f"{os.fspath(path)} was not written"
-            )
-    return worst
-
-
-def onnx_error(detector: SlipDetector, path: str | os.PathLike[str]) -> float:
-    """Difference between the scores of an exported file and of the detector in float32.
-
-    On noise of several sizes, at batch sizes the graph was not traced with; in units of the
-    standard deviation of the detector's scores there; exceeded by no bin, or by a tenth of the bins
-    at most where features are computed in float32.
-    What float32 itself costs is another question: it belongs to the detector, not to the file.
-
-    Raises:
-        ValueError: if the graph gives another number of scores than bins.
-    """
-    single = copy.deepcopy(detector).float()
-    session = onnxruntime.InferenceSession(os.fspath(path), providers=["CPUExecutionProvider"])
-    generator = torch.Generator().manual_seed(0)
-    errors, scores = [], []
-    for batch in CHECKED_BATCHES:
-        size = 10 ** torch.linspace(0, -3, batch)[:, None, None]
-        samples = size * torch.randn(batch, *_input_shape(detector), generator=generator)
-        with torch.no_grad():
-            expected = single.score_raw(samples)
-        got = torch.from_numpy(session.run(["score"], {"samples": samples.numpy()})[0])
-        if got.shape != expected.shape:
-            raise ValueError(
-                f"the graph gives scores {tuple(got.shape)} at batch {batch}, "
-                f"expected {tuple(expected.shape)}"
-            )
-        errors.append((got - expected).abs())
-        scores.append(expected)
-    share = CHECKED_SHARE if single.pool.arithmetic == "native" else 1.0
-    return float(torch.cat(errors).quantile(share) / torch.cat(scores).std())
-
-
-def _wrong_flags(detector: SlipDetector, path: Path) -> list[str]:
-    """Kinds of extreme bins of which a file and the detector disagree, or give no finite score."""
-    single = copy.deepcopy(detector).float()
-    session = onnxruntime.InferenceSession(os.fspath(path), providers=["CPUExecutionProvider"])
-    generator = torch.Generator().manual_seed(2)
-    wrong = []
-    for kind in (*EXTREMES, "nan", "inf"):
-        broken = kind not in EXTREMES
-        drawn = extreme_bins(
-            "plain" if broken else kind, (24, *_input_shape(detector)), generator, torch.float32
-        )
-        if broken:  # one sample of one channel a bin
-            rows = torch.arange(24)
-            drawn[rows, rows % drawn.shape[1], 5 * rows % drawn.shape[2]] = float(kind)
-        with torch.no_grad():
-            expected = single.judge_raw(drawn).is_valid
-        score, is_valid = session.run(["score", "valid"], {"samples": drawn.numpy()})
-        if not (np.isfinite(score).all() and np.array_equal(is_valid, expected.numpy())):
-            wrong.append(kind)
-    return wrong
-
-
-def float32_error(detector: SlipDetector, num_bins: int = 256) -> dict[str, float]:
-    """What float32 costs the detector: torch against torch in float64, on generated bins.
-
-    Noise of several sizes, the gauges with an offset of 1 V. ``certify`` measures it on recordings.
+    Args:
+        detector: as fitted.
+        folder: for ``model.onnx`` and ``stream.onnx``.
+        graphs: ``"bin"``, ``"stream"`` or both.
+        precision: of samples and scores, ``"float32"`` or ``"float64"``.
+        layout: ``"latency"`` for one bin at a time, ``"bulk"`` for many.
+        source: file that the detector is kept in; by it a host knows which it has, and a
+            ``certificate.json`` beside it is handed on if it is this detector's.
+        alone: whether the check runs each file in a process of its own, which takes a second.
 
     Returns:
-        ``float32_median`` and ``float32_p95``, differences in standard deviations of the score, and
-        ``float32_flips``, the share of bins whose decision differs.
+        The models' paths, in the order of ``graphs``.
+
+    Raises:
+        ValueError: if there is no such graph, form or setting, or a model fails its check; what
+            was in the folder is kept then.
     """
-    hand = detector.pool.hand
-    generator = torch.Generator().manual_seed(1)
-    size = 10 ** torch.linspace(0, -3, num_bins)[:, None, None]
-    samples = size * torch.randn(num_bins, *_input_shape(detector), generator=generator)
-    samples[:, list(hand.indices("SG"))] += 1.0
-    with torch.no_grad():
-        single = copy.deepcopy(detector).float().score_raw(samples)
-        double = copy.deepcopy(detector).double().score_raw(samples.double())
-    errors = (single - double).abs() / double.std()
-    return {
-        "float32_median": float(errors.median()),
-        "float32_p95": float(errors.quantile(0.95)),
-        "float32_flips": float(((single >= 0) != (double >= 0)).double().mean()),
-    }
+    form = Form(precision, layout)
+    if not graphs or not set(graphs) <= set(get_args(GraphKind)):
+        wanted = " or ".join(get_args(GraphKind))
+        raise ValueError(f"graphs must be {wanted}, or both, got {', '.join(graphs) or 'none'}")
+    if "stream" in graphs:
+        AlarmSettings.of(detector)  # says what is missing before there is anything to undo
+    origin = _origin(detector, None if source is None else Path(source))
+    paths = tuple(Path(folder) / FILES[kind] for kind in graphs)
+    with ExitStack() as files:
+        for kind, path in zip(graphs, paths, strict=True):
+            sidecar = files.enter_context(whole_file(sidecar_path(path)))
+            temporary = files.enter_context(whole_file(path))
+            try:
+                facts = _write(temporary, detector, form, kind, origin, alone)
+            except ValueError as error:
+                raise ValueError(f"{path} was not written: {error}") from error
+            sidecar.write_text(sidecar_text(facts, path.name, temporary.read_bytes()))
+    return paths
 
 
-def _write_graph(
-    module: nn.Module, traced: Tensor, path: Path, outputs: Sequence[str] = ("score",)
-) -> None:
-    """Trace a module of one input and named outputs; their first axis may have any length."""
-    # the exporter prints its progress and warns of its own internals
-    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings(), _quiet():
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            module,
-            (traced,),
-            str(path),
-            dynamo=True,
-            external_data=False,
-            opset_version=OPSET,
-            input_names=["samples"],
-            output_names=list(outputs),
-            dynamic_shapes=({0: torch.export.Dim.DYNAMIC},),
-        )
+def sidecar_facts(path: Path) -> dict[str, Any]:
+    """What the sidecar of a model says."""
+    facts: dict[str, Any] = json.loads(sidecar_path(path).read_text())
+    return facts
 
 
-def _describe_in_file(detector: SlipDetector, path: Path) -> None:
-    """Put what a host must know of the input into the file's metadata."""
-    model = onnx.load(path)
-    facts = {
-        "tactslip_torch": tactslip_torch.__version__,
-        "channels": ",".join(detector.pool.hand.names),
-        "unit": "V",
-        "sample_rate_hz": f"{detector.pool.sample_rate_hz:g}",
-        "bin_samples": str(detector.pool.bin_samples),
-        "context_before_samples": str(detector.context_before),
-        "context_after_samples": str(detector.context_after),
-        "look_ahead_samples": str(detector.look_ahead),
-        "simulated": str(bool(detector.info.get("simulated", False))).lower(),
-        "slip_if_score_at_least": "0",
-        "valid": "false: a channel in use is dead, or held a NaN or Inf and was left out",
-    }
-    onnx.helper.set_model_props(model, facts)
+def worst_error(facts: dict[str, Any]) -> float:
+    """The largest score error that a model's check measured, in standard deviations."""
+    check = facts["check"]
+    if facts["graph"] == "stream":
+        return float(check["worst_sd"])
+    return max(float(check[name]["worst_sd"]) for name in ("noise", "recorded"))
+
+
+def summary(path: Path) -> str:
+    """One line about a model: size, error, certificate."""
+    facts = sidecar_facts(path)
+    certificate = facts["certificate"]
+    if certificate is None:
+        trust = "no certificate (python -m tactslip_torch.certify makes one)"
+    elif not certificate["holds"]:
+        trust = "its certificate does not hold"
+    else:
+        trust = f"certified but where |score| is below {certificate['margin']:.1e}"
+        trust += " (simulated data)" * bool(certificate["simulated"])
+    return (
+        f"{path}: {facts['onnx_bytes'] / 1000:.0f} kB, {facts['precision']}, within "
+        f"{worst_error(facts):.1e} score deviations of torch in float64 (simulated slip), {trust}"
+    )
+
+
+def _write(
+    path: Path,
+    detector: SlipDetector,
+    form: Form,
+    kind: GraphKind,
+    origin: Origin,
+    alone: bool,
+) -> dict[str, Any]:
+    """Write and check a model; its facts, what the check measured among them."""
+    graph = _graph(detector, form, kind)
+    model = graph.model({})
+    check, memory = check_model(model, detector, form, kind)
+    facts = {**model_facts(detector, form, origin, memory), "check": check}
+    model = graph.model(in_file(facts))
     onnx.save(model, path)
+    check_file(path, facts, model, detector, form, alone=alone)
+    return facts
 
 
-def _input_shape(detector: SlipDetector) -> tuple[int, int]:
-    pool = detector.pool
-    context = detector.context_before + detector.context_after
-    return len(pool.hand), pool.bin_samples + context
+def _graph(detector: SlipDetector, form: Form, kind: GraphKind) -> Graph:
+    if kind == "bin":
+        return bin_graph(detector, form)
+    return stream_graph(detector, AlarmSettings.of(detector), form)
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the exporter's libraries from logging every rewrite."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
+def _origin(detector: SlipDetector, source: Path | None) -> Origin:
+    if source is None:
+        return Origin(tactslip_torch.__version__, detector_sha256(detector))
+    digest = hashlib.sha256(source.read_bytes()).hexdigest()
+    certificate = _certificate(source.with_name("certificate.json"), digest)
+    return Origin(tactslip_torch.__version__, digest, certificate)
+
+
+def _certificate(path: Path, digest: str) -> dict[str, Any] | None:
+    """That of the detector with this digest, if it stands there."""
     try:
-        yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != CERTIFICATE_FORMAT or content["detector"]["sha256"] != digest:
+            return None
+        return certificate_facts(content)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _wanted(graph: str | None, detector: SlipDetector) -> tuple[GraphKind, ...]:
+    """The graphs that ``graph=`` asks for; by default all that the detector can give."""
+    choices: dict[str | None, tuple[GraphKind, ...]] = {
+        "bin": ("bin",),
+        "stream": ("stream",),
+        "both": ("bin", "stream"),
+        None: ("bin", "stream") if KEY in detector.info else ("bin",),
+    }
+    if graph not in choices:
+        raise ValueError(f"graph must be bin, stream or both, got {graph!r}")
+    return choices[graph]
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="export")
 def main(config: DictConfig) -> None:
     """Entry point."""
     with errors_in_one_line():
-        output = Path(config.output or Path(config.model).with_name("model.onnx"))
-        detector = SlipDetector.load(config.model)
-        worst = export_onnx(detector, output)
-        cost = float32_error(detector)
-        print(
-            f"{output}: {output.stat().st_size} bytes, within {worst:.1e} score deviations of "
-            f"float32 torch; float32 itself costs {cost['float32_median']:.1e} (median), "
-            f"{cost['float32_p95']:.1e} (95 %), and flips {cost['float32_flips']:.2%} of decisions "
-            "on generated bins"
+        source = Path(config.model)
+        detector = SlipDetector.load(source)
+        folder = Path(config.output or source.parent)
+        if folder.suffix == ".onnx" or folder.is_file():
+            raise ValueError(f"output must be a folder, got {folder}; the files have their names")
+        graphs = _wanted(config.graph, detector)
+        paths = export_detector(
+            detector, folder, graphs, config.precision, config.layout, source=source
         )
+        for path in paths:
+            print(summary(path))
 
 
 if __name__ == "__main__":

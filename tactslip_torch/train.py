@@ -1,8 +1,9 @@
 """Train and judge a detector: ``python -m tactslip_torch.train +exp=unseen4``.
 
 Simulates (or reads) the recordings, makes features, selects, solves, tests, and leaves
-``metrics.json``, ``detector.pt``, ``model.onnx``, figures, logs and the resolved configuration in
-``outputs/<name>/<time>``. ``--help`` and ``--cfg job`` show what can be set.
+``metrics.json``, ``detector.pt``, ``model.onnx`` (and ``stream.onnx`` where an alarm was set),
+figures, logs and the resolved configuration in ``outputs/<name>/<time>``. ``--help`` and
+``--cfg job`` show what can be set.
 """
 
 from __future__ import annotations
@@ -39,15 +40,17 @@ from tactslip_torch.experiment import (
     make_trainer,
     save_config,
 )
-from tactslip_torch.export import export_onnx, float32_error
+from tactslip_torch.export import export_detector, sidecar_facts, worst_error
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.files import whole_file
+from tactslip_torch.graph.facts import GraphKind
 from tactslip_torch.judging import event_numbers, together
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.scoring import Scorer
+from tactslip_torch.onset.settings import KEY
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.report.scores import merged_metrics, summed_metrics
@@ -124,9 +127,9 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         write_results(folder, metrics, rows)
         print_results(metrics, rows)
         print(f"\nresults in {folder}")
-    problems = [fold["onnx"] for fold in fold_metrics.values() if isinstance(fold["onnx"], str)]
-    if problems:
-        raise ValueError(f"all but model.onnx is written: {problems[0]}")
+    exports = [found for fold in fold_metrics.values() for found in fold["onnx"].values()]
+    if problems := [found for found in exports if isinstance(found, str)]:
+        raise ValueError(f"all else is written: {problems[0]}")
     return {
         f"{role}/{name}": scores[name]
         for role, scores in metrics["splits"].items()
@@ -166,7 +169,7 @@ def _run_fold(
         "train_materials": sorted({recording.material for recording in trained}),
         "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
     }
-    onnx: dict[str, float] | str | None = None
+    onnx: dict[str, dict[str, float] | str] = {}
     alarm: dict[str, Any] = {}
     if getattr(trainer, "fast_dev_run", False):
         alarming = None  # hours of streams are no quick look
@@ -176,7 +179,7 @@ def _run_fold(
     told = time.perf_counter()
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")
-        onnx = _export(detector, folder / "model.onnx") if config.export else None
+        onnx = _export(detector, folder) if config.export else {}
     seconds = dict(learner.seconds)
     seconds["test_pass"] = tested - started
     if alarming is not None:
@@ -206,13 +209,19 @@ def _rivals(detector: SlipDetector) -> dict[str, Scorer]:
     }
 
 
-def _export(detector: SlipDetector, path: Path) -> dict[str, float] | str:
-    """Write the ONNX file; its errors, or why there is none: what was learned must not be lost."""
-    try:
-        return {"error": export_onnx(detector, path), **float32_error(detector)}
-    except Exception as error:  # the exporter raises many kinds
-        log.exception("model.onnx was not written")
-        return one_line(error).splitlines()[0]
+def _export(detector: SlipDetector, folder: Path) -> dict[str, dict[str, float] | str]:
+    """Write the ONNX files; by graph their error, or why there is none: nothing learned is lost."""
+    kinds: list[GraphKind] = ["bin", "stream"] if KEY in detector.info else ["bin"]
+    found: dict[str, dict[str, float] | str] = {}
+    for kind in kinds:
+        try:
+            paths = export_detector(detector, folder, [kind], source=folder / "detector.pt")
+            facts = sidecar_facts(paths[0])
+            found[kind] = {"error": worst_error(facts), "bytes": facts["onnx_bytes"]}
+        except Exception as error:  # of onnxruntime they have no base in common
+            log.exception("the %s graph was not written", kind)
+            found[kind] = one_line(error).splitlines()[0]
+    return found
 
 
 def _checkpoint(given: str | None, fold: Split) -> Path | None:
