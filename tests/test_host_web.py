@@ -21,6 +21,7 @@ from hosts import (
     truncated,
     truth,
 )
+from PIL import Image
 from test_host_node import EXPORT, installed
 
 from tactslip_torch.onset.settings import KEY
@@ -198,7 +199,12 @@ def test_a_shot_leaves_a_picture_and_the_decisions(script, model, recording, tmp
         "shot.mjs", "--model", model, "--recording", recording, "--output", picture, "--scheme=dark"
     )
     assert done.returncode == 0, done.stderr
-    assert picture.read_bytes().startswith(b"\x89PNG")
+    with Image.open(picture) as image:
+        pixels = image.convert("RGB").getcolors(maxcolors=1 << 24)
+    num_pixels = {"#{:02x}{:02x}{:02x}".format(*colour): num for num, colour in pixels}
+    dark = (WEB / "style.css").read_text().split("prefers-color-scheme: dark")[1]
+    for name in ("page", "panel", "rest", "slip", "alarm"):  # it is dark, and both states are there
+        assert num_pixels[dark.split(f"--{name}: ")[1][:7]] > 100, name
     assert [path.name for path in tmp_path.iterdir()] == ["page.png"]
     assert_same(ran(done.stdout.splitlines()), truth(slipping_stream()))
 
