@@ -95,6 +95,8 @@ class Front:
         self._maps = LinearMaps.of(detector.pool)
         self._detector = detector
         self.window = Window.of(detector)
+        stepping = (self._plan.rows[row] for row in self._plan.rows_for(*EXACT))
+        self._stepping = {self._key(row) for row in stepping}
         self._missing: list[Value] = []
         self._trusted: list[Value] = []
         frames: dict[tuple[int, bool], list[int]] = {}
@@ -162,12 +164,16 @@ class Front:
     def _values(self, rows: Sequence[Row], dtype: np.dtype[Any]) -> tuple[Value, ...]:
         """Of rows of one block: values, or the two parts of spectra."""
         group, key = self._of[rows[0].channel], self._key(rows[0])
-        shape, known = group.blocks[key], group.exact if dtype == F64 else group.coordinates
         places = [group.channels.index(row.channel) for row in rows]
-        chosen = _taken(known[key], places, len(group.channels))
-        if rows[0].kind == "freq":
-            return chosen @ shape.cosine, chosen @ shape.sine
-        return (chosen if shape.out is None else chosen @ shape.out,)
+        parts = group.coordinates if dtype == self._form.dtype else group.exact
+        chosen = _taken(parts[key], places, len(group.channels))
+        shape, is_freq = group.blocks[key], rows[0].kind == "freq"
+        maps = (shape.cosine, shape.sine) if is_freq else (shape.out,)
+        kept = F64 if self._key(rows[0]) in self._stepping else dtype  # one copy for both
+        return tuple(
+            chosen if each is None else chosen @ self._graph.constant(each, kept).cast(dtype)
+            for each in maps
+        )
 
     def _cells(self, rows: Sequence[Row], what: Literal["length", "mean"]) -> Value:
         """The length or mean of each row's block, ``[B, R]``."""
@@ -190,7 +196,7 @@ class Front:
         film = self._graph.concat(*films, axis=1).cast(F64)
         centred = film - film.mean(2, keep=True)
         size, scale = centred.abs().amax(2, keep=True), film.abs().amax(2, keep=True)
-        least = scale * (_LEAST_SPAN / 2) + _TINY
+        least = (scale * (_LEAST_SPAN / 2)).max(_TINY)  # onnxruntime drops an addition of it
         kept = (size >= least).cast(F64) / size.max(least)
         return (centred * kept).cast(dtype)
 
