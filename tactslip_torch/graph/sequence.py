@@ -97,12 +97,13 @@ def rule_start(rule: Rule) -> list[float]:
     raise ValueError(f"no graph is written for the rule {rule!r}")
 
 
-def statistic_of(rule: Rule, llr: Value, memory: Value) -> Walk:
+def statistic_of(graph: Graph, rule: Rule, llr: Value, memory: Value) -> Walk:
     """The statistic of each decision, in the dtype of the ratios, and the memory behind the last.
 
     To the bit what the rule's ``scan`` makes of them; ``BayesFilter`` to rounding of the ratios.
 
     Args:
+        graph: to which nodes are added.
         rule: whose statistic.
         llr: finite ratios.
         memory: of ``rule_start`` or the call before.
@@ -120,9 +121,9 @@ def statistic_of(rule: Rule, llr: Value, memory: Value) -> Walk:
         case Hysteresis():
             return llr, memory
         case BayesFilter():
-            return _odds(rule, llr, memory)
+            return _odds(graph, rule, llr, memory)
         case Cusum():
-            return _sum(rule, llr, memory)
+            return _sum(graph, rule, llr, memory)
     raise ValueError(f"no graph is written for the rule {rule!r}")
 
 
@@ -141,6 +142,7 @@ class Latched(NamedTuple):
 
 
 def latched(
+    graph: Graph,
     statistic: Value,
     level: Value,
     low: Value,
@@ -153,6 +155,7 @@ def latched(
     """Alarms as ``onset.latch`` raises them.
 
     Args:
+        graph: to which nodes are added.
         statistic: finite.
         level: from which on an alarm is raised.
         low: below which it counts towards re-arming; not above ``level``.
@@ -167,12 +170,11 @@ def latched(
         - level, low: ``[1]``
         - memory: ``[3]``
     """
-    graph = statistic.graph
     is_awake = (statistic.amax(0, keep=True) >= level) | (memory.slice(0, 1, 0) > 0.0)
 
     def watch(body: Graph) -> Latched:
         given = (x.at(body) for x in (statistic, level, low, number, memory))
-        return _watched(*given, rearm=rearm, refractory=refractory)
+        return _watched(body, *given, rearm=rearm, refractory=refractory)
 
     def sleep(body: Graph) -> Latched:
         is_high = statistic.at(body) >= level.at(body)  # nowhere
@@ -183,6 +185,7 @@ def latched(
 
 
 def _watched(
+    graph: Graph,
     statistic: Value,
     level: Value,
     low: Value,
@@ -197,7 +200,6 @@ def _watched(
     One is raised where it is high and the last alarm is no later than the last re-arming, and than
     ``refractory`` decisions back. So only the number of the last alarm is walked.
     """
-    graph = statistic.graph
     on, below, since = graph.ops("Split", memory, dtypes=(F64,) * 3, axis=0, num_outputs=3)
     before = number.slice(0, 1, 0) - 1.0
     last = before - since
@@ -230,8 +232,7 @@ def _k_th_largest(rule: KOfN, llr: Value, memory: Value) -> Walk:
     return largest.slice(rule.k - 1, rule.k, 1).squeeze(1), kept
 
 
-def _sum(rule: Cusum, llr: Value, memory: Value) -> Walk:
-    graph = llr.graph
+def _sum(graph: Graph, rule: Cusum, llr: Value, memory: Value) -> Walk:
     step = llr - rule.drift if rule.drift else llr
     step = step * rule.evidence if rule.evidence != 1 else step
     start = memory.cast(llr.dtype)
@@ -249,9 +250,9 @@ def _sum(rule: Cusum, llr: Value, memory: Value) -> Walk:
     return total, _last(total).cast(F64)
 
 
-def _odds(rule: BayesFilter, llr: Value, memory: Value) -> Walk:
+def _odds(graph: Graph, rule: BayesFilter, llr: Value, memory: Value) -> Walk:
     """By the odds against slip, ``e``: ``(b + (1 - a) e) / (1 - b + a e)`` before the evidence."""
-    graph, rate = llr.graph, rule.slips_per_s + 1 / rule.slip_s
+    rate = rule.slips_per_s + 1 / rule.slip_s
     change = -math.expm1(-rate * rule.hop_s)
     begin, end = change * rule.slips_per_s / rate, change / (rule.slip_s * rate)
     evidence = llr.cast(F64) * rule.evidence

@@ -105,7 +105,7 @@ def stream_graph(
     deciding = _Deciding(detector, settings, form, judge, timing)
     made = graph.if_(
         decided > state.slice(1, 2, 0),
-        lambda body: deciding(*(x.at(body) for x in (held, state, threshold, seen, decided))),
+        lambda body: deciding(body, *(x.at(body) for x in (held, state, threshold, seen, decided))),
         lambda body: _none(seen.at(body), state.at(body), form),
     )
     for (name, _), value in zip(_outputs(form), made[:-1], strict=True):
@@ -140,23 +140,30 @@ class _Deciding:
     timing: Timing
 
     def __call__(
-        self, held: Value, state: Value, threshold: Value, seen: Value, decided: Value
+        self,
+        graph: Graph,
+        held: Value,
+        state: Value,
+        threshold: Value,
+        seen: Value,
+        decided: Value,
     ) -> list[Value]:
         """All outputs but the tail, the state last."""
-        graph, settings, pool = held.graph, self.settings, self.detector.pool
+        settings, pool = self.settings, self.detector.pool
         sizes = graph.axes(1, 1, 1, 3, self.timing.state_size - 6)
         parts = graph.ops("Split", state, sizes, dtypes=(F64,) * 5, axis=0)
         _, made, run, of_latch, of_rule = parts
         places = count_up((decided - made).cast(I64))
         number = places.cast(F64) + made
-        windows = self._windows(held, seen, made, places)
+        windows = self._windows(graph, held, seen, made, places)
         judged = self.judge(graph, self.detector, windows, self.form)
 
         llr = graph.where(judged.is_usable, llr_of(judged.score, settings.calibration), NEUTRAL)
-        statistic, of_rule = statistic_of(settings.rule, llr, of_rule)
+        statistic, of_rule = statistic_of(graph, settings.rule, llr, of_rule)
         own = graph.constant([settings.threshold], F64)
         level = graph.concat(threshold, own, axis=0).slice(0, 1, 0).cast(self.form.dtype)
         raised = latched(
+            graph,
             statistic,
             level,
             level - settings.rule.margin if settings.rule.margin else level,
@@ -178,13 +185,13 @@ class _Deciding:
             graph.concat(seen, decided, last_run, raised.memory, of_rule, axis=0),
         ]
 
-    def _windows(self, held: Value, seen: Value, made: Value, places: Value) -> Value:
+    def _windows(self, graph: Graph, held: Value, seen: Value, made: Value, places: Value) -> Value:
         """The samples of each decision, float64, ``[k, channels in use, Window.length]``.
 
         ``held`` ends with sample number ``seen``. Channels in between that are not in use go along,
         as columns are costly to pick and rows are not.
         """
-        graph, timing, window = held.graph, self.timing, self.timing.window
+        timing, window = self.timing, self.timing.window
         start = made * float(timing.hop)  # of the first bin
         origin = start - seen - float(window.before)  # negative: counted from the end
         x = held.slice(origin.cast(I64), END, 0)

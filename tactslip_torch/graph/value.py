@@ -7,16 +7,95 @@ take the dtype of the value they meet, so nothing is widened or narrowed unasked
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from onnx import helper
-
-if TYPE_CHECKING:
-    from tactslip_torch.graph.writer import Graph
+import onnx
+from numpy.typing import ArrayLike, NDArray
+from onnx import helper, numpy_helper
 
 F32, F64, I64, BOOL = (np.dtype(name) for name in ("float32", "float64", "int64", "bool"))
+_FEW = 64  # as many ones and zeros are not worth a node
+
+
+class Nodes:
+    """Nodes and constants; what reads on is a ``Graph``.
+
+    Args:
+        parent: of a body: whose values it may use and whose names it avoids.
+    """
+
+    def __init__(self, parent: Nodes | None = None) -> None:
+        self._top: Nodes = self if parent is None else parent._top
+        self._nodes: list[onnx.NodeProto] = []
+        self._constants: dict[tuple[str, tuple[int, ...], bytes], Value] = {}
+        self._tensors: list[onnx.TensorProto] = []
+        self._count = 0
+
+    def constant(self, value: ArrayLike, dtype: np.dtype[Any]) -> Value:
+        """A tensor, kept once in its graph however often it is asked for.
+
+        A body has its own: what is around a body is handed over to it anew at each run.
+        """
+        array = np.ascontiguousarray(np.asarray(value, dtype)).reshape(np.shape(value))
+        key = (array.dtype.name, array.shape, array.tobytes())
+        if key not in self._constants:
+            name = self._name("c")
+            bits = array.astype(BOOL)
+            is_mask = array.size > _FEW and array.dtype != BOOL and np.array_equal(bits, array)
+            self._tensors.append(numpy_helper.from_array(bits if is_mask else array, name))
+            kept = Value(self, name, BOOL if is_mask else dtype)
+            self._constants[key] = kept.cast(dtype)  # which a runtime does once, at load
+        return self._constants[key]
+
+    def axes(self, *numbers: int) -> Value:
+        """Axes, lengths or places, as operators take them."""
+        return self.constant(list(numbers), I64)
+
+    def op(
+        self,
+        kind: str,
+        *inputs: Value | None,
+        dtype: np.dtype[Any] | None = None,
+        name: str | None = None,
+        **attributes: Any,
+    ) -> Value:
+        """The only output of a node; its dtype is that of the first input if not said."""
+        return self.ops(kind, *inputs, dtypes=(dtype,), names=(name,), **attributes)[0]
+
+    def ops(
+        self,
+        kind: str,
+        *inputs: Value | None,
+        dtypes: Sequence[np.dtype[Any] | None],
+        names: Sequence[str | None] | None = None,
+        **attributes: Any,
+    ) -> tuple[Value, ...]:
+        """The outputs of a node that has as many as there are dtypes."""
+        outputs = [given or self._name() for given in names or [None] * len(dtypes)]
+        fed = [each.name if each is not None else "" for each in inputs]
+        self._nodes.append(helper.make_node(kind, fed, outputs, **attributes))
+        first = inputs[0].dtype if inputs and inputs[0] is not None else F64
+        return tuple(
+            Value(self, output, dtype or first)
+            for output, dtype in zip(outputs, dtypes, strict=True)
+        )
+
+    def concat(self, *parts: Value, axis: int) -> Value:
+        """Values one behind the other along an axis; one alone as it is."""
+        return parts[0] if len(parts) == 1 else self.op("Concat", *parts, axis=axis)
+
+    def where(self, mask: Value, yes: Value | float, no: Value | float) -> Value:
+        """Values of ``yes`` where the mask holds and of ``no`` elsewhere; one must be a value."""
+        like = yes if isinstance(yes, Value) else no
+        if not isinstance(like, Value):
+            raise TypeError("where needs a value on one side, got two numbers")
+        sides = (like._operand(side) for side in (yes, no))
+        return self.op("Where", mask, *sides, dtype=like.dtype)
+
+    def _name(self, prefix: str = "v") -> str:
+        self._top._count += 1
+        return f"{prefix}{self._top._count}"
 
 
 class Value:
@@ -28,12 +107,12 @@ class Value:
         dtype: float32, float64, int64 or bool.
     """
 
-    def __init__(self, graph: Graph, name: str, dtype: np.dtype[Any]) -> None:
+    def __init__(self, graph: Nodes, name: str, dtype: np.dtype[Any]) -> None:
         self.graph = graph
         self.name = name
         self.dtype = dtype
 
-    def at(self, graph: Graph) -> Value:
+    def at(self, graph: Nodes) -> Value:
         """The same value, used in a body."""
         return Value(graph, self.name, self.dtype)
 

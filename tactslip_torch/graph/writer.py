@@ -11,18 +11,16 @@ from typing import Any
 
 import numpy as np
 import onnx
-from numpy.typing import ArrayLike
-from onnx import helper, numpy_helper
+from onnx import helper
 
-from tactslip_torch.graph.value import F64, I64, Value
+from tactslip_torch.graph.value import Nodes, Value
 
 OPSET = 20
 IR_VERSION = 10  # the oldest that has the opset; newer ones are refused by older runtimes
-_FEW = 64  # ones and zeros that are not worth a node
 Shape = Sequence[int | str]
 
 
-class Graph:
+class Graph(Nodes):
     """Nodes, constants, inputs and outputs that become a model, or the body of an ``if_``.
 
     Args:
@@ -30,13 +28,9 @@ class Graph:
     """
 
     def __init__(self, parent: Graph | None = None) -> None:
-        self._top: Graph = self if parent is None else parent._top
-        self._nodes: list[onnx.NodeProto] = []
+        super().__init__(parent)
         self._inputs: list[onnx.ValueInfoProto] = []
         self._outputs: list[onnx.ValueInfoProto] = []
-        self._constants: dict[tuple[str, tuple[int, ...], bytes], Value] = {}
-        self._tensors: list[onnx.TensorProto] = []
-        self._count = 0
 
     def input(self, name: str, dtype: np.dtype[Any], shape: Shape) -> Value:
         """An input; axes that are named may have any length."""
@@ -47,64 +41,6 @@ class Graph:
         """Hand a value out under a name; without a shape nothing is said of it."""
         named = self.op("Identity", value, name=name)
         self._outputs.append(_info(name, named.dtype, shape))
-
-    def constant(self, value: ArrayLike, dtype: np.dtype[Any]) -> Value:
-        """A tensor, kept once in its graph however often it is asked for.
-
-        A body has its own: what is around a body is handed over to it anew at each run.
-        """
-        array = np.ascontiguousarray(np.asarray(value, dtype)).reshape(np.shape(value))
-        key = (array.dtype.name, array.shape, array.tobytes())
-        if key not in self._constants:
-            name = self._name("c")
-            self._tensors.append(numpy_helper.from_array(array, name))
-            self._constants[key] = Value(self, name, dtype)
-        return self._constants[key]
-
-    def axes(self, *numbers: int) -> Value:
-        """Axes, lengths or places, as operators take them."""
-        return self.constant(list(numbers), I64)
-
-    def op(
-        self,
-        kind: str,
-        *inputs: Value | None,
-        dtype: np.dtype[Any] | None = None,
-        name: str | None = None,
-        **attributes: Any,
-    ) -> Value:
-        """The only output of a node; its dtype is that of the first input if not said."""
-        return self.ops(kind, *inputs, dtypes=(dtype,), names=(name,), **attributes)[0]
-
-    def ops(
-        self,
-        kind: str,
-        *inputs: Value | None,
-        dtypes: Sequence[np.dtype[Any] | None],
-        names: Sequence[str | None] | None = None,
-        **attributes: Any,
-    ) -> tuple[Value, ...]:
-        """The outputs of a node that has as many as there are dtypes."""
-        outputs = [given or self._name() for given in names or [None] * len(dtypes)]
-        fed = [each.name if each is not None else "" for each in inputs]
-        self._nodes.append(helper.make_node(kind, fed, outputs, **attributes))
-        first = inputs[0].dtype if inputs and inputs[0] is not None else F64
-        return tuple(
-            Value(self, output, dtype or first)
-            for output, dtype in zip(outputs, dtypes, strict=True)
-        )
-
-    def concat(self, *parts: Value, axis: int) -> Value:
-        """Values one behind the other along an axis; one alone as it is."""
-        return parts[0] if len(parts) == 1 else self.op("Concat", *parts, axis=axis)
-
-    def where(self, mask: Value, yes: Value | float, no: Value | float) -> Value:
-        """Values of ``yes`` where the mask holds and of ``no`` elsewhere; one must be a value."""
-        like = yes if isinstance(yes, Value) else no
-        if not isinstance(like, Value):
-            raise TypeError("where needs a value on one side, got two numbers")
-        sides = (like._operand(side) for side in (yes, no))
-        return self.op("Where", mask, *sides, dtype=like.dtype)
 
     def if_(
         self,
@@ -184,10 +120,6 @@ class Graph:
             handed = value if value.name in made else self.op("Identity", value)
             made.discard(handed.name)
             self._outputs.append(_info(handed.name, handed.dtype, shape))
-
-    def _name(self, prefix: str = "v") -> str:
-        self._top._count += 1
-        return f"{prefix}{self._top._count}"
 
 
 def _info(name: str, dtype: np.dtype[Any], shape: Shape | None) -> onnx.ValueInfoProto:
