@@ -22,7 +22,32 @@ torch.set_num_threads(1)  # two processes with two threads each on two cores spe
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """With ``-n``, a file stays in one process, and every process computes in one thread.
+
+    Fixtures of a file are then made once, and tests that count over their file count all of it.
+    Processes that tests start themselves read the variable; it is set before workers are made.
+    """
+    if getattr(config.option, "numprocesses", None):
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        if config.option.dist == "load":  # the plugin's choice where the user made none
+            config.option.dist = "loadfile"
+        config.option.loadscopereorder = False  # the order is that of slow_files_first
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    seed_hypothesis(config, items)
+    if hasattr(config, "workerinput"):  # of pytest-xdist
+        slow_files_first(items)
+
+
+def slow_files_first(items: list[pytest.Item]) -> None:
+    """What is left for the end is short, so no worker waits long for another."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
+def seed_hypothesis(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Each hypothesis test draws by the seed of the run and its own name, in any selection."""
     if config.getoption("--hypothesis-seed", None) is not None:
         return  # hypothesis sees to it
@@ -31,6 +56,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if test is not None and is_hypothesis_test(test):
             name = item.nodeid.split("[")[0]
             seed(f"{generated.SEED} {name}")(test)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """A worker of pytest-xdist tells what it made."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["generated"] = generated.told()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: object) -> None:
+    """A worker has ended; one that broke down tells nothing."""
+    generated.hear(getattr(node, "workeroutput", {}).get("generated", []))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

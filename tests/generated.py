@@ -21,8 +21,20 @@ _made: set[tuple[int, int, torch.dtype]] = set()
 
 
 def num_generated() -> int:
-    """How many different bins this process has made so far."""
+    """How many different bins this process has made, or has heard of, so far."""
     return sum(num for _, num, _ in _made)
+
+
+def told() -> list[tuple[int, int, str]]:
+    """What ``hear`` takes in another process: which bins were made in this one."""
+    return [(drawn, num, str(dtype)) for drawn, num, dtype in _made]
+
+
+def hear(others: list[tuple[int, int, str]]) -> None:
+    """Count what another process made; the same bins count once, as they do in one process."""
+    _made.update(
+        (drawn, num, getattr(torch, dtype.removeprefix("torch."))) for drawn, num, dtype in others
+    )
 
 
 def generator(drawn: int) -> torch.Generator:

@@ -1,5 +1,7 @@
 """One seed decides what property tests see, and the summary line is right about it."""
 
+import json
+
 import generated
 import pytest
 import torch
@@ -65,6 +67,19 @@ def test_the_same_bins_are_counted_once():
     assert generated.num_generated() == before
     generated.make_batch(2**40 + 1, 41, 24, 100, torch.float64)
     assert generated.num_generated() == before + 41
+
+
+def test_bins_of_other_processes_count_as_if_made_here(monkeypatch):
+    monkeypatch.setattr(generated, "_made", set())
+    make()
+    generated.make_batch(2**40 + 1, 40, 24, 100, torch.float32)
+    elsewhere = json.loads(json.dumps(generated.told()))  # plain words, as they cross processes
+    monkeypatch.setattr(generated, "_made", set())
+    make()  # the same bins here and there are counted once
+    generated.hear([tuple(of) for of in elsewhere])
+    assert generated.num_generated() == 80
+    generated.hear([])
+    assert generated.num_generated() == 80
 
 
 def test_blame_names_bin_feature_and_kind():

@@ -219,7 +219,7 @@ def told_apart(rng, pool):
         ({"component": "D1", "domain": "time"}, lambda n: " D1 time " in str(n), 10 * 14),
         ({"descriptor": ["mean", "std"], "component": ["A1", "A2"]}, None, 10 * 2 * 2 * 2),
     ],
-    ids=str,
+    ids=lambda value: "rule" if callable(value) else str(value),  # no address: as in any process
 )
 def test_what_matches_has_every_attribute_that_is_asked_for(wanted, does, num):
     mask = matching(POOL.hand, POOL.names, wanted)
