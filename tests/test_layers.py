@@ -261,7 +261,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "graph.descriptors": ("graph.*", "features.*"),
     "graph.order": ("graph.*", "features.*"),
     "graph.head": ("graph.*", "model.*"),
-    "graph.bins": ("graph.*", "features.*", "model.*"),
+    "graph.bins": ("graph.*", "features.*", "model.*", "onset.settings"),
     "graph.sequence": ("graph.*", "model.calibration", "onset.*"),
     "graph.stream": ("graph.*", "signals.*", "model.detector", "onset.*"),
     "graph.facts": ("graph.form", "model.detector", "onset.settings"),

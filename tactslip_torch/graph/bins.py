@@ -10,10 +10,12 @@ from tactslip_torch.graph.descriptors import DESCRIPTORS
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.head import machine, scaled, with_typical
 from tactslip_torch.graph.rows import EXACT, Front
+from tactslip_torch.graph.sequence import llr_of, probability_of
 from tactslip_torch.graph.shared import Shared
 from tactslip_torch.graph.value import BOOL, F64, I64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.settings import KEY, AlarmSettings
 
 
 class Judged(NamedTuple):
@@ -60,13 +62,18 @@ def bin_graph(detector: SlipDetector, form: Form) -> Graph:
 
     Shape:
         - in ``samples``: ``[batch, C, Window.length]``, volts, in the precision of the form
-        - out ``score``: ``[batch]``; ``valid``: ``[batch]``, bool
+        - out ``score``: ``[batch]``; ``probability``: ``[batch]``, if the detector has a calibration;
+          ``valid``: ``[batch]``, bool
     """
     graph, window = Graph(), Window.of(detector)
     shape = ("batch", len(detector.pool.hand), window.length)
     samples = graph.input("samples", form.dtype, shape)
     judged = judge_bins(graph, detector, samples.take(window.channels, 1), form)
     graph.output("score", judged.score, ("batch",))
+    if KEY in detector.info:
+        settings = AlarmSettings.of(detector)
+        llr = llr_of(judged.score, settings.calibration)
+        graph.output("probability", probability_of(llr, settings.slip_share), ("batch",))
     graph.output("valid", judged.is_valid, ("batch",))
     return graph
 
