@@ -5,10 +5,13 @@
 //       for (const decision of await stream.push(volts)) if (decision.alarm) stop(decision);
 //     }
 
+import { webcrypto } from "node:crypto";
 import { readFile } from "node:fs/promises";
 import { basename } from "node:path";
 
 import { StreamGraph } from "./graph.mjs";
+
+globalThis.crypto ??= webcrypto; // Node 18 has it under this name alone
 
 /** `StreamGraph` in Node: what it takes, gives and raises stands there. */
 export class SlipStream extends StreamGraph {

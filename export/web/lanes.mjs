@@ -83,8 +83,9 @@ export function usedChannels(facts) {
 
 /** Lowest and highest statistic shown. */
 export function statisticRange(facts) {
-  const ceiling = facts.rule?.ceiling;
-  if (Number.isFinite(ceiling)) return [0, 1.05 * ceiling];
-  const reach = Math.max(5, Math.abs(facts.threshold));
-  return [facts.threshold - reach, facts.threshold + reach];
+  const ceiling = facts.rule?.ceiling ?? null;
+  if (ceiling !== null) return [0, 1.05 * ceiling];
+  const threshold = facts.threshold ?? 0;
+  const reach = Math.max(5, Math.abs(threshold));
+  return [threshold - reach, threshold + reach];
 }

@@ -173,7 +173,7 @@ function run(scope, isWaiting) {
       player.isPlaying = false;
       say(error);
     }
-    scope.draw(player, player.stream.threshold ?? facts.threshold);
+    scope.draw(player, player.stream.threshold ?? facts.threshold ?? Infinity);
     report(player, facts.sample_rate_hz);
     document.body.ariaBusy = String(isWaiting() || player.isCatchingUp);
     requestAnimationFrame(frame);

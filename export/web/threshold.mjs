@@ -32,7 +32,7 @@ function byRate(facts, curve) {
   const level = (share) => first + share * (last - first);
   const toThreshold = (share) => interpolated(level(share), levels, thresholds);
   const falling = thresholds.map((threshold) => -threshold);
-  const ownLevel = interpolated(-facts.threshold, falling, levels);
+  const ownLevel = interpolated(-(facts.threshold ?? Infinity), falling, levels);
   return {
     title: "False alarms allowed",
     note: facts.simulated ? "as counted on simulated recordings" : "as counted on recordings",
@@ -43,11 +43,11 @@ function byRate(facts, curve) {
 }
 
 function byStatistic(facts) {
-  const { threshold, rule } = facts;
-  const ceiling = rule?.ceiling ?? Infinity;
+  const { rule } = facts;
+  const ceiling = rule?.ceiling ?? null; // with one, 0 bounds the statistic from below
+  const threshold = facts.threshold ?? ceiling ?? 0; // null is one that nothing reaches
   const reach = Math.max(5, Math.abs(threshold));
-  const isBounded = Number.isFinite(ceiling); // then by 0 from below
-  const [low, high] = isBounded ? [0, ceiling] : [threshold - reach, threshold + reach];
+  const [low, high] = ceiling === null ? [threshold - reach, threshold + reach] : [0, ceiling];
   const toThreshold = (share) => low + share * (high - low);
   return {
     title: "Alarm threshold",
