@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks import train
+from benchmarks.deployment import figure as deployment_figure
+from benchmarks.deployment import report as deployment
 from benchmarks.features import figure as features_figure
 from benchmarks.features import report as features
 from benchmarks.features.guards import measure as guards
@@ -105,6 +107,14 @@ SECTIONS = {
         streaming_figure.figure,
         streaming.about,
         needs=streaming_measure.SECTIONS,
+    ),
+    "deployment": Section(
+        "Deployed: files in onnxruntime",
+        deployment.tables,
+        deployment.report_text,
+        deployment_figure.figure,
+        deployment.about,
+        needs=deployment.SECTIONS,
     ),
     "onset": Section(
         "Alarms: hops, filters and rivals",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from benchmarks.exported import ORT, session
 from benchmarks.latency.sizes import Sizes
 from benchmarks.peers import heads, loop, others
 from tactslip_torch.features.extractor import EngineName
+from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.signals.filtering import ChannelFilter
 
 LOOP = "SciPy + PyWavelets loop, kernel sum"
@@ -126,6 +127,18 @@ def _heads(timed: Timed) -> dict[str, Callable[[Tensor], Any]]:
 
 
 def _looped(timed: Timed, samples: Any, wanted: Any) -> Callable[[int], float]:
+    score = looped(timed, timed.kernel_sum(), wanted)
+    return lambda number: score(samples[number % len(samples)])
+
+
+def looped(timed: Timed, machine: KernelSum, wanted: Sequence[int]) -> Callable[[Any], float]:
+    """The loop, from one raw bin ``[C, n + 2 * context]`` to its score.
+
+    Args:
+        timed: filter, features and scaler.
+        machine: the kernel sum.
+        wanted: pool indices of the features that are made, among them those in use.
+    """
     pool, channel_filter = pool_of(FLOAT64), ChannelFilter(WINDOW_LENGTHS)
     chosen = [pool.names[index] for index in wanted]
     names = [(n.channel, n.component, n.domain, n.descriptor) for n in chosen]
@@ -134,13 +147,12 @@ def _looped(timed: Timed, samples: Any, wanted: Any) -> Callable[[int], float]:
     channels = list(dict.fromkeys(name.channel for name in chosen))  # the others are not filtered
     rows = [pool.hand.names.index(channel) for channel in channels]
     lengths = [WINDOW_LENGTHS[row] for row in rows]
-    machine = timed.kernel_sum()
     support, beta = (np.asarray(of) for of in (machine.support, machine.beta))
     low, high = (np.asarray(of) for of in (timed.scaler.minimum, timed.scaler.maximum))
     knee = None if timed.scaler.knee is None else np.asarray(timed.scaler.knee)
 
-    def score(number: int) -> float:
-        raw = samples[number % len(samples)][rows].astype(np.float64)
+    def score(samples: Any) -> float:
+        raw = samples[rows].astype(np.float64)
         filtered = loop.savgol(raw, lengths, 1, channel_filter.context)
         with others.quiet():
             x = loop.features(filtered, names, channels)[used]
@@ -168,6 +180,6 @@ def _rocket(sizes: Sizes, samples: Any) -> Callable[[int], Any]:
 
 
 def _in_onnxruntime(timed: Timed, samples: Tensor) -> Callable[[int], Any]:
-    run = session(timed, threads=1)
-    each = [value[None].numpy() for value in samples]
-    return lambda number: run(each[number % len(each)])
+    judge = session(timed, threads=1)
+    each = [judge.cut(value[None]) for value in samples]
+    return lambda number: judge.run(each[number % len(each)])

@@ -70,9 +70,9 @@ def _bulk_calls(timed: Timed, sizes: Sizes, threads: int) -> tuple[Calls, dict[s
 
 
 def _exported(timed: Timed, samples: Tensor, threads: int) -> Callable[[], object]:
-    run = session(timed, threads)
-    chunks = [chunk.numpy() for chunk in samples.split(_ONNX_CHUNK)]
-    return lambda: [run(chunk) for chunk in chunks]
+    judge = session(timed, threads, "bulk")
+    chunks = [judge.cut(chunk) for chunk in samples.split(_ONNX_CHUNK)]
+    return lambda: [judge.run(chunk) for chunk in chunks]
 
 
 def batch(timed: Timed, sizes: Sizes) -> dict[str, Any]:

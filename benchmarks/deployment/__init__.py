@@ -1,0 +1,1 @@
+"""What a deployed detector costs: ``python -m benchmarks.deployment``."""
