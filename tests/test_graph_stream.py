@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 import onnxruntime
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,7 +12,7 @@ from streams import detector_of, signal
 
 from tactslip_torch.graph.bins import Judged
 from tactslip_torch.graph.form import Form, Window
-from tactslip_torch.graph.stream import Timing, stream_graph
+from tactslip_torch.graph.stream import stream_graph
 from tactslip_torch.graph.value import F64
 from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.judgement import Judgement

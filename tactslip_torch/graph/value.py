@@ -126,20 +126,23 @@ class Value:
         return self._operand(other) - self
 
     def __mul__(self, other: Value | float) -> Value:
+        if _is_taken_for_one(other):
+            return self * (other / 2) * 2.0
         return self._with("Mul", other)
 
     def __rmul__(self, other: float) -> Value:
         return self * other
 
     def __truediv__(self, other: Value | float) -> Value:
+        if _is_taken_for_one(other):
+            return self / (other * 2) * 2.0
         return self._with("Div", other)
 
     def __rtruediv__(self, other: float) -> Value:
         return self._operand(other) / self
 
     def __matmul__(self, other: Value | NDArray[Any]) -> Value:
-        right = other if isinstance(other, Value) else self.graph.constant(other, self.dtype)
-        return self.graph.op("MatMul", self, right)
+        return self._with("MatMul", other)
 
     def __neg__(self) -> Value:
         return self.graph.op("Neg", self)
@@ -264,15 +267,22 @@ class Value:
         """Neither NaN nor Inf, bool: a difference with itself is 0."""
         return (self - self).equals(0.0)
 
-    def _operand(self, other: Value | float) -> Value:
+    def _operand(self, other: Value | ArrayLike) -> Value:
         if not isinstance(other, Value):
             return self.graph.constant(other, self.dtype)
         if other.dtype != self.dtype:
             raise TypeError(f"{self.dtype} meets {other.dtype}; cast one of them")
         return other
 
-    def _with(self, kind: str, other: Value | float, dtype: np.dtype[Any] | None = None) -> Value:
+    def _with(
+        self, kind: str, other: Value | ArrayLike, dtype: np.dtype[Any] | None = None
+    ) -> Value:
         return self.graph.op(kind, self, self._operand(other), dtype=dtype)
 
     def _reduced(self, kind: str, axis: int, keep: bool) -> Value:
         return self.graph.op(kind, self, self.graph.axes(axis), keepdims=int(keep))
+
+
+def _is_taken_for_one(number: Value | float) -> bool:
+    """Whether onnxruntime, which looks at it in float32, would drop a factor of it as 1."""
+    return not isinstance(number, Value) and number != 1 and np.float32(number) == 1
