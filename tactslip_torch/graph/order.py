@@ -79,7 +79,8 @@ def entropy(values: Value, num: int, dtype: np.dtype[Any]) -> Value:
     level = ((values - least) * levels + (0.5 + HALF_SLACK[torch.float64])).floor()
     ones = (values * 0.0 + 1.0).cast(dtype)
     none = (span * 0.0).cast(dtype) + graph.constant(np.zeros(ENTROPY_LEVELS + 1), dtype)
-    count = graph.op("ScatterElements", none, level.cast(I64), ones, axis=2, reduction="add")
+    place = graph.where(level >= 0.0, level, 0.0).cast(I64)  # NaN, of a missing channel, is none
+    count = graph.op("ScatterElements", none, place, ones, axis=2, reduction="add")
     below = count.slice(0, ENTROPY_LEVELS, 2)
     top = count.slice(ENTROPY_LEVELS, ENTROPY_LEVELS + 1, 2)
     numbers = graph.constant(np.arange(1, ENTROPY_LEVELS + 1), dtype)

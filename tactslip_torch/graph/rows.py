@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,15 +15,7 @@ from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import Row
 from tactslip_torch.features.pool import LARGEST_SAMPLE
 from tactslip_torch.graph.form import Form, Window
-from tactslip_torch.graph.maps import (
-    Block,
-    BlockKind,
-    Matrix,
-    block_kind,
-    blocks,
-    energy_matrix,
-    filter_matrix,
-)
+from tactslip_torch.graph.maps import Block, Matrix, block, energy_matrix, filter_matrix
 from tactslip_torch.graph.value import F64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
@@ -30,7 +23,6 @@ from tactslip_torch.model.detector import SlipDetector
 EXACT = frozenset({"mode", "entropy"})
 """Descriptors that step: two roundings of one value may differ by a whole step."""
 SPAN_OF_LENGTH = 0.35  # span of 100 centred values of length 1: from .2 (two levels) to 1.41
-Key = tuple[BlockKind, int]
 _TINY = 1e-300  # instead of 0, where a quotient of 0 is to be 0
 _LEAST_SPAN = 16 * float(np.finfo(np.float64).eps)  # guards.is_constant
 
@@ -55,23 +47,27 @@ class Rows(NamedTuple):
     film: Value | None
 
 
+class _Scaled(NamedTuple):
+    """Coordinates of all blocks of some channels brought to length one."""
+
+    narrow: Value  # [B, c, sum of ranks], in the precision of the form
+    exact: Value  # the same in float64
+    length: Value  # [B, c, blocks], in volts
+    is_kept: Value  # [B, c, blocks], 1 or 0: not rounding beside its bin
+
+
 @dataclass(frozen=True)
 class _Channels:
     """Channels that share a frame and a kind, and their nodes, in volts."""
 
     channels: tuple[int, ...]
-    blocks: dict[Key, Block]
-    shifted: Value  # [B, c, W + 1]
     smooth: torch.Tensor
+    shifted: Value  # [B, c, W + 1]
     filtered: Value  # [B, c, n]
     scale: Value  # [B, c]
-    coordinates: Mapping[Key, Value]  # of length one, [B, c, r]
-    exact: Mapping[Key, Value]  # the same in float64
-    length: Value | None  # [B, c, blocks]
+    blocks: Mapping[int, Block]  # by branch
     mean: Value | None  # [B, c, blocks]
-
-
-_Settled = tuple[dict[Key, Value], dict[Key, Value], Value | None, Value | None]
+    scaled: Mapping[bool, _Scaled]  # for spectra, or not
 
 
 class Front:
@@ -96,7 +92,7 @@ class Front:
         self._detector = detector
         self.window = Window.of(detector)
         stepping = (self._plan.rows[row] for row in self._plan.rows_for(*EXACT))
-        self._stepping = {self._key(row) for row in stepping}
+        self._stepping = {(row.branch, row.kind == "freq") for row in stepping}
         self._missing: list[Value] = []
         self._trusted: list[Value] = []
         frames: dict[tuple[int, bool], list[int]] = {}
@@ -109,7 +105,7 @@ class Front:
         self._order = [channel for group in self._groups for channel in group.channels]
         places = [self._order.index(channel) for channel in self.window.channels]
         self.is_missing, self.is_trusted = (
-            _taken(graph.concat(*parts, axis=1), places, len(places))
+            _taken(graph.concat(*parts, axis=1), places, places)
             for parts in (self._missing, self._trusted)
         )
 
@@ -133,14 +129,16 @@ class Front:
         if is_freq:
             real, imaginary = made
             made = [(real * real + imaginary * imaginary).sqrt()]
-        unit = self._cells(ordered, "length")
+        unit = self._cells(
+            ordered, lambda group: group.scaled[is_freq].length if is_freq in group.scaled else None
+        )
         scale = film = None
         if with_scale:
             scales = graph.concat(*(group.scale for group in self._groups), axis=1)
             scale = scales.take([self._order.index(row.channel) for row in ordered], 1) / unit
         if with_film and not is_freq:
             film = self._films(parts, dtype)
-        mean = None if is_freq else self._cells(ordered, "mean") / unit
+        mean = None if is_freq else self._cells(ordered, lambda group: group.mean) / unit
         return Rows(tuple(ordered), made[0], mean, unit, scale, film)
 
     def shares(self, channel: int, branches: Sequence[int]) -> Value:
@@ -154,37 +152,36 @@ class Front:
         total = energies.slice(0, 1, 1).max(_TINY)
         return energies.slice(1, len(ranks), 1) / total
 
-    def _key(self, row: Row) -> Key:
-        return block_kind(row, self._maps), row.branch
-
-    def _place(self, row: Row) -> tuple[int, Key]:
+    def _place(self, row: Row) -> tuple[int, int]:
         """Of a row's block among all."""
-        return self._groups.index(self._of[row.channel]), self._key(row)
+        return self._groups.index(self._of[row.channel]), row.branch
 
     def _values(self, rows: Sequence[Row], dtype: np.dtype[Any]) -> tuple[Value, ...]:
         """Of rows of one block: values, or the two parts of spectra."""
-        group, key = self._of[rows[0].channel], self._key(rows[0])
-        places = [group.channels.index(row.channel) for row in rows]
-        parts = group.coordinates if dtype == self._form.dtype else group.exact
-        chosen = _taken(parts[key], places, len(group.channels))
-        shape, is_freq = group.blocks[key], rows[0].kind == "freq"
+        group, branch, is_freq = self._of[rows[0].channel], rows[0].branch, rows[0].kind == "freq"
+        start = sum(each.rank + 1 for key, each in group.blocks.items() if key < branch)
+        shape, scaled = group.blocks[branch], group.scaled[is_freq]
+        source = scaled.narrow if dtype == self._form.dtype else scaled.exact
+        own = source.slice(start, start + shape.rank + is_freq, 2)
+        chosen = _taken(own, [group.channels.index(row.channel) for row in rows], group.channels)
         maps = (shape.cosine, shape.sine) if is_freq else (shape.out,)
-        kept = F64 if self._key(rows[0]) in self._stepping else dtype  # one copy for both
+        kept = F64 if (branch, is_freq) in self._stepping else dtype  # one copy for both
         return tuple(
             chosen if each is None else chosen @ self._graph.constant(each, kept).cast(dtype)
             for each in maps
         )
 
-    def _cells(self, rows: Sequence[Row], what: Literal["length", "mean"]) -> Value:
-        """The length or mean of each row's block, ``[B, R]``."""
-        tables, cells = list[Value](), list[tuple[int, Key]]()
+    def _cells(self, rows: Sequence[Row], of: Callable[[_Channels], Value | None]) -> Value:
+        """What there is one of per channel and block, of each row, ``[B, R]``."""
+        tables, cells = list[Value](), list[tuple[int, int]]()
         for group in self._groups:
-            table = getattr(group, what)
-            if table is not None:
-                cells += [(channel, key) for channel in group.channels for key in group.blocks]
+            if (table := of(group)) is not None:
+                cells += [
+                    (channel, branch) for channel in group.channels for branch in group.blocks
+                ]
                 tables.append(table.reshape(0, len(group.channels) * len(group.blocks)))
-        places = [cells.index((row.channel, self._key(row))) for row in rows]
-        return _taken(self._graph.concat(*tables, axis=1), places, len(cells))
+        places = [cells.index((row.channel, row.branch)) for row in rows]
+        return _taken(self._graph.concat(*tables, axis=1), places, cells)
 
     def _films(self, parts: Sequence[Sequence[Row]], dtype: np.dtype[Any]) -> Value:
         """Filtered bins of rows less their mean, of order one; 0 where that is rounding."""
@@ -192,7 +189,7 @@ class Front:
         for rows in parts:
             group = self._of[rows[0].channel]
             places = [group.channels.index(row.channel) for row in rows]
-            films.append(_taken(group.filtered, places, len(group.channels)))
+            films.append(_taken(group.filtered, places, group.channels))
         film = self._graph.concat(*films, axis=1).cast(F64)
         centred = film - film.mean(2, keep=True)
         size, scale = centred.abs().amax(2, keep=True), film.abs().amax(2, keep=True)
@@ -204,7 +201,7 @@ class Front:
         """The nodes of channels that share a frame."""
         graph, num, used = self._graph, self.window.bin, self.window.channels
         before, after = self._detector.channel_filter.reaches[channels[0]]
-        x = _taken(windows, [used.index(channel) for channel in channels], len(used))
+        x = _taken(windows, [used.index(channel) for channel in channels], used)
         if (before, after) != (self.window.before, self.window.after):
             start = self.window.before - before
             x = x.slice(start, start + before + num + after, 2)
@@ -221,19 +218,20 @@ class Front:
         first = first.cast(F64)
         shifted = graph.concat(x.cast(F64) - first, first, axis=2)
         rows = [row for row in self._plan.rows if row.channel in channels]
-        own = blocks(rows, self._maps, smooth)
-        nodes: _Settled = ({}, {}, None, None)
+        own = {
+            branch: block(branch, self._maps, smooth)
+            for branch in sorted({row.branch for row in rows})
+        }
+        mean, scaled = None, dict[bool, _Scaled]()
         if own:
-            maps = [each.into for each in own.values()]
-            means = np.stack([each.mean for each in own.values()], axis=1)
-            nodes = self._settle(channels, own, shifted, np.concatenate(maps, axis=1), means, scale)
-        coordinates, exact, length, mean = nodes
+            coordinates = shifted @ np.concatenate([each.into for each in own.values()], axis=1)
+            for is_freq in sorted({row.kind == "freq" for row in rows}):
+                scaled[is_freq] = self._scaled(coordinates, own, scale, is_freq, unit)
+        if False in scaled:
+            mean = self._mean(coordinates, own, scaled[False].is_kept, unit)
         if unit is not None:
             scale = scale * unit.squeeze(2)
-            length, mean = (None if each is None else each * unit for each in (length, mean))
-        return _Channels(
-            channels, own, shifted, smooth, filtered, scale, coordinates, exact, length, mean
-        )
+        return _Channels(channels, smooth, shifted, filtered, scale, own, mean, scaled)
 
     def _judge(self, channels: tuple[int, ...], filtered: Value, unit: Value | None) -> Value:
         """Which channels can be trusted; and the largest magnitude of each, ``[B, c]``, float64.
@@ -253,40 +251,53 @@ class Front:
         self._trusted.append(is_alive & is_known)
         return scale.cast(F64)
 
-    def _settle(
+    def _scaled(
         self,
-        channels: Sequence[int],
-        own: Mapping[Key, Block],
-        shifted: Value,
-        into: Matrix,
-        means: Matrix,
+        coordinates: Value,
+        own: Mapping[int, Block],
         scale: Value,
-    ) -> _Settled:
-        """Coordinates of length one, 0 of rows that are rounding beside their bin; their lengths.
+        with_mean: bool,
+        unit: Value | None,
+    ) -> _Scaled:
+        """Coordinates of length one, and 0 of blocks that are rounding beside their bin.
 
-        Means are of all blocks, those of details 0 where the rest is.
+        Args:
+            coordinates: of all blocks, ``[B, c, sum of ranks + 1]``.
+            own: the blocks.
+            scale: largest magnitude of the filtered bin, ``[B, c]``.
+            with_mean: whether the length is that of the branch in full.
+            unit: of coordinates and scale, ``[B, c, 1]``; None for volts.
         """
-        coordinates = shifted @ into
-        ranks = [each.rank for each in own.values()]
-        of_block = np.repeat(np.eye(len(own)), ranks, axis=0)  # [sum of ranks, blocks]
-        length = ((coordinates * coordinates) @ of_block).sqrt()  # [B, c, blocks]
+        of_block = _of_block(own, mean=with_mean)  # [sum of ranks + 1, blocks]
+        length = ((coordinates * coordinates) @ of_block).sqrt()
         least = (scale * (_LEAST_SPAN / SPAN_OF_LENGTH)).max(_TINY).expand(2)
         is_kept = (length >= least).cast(F64)
         length = length.max(least)
-        coordinates = coordinates * ((is_kept / length) @ of_block.T)
-        mean = shifted @ means
+        exact = coordinates * ((is_kept / length) @ _of_block(own, mean=True).T)
+        in_volts = length if unit is None else length * unit
+        return _Scaled(exact.cast(self._form.dtype), exact, in_volts, is_kept)
+
+    def _mean(
+        self, coordinates: Value, own: Mapping[int, Block], is_kept: Value, unit: Value | None
+    ) -> Value:
+        """Means of all blocks, ``[B, c, blocks]``, in volts; of details 0 where the rest is."""
+        mean_alone = _of_block(own, mean=True) - _of_block(own, mean=False)
+        mean = coordinates @ (mean_alone / math.sqrt(self.window.bin))
         if any(each.is_detail for each in own.values()):
-            stays = np.array([float(not each.is_detail) for each in own.values()])
+            stays = [float(not each.is_detail) for each in own.values()]
             mean = mean * is_kept.max(self._graph.constant(stays, F64))
-        edges = np.cumsum([0, *ranks]).tolist()
-        narrow = coordinates.cast(self._form.dtype)
-        parts, exact = (
-            {key: each.slice(edges[place], edges[place + 1], 2) for place, key in enumerate(own)}
-            for each in (narrow, coordinates)
-        )
-        return parts, exact, length, mean
+        return mean if unit is None else mean * unit
 
 
-def _taken(value: Value, places: Sequence[int], num: int) -> Value:
-    """Entries of the second axis, which has ``num``; all of them in order as they are."""
-    return value if list(places) == list(range(num)) else value.take(places, 1)
+def _of_block(own: Mapping[int, Block], *, mean: bool) -> Matrix:
+    """Which coordinate is of which block, with or without their means, ``[.., blocks]``."""
+    widths = [each.rank + 1 for each in own.values()]
+    matrix: Matrix = np.repeat(np.eye(len(own)), widths, axis=0)
+    if not mean:
+        matrix[np.cumsum(widths) - 1] = 0.0
+    return matrix
+
+
+def _taken(value: Value, places: Sequence[int], of: Sequence[Any]) -> Value:
+    """Entries of the second axis, which is ``of``; all of them in order as they are."""
+    return value if list(places) == list(range(len(of))) else value.take(places, 1)
