@@ -138,6 +138,7 @@ def test_the_slider_judges_again_by_another_threshold(seen):
     assert standing[low] > standing["own"] > standing[high]
     assert alarms[high] < alarms["own"]
     assert own not in (0.0, 8.0)  # the ends of the slider are others
+    assert seen["slider"]["stepped"]["step"] == seen["slider"]["most"]["step"] - 1  # by an arrow
 
 
 @pytest.mark.onnx

@@ -54,12 +54,13 @@ async function keyboard(page) {
 
 /** Alarms at both ends of the slider, and after the reset. */
 async function slider(page) {
+  const threshold = page.locator("#threshold");
   const move = async (act) => {
     await act();
     await page.waitForFunction(() => document.body.ariaBusy === "false"); // all is judged again
-    return { shown: await text(page, "threshold-value"), lines: await decisionLines(page) };
+    return { step: Number(await threshold.inputValue()), lines: await decisionLines(page) };
   };
-  await page.locator("#threshold").focus();
+  await threshold.focus();
   const least = await move(() => page.keyboard.press("Home"));
   const most = await move(() => page.keyboard.press("End"));
   const stepped = await move(() => page.keyboard.press("ArrowLeft"));

@@ -109,16 +109,13 @@ function connectFiles(scope) {
     target.value = ""; // so that the same file can be chosen again
   });
   const mark = (isOver) => document.body.classList.toggle("dropping", isOver);
-  document.addEventListener("dragover", (event) => {
-    event.preventDefault();
-    mark(true);
-  });
+  document.addEventListener("dragover", () => mark(true));
   document.addEventListener("dragleave", ({ relatedTarget }) => mark(relatedTarget !== null));
-  document.addEventListener("drop", (event) => {
-    event.preventDefault();
+  document.addEventListener("drop", ({ dataTransfer }) => {
     mark(false);
-    open(event.dataTransfer.files[0]);
+    open(dataTransfer.files[0]);
   });
+  element("file").disabled = false;
 }
 
 /** Returns whether the slider has moved and nothing was judged by it yet. */
@@ -190,6 +187,11 @@ export function decisionLines() {
     lines.push(decisionLine(history.decision(i), precision, true));
   }
   return [...lines, summaryLine(history.count, history.alarms.length, fed / rate)];
+}
+
+for (const name of ["dragover", "drop"]) {
+  // what is dropped does not replace the page, even where there is no detector
+  document.addEventListener(name, (event) => event.preventDefault());
 }
 
 try {
