@@ -137,6 +137,8 @@ def test_the_slider_judges_again_by_another_threshold(seen):
     low, high = ("least", "most") if standing["least"] > standing["most"] else ("most", "least")
     assert standing[low] > standing["own"] > standing[high]
     assert alarms[high] < alarms["own"]
+    pixels = {name: told["pixels"] for name, told in seen["slider"].items()}
+    assert pixels[low] > pixels["own"] > pixels[high]  # the picture is judged again, too
     assert own not in (0.0, 8.0)  # the ends of the slider are others
     assert seen["slider"]["stepped"]["step"] == seen["slider"]["most"]["step"] - 1  # by an arrow
 

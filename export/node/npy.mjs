@@ -78,6 +78,7 @@ function latin1(bytes) {
 export function npyVolts(content, name, channels) {
   const head = new Uint8Array(content, 0, Math.min(HEADER_BYTES, content.byteLength));
   const { Type, rows, offset } = npyHeader(head, content.byteLength, name, channels);
-  const end = offset + rows * channels.length * Type.BYTES_PER_ELEMENT;
-  return new Type(content.slice(offset, end)); // a copy, for alignment is not promised
+  const num = rows * channels.length;
+  if (offset % Type.BYTES_PER_ELEMENT === 0) return new Type(content, offset, num);
+  return new Type(content.slice(offset, offset + num * Type.BYTES_PER_ELEMENT));
 }

@@ -52,13 +52,30 @@ async function keyboard(page) {
   return { playing, paused, after: await position(page) };
 }
 
+/** Pixels of the picture in the colour of slip. */
+function slipPixels(page) {
+  return page.evaluate(() => {
+    const { width, height } = document.getElementById("scope");
+    const context = document.getElementById("scope").getContext("2d");
+    const hex = getComputedStyle(document.documentElement).getPropertyValue("--slip").trim();
+    const [r, g, b] = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
+    const { data } = context.getImageData(0, 0, width, height);
+    let num = 0;
+    for (let i = 0; i < data.length; i += 4) {
+      num += data[i] === r && data[i + 1] === g && data[i + 2] === b;
+    }
+    return num;
+  });
+}
+
 /** Alarms at both ends of the slider, and after the reset. */
 async function slider(page) {
   const threshold = page.locator("#threshold");
   const move = async (act) => {
     await act();
     await page.waitForFunction(() => document.body.ariaBusy === "false"); // all is judged again
-    return { step: Number(await threshold.inputValue()), lines: await decisionLines(page) };
+    const step = Number(await threshold.inputValue());
+    return { step, pixels: await slipPixels(page), lines: await decisionLines(page) };
   };
   await threshold.focus();
   const least = await move(() => page.keyboard.press("Home"));

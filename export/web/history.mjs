@@ -18,7 +18,9 @@ export class History {
     this.clear();
   }
 
+  /** Forget all; `take` is another one from now on. */
   clear() {
+    this.take = {};
     this.count = 0;
     this.numInvalid = 0;
     this.alarms = []; // which decisions raised one

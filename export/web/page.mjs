@@ -23,7 +23,7 @@ function say(problem) {
 
 async function fetched(path, what) {
   const response = await fetch(path);
-  if (!response.ok) throw new Error(`cannot read ${what}: is it beside the model?`);
+  if (!response.ok) throw new Error(`the server cannot read ${what}: is it still there?`);
   return response;
 }
 
@@ -51,6 +51,11 @@ async function take(content, name, isSimulated, scope) {
   element("rate").value = facts.sample_rate_hz;
   for (const id of ["play", "restart"]) element(id).disabled = false;
   say(null);
+}
+
+async function takeGiven({ recording, simulated }, scope) {
+  const response = await fetched("/recording", recording);
+  await take(await response.arrayBuffer(), recording, simulated, scope);
 }
 
 function isRateRight() {
@@ -206,10 +211,7 @@ try {
   const isWaiting = connectThreshold(facts);
   new ResizeObserver(() => scope.resize()).observe(element("scope"));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => scope.restyle());
-  if (given.recording) {
-    const content = await (await fetched("/recording", given.recording)).arrayBuffer();
-    await take(content, given.recording, given.simulated, scope).catch(say);
-  }
+  if (given.recording) await takeGiven(given, scope).catch(say);
   run(scope, isWaiting);
 } catch (error) {
   element("model").textContent = "no detector";

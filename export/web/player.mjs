@@ -63,13 +63,9 @@ export class Player {
     return done;
   }
 
-  /**
-   * Feed what is due after so many seconds, within the budget of a frame.
-   *
-   * @returns {Promise<boolean>} whether anything was fed
-   */
+  /** Feed what is due after so many seconds, within the budget of a frame. */
   async advance(seconds) {
-    if (this.recording === null) return false;
+    if (this.recording === null) return;
     const { rows } = this.recording;
     const isLate = this.isCatchingUp;
     if (this.isPlaying && !isLate && seconds > 0) {
@@ -79,15 +75,14 @@ export class Player {
       );
     }
     const goal = isLate ? this.#again : Math.floor(this.#due);
-    const [before, era] = [this.fed, this.#era];
+    const era = this.#era;
     const stop = performance.now() + BUDGET_MS;
     while (this.fed < goal && performance.now() < stop) {
       await this.#push(goal);
-      if (this.#era !== era) return true;
+      if (this.#era !== era) return;
     }
     if (!isLate && this.fed < goal) this.#due = this.fed; // too fast for this machine: no debt
     if (this.isAtEnd && !this.isCatchingUp) this.isPlaying = false;
-    return this.fed > before;
   }
 
   async #push(goal) {

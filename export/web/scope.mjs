@@ -4,18 +4,7 @@ import { GUTTER, laneScales, panels, statisticRange, usedChannels } from "./lane
 import { drawOverlay } from "./overlay.mjs";
 
 const VIEW_S = 4; // seconds from left to right
-const COLOURS = [
-  "ink",
-  "muted",
-  "grid",
-  "panel",
-  "gauge",
-  "rest",
-  "slip",
-  "pale",
-  "alarm",
-  "hatch",
-];
+const COLOURS = "ink muted grid panel gauge rest slip pale alarm hatch".split(" ");
 
 /** Draws what a player has played. */
 export class Scope {
@@ -23,7 +12,8 @@ export class Scope {
   #ring = new OffscreenCanvas(1, 1);
   #first = 0; // columns from here ...
   #end = 0; // ... to here are in the ring
-  #history = null; // whose they are
+  #take = null; // of the history, whose they are
+  #hatch = null; // fills what is not valid
 
   constructor(canvas, facts) {
     this.#canvas = canvas;
@@ -31,7 +21,6 @@ export class Scope {
     this.used = usedChannels(facts);
     this.range = statisticRange(facts);
     this.restyle();
-    this.resize();
   }
 
   /** Take the colours of the page. */
@@ -39,7 +28,7 @@ export class Scope {
     const style = getComputedStyle(document.documentElement);
     const read = (name) => [name, style.getPropertyValue(`--${name}`).trim()];
     this.colours = Object.fromEntries(COLOURS.map(read));
-    this.forget();
+    this.resize(); // the hatching has a colour too
   }
 
   /** Take the size of the canvas' box. */
@@ -56,7 +45,6 @@ export class Scope {
     this.#hatch = hatching(this.#ring.getContext("2d"), this.colours.hatch, ratio);
     this.forget();
   }
-  #hatch;
 
   /** Scale the lanes for another recording. */
   show(recording) {
@@ -95,13 +83,13 @@ export class Scope {
 
   /** Bring the ring from what it holds to the columns in view. */
   #fill(first, end, history) {
-    const isBehind = history !== this.#history || end < this.#end || this.#end < first;
-    if (isBehind || this.#end === this.#first) {
-      this.#ring.getContext("2d").clearRect(0, 0, this.#ring.width, this.#ring.height);
-      this.#history = history;
+    const context = this.#ring.getContext("2d");
+    const isOther = history.take !== this.#take || end < this.#end || this.#end < first;
+    if (isOther || this.#end === this.#first) {
+      context.clearRect(0, 0, this.#ring.width, this.#ring.height);
+      this.#take = history.take;
       this.#end = first;
     }
-    const context = this.#ring.getContext("2d");
     for (let column = this.#end; column < end; column += 1) this.#column(context, column, history);
     this.#first = first;
     this.#end = end;
