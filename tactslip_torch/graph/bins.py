@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import Plan, Wanted
 from tactslip_torch.graph.descriptors import DESCRIPTORS
@@ -62,19 +64,27 @@ def bin_graph(detector: SlipDetector, form: Form) -> Graph:
 
     Shape:
         - in ``samples``: ``[batch, C, Window.length]``, volts, in the precision of the form
-        - out ``score``: ``[batch]``; ``probability``: ``[batch]``, if the detector has a calibration;
-          ``valid``: ``[batch]``, bool
+        - out ``score``, ``valid`` (bool) and, if calibrated, ``probability``: ``[batch]``
     """
     graph, window = Graph(), Window.of(detector)
+    settings = AlarmSettings.of(detector) if KEY in detector.info else None
     shape = ("batch", len(detector.pool.hand), window.length)
     samples = graph.input("samples", form.dtype, shape)
-    judged = judge_bins(graph, detector, samples.take(window.channels, 1), form)
-    graph.output("score", judged.score, ("batch",))
-    if KEY in detector.info:
-        settings = AlarmSettings.of(detector)
-        llr = llr_of(judged.score, settings.calibration)
-        graph.output("probability", probability_of(llr, settings.slip_share), ("batch",))
-    graph.output("valid", judged.is_valid, ("batch",))
+
+    def judged(body: Graph) -> list[Value]:
+        found = judge_bins(body, detector, samples.at(body).take(window.channels, 1), form)
+        if settings is None:
+            return [found.score, found.is_valid]
+        llr = llr_of(found.score, settings.calibration)
+        return [found.score, found.is_valid, probability_of(llr, settings.slip_share)]
+
+    def nothing(body: Graph) -> list[Value]:  # onnxruntime reduces and reshapes no empty batch
+        dtypes = (form.dtype, BOOL, *([] if settings is None else [form.dtype]))
+        return [body.constant(np.zeros(0), dtype) for dtype in dtypes]
+
+    made = graph.if_(samples.length(0).squeeze(0) > 0, judged, nothing)
+    for name, value in zip(("score", "valid", "probability"), made, strict=False):
+        graph.output(name, value, ("batch",))
     return graph
 
 

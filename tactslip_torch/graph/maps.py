@@ -1,8 +1,8 @@
 """The constant matrices of a graph: filter, branches and spectra fused, and cut to their rank.
 
-A bin's window goes to a few coordinates of each branch (51, 27, 15 or 9 for 100 samples), in
-float64; from coordinates brought to length one it goes on to branches and spectra, which are then
-good to rounding in any precision. All of it is made of ``LinearMaps`` and the filter's kernel.
+A bin's window goes to a few coordinates of each branch (51, 27, 15 or 9 for 100 samples) and to its
+mean, in float64; from coordinates brought to length one it goes on to branches and spectra, which
+are then good to rounding in any precision. All is made of ``LinearMaps`` and the filter's kernel.
 
 A window ``x`` is given as ``[x - first, first]``, ``first`` being the first sample of its bin: so
 a small vibration keeps its digits on any offset, and details of a constant are exactly 0.
@@ -10,9 +10,9 @@ a small vibration keeps its digits on any offset, and details of a constant are 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.features.linear_maps import RANK_TOLERANCE, LinearMaps
-from tactslip_torch.features.plan import Row
 from tactslip_torch.signals.filtering import ChannelFilter
 
 Matrix = NDArray[np.float64]
-BlockKind = Literal["gauge", "branch", "level"]
-"""``branch``: a detail, or a centred approximation. ``level``: an approximation as it is, for its
-spectrum, which knows the offset."""
+GAUGE = -1
+"""Instead of a branch: a gauge's bin as it is."""
 
 
 @dataclass(frozen=True)
@@ -34,21 +32,15 @@ class Block:
     """The coordinates of one branch (or of a gauge's bin), and what is made of them.
 
     Args:
-        kind: which coordinates.
-        branch: index in ``branch_names``; -1 for a gauge.
-        into: from ``[x - first, first]`` to the coordinates, ``[W + 1, r]``; their length is that
-            of the branch.
-        mean: from the same to the branch's mean, ``[W + 1]``.
-        out: from coordinates to the branch less its mean, ``[r, n]``; None if they are that.
-        cosine: from coordinates to the real part of its spectrum, ``[r, L]``.
+        into: from ``[x - first, first]`` to coordinates, ``[W + 1, r + 1]``: r of the branch less
+            its mean, and its mean. Their length is that of the branch, less its mean and in full.
+        out: from the first r to the branch less its mean, ``[r, n]``; None if they are that.
+        cosine: from all to the real part of its spectrum, ``[r + 1, L]``.
         sine: to the imaginary part.
         is_detail: whether its mean vanishes with the rest.
     """
 
-    kind: BlockKind
-    branch: int
     into: Matrix
-    mean: Matrix
     out: Matrix | None
     cosine: Matrix
     sine: Matrix
@@ -56,56 +48,41 @@ class Block:
 
     @property
     def rank(self) -> int:
-        """Number of coordinates."""
-        return int(self.into.shape[1])
+        """Number of coordinates but the mean."""
+        return int(self.into.shape[1]) - 1
 
 
-def block_kind(row: Row, maps: LinearMaps) -> BlockKind:
-    """Which coordinates a row is made of."""
-    if row.kind == "gauge":
-        return "gauge"
-    return "level" if row.kind == "freq" and maps.is_approximation[row.branch] else "branch"
-
-
-def block(kind: BlockKind, branch: int, maps: LinearMaps, smooth: Tensor) -> Block:
+def block(branch: int, maps: LinearMaps, smooth: Tensor) -> Block:
     """The coordinates of one branch.
 
     Args:
-        kind: which.
-        branch: index in ``branch_names``.
+        branch: index in ``branch_names``, or ``GAUGE``.
         maps: of the pool.
         smooth: the filter, ``[n, W]`` (``filter_matrix``).
     """
     num = maps.num_samples
     identity = torch.eye(num, dtype=torch.float64)
-    dense = identity if kind == "gauge" else maps.dense[branch]
-    is_detail = kind != "gauge" and not maps.is_approximation[branch]
-    shown = dense - dense.mean(0) if kind != "level" and not is_detail else dense
-    if kind == "gauge":
-        out, into = identity, shown
+    dense = identity if branch == GAUGE else maps.dense[branch]
+    is_detail = branch != GAUGE and not maps.is_approximation[branch]
+    mean = dense.mean(0, keepdim=True)
+    if branch == GAUGE:
+        out, into = identity, dense - mean
     else:
-        left, sizes, right = torch.linalg.svd(shown)
+        left, sizes, right = torch.linalg.svd(dense - mean)
         rank = max(1, int((sizes > RANK_TOLERANCE * sizes[0]).sum()))
         out, into = left[:, :rank], sizes[:rank, None] * right[:rank]
-    lines = maps.dense_lines @ out
-    offset = into.sum(-1) if kind == "level" else into.new_zeros(len(into))
-    centred = None if kind == "gauge" else (out - out.mean(0)).T.numpy()
+    root = math.sqrt(num)
+    both = torch.cat([into, root * mean]) @ smooth
+    of_first = torch.zeros(len(both), 1, dtype=torch.float64)
+    of_first[-1] = 0.0 if is_detail else root
+    lines = maps.dense_lines @ torch.cat([out, out.new_full((num, 1), 1 / root)], dim=-1)
     return Block(
-        kind,
-        branch,
-        torch.cat([into @ smooth, offset[:, None]], dim=-1).T.numpy(),
-        torch.cat([dense.mean(0) @ smooth, dense.new_tensor([float(not is_detail)])]).numpy(),
-        centred,
+        torch.cat([both, of_first], dim=-1).T.numpy(),
+        None if branch == GAUGE else out.T.numpy(),
         lines[: maps.num_lines].T.numpy(),
         lines[maps.num_lines :].T.numpy(),
         is_detail,
     )
-
-
-def blocks(rows: Iterable[Row], maps: LinearMaps, smooth: Tensor) -> dict[Any, Block]:
-    """The blocks of rows, by kind and branch, in order."""
-    wanted = sorted({(block_kind(row, maps), row.branch) for row in rows})
-    return {key: block(*key, maps, smooth) for key in wanted}
 
 
 def filter_matrix(channel_filter: ChannelFilter, channel: int, num: int) -> Tensor:
@@ -131,10 +108,7 @@ def energy_matrix(
         The matrix of all branches together and of each wanted one, ``[W + 1, sum of ranks]``; and
         these ranks.
     """
-    own = [
-        block("level" if is_approximation else "branch", branch, maps, smooth)
-        for branch, is_approximation in enumerate(maps.is_approximation)
-    ]
+    own = [block(branch, maps, smooth) for branch in range(len(maps.branches))]
     lines = [np.concatenate([each.cosine, each.sine], axis=1).T @ each.into.T for each in own]
     parts = [np.concatenate(lines), *(lines[branch] for branch in branches)]
     columns = []

@@ -234,10 +234,7 @@ class Front:
         return _Channels(channels, smooth, shifted, filtered, scale, own, mean, scaled)
 
     def _judge(self, channels: tuple[int, ...], filtered: Value, unit: Value | None) -> Value:
-        """Which channels can be trusted; and the largest magnitude of each, ``[B, c]``, float64.
-
-        In the precision of the form: sensors resolve no more than they give.
-        """
+        """Which channels can be trusted, by what sensors resolve; and the largest magnitudes."""
         high, low = filtered.amax(2), filtered.amin(2)
         scale = high.max(-low)
         probe = filtered.slice(0, 1, 2).squeeze(2)  # NaN if anything in the window is no number
