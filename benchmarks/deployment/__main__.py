@@ -41,9 +41,11 @@ from benchmarks.deployment.stream import on_streams
 from benchmarks.deployment.subject import subject_of
 from benchmarks.engines import ENGINES
 from benchmarks.exported import judge_of
-from benchmarks.machine import PEERS, machine_facts, versions
+from benchmarks.machine import machine_facts, versions
 from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, add_paths, refuse_paths, told
 from tactslip_torch.signals.filtering import ChannelFilter
+
+_LIBRARIES = ("numba", "PyWavelets", "ptwt", "onnx", "onnxruntime", "onnxscript")
 
 
 def measure(sizes: Sizes, path: Path | None, quick: bool) -> dict[str, Any]:
@@ -68,7 +70,7 @@ def measure(sizes: Sizes, path: Path | None, quick: bool) -> dict[str, Any]:
         "quick": quick,
         "machine": machine,
         "threads": max(sizes.threads),
-        "versions": versions((*PEERS, "onnx", "onnxscript")),
+        "versions": versions(_LIBRARIES),
         "settings": asdict(sizes),
         "selection": dict(subject.timed.selection) | {"trained": dict(subject.source)},
         "training_bins": len(subject.machine.support),

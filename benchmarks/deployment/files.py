@@ -32,11 +32,8 @@ def exported(precision: str, layout: str) -> str:
     return f"export, {precision}, {layout}"
 
 
-def naive_of(subject: Subject, is_whole: bool) -> NaivePipeline:
-    """The naive pipeline with the kernel sum, in float64."""
-    of = subject.timed
-    parts = (pool_of(FLOAT64), ChannelFilter(WINDOW_LENGTHS), of.selected, of.scaler)
-    return NaivePipeline(*parts, subject.machine, is_whole)
+EXPORTS = {exported(*form): form for form in product(PRECISIONS, LAYOUTS)}
+"""Every way by our export, with precision and layout."""
 
 
 class Files(NamedTuple):
@@ -51,6 +48,13 @@ class Files(NamedTuple):
     seconds: dict[str, float]
 
 
+def naive_of(subject: Subject, is_whole: bool) -> NaivePipeline:
+    """The naive pipeline with the kernel sum, in float64."""
+    of = subject.timed
+    parts = (pool_of(FLOAT64), ChannelFilter(WINDOW_LENGTHS), of.selected, of.scaler)
+    return NaivePipeline(*parts, subject.machine, is_whole)
+
+
 def of_way(way: str, graph: str) -> str:
     """What the file of a graph of ours is called."""
     return f"{way}, {graph}"
@@ -61,8 +65,7 @@ def make_files(subject: Subject, sizes: Sizes, folder: Path) -> Files:
     files = Files({DETECTOR: folder / DETECTOR}, {})
     detector = subject.detector("reference", FLOAT64)
     detector.save(files.paths[DETECTOR])
-    for precision, layout in product(PRECISIONS, LAYOUTS):
-        way = exported(precision, layout)
+    for way, (precision, layout) in EXPORTS.items():
         say(f"deployment: {way}")
         own = folder / f"{precision}-{layout}"
         own.mkdir()

@@ -15,7 +15,7 @@ class Sizes:
     Args:
         recordings: simulated, to whose bins the machine is fitted; they are its kernel sum.
         held_out: bins of other recordings and materials, that are judged.
-        judged_s: a way judges as many of them as it can in about so long.
+        judged_s: a way other than our export judges as many of them as it can in about so long.
         timed: bins that calls take in turn.
         threads: one after the other.
         rounds: of every way on a single bin.
@@ -37,15 +37,15 @@ class Sizes:
 
     recordings: int = 33
     held_out: int = 10_000
-    judged_s: float = 3.0
+    judged_s: float = 1.5
     timed: int = 64
     threads: tuple[int, ...] = (1, 2)
     rounds: int = 20
     block_ms: float = 10.0
     most_calls: int = 60
     chunks: tuple[int, ...] = (1, 4, 16, 64, 256, 1024)
-    bulk_rounds: int = 5
-    longest_s: float = 0.15
+    bulk_rounds: int = 4
+    longest_s: float = 0.1
     stream_rounds: int = 10
     stretch: int = 40
     streamed_s: float = 20.0

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.clocks import on_threads, say
-from benchmarks.deployment.files import LAYOUTS, PRECISIONS, STREAM, Files, exported, of_way
+from benchmarks.deployment.files import EXPORTS, STREAM, Files, of_way
 from benchmarks.deployment.measure import error_of
 from benchmarks.deployment.sizes import PUSHES, Sizes
 from benchmarks.deployment.subject import Subject
@@ -85,8 +85,7 @@ class Stream:
 def watchers(subject: Subject, files: Files) -> dict[str, Callable[[], Watcher]]:
     """What makes a watcher, by way."""
     found: dict[str, Callable[[], Watcher]] = {}
-    for precision, layout in product(PRECISIONS, LAYOUTS):
-        way = exported(precision, layout)
+    for way in EXPORTS:
         found[way] = partial(Graph, files.paths[of_way(way, STREAM)])
     for engine, dtype in product(ENGINES, (FLOAT32, FLOAT64)):
         found[engine_way(engine, dtype)] = partial(Stream, subject, engine, dtype)

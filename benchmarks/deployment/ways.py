@@ -18,11 +18,9 @@ from benchmarks.bins import raw_bins
 from benchmarks.clocks import say, timed
 from benchmarks.deployment.files import (
     BIN,
-    LAYOUTS,
+    EXPORTS,
     NAIVE,
-    PRECISIONS,
     Files,
-    exported,
     naive_of,
     of_way,
 )
@@ -119,8 +117,7 @@ def fresh_compilation() -> AbstractContextManager[Any]:
 def _exports(subject: Subject, files: Files, threads: int) -> dict[str, Way]:
     context = subject.detector("reference", FLOAT64).channel_filter.context
     found = {}
-    for precision, layout in product(PRECISIONS, LAYOUTS):
-        name = exported(precision, layout)
+    for name in EXPORTS:
         judge = judge_of(files.paths[of_way(name, BIN)], threads, context)
         found[name] = Way(*judge, len(subject.timed.selected))
     return found
