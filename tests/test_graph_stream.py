@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import onnxruntime
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,37 +13,34 @@ from streams import detector_of, signal
 
 from tactslip_torch.graph.bins import Judged
 from tactslip_torch.graph.form import Form, Window
-from tactslip_torch.graph.stream import stream_graph
+from tactslip_torch.graph.stream import Timing, stream_graph
 from tactslip_torch.graph.value import F64
 from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.judgement import Judgement
+from tactslip_torch.onset.scoring import score_stream
 from tactslip_torch.onset.sequential import BayesFilter, Cusum, Hysteresis, KOfN
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.signals.filtering import ChannelFilter
 
 RATE = 2000.0
-KINDS = ("all", "PVDF")
+KINDS = ("all", "PVDF", "long")  # long: a frame that a causal bin does not hold
 ALIGNMENTS = ("centred", "causal", "trailing")
 RULES = {
     rule.name: rule
     for rule in (KOfN(2, 3), Hysteresis(0.5), BayesFilter(1.0, 0.3, 0.01, 0.2), Cusum(0.5, 0.5, 2))
 }
-# Scores of the stand-in lie about 0.3; these make half of them speak for slip.
+# Scores of the stand-in lie about 0, so that half of them speak for slip.
 CALIBRATIONS = {
-    "platt": Platt(6.0, -1.5),
-    "isotonic": Isotonic((0.05, 0.1, 0.2, 0.4, 0.8), (-3.0, -2.0, -0.5, 1.0, 2.5)),
+    "platt": Platt(1.0, 0.0),
+    "isotonic": Isotonic((-4.0, -1.0, 0.0, 1.0, 2.0), (-3.0, -2.0, -0.5, 1.0, 2.5)),
 }
-
-
-def loudness(bins, *, given):
-    """Stands in for a detector's ``judge``: mean square of its channels, those missing apart."""
-    is_missing = ~bins.isfinite().all(-1)
-    loud = bins.square().mean(-1).masked_fill(is_missing, 0.0).mean(-1)
-    return Judgement(loud.to(given), ~is_missing.any(-1), is_missing)
+USUAL = {"all": -6.0, "PVDF": -8.0, "long": -6.0}  # log of the mean variance of channels in use
+FLOOR = 1e-9  # of a variance, volts squared: what does not move has one score in any arithmetic
 
 
 def judge_loudness(graph, detector, windows, form):
-    """The same of raw windows, as nodes; samples beyond a channel's frame may be anything."""
+    """The same of raw windows, as nodes; what lies beyond a channel's frame is not looked at."""
     window, layer = Window.of(detector), detector.channel_filter
     parts = []
     for place, channel in enumerate(window.channels):
@@ -55,9 +53,11 @@ def judge_loudness(graph, detector, windows, form):
             matrix[i : i + len(kernel), i] = kernel
         parts.append(own.cast(F64) @ matrix.numpy())
     filtered = graph.concat(*parts, axis=1)
-    loud = (filtered * filtered).mean(2)
+    moved = filtered - filtered.mean(2, keep=True)
+    loud = (moved * moved).mean(2)
     is_there = loud.is_finite()
-    total = graph.where(is_there, loud, 0.0).sum(1) / float(len(detector.pool.hand))
+    total = graph.where(is_there, loud, 0.0).sum(1)
+    total = (total + FLOOR).log() - detector.usual
     num_there = is_there.cast(F64).sum(1)
     is_valid = num_there.equals(float(len(window.channels)))
     return Judged(total.cast(form.dtype), is_valid, num_there > 0.0)
@@ -65,13 +65,18 @@ def judge_loudness(graph, detector, windows, form):
 
 @cache
 def loud_detector(kind="all", align="centred"):
-    detector = detector_of(kind, align)
-    unused = torch.ones(len(detector.pool.hand), dtype=torch.bool)
-    unused[detector.needed_index] = False
+    """A detector whose score is the logarithm of what its channels move, those missing apart."""
+    detector = detector_of("all" if kind == "long" else kind, align)
+    if kind == "long":
+        detector.channel_filter = ChannelFilter([151, 51, 11, 3], align=align)
+    detector.usual = USUAL[kind]
+    used = detector.needed_index
 
     def judge(bins, *, given):
-        judged = loudness(bins.masked_fill(unused[:, None], 0.0), given=given)
-        return judged._replace(is_missing=judged.is_missing)
+        is_missing = ~bins.isfinite().all(-1)
+        loud = bins.var(-1, correction=0).masked_fill(is_missing, 0.0)[:, used].sum(-1)
+        score = (loud + FLOOR).log() - detector.usual
+        return Judgement(score.to(given), ~is_missing[:, used].any(-1), is_missing)
 
     detector.judge = judge
     return detector
@@ -92,7 +97,7 @@ def settings_of(rule="k_of_n", calibration="platt", hop=20, threshold=1.0, share
 
 
 class Host:
-    """What a program around the graph does: it keeps tail and state, and no more."""
+    """What a program around the graph does: it keeps tail and state, and nothing else."""
 
     def __init__(self, session, num_channels, dtype):
         self.session, self.dtype = session, dtype
@@ -149,7 +154,8 @@ def assert_same(found, expected):
         np.testing.assert_array_equal(found[name], wanted, err_msg=name)
 
 
-def assert_same_stream(host, stream, samples, cuts):
+def assert_same_stream(host, stream, samples, cuts=()):
+    """Push pieces to both; returns how many alarms there were."""
     places = [0, *sorted(min(cut, samples.shape[-1]) for cut in cuts), samples.shape[-1]]
     num = 0
     for start, stop in pairwise(places):
@@ -169,13 +175,130 @@ def assert_same_stream(host, stream, samples, cuts):
     calibration=st.sampled_from(list(CALIBRATIONS)),
     hop=st.sampled_from([5, 7, 20, 100, 120]),
     double=st.booleans(),
+    seed=st.integers(0, 20),
     bad=st.lists(st.tuples(st.integers(0, 899), st.sampled_from([np.nan, np.inf])), max_size=3),
 )
 def test_any_cut_gives_what_the_detector_gives(
-    num_samples, cuts, kind, align, rule, calibration, hop, double, bad
+    num_samples, cuts, kind, align, rule, calibration, hop, double, seed, bad
 ):
     host, stream = pair_of(kind, align, rule, calibration, hop, double)
-    samples = signal(900, 5, stream.dtype)
+    samples = signal(900, seed, stream.dtype)
     for place, value in bad:
         samples[place % 4, place] = value
     assert_same_stream(host, stream, samples[:, :num_samples], cuts)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("double", [True, False])
+def test_small_pieces_raise_the_same_alarms(rule, double):
+    host, stream = pair_of(rule=rule, double=double)
+    samples = signal(3000, 5, stream.dtype)
+    cuts = [*range(300), *range(300, 3000, 7)]
+    assert assert_same_stream(host, stream, samples, cuts) >= 3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("align", ALIGNMENTS)
+def test_the_start_of_a_stream_is_filtered_as_a_recording(kind, align):
+    host, stream = pair_of(kind, align, hop=5)
+    samples = signal(300, 3) + torch.linspace(0, 5, 300, dtype=torch.float64)
+    assert_same_stream(host, stream, samples, [120, 180])
+    host, stream = pair_of(kind, align, hop=5)
+    still = torch.full((4, 300), 0.1, dtype=torch.float64)  # 0.1 has no exact mean
+    assert_same_stream(host, stream, still)
+
+
+@pytest.mark.parametrize("align", ALIGNMENTS)
+@pytest.mark.parametrize("place", [0, 4, 5, 10, 11, 25, 50, 51, 99])
+def test_a_hole_at_the_start_reaches_as_far_as_in_the_detector(align, place):
+    for channel in (0, 3):
+        host, stream = pair_of(align=align, hop=5)
+        samples = signal(300, 3)
+        samples[channel, place] = torch.nan
+        assert_same_stream(host, stream, samples, [60, 140])
+
+
+def test_a_threshold_that_is_given_counts_for_that_push():
+    host, own = pair_of(rule="hysteresis")[0], pair_of(rule="hysteresis")[0]
+    samples = signal(1200, 8).T.numpy()
+    for threshold in (0.3, 2.0, -np.inf, np.inf):
+        at_it, _ = pair_of(rule="hysteresis")
+        at_it.session = session_of(
+            "all", "centred", "hysteresis", "platt", 20, "float64", threshold
+        )
+        at_it.tail, at_it.state = host.tail, host.state
+        expected, found = at_it.push(samples), host.push(samples, threshold)
+        for name, value in expected.items():
+            np.testing.assert_array_equal(found[name], value, err_msg=name)
+    usual, found = own.push(samples), pair_of(rule="hysteresis")[0].push(samples, 1.0)
+    np.testing.assert_array_equal(found["alarm"], usual["alarm"])
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("double", [True, False])
+def test_what_is_kept_has_one_size_and_nothing_else_is(rule, double):
+    settings, detector = settings_of(rule), loud_detector()
+    timing = Timing.of(detector, settings)
+    host, stream = pair_of(rule=rule, double=double)
+    other, other_stream = pair_of(rule=rule, double=double)
+    other.session = host.session
+    samples, others = (signal(900, seed, stream.dtype) for seed in (1, 2))
+    for start, stop in pairwise([0, 0, 1, 50, 124, 125, 126, 400, 400, 900]):
+        for one, torch_one, given_samples in (
+            (host, stream, samples),
+            (other, other_stream, others),
+        ):
+            piece = given_samples[:, start:stop].T
+            assert_same(one.push(piece.numpy()), torch_one.push(piece))
+            assert one.tail.shape == (timing.tail, 4)
+            assert one.state.shape == (timing.state_size,)
+            assert one.tail.dtype == one.dtype
+    np.testing.assert_array_equal(host.tail, samples[:, -timing.tail :].T.numpy())
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_stream_that_ran_for_years_goes_on(rule):
+    young, _ = pair_of(rule=rule)
+    samples = signal(2000, 5).T.numpy()
+    young.push(samples[:700])
+    old, _ = pair_of(rule=rule)
+    num = 10**12  # decisions
+    old.tail, old.state = young.tail, young.state.copy()
+    old.state[[0, 1, 2]] += [num * 20, num, num]
+    expected, found = young.push(samples[700:]), old.push(samples[700:])
+    for name in ("score", "statistic", "valid", "alarm", "on"):
+        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+    assert expected["alarm"].any()
+    samples_by_then = np.rint(expected["time_s"] * RATE) + num * 20
+    np.testing.assert_array_equal(found["time_s"], samples_by_then / RATE)
+
+
+# With the detector's own judgement --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["all", "PVDF"])
+@pytest.mark.parametrize("align", ALIGNMENTS)
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_a_detector_that_judges_for_itself_raises_the_same_alarms(kind, align, precision):
+    detector, dtype = detector_of(kind, align), getattr(torch, precision)
+    samples = signal(2000, 5, dtype)
+    samples[2, 1500] = torch.nan
+    usual = score_stream(detector, samples[:, :1400], 20).score
+    middle, spread = float(usual.median()), float(usual.std())
+    calibration, rule = Platt(2 / spread, -2 * middle / spread), KOfN(1, 2)
+    times = {"rearm_s": 0.02, "refractory_s": 0.05}
+    settings = AlarmSettings(20, calibration, rule, 0.5, target_per_hour=1.0, **times)
+    graph = stream_graph(detector, settings, Form(precision))
+    session = onnxruntime.InferenceSession(graph.model({}).SerializeToString())
+    host = Host(session, 4, np.dtype(precision))
+    stream = StreamingDetector(detector, settings, dtype=dtype)
+    alarms, close = 0, 1e-9 if precision == "float64" else 1e-3
+    for piece in samples.T.split([1, 299, 700, 3, 997]):
+        found, expected = host.push(piece.numpy()), stream.push(piece)
+        for name, attribute in EXACT.items():
+            wanted = getattr(expected, attribute).numpy()
+            np.testing.assert_array_equal(found[name], wanted, err_msg=name)
+        np.testing.assert_allclose(found["score"], expected.score, rtol=0, atol=close * spread)
+        alarms += len(expected.alarms)
+    assert alarms >= 3
+    assert not expected.is_valid.all()
