@@ -77,7 +77,7 @@ def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
 
     The first samples of a signal take the polynomial of its first frame. The plain filter makes
     the same of them if it is given these in front: ``x[0] + past @ (x[:window_length] - x[0])``,
-    the last one next to ``x[0]``. A NaN or Inf in the first frame makes all of them NaN.
+    the last one next to ``x[0]``. A NaN or Inf in the first frame leaves none of them finite.
 
     Shape:
         - output: ``[before, window_length]``, float64, with ``before, after`` of ``reach``; its
@@ -88,7 +88,8 @@ def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
 
     Example:
         >>> x = torch.tensor([0.0, 2.0, 4.0], dtype=torch.float64)
-        >>> x[0] + past_matrix(3, 1, "centred") @ (x - x[0])  # a line goes on
+        >>> past = x[0] + past_matrix(3, 1, "centred") @ (x - x[0])  # a line goes on
+        >>> past.round(decimals=9)
         tensor([-2.], dtype=torch.float64)
     """
     head, kernel, _ = edge_matrices(window_length, polyorder, align)
@@ -99,7 +100,8 @@ def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
     for i, row in enumerate(rows):
         row[i : i + window_length] = kernel
     past, known = rows[:, :before], rows[:, before:]
-    return torch.linalg.lstsq(past, head - known, driver="gelsd").solution
+    solution: Tensor = torch.linalg.lstsq(past, head - known, driver="gelsd").solution
+    return solution
 
 
 def savgol_filter(
