@@ -47,7 +47,7 @@ def judge_bins(graph: Graph, detector: SlipDetector, windows: Value, form: Form)
         - windows: ``[B, channels, Window.length]``
     """
     front = Front(graph, detector, windows, form)
-    features = _features(graph, detector, front, form)
+    features = selected_features(graph, detector, front, form)
     z = with_typical(graph, scaled(graph, features, detector.scaler), front.is_missing, detector)
     score = machine(graph, z, detector.head, form)
     is_finite = score.is_finite()
@@ -88,7 +88,7 @@ def bin_graph(detector: SlipDetector, form: Form) -> Graph:
     return graph
 
 
-def _features(graph: Graph, detector: SlipDetector, front: Front, form: Form) -> Value:
+def selected_features(graph: Graph, detector: SlipDetector, front: Front, form: Form) -> Value:
     """Selected features in their order, ``[B, K]``, float64."""
     plan, axis_hz = detector.extractor.plan, LinearMaps.of(detector.pool).frequency_hz
     pieces, column_of, width = list[Value](), dict[int, int](), 0

@@ -52,21 +52,22 @@ class _Scaled(NamedTuple):
 
     narrow: Value  # [B, c, sum of ranks], in the precision of the form
     exact: Value  # the same in float64
-    length: Value  # [B, c, blocks], in volts
+    length: Value  # [B, c, blocks]
     is_kept: Value  # [B, c, blocks], 1 or 0: not rounding beside its bin
 
 
 @dataclass(frozen=True)
 class _Channels:
-    """Channels that share a frame and a kind, and their nodes, in volts."""
+    """Channels that share a frame and a kind, and their nodes; all in one unit a channel."""
 
     channels: tuple[int, ...]
     smooth: torch.Tensor
     shifted: Value  # [B, c, W + 1]
+    unit: Value | None  # [B, c], in volts; None: everything is in volts
     filtered: Value  # [B, c, n]
     scale: Value  # [B, c]
     blocks: Mapping[int, Block]  # by branch
-    mean: Value | None  # [B, c, blocks]
+    mean: Value | None  # of rows that are no spectra, over their length, [B, c, blocks]
     scaled: Mapping[bool, _Scaled]  # for spectra, or not
 
 
@@ -129,16 +130,16 @@ class Front:
         if is_freq:
             real, imaginary = made
             made = [(real * real + imaginary * imaginary).sqrt()]
-        unit = self._cells(
-            ordered, lambda group: group.scaled[is_freq].length if is_freq in group.scaled else None
-        )
+        length = self._cells(ordered, lambda group: group.scaled[is_freq].length)
         scale = film = None
         if with_scale:
-            scales = graph.concat(*(group.scale for group in self._groups), axis=1)
-            scale = scales.take([self._order.index(row.channel) for row in ordered], 1) / unit
+            scale = self._of_channels(ordered, lambda group: group.scale) / length
         if with_film and not is_freq:
             film = self._films(parts, dtype)
-        mean = None if is_freq else self._cells(ordered, lambda group: group.mean) / unit
+        mean = None if is_freq else self._cells(ordered, lambda group: group.mean)
+        unit = length
+        if self._form.dtype == F64:
+            unit = unit * self._of_channels(ordered, lambda group: group.unit)
         return Rows(tuple(ordered), made[0], mean, unit, scale, film)
 
     def shares(self, channel: int, branches: Sequence[int]) -> Value:
@@ -175,13 +176,18 @@ class Front:
         """What there is one of per channel and block, of each row, ``[B, R]``."""
         tables, cells = list[Value](), list[tuple[int, int]]()
         for group in self._groups:
-            if (table := of(group)) is not None:
-                cells += [
-                    (channel, branch) for channel in group.channels for branch in group.blocks
-                ]
+            is_asked = any(row.channel in group.channels for row in rows)
+            if is_asked and (table := of(group)) is not None:
+                cells += itertools.product(group.channels, group.blocks)
                 tables.append(table.reshape(0, len(group.channels) * len(group.blocks)))
         places = [cells.index((row.channel, row.branch)) for row in rows]
         return _taken(self._graph.concat(*tables, axis=1), places, cells)
+
+    def _of_channels(self, rows: Sequence[Row], of: Callable[[_Channels], Value | None]) -> Value:
+        """What there is one of per channel, of each row, ``[B, R]``."""
+        tables = [table for group in self._groups if (table := of(group)) is not None]
+        whole = self._graph.concat(*tables, axis=1)
+        return whole.take([self._order.index(row.channel) for row in rows], 1)
 
     def _films(self, parts: Sequence[Sequence[Row]], dtype: np.dtype[Any]) -> Value:
         """Filtered bins of rows less their mean, of order one; 0 where that is rounding."""
@@ -226,12 +232,11 @@ class Front:
         if own:
             coordinates = shifted @ np.concatenate([each.into for each in own.values()], axis=1)
             for is_freq in sorted({row.kind == "freq" for row in rows}):
-                scaled[is_freq] = self._scaled(coordinates, own, scale, is_freq, unit)
+                scaled[is_freq] = self._scaled(coordinates, own, scale, is_freq)
         if False in scaled:
-            mean = self._mean(coordinates, own, scaled[False].is_kept, unit)
-        if unit is not None:
-            scale = scale * unit.squeeze(2)
-        return _Channels(channels, smooth, shifted, filtered, scale, own, mean, scaled)
+            mean = self._mean(coordinates, own, scaled[False])
+        unit = None if unit is None else unit.squeeze(2)
+        return _Channels(channels, smooth, shifted, unit, filtered, scale, own, mean, scaled)
 
     def _judge(self, channels: tuple[int, ...], filtered: Value, unit: Value | None) -> Value:
         """Which channels can be trusted, by what sensors resolve; and the largest magnitudes."""
@@ -249,12 +254,7 @@ class Front:
         return scale.cast(F64)
 
     def _scaled(
-        self,
-        coordinates: Value,
-        own: Mapping[int, Block],
-        scale: Value,
-        with_mean: bool,
-        unit: Value | None,
+        self, coordinates: Value, own: Mapping[int, Block], scale: Value, with_mean: bool
     ) -> _Scaled:
         """Coordinates of length one, and 0 of blocks that are rounding beside their bin.
 
@@ -263,27 +263,22 @@ class Front:
             own: the blocks.
             scale: largest magnitude of the filtered bin, ``[B, c]``.
             with_mean: whether the length is that of the branch in full.
-            unit: of coordinates and scale, ``[B, c, 1]``; None for volts.
         """
-        of_block = _of_block(own, mean=with_mean)  # [sum of ranks + 1, blocks]
-        length = ((coordinates * coordinates) @ of_block).sqrt()
+        length = ((coordinates * coordinates) @ _of_block(own, mean=with_mean)).sqrt()
         least = (scale * (_LEAST_SPAN / SPAN_OF_LENGTH)).max(_TINY).expand(2)
         is_kept = (length >= least).cast(F64)
         length = length.max(least)
         exact = coordinates * ((is_kept / length) @ _of_block(own, mean=True).T)
-        in_volts = length if unit is None else length * unit
-        return _Scaled(exact.cast(self._form.dtype), exact, in_volts, is_kept)
+        return _Scaled(exact.cast(self._form.dtype), exact, length, is_kept)
 
-    def _mean(
-        self, coordinates: Value, own: Mapping[int, Block], is_kept: Value, unit: Value | None
-    ) -> Value:
-        """Means of all blocks, ``[B, c, blocks]``, in volts; of details 0 where the rest is."""
+    def _mean(self, coordinates: Value, own: Mapping[int, Block], scaled: _Scaled) -> Value:
+        """Means over lengths, ``[B, c, blocks]``; of details 0 where the rest is."""
         mean_alone = _of_block(own, mean=True) - _of_block(own, mean=False)
-        mean = coordinates @ (mean_alone / math.sqrt(self.window.bin))
+        mean = coordinates @ (mean_alone / math.sqrt(self.window.bin)) / scaled.length
         if any(each.is_detail for each in own.values()):
             stays = [float(not each.is_detail) for each in own.values()]
-            mean = mean * is_kept.max(self._graph.constant(stays, F64))
-        return mean if unit is None else mean * unit
+            mean = mean * scaled.is_kept.max(self._graph.constant(stays, F64))
+        return mean
 
 
 def _of_block(own: Mapping[int, Block], *, mean: bool) -> Matrix:
