@@ -12,7 +12,16 @@ const HERE = new URL("./", import.meta.url);
 const ORT = "node_modules/onnxruntime-web/dist/";
 const PAGE = {
   "/": "index.html",
-  ...own("style.css", "page.mjs", "player.mjs", "history.mjs", "scope.mjs", "lanes.mjs"),
+  ...own(
+    "style.css",
+    "controls.css",
+    "readout.css",
+    "page.mjs",
+    "player.mjs",
+    "history.mjs",
+    "scope.mjs",
+    "lanes.mjs",
+  ),
   ...own("overlay.mjs", "readout.mjs", "threshold.mjs"),
   "/node/graph.mjs": "../node/graph.mjs",
   "/node/npy.mjs": "../node/npy.mjs",
