@@ -147,7 +147,8 @@ class Front:
         group = self._of[channel]
         matrix, ranks = energy_matrix(self._maps, group.smooth, branches)
         place = group.channels.index(channel)
-        parts = group.shifted.slice(place, place + 1, 1).squeeze(1) @ matrix
+        own = group.shifted.slice(place, place + 1, 1).squeeze(1)
+        parts = (own.cast(self._form.dtype) @ matrix).cast(F64)  # whose squares may leave float32
         of_branch: Matrix = np.repeat(np.eye(len(ranks)), ranks, axis=0)
         energies = (parts * parts) @ of_branch
         total = energies.slice(0, 1, 1).max(_TINY)
