@@ -1,325 +1,460 @@
+"""The files of an export: right, whole, with their facts; or none, and the earlier ones kept."""
+
 import copy
-import shutil
+import hashlib
+import json
+import subprocess
+import sys
 
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
 import torch
+from onnx import TensorProto, helper, numpy_helper
+from small_detector import HAND, certified, raw_bins, small_detector
 from test_detector import VARIANTS, noise, random_detector
+from test_graph_check import alarming
 
 from tactslip_torch import export
-from tactslip_torch.export import export_onnx, float32_error, onnx_error
-from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.certify import FORMAT as CERTIFICATE_FORMAT
+from tactslip_torch.export import export_detector, sidecar_facts, summary, worst_error
+from tactslip_torch.graph.facts import sidecar_path
+from tactslip_torch.graph.form import Window
+from tactslip_torch.graph.trials import simulated_stream
+from tactslip_torch.model.calibration import probability
+from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.onset.streaming import StreamingDetector
 
 pytestmark = pytest.mark.onnx
-
-SLOW_OR_MISSING = {  # EXPORT.md trap 7, and what a solve or a loop over samples would leave
-    *("DFT", "STFT", "MelWeightMatrix", "Det", "Einsum"),
-    *("Loop", "Scan", "If", "SequenceMap", "Unique", "NonZero"),
-}
 
 
 @pytest.fixture(scope="module")
 def detector():
-    return random_detector()
+    return alarming()
 
 
 @pytest.fixture(scope="module")
 def exported(detector, tmp_path_factory):
-    """The one export of this file (seconds), and the error it reports."""
-    path = tmp_path_factory.mktemp("export") / "deep" / "model.onnx"
+    """Both files as they are usually made, with the whole check."""
+    folder = tmp_path_factory.mktemp("export") / "deep"
     before = {name: value.clone() for name, value in detector.state_dict().items()}
-    worst = export_onnx(detector, path)
+    paths = export_detector(detector, folder)
     for name, value in detector.state_dict().items():  # the detector stays as it was: float64
         assert torch.equal(value, before[name])
         assert value.dtype == torch.float64
-    return path, worst
+    return paths
 
 
-@pytest.fixture(scope="module")
-def session(exported):
-    return onnxruntime.InferenceSession(exported[0], providers=["CPUExecutionProvider"])
-
-
-@pytest.fixture(scope="module")
-def graph(exported):
-    return onnx.load(exported[0]).graph
-
-
-# The file ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("batch", [1, 2, 3, 7, 64])
-def test_onnxruntime_equals_torch(batch, detector, session):
-    """Three is the batch it was traced with; none of the others was seen by the exporter."""
-    samples = noise(batch, seed=batch)
-    expected = detector.score_raw(samples).numpy()
-    got, valid = session.run(None, {"samples": samples.numpy().astype(np.float32)})
-    assert valid.tolist() == [True] * batch
-    assert got.dtype == np.float32
-    assert got.shape == (batch,)
-    spread = detector.score_raw(noise(64)).std().item()
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-3 * spread)
-
-
-def test_bins_of_a_batch_do_not_meet(session):
-    samples = noise(7).numpy().astype(np.float32)
-    together, _ = session.run(None, {"samples": samples})
-    alone = [session.run(None, {"samples": sample[None]})[0][0] for sample in samples]
-    np.testing.assert_allclose(together, alone, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("sample", [0, 75, 149])
-def test_a_broken_channel_counts_as_missing(sample, bad, detector, session):
-    samples = noise(3).numpy().astype(np.float32)
-    channel = detector.pool.hand.names.index(detector.selected_names[0].channel)
-    whole, _ = session.run(None, {"samples": samples})
-    samples[1, channel, sample] = bad
-    scores, valid = session.run(None, {"samples": samples})
-    expected = copy.deepcopy(detector).float().judge_raw(torch.from_numpy(samples))
-    # a film's frame is 11 samples: the ends of the context belong to the gauges alone
-    reaches = expected.is_missing[1, channel].item()
-    assert reaches == (detector.selected_names[0].channel.startswith("SG") or sample == 75)
-    assert valid.tolist() == [True, not reaches, True]
-    assert np.isfinite(scores).all()
-    np.testing.assert_allclose(scores, expected.score.numpy(), rtol=1e-4, atol=1e-5)
-    assert np.array_equal(scores[[0, 2]], whole[[0, 2]])
-    assert (scores[1] != whole[1]) == reaches
-
-
-def test_a_dead_channel_is_no_valid_bin(detector, session):
-    samples = noise(2).numpy().astype(np.float32)
-    channel = detector.pool.hand.names.index(detector.selected_names[0].channel)
-    samples[1, channel] = 2.5
-    scores, valid = session.run(None, {"samples": samples})
-    assert valid.tolist() == [True, False]
-    assert np.isfinite(scores).all()
-
-
-def test_input_and_output_are_named_float32_and_of_any_batch(graph):
-    (samples,), (score, valid) = graph.input, graph.output
-    assert (samples.name, score.name, valid.name) == ("samples", "score", "valid")
-    kinds = [value.type.tensor_type.elem_type for value in (samples, score, valid)]
-    assert kinds == [onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT, onnx.TensorProto.BOOL]
-    for value in (samples, score, valid):
-        batch = value.type.tensor_type.shape.dim[0]
-        assert batch.dim_param
-        assert not batch.HasField("dim_value")
-    fixed = [dim.dim_value for dim in samples.type.tensor_type.shape.dim[1:]]
-    assert fixed == [24, 100 + 2 * 25]
-    assert len(score.type.tensor_type.shape.dim) == 1
-
-
-def test_another_dtype_or_shape_is_refused(session):
-    with pytest.raises(Exception, match="Unexpected input data type"):
-        session.run(None, {"samples": noise(1).numpy()})
-    with pytest.raises(Exception, match="invalid dimensions"):
-        session.run(None, {"samples": np.zeros((1, 23, 150), np.float32)})
-
-
-def test_no_operator_is_slow_or_missing(exported, graph):
-    operators = {node.op_type for node in graph.node}
-    assert "MatMul" in operators or "Gemm" in operators
-    assert not operators & SLOW_OR_MISSING
-    assert {node.domain for node in graph.node} <= {"", "ai.onnx"}
-    model = onnx.load(exported[0])
-    assert not model.functions
-    assert [(entry.domain, entry.version) for entry in model.opset_import] == [("", export.OPSET)]
-
-
-def test_what_turns_bins_into_features_is_double_and_the_head_is_single(detector, graph):
-    """Rounded constants would move the steps of entropy and mode."""
-    kinds = {tuple(tensor.dims): tensor.data_type for tensor in graph.initializer}
-    assert kinds[8, 100, 100] == onnx.TensorProto.DOUBLE  # the wavelet branches
-    num = detector.head.num_features
-    assert kinds[num, num] == onnx.TensorProto.FLOAT
-
-
-def test_the_file_says_what_a_host_must_know_of_its_input(detector, session):
-    facts = session.get_modelmeta().custom_metadata_map
-    assert facts["channels"].split(",") == list(detector.pool.hand.names)
-    expected = {"unit": "V", "sample_rate_hz": "2000", "bin_samples": "100"}
-    expected |= {"context_before_samples": "25", "context_after_samples": "25"}
-    expected |= {"look_ahead_samples": "25", "slip_if_score_at_least": "0", "simulated": "true"}
-    assert {name: facts[name] for name in expected} == expected
-
-
-def test_the_file_is_whole_and_valid(exported):
-    path, _ = exported
-    onnx.checker.check_model(onnx.load(path), full_check=True)
-    assert [p.name for p in path.parent.iterdir()] == ["model.onnx"]  # no data beside, no rest
-
-
-# Heads and scalers ---------------------------------------------------------------------------
-
-
-class ScoreFeatures(torch.nn.Module):
-    """What differs between kinds of detectors: the way from selected features to a score."""
-
-    def __init__(self, detector):
-        super().__init__()
-        self.detector = detector
-
-    def forward(self, features):
-        return self.detector.score_features(features)
-
-
-def run_tail(module, traced, inputs, path):
-    """Export a part of a detector as ``export_onnx`` exports the whole, and run it."""
-    export._write_graph(module, traced, path)
+def run(path, **inputs):
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    return [session.run(None, {"samples": one.numpy()})[0] for one in inputs], onnx.load(path).graph
+    names = [output.name for output in session.get_outputs()]
+    return dict(zip(names, session.run(names, inputs), strict=True))
 
 
+def cropped(detector, samples):
+    """Raw bins as the graph takes them: no more context than its channels reach."""
+    window = Window.of(detector)
+    before = detector.context_before - window.before
+    after = detector.context_after - window.after
+    return samples[..., before : samples.shape[-1] - after].numpy()
+
+
+# Files that are right ---------------------------------------------------------------------------
+
+
+def test_an_export_leaves_its_files_and_nothing_else(exported):
+    names = ["model.onnx", "model.onnx.json", "stream.onnx", "stream.onnx.json"]
+    assert [path.name for path in exported] == ["model.onnx", "stream.onnx"]
+    assert sorted(path.name for path in exported[0].parent.iterdir()) == names
+    for path in exported:
+        onnx.checker.check_model(onnx.load(path), full_check=True)
+
+
+@pytest.mark.parametrize("batch", [0, 1, 2, 7, 64])
+def test_the_bin_graph_gives_the_detectors_judgement(detector, exported, batch):
+    samples = raw_bins(batch, seed=batch).float()
+    expected = detector.judge_raw(samples.double())
+    got = run(exported[0], samples=cropped(detector, samples))
+    assert got.keys() == {"score", "probability", "valid"}
+    spread = float(detector.score_raw(raw_bins(64)).std())
+    np.testing.assert_allclose(got["score"], expected.score, rtol=0, atol=1e-3 * spread)
+    assert got["score"].dtype == got["probability"].dtype == np.float32
+    assert got["valid"].tolist() == [True] * batch
+    settings = AlarmSettings.of(detector)
+    stated = probability(settings.calibration.llr(expected.score), settings.slip_share)
+    np.testing.assert_allclose(got["probability"], stated, rtol=0, atol=1e-4)
+
+
+def test_bins_of_a_batch_do_not_meet(detector, exported):
+    samples = cropped(detector, raw_bins(7).float())
+    together = run(exported[0], samples=samples)["score"]
+    alone = [run(exported[0], samples=sample[None])["score"][0] for sample in samples]
+    np.testing.assert_allclose(together, alone, rtol=1e-6, atol=1e-6)
+
+
+def test_the_stream_graph_raises_the_detectors_alarms(detector, exported):
+    samples = simulated_stream(HAND, 2000.0, torch.float32).T.contiguous()
+    made = StreamingDetector(detector, dtype=torch.float64).push(samples)
+    feeds = {"tail": np.empty((0, 4), np.float32), "state": np.empty(0), "threshold": np.empty(0)}
+    got = run(exported[1], samples=samples.numpy(), **feeds)
+    assert made.is_alarm.any()
+    assert np.array_equal(got["alarm"], made.is_alarm)
+    np.testing.assert_allclose(got["time_s"], made.available_s, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(got["onset_s"], made.onset_s, rtol=0, atol=1e-9)
+
+
+def test_a_model_says_of_itself_what_its_sidecar_says(detector, exported):
+    for path, kind in zip(exported, ("bin", "stream"), strict=True):
+        session = onnxruntime.InferenceSession(path)
+        text = session.get_modelmeta().custom_metadata_map
+        facts = {name: json.loads(value) for name, value in text.items()}
+        beside = sidecar_facts(path)
+        content = path.read_bytes()
+        assert facts["graph"] == kind
+        assert beside == facts | {
+            "file": path.name,
+            "onnx_sha256": hashlib.sha256(content).hexdigest(),
+            "onnx_bytes": len(content),
+        }
+        shape = session.get_inputs()[0].shape
+        assert len(facts["channels"]) == shape[-2 if kind == "bin" else -1] == 4
+    window = Window.of(detector)
+    parts = ("context_before_samples", "bin_samples", "context_after_samples")
+    assert sum(sidecar_facts(exported[0])[name] for name in parts) == window.length
+
+
+def test_a_stream_hands_on_what_it_says_it_does(exported):
+    facts = sidecar_facts(exported[1])
+    feeds = {"tail": np.empty((0, 4), np.float32), "state": np.empty(0), "threshold": np.empty(0)}
+    for num in (0, 1, 300):
+        got = run(exported[1], samples=np.zeros((num, 4), np.float32), **feeds)
+        assert got["next_tail"].shape == (facts["tail_samples"], 4)
+        assert got["next_state"].shape == (facts["state_size"],)
+        needed = max(facts["first_samples"], facts["frame_samples"])
+        due = 0 if num < needed else (num - facts["first_samples"]) // facts["hop_samples"] + 1
+        assert len(got["score"]) == due
+
+
+def test_what_the_check_measured_is_told(exported):
+    for path in exported:
+        facts = sidecar_facts(path)
+        assert facts["check"]["simulated"] is True
+        assert facts["check"]["guards"] > 5
+        assert 0 < worst_error(facts) < 1e-3
+        assert f"{worst_error(facts):.1e} score deviations" in summary(path)
+        assert "no certificate" in summary(path)
+    assert sidecar_facts(exported[1])["check"]["alarms"] > 0
+
+
+def test_an_export_of_the_same_detector_gives_the_same_bytes(detector, exported, tmp_path):
+    again = export_detector(detector, tmp_path, ["bin"], alone=False)[0]
+    assert again.read_bytes() == exported[0].read_bytes()
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_every_head_and_scaler_comes_through(variant, tmp_path):
-    """The rest of the graph is the same for all; making it takes many times as long."""
+def test_every_head_and_scaler_comes_through(variant, precision, tmp_path):
+    """The check sees to the errors; its bound is the one that it states."""
     detector = random_detector(**VARIANTS[variant])
-    bins = detector.channel_filter.valid(noise(65, seed=1))
-    features = detector.pool(bins)[:, list(detector.selected)]
-    expected = detector.score_features(features)
-    tail = ScoreFeatures(copy.deepcopy(detector).float())
-    parts = [features.float()[cut] for cut in (slice(0, 1), slice(1, 65))]
-    got, graph = run_tail(tail, features[:3].float(), parts, tmp_path / "tail.onnx")
-    assert [len(part) for part in got] == [1, 64]
-    spread = float(expected.std())
-    np.testing.assert_allclose(np.concatenate(got), expected.numpy(), rtol=0, atol=1e-4 * spread)
-    operators = {node.op_type for node in graph.node}
-    assert "MatMul" in operators or "Gemm" in operators
-    assert not operators & SLOW_OR_MISSING
-    assert ("Log" in operators) == ("knee" in variant)
-    assert ("Exp" in operators) == ("radial" in variant)
-    in_double = [t.dims for t in graph.initializer if t.data_type == onnx.TensorProto.DOUBLE]
-    assert max(map(len, in_double)) == 1  # ranges and knees, and nothing of the head
+    (path,) = export_detector(detector, tmp_path, ["bin"], precision, alone=False)
+    worst = {"float32": 1e-3, "float64": 1e-9}[precision]
+    assert 0 < worst_error(sidecar_facts(path)) <= worst
+    samples = noise(5).to(getattr(torch, precision))
+    got = run(path, samples=cropped(detector, samples))
+    expected = detector.score_raw(samples.double())
+    spread = float(detector.score_raw(noise(64)).std())
+    np.testing.assert_allclose(got["score"], expected, rtol=0, atol=worst * spread)
+    assert got["score"].dtype == precision
 
 
-def test_a_knee_survives_the_missing_log1p(rng, tmp_path):
-    """Heavy tails, zeros with few spikes, tiny units, both signs, and far below the knee."""
-    columns = [
-        np.exp(4 * rng.standard_normal(2000)),
-        np.where(rng.uniform(size=2000) < 0.7, 0.0, 1e-3 * rng.uniform(size=2000)),
-        1e-9 * np.exp(4 * rng.standard_normal(2000)),
-        rng.standard_normal(2000) ** 5,
-        np.where(np.arange(2000) < 900, 1e-7 * rng.standard_normal(2000), 1.0),
-    ]
-    features = np.stack(columns, axis=1)
-    scaler = FeatureScaler.fit(torch.from_numpy(features), compress=True, tail=0.01)
-    knee, low, high = (value.numpy() for value in (scaler.knee, scaler.minimum, scaler.maximum))
-    bent = np.sign(features) * knee * np.log1p(np.abs(features) / knee)
-    expected = np.clip(2 * (bent - low) / (high - low) - 1, -1, 1)
-    single = torch.from_numpy(features).float()
-    (got,), _ = run_tail(scaler.float(), single[:3], [single], tmp_path / "scaler.onnx")
-    np.testing.assert_allclose(got, expected, rtol=0, atol=2e-6)
+def test_the_bulk_layout_gives_the_same(detector, exported, tmp_path):
+    paths = export_detector(detector, tmp_path, layout="bulk", alone=False)
+    samples = cropped(detector, raw_bins(64).float())
+    in_bulk, one = (run(path, samples=samples)["score"] for path in (paths[0], exported[0]))
+    assert sidecar_facts(paths[0])["layout"] == sidecar_facts(paths[1])["layout"] == "bulk"
+    np.testing.assert_allclose(in_bulk, one, rtol=0, atol=1e-4 * float(one.std()))
 
 
-# The check -----------------------------------------------------------------------------------
+# What is refused --------------------------------------------------------------------------------
 
 
-def test_the_error_it_reports_is_small_and_comes_from_the_file(detector, exported):
-    path, worst = exported
-    assert 0 < worst <= 1e-5 < export.WORST_ERROR  # what float32 leaves of a head
-    assert onnx_error(detector, path) == pytest.approx(worst)
+def test_a_detector_without_alarm_gives_no_stream(tmp_path):
+    with pytest.raises(ValueError, match="this detector has no alarm threshold"):
+        export_detector(small_detector(), tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
-def changed_head(detector, by):
-    other = copy.deepcopy(detector)
-    other.head.linear[-1] += by
-    return other
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"graphs": ["both"]}, "graphs must be bin or stream, or both, got both"),
+        ({"graphs": []}, "got none"),
+        ({"precision": "float16"}, "precision must be one of float32, float64, got 'float16'"),
+        ({"layout": "small"}, "layout must be one of latency, bulk, got 'small'"),
+    ],
+)
+def test_another_choice_is_refused(detector, tmp_path, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        export_detector(detector, tmp_path, **arguments)
+    assert not list(tmp_path.iterdir())
 
 
-def test_the_error_grows_with_the_difference(detector, exported):
-    errors = [onnx_error(changed_head(detector, by), exported[0]) for by in (0.1, 1.0)]
-    assert export.WORST_ERROR < errors[0] < errors[1]
+class Broken:
+    """A graph whose model somebody changed."""
+
+    def __init__(self, graph, change):
+        self.graph, self.change = graph, change
+
+    def model(self, metadata):
+        model = self.graph.model(metadata)
+        self.change(model)
+        return model
 
 
-def test_a_single_precision_detector_is_checked_in_double_precision(detector, exported):
-    single = copy.deepcopy(detector).float()
-    assert onnx_error(single, exported[0]) < export.WORST_ERROR
+def node_before(model, output):
+    return next(node for node in model.graph.node if output in node.output)
+
+
+def denies(model):
+    """``valid`` is its contrary."""
+    node = node_before(model, "valid")
+    node.CopyFrom(helper.make_node("Not", node.input[:1], ["valid"]))
+
+
+def tensors_of(graph):
+    """Constants, those of bodies too."""
+    yield from graph.initializer
+    for node in graph.node:
+        for part in node.attribute:
+            if part.HasField("g"):
+                yield from tensors_of(part.g)
+
+
+def other_numbers(model):
+    """Every second column of the largest matrix is 1 % larger."""
+    largest = max(tensors_of(model.graph), key=lambda tensor: np.prod(tensor.dims))
+    numbers = numpy_helper.to_array(largest).copy()
+    numbers[..., ::2] *= 1.01
+    largest.CopyFrom(numpy_helper.from_array(numbers, largest.name))
+
+
+def static(model):
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 7
+
+
+def foreign(model):
+    model.graph.node.append(helper.make_node("DFT", ["samples"], ["spectrum"]))
+
+
+def heavy(model):
+    numbers = np.zeros(200_000, np.float32)
+    model.graph.initializer.append(numpy_helper.from_array(numbers, "ballast"))
+
+
+def silent(model):
+    """Scores are of no number where a sample is none."""
+    node = node_before(model, "score")
+    model.graph.node.remove(node)
+    first = model.graph.node.add
+    first(op_type="ReduceSum", input=["samples", "both"], output=["sum"]).attribute.append(
+        helper.make_attribute("keepdims", 0)
+    )
+    first(op_type="Sub", input=["sum", "sum"], output=["none"])
+    first(op_type="Add", input=[node.input[0], "none"], output=["score"])
+    model.graph.initializer.append(numpy_helper.from_array(np.array([1, 2]), "both"))
+
+
+def wide(model):
+    node = node_before(model, "score")
+    node.CopyFrom(helper.make_node("Cast", node.input[:1], ["score"], to=TensorProto.DOUBLE))
+    output = next(value for value in model.graph.output if value.name == "score")
+    output.type.tensor_type.elem_type = TensorProto.DOUBLE
+
+
+BREAKS = {
+    "valid is wrong": (denies, "valid differs from torch"),
+    "a matrix is wrong": (other_numbers, "scores differ from torch in float64"),
+    "batch is fixed": (static, "axis 0 of samples is 7 for ever"),
+    "an operator is slow": (foreign, "it has the operators DFT"),
+    "the file is large": (heavy, "its file has .* bytes, more than"),
+    "a guard is gone": (silent, "scores are not finite"),
+    "a score is wide": (wide, "expected .*score float32"),
+}
+
+
+@pytest.mark.parametrize("name", BREAKS)
+def test_a_bad_model_is_not_left_and_the_earlier_one_is_kept(detector, tmp_path, monkeypatch, name):
+    change, message = BREAKS[name]
+    earlier = {"model.onnx": b"yesterday's", "model.onnx.json": b"{}"}
+    for file, content in earlier.items():
+        (tmp_path / file).write_bytes(content)
+    made = export._graph
+    monkeypatch.setattr(export, "_graph", lambda *given: Broken(made(*given), change))
+    with pytest.raises(ValueError, match=rf"model\.onnx was not written: .*{message}") as caught:
+        export_detector(detector, tmp_path, ["bin"], alone=False)
+    assert "\n" not in str(caught.value)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == earlier
+
+
+def test_all_files_are_left_or_none(detector, tmp_path, monkeypatch):
+    made = export._graph
+
+    def graph(of, form, kind):
+        return made(of, form, kind) if kind == "bin" else Broken(made(of, form, kind), denies)
+
+    monkeypatch.setattr(export, "_graph", graph)
+    with pytest.raises(ValueError, match=r"stream\.onnx was not written: .*valid differs"):
+        export_detector(detector, tmp_path, alone=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_fresh_process_says_counts(detector, tmp_path, monkeypatch):
+    """It is the file that is run there; here a changed one."""
+    saved = onnx.save
+
+    def save(model, path):
+        model = copy.deepcopy(model)
+        other_numbers(model)
+        saved(model, path)
+
+    monkeypatch.setattr(export.onnx, "save", save)
+    with pytest.raises(ValueError, match="in a fresh process score is another"):
+        export_detector(detector, tmp_path, ["bin"])
+    assert not list(tmp_path.iterdir())
+
+
+# Where it comes from ----------------------------------------------------------------------------
 
 
 @pytest.fixture
-def instant(exported, monkeypatch):
-    """The exporter hands out the file made before, so that only the check is new."""
-
-    def copy_file(module, arguments, path, **options):
-        shutil.copy(exported[0], path)
-
-    monkeypatch.setattr(torch.onnx, "export", copy_file)
+def kept(tmp_path):
+    """A detector in its file, and the digest of that."""
+    source = tmp_path / "detector.pt"
+    small_detector(engine="eager").save(source)
+    return source, hashlib.sha256(source.read_bytes()).hexdigest()
 
 
-@pytest.mark.usefixtures("instant")
-def test_a_graph_that_differs_is_not_written(detector, tmp_path):
-    """The file is another detector's: the check runs it and sees."""
-    with pytest.raises(ValueError, match=r"onnxruntime and torch differ by .* was not written"):
-        export_onnx(changed_head(detector, 0.5), tmp_path / "model.onnx")
-    assert not list(tmp_path.iterdir())
-    export_onnx(detector, tmp_path / "model.onnx")
-    assert [path.name for path in tmp_path.iterdir()] == ["model.onnx"]
+@pytest.fixture
+def quick(monkeypatch):
+    """What is asked is where a model comes from; that it is right is asked elsewhere."""
+    measured = {"noise": {"worst_sd": 1e-6}, "recorded": {"worst_sd": 1e-6}}
+    monkeypatch.setattr(export, "check_model", lambda *given: (measured, None))
 
 
-@pytest.mark.usefixtures("instant")
-@pytest.mark.parametrize("worst", [1.0, float("nan")])
-def test_a_failed_check_leaves_no_file(detector, tmp_path, monkeypatch, worst):
-    monkeypatch.setattr(export, "onnx_error", lambda detector, path: worst)
-    with pytest.raises(ValueError, match=r"model\.onnx was not written"):
-        export_onnx(detector, tmp_path / "model.onnx")
-    assert not list(tmp_path.iterdir())
+def exported_with(source, certificate=None):
+    if certificate is not None:
+        source.with_name("certificate.json").write_text(certificate)
+    (path,) = export_detector(
+        small_detector(engine="eager"), source.parent, ["bin"], source=source, alone=False
+    )
+    return sidecar_facts(path), summary(path)
 
 
-@pytest.mark.usefixtures("instant")
-def test_a_graph_with_other_flags_is_not_written(detector, tmp_path, monkeypatch):
-    """The detector trusts what the file does not."""
-    trusting = copy.deepcopy(detector)
-    monkeypatch.setattr(FeaturePool, "is_alive", lambda pool, bins: bins.isfinite().all(-1))
-    with pytest.raises(ValueError, match=r"disagree on which bins are valid \(kinds .*'constant'"):
-        export_onnx(trusting, tmp_path / "model.onnx")
-    assert not list(tmp_path.iterdir())
+@pytest.mark.usefixtures("quick")
+def test_the_certificate_of_this_detector_is_handed_on(kept):
+    source, digest = kept
+    content = certified(small_detector()).facts()
+    content |= {"format": CERTIFICATE_FORMAT, "detector": {"sha256": digest}}
+    facts, line = exported_with(source, json.dumps(content))
+    assert facts["detector_sha256"] == digest
+    margin = content["margin"]["score"]
+    assert facts["certificate"]["margin"] == margin
+    assert f"certified but where |score| is below {margin:.1e} (simulated data)" in line
+    _, line = exported_with(source, json.dumps(content | {"holds": False}))
+    assert "its certificate does not hold" in line
 
 
-@pytest.mark.usefixtures("instant")
-def test_a_failed_check_keeps_the_file_that_was_there(detector, tmp_path, monkeypatch):
-    (tmp_path / "model.onnx").write_bytes(b"yesterday's")
-    monkeypatch.setattr(export, "onnx_error", lambda detector, path: 1.0)
-    with pytest.raises(ValueError, match="was not written"):
-        export_onnx(detector, tmp_path / "model.onnx")
-    assert (tmp_path / "model.onnx").read_bytes() == b"yesterday's"
-    assert len(list(tmp_path.iterdir())) == 1
+@pytest.mark.usefixtures("quick")
+def test_no_other_certificate_is_handed_on(kept):
+    source, digest = kept
+    content = certified(small_detector()).facts()
+    of_another = content | {"format": CERTIFICATE_FORMAT, "detector": {"sha256": "0" * 64}}
+    foreign = {"format": "another", "detector": {"sha256": digest}}
+    hollow = {"format": CERTIFICATE_FORMAT, "detector": {"sha256": digest}}
+    for text in (None, json.dumps(of_another), json.dumps(foreign), json.dumps(hollow), "{", "[]"):
+        facts, line = exported_with(source, text)
+        assert facts["detector_sha256"] == digest
+        assert facts["certificate"] is None
+        assert "no certificate" in line
 
 
-def frozen(path, batch):
-    """A graph that only takes, or always gives, one batch size."""
-    shape = ("batch", 24, 150)
-    samples = onnx.helper.make_tensor_value_info("samples", onnx.TensorProto.FLOAT, shape)
-    score = onnx.helper.make_tensor_value_info("score", onnx.TensorProto.FLOAT, (batch,))
-    value = onnx.numpy_helper.from_array(np.zeros(batch, np.float32), "zeros")
-    node = onnx.helper.make_node("Identity", ["zeros"], ["score"])
-    graph = onnx.helper.make_graph([node], "frozen", [samples], [score], [value])
-    opset = onnx.helper.make_opsetid("", export.OPSET)
-    onnx.save(onnx.helper.make_model(graph, opset_imports=[opset], ir_version=10), path)
+# The command ------------------------------------------------------------------------------------
 
 
-def test_a_graph_frozen_to_one_batch_is_seen(detector, tmp_path):
-    frozen(tmp_path / "model.onnx", 1)
-    with pytest.raises(ValueError, match=r"gives scores \(1,\) at batch 7, expected \(7,\)"):
-        onnx_error(detector, tmp_path / "model.onnx")
+def command(monkeypatch, capsys, *arguments):
+    """Exit status, what was said, and what was wrong."""
+    monkeypatch.setattr(sys, "argv", ["export", *arguments])
+    status = 0
+    try:
+        export.main()
+    except SystemExit as stop:
+        status = stop.code
+    said = capsys.readouterr()
+    return status, said.out, said.err
 
 
-def test_what_single_precision_costs_is_measured(detector):
-    """Little; much for one that reads a mode out of features made in float32."""
-    cost = float32_error(detector)
-    assert 0 < cost["float32_median"] <= cost["float32_p95"] < 1e-2
-    assert 0 <= cost["float32_flips"] < 0.05
-    mode = [i for i, n in enumerate(detector.pool.names) if n.descriptor == "mode"][20:32]
-    bins = detector.channel_filter.valid(noise(64, seed=99))
-    scaler = FeatureScaler.fit(detector.pool(bins)[:, mode])
-    stepping = SlipDetector(detector.pool, detector.channel_filter, mode, scaler, detector.head)
-    in_double = float32_error(stepping)["float32_p95"]
-    assert in_double < 1e-4
-    native = FeaturePool(detector.pool.hand, arithmetic="native")
-    parts = (detector.channel_filter, mode, scaler, detector.head)
-    stepping = SlipDetector(native, *parts, engine="reference")
-    assert float32_error(stepping)["float32_p95"] > 10 * in_double
+def test_the_command_leaves_what_the_detector_can_give(monkeypatch, capsys, tmp_path, detector):
+    detector.save(tmp_path / "detector.pt")
+    made = []
+
+    def instead(of, folder, graphs, precision, layout, *, source):
+        made.append((str(folder), graphs, precision, layout, str(source)))
+        return ()
+
+    monkeypatch.setattr(export, "export_detector", instead)
+    model = f"model={tmp_path / 'detector.pt'}"
+    assert command(monkeypatch, capsys, model) == (0, "", "")
+    out = tmp_path / "out"
+    options = ("graph=stream", "precision=float64", "layout=bulk", f"output={out}")
+    assert command(monkeypatch, capsys, model, *options)[0] == 0
+    command(monkeypatch, capsys, model, "graph=both")
+    detector = small_detector()
+    detector.save(tmp_path / "detector.pt")
+    command(monkeypatch, capsys, model)
+    source, here = str(tmp_path / "detector.pt"), str(tmp_path)
+    assert made == [
+        (here, ("bin", "stream"), "float32", "latency", source),
+        (str(out), ("stream",), "float64", "bulk", source),
+        (here, ("bin", "stream"), "float32", "latency", source),
+        (here, ("bin",), "float32", "latency", source),
+    ]
+
+
+WRONG_COMMANDS = {
+    "another graph": (["graph=all"], "graph must be bin, stream or both, got 'all'"),
+    "another precision": (["precision=float16"], "precision must be one of float32, float64"),
+    "no alarm": (["graph=stream"], "this detector has no alarm threshold; train with +exp=onset"),
+    "a file": (["output=small.onnx"], "output must be a folder, got small.onnx"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_COMMANDS)
+def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, name):
+    small_detector().save(tmp_path / "detector.pt")
+    arguments, words = WRONG_COMMANDS[name]
+    model = f"model={tmp_path / 'detector.pt'}"
+    status, out, err = command(monkeypatch, capsys, model, *arguments)
+    assert (status, out) == (2, "")
+    assert err.startswith("error: ")
+    assert words in err
+    assert err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["detector.pt"]
+
+
+@pytest.mark.slow
+def test_it_works_as_a_command(detector, tmp_path):
+    detector.save(tmp_path / "detector.pt")
+    done = subprocess.run(
+        [sys.executable, "-m", "tactslip_torch.export", "model=detector.pt", "output=out"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["out/model.onnx", "out/stream.onnx"]
+    assert all("kB, float32, within" in line for line in lines)
+    for name in ("model.onnx", "stream.onnx"):
+        assert sidecar_path(tmp_path / "out" / name).is_file()

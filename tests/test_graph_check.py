@@ -42,8 +42,7 @@ pytestmark = pytest.mark.onnx
 SINGLE = Form("float32")
 
 
-@pytest.fixture(scope="module")
-def detector():
+def alarming():
     """The small detector, with settings by which the simulated slip raises alarms."""
     made = small_detector(engine="eager")
     scores = score_stream(made, simulated_stream(HAND, 2000.0, torch.float64), 20).score
@@ -59,6 +58,11 @@ def detector():
     )
     made.info[KEY] = settings.to_dict()
     return made
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return alarming()
 
 
 # A bin graph that is torch, and what may be wrong with it -------------------------------------
@@ -92,6 +96,8 @@ def test_a_right_bin_graph_passes_and_is_measured(detector):
     assert set(facts["degenerate"]) == set(KINDS)
     assert facts["degenerate"]["constant"]["valid"] == 0
     assert facts["degenerate"]["ramp"]["valid"] == facts["degenerate"]["ramp"]["bins"] == 16
+    assert facts["degenerate"]["ramp"]["decided_by_rounding"] == 16  # of the sign of a mean of 0
+    assert facts["degenerate"]["plain"]["decided_by_rounding"] == 0
 
 
 def at(is_there, **values):
@@ -147,7 +153,10 @@ def mixed_up(samples, out):
 
 
 WRONG_BINS = {
-    "another name": (renamed, r"it gives .*scores float32\[256\].*, expected .*score float32\[256\]"),
+    "another name": (
+        renamed,
+        r"it gives .*scores float32\[256\].*, expected .*score float32\[256\]",
+    ),
     "another dtype": (widened, r"it gives .*score float64.*, expected .*score float32"),
     "frozen batch": (frozen, r"it gives .*\[7\].*, expected .*\[256\]"),
     "rows mixed up": (mixed_up, "scores differ from torch in float64"),
@@ -493,6 +502,8 @@ def test_a_file_of_a_usual_head_has_700_kb():
     assert size_limit("float32", 120 * 120 * 4) == 700_000
     assert size_limit("float64", 120 * 120 * 8) == 1_400_000
     assert size_limit("float32", 5_000_000) == 5_600_000
+    assert size_limit("float32", 0, shares=1) == 700_000
+    assert size_limit("float32", 0, shares=3) == 1_000_000
 
 
 # Running --------------------------------------------------------------------------------------

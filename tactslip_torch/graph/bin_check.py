@@ -26,9 +26,7 @@ WORST_SD = {"float32": 1e-3, "float64": 1e-9}
 """Largest score error allowed on noise and on simulated bins, in standard deviations of the score
 on simulated bins."""
 WORST_DEGENERATE_SD = {"float32": 1e-2, "float64": 1e-6}
-"""The same on degenerate bins but those ``ALL_ROUNDING``, whose errors are reported."""
-ALL_ROUNDING = ("offset 1e6, vibration 1e-6",)
-"""Kinds that hold so few digits that a step in a descriptor may fall between any two sums."""
+"""The same on degenerate bins, but for those that rounding decides (``_Judged.is_rounding``)."""
 WORST_PROBABILITY = {"float32": 1e-5, "float64": 1e-9}
 """By which a probability may differ from that of the score beside it."""
 _SIMULATED, _EACH = 256, 16  # bins, and of each degenerate kind
@@ -86,7 +84,7 @@ def check_bins(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
     noise = judged.compare(drawn, "noise")
     # the latter of a detector for which nothing happens in a simulation
     sd = float(recorded.exact.std()) or float(noise.exact.std()) or 1.0
-    worst = WORST_SD[form.precision]
+    worst, loose = WORST_SD[form.precision], WORST_DEGENERATE_SD[form.precision]
     facts: dict[str, Any] = {"score_sd": sd, "simulated": True}
     for name, compared in (("noise", noise), ("recorded", recorded)):
         facts[name] = _set_facts(compared, sd)
@@ -97,8 +95,12 @@ def check_bins(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
         bins = degenerate_bins(hand, kind, _EACH, length, dtype)
         compared = judged.compare([bins], f"degenerate bins ({kind})")
         facts["degenerate"][kind] = _set_facts(compared, sd)
-        most = np.inf if kind in ALL_ROUNDING else WORST_DEGENERATE_SD[form.precision]
-        judged.refuse_errors(compared, sd, most, kind)
+        firm = ~judged.is_rounding(bins, compared.exact, loose * sd)
+        judged.refuse_errors(compared.of(firm), sd, loose, kind)
+        facts["degenerate"][kind] |= {
+            "decided_by_rounding": int((~firm).sum()),
+            "worst_sd_of_others": float(compared.error[firm].max(initial=0.0)) / sd,
+        }
         first.append(bins[:1])
     # in one batch with whole ones, where a graph may go another way
     mixed = torch.cat([*first, simulated])
@@ -128,6 +130,25 @@ class _Judged:
             score = self.detector.judge_raw(samples.double()).score
             # a sensor is trusted by what its samples resolve in the precision they come in
             return self.detector.judge_raw(samples)._replace(score=score)
+
+    def is_rounding(
+        self, samples: Tensor, exact: NDArray[np.float64], most: float
+    ) -> NDArray[np.bool_]:
+        """Bins ``[N]`` whose score another rounding of the samples changes by more than ``most``.
+
+        Such as the sign of a mean of 0, by which the coefficient of variation takes its own, or a
+        step between values of few digits. Samples are moved by 4 eps of the largest magnitude of
+        their channel in float64, together and each by itself, up and down: a constant stays one.
+        """
+        x = samples.double()
+        size = (
+            4 * torch.finfo(x.dtype).eps * x.nan_to_num(0.0, 0.0, 0.0).abs().amax(-1, keepdim=True)
+        )
+        generator = torch.Generator().manual_seed(0)
+        drawn = 2 * torch.rand(x.shape, generator=generator, dtype=x.dtype) - 1
+        moved = [size.expand_as(x), -size, size * drawn, -size * drawn]
+        scores = torch.stack([self.judge(x + each).score for each in moved]).numpy()
+        return np.asarray((np.abs(scores - exact) > most).any(0))
 
     def compare(self, batches: Sequence[Tensor], what: str) -> Compared:
         """Errors, where shapes and validity are right and scores finite.

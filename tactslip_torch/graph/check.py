@@ -90,7 +90,8 @@ def check_file(
     """
     size = path.stat().st_size
     numbers = sum(buffer.numel() for buffer in detector.head.buffers())
-    limit = size_limit(form.precision, numbers * form.dtype.itemsize)
+    shares = len(detector.extractor.plan.share_channels)
+    limit = size_limit(form.precision, numbers * form.dtype.itemsize, shares)
     if size > limit:
         raise ValueError(f"its file has {size} bytes, more than {limit}")
     session = session_of(onnx.load(path))

@@ -33,23 +33,25 @@ _CHOICES = {"Where", "Clip", "Max", "Min", "Equal", "Less", "LessOrEqual", "Not"
 _CHOICES |= {"Greater", "GreaterOrEqual", "And", "Or", "IsNaN", "IsInf"}
 _COMMUTE = {"Max", "Min", "Equal", "And", "Or", "Add", "Mul"}
 _TINY = 1e-3  # an added term, or a factor's distance from 1, below which it guards
-_SIZES = {"float32": 700_000, "float64": 1_400_000}
+_SIZES, _SHARE_BYTES = {"float32": 700_000, "float64": 1_400_000}, 150_000
 
 Guard = tuple[str, tuple[float, ...]]
 """An operator, and the numbers that it is given as constants."""
 
 
-def size_limit(precision: str, head_bytes: int) -> int:
+def size_limit(precision: str, head_bytes: int, shares: int = 0) -> int:
     """Bytes that a file may have: 700 kB in float32, twice that in float64.
 
-    The numbers of a head count only in so far as they exceed a seventh of it.
+    And what a large head has above a seventh of it; and 150 kB, in either, for each film but one
+    of whose energy the detector wants shares, as each has a matrix of its own.
 
     Args:
         precision: of the graph.
         head_bytes: of the head's numbers in that precision.
+        shares: films of whose energy shares are wanted.
     """
     limit = _SIZES[precision]
-    return limit + max(0, head_bytes - limit // 7)
+    return limit + max(0, head_bytes - limit // 7) + _SHARE_BYTES * max(0, shares - 1)
 
 
 def check_operators(model: onnx.ModelProto) -> None:
