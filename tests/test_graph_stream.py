@@ -218,6 +218,18 @@ def test_a_hole_at_the_start_reaches_as_far_as_in_the_detector(align, place):
         assert_same_stream(host, stream, samples, [60, 140])
 
 
+@pytest.mark.parametrize("rule", RULES)
+def test_a_decision_that_nothing_reaches_says_nothing(rule):
+    host, stream = pair_of(rule=rule)
+    samples = torch.from_numpy(np.random.default_rng(0).standard_normal((4, 900)))
+    samples[:, 400:410] = torch.nan
+    expected = stream.push(samples.T)
+    says_nothing = expected.llr == 0
+    assert says_nothing.any()
+    assert (expected.llr[~says_nothing] > 0).all()  # so the hole alone ends the run
+    assert_same(host.push(samples.T.numpy()), expected)
+
+
 def test_a_threshold_that_is_given_counts_for_that_push():
     host, own = pair_of(rule="hysteresis")[0], pair_of(rule="hysteresis")[0]
     samples = signal(1200, 8).T.numpy()
