@@ -250,7 +250,7 @@ class SlipLearner(L.LightningModule):
             plan.frame.selected,
             plan.frame.scaler,
             head,
-            self.facts | {"rival": plan.threshold.to_dict()},
+            self.facts | {"rival": plan.threshold.to_dict(), "calibration": plan.calibration},
             plan.typical,
         )
 

@@ -9,11 +9,12 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 from torch import Tensor
 
 from tactslip_torch.features.survey import Survey
+from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.held_out import HeldOut
 from tactslip_torch.model.kernels import Kernel, Polynomial, kernel_from_dict
@@ -52,8 +53,8 @@ class Plan:
         threshold: the best single selected feature, a rival to be reported beside.
         typical: mean of the scaled features, both classes counting alike; it stands in where a
             sensor is missing.
-        validation: one row per choice: what was chosen from, and the balanced accuracy of
-            each held-out group.
+        validation: one row per choice: what was chosen from, the balanced accuracy of each
+            held-out group, and the calibration of held-out scores.
         among: of a recipe that restricts the ranking: to what, how many features that leaves
             (``matching``), and the numbers chosen from after cutting them to it; else ``None``.
     """
@@ -75,6 +76,15 @@ class Plan:
         """Whether training bins become sums of fixed size; few bins, or other kernels, do not."""
         fewer = self.num_bins <= num_quadratic_features(len(self.frame.selected))
         return adds_up(self.kernel) and not fewer
+
+    @property
+    def calibration(self) -> dict[str, Any] | None:
+        """By held-out scores of the choice that was taken; None if there was nothing to choose."""
+        chosen = (len(self.frame.selected), self.kernel.to_dict(), self.penalty)
+        for row in self.validation:
+            if (row["num_features"], row["kernel"], row["penalty"]) == chosen:
+                return cast("dict[str, Any] | None", row.get("calibration"))
+        return None
 
     def facts(self) -> dict[str, Any]:
         """JSON-able; ``Plan.of`` takes it together with the tensors of the scaler."""
@@ -228,7 +238,8 @@ def validate(
             few = TrainingBins(bins.features[:, :size], bins.is_slip, bins.weights)
             machine, made_of = HeldOut(few, groups, kernel), (size, kernel)
         assert machine is not None
-        says_slip = machine.at(penalty).scores >= 0
+        scores = machine.at(penalty).scores
+        says_slip = scores >= 0
         by_group = {
             name: recalls_mean(says_slip[groups == index], bins.is_slip[groups == index])
             for index, name in enumerate(names)
@@ -246,9 +257,19 @@ def validate(
                 "penalty": penalty,
                 "mean": sum(known) / len(known),
                 "balanced_accuracy": by_group,
+                "calibration": _calibration(scores, bins),
             }
         )
     return rows
+
+
+def _calibration(scores: Tensor, bins: TrainingBins) -> dict[str, Any] | None:
+    """What held-out scores tell of slip, as plain values; None if they tell it backwards."""
+    try:
+        return fit_platt(scores, bins.is_slip, bins.weights).to_dict()
+    except ValueError as error:
+        log.warning("scores are not calibrated: %s", error)
+        return None
 
 
 def adds_up(kernel: Kernel) -> bool:

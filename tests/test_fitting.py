@@ -9,6 +9,7 @@ from test_recipe import make_parts, surveyed, together
 
 from tactslip_torch import planning
 from tactslip_torch.fitting import TrainingPass
+from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.planning import Plan, plan_detector
 from tactslip_torch.recipe import Recipe, recalls_mean
@@ -53,6 +54,31 @@ def test_validation_equals_refits_without_the_group(rng):
         assert row["mean"] == pytest.approx(sum(row["balanced_accuracy"].values()) / 3)
     best = max(row["mean"] for row in plan.validation)
     assert plan.penalty == min(r["penalty"] for r in plan.validation if r["mean"] == best)
+
+
+def test_scores_are_calibrated_by_machines_that_never_met_the_group(rng):
+    parts = make_parts(rng)
+    plan = planned(Recipe(**FEW, balance="weights"), parts)
+    features, is_slip = together(parts)
+    z = plan.frame(features)
+    weights = (len(is_slip) / (2 * torch.bincount(is_slip.long()).double()))[is_slip.long()]
+    material = [r.material for r, _, s in parts for _ in s]
+    scores = torch.zeros(len(is_slip), dtype=torch.float64)
+    for name in set(material):
+        mine = torch.tensor([each == name for each in material])
+        others = TrainingBins(z[~mine], is_slip[~mine], weights[~mine])
+        scores[mine] = fit_machine(others, plan.penalty)(z[mine])
+    expected = fit_platt(scores, is_slip, weights)
+    found = calibration_from_dict(plan.calibration)
+    assert (found.slope, found.offset) == pytest.approx((expected.slope, expected.offset), rel=1e-6)
+    assert Plan.of(plan.facts(), plan.frame.scaler).calibration == plan.calibration
+
+
+def test_scores_that_tell_slip_backwards_are_not_calibrated(rng, caplog):
+    features, is_slip = together(make_parts(rng))
+    bins = TrainingBins(features.double(), is_slip)
+    assert planning._calibration(-is_slip.double(), bins) is None
+    assert "slip has the lower scores" in caplog.text
 
 
 def test_size_offset_and_penalty_are_chosen_together(rng):

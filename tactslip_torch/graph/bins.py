@@ -17,7 +17,7 @@ from tactslip_torch.graph.shared import Shared
 from tactslip_torch.graph.value import BOOL, F64, I64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.settings import KEY, AlarmSettings
+from tactslip_torch.onset.settings import calibration_of
 
 
 class Judged(NamedTuple):
@@ -67,19 +67,20 @@ def bin_graph(detector: SlipDetector, form: Form) -> Graph:
         - out ``score``, ``valid`` (bool) and, if calibrated, ``probability``: ``[batch]``
     """
     graph, window = Graph(), Window.of(detector)
-    settings = AlarmSettings.of(detector) if KEY in detector.info else None
+    calibrated = calibration_of(detector)
     shape = ("batch", len(detector.pool.hand), window.length)
     samples = graph.input("samples", form.dtype, shape)
 
     def judged(body: Graph) -> list[Value]:
         found = judge_bins(body, detector, samples.at(body).take(window.channels, 1), form)
-        if settings is None:
+        if calibrated is None:
             return [found.score, found.is_valid]
-        llr = llr_of(found.score, settings.calibration)
-        return [found.score, found.is_valid, probability_of(llr, settings.slip_share)]
+        calibration, slip_share = calibrated
+        stated = probability_of(llr_of(found.score, calibration), slip_share)
+        return [found.score, found.is_valid, stated]
 
     def nothing(body: Graph) -> list[Value]:  # onnxruntime reduces and reshapes no empty batch
-        dtypes = (form.dtype, BOOL, *([] if settings is None else [form.dtype]))
+        dtypes = (form.dtype, BOOL, *([] if calibrated is None else [form.dtype]))
         return [body.constant(np.zeros(0), dtype) for dtype in dtypes]
 
     made = graph.if_(samples.length(0).squeeze(0) > 0, judged, nothing)

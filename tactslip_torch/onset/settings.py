@@ -104,3 +104,17 @@ class AlarmSettings:
                 "give alarm settings"
             )
         return cls.from_dict(detector.info[KEY])
+
+
+def calibration_of(detector: SlipDetector) -> tuple[Calibration, float] | None:
+    """What makes a probability of a detector's score, and the share of slip it is stated for.
+
+    That of its alarm settings; else that of the held-out scores its training chose by, at equal
+    shares; else None.
+    """
+    if KEY in detector.info:
+        settings = AlarmSettings.of(detector)
+        return settings.calibration, settings.slip_share
+    if plain := detector.info.get("calibration"):
+        return calibration_from_dict(plain), 0.5
+    return None
