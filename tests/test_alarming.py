@@ -14,6 +14,7 @@ from small_set import RATE_HZ, SMALL_HAND
 
 from benchmarks.alarms import text_of
 from benchmarks.outcome import RESULTS, ROOT, between_markers
+from tactslip_torch.alarming.curve import LEAST, MOST
 from tactslip_torch.alarming.methods import FITS, Promise, labelled
 from tactslip_torch.alarming.stage import FIRST_TRANSITION, OURS, Alarming
 from tactslip_torch.alarming.watching import Clock, Stream, decide, slip_bins, watch, watched
@@ -173,6 +174,30 @@ def test_bad_settings_are_refused_in_one_line(changes, match):
     with pytest.raises(ValueError, match=match) as caught:
         stage(**changes)
     assert "\n" not in str(caught.value)
+
+
+# --------------------------------------------------------------------- what other thresholds give
+def test_the_curve_is_what_the_rule_of_the_file_does_at_other_thresholds(told):
+    detector, found = told
+    settings = AlarmSettings.of(detector)
+    curve = settings.facts["threshold_curve"]
+    assert found["settings"]["facts"]["threshold_curve"] == curve
+    assert json.loads(json.dumps(curve)) == curve
+    assert 3 <= len(curve) <= 25
+    thresholds, rates = zip(*curve, strict=True)
+    assert list(thresholds) == sorted(set(thresholds))
+    assert list(rates) == sorted(set(rates), reverse=True)
+    assert LEAST <= rates[-1] <= rates[0] <= MOST
+    own = stage().roles(detector)["calibrate"]
+    quiet = [recording for recording in own if recording.scene == "held"]
+    for threshold, rate in curve[:: len(curve) // 3]:
+        alarms = hours = 0
+        for recording in quiet:
+            stream = StreamingDetector(detector, replace(settings, threshold=threshold))
+            for made in (stream.push(Streams().load(recording).samples.T), stream.flush()):
+                alarms += len(made.alarms)
+                hours += len(made.number) * stream.hop_s / 3600
+        assert alarms / hours == pytest.approx(rate)
 
 
 # ------------------------------------------------------------------------------- what is promised

@@ -190,6 +190,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "onset.streaming": ("onset.*", "model.*", "signals.*"),
     "report.*": ("report.*", "files"),
     "alarming.watching": ("onset.*", "data.*", "workers"),
+    "alarming.curve": ("alarming.watching", "onset.*"),
     "alarming.methods": ("alarming.watching", "onset.*", "model.calibration"),
     "alarming.outcome": (
         "alarming.methods",

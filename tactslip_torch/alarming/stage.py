@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from tactslip_torch.alarming.curve import threshold_curve
 from tactslip_torch.alarming.methods import FITS, Promise, methods_of
 from tactslip_torch.alarming.outcome import amounts_of, events_of, push_seconds, reliability_of
 from tactslip_torch.alarming.watching import Clock, Stream, watch
@@ -216,7 +217,12 @@ class Alarming:
         )
         amounts = amounts_of({"calibrate": calibrating, **streams})
         settings = methods[self.rule].settings
-        facts = {"simulated": self.streams.is_simulated, "streams": amounts["calibrate"]}
+        quiet = [stream for stream in calibrating if stream.recording.scene == self.slip_free]
+        facts = {
+            "simulated": self.streams.is_simulated,
+            "streams": amounts["calibrate"],
+            "threshold_curve": threshold_curve(quiet, OURS, settings, clocks[OURS]),
+        }
         settings = replace(settings, facts={**settings.facts, **facts})
         detector.info[KEY] = settings.to_dict()
         usual, scenes = self._parts(streams)
