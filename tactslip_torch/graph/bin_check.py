@@ -19,7 +19,7 @@ from tactslip_torch.graph.trials import KINDS, degenerate_bins, noise_bins, simu
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.judgement import Judgement
-from tactslip_torch.onset.settings import KEY, AlarmSettings
+from tactslip_torch.onset.settings import calibration_of
 
 BATCHES = (1, 7, 0, 56)
 WORST_SD = {"float32": 1e-3, "float64": 1e-9}
@@ -118,7 +118,7 @@ class _Judged:
         self.window = Window.of(detector)
         self.form = form
         self.dtype = torch.float32 if form.precision == "float32" else torch.float64
-        self.settings = AlarmSettings.of(detector) if KEY in detector.info else None
+        self.calibrated = calibration_of(detector)
         self.unstated = WORST_PROBABILITY[form.precision]
 
     def judge(self, samples: Tensor) -> Judgement:
@@ -172,9 +172,10 @@ class _Judged:
         if wrong := int((got["valid"] != is_valid).sum()):
             raise ValueError(f"{what}: valid differs from torch on {wrong} of {len(score)} bins")
         unstated = np.zeros(len(score))
-        if self.settings is not None:
-            llr = self.settings.calibration.llr(torch.from_numpy(score))
-            stated = probability(llr, self.settings.slip_share).numpy()
+        if self.calibrated is not None:
+            calibration, slip_share = self.calibrated
+            llr = calibration.llr(torch.from_numpy(score))
+            stated = probability(llr, slip_share).numpy()
             unstated = np.abs(got["probability"] - stated)
         flips = (score >= 0) != (exact >= 0)
         return Compared(np.abs(score - exact), unstated, flips, exact, is_valid)
@@ -194,7 +195,7 @@ class _Judged:
 
     def _check_form(self, got: dict[str, NDArray[Any]], num: int, what: str) -> None:
         wanted = {"score": self.form.dtype, "valid": np.dtype(bool)}
-        if self.settings is not None:
+        if self.calibrated is not None:
             wanted["probability"] = self.form.dtype
         found = {name: f"{array.dtype}{list(array.shape)}" for name, array in got.items()}
         expected = {name: f"{dtype}[{num}]" for name, dtype in wanted.items()}

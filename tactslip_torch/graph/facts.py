@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.settings import KEY, AlarmSettings
+from tactslip_torch.onset.settings import AlarmSettings, calibration_of
 
 FORMAT = "tactslip_torch onnx 1"
 GraphKind = Literal["bin", "stream"]
@@ -57,7 +57,7 @@ def model_facts(
     """
     hand, info = detector.pool.hand, detector.info
     window = Window.of(detector)
-    settings = AlarmSettings.of(detector) if KEY in info else None
+    calibrated = calibration_of(detector)
     facts: dict[str, Any] = {
         "format": FORMAT,
         "version": origin.version,
@@ -73,8 +73,8 @@ def model_facts(
         "context_after_samples": window.after,
         "features": [str(name) for name in detector.selected_names],
         "slip_if_score_at_least": 0.0,
-        "calibration": settings and settings.calibration.to_dict(),
-        "slip_share": settings and settings.slip_share,
+        "calibration": calibrated and calibrated[0].to_dict(),
+        "slip_share": calibrated and calibrated[1],
         "experiment": info.get("experiment"),
         "train_materials": list(info.get("train_materials", ())),
         "simulated": info.get("simulated"),
