@@ -595,7 +595,8 @@ def quick(tmp_path_factory):
 
 @pytest.mark.slow
 def test_quick_leaves_everything(quick):
-    assert_files(quick.folder, "model.onnx")
+    assert_files(quick.folder, "model.onnx", "model.onnx.json")
+    assert quick.metrics["onnx"]["bin"]["error"] < 1e-3
     assert_results(quick.folder, quick.metrics, ["train", "test", "unseen"], 2582)
     assert quick.metrics["simulated"] is True
     assert len(quick.metrics["selected"]) in (60, 120)  # of which the recipe chooses
@@ -677,7 +678,11 @@ def test_evaluate_works_as_a_command(quick, tmp_path):
 @pytest.mark.onnx
 def test_export_works_as_a_command(quick, tmp_path):
     model = f"model={quick.folder / 'detector.pt'}"
-    done = run_entry(tmp_path, "export", model, "output=out/small.onnx")
+    done = run_entry(tmp_path, "export", model, "precision=float64", "output=out")
     assert done.returncode == 0, done.stderr
-    onnx.checker.check_model(onnx.load(tmp_path / "out" / "small.onnx"))
-    assert [path.name for path in tmp_path.rglob("*")] == ["out", "small.onnx"]
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["model.onnx", "model.onnx.json"]
+    assert (tmp_path / "out" / "model.onnx").read_bytes() != (
+        quick.folder / "model.onnx"
+    ).read_bytes()
+    onnx.checker.check_model(onnx.load(tmp_path / "out" / "model.onnx"))

@@ -16,7 +16,7 @@ from small_detector import HAND, certified, raw_bins, small_detector
 from test_detector import VARIANTS, noise, random_detector
 from test_graph_check import alarming
 
-from tactslip_torch import export
+from tactslip_torch import export, train
 from tactslip_torch.certify import FORMAT as CERTIFICATE_FORMAT
 from tactslip_torch.export import export_detector, sidecar_facts, summary, worst_error
 from tactslip_torch.graph.facts import sidecar_path
@@ -248,7 +248,7 @@ def foreign(model):
 
 
 def heavy(model):
-    numbers = np.zeros(200_000, np.float32)
+    numbers = np.zeros(400_000, np.float32)
     model.graph.initializer.append(numpy_helper.from_array(numbers, "ballast"))
 
 
@@ -377,6 +377,27 @@ def test_no_other_certificate_is_handed_on(kept):
         assert facts["detector_sha256"] == digest
         assert facts["certificate"] is None
         assert "no certificate" in line
+
+
+# The end of training ----------------------------------------------------------------------------
+
+
+def test_training_tells_of_each_graph_and_loses_nothing(detector, tmp_path, monkeypatch):
+    detector.save(tmp_path / "detector.pt")
+    found = train._export(detector, tmp_path)
+    assert found.keys() == {"bin", "stream"}
+    for kind, name in export.FILES.items():
+        assert found[kind]["bytes"] == (tmp_path / name).stat().st_size
+        assert found[kind]["error"] == worst_error(sidecar_facts(tmp_path / name)) < 1e-3
+    digest = hashlib.sha256((tmp_path / "detector.pt").read_bytes()).hexdigest()
+    assert sidecar_facts(tmp_path / "stream.onnx")["detector_sha256"] == digest
+
+    def failing(of, form, kind):
+        raise ValueError("no such descriptor\nas a graph")
+
+    monkeypatch.setattr(export, "_graph", failing)
+    found = train._export(small_detector(), tmp_path)
+    assert found == {"bin": f"{tmp_path / 'model.onnx'} was not written: no such descriptor"}
 
 
 # The command ------------------------------------------------------------------------------------

@@ -499,11 +499,12 @@ def test_an_axis_that_is_not_free_is_refused():
 
 
 def test_a_file_of_a_usual_head_has_700_kb():
-    assert size_limit("float32", 120 * 120 * 4) == 700_000
-    assert size_limit("float64", 120 * 120 * 8) == 1_400_000
-    assert size_limit("float32", 5_000_000) == 5_600_000
+    assert size_limit("float32", 120 * 120) == 700_000
+    assert size_limit("float64", 120 * 120) == 1_400_000
+    assert size_limit("float32", 1_025_000) == 4_700_000
+    assert size_limit("float32", 0, frames=2) == 1_400_000
     assert size_limit("float32", 0, shares=1) == 700_000
-    assert size_limit("float32", 0, shares=3) == 1_000_000
+    assert size_limit("float64", 0, shares=3) == 1_700_000
 
 
 # Running --------------------------------------------------------------------------------------

@@ -77,6 +77,13 @@ def test_a_stream_graph_says_how_it_decides():
     assert facts["threshold_curve"] == []
 
 
+def test_a_calibration_of_training_is_told_without_an_alarm():
+    detector = small_detector()
+    detector.info["calibration"] = Platt(2.0, 0.5).to_dict()
+    facts = model_facts(detector, Form(), ORIGIN)
+    assert (facts["calibration"], facts["slip_share"]) == (Platt(2.0, 0.5).to_dict(), 0.5)
+
+
 def test_the_curve_of_thresholds_is_handed_on_where_it_is_known():
     curve = [[2.0, 30.0], [4.0, 0.5]]
     settings = AlarmSettings(

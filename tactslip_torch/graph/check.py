@@ -89,9 +89,13 @@ def check_file(
         ValueError: for the first thing that is wrong, in one line.
     """
     size = path.stat().st_size
-    numbers = sum(buffer.numel() for buffer in detector.head.buffers())
-    shares = len(detector.extractor.plan.share_channels)
-    limit = size_limit(form.precision, numbers * form.dtype.itemsize, shares)
+    plan, lengths = detector.extractor.plan, detector.channel_filter.window_lengths
+    limit = size_limit(
+        form.precision,
+        sum(buffer.numel() for buffer in detector.head.buffers()),
+        len({lengths[channel] for channel in plan.channels}),
+        len(plan.share_channels),
+    )
     if size > limit:
         raise ValueError(f"its file has {size} bytes, more than {limit}")
     session = session_of(onnx.load(path))

@@ -33,25 +33,27 @@ _CHOICES = {"Where", "Clip", "Max", "Min", "Equal", "Less", "LessOrEqual", "Not"
 _CHOICES |= {"Greater", "GreaterOrEqual", "And", "Or", "IsNaN", "IsInf"}
 _COMMUTE = {"Max", "Min", "Equal", "And", "Or", "Add", "Mul"}
 _TINY = 1e-3  # an added term, or a factor's distance from 1, below which it guards
-_SIZES, _SHARE_BYTES = {"float32": 700_000, "float64": 1_400_000}, 150_000
 
 Guard = tuple[str, tuple[float, ...]]
 """An operator, and the numbers that it is given as constants."""
 
 
-def size_limit(precision: str, head_bytes: int, shares: int = 0) -> int:
-    """Bytes that a file may have: 700 kB in float32, twice that in float64.
+def size_limit(precision: str, head_numbers: int, frames: int = 1, shares: int = 0) -> int:
+    """Bytes that a file may have: 700 kB in float32 where films alone are in use, or gauges alone.
 
-    And what a large head has above a seventh of it; and 150 kB, in either, for each film but one
-    of whose energy the detector wants shares, as each has a matrix of its own.
+    As much again for each further length of filter, as branches and spectra are fused with it; for
+    each film but one of whose energy the detector wants shares, 75 kB; for the numbers of a head
+    beyond the first 25 000, their own. Twice that in float64.
 
     Args:
         precision: of the graph.
-        head_bytes: of the head's numbers in that precision.
+        head_numbers: that the head is made of.
+        frames: different lengths of filter among the channels in use.
         shares: films of whose energy shares are wanted.
     """
-    limit = _SIZES[precision]
-    return limit + max(0, head_bytes - limit // 7) + _SHARE_BYTES * max(0, shares - 1)
+    head = 4 * max(0, head_numbers - 25_000)
+    single = 700_000 * frames + 75_000 * max(0, shares - 1) + head
+    return single if precision == "float32" else 2 * single
 
 
 def check_operators(model: onnx.ModelProto) -> None:
