@@ -86,8 +86,10 @@ def test_scores_become_the_same_ratios_and_probabilities(calibration, dtype, dat
     expected = calibration.llr(torch.from_numpy(score))
     llr, found = calibrating(calibration, dtype, slip_share).run(None, {"score": score})
     assert llr.dtype == found.dtype == dtype
-    if isinstance(calibration, Platt):
-        np.testing.assert_array_equal(llr, expected.numpy())
+    if isinstance(
+        calibration, Platt
+    ):  # a slope next to 1 is halved and doubled, so denormals round
+        np.testing.assert_allclose(llr, expected.numpy(), rtol=0, atol=1e-300)
     else:  # of which torch.lerp rounds some once less
         tiny = 4 * np.finfo(dtype).eps
         np.testing.assert_allclose(llr, expected.numpy(), rtol=tiny, atol=tiny)
