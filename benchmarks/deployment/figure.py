@@ -9,17 +9,18 @@ from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import NullLocator
 
+from benchmarks.deployment.files import EXPORTS
 from benchmarks.deployment.report import LEAST_RATE, MOST_ERROR, RATE_THREADS, row_of
-from benchmarks.deployment.ways import REFERENCE
+from benchmarks.deployment.ways import REFERENCE, at_once
 from benchmarks.drawing import GREY, LIGHT, OURS, PEER, SECOND, THIRD, finish, plain_decades
 from benchmarks.rates import rate
 
 _FLOOR = 1e-16  # where what errors are held against is drawn
 _APART = 0.12  # decades between two labels, at least
 _CLUSTER = 2.0  # decades of error within which labels keep apart
-_LEFT = 1e-4  # from this error on, labels stand to the left
+_ROOM = 1e6  # up to here labels reach, beyond the largest error
 _ENGINES = {"compiled": SECOND, "eager": THIRD, "reference": GREY}
 Rows = Sequence[Mapping[str, Any]]
 
@@ -33,7 +34,7 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
     """
     sections = {name: of["rows"] for name, of in report["sections"].items()}
     drawing = Figure(figsize=(13, 5.6), layout="constrained")
-    trade, bulk = drawing.subplots(1, 2, width_ratios=(1.35, 1))
+    trade, bulk = drawing.subplots(1, 2, width_ratios=(1.6, 1))
     _trade(trade, sections)
     _bulk(bulk, sections["bulk"])
     finish(drawing, report, "What a deployed detector costs", path)
@@ -92,17 +93,15 @@ def _marks(sections: Mapping[str, Rows]) -> list[Mark]:
 def _trade(axes: Axes, sections: Mapping[str, Rows]) -> None:
     for cluster in clusters(_marks(sections)):
         heights = label_heights(cluster)
-        is_left = cluster[0].error > _LEFT
-        edge = min(m.error for m in cluster) / 8 if is_left else max(m.error for m in cluster) * 8
+        edge = 3 * max(mark.error for mark in cluster)
         for way, error, p50_us in cluster:
             axes.plot(error, p50_us, "s" if way.endswith("bulk") else "o", color=colour(way), ms=6)
             axes.plot([error, edge], [p50_us, heights[way]], color=colour(way), lw=0.6)
             axes.annotate(
                 way,
                 (edge, heights[way]),
-                (-2 if is_left else 2, 0),
+                (2, 0),
                 textcoords="offset points",
-                ha="right" if is_left else "left",
                 va="center",
                 size=7.5,
             )
@@ -118,10 +117,10 @@ def _trade(axes: Axes, sections: Mapping[str, Rows]) -> None:
             color="#555555",
             va="top",
         )
-    axes.set(xscale="log", yscale="log", xlim=(_FLOOR / 3, 10))
+    axes.set(xscale="log", yscale="log", xlim=(_FLOOR / 3, _ROOM))
     low, high = axes.get_ylim()
     axes.set_ylim(low / 1.3, high * 2)
-    axes.xaxis.set_major_locator(LogLocator(numticks=9))
+    axes.set_xticks([10.0**power for power in range(-16, 1, 2)])
     axes.xaxis.set_minor_locator(NullLocator())
     plain_decades(axes.yaxis)
     axes.grid(color=LIGHT)
@@ -136,15 +135,17 @@ def _trade(axes: Axes, sections: Mapping[str, Rows]) -> None:
 def _bulk(axes: Axes, rows: Rows) -> None:
     threads = RATE_THREADS if any(row["threads"] == RATE_THREADS for row in rows) else 1
     own = [row for row in rows if row["threads"] == threads]
+    shared = {at_once(way) for way in EXPORTS}
     peers = [way for way in dict.fromkeys(row["way"] for row in own) if colour(way) == PEER]
     for way in dict.fromkeys(row["way"] for row in own):
         mine = [row for row in own if row["way"] == way]
         rates = [rate(row) for row in mine]
         style = ":" if way in peers else ("--" if "float64" in way else "-")
+        shade = "#56b4e9" if way in shared else colour(way)
         marker = "v^DX"[peers.index(way) % 4] if way in peers else "s" if "bulk" in way else "o"
         chunks = [row["chunk"] for row in mine]
         middles = [of.median for of in rates]
-        axes.plot(chunks, middles, style, marker=marker, ms=4, color=colour(way), label=way)
+        axes.plot(chunks, middles, style, marker=marker, ms=4, color=shade, label=way)
     axes.set(xscale="log", yscale="log")
     chunks = sorted({row["chunk"] for row in own})
     axes.set_xticks(chunks, [f"{chunk:,}" for chunk in chunks])

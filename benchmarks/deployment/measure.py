@@ -52,7 +52,7 @@ def _single(ways: Mapping[str, Way], sizes: Sizes, threads: int) -> Rows:
     """One bin at a time."""
     say(f"deployment: single bins on {threads_text(threads)}, {len(ways)} ways")
     samples = raw_bins(sizes.timed)
-    runs = {name: _in_turn(way, samples, 1) for name, way in ways.items()}
+    runs = {name: _in_turn(way, samples, 1) for name, way in ways.items() if way.calls == 1}
     block_s = sizes.block_ms / 1e3
     seconds = shuffled_singles(runs, sizes.rounds, sizes.seed, block_s, sizes.most_calls)
     return [
@@ -70,14 +70,15 @@ def _bulk(ways: Mapping[str, Way], sizes: Sizes, threads: int) -> Rows:
         say(f"deployment: chunks of {chunk} on {threads_text(threads)}")
         calls = {}
         for name, way in ways.items():
-            is_long = chunk * a_bin_s.get(name, 0.0) > sizes.longest_s
+            bins = chunk * way.calls
+            is_long = bins * a_bin_s.get(name, 0.0) > sizes.longest_s
             if not is_long and chunk <= (way.most or chunk):
-                num = max(chunk, sizes.timed)
-                many = samples[torch.arange(num) % len(samples)]
-                calls[name] = Timed(_counted(_in_turn(way, many, chunk)))
+                many = samples[torch.arange(max(bins, sizes.timed)) % len(samples)]
+                calls[name] = Timed(_counted(_in_turn(way, many, bins)))
         for name, taken in shuffled_rounds(calls, sizes.bulk_rounds, sizes.seed).items():
-            a_bin_s[name] = min(taken) / chunk
-            rows.append({"way": name, "chunk": chunk, "bins": chunk, "seconds": taken})
+            bins = chunk * ways[name].calls
+            a_bin_s[name] = min(taken) / bins
+            rows.append({"way": name, "chunk": chunk, "bins": bins, "seconds": taken})
     return rows
 
 

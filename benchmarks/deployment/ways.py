@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import partial
 from importlib import import_module
@@ -46,12 +47,14 @@ class Way(NamedTuple):
         run: that to scores ``[N]``.
         features: how many it makes of a bin, or is asked for.
         most: bins that it takes at once; ``None`` for any number.
+        calls: chunks of bins that it takes at once, for work in bulk alone if more than one.
     """
 
     cut: Callable[[Tensor], Any]
     run: Callable[[Any], Any]
     features: int
     most: int | None = None
+    calls: int = 1
 
 
 def engine_way(engine: str, dtype: str) -> str:
@@ -64,12 +67,20 @@ def engine_way(engine: str, dtype: str) -> str:
     return f"{engine} engine, {dtype}"
 
 
+def at_once(way: str) -> str:
+    """The name of a way whose threads each run a chunk, instead of sharing one."""
+    return f"{way}, a chunk a thread"
+
+
 REFERENCE = engine_way("reference", FLOAT64)
 
 
 def ways_of(subject: Subject, files: Files, sizes: Sizes, threads: int) -> dict[str, Way]:
     """Every way by its name, on so many threads; the loop knows one alone."""
     found = _exports(subject, files, threads) | _engines(subject)
+    if threads > 1:
+        alone = _exports(subject, files, 1)
+        found |= {at_once(name): _shared_out(way, threads) for name, way in alone.items()}
     needed, every = len(subject.timed.selected), len(pool_of(FLOAT64).names)
     made = {True: every, False: needed}
     for is_whole, name in NAIVE.items():
@@ -121,6 +132,17 @@ def _exports(subject: Subject, files: Files, threads: int) -> dict[str, Way]:
         judge = judge_of(files.paths[of_way(name, BIN)], threads, context)
         found[name] = Way(*judge, len(subject.timed.selected))
     return found
+
+
+def _shared_out(way: Way, threads: int) -> Way:
+    """Two chunks for each thread at a time."""
+    pool = ThreadPoolExecutor(threads)
+    calls = 2 * threads
+
+    def run(samples: Any) -> Any:
+        return np.concatenate(list(pool.map(way.run, np.array_split(samples, calls))))
+
+    return way._replace(run=run, calls=calls)
 
 
 def _engines(subject: Subject) -> dict[str, Way]:
