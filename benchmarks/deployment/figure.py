@@ -20,7 +20,7 @@ from benchmarks.rates import rate
 _FLOOR = 1e-16  # where what errors are held against is drawn
 _APART = 0.12  # decades between two labels, at least
 _CLUSTER = 2.0  # decades of error within which labels keep apart
-_ROOM = 1e6  # up to here labels reach, beyond the largest error
+_ROOM = 3e4  # up to here labels reach, beyond the largest error
 _ENGINES = {"compiled": SECOND, "eager": THIRD, "reference": GREY}
 Rows = Sequence[Mapping[str, Any]]
 
@@ -33,8 +33,8 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
         path: of the PNG.
     """
     sections = {name: of["rows"] for name, of in report["sections"].items()}
-    drawing = Figure(figsize=(13, 5.6), layout="constrained")
-    trade, bulk = drawing.subplots(1, 2, width_ratios=(1.6, 1))
+    drawing = Figure(figsize=(11, 9.5), layout="constrained")
+    trade, bulk = drawing.subplots(2, 1, height_ratios=(1.2, 1))
     _trade(trade, sections)
     _bulk(bulk, sections["bulk"])
     finish(drawing, report, "What a deployed detector costs", path)
