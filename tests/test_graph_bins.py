@@ -240,3 +240,13 @@ def test_only_what_the_selected_features_need_is_in_the_file():
     assert sizes[1] < sizes[0] / 2
     assert len(Window.of(small).channels) == 1
     assert Window.of(small).length == 110  # a film's frame, not a gauge's
+
+
+@pytest.mark.parametrize("offset", [2.5, 1000.0])
+def test_an_offset_takes_no_digits_from_float32(offset):
+    """Off by what the offset took from the samples, which torch is given too, and by no more."""
+    samples = (0.01 * torch.randn(24, 4, 150, generator=torch.Generator().manual_seed(8))).double()
+    error = off(whole_pool(), Form("float32"), samples + offset)
+    names = [name for name in error if name.startswith("PVDF") and name.endswith("correlation")]
+    assert len(names) == 16
+    assert max(error[name] for name in names) < 1e-5

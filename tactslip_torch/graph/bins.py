@@ -37,6 +37,9 @@ class Judged(NamedTuple):
 def judge_bins(graph: Graph, detector: SlipDetector, windows: Value, form: Form) -> Judged:
     """Nodes that judge raw bins.
 
+    Where samples of a bin differ by more than their precision can hold, or by so little that they
+    are denormal in it, their channel may count as missing or dead (1e38 V and 1e-38 V in float32).
+
     Args:
         graph: to which they are added; may be a body.
         detector: whose judgement.
@@ -51,8 +54,8 @@ def judge_bins(graph: Graph, detector: SlipDetector, windows: Value, form: Form)
     z = with_typical(graph, scaled(graph, features, detector.scaler), front.is_missing, detector)
     score = machine(graph, z, detector.head, form)
     is_finite = score.is_finite()
-    all_of = _all(front.is_trusted)
-    return Judged(score, all_of & is_finite, is_finite & ~_all(front.is_missing))
+    is_valid = _all(front.is_trusted) & is_finite
+    return Judged(score, is_valid, is_finite & ~_all(front.is_missing))
 
 
 def bin_graph(detector: SlipDetector, form: Form) -> Graph:

@@ -64,8 +64,8 @@ class _Channels:
     smooth: torch.Tensor
     shifted: Value  # [B, c, W + 1]
     unit: Value | None  # [B, c], in volts; None: everything is in volts
-    filtered: Value  # [B, c, n]
-    scale: Value  # [B, c]
+    moving: Value  # the filtered bin but for a constant, [B, c, n]
+    scale: Value  # largest magnitude of the filtered bin, [B, c]
     blocks: Mapping[int, Block]  # by branch
     mean: Value | None  # of rows that are no spectra, over their length, [B, c, blocks]
     scaled: Mapping[bool, _Scaled]  # for spectra, or not
@@ -135,7 +135,7 @@ class Front:
         if with_scale:
             scale = self._of_channels(ordered, lambda group: group.scale) / length
         if with_film and not is_freq:
-            film = self._films(parts, dtype)
+            film = self._films(ordered, dtype)
         mean = None if is_freq else self._cells(ordered, lambda group: group.mean)
         unit = length
         if self._form.dtype == F64:
@@ -190,17 +190,15 @@ class Front:
         whole = self._graph.concat(*tables, axis=1)
         return whole.take([self._order.index(row.channel) for row in rows], 1)
 
-    def _films(self, parts: Sequence[Sequence[Row]], dtype: np.dtype[Any]) -> Value:
+    def _films(self, rows: Sequence[Row], dtype: np.dtype[Any]) -> Value:
         """Filtered bins of rows less their mean, of order one; 0 where that is rounding."""
-        films = []
-        for rows in parts:
-            group = self._of[rows[0].channel]
-            places = [group.channels.index(row.channel) for row in rows]
-            films.append(_taken(group.filtered, places, group.channels))
-        film = self._graph.concat(*films, axis=1).cast(F64)
+        places = [self._order.index(row.channel) for row in rows]
+        film = self._graph.concat(*(group.moving for group in self._groups), axis=1)
+        film = film.take(places, 1).cast(F64)
         centred = film - film.mean(2, keep=True)
-        size, scale = centred.abs().amax(2, keep=True), film.abs().amax(2, keep=True)
-        least = (scale * (_LEAST_SPAN / 2)).max(_TINY)  # onnxruntime drops an addition of it
+        size = centred.abs().amax(2, keep=True)
+        scale = self._of_channels(rows, lambda group: group.scale).expand(2)
+        least = (scale * (_LEAST_SPAN / 2)).max(_TINY)
         kept = (size >= least).cast(F64) / size.max(least)
         return (centred * kept).cast(dtype)
 
@@ -218,9 +216,8 @@ class Front:
             x = x / unit
         smooth = filter_matrix(self._detector.channel_filter, channels[0], num)
         first = x.slice(before, before + 1, 2)
-        filtered = (x - first).cast(self._form.dtype) @ smooth.T.numpy() + first.cast(
-            self._form.dtype
-        )
+        moving = (x - first).cast(self._form.dtype) @ smooth.T.numpy()
+        filtered = moving + first.cast(self._form.dtype)
         scale = self._judge(channels, filtered, unit)
         first = first.cast(F64)
         shifted = graph.concat(x.cast(F64) - first, first, axis=2)
@@ -237,7 +234,7 @@ class Front:
         if False in scaled:
             mean = self._mean(coordinates, own, scaled[False])
         unit = None if unit is None else unit.squeeze(2)
-        return _Channels(channels, smooth, shifted, unit, filtered, scale, own, mean, scaled)
+        return _Channels(channels, smooth, shifted, unit, moving, scale, own, mean, scaled)
 
     def _judge(self, channels: tuple[int, ...], filtered: Value, unit: Value | None) -> Value:
         """Which channels can be trusted, by what sensors resolve; and the largest magnitudes."""

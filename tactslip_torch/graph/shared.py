@@ -17,6 +17,7 @@ from tactslip_torch.graph.value import F64, Value
 from tactslip_torch.graph.writer import Graph
 
 _NEXT_TO_NOTHING = 1e-60  # variances of rows of order one are 0 or far above
+_MOST = 0.7  # of the rows: to pick more of them costs more than it spares
 _MOMENTS = (
     "mean",
     "std",
@@ -75,10 +76,12 @@ class Shared:
         self._made: dict[str, Part] = {}
 
     def of_rows(self, names: Iterable[str], always: bool = False) -> tuple[int, ...]:
-        """Places of the rows for which these descriptors have to be made."""
+        """Places of the rows for which descriptors have to be made: all, if few are spared."""
+        whole = tuple(range(len(self.rows.rows)))
         if not (self._frugal or always):
-            return tuple(range(len(self.rows.rows)))
-        return tuple(sorted({place for name in names for place in self._wanted.get(name, ())}))
+            return whole
+        wanted = {place for name in names for place in self._wanted.get(name, ())}
+        return tuple(sorted(wanted)) if always or len(wanted) < _MOST * len(whole) else whole
 
     def once(self, name: str, make: Callable[[], Part]) -> Part:
         """A shared part, made when first asked for."""
