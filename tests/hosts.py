@@ -5,10 +5,9 @@ and what they say is held against ``StreamingDetector`` in float64.
 """
 
 import json
-import re
 import shutil
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -195,127 +194,3 @@ def assert_same(ran: Ran, expected: list[dict[str, Any]], *, exact: bool = False
             assert abs(line[name] - row[name]) <= bound, (name, line, row)
     assert ran.summary["decisions"] == len(expected)
     assert ran.summary["alarms"] == sum(row["alarm"] for row in expected)
-
-
-# What is wrong ---------------------------------------------------------------------------------
-
-
-class Case(NamedTuple):
-    """Something wrong, and what a host is to say of it.
-
-    Attributes:
-        arguments: made of a fresh folder and a whole ``stream.onnx``.
-        says: all of them stand in the one line on stderr.
-        status: of the exit.
-    """
-
-    arguments: Callable[[Path, Path], list[object]]
-    says: tuple[str, ...]
-    status: int = 1
-
-
-def _recording(folder: Path) -> Path:
-    return saved(folder / "recording.npy", slipping_stream()[:600])
-
-
-def _with_model(change: Callable[[Path], object]) -> Callable[[Path, Path], list[object]]:
-    """Arguments with a model that was changed behind its export."""
-
-    def arguments(folder: Path, model: Path) -> list[object]:
-        mine = copied(model, folder)
-        change(mine)
-        return [mine, _recording(folder)]
-
-    return arguments
-
-
-def _with_array(make: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path, Path], list[object]]:
-    """Arguments with another array in the recording's file."""
-
-    def arguments(folder: Path, model: Path) -> list[object]:
-        return [model, saved(folder / "recording.npy", make(slipping_stream()[:600]))]
-
-    return arguments
-
-
-def _with_file(change: Callable[[Path], object]) -> Callable[[Path, Path], list[object]]:
-    """Arguments with a recording whose file was changed."""
-
-    def arguments(folder: Path, model: Path) -> list[object]:
-        path = _recording(folder)
-        change(path)
-        return [model, path]
-
-    return arguments
-
-
-def _with_options(*options: object) -> Callable[[Path, Path], list[object]]:
-    return lambda folder, model: [model, _recording(folder), *options]
-
-
-CASES = {
-    "no model": Case(_with_model(Path.unlink), ("stream.onnx",)),
-    "truncated model": Case(_with_model(truncated), ("stream.onnx.json", "again")),
-    "altered model": Case(_with_model(altered), ("stream.onnx.json", "again")),
-    "no sidecar": Case(
-        _with_model(lambda path: sidecar_of(path).unlink()), ("stream.onnx.json", "beside")
-    ),
-    "truncated sidecar": Case(
-        _with_model(lambda path: truncated(sidecar_of(path))), ("stream.onnx.json",)
-    ),
-    "sidecar of something else": Case(
-        _with_model(lambda path: sidecar_of(path).write_text("{}")), ("stream.onnx.json", "format")
-    ),
-    "bin graph": Case(
-        lambda folder, model: [model.with_name("model.onnx"), _recording(folder)],
-        ("model.onnx", "bin", "stream"),
-    ),
-    "no recording": Case(_with_file(Path.unlink), ("recording.npy",)),
-    "truncated recording": Case(_with_file(truncated), ("recording.npy", "cut off")),
-    "truncated header": Case(_with_file(lambda path: truncated(path, 0.001)), ("recording.npy",)),
-    "text": Case(_with_file(lambda path: path.write_text("volts\n")), ("recording.npy", ".npy")),
-    "Fortran order": Case(_with_array(np.asfortranarray), ("Fortran",)),
-    "integers": Case(
-        _with_array(lambda x: (1000 * x).astype("<i2")), ("recording.npy", "<i2", "float32")
-    ),
-    "big-endian": Case(_with_array(lambda x: x.astype(">f4")), (">f4", "little-endian")),
-    "one axis": Case(_with_array(np.ravel), ("14400", "24")),
-    "three axes": Case(_with_array(lambda x: x[None]), ("600", "24")),
-    "seven channels": Case(_with_array(lambda x: x[:, :7].copy()), ("7", "24")),
-    "channels first": Case(_with_array(lambda x: x.T.copy()), ("600", "24")),
-    "another rate": Case(_with_options("--rate", 1000), ("1000", "2000")),
-    "no chunk": Case(_with_options("--chunk", 0), ("--chunk", "0"), 2),
-    "too large a chunk": Case(_with_options("--chunk", 5000), ("--chunk", "5000", "2000"), 2),
-    "half a chunk": Case(_with_options("--chunk", 2.5), ("--chunk", "2.5"), 2),
-    "no number": Case(_with_options("--threshold", "high"), ("--threshold", "high"), 2),
-    "threshold that is NaN": Case(_with_options("--threshold", "nan"), ("--threshold", "nan"), 2),
-    "unknown option": Case(_with_options("--verbose"), ("--verbose",), 2),
-    "no arguments": Case(lambda folder, model: [], ("recording.npy",), 2),
-}
-"""By name; ``pytest.mark.parametrize("case", CASES)``."""
-
-
-def assert_refused(host: Sequence[object], case: str, folder: Path, model: Path) -> None:
-    """A host says in one line what is wrong, prints nothing else, and ends as it should."""
-    ran = run_host(host, *CASES[case].arguments(folder, model))
-    assert ran.status == CASES[case].status, ran.stderr
-    (line,) = ran.stderr.splitlines()
-    assert line.startswith("error: ")
-    for words in CASES[case].says:
-        assert words in line
-    assert ran.lines == []
-
-
-def assert_warned(ran: Ran, expected: list[dict[str, Any]]) -> None:
-    """A host went on where decisions are not valid, and said so in one line at the end."""
-    times_s = [row["time_s"] for row in expected if not row["valid"]]
-    assert times_s
-    (line,) = ran.stderr.splitlines()
-    found = re.fullmatch(
-        r"warning: (\d+) of (\d+) decisions are not valid, the first at ([\d.]+) s: "
-        r"a channel in use is dead or broken",
-        line,
-    )
-    assert found, line
-    assert [int(found[1]), int(found[2])] == [len(times_s), len(expected)]
-    assert abs(float(found[3]) - times_s[0]) <= 1e-3

@@ -9,7 +9,16 @@ from pathlib import Path
 import hosts
 import numpy as np
 import pytest
-from hosts import CASES, assert_refused, assert_same, assert_warned, run_host, saved, truth
+from host_cases import (
+    CASES,
+    SPELLINGS,
+    assert_loss_is_told,
+    assert_read,
+    assert_refused,
+    assert_versions_are_read,
+    assert_warned,
+)
+from hosts import assert_same, run_host, saved, truth
 
 pytestmark = [
     pytest.mark.onnx,
@@ -114,21 +123,48 @@ def test_a_recording_of_nothing_has_no_decision(host, model, tmp_path):
     assert ran == ([], {"decisions": 0, "alarms": 0, "seconds": 0}, "", 0)
 
 
-def test_the_second_version_of_the_file_format_is_read(host, model, tmp_path):
-    path = tmp_path / "recording.npy"
-    with path.open("wb") as file:
-        np.lib.format.write_array(file, hosts.slipping_stream(), version=(2, 0))
-    ran = run_host(host, model, path, "--decisions")
-    assert_same(ran, truth(hosts.slipping_stream()))
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_wrong_is_one_line(host, model, tmp_path, case):
     assert_refused(host, case, tmp_path, model)
 
 
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_options_are_read_however_they_are_written(host, model, recording, spelling):
+    assert_read(host, spelling, model, recording)
+
+
+def test_later_versions_of_the_file_format_are_read(host, model, tmp_path):
+    assert_versions_are_read(host, model, tmp_path)
+
+
+def test_lines_that_cannot_be_written_are_an_error(host, model, recording):
+    assert_loss_is_told(host, model, recording)
+
+
 def test_parts_hold_chunks_agree_and_a_push_takes_no_memory(make, model):
     assert "parts and pushes hold" in make("test", f"MODEL={model}")
+
+
+def test_a_program_may_write_numbers_with_a_comma(make, model, tmp_path):
+    if shutil.which("localedef") is None:
+        pytest.skip("no localedef here to make a locale")
+    ascii_map = "".join(f"<U{i:04X}> /x{i:02x}\n" for i in range(128))
+    head = "<code_set_name> ANSI_X3.4-1968\n<comment_char> %\n<escape_char> /\n"
+    (tmp_path / "ascii").write_text(f"{head}CHARMAP\n{ascii_map}END CHARMAP\n")
+    mark = 'decimal_point ","\nthousands_sep ""\ngrouping -1\n'
+    (tmp_path / "comma.txt").write_text(f"LC_NUMERIC\n{mark}END LC_NUMERIC\n")
+    command = ["localedef", "-c", "-f", "./ascii", "-i", "./comma.txt", "./comma"]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)  # 1: it is no whole one
+    make(f"{make.build}/check")
+    done = subprocess.run(
+        [make.build / "check", model],
+        env={"LOCPATH": str(tmp_path), "LC_NUMERIC": "comma"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["parts and pushes hold", "a half is written 0,5 here"]
 
 
 def test_the_example_of_the_page_compiles_and_feels_the_slips(make, host, model, tmp_path):

@@ -7,12 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from host_cases import (
+    CASES,
+    SPELLINGS,
+    assert_loss_is_told,
+    assert_read,
+    assert_refused,
+    assert_versions_are_read,
+    assert_warned,
+)
 from hosts import (
     ALARM_KEYS,
-    CASES,
-    assert_refused,
     assert_same,
-    assert_warned,
     exported,
     run_host,
     saved,
@@ -97,6 +103,22 @@ def test_missing_samples_are_flagged_and_the_host_goes_on(host, model, tmp_path)
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_wrong_is_said_in_one_line(host, model, tmp_path, case):
     assert_refused(host, case, tmp_path, model)
+
+
+@pytest.mark.onnx
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_options_are_read_however_they_are_written(host, model, recording, spelling):
+    assert_read(host, spelling, model, recording)
+
+
+@pytest.mark.onnx
+def test_later_versions_of_the_file_format_are_read(host, model, tmp_path):
+    assert_versions_are_read(host, model, tmp_path)
+
+
+@pytest.mark.onnx
+def test_lines_that_cannot_be_written_are_an_error(host, model, recording):
+    assert_loss_is_told(host, model, recording)
 
 
 PROGRAM = """

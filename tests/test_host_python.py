@@ -8,7 +8,16 @@ import hosts
 import numpy as np
 import pytest
 import torch
-from hosts import CASES, assert_refused, assert_same, assert_warned, run_host, saved, truth
+from host_cases import (
+    CASES,
+    SPELLINGS,
+    assert_loss_is_told,
+    assert_read,
+    assert_refused,
+    assert_versions_are_read,
+    assert_warned,
+)
+from hosts import assert_same, run_host, saved, truth
 
 pytestmark = pytest.mark.onnx
 
@@ -73,6 +82,19 @@ def test_a_recording_of_nothing_has_no_decision(model, tmp_path):
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_wrong_is_one_line(model, tmp_path, case):
     assert_refused(HOST, case, tmp_path, model)
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_options_are_read_however_they_are_written(model, recording, spelling):
+    assert_read(HOST, spelling, model, recording)
+
+
+def test_later_versions_of_the_file_format_are_read(model, tmp_path):
+    assert_versions_are_read(HOST, model, tmp_path)
+
+
+def test_lines_that_cannot_be_written_are_an_error(model, recording):
+    assert_loss_is_told(HOST, model, recording)
 
 
 def test_it_needs_no_torch(model, recording):

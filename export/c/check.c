@@ -1,5 +1,6 @@
 /* Checks the parts by themselves and, given a model, that pushes take no memory and that chunks
  * make no difference. Ends at the first that does not hold. */
+#include <locale.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -52,8 +53,13 @@ static void check_sidecar(void) {
                        "\n \"b\": -2.5e1,\n \"t\": \"whole\",\n \"c\": null\n}\n";
     double value;
     size_t count;
-    char text[8];
+    char text[8], said[64];
     HOLDS(sidecar_number(json, "b", &value) && value == -25.0);
+    HOLDS(!sidecar_number("{\"b\": 2,5}", "b", &value) || value == 2.0); /* a comma ends a number */
+    sidecar_said(json, "pairs", said, sizeof said);
+    HOLDS(!strcmp(said, "[[1, 2], [3, 4], [5, 6]]"));
+    sidecar_said(json, "p", said, sizeof said);
+    HOLDS(!strcmp(said, "nothing"));
     HOLDS(sidecar_text(json, "t", text, sizeof text) && !strcmp(text, "whole"));
     HOLDS(sidecar_entries(json, "list", &count) && count == 2);
     HOLDS(sidecar_entries(json, "pairs", &count) && count == 3);
@@ -121,10 +127,12 @@ static void check_pushes(const char *path) {
 }
 
 int main(int count, char **words) {
+    setlocale(LC_NUMERIC, ""); /* as programs do that speak the user's language */
     check_sha256();
     check_sidecar();
     if (count > 1) check_pushes(words[1]);
     puts(count > 1 ? "parts and pushes hold" : "parts hold; MODEL=stream.onnx checks pushes too");
+    printf("a half is written %.1f here\n", 0.5);
     slip_close(NULL);
     return 0;
 }

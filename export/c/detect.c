@@ -28,6 +28,28 @@ struct tally {
     double first_not_valid_s;
 };
 
+/* A finite decimal number and nothing else: strtod takes spaces and 0x10 as well. */
+static bool read_number(const char *word, double *value) {
+    char *end;
+    bool is_plain = !word[strspn(word, "+-.0123456789eE")];
+    *value = strtod(word, &end);
+    return is_plain && end != word && !*end && isfinite(*value);
+}
+
+static bool read_chunk(const char *word, size_t *chunk) {
+    bool is_whole = *word && !word[strspn(word, "0123456789")];
+    unsigned long value = strtoul(word, NULL, 10);
+    *chunk = (size_t)value;
+    return is_whole && value >= 1 && value <= LARGEST_CHUNK;
+}
+
+/* Behind the name of an option: "", "=value", or NULL where it is another option. */
+static const char *behind(const char *word, const char *name) {
+    size_t length = strlen(name);
+    bool is_it = !strncmp(word, name, length) && (!word[length] || word[length] == '=');
+    return is_it ? word + length : NULL;
+}
+
 static int refuse(int status, const char *format, ...) {
     va_list arguments;
     va_start(arguments, format);
@@ -42,30 +64,29 @@ static int refuse(int status, const char *format, ...) {
 static int read_options(int count, char **words, struct options *options) {
     *options = (struct options){.rate = NAN, .threshold = NAN, .chunk = 200};
     for (int i = 1; i < count; i++) {
-        const char *name = words[i];
-        if (strncmp(name, "--", 2)) {
+        const char *word = words[i], *inline_value = NULL;
+        if (*word != '-') {
             const char **place = options->model ? &options->recording : &options->model;
-            if (*place) return refuse(WRONG_USAGE, "one argument too many, %s", name);
-            *place = name;
+            if (*place) return refuse(WRONG_USAGE, "one argument too many, %s", word);
+            *place = word;
             continue;
         }
-        if (!strcmp(name, "--decisions")) {
+        if (!strcmp(word, "--decisions")) {
             options->all_decisions = true;
             continue;
         }
-        bool is_rate = !strcmp(name, "--rate"), is_chunk = !strcmp(name, "--chunk");
-        if (!is_rate && !is_chunk && strcmp(name, "--threshold"))
-            return refuse(WRONG_USAGE, "no option %s", name);
-        if (++i == count) return refuse(WRONG_USAGE, "%s needs a number", name);
-        char *end;
-        double value = strtod(words[i], &end);
-        if (end == words[i] || *end || !isfinite(value))
-            return refuse(WRONG_USAGE, "%s: expected a number, got %s", name, words[i]);
-        if (is_chunk && !(value >= 1 && value <= LARGEST_CHUNK && value == floor(value)))
+        static const char *const names[] = {"--rate", "--chunk", "--threshold"};
+        int which = 0;
+        while (which < 3 && !(inline_value = behind(word, names[which]))) which++;
+        if (which == 3) return refuse(WRONG_USAGE, "no option %s", word);
+        const char *name = names[which];
+        if (!*inline_value && ++i == count) return refuse(WRONG_USAGE, "%s needs a number", name);
+        const char *value = *inline_value ? inline_value + 1 : words[i];
+        if (which == 1 && !read_chunk(value, &options->chunk))
             return refuse(WRONG_USAGE, "%s: expected 1 to %d samples, got %s", name, LARGEST_CHUNK,
-                          words[i]);
-        if (is_chunk) options->chunk = (size_t)value;
-        else *(is_rate ? &options->rate : &options->threshold) = value;
+                          value);
+        if (which != 1 && !read_number(value, which ? &options->threshold : &options->rate))
+            return refuse(WRONG_USAGE, "%s: expected a finite decimal number, got %s", name, value);
     }
     if (!options->recording) return refuse(WRONG_USAGE, "stream.onnx and recording.npy are needed");
     return 0;
@@ -137,6 +158,7 @@ static int watch(struct slip *slip, struct npy *recording, const struct options 
     print_number(", ", "seconds", (double)recording->num_samples / facts->sample_rate_hz, false);
     puts("}");
     fflush(stdout);
+    if (ferror(stdout)) return refuse(WRONG, "the output cannot be written; is the disk full?");
     if (tally.not_valid)
         fprintf(stderr,
                 "warning: %zu of %zu decisions are not valid, the first at %.3f s: a channel in "

@@ -37,9 +37,42 @@ static char *file_content(const char *path, size_t *size) {
 
 static bool read_count(const char *json, const char *key, size_t *count) {
     double value;
-    bool is_count = sidecar_number(json, key, &value) && value >= 0 && value <= LARGEST_COUNT;
+    bool is_count = sidecar_number(json, key, &value) && value >= 0 && value <= LARGEST_COUNT &&
+                    value == (double)(size_t)value;
     if (is_count) *count = (size_t)value;
     return is_count;
+}
+
+/* The key of the first fact that is missing or wrong, and in wanted what it should be; or NULL. */
+static const char *wrong_fact(struct model *model, const char *json, const char **wanted) {
+    char text[SHA256_HEX];
+    *wanted = "64 hexadecimal digits";
+    if (!sidecar_text(json, "onnx_sha256", text, sizeof text)) return "onnx_sha256";
+    *wanted = "bin or stream";
+    if (!sidecar_text(json, "graph", text, sizeof text) ||
+        (strcmp(text, "bin") && strcmp(text, "stream")))
+        return "graph";
+    if (!strcmp(text, "bin")) return NULL; /* refused as such, whatever else it says */
+    *wanted = "float32 or float64";
+    if (!sidecar_text(json, "precision", text, sizeof text)) return "precision";
+    model->is_double = !strcmp(text, "float64");
+    if (!model->is_double && strcmp(text, "float32")) return "precision";
+    *wanted = "a list of names";
+    if (!sidecar_entries(json, "channels", &model->num_channels) || !model->num_channels)
+        return "channels";
+    *wanted = "a positive number";
+    if (!sidecar_number(json, "sample_rate_hz", &model->sample_rate_hz) ||
+        !(model->sample_rate_hz > 0))
+        return "sample_rate_hz";
+    *wanted = "a positive whole number";
+    if (!read_count(json, "hop_samples", &model->hop_samples) || !model->hop_samples)
+        return "hop_samples";
+    *wanted = "a whole number";
+    if (!read_count(json, "first_samples", &model->first_samples)) return "first_samples";
+    if (!read_count(json, "frame_samples", &model->frame_samples)) return "frame_samples";
+    if (!read_count(json, "tail_samples", &model->tail_samples)) return "tail_samples";
+    if (!read_count(json, "state_size", &model->state_size)) return "state_size";
+    return NULL;
 }
 
 static bool read_facts(struct model *model, const char *json, const char *path, const char *sidecar,
@@ -48,27 +81,20 @@ static bool read_facts(struct model *model, const char *json, const char *path, 
     if (!sidecar_text(json, "format", text, sizeof text) || strcmp(text, FORMAT))
         return fail(error, size, "%s is no sidecar of format '%s'; export the model again", sidecar,
                     FORMAT);
+    const char *wanted, *wrong = wrong_fact(model, json, &wanted);
+    if (wrong) {
+        sidecar_said(json, wrong, text, sizeof text);
+        return fail(error, size, "%s says %s %s, wanted %s; export the model again", sidecar, wrong,
+                    text, wanted);
+    }
     sha256_hex(model->bytes, model->size, hex);
-    if (!sidecar_text(json, "onnx_sha256", text, sizeof text))
-        return fail(error, size, "%s is damaged: it has no onnx_sha256; copy it again", sidecar);
-    if (strcmp(text, hex))
+    if (!sidecar_text(json, "onnx_sha256", text, sizeof text) || strcmp(text, hex))
         return fail(error, size,
                     "%s is cut off or altered: its SHA-256 is not the onnx_sha256 of %s; copy both "
                     "again",
                     path, sidecar);
     if (!sidecar_text(json, "graph", text, sizeof text) || strcmp(text, "stream"))
-        return fail(error, size, "%s is a %s graph, no stream graph; give stream.onnx", path, text);
-    bool is_whole = sidecar_text(json, "precision", text, sizeof text) &&
-                    sidecar_entries(json, "channels", &model->num_channels) &&
-                    sidecar_number(json, "sample_rate_hz", &model->sample_rate_hz) &&
-                    read_count(json, "hop_samples", &model->hop_samples) &&
-                    read_count(json, "first_samples", &model->first_samples) &&
-                    read_count(json, "frame_samples", &model->frame_samples) &&
-                    read_count(json, "tail_samples", &model->tail_samples) &&
-                    read_count(json, "state_size", &model->state_size);
-    model->is_double = !strcmp(text, "float64");
-    if (!is_whole || !model->num_channels || !model->hop_samples || model->sample_rate_hz <= 0)
-        return fail(error, size, "%s is damaged: a fact is missing; export the model again", sidecar);
+        return fail(error, size, "%s is a bin graph, no stream graph; give stream.onnx", path);
     return true;
 }
 

@@ -1,17 +1,18 @@
 #include "npy.h"
 
+#include <ctype.h>
 #include <stdarg.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
-enum { LONGEST_HEADER = 4096, MOST_AXES = 8 };
+enum { LONGEST_HEADER = 4096, MOST_AXES = 8, LAST_VERSION = 3 };
 
 struct header {
     char text[LONGEST_HEADER];
     char dtype[16];
     size_t shape[MOST_AXES];
-    int num_axes;
+    int num_axes, version; /* 0: no .npy at all */
     bool is_fortran;
 };
 
@@ -31,14 +32,15 @@ static const char *value_of(const struct header *header, const char *key) {
 }
 
 static bool read_header(FILE *file, struct header *header) {
-    uint8_t start[12]; /* magic, version, length: 2 bytes in version 1, 4 in version 2 */
+    uint8_t start[12]; /* magic, version, length: 2 bytes in version 1, 4 in later ones */
     if (fread(start, 1, 10, file) != 10 || memcmp(start, "\x93NUMPY", 6)) return false;
+    header->version = start[6];
     size_t length = start[8] | (size_t)start[9] << 8;
-    if (start[6] == 2) {
+    if (start[6] > 1) {
         if (fread(start + 10, 1, 2, file) != 2) return false;
         length |= (size_t)start[10] << 16 | (size_t)start[11] << 24;
     }
-    if (start[6] < 1 || start[6] > 2 || length >= LONGEST_HEADER) return false;
+    if (start[6] < 1 || start[6] > LAST_VERSION || length >= LONGEST_HEADER) return false;
     if (fread(header->text, 1, length, file) != length) return false;
     header->text[length] = '\0';
 
@@ -48,9 +50,9 @@ static bool read_header(FILE *file, struct header *header) {
     if (sscanf(dtype, "'%15[a-zA-Z0-9<>|=]'", header->dtype) != 1) strcpy(header->dtype, "a record");
     header->is_fortran = !strncmp(order, "True", 4);
     for (header->num_axes = 0, shape++; header->num_axes < MOST_AXES; header->num_axes++) {
-        char *end;
+        char *end; /* strtoull takes signs, a shape has none */
         unsigned long long axis = strtoull(shape, &end, 10);
-        if (end == shape) break;
+        if (!isdigit((unsigned char)*shape)) break;
         header->shape[header->num_axes] = (size_t)axis;
         shape = end + strspn(end, ", ");
     }
@@ -72,7 +74,11 @@ bool npy_open(struct npy *npy, const char *path, size_t num_channels, char *erro
     *npy = (struct npy){.file = fopen(path, "rb")};
     if (!npy->file)
         return fail(npy, error, size, "no file %s; give a recording that numpy.save wrote", path);
-    if (!read_header(npy->file, &header))
+    bool is_read = read_header(npy->file, &header);
+    if (header.version > LAST_VERSION)
+        return fail(npy, error, size, "%s has .npy version %d, wanted 1 to %d; save it again", path,
+                    header.version, LAST_VERSION);
+    if (!is_read)
         return fail(npy, error, size, "%s is no .npy file, or cut off; save it again", path);
     npy->is_double = !strcmp(header.dtype, "<f8");
     if (!npy->is_double && strcmp(header.dtype, "<f4"))

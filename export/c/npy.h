@@ -1,4 +1,4 @@
-/* Volts [T, C] from a .npy file (version 1 or 2, little-endian float32 or float64, C order). */
+/* Volts [T, C] from a .npy file (version 1 to 3, little-endian float32 or float64, C order). */
 #ifndef NPY_H
 #define NPY_H
 

@@ -2,6 +2,7 @@
  * json.dumps writes; of a text that is no JSON it finds what comes before the fault, or nothing. */
 #include "sidecar.h"
 
+#include <locale.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -52,12 +53,21 @@ static const char *value_of(const char *json, const char *key) {
     return NULL;
 }
 
+/* strtod knows the decimal mark of the program's locale alone, which need not be JSON's point. */
 bool sidecar_number(const char *json, const char *key, double *value) {
-    const char *at = value_of(json, key);
+    const char *at = value_of(json, key), *mark = localeconv()->decimal_point;
     if (!at || !strchr("-0123456789", *at)) return false;
-    char *end;
-    *value = strtod(at, &end);
-    return *(end = (char *)past_space(end)) == ',' || *end == '}';
+    char text[64] = "", *end;
+    size_t length = strspn(at, "-+.0123456789eE"), whole = strcspn(at, "."), used = strlen(mark);
+    if (length + used >= sizeof text) return false;
+    memcpy(text, at, length);
+    if (whole < length) {
+        memcpy(text + whole, mark, used);
+        memcpy(text + whole + used, at + whole + 1, length - whole - 1);
+    }
+    *value = strtod(text, &end);
+    at = past_space(at + length);
+    return !*end && (*at == ',' || *at == '}');
 }
 
 bool sidecar_text(const char *json, const char *key, char *text, size_t size) {
@@ -68,6 +78,18 @@ bool sidecar_text(const char *json, const char *key, char *text, size_t size) {
     memcpy(text, at + 1, length);
     text[length] = '\0';
     return true;
+}
+
+void sidecar_said(const char *json, const char *key, char *text, size_t size) {
+    const char *at = value_of(json, key), *end;
+    size_t commas, length = 0;
+    if (at && (end = past_value(at, &commas))) length = (size_t)(end - at);
+    while (length && strchr(" \t\r\n", at[length - 1])) length--;
+    if (length >= size) length = size - 1;
+    if (length) memcpy(text, at, length);
+    text[length] = '\0';
+    for (char *each = text; (each = strpbrk(each, "\r\n"));) *each = ' ';
+    if (!length && size > strlen("nothing")) strcpy(text, "nothing");
 }
 
 bool sidecar_entries(const char *json, const char *key, size_t *count) {

@@ -10,4 +10,7 @@ bool sidecar_number(const char *json, const char *key, double *value);
 bool sidecar_text(const char *json, const char *key, char *text, size_t size);
 bool sidecar_entries(const char *json, const char *key, size_t *count); /* of a list */
 
+/* What stands there, on one line and cut to the size, or "nothing": for messages. */
+void sidecar_said(const char *json, const char *key, char *text, size_t size);
+
 #endif

@@ -10,6 +10,7 @@ import { SlipStream } from "./stream.mjs";
 const USAGE =
   "node detect.mjs stream.onnx recording.npy [--rate HZ] [--chunk N] [--threshold T] [--decisions]";
 const MOST_ROWS = 2000;
+const NUMBER = /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i; // Number alone takes spaces and 0x10 too
 
 class UsageError extends Error {}
 
@@ -19,25 +20,31 @@ function options(words) {
   const asked = { chunk: 200, rate: null, threshold: null, decisions: false };
   for (let i = 0; i < words.length; i += 1) {
     const [name, inline] = words[i].split(/=(.*)/s);
-    if (!name.startsWith("--")) files.push(words[i]);
+    if (!name.startsWith("-")) files.push(words[i]);
     else if (name === "--decisions" && inline === undefined) asked.decisions = true;
     else if (["--rate", "--chunk", "--threshold"].includes(name)) {
-      asked[name.slice(2)] = number(name, inline ?? words[++i]);
+      const read = name === "--chunk" ? chunk : number;
+      asked[name.slice(2)] = read(name, inline ?? words[++i]);
     } else throw new UsageError(`unknown option ${words[i]}; usage: ${USAGE}`);
   }
   if (files.length !== 2) {
     throw new UsageError(`wanted two files, got ${files.length}; usage: ${USAGE}`);
   }
-  if (!Number.isInteger(asked.chunk) || asked.chunk < 1 || asked.chunk > MOST_ROWS) {
-    throw new UsageError(`--chunk must be 1 to ${MOST_ROWS} whole samples, got ${asked.chunk}`);
-  }
   return { ...asked, model: files[0], recording: files[1] };
 }
 
 function number(name, word) {
-  const value = Number(word);
-  if (!word?.trim() || Number.isNaN(value)) {
-    throw new UsageError(`${name} wants a number, got ${word ?? "nothing"}`);
+  const value = NUMBER.test(word) ? Number(word) : NaN;
+  if (!Number.isFinite(value)) {
+    throw new UsageError(`${name} wants a finite decimal number, got ${word ?? "nothing"}`);
+  }
+  return value;
+}
+
+function chunk(name, word) {
+  const value = /^\d+$/.test(word) ? Number(word) : NaN;
+  if (!(value >= 1 && value <= MOST_ROWS)) {
+    throw new UsageError(`${name} wants 1 to ${MOST_ROWS} samples, got ${word ?? "nothing"}`);
   }
   return value;
 }
@@ -78,7 +85,11 @@ async function detect({ model, recording, rate, chunk, threshold, decisions: isW
   }
 }
 
-process.stdout.on("error", (error) => process.exit(error.code === "EPIPE" ? 0 : 1));
+process.stdout.on("error", ({ code }) => {
+  if (code === "EPIPE") process.exit(0); // whoever reads has seen enough
+  process.stderr.write(`error: the output cannot be written (${code}); is the disk full?\n`);
+  process.exit(1);
+});
 try {
   await detect(options(process.argv.slice(2)));
 } catch (error) {

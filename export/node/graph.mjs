@@ -3,6 +3,7 @@
 const FORMAT = "tactslip_torch onnx 1";
 const MOST_ROWS = 2000; // in one run; memory grows with its decisions
 const SESSION = { intraOpNumThreads: 1, interOpNumThreads: 1, logSeverityLevel: 3 }; // errors only
+const COUNTS = ["first_samples", "frame_samples", "tail_samples", "state_size"];
 const ARRAYS = { float32: Float32Array, float64: Float64Array };
 
 /**
@@ -16,24 +17,23 @@ const ARRAYS = { float32: Float32Array, float64: Float64Array };
  */
 export async function checkedFacts(model, sidecar, name) {
   const facts = parsed(sidecar, name);
-  if (facts.graph !== "stream") {
-    throw new Error(
-      `${name} holds a ${facts.graph} graph, wanted a stream graph: export with graph=stream`,
-    );
+  if (facts.graph === "bin") {
+    throw new Error(`${name} holds a bin graph, wanted a stream graph: export with graph=stream`);
   }
   const { channels, sample_rate_hz: rate, hop_samples: hop, precision } = facts;
   const wrong = [
+    ["graph", facts.graph === "stream", "bin or stream"],
     ["channels", Array.isArray(channels) && channels.length > 0, "a list of names"],
     ["sample_rate_hz", Number.isFinite(rate) && rate > 0, "a positive number"],
-    ["hop_samples", Number.isInteger(hop) && hop > 0, "a positive integer"],
+    ["hop_samples", isCount(hop) && hop > 0, "a positive whole number"],
+    ...COUNTS.map((key) => [key, isCount(facts[key]), "a whole number"]),
     ["precision", Object.hasOwn(ARRAYS, precision), Object.keys(ARRAYS).join(" or ")],
     ["onnx_sha256", typeof facts.onnx_sha256 === "string", "64 hexadecimal digits"],
   ].find(([, isRight]) => !isRight);
   if (wrong) {
     const [key, , wanted] = wrong;
-    throw new Error(
-      `${name}.json says ${key} ${JSON.stringify(facts[key])}, wanted ${wanted}: export again`,
-    );
+    const said = JSON.stringify(facts[key]) ?? "nothing";
+    throw new Error(`${name}.json says ${key} ${said}, wanted ${wanted}: export again`);
   }
   if (!globalThis.crypto?.subtle) {
     throw new Error("no SHA-256 here: a browser has it for pages of localhost or https only");
@@ -47,6 +47,10 @@ export async function checkedFacts(model, sidecar, name) {
     );
   }
   return facts;
+}
+
+function isCount(value) {
+  return Number.isInteger(value) && value >= 0;
 }
 
 function parsed(sidecar, name) {

@@ -1,5 +1,6 @@
 // Recordings as NumPy keeps them: volts [samples, channels] in a .npy file.
 
+const LAST_VERSION = 3;
 const MAGIC = "\x93NUMPY";
 const TYPES = { "<f4": Float32Array, "<f8": Float64Array };
 const CUT = (name) => `${name} is cut off within its header: copy it again`;
@@ -53,11 +54,13 @@ export function npyHeader(head, bytes, name, channels) {
 function headerText(head, name) {
   const isNpy = latin1(head.subarray(0, MAGIC.length)) === MAGIC;
   if (!isNpy) throw new Error(`${name} is no .npy file: write it with numpy.save`);
-  const isLong = head[6] !== 1; // of version 2, with four bytes for the length of the header
+  const isLong = head[6] !== 1; // later versions have four bytes for the length of the header
   const start = isLong ? 12 : 10;
   if (head.length < start) throw new Error(CUT(name));
-  if (head[6] !== 1 && head[6] !== 2) {
-    throw new Error(`${name} has .npy version ${head[6]}, wanted 1 or 2: save it with numpy.save`);
+  if (head[6] < 1 || head[6] > LAST_VERSION) {
+    throw new Error(
+      `${name} has .npy version ${head[6]}, wanted 1 to ${LAST_VERSION}: save it with numpy.save`,
+    );
   }
   const view = new DataView(head.buffer, head.byteOffset, head.byteLength);
   const end = start + (isLong ? view.getUint32(8, true) : view.getUint16(8, true));

@@ -19,7 +19,9 @@ export async function* pieces(path, channels, rows) {
     throw new Error(`cannot read the recording ${path}: does it exist?`);
   });
   try {
-    const bytes = (await file.stat()).size;
+    const about = await file.stat();
+    if (!about.isFile()) throw new Error(`${path} is no file: write a .npy with numpy.save`);
+    const bytes = about.size;
     const head = await filled(file, new Uint8Array(Math.min(HEADER_BYTES, bytes)), 0, name);
     const { Type, rows: total, offset } = npyHeader(head, bytes, name, channels);
     let position = offset;

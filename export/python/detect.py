@@ -10,6 +10,7 @@ import json
 import sys
 
 from arguments import Parser, chunk, number
+from command import run, say
 from files import load_recording
 from stream import KEYS, Stream
 
@@ -25,11 +26,11 @@ def main(options):
         num_decisions, num_alarms = num_decisions + len(decisions), num_alarms + len(alarms)
         not_valid_s += [decision["time_s"] for decision in decisions if not decision["valid"]]
         for decision in decisions if options.decisions else alarms:
-            print(
-                json.dumps({key: decision[key] for key in KEYS[: None if options.decisions else 5]})
-            )
+            line = {key: decision[key] for key in KEYS[: None if options.decisions else 5]}
+            say(json.dumps(line))
     seconds = len(recording) / stream.facts["sample_rate_hz"]
-    print(json.dumps({"decisions": num_decisions, "alarms": num_alarms, "seconds": seconds}))
+    sums = {"decisions": num_decisions, "alarms": num_alarms, "seconds": seconds}
+    say(json.dumps(sums), flush=True)
     if not_valid_s:
         print(
             f"warning: {len(not_valid_s)} of {num_decisions} decisions are not valid, the first at "
@@ -46,7 +47,4 @@ if __name__ == "__main__":
     parser.add_argument("--chunk", type=chunk, default=200, metavar="N")
     parser.add_argument("--threshold", type=number, metavar="T")
     parser.add_argument("--decisions", action="store_true")
-    try:
-        main(parser.parse_args())
-    except Exception as error:  # onnxruntime's errors share no other base
-        sys.exit(f"error: {' '.join(str(error).split())}")
+    run(main, parser.parse_args())

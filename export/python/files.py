@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,11 @@ import onnxruntime
 
 FORMAT = "tactslip_torch onnx 1"
 USUAL = {"bin": "model.onnx", "stream": "stream.onnx"}  # which file holds which graph
+COUNTS = {
+    "bin": ("bin_samples", "context_before_samples", "context_after_samples"),
+    "stream": ("hop_samples", "first_samples", "frame_samples", "tail_samples", "state_size"),
+}
+POSITIVE = ("bin_samples", "hop_samples")
 
 
 def load_model(path, graph):
@@ -30,6 +36,7 @@ def load_model(path, graph):
         raise ValueError(f"{sidecar} is damaged ({error}); copy it again") from None
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
         raise ValueError(f"{sidecar} is no sidecar of format {FORMAT!r}; export the model again")
+    check_facts(sidecar, facts)
     if hashlib.sha256(content).hexdigest() != facts["onnx_sha256"]:
         raise ValueError(
             f"{path} is cut off or altered: its SHA-256 is not the onnx_sha256 of {sidecar.name}; "
@@ -43,6 +50,37 @@ def load_model(path, graph):
     options.intra_op_num_threads = 1  # a push is too small to be shared
     options.log_severity_level = 4
     return onnxruntime.InferenceSession(content, options, ["CPUExecutionProvider"]), facts
+
+
+def is_count(value, least):
+    """A whole number; in JSON true is none."""
+    return type(value) is int and value >= least
+
+
+def check_facts(sidecar, facts):
+    """Refuse a sidecar that lacks something a host needs, or has it wrong."""
+    graph, names, rate = (facts.get(key) for key in ("graph", "channels", "sample_rate_hz"))
+    checks = [
+        ("graph", graph in ("bin", "stream"), "bin or stream"),
+        ("onnx_sha256", isinstance(facts.get("onnx_sha256"), str), "64 hexadecimal digits"),
+        ("precision", facts.get("precision") in ("float32", "float64"), "float32 or float64"),
+        ("channels", isinstance(names, list) and len(names) > 0, "a list of names"),
+        (
+            "sample_rate_hz",
+            type(rate) in (int, float) and math.isfinite(rate) and rate > 0,
+            "a positive number",
+        ),
+    ]
+    for key in COUNTS.get(graph, ()):
+        least = int(key in POSITIVE)
+        wanted = "a positive whole number" if least else "a whole number"
+        checks.append((key, is_count(facts.get(key), least), wanted))
+    for key, is_right, wanted in checks:
+        if not is_right:
+            said = json.dumps(facts[key]) if key in facts else "nothing"
+            raise ValueError(
+                f"{sidecar} says {key} {said}, wanted {wanted}; export the model again"
+            )
 
 
 def load_recording(path, facts, rate=None):
@@ -60,7 +98,7 @@ def load_recording(path, facts, rate=None):
         raise ValueError(f"no file {path}; give a recording that numpy.save wrote")
     try:
         samples = np.lib.format.open_memmap(path, mode="r")
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:  # the other for a shape that no file can have
         raise ValueError(f"{path} is no .npy file, or cut off ({error}); save it again") from None
     if samples.dtype.str not in ("<f4", "<f8"):
         raise ValueError(

@@ -7,10 +7,10 @@
 """
 
 import json
-import sys
 
 import numpy as np
 from arguments import Parser
+from command import run, say
 from files import load_model, load_recording
 
 BATCH = 256  # bins judged at a time
@@ -31,15 +31,16 @@ def score_bins(session, facts, recording):
             yield {"start_s": start_s, **dict(zip(names, row, strict=True))}
 
 
+def main(options):
+    """Print a line a bin."""
+    session, facts = load_model(options.model, "bin")
+    recording = load_recording(options.recording, facts)
+    for judged in score_bins(session, facts, recording):
+        say(json.dumps(judged))
+
+
 if __name__ == "__main__":
     parser = Parser()
     parser.add_argument("model", metavar="model.onnx")
     parser.add_argument("recording", metavar="recording.npy")
-    try:
-        options = parser.parse_args()
-        session, facts = load_model(options.model, "bin")
-        recording = load_recording(options.recording, facts)
-        for judged in score_bins(session, facts, recording):
-            print(json.dumps(judged))
-    except Exception as error:  # onnxruntime's errors share no other base
-        sys.exit(f"error: {' '.join(str(error).split())}")
+    run(main, parser.parse_args())

@@ -131,7 +131,7 @@ function connectThreshold(facts) {
   let waiting = 0;
   const show = () => {
     const share = slider.value / slider.max;
-    const text = Number(slider.value) === own ? scale.text(scale.own) : scale.text(share);
+    const text = Number(slider.value) === own ? scale.ownText : scale.text(share);
     element("threshold-value").textContent = text;
     slider.setAttribute("aria-valuetext", text);
   };

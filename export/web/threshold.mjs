@@ -8,7 +8,7 @@
  *
  * @param {object} facts of the sidecar
  * @returns {{title: string, note: string, own: number, toThreshold: (share: number) => number,
- *   text: (share: number) => string}} `own` is where the file's threshold stands
+ *   text: (share: number) => string, ownText: string}} `own` is where the file's threshold stands
  */
 export function thresholdScale(facts) {
   const curve = risingRates(facts.threshold_curve ?? []);
@@ -32,13 +32,19 @@ function byRate(facts, curve) {
   const level = (share) => first + share * (last - first);
   const toThreshold = (share) => interpolated(level(share), levels, thresholds);
   const falling = thresholds.map((threshold) => -threshold);
-  const ownLevel = interpolated(-(facts.threshold ?? Infinity), falling, levels);
+  const own = facts.threshold ?? Infinity; // null is one that nothing reaches
+  const ownLevel = interpolated(-own, falling, levels);
+  const text = (share) => `${rounded(10 ** level(share))} an hour`;
+  const share = (ownLevel - first) / (last - first);
+  // beyond the curve nothing was counted: the slider stands at its end, and the text says so
+  const beyond = own > thresholds[0] ? "at most " : own < thresholds.at(-1) ? "at least " : "";
   return {
     title: "False alarms allowed",
     note: facts.simulated ? "as counted on simulated recordings" : "as counted on recordings",
-    own: (ownLevel - first) / (last - first),
+    own: share,
     toThreshold,
-    text: (share) => `${rounded(10 ** level(share))} an hour`,
+    text,
+    ownText: beyond + text(share),
   };
 }
 
@@ -55,6 +61,7 @@ function byStatistic(facts) {
     own: (threshold - low) / (high - low),
     toThreshold,
     text: (share) => rounded(toThreshold(share)),
+    ownText: facts.threshold === null ? "out of reach" : rounded(threshold),
   };
 }
 
