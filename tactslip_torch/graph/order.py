@@ -11,10 +11,8 @@ import torch
 
 from tactslip_torch.features.descriptors import ENTROPY_LEVELS, HALF_SLACK, RUN_TOLERANCE
 from tactslip_torch.features.runs import EPS64
-from tactslip_torch.graph.value import F64, I64, Value
+from tactslip_torch.graph.value import F64, I64, TINY, Value
 from tactslip_torch.graph.writer import Graph
-
-_TINY = 1e-300  # instead of 0, where a quotient of 0 is to be 0
 
 
 def medians(values: Value, num: int) -> Value:
@@ -75,7 +73,7 @@ def entropy(values: Value, num: int, dtype: np.dtype[Any]) -> Value:
     graph = values.graph
     least = values.amin(2, keep=True)
     span = values.amax(2, keep=True) - least
-    levels = ENTROPY_LEVELS / span.max(_TINY)
+    levels = ENTROPY_LEVELS / span.max(TINY)
     level = ((values - least) * levels + (0.5 + HALF_SLACK[torch.float64])).floor()
     ones = (values * 0.0 + 1.0).cast(dtype)
     none = (span * 0.0).cast(dtype) + graph.constant(np.zeros(ENTROPY_LEVELS + 1), dtype)
