@@ -106,7 +106,7 @@ def worst_error(facts: dict[str, Any]) -> float:
     check = facts["check"]
     if facts["graph"] == "stream":
         return float(check["worst_sd"])
-    return max(float(check[name]["worst_sd"]) for name in ("noise", "recorded"))
+    return max(float(check[name]["worst_sd"]) for name in ("noise", "simulated_slip"))
 
 
 def summary(path: Path) -> str:
@@ -137,8 +137,8 @@ def _write(
     """Write and check a model; its facts, what the check measured among them."""
     graph = _graph(detector, form, kind)
     model = graph.model({})
-    check, memory = check_model(model, detector, form, kind)
-    facts = {**model_facts(detector, form, origin, memory), "check": check}
+    check = check_model(model, detector, form, kind)
+    facts = {**model_facts(detector, form, origin, kind), "check": check}
     model = graph.model(in_file(facts))
     onnx.save(model, path)
     check_file(path, facts, model, detector, form, alone=alone)

@@ -6,12 +6,17 @@ import torch
 from tactslip_torch.certificate import certify
 from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.graph.trials import simulated_stream
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.sequential import Cusum
+from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.signals.filtering import ChannelFilter
 
 HAND = HandLayout.from_rows(
@@ -59,6 +64,24 @@ def small_detector(
         machine = QuadraticForm(bend + bend.T, linear, middle)
     facts = {"simulated": True}
     return SlipDetector(pool, channel_filter, selected, scaler, machine, facts, engine=engine)
+
+
+def alarming_detector() -> SlipDetector:
+    """The small detector, with settings by which the simulated slip raises alarms."""
+    made = small_detector(engine="eager")
+    scores = score_stream(made, simulated_stream(HAND, 2000.0, torch.float64), 20).score
+    rise = 2.0 / float(scores.std())
+    settings = AlarmSettings(
+        20,
+        Platt(rise, -rise * float(scores.mean())),
+        Cusum(0.5, 0.4, 8.0),
+        threshold=2.0,
+        target_per_hour=1.0,
+        rearm_s=0.03,
+        refractory_s=0.1,
+    )
+    made.info[KEY] = settings.to_dict()
+    return made
 
 
 class Lying(QuadraticForm):

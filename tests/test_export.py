@@ -12,9 +12,8 @@ import onnxruntime
 import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
-from small_detector import HAND, certified, raw_bins, small_detector
+from small_detector import HAND, alarming_detector, certified, raw_bins, small_detector
 from test_detector import VARIANTS, noise, random_detector
-from test_graph_check import alarming
 
 from tactslip_torch import export, train
 from tactslip_torch.certify import FORMAT as CERTIFICATE_FORMAT
@@ -31,7 +30,7 @@ pytestmark = pytest.mark.onnx
 
 @pytest.fixture(scope="module")
 def detector():
-    return alarming()
+    return alarming_detector()
 
 
 @pytest.fixture(scope="module")
@@ -338,8 +337,8 @@ def kept(tmp_path):
 @pytest.fixture
 def quick(monkeypatch):
     """What is asked is where a model comes from; that it is right is asked elsewhere."""
-    measured = {"noise": {"worst_sd": 1e-6}, "recorded": {"worst_sd": 1e-6}}
-    monkeypatch.setattr(export, "check_model", lambda *given: (measured, None))
+    measured = {"noise": {"worst_sd": 1e-6}, "simulated_slip": {"worst_sd": 1e-6}}
+    monkeypatch.setattr(export, "check_model", lambda *given: measured)
 
 
 def exported_with(source, certificate=None):

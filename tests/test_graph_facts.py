@@ -8,11 +8,10 @@ import math
 import onnxruntime
 import pytest
 from small_detector import certified, small_detector
-from test_graph_check import guarded
+from test_graph_structure import guarded
 
 from tactslip_torch.graph.facts import (
     FORMAT,
-    Memory,
     Origin,
     certificate_facts,
     detector_sha256,
@@ -66,10 +65,11 @@ def test_a_bin_graph_says_what_a_host_must_know():
 
 def test_a_stream_graph_says_how_it_decides():
     detector = alarming()
-    facts = model_facts(detector, Form(), ORIGIN, Memory(150, 7))
+    facts = model_facts(detector, Form(), ORIGIN, "stream")
     assert facts.keys() == IN_BOTH | IN_STREAM
     assert (facts["graph"], facts["train_materials"]) == ("stream", ["M1", "M4"])
-    assert (facts["hop_samples"], facts["tail_samples"], facts["state_size"]) == (20, 150, 7)
+    assert (facts["hop_samples"], facts["state_size"]) == (20, 7)
+    assert facts["tail_samples"] == 25 + 100 + 25 - 1  # with the next, those of a bin
     assert (facts["first_samples"], facts["frame_samples"]) == (125, 51)
     assert facts["rule"] == Cusum(ceiling=8.0).to_dict()
     assert facts["calibration"] == {"kind": "platt", "slope": 2.0, "offset": 0.5}
@@ -89,20 +89,20 @@ def test_the_curve_of_thresholds_is_handed_on_where_it_is_known():
     settings = AlarmSettings(
         20, Platt(2.0, 0.5), Cusum(), 3.0, 1.0, facts={"threshold_curve": curve}
     )
-    facts = model_facts(alarming(settings), Form(), ORIGIN, Memory(1, 7))
+    facts = model_facts(alarming(settings), Form(), ORIGIN, "stream")
     assert facts["threshold_curve"] == curve
 
 
 def test_what_json_does_not_have_is_null():
     settings = AlarmSettings(20, Isotonic((0.0, 1.0), (-2.0, 2.0)), Cusum(), math.inf, 1.0)
-    facts = model_facts(alarming(settings), Form(), ORIGIN, Memory(1, 7))
+    facts = model_facts(alarming(settings), Form(), ORIGIN, "stream")
     assert facts["threshold"] is None
     assert facts["calibration"]["scores"] == [0.0, 1.0]
     assert json.loads(json.dumps(facts, allow_nan=False)) == facts
 
 
 def test_facts_come_back_from_the_file_through_onnxruntime():
-    facts = model_facts(alarming(), Form(), ORIGIN, Memory(150, 7)) | {"check": {"worst_sd": 1e-6}}
+    facts = model_facts(alarming(), Form(), ORIGIN, "stream") | {"check": {"worst_sd": 1e-6}}
     model = guarded()
     for name, text in in_file(facts).items():
         model.metadata_props.add(key=name, value=text)
@@ -113,7 +113,7 @@ def test_facts_come_back_from_the_file_through_onnxruntime():
 
 def test_a_sidecar_has_a_line_for_each_scalar_and_knows_its_file(tmp_path):
     assert sidecar_path(tmp_path / "stream.onnx") == tmp_path / "stream.onnx.json"
-    facts = model_facts(alarming(), Form(), ORIGIN, Memory(150, 7))
+    facts = model_facts(alarming(), Form(), ORIGIN, "stream")
     text = sidecar_text(facts, "stream.onnx", b"all of it")
     read = json.loads(text)
     assert {name: read[name] for name in facts} == facts

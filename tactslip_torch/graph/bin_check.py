@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
+from tactslip_torch.features.extractor import EngineName, FeatureExtractor
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.runs import Run
 from tactslip_torch.graph.trials import KINDS, degenerate_bins, noise_bins, simulated_bins
@@ -26,10 +27,11 @@ WORST_SD = {"float32": 1e-3, "float64": 1e-9}
 """Largest score error allowed on noise and on simulated bins, in standard deviations of the score
 on simulated bins."""
 WORST_DEGENERATE_SD = {"float32": 1e-2, "float64": 1e-6}
-"""The same on degenerate bins, but for those that rounding decides (``_Judged.is_rounding``)."""
+"""The same on degenerate bins, but for those that rounding decides (``Judged.is_rounding``)."""
 WORST_PROBABILITY = {"float32": 1e-5, "float64": 1e-9}
 """By which a probability may differ from that of the score beside it."""
 _SIMULATED, _EACH = 256, 16  # bins, and of each degenerate kind
+_DRAWS = 4  # of moves by which rounding is told, each taken both ways
 
 
 @dataclass(frozen=True)
@@ -75,18 +77,18 @@ def check_bins(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
     Raises:
         ValueError: for the first thing that is wrong, in one line.
     """
-    judged = _Judged(run, detector, form)
+    judged = Judged(run, detector, form)
     hand, rate = detector.pool.hand, detector.pool.sample_rate_hz
     length, dtype = judged.window.length, judged.dtype
     simulated = simulated_bins(hand, rate, _SIMULATED, length, dtype)
-    recorded = judged.compare([simulated], "simulated bins")
+    slip = judged.compare([simulated], "simulated bins")
     drawn = [noise_bins(hand, batch, length, seed, dtype) for seed, batch in enumerate(BATCHES)]
     noise = judged.compare(drawn, "noise")
     # the latter of a detector for which nothing happens in a simulation
-    sd = float(recorded.exact.std()) or float(noise.exact.std()) or 1.0
+    sd = float(slip.exact.std()) or float(noise.exact.std()) or 1.0
     worst, loose = WORST_SD[form.precision], WORST_DEGENERATE_SD[form.precision]
     facts: dict[str, Any] = {"score_sd": sd, "simulated": True}
-    for name, compared in (("noise", noise), ("recorded", recorded)):
+    for name, compared in (("noise", noise), ("simulated_slip", slip)):
         facts[name] = _set_facts(compared, sd)
         judged.refuse_errors(compared, sd, worst, name)
     facts["degenerate"] = {}
@@ -109,7 +111,7 @@ def check_bins(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
     return facts
 
 
-class _Judged:
+class Judged:
     """Bins as the graph and as the detector in float64 judge them."""
 
     def __init__(self, run: Run, detector: SlipDetector, form: Form) -> None:
@@ -122,32 +124,46 @@ class _Judged:
         self.unstated = WORST_PROBABILITY[form.precision]
 
     def judge(self, samples: Tensor) -> Judgement:
-        """By torch, scores in float64; samples that no filter in use takes in are 0."""
+        """By torch, scores in float64."""
+        with torch.no_grad():
+            # a sensor is trusted by what its samples resolve in the precision they come in
+            judged = self.detector.judge_raw(self._padded(samples))
+        return judged._replace(score=self.score(samples))
+
+    def score(self, samples: Tensor, engine: EngineName | None = None) -> Tensor:
+        """Scores ``[N]`` in float64, by another engine if one is named."""
+        detector = self.detector
+        if engine is not None:
+            detector = copy.copy(detector)
+            detector.extractor = FeatureExtractor(detector.pool, detector.selected, engine)
+        with torch.no_grad():
+            return detector.judge_raw(self._padded(samples.double())).score
+
+    def _padded(self, samples: Tensor) -> Tensor:
+        """With the context of all channels: what no filter in use takes in is 0."""
         before = self.detector.context_before - self.window.before
         after = self.detector.context_after - self.window.after
-        samples = pad(samples, (before, after))
-        with torch.no_grad():
-            score = self.detector.judge_raw(samples.double()).score
-            # a sensor is trusted by what its samples resolve in the precision they come in
-            return self.detector.judge_raw(samples)._replace(score=score)
+        return pad(samples, (before, after))
 
     def is_rounding(
         self, samples: Tensor, exact: NDArray[np.float64], most: float
     ) -> NDArray[np.bool_]:
-        """Bins ``[N]`` whose score another rounding of the samples changes by more than ``most``.
+        """Bins ``[N]`` whose score another rounding changes by more than ``most``.
 
         Such as the sign of a mean of 0, by which the coefficient of variation takes its own, or a
-        step between values of few digits. Samples are moved by 4 eps of the largest magnitude of
-        their channel in float64, together and each by itself, up and down: a constant stays one.
+        step between values of few digits. Rounding is another in another engine, and where samples
+        are moved by 4 eps of the largest magnitude of their channel in float64, together and each
+        by itself, up and down: a constant stays one.
         """
         x = samples.double()
         size = (
             4 * torch.finfo(x.dtype).eps * x.nan_to_num(0.0, 0.0, 0.0).abs().amax(-1, keepdim=True)
         )
         generator = torch.Generator().manual_seed(0)
-        drawn = 2 * torch.rand(x.shape, generator=generator, dtype=x.dtype) - 1
-        moved = [size.expand_as(x), -size, size * drawn, -size * drawn]
-        scores = torch.stack([self.judge(x + each).score for each in moved]).numpy()
+        drawn = 2 * torch.rand((_DRAWS, *x.shape), generator=generator, dtype=x.dtype) - 1
+        moves = [size, -size, *(size * drawn), *(-size * drawn)]
+        others = [self.score(x, engine) for engine in ("reference", "eager")]
+        scores = torch.stack([*others, *(self.score(x + move) for move in moves)]).numpy()
         return np.asarray((np.abs(scores - exact) > most).any(0))
 
     def compare(self, batches: Sequence[Tensor], what: str) -> Compared:

@@ -15,10 +15,10 @@ import onnxruntime
 import torch
 
 from tactslip_torch.graph.bin_check import check_bins
-from tactslip_torch.graph.facts import GraphKind, Memory, in_file
+from tactslip_torch.graph.facts import GraphKind, in_file
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.runs import Arrays, run_alone, runner, session_of
-from tactslip_torch.graph.stream_check import check_stream, memory_of
+from tactslip_torch.graph.stream_check import check_stream
 from tactslip_torch.graph.structure import (
     check_free_axes,
     check_guards,
@@ -36,7 +36,7 @@ _FREE_AXES: dict[GraphKind, tuple[str, ...]] = {
 
 def check_model(
     model: onnx.ModelProto, detector: SlipDetector, form: Form, kind: GraphKind
-) -> tuple[dict[str, Any], Memory | None]:
+) -> dict[str, Any]:
     """Hold a model against its detector.
 
     Args:
@@ -46,7 +46,7 @@ def check_model(
         kind: of its graph.
 
     Returns:
-        What was measured, in JSON types, and what a stream graph hands on.
+        What was measured, in JSON types.
 
     Raises:
         ValueError: for the first thing that is wrong, in one line.
@@ -60,10 +60,8 @@ def check_model(
         "guards": check_guards(model),
     }
     run = runner(session_of(model))
-    if kind == "bin":
-        return facts | check_bins(run, detector, form), None
-    memory = memory_of(run, len(detector.pool.hand), form)
-    return facts | check_stream(run, detector, form, memory), memory
+    check = check_bins if kind == "bin" else check_stream
+    return facts | check(run, detector, form)
 
 
 def check_file(

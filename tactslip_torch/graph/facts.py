@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from tactslip_torch.graph.form import Form, Window
+from tactslip_torch.graph.stream import Timing
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import AlarmSettings, calibration_of
 
@@ -32,20 +33,8 @@ class Origin(NamedTuple):
     certificate: Mapping[str, Any] | None = None
 
 
-class Memory(NamedTuple):
-    """What a host keeps between two pushes to a stream graph.
-
-    Attributes:
-        tail_samples: length of ``next_tail``.
-        state_size: length of ``next_state``.
-    """
-
-    tail_samples: int
-    state_size: int
-
-
 def model_facts(
-    detector: SlipDetector, form: Form, origin: Origin, memory: Memory | None = None
+    detector: SlipDetector, form: Form, origin: Origin, kind: GraphKind = "bin"
 ) -> dict[str, Any]:
     """All that a host must know, in JSON types; ``null`` for what is not known or not finite.
 
@@ -53,7 +42,7 @@ def model_facts(
         detector: that was exported.
         form: of its graph.
         origin: where it comes from.
-        memory: of a stream graph; without, it is a bin graph.
+        kind: of its graph.
     """
     hand, info = detector.pool.hand, detector.info
     window = Window.of(detector)
@@ -61,7 +50,7 @@ def model_facts(
     facts: dict[str, Any] = {
         "format": FORMAT,
         "version": origin.version,
-        "graph": "bin" if memory is None else "stream",
+        "graph": kind,
         "precision": form.precision,
         "layout": form.layout,
         "channels": list(hand.names),
@@ -81,8 +70,8 @@ def model_facts(
         "detector_sha256": origin.detector_sha256,
         "certificate": origin.certificate,
     }
-    if memory is not None:
-        facts |= _stream_facts(detector, AlarmSettings.of(detector), window, memory)
+    if kind == "stream":
+        facts |= _stream_facts(detector, AlarmSettings.of(detector))
     plain: dict[str, Any] = _plain(facts)
     return plain
 
@@ -148,16 +137,14 @@ def certificate_facts(content: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _stream_facts(
-    detector: SlipDetector, settings: AlarmSettings, window: Window, memory: Memory
-) -> dict[str, Any]:
-    lengths = detector.channel_filter.window_lengths
+def _stream_facts(detector: SlipDetector, settings: AlarmSettings) -> dict[str, Any]:
+    timing = Timing.of(detector, settings)
     return {
-        "hop_samples": settings.hop_samples,
-        "first_samples": window.bin + window.after,
-        "frame_samples": max(lengths[channel] for channel in window.channels),
-        "tail_samples": memory.tail_samples,
-        "state_size": memory.state_size,
+        "hop_samples": timing.hop,
+        "first_samples": timing.first,
+        "frame_samples": timing.frame,
+        "tail_samples": timing.tail,
+        "state_size": timing.state_size,
         "rule": settings.rule.to_dict(),
         "threshold": settings.threshold,
         "target_false_alarms_per_hour": settings.target_per_hour,

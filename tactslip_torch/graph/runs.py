@@ -63,7 +63,9 @@ def run_alone(path: Path, inputs: Arrays) -> dict[str, NDArray[Any]]:
     given = io.BytesIO()
     np.savez(given, **dict(inputs))  # type: ignore[arg-type]  # takes arrays by any name
     script = Path(__file__).with_name("alone.py")
-    command = [sys.executable, "-I", str(script), str(path)]
+    # -P: no module beside the script stands in for another of its name. Not -I, by which neither
+    # PYTHONPATH nor the packages of the user are seen, where onnxruntime may be.
+    command = [sys.executable, "-P", str(script), str(path)]
     done = subprocess.run(command, input=given.getvalue(), capture_output=True, check=False)
     if done.returncode != 0:
         lines = done.stderr.decode(errors="replace").strip().splitlines() or ["it ended"]

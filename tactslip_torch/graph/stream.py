@@ -62,6 +62,10 @@ class Timing:
         state_size = 6 + len(rule_start(settings.rule))
         return cls(window, settings.hop_samples, first, frame, window.length - 1, state_size)
 
+    def decisions(self, num: int) -> int:
+        """How many are made by the time that as many samples have come."""
+        return 0 if num < max(self.first, self.frame) else (num - self.first) // self.hop + 1
+
 
 def stream_graph(
     detector: SlipDetector, settings: AlarmSettings, form: Form, judge: Judge = judge_bins

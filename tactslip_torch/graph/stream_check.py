@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.graph.bin_check import WORST_DEGENERATE_SD, WORST_PROBABILITY, WORST_SD
-from tactslip_torch.graph.facts import Memory
 from tactslip_torch.graph.form import Form
 from tactslip_torch.graph.runs import Run
+from tactslip_torch.graph.stream import Timing
 from tactslip_torch.graph.trials import simulated_stream
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
@@ -28,36 +28,19 @@ Columns = dict[str, NDArray[Any]]
 FLAGS = ("valid", "alarm", "on")
 TIMES = ("time_s", "onset_s")
 NUMBERS = ("score", "probability", "statistic")
+_DECISIONS = 12  # that are made at least
+_LONGEST_HOP = 20_000  # samples; of more, a stream of that many decisions takes much memory
 _LATE_S = 1e-9  # by which times may differ
 _STATISTIC = {"float32": 1e-3, "float64": 1e-8}  # share of its range by which one may differ
 
 
-def memory_of(run: Run, num_channels: int, form: Form) -> Memory:
-    """What a host keeps between two pushes, as a first push of nothing gives it.
-
-    Raises:
-        ValueError: if it is not a tail of all channels and a row of float64.
-    """
-    made = _Host(run, num_channels, form)
-    made.push(np.empty((0, num_channels), form.dtype))
-    tail, state = made.tail, made.state
-    if tail.ndim != 2 or tail.shape[1] != num_channels or tail.dtype != form.dtype:
-        raise ValueError(
-            f"next_tail is {tail.dtype}{list(tail.shape)}, expected [R, {num_channels}]"
-        )
-    if state.ndim != 1 or state.dtype != np.float64:
-        raise ValueError(f"next_state is {state.dtype}{list(state.shape)}, expected float64 [S]")
-    return Memory(len(tail), len(state))
-
-
-def check_stream(run: Run, detector: SlipDetector, form: Form, memory: Memory) -> dict[str, Any]:
+def check_stream(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
     """Hold a stream graph against the detector on a simulated slip, whole and broken.
 
     Args:
         run: the graph.
         detector: that it was made of, with alarm settings.
         form: of the graph.
-        memory: lengths that every push must give.
 
     Returns:
         What was measured, in JSON types.
@@ -68,24 +51,26 @@ def check_stream(run: Run, detector: SlipDetector, form: Form, memory: Memory) -
     double = copy.deepcopy(detector).double()
     settings = AlarmSettings.of(detector)
     dtype = torch.float32 if form.precision == "float32" else torch.float64
-    whole = simulated_stream(detector.pool.hand, detector.pool.sample_rate_hz, dtype).T
+    timing = Timing.of(detector, settings)
+    slip = simulated_stream(detector.pool.hand, detector.pool.sample_rate_hz, dtype).T
+    whole = slowed(slip, timing)
     expected = _columns(double, settings, whole)
     sd = float(expected["score"].std()) or 1.0
     worst = WORST_SD[form.precision]
     samples = whole.numpy()
-    host = _Host(run, samples.shape[1], form, memory)
+    host = _Host(run, samples.shape[1], form, timing)
     found = 0.0
-    for name, sizes in cuts(len(samples), settings.hop_samples).items():
+    ways = cuts(len(samples), timing.hop)
+    for name, sizes in ways.items():
         got = host.watch(samples, sizes)
         found = max(found, _compare(got, expected, settings, sd, worst, form, f"cut {name}"))
     middling = replace(settings, threshold=middle_threshold(expected["statistic"]))
     at_middle = _columns(double, middling, whole)
-    every = [settings.hop_samples] * (len(samples) // settings.hop_samples)
-    got = host.watch(samples, every, middling.threshold)
+    got = host.watch(samples, ways["by hop"], middling.threshold)
     _compare(got, at_middle, middling, sd, worst, form, "another threshold")
     broken = broken_stream(whole, detector.needed_index.tolist())
     of_broken = _columns(double, settings, broken)
-    got = host.watch(broken.numpy(), every)
+    got = host.watch(broken.numpy(), ways["by hop"])
     worst = WORST_DEGENERATE_SD[form.precision]
     lost = _compare(got, of_broken, settings, sd, worst, form, "broken sensors")
     return {
@@ -97,6 +82,28 @@ def check_stream(run: Run, detector: SlipDetector, form: Form, memory: Memory) -
         "worst_sd": found,
         "broken": {"not_valid": int((~of_broken["valid"]).sum()), "worst_sd": lost},
     }
+
+
+def slowed(samples: Tensor, timing: Timing) -> Tensor:
+    """The same, or what a long hop leaves of it: each decision sees another part.
+
+    Args:
+        samples: ``[T, C]``.
+        timing: of the decisions.
+
+    Raises:
+        ValueError: if the hop is so long that the stream would be too large.
+    """
+    num, hop = len(samples), timing.hop
+    if timing.decisions(num) >= _DECISIONS:
+        return samples
+    if hop > _LONGEST_HOP:
+        raise ValueError(
+            f"a hop of {hop} samples is too long to be checked, at most {_LONGEST_HOP}; train with "
+            "a shorter onset.hop_ms"
+        )
+    places = torch.arange(max(timing.first, timing.frame) + hop * (_DECISIONS - 1))
+    return samples[(places - places // hop * (hop - num // _DECISIONS)) % num]
 
 
 def cuts(num: int, hop: int) -> dict[str, list[int]]:
@@ -149,16 +156,15 @@ def broken_stream(samples: Tensor, needed: Sequence[int]) -> Tensor:
 class _Host:
     """A graph and what it remembers, as every host has them."""
 
-    def __init__(
-        self, run: Run, num_channels: int, form: Form, memory: Memory | None = None
-    ) -> None:
-        self.run, self.form, self.memory = run, form, memory
+    def __init__(self, run: Run, num_channels: int, form: Form, timing: Timing) -> None:
+        self.run, self.form, self.timing = run, form, timing
         self.num_channels = num_channels
         self.reset()
 
     def reset(self) -> None:
         self.tail: NDArray[Any] = np.empty((0, self.num_channels), self.form.dtype)
         self.state: NDArray[Any] = np.empty(0, np.float64)
+        self.seen = self.made = 0
 
     def push(self, samples: NDArray[Any], threshold: float | None = None) -> Columns:
         given = np.array([] if threshold is None else [threshold], np.float64)
@@ -169,12 +175,23 @@ class _Host:
             found = ", ".join(sorted(columns.keys() ^ wanted))
             raise ValueError(f"its outputs are not those of a stream graph: {found}")
         self.tail, self.state = columns.pop("next_tail"), columns.pop("next_state")
-        if self.memory is not None and (len(self.tail), len(self.state)) != self.memory:
+        self._check_memory()
+        self.seen, self.made = self.seen + len(samples), self.made + len(columns["score"])
+        if self.made != (due := self.timing.decisions(self.seen)):
             raise ValueError(
-                f"it hands on {len(self.tail)} samples and a state of {len(self.state)} after a "
-                f"push of {len(samples)}, expected {self.memory[0]} and {self.memory[1]} always"
+                f"it has made {self.made} decisions of {self.seen} samples, its facts say {due}"
             )
         return columns
+
+    def _check_memory(self) -> None:
+        tail = f"{self.form.dtype}{[self.timing.tail, self.num_channels]}"
+        state = f"float64{[self.timing.state_size]}"
+        for name, kept, wanted in (
+            ("next_tail", self.tail, tail),
+            ("next_state", self.state, state),
+        ):
+            if (found := f"{kept.dtype}{list(kept.shape)}") != wanted:
+                raise ValueError(f"{name} is {found}, expected {wanted} always")
 
     def watch(
         self, samples: NDArray[Any], sizes: Sequence[int], threshold: float | None = None
