@@ -1,6 +1,5 @@
 """The example host in Python, which knows no torch, says what ``StreamingDetector`` says."""
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -148,18 +147,3 @@ def test_a_stream_graph_is_refused_for_bins(model, recording):
     ran = run_host([sys.executable, FOLDER / "score.py"], model, recording)
     assert ran.status == 1
     assert "give model.onnx" in ran.stderr
-
-
-# What the page shows ---------------------------------------------------------------------------
-
-
-def test_the_page_turns_a_recording_of_ours_into_an_array(tmp_path):
-    page = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
-    command = page.split("<!-- command: recording -->\n```bash\n")[1].split("\n```")[0]
-    channels_first = hosts.slipping_stream()[:50].T
-    np.savez(tmp_path / "recording.npz", samples=channels_first)
-    command = command.replace("python3", sys.executable)
-    subprocess.run(["bash", "-ec", command], cwd=tmp_path, check=True)
-    array = np.load(tmp_path / "recording.npy")
-    assert np.array_equal(array, channels_first.T)
-    assert array.flags.c_contiguous

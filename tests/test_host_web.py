@@ -21,7 +21,6 @@ from hosts import (
     truncated,
     truth,
 )
-from PIL import Image
 from test_host_node import EXPORT, installed
 
 from tactslip_torch.onset.settings import KEY
@@ -193,30 +192,13 @@ def test_the_page_says_what_is_simulated(seen):
     assert "recording" in seen["simulated"]
 
 
-@pytest.mark.onnx
-@pytest.mark.slow
-def test_a_shot_leaves_a_picture_and_the_decisions(script, model, recording, tmp_path):
-    picture = tmp_path / "page.png"
-    done = script(
-        "shot.mjs", "--model", model, "--recording", recording, "--output", picture, "--scheme=dark"
-    )
-    assert done.returncode == 0, done.stderr
-    with Image.open(picture) as image:
-        pixels = image.convert("RGB").getcolors(maxcolors=1 << 24)
-    num_pixels = {"#{:02x}{:02x}{:02x}".format(*colour): num for num, colour in pixels}
-    dark = (WEB / "style.css").read_text().split("prefers-color-scheme: dark")[1]
-    for name in ("page", "panel", "rest", "slip", "alarm"):  # it is dark, and both states are there
-        assert num_pixels[dark.split(f"--{name}: ")[1][:7]] > 100, name
-    assert [path.name for path in tmp_path.iterdir()] == ["page.png"]
-    assert_same(ran(done.stdout.splitlines()), truth(slipping_stream()))
-
-
 SCALE = """
 import { thresholdScale } from "./threshold.mjs";
 const scale = thresholdScale(JSON.parse(process.argv[1]));
 const shares = Array.from({ length: 101 }, (_, i) => i / 100);
 const own = scale.toThreshold(scale.own);
-console.log(JSON.stringify({ thresholds: shares.map(scale.toThreshold), own, title: scale.title }));
+const thresholds = shares.map(scale.toThreshold);
+console.log(JSON.stringify({ thresholds, own, title: scale.title, ownText: scale.ownText }));
 """
 
 
@@ -237,6 +219,25 @@ def test_the_slider_goes_by_false_alarms_where_the_model_knows_them():
     assert told["thresholds"][0] == 8.0  # a rate of 0 has no logarithm
     assert told["thresholds"][-1] == 1.0
     assert told["own"] == pytest.approx(5.0)
+    assert told["ownText"] == "7.1 an hour"  # 2 (90 / 2)^(1/3): a third of the way, by logarithm
+
+
+@pytest.mark.parametrize(
+    ("threshold", "said"),
+    [
+        (8.5, "at most 0.5 an hour"),  # between the highest that let one through and the next
+        (20.0, "at most 0.5 an hour"),
+        (None, "at most 0.5 an hour"),  # one that nothing reaches
+        (8.0, "0.5 an hour"),
+        (1.0, "700 an hour"),
+        (0.5, "at least 700 an hour"),
+    ],
+)
+def test_a_threshold_beyond_what_was_counted_is_told_as_such(threshold, said):
+    curve = [[9.0, 0.0], [8.0, 0.5], [6.0, 2.0], [1.0, 700.0]]
+    rule = {"name": "cusum", "ceiling": 30.0}
+    told = scale_of({"threshold_curve": curve, "threshold": threshold, "rule": rule})
+    assert told["ownText"] == said
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,179 @@
+"""Commands in the READMEs of export/, run as written: the hosts agree about one recording."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from itertools import combinations
+from pathlib import Path
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from hosts import (
+    RATE,
+    Ran,
+    assert_same,
+    copied,
+    exported,
+    saved,
+    slipping_stream,
+    truth,
+)
+from PIL import Image
+from test_host_node import EXPORT, installed
+from test_host_web import BROWSER
+
+from tactslip_torch import Scene, simulate
+
+pytestmark = [
+    pytest.mark.onnx,
+    pytest.mark.slow,
+    pytest.mark.skipif(not shutil.which("gcc"), reason="no gcc here to build the C host"),
+    pytest.mark.skipif(not shutil.which("make"), reason="no make here to build the C host"),
+]
+
+ENVIRONMENT = os.environ | {
+    "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+    "CHROMIUM": str(BROWSER),
+}
+
+
+def command(folder: str, mark: str) -> str:
+    """The command of a README behind its mark, without what would be installed before."""
+    page = (EXPORT / folder / "README.md").read_text(encoding="utf-8")
+    text = page.split(f"<!-- command: {mark} -->\n```bash\n")[1].split("\n```")[0]
+    return text.split(" && ")[-1]
+
+
+def run(folder: Path, text: str) -> str:
+    """What a command prints that runs in a folder to its end, without a word of complaint."""
+    done = subprocess.run(
+        ["bash", "-ec", text],
+        cwd=folder,
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+def ran(printed: str) -> Ran:
+    *lines, summary = map(json.loads, printed.splitlines())
+    return Ran(lines, summary, "", 0)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A copy of export/ where model and recording lie as the READMEs have them."""
+    room = tmp_path_factory.mktemp("room")
+    made = exported(tmp_path_factory)
+    copied(made / "stream.onnx", room)
+    leave = shutil.ignore_patterns("node_modules", "build", "__pycache__", "page.png")
+    for folder in ("python", "c", "node", "web"):
+        place = room / "export" / folder
+        shutil.copytree(EXPORT / folder, place, ignore=leave)
+        saved(place / "recording.npy", slipping_stream())
+        for name in ("model.onnx", "stream.onnx"):
+            copied(made / name, place)
+    for folder in ("node", "web"):
+        installed(EXPORT / folder)
+        (room / "export" / folder / "node_modules").symlink_to(EXPORT / folder / "node_modules")
+    run(room / "export" / "c", command("c", "build"))
+    return room / "export"
+
+
+@pytest.fixture(scope="module")
+def shot(room):
+    """What the page decided, once it has left its picture."""
+    if not BROWSER.exists():
+        pytest.skip(f"no browser {BROWSER}: apt-get install chromium, or set CHROMIUM")
+    return run(room / "web", f"{command('web', 'shot')} --scheme=dark")
+
+
+def test_the_hosts_agree_about_every_decision(room, shot):
+    """Scores of single precision: to 1e-4 of one another."""
+    said = {
+        host: ran(run(room / host, f"{command(host, 'detect')} --decisions"))
+        for host in ("python", "c", "node")
+    }
+    said["page"] = ran(shot)
+    expected = truth(slipping_stream())
+    assert sum(row["alarm"] for row in expected) > 1
+    for one, other in combinations(said.values(), 2):
+        assert one.summary == other.summary
+        assert len(one.lines) == len(other.lines) == len(expected)
+        for left, right in zip(one.lines, other.lines, strict=True):
+            assert list(left) == list(right)
+            for name in ("time_s", "valid", "alarm", "on"):
+                assert left[name] == right[name], (name, left, right)
+            assert abs(left["score"] - right["score"]) <= 1e-4
+    for each in said.values():
+        assert_same(each, expected)
+
+
+@pytest.mark.parametrize("host", ["python", "c", "node"])
+def test_alarms_are_what_the_command_as_written_prints(room, host):
+    expected = [row["time_s"] for row in truth(slipping_stream()) if row["alarm"]]
+    found = ran(run(room / host, command(host, "detect")))
+    assert [line["time_s"] for line in found.lines] == expected
+    assert found.summary["seconds"] == len(slipping_stream()) / RATE
+
+
+def test_bins_are_scored_a_line_each(room):
+    lines = [
+        json.loads(each) for each in run(room / "python", command("python", "score")).splitlines()
+    ]
+    assert len(lines) == (len(slipping_stream()) - 110) // 100 + 1  # a bin and its context
+    assert {tuple(line) for line in lines} == {("start_s", "score", "valid", "probability")}
+
+
+def test_the_page_is_served_with_what_was_given(room):
+    words = ["bash", "-c", f"exec {command('web', 'serve')}"]
+    with subprocess.Popen(
+        words, cwd=room / "web", env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
+    ) as server:
+        try:
+            address = server.stdout.readline().strip()
+            got = {}
+            for path in ("", "model", "recording", "given.json"):
+                with urlopen(address + path, timeout=60) as response:
+                    got[path] = response.read()
+        finally:
+            server.kill()
+    assert got[""] == (EXPORT / "web" / "index.html").read_bytes()
+    assert got["model"] == (room.parent / "stream.onnx").read_bytes()
+    assert got["recording"] == (room / "web" / "recording.npy").read_bytes()
+    told = {"model": "stream.onnx", "recording": "recording.npy", "simulated": True}
+    assert json.loads(got["given.json"]) == told
+
+
+def test_a_shot_leaves_a_picture_of_rest_slip_and_alarms(room, shot):
+    with Image.open(room / "web" / "page.png") as image:
+        pixels = image.convert("RGB").getcolors(maxcolors=1 << 24)
+    num_pixels = {"#{:02x}{:02x}{:02x}".format(*colour): num for num, colour in pixels}
+    dark = (EXPORT / "web" / "style.css").read_text().split("prefers-color-scheme: dark")[1]
+    for name in ("page", "panel", "rest", "slip", "alarm"):  # it is dark, and both states are there
+        assert num_pixels[dark.split(f"--{name}: ")[1][:7]] > 100, name
+    assert [path.name for path in (room / "web").glob("page.png*")] == ["page.png"]
+
+
+def test_a_recording_of_ours_becomes_an_array(tmp_path):
+    channels_first = slipping_stream()[:50].T
+    np.savez(tmp_path / "recording.npz", samples=channels_first)
+    run(tmp_path, command(".", "recording"))
+    array = np.load(tmp_path / "recording.npy")
+    assert np.array_equal(array, channels_first.T)
+    assert array.flags.c_contiguous
+
+
+def test_a_recording_to_try_on_the_page_is_simulated(tmp_path):
+    run(tmp_path, command("web", "recording"))
+    expected = simulate(Scene("M1", seed=1)).samples.T.numpy()
+    array = np.load(tmp_path / "recording.npy")
+    assert np.array_equal(array, expected, equal_nan=True)
+    assert array.flags.c_contiguous
