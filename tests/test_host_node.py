@@ -1,5 +1,6 @@
 """The exported detector in Node, export/node, decides what the package decides."""
 
+import fcntl
 import json
 import shutil
 import subprocess
@@ -30,16 +31,21 @@ EXPORT = Path(__file__).parents[1] / "export"
 
 
 def installed(folder: Path) -> None:
-    """Install a folder's packages where its lock file is newer than what is there."""
+    """Install a folder's packages where its lock file is newer than what is there.
+
+    Two test files may want the same folder in two processes: one of them waits.
+    """
     if shutil.which("node") is None:
         pytest.skip("node is not installed: apt-get install nodejs npm")
-    done = folder / "node_modules" / ".package-lock.json"
-    if done.exists() and done.stat().st_mtime >= (folder / "package-lock.json").stat().st_mtime:
-        return
-    if shutil.which("npm") is None:
-        pytest.skip("npm is not installed: apt-get install npm")
-    ran = subprocess.run(["npm", "ci"], cwd=folder, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr
+    wanted, done = folder / "package-lock.json", folder / "node_modules" / ".package-lock.json"
+    with wanted.open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if done.exists() and done.stat().st_mtime >= wanted.stat().st_mtime:
+            return
+        if shutil.which("npm") is None:
+            pytest.skip("npm is not installed: apt-get install npm")
+        ran = subprocess.run(["npm", "ci"], cwd=folder, capture_output=True, text=True, check=False)
+        assert ran.returncode == 0, ran.stderr
 
 
 @pytest.fixture(scope="module")
