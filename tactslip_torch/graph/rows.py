@@ -16,14 +16,13 @@ from tactslip_torch.features.plan import Row
 from tactslip_torch.features.pool import LARGEST_SAMPLE
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.maps import Block, Matrix, block, energy_matrix, filter_matrix
-from tactslip_torch.graph.value import F64, Value
+from tactslip_torch.graph.value import F64, TINY, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
 
 EXACT = frozenset({"mode", "entropy"})
 """Descriptors that step: two roundings of one value may differ by a whole step."""
 SPAN_OF_LENGTH = 0.35  # span of 100 centred values of length 1: from .2 (two levels) to 1.41
-_TINY = 1e-300  # instead of 0, where a quotient of 0 is to be 0
 _LEAST_SPAN = 16 * float(np.finfo(np.float64).eps)  # guards.is_constant
 
 
@@ -151,7 +150,7 @@ class Front:
         parts = (own.cast(self._form.dtype) @ matrix).cast(F64)  # whose squares may leave float32
         of_branch: Matrix = np.repeat(np.eye(len(ranks)), ranks, axis=0)
         energies = (parts * parts) @ of_branch
-        total = energies.slice(0, 1, 1).max(_TINY)
+        total = energies.slice(0, 1, 1).max(TINY)
         return energies.slice(1, len(ranks), 1) / total
 
     def _place(self, row: Row) -> tuple[int, int]:
@@ -198,7 +197,7 @@ class Front:
         centred = film - film.mean(2, keep=True)
         size = centred.abs().amax(2, keep=True)
         scale = self._of_channels(rows, lambda group: group.scale).expand(2)
-        least = (scale * (_LEAST_SPAN / 2)).max(_TINY)
+        least = (scale * (_LEAST_SPAN / 2)).max(TINY)
         kept = (size >= least).cast(F64) / size.max(least)
         return (centred * kept).cast(dtype)
 
@@ -212,7 +211,7 @@ class Front:
             x = x.slice(start, start + before + num + after, 2)
         unit = None
         if self._form.dtype == F64:  # whose squares float64 does not hold
-            unit = x.abs().amax(2, keep=True).max(_TINY)
+            unit = x.abs().amax(2, keep=True).max(TINY)
             x = x / unit
         smooth = filter_matrix(self._detector.channel_filter, channels[0], num)
         first = x.slice(before, before + 1, 2)
@@ -263,7 +262,7 @@ class Front:
             with_mean: whether the length is that of the branch in full.
         """
         length = ((coordinates * coordinates) @ _of_block(own, mean=with_mean)).sqrt()
-        least = (scale * (_LEAST_SPAN / SPAN_OF_LENGTH)).max(_TINY).expand(2)
+        least = (scale * (_LEAST_SPAN / SPAN_OF_LENGTH)).max(TINY).expand(2)
         is_kept = (length >= least).cast(F64)
         length = length.max(least)
         exact = coordinates * ((is_kept / length) @ _of_block(own, mean=True).T)
