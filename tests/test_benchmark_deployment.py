@@ -276,7 +276,7 @@ def test_ratios_are_of_rounds_and_rates_of_the_best_chunk() -> None:
 
 
 def made(**changes: Any) -> dict[str, Any]:
-    found = sections()
+    found = sections(flips=3)
     return {
         "quick": False,
         "machine": {"processor": "abacus"},
