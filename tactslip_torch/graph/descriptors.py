@@ -7,7 +7,7 @@ from collections.abc import Callable
 from tactslip_torch.features.descriptors import CV_FLOOR
 from tactslip_torch.graph.order import entropy as level_entropy
 from tactslip_torch.graph.order import interquartile, medians, modes
-from tactslip_torch.graph.shared import Part, Shared
+from tactslip_torch.graph.shared import NEXT_TO_NOTHING, Part, Shared
 from tactslip_torch.graph.value import F64
 
 # Each of these is a number for each row it is wanted of, [B, R'], float64, in its unit.
@@ -91,7 +91,7 @@ def correlation(x: Shared) -> Part:
     own = x.safe_variance(places)
     covariance = (x.centred().of(places) * other).mean().cast(F64)
     theirs = (other * other).mean().cast(F64)
-    return Part(covariance / (own * theirs.max(1e-60)).sqrt(), places)
+    return Part(covariance / (own * theirs.max(NEXT_TO_NOTHING)).sqrt(), places)
 
 
 def spectral_centroid(x: Shared) -> Part:

@@ -16,7 +16,7 @@ from tactslip_torch.graph.rows import Rows
 from tactslip_torch.graph.value import F64, Value
 from tactslip_torch.graph.writer import Graph
 
-_NEXT_TO_NOTHING = 1e-60  # variances of rows of order one are 0 or far above
+NEXT_TO_NOTHING = 1e-60  # variances of rows of order one are 0 or far above
 _MOST = 0.7  # of the rows: to pick more of them costs more than it spares
 _MOMENTS = (
     "mean",
@@ -162,13 +162,13 @@ class Shared:
 
     def safe_variance(self, places: Sequence[int]) -> Value:
         """The variance; next to nothing where all values are equal, and all moments 0."""
-        return self.variance().of(places).max(_NEXT_TO_NOTHING)
+        return self.variance().of(places).max(NEXT_TO_NOTHING)
 
     def rms(self, places: Sequence[int]) -> Value:
         """Root mean square, in the unit; next to nothing for a zero row, over which all is 0."""
         mean = self.mean(places)
         square = mean * mean + self.variance().of(places)
-        return square.max(_NEXT_TO_NOTHING).sqrt()
+        return square.max(NEXT_TO_NOTHING).sqrt()
 
     def in_volts(self, value: Value, places: Sequence[int]) -> Part:
         """A quantity of the unit."""
@@ -189,7 +189,7 @@ class Shared:
         ).value
         total, first, second = (sums.slice(k, k + 1, 2).squeeze(2) for k in range(3))
         is_some = (total > 0.0).cast(F64)
-        total = total.max(_NEXT_TO_NOTHING)
+        total = total.max(NEXT_TO_NOTHING)
         centre = first / total
         spread = (second / total - centre * centre).max(0.0).sqrt() * half
         return Part((centre * half + middle) * is_some, places), Part(spread, places)
