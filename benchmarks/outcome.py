@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -107,6 +108,45 @@ def keep_figure(
         return
     draw(report, path)
     print(f"figure in {path}")
+
+
+def keep_by_default(parsed: argparse.Namespace, name: str) -> None:
+    """Numbers and figure go to ``RESULTS`` by this name, where the options do not say otherwise."""
+    parsed.json = parsed.json or RESULTS / f"{name}.json"
+    parsed.figure = parsed.figure or RESULTS / f"{name}.png"
+
+
+def outcome(
+    measure: Callable[[], Mapping[str, Any]],
+    text: Callable[[Mapping[str, Any]], str],
+    draw: Callable[[Mapping[str, Any], Path], None],
+    parsed: argparse.Namespace,
+    given: Path | None,
+    failures: tuple[type[Exception], ...] = (),
+) -> int:
+    """Measure and tell; the exit status.
+
+    Args:
+        measure: makes the report.
+        text: of it.
+        draw: its figure.
+        parsed: with the options of ``add_paths``.
+        given: the detector's file that was asked for; what is wrong with it is status 2.
+        failures: of processes that were started, status 1.
+    """
+    try:
+        report = measure()
+    except failures as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except (FileNotFoundError, ValueError) as error:
+        if given is None:
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    return told(report, text, draw, parsed)
 
 
 def told(

@@ -229,7 +229,7 @@ def test_quick_run_measures_every_guard(
 def test_runs_in_part_or_in_brief_leave_the_results_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench, "RESULTS", tmp_path)
+    monkeypatch.setattr(outcome, "RESULTS", tmp_path)
     monkeypatch.setattr(bench, "QUICK", TINY)
     monkeypatch.setattr(bench, "Sizes", lambda: TINY)
     monkeypatch.setattr(bench, "SECTIONS", {"extract": measure.extract})

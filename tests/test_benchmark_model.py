@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.kernel_ridge import KernelRidge
 
-from benchmarks import clocks
+from benchmarks import clocks, outcome
 from benchmarks.model import __main__ as bench
 from benchmarks.model import measure, worker
 from benchmarks.model import report as reports
@@ -418,8 +418,8 @@ def test_quick_run_measures_everything(
 
 
 def test_runs_in_part_or_in_brief_leave_the_results_alone() -> None:
-    assert bench._arguments([]).json == bench.RESULTS / "model.json"
-    assert bench._arguments([]).figure == bench.RESULTS / "model.png"
+    assert bench._arguments([]).json == outcome.RESULTS / "model.json"
+    assert bench._arguments([]).figure == outcome.RESULTS / "model.png"
     for arguments in (["--quick"], ["--only", "size"]):
         parsed = bench._arguments(arguments)
         assert parsed.json is parsed.figure is None

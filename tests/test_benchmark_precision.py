@@ -10,6 +10,7 @@ import torch
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.metrics import balanced_accuracy_score
 
+from benchmarks import outcome
 from benchmarks.arithmetic import FLOAT64, NATIVE, WIDE
 from benchmarks.precision import __main__ as bench
 from benchmarks.precision import measure, report
@@ -203,7 +204,7 @@ def test_quick_run_writes_numbers_and_figure(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(bench, "QUICK", TINY)
-    monkeypatch.setattr(bench, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(outcome, "RESULTS", tmp_path / "results")
     monkeypatch.setattr(bench, "load_experiment", lambda sizes: experiment)
     paths = [tmp_path / "numbers.json", tmp_path / "figure.png"]
     arguments = ["--quick", "--threads", "1", "--json", str(paths[0]), "--figure", str(paths[1])]
@@ -223,7 +224,7 @@ def test_a_full_run_keeps_its_results(
     experiment: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bench, "Sizes", lambda: TINY)
-    monkeypatch.setattr(bench, "RESULTS", tmp_path)
+    monkeypatch.setattr(outcome, "RESULTS", tmp_path)
     monkeypatch.setattr(bench, "load_experiment", lambda sizes: experiment)
     assert bench.main(["--threads", "1"]) == 0
     assert json.loads((tmp_path / "precision.json").read_text())["quick"] is False

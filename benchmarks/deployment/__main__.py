@@ -11,7 +11,6 @@ figure in ``benchmarks/results``. ``--quick`` looks whether all of that but the 
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -42,7 +41,7 @@ from benchmarks.deployment.subject import subject_of
 from benchmarks.engines import ENGINES
 from benchmarks.exported import judge_of
 from benchmarks.machine import machine_facts, versions
-from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, add_paths, refuse_paths, told
+from benchmarks.outcome import add_paths, keep_by_default, outcome, refuse_paths
 from tactslip_torch.signals.filtering import ChannelFilter
 
 _LIBRARIES = ("numba", "PyWavelets", "ptwt", "onnx", "onnxruntime", "onnxscript")
@@ -111,21 +110,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = parser.parse_args(arguments)
     refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
-        parsed.json = parsed.json or RESULTS / "deployment.json"
-        parsed.figure = parsed.figure or RESULTS / "deployment.png"
-    try:
-        report = measure(QUICK if parsed.quick else Sizes(), parsed.detector, parsed.quick)
-    except StartFailedError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except (FileNotFoundError, ValueError) as error:
-        if parsed.detector is None:
-            raise
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    return told(report, report_text, figure, parsed)
+        keep_by_default(parsed, "deployment")
+    return outcome(
+        lambda: measure(QUICK if parsed.quick else Sizes(), parsed.detector, parsed.quick),
+        report_text,
+        figure,
+        parsed,
+        parsed.detector,
+        (StartFailedError,),
+    )
 
 
 if __name__ == "__main__":

@@ -23,13 +23,7 @@ from benchmarks.features.report import following, report_text
 from benchmarks.features.roofline import roofline
 from benchmarks.features.sizes import QUICK, Sizes
 from benchmarks.machine import PEERS, machine_facts, versions
-from benchmarks.outcome import (
-    EXIT_INTERRUPTED,
-    RESULTS,
-    add_paths,
-    refuse_paths,
-    told,
-)
+from benchmarks.outcome import EXIT_INTERRUPTED, add_paths, keep_by_default, refuse_paths, told
 
 SECTIONS: dict[str, Callable[[Sizes], dict[str, Any]]] = {
     "pool": full_pool,
@@ -76,8 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if parsed.figure and parsed.only and "pool" not in parsed.only:
         parser.error("--figure shows the section pool; measure it, with roofline if you like")
     if not (parsed.quick or parsed.only):
-        parsed.json = parsed.json or RESULTS / "features.json"
-        parsed.figure = parsed.figure or RESULTS / "features.png"
+        keep_by_default(parsed, "features")
     names = [name for name in SECTIONS if parsed.only is None or name in parsed.only]
     try:
         report = measure(QUICK if parsed.quick else Sizes(), names, parsed.quick)

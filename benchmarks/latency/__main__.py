@@ -9,7 +9,6 @@ itself, and keeps numbers and figure in ``benchmarks/results``.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -21,13 +20,7 @@ from benchmarks.latency.measure import latencies
 from benchmarks.latency.report import limit_rows, report_text
 from benchmarks.latency.sizes import QUICK, Sizes
 from benchmarks.machine import PEERS, machine_facts, versions
-from benchmarks.outcome import (
-    EXIT_INTERRUPTED,
-    RESULTS,
-    add_paths,
-    refuse_paths,
-    told,
-)
+from benchmarks.outcome import add_paths, keep_by_default, outcome, refuse_paths
 
 
 def measure(sizes: Sizes, model: Path | None, quick: bool) -> dict[str, Any]:
@@ -67,18 +60,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = parser.parse_args(arguments)
     refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
-        parsed.json = parsed.json or RESULTS / "latency.json"
-        parsed.figure = parsed.figure or RESULTS / "latency.png"
-    try:
-        report = measure(QUICK if parsed.quick else Sizes(), parsed.model, parsed.quick)
-    except (FileNotFoundError, ValueError) as error:
-        if parsed.model is None:
-            raise
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    return told(report, report_text, figure, parsed)
+        keep_by_default(parsed, "latency")
+    return outcome(
+        lambda: measure(QUICK if parsed.quick else Sizes(), parsed.model, parsed.quick),
+        report_text,
+        figure,
+        parsed,
+        parsed.model,
+    )
 
 
 if __name__ == "__main__":

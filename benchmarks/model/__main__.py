@@ -25,7 +25,13 @@ from benchmarks.model.measure import SECTIONS
 from benchmarks.model.report import limit_rows, ratios, report_text
 from benchmarks.model.sizes import QUICK, Sizes
 from benchmarks.model.worker import WorkerFailedError
-from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, add_paths, keep_numbers, refuse_paths
+from benchmarks.outcome import (
+    EXIT_INTERRUPTED,
+    add_paths,
+    keep_by_default,
+    keep_numbers,
+    refuse_paths,
+)
 
 EXIT_FAILED = 1
 
@@ -78,8 +84,7 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     if parsed.figure and parsed.only and not set(parsed.only) & set(PANELS):
         parser.error(f"--figure shows {', '.join(PANELS)}; measure one of them")
     if not (parsed.quick or parsed.only):
-        parsed.json = parsed.json or RESULTS / "model.json"
-        parsed.figure = parsed.figure or RESULTS / "model.png"
+        keep_by_default(parsed, "model")
     return parsed
 
 

@@ -27,9 +27,9 @@ from benchmarks.onset.sizes import QUICK, Sizes
 from benchmarks.onset.trained import train_all
 from benchmarks.outcome import (
     EXIT_INTERRUPTED,
-    RESULTS,
     ROOT,
     add_paths,
+    keep_by_default,
     refuse_paths,
     told,
 )
@@ -82,8 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = parser.parse_args(arguments)
     refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
-        parsed.json = parsed.json or RESULTS / "onset.json"
-        parsed.figure = parsed.figure or RESULTS / "onset.png"
+        keep_by_default(parsed, "onset")
     folder = parsed.runs or ROOT / "outputs" / f"onset-bench{'-quick' * parsed.quick}"
     torch.set_num_threads(1)  # watching and training use the processors
     machine = machine_facts()

@@ -19,8 +19,8 @@ from benchmarks.clocks import on_threads
 from benchmarks.machine import machine_facts, versions
 from benchmarks.outcome import (
     EXIT_INTERRUPTED,
-    RESULTS,
     add_paths,
+    keep_by_default,
     keep_numbers,
     refuse_paths,
 )
@@ -71,8 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--threads must be at least 1, got {parsed.threads}")
     refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
-        parsed.json = parsed.json or RESULTS / "precision.json"
-        parsed.figure = parsed.figure or RESULTS / "precision.png"
+        keep_by_default(parsed, "precision")
     try:
         report = measure(QUICK if parsed.quick else Sizes(), parsed.threads, parsed.quick)
     except KeyboardInterrupt:

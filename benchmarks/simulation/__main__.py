@@ -16,13 +16,7 @@ from typing import Any
 
 from benchmarks.clocks import on_threads
 from benchmarks.machine import machine_facts, versions
-from benchmarks.outcome import (
-    EXIT_INTERRUPTED,
-    RESULTS,
-    add_paths,
-    refuse_paths,
-    told,
-)
+from benchmarks.outcome import EXIT_INTERRUPTED, add_paths, keep_by_default, refuse_paths, told
 from benchmarks.simulation.accuracy import accuracies
 from benchmarks.simulation.cost import RUNGS, minute_costs, needed_seconds, parts
 from benchmarks.simulation.errors import elements, kinematic_errors, step_errors
@@ -73,8 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = parser.parse_args(arguments)
     refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
-        parsed.json = parsed.json or RESULTS / "simulation.json"
-        parsed.figure = parsed.figure or RESULTS / "simulation.png"
+        keep_by_default(parsed, "simulation")
     try:
         report = measure(QUICK if parsed.quick else Sizes(), parsed.quick)
     except KeyboardInterrupt:

@@ -9,7 +9,6 @@ own. Prints tables and limits, and keeps numbers and figure in ``benchmarks/resu
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -17,13 +16,7 @@ from typing import Any
 
 from benchmarks.detectors import timed_detector
 from benchmarks.machine import machine_facts, versions
-from benchmarks.outcome import (
-    EXIT_INTERRUPTED,
-    RESULTS,
-    add_paths,
-    refuse_paths,
-    told,
-)
+from benchmarks.outcome import add_paths, keep_by_default, outcome, refuse_paths
 from benchmarks.streaming.figure import figure
 from benchmarks.streaming.measure import memory, speed
 from benchmarks.streaming.report import limit_rows, report_text
@@ -66,18 +59,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = parser.parse_args(arguments)
     refuse_paths(parser, parsed, "json", "figure")
     if not parsed.quick:
-        parsed.json = parsed.json or RESULTS / "streaming.json"
-        parsed.figure = parsed.figure or RESULTS / "streaming.png"
-    try:
-        report = measure(QUICK if parsed.quick else Sizes(), parsed.model, parsed.quick)
-    except (FileNotFoundError, ValueError) as error:
-        if parsed.model is None:
-            raise
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    return told(report, report_text, figure, parsed)
+        keep_by_default(parsed, "streaming")
+    return outcome(
+        lambda: measure(QUICK if parsed.quick else Sizes(), parsed.model, parsed.quick),
+        report_text,
+        figure,
+        parsed,
+        parsed.model,
+    )
 
 
 if __name__ == "__main__":

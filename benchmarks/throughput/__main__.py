@@ -9,7 +9,6 @@ set itself, and keeps numbers and figure in ``benchmarks/results``.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,13 +17,7 @@ from typing import Any
 from benchmarks.detectors import timed_detector
 from benchmarks.machine import PEERS, machine_facts, versions
 from benchmarks.model.worker import WorkerFailedError
-from benchmarks.outcome import (
-    EXIT_INTERRUPTED,
-    RESULTS,
-    add_paths,
-    refuse_paths,
-    told,
-)
+from benchmarks.outcome import add_paths, keep_by_default, outcome, refuse_paths
 from benchmarks.throughput.figure import PANELS, figure
 from benchmarks.throughput.measure import SECTIONS
 from benchmarks.throughput.report import limit_rows, report_text
@@ -73,22 +66,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if parsed.figure and parsed.only and not set(parsed.only) & set(PANELS):
         parser.error(f"--figure shows {', '.join(PANELS)}; measure one of them")
     if not (parsed.quick or parsed.only):
-        parsed.json = parsed.json or RESULTS / "throughput.json"
-        parsed.figure = parsed.figure or RESULTS / "throughput.png"
+        keep_by_default(parsed, "throughput")
     names = [name for name in SECTIONS if parsed.only is None or name in parsed.only]
-    try:
-        report = measure(QUICK if parsed.quick else Sizes(), names, parsed.model, parsed.quick)
-    except WorkerFailedError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except (FileNotFoundError, ValueError) as error:
-        if parsed.model is None:
-            raise
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    return told(report, report_text, figure, parsed)
+    return outcome(
+        lambda: measure(QUICK if parsed.quick else Sizes(), names, parsed.model, parsed.quick),
+        report_text,
+        figure,
+        parsed,
+        parsed.model,
+        (WorkerFailedError,),
+    )
 
 
 if __name__ == "__main__":
