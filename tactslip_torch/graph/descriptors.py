@@ -87,7 +87,7 @@ def correlation(x: Shared) -> Part:
     film = x.rows.film
     if film is None:
         raise ValueError("correlation needs the film that rows are branches of")
-    other = Part(film, range(len(x.rows.rows))).of(places)
+    other = x.of_all(film, places)
     own = x.safe_variance(places)
     covariance = (x.centred().of(places) * other).mean().cast(F64)
     theirs = (other * other).mean().cast(F64)
@@ -122,7 +122,7 @@ def mode(x: Shared) -> Part:
     places = x.of_rows(("mode",), always=True)
     if x.rows.scale is None:
         raise ValueError("mode needs the scale of the bins that rows are of")
-    scale = Part(x.rows.scale, range(len(x.rows.rows))).of(places)
+    scale = x.of_all(x.rows.scale, places)
     value = modes(x.graph, x.values(places), scale, x.num)
     return x.in_volts(x.with_mean(value, places), places)
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.features.linear_maps import RANK_TOLERANCE, LinearMaps
-from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.signals.filtering import ChannelFilter, overlap_matrix
 
 Matrix = NDArray[np.float64]
 GAUGE = -1
@@ -87,11 +87,7 @@ def block(branch: int, maps: LinearMaps, smooth: Tensor) -> Block:
 
 def filter_matrix(channel_filter: ChannelFilter, channel: int, num: int) -> Tensor:
     """A channel's filter from its window to the bin's ``num`` samples, ``[num, W]``, float64."""
-    kernel = channel_filter.kernel(channel)
-    matrix = torch.zeros(num, num + len(kernel) - 1, dtype=torch.float64)
-    for place in range(num):
-        matrix[place, place : place + len(kernel)] = kernel
-    return matrix
+    return overlap_matrix(channel_filter.kernel(channel), num).T
 
 
 def energy_matrix(

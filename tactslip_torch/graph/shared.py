@@ -46,7 +46,7 @@ class Part:
 
 
 class Shared:
-    """Descriptors of rows of one length and dtype, what they share made once.
+    """What the descriptors of rows of one length and dtype share, each made once.
 
     Args:
         graph: to which nodes are added.
@@ -83,6 +83,10 @@ class Shared:
         wanted = {place for name in names for place in self._wanted.get(name, ())}
         return tuple(sorted(wanted)) if always or len(wanted) < _MOST * len(whole) else whole
 
+    def of_all(self, value: Value, places: Sequence[int]) -> Value:
+        """The part at these places of what there is one of for every row."""
+        return Part(value, range(len(self.rows.rows))).of(places)
+
     def once(self, name: str, make: Callable[[], Part]) -> Part:
         """A shared part, made when first asked for."""
         if name not in self._made:
@@ -98,8 +102,10 @@ class Shared:
 
     def values(self, places: Sequence[int]) -> Value:
         """Values as they are: branches less their mean, spectra in full."""
-        whole = Part(self.rows.values, range(len(self.rows.rows)))
-        return self.once(f"values {tuple(places)}", lambda: Part(whole.of(places), places)).value
+        return self.once(
+            f"values {tuple(places)}",
+            lambda: Part(self.of_all(self.rows.values, places), places),
+        ).value
 
     def centred(self) -> Part:
         """Values less their mean, of all rows that have a moment."""
@@ -131,12 +137,12 @@ class Shared:
 
     def unit(self, places: Sequence[int]) -> Value:
         """By which values are volts."""
-        return Part(self.rows.unit, range(len(self.rows.rows))).of(places)
+        return self.of_all(self.rows.unit, places)
 
     def mean(self, places: Sequence[int]) -> Value:
         """In the unit."""
         if self.rows.mean is not None:
-            return Part(self.rows.mean, range(len(self.rows.rows))).of(places)
+            return self.of_all(self.rows.mean, places)
         return self.once(
             "mean",
             lambda: Part(self.plain_mean().value.squeeze(2).cast(F64), self.plain_mean().places),

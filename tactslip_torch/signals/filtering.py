@@ -171,14 +171,14 @@ class ChannelFilter(nn.Module):
         A trace makes its own: what is made in one must not outlive it.
         """
         if torch.compiler.is_compiling():
-            return _overlap_matrix(self._kernels[length].to(like), num_kept)
+            return overlap_matrix(self._kernels[length].to(like), num_kept)
         key = (length, num_kept, like.dtype, like.device)
         matrix = self._matrices.get(key)
         if matrix is None:
             if len(self._matrices) >= _MOST_MATRICES:
                 self._matrices.clear()
             with torch.inference_mode(False):  # it may be needed for a gradient later
-                matrix = _overlap_matrix(self._kernels[length].to(like), num_kept)
+                matrix = overlap_matrix(self._kernels[length].to(like), num_kept)
             self._matrices[key] = matrix
         return matrix
 
@@ -198,8 +198,13 @@ def _channels(samples: Tensor, chosen: Sequence[int]) -> Tensor:
     return samples[..., list(chosen), :]
 
 
-def _overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
-    """``convolve_valid`` as a matrix ``[num_kept + W - 1, num_kept]``, for short signals."""
+def overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
+    """``convolve_valid`` as a matrix, for short signals: ``convolve_valid(x) = x @ matrix``.
+
+    Shape:
+        - kernel: ``[W]``
+        - output: ``[num_kept + W - 1, num_kept]``
+    """
     margin = kernel.new_zeros(num_kept - 1)
     padded = torch.cat([margin, kernel, margin])
     return padded.unfold(0, num_kept + len(kernel) - 1, 1).flip(0).T
