@@ -87,7 +87,7 @@ def block(branch: int, maps: LinearMaps, smooth: Tensor) -> Block:
 
 def filter_matrix(channel_filter: ChannelFilter, channel: int, num: int) -> Tensor:
     """A channel's filter from its window to the bin's ``num`` samples, ``[num, W]``, float64."""
-    return overlap_matrix(channel_filter.kernel(channel), num).T
+    return overlap_matrix(channel_filter.kernel(channel), num).T.contiguous()
 
 
 def energy_matrix(
