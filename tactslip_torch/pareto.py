@@ -33,7 +33,7 @@ from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
 from tactslip_torch.deadline.cost import CostModel
-from tactslip_torch.deadline.front import Candidate, nondominated, worth_timing
+from tactslip_torch.deadline.front import Candidate, distinct, nondominated, worth_timing
 from tactslip_torch.deadline.latency import (
     DEFINITION,
     Latency,
@@ -91,6 +91,7 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
             keeping = [each for each in candidates if not limits.misses(each.latency)]
             best = max(keeping or candidates, key=lambda each: each.balanced_accuracy)
             candidates += searcher.without_fingers(best, bar)
+        candidates = distinct(candidates)
         timed = shop.timed(worth_timing(candidates, shop.search.most_timed, limits))
         trial = folder / "trial.pt"
         try:

@@ -14,7 +14,7 @@ import tactslip_torch.pareto as command
 from tactslip_torch import SlipDetector
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import seen6, unseen4
-from tactslip_torch.deadline.front import Candidate
+from tactslip_torch.deadline.front import Candidate, distinct
 from tactslip_torch.deadline.latency import Latency, Limits
 from tactslip_torch.deadline.search import Search
 from tactslip_torch.deadline.timing import Timing
@@ -391,6 +391,19 @@ def candidate(**changes):
         "latency": Latency(0.0, 50.0, 5.0, 100.0),
     }
     return Candidate(**(parts | changes))
+
+
+def test_a_detector_found_twice_is_one_candidate():
+    found = [
+        candidate(),
+        candidate(channels="pvdf"),
+        candidate(ranking="ccweighting", selected=(40, 3, 17, 300)),
+        candidate(penalty=0.1),
+        candidate(degree=2),
+        candidate(align="centred"),
+        candidate(selected=(3, 40, 300)),
+    ]
+    assert distinct(found) == [found[0], *found[3:]]
 
 
 @pytest.mark.parametrize("degree", [1, 2])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from tactslip_torch.deadline.latency import Latency, Limits
@@ -43,6 +43,19 @@ class Candidate(NamedTuple):
     def point(self) -> tuple[float, float, float]:
         """What is traded, smaller is better: latency, compute, errors."""
         return self.latency.worst_ms, self.latency.compute_us, -self.balanced_accuracy
+
+    @property
+    def detector(self) -> tuple[Align, int, float, frozenset[int]]:
+        """What its detector is made of, however its features were found."""
+        return self.align, self.degree, self.penalty, frozenset(self.selected)
+
+
+def distinct(candidates: Iterable[Candidate]) -> list[Candidate]:
+    """One candidate a detector, the first: two groups of features may have the same best ones."""
+    first: dict[object, Candidate] = {}
+    for each in candidates:
+        first.setdefault(each.detector, each)
+    return list(first.values())
 
 
 def nondominated(points: Sequence[Sequence[float]]) -> list[int]:
