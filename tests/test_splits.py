@@ -278,6 +278,26 @@ def test_folds_keep_a_materials_draw():
     assert all(test == tests[0] for test in tests)
 
 
+def test_all_materials_of_the_set_where_none_are_named():
+    mixed = recordings(["iron", "M2", "M1"])
+    folds = leave_one_material_out(mixed, materials=None)
+    assert [fold.name for fold in folds] == ["without_iron", "without_M2", "without_M1"]
+    named = leave_one_material_out(mixed, materials=["iron", "M2", "M1"])
+    assert [fold.roles for fold in folds] == [fold.roles for fold in named]
+
+
+def test_all_of_the_others_can_be_trained_on():
+    """Small sets have no cycle to spare, and are judged on what was left out alone."""
+    one_each = recordings(SEEN, cycles=1)
+    for whole in (one_each, recordings(SEEN)):
+        for fold, left_out in zip(leave_one_material_out(whole, train_share=1), SEEN, strict=True):
+            assert of_role(fold, "unseen") == {r for r in whole if r.material == left_out}
+            assert of_role(fold, "train") == {r for r in whole if r.material != left_out}
+            assert fold.having("test") == []
+    with pytest.raises(ValueError, match="no recording has the role 'test'"):
+        leave_one_material_out(one_each)
+
+
 # Folds together ------------------------------------------------------------------------------
 
 
@@ -361,8 +381,17 @@ def test_a_share_outside_zero_to_one_is_refused(share):
 
 
 def test_one_material_cannot_be_left_out():
-    with pytest.raises(ValueError, match=r"needs at least two, got \['M1'\]"):
-        leave_one_material_out(recordings(), materials=["M1"])
+    for materials in (["M1"], ["M1", "M1"]):
+        with pytest.raises(ValueError, match=r"needs at least two, each named once, got \['M1'"):
+            leave_one_material_out(recordings(), materials=materials)
+    with pytest.raises(
+        ValueError, match=r"needs at least two, each named once, got \['M1', 'M1', 'M2'\]"
+    ):
+        leave_one_material_out(recordings(), materials=["M1", "M1", "M2"])
+    with pytest.raises(ValueError, match=r"needs at least two, each named once, got \['M1'\]"):
+        leave_one_material_out(recordings(["M1"]), materials=None)
+    with pytest.raises(ValueError, match=r"train_share must lie between 0 and 1, got 1\.5"):
+        leave_one_material_out(recordings(), train_share=1.5)
 
 
 def test_a_split_without_shares_ignores_the_seed():

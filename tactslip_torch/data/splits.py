@@ -121,25 +121,38 @@ def random_bins(
 def leave_one_material_out(
     recordings: Sequence[RecordingId],
     *,
-    materials: Sequence[str],
+    materials: Sequence[str] | None = None,
     train_share: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
     """One fold per material: train and test on the others' cycles, judge on its own.
 
+    Args:
+        recordings: of the set.
+        materials: to leave out and train on; ``None`` for all of the set, in its order.
+        train_share: of the others' cycles; 1 trains on all of them, and no role is ``test``.
+        seed: of the draw.
+
     Raises:
-        ValueError: if a material is not in the set, there are fewer than two, or a role stays
-            empty.
+        ValueError: if a material is not in the set or named twice, there are fewer than two, or a
+            role stays empty.
     """
-    if len(materials) < 2:
-        raise ValueError(f"leaving one material out needs at least two, got {list(materials)}")
+    if materials is None:
+        materials = list(dict.fromkeys(recording.material for recording in recordings))
+    if len(set(materials)) < max(2, len(materials)):
+        raise ValueError(
+            f"leaving one material out needs at least two, each named once, got {list(materials)}"
+        )
     folds = []
     for left_out in materials:
         others = [material for material in materials if material != left_out]
-        fold = unseen4(
-            recordings, seen=others, unseen=[left_out], train_share=train_share, seed=seed
-        )[0]
-        folds.append(Split(f"without_{left_out}", fold.roles))
+        if train_share == 1:
+            roles = {r: "train" for material in others for r in _cycles_of(recordings, material)}
+            roles |= dict.fromkeys(_cycles_of(recordings, left_out), "unseen")
+        else:
+            sides = {"seen": others, "unseen": [left_out]}
+            roles = dict(unseen4(recordings, **sides, train_share=train_share, seed=seed)[0].roles)
+        folds.append(Split(f"without_{left_out}", roles))
     return folds
 
 
