@@ -1,6 +1,6 @@
 """Onsets of slip in recordings: ``python -m tactslip_torch.detect model=detector.pt input=PLACE``.
 
-The place is a file or a folder of what ``data.folder.readers`` knows. Samples are read by stretches
+The place is a file or a folder of what ``data.formats`` knows. Samples are read by stretches
 and pushed through a ``StreamingDetector``, so a recording may be of any length. Leaves
 ``onsets.json``, ``onsets.csv`` and a figure of each recording. Where one cannot be read the others
 are done all the same; the exit status is 2 then.
@@ -29,14 +29,14 @@ from tactslip_torch.config import (
     one_line,
     run_entry_point,
 )
-from tactslip_torch.data.archive import OpenRecording
 from tactslip_torch.data.folder import (
     file_facts,
     has_truth,
-    reader,
     recording_files,
     refuse_other_channels,
 )
+from tactslip_torch.data.formats.reading import Opened, pieces
+from tactslip_torch.data.formats.registry import open_file
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.experiment import save_config, versions
 from tactslip_torch.hand import HandLayout
@@ -146,13 +146,13 @@ def _hear(
     detector, settings, config, folder = listener
     table = folder / f"{name}_decisions.csv"
     with (
-        reader(path)(path) as opened,
+        open_file(path) as opened,
         decisions_file(table, Decisions._fields, wanted=config.decisions) as keep,
     ):
-        samples, archived = opened
+        samples, archived = opened.samples, opened.archived
         rate = _checked_rate(path, opened, listener)
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
-        stream = StreamingDetector(detector, settings, dtype=samples.read(0, 0).dtype)
+        stream = StreamingDetector(detector, settings, dtype=samples.dtype)
         view = view_of(config.view, entry["duration_s"])
         traces = Traces(_drawn(detector.pool.hand), rate, stream.hop_s, view)
         tally = Tally(archived.recording.onsets_s if archived else ())
@@ -165,7 +165,7 @@ def _hear(
             traces.add_decisions(times, found["probability"], is_on, is_valid)
             keep(zip(*(part.tolist() for part in found.values()), strict=True))
 
-        for piece in samples.pieces(_piece_samples(detector)):
+        for piece in pieces(samples, _piece_samples(detector)):
             traces.add_samples(piece.numpy())
             take(stream.push(piece.T))
             yield
@@ -225,7 +225,7 @@ def _settings(config: DictConfig, detector: SlipDetector) -> AlarmSettings:
     return dataclasses.replace(settings, threshold=float(config.threshold))
 
 
-def _checked_rate(path: Path, opened: OpenRecording, listener: Listener) -> float:
+def _checked_rate(path: Path, opened: Opened, listener: Listener) -> float:
     """Samples per second of what was opened, which the detector must fit."""
     pool, archived = listener.detector.pool, opened.archived
     refuse_other_channels(path, opened, pool.hand.to_rows())
@@ -241,7 +241,7 @@ def _checked_rate(path: Path, opened: OpenRecording, listener: Listener) -> floa
 
 def _drawn(hand: HandLayout) -> dict[str, int]:
     """The rows of its films, of a hand without any all rows, by name."""
-    return {hand.names[i]: i for i in hand.indices("PVDF") or range(len(hand))}
+    return {hand.names[i]: i for i in hand.fast or range(len(hand))}
 
 
 def _piece_samples(detector: SlipDetector) -> int:
@@ -251,8 +251,8 @@ def _piece_samples(detector: SlipDetector) -> int:
 def _num_pieces(path: Path, detector: SlipDetector) -> int:
     """For the bar; of a file that cannot be read, as will be said, none."""
     try:
-        with reader(path)(path) as (samples, _):
-            return -(-samples.num_samples // _piece_samples(detector))
+        with open_file(path) as opened:
+            return -(-opened.samples.num_samples // _piece_samples(detector))
     except (ValueError, OSError):
         return 0
 

@@ -15,8 +15,9 @@ from small_detector import HAND, small_detector
 from tactslip_torch import HandLayout, Recording
 from tactslip_torch import detect as module
 from tactslip_torch.config import conf_dir
-from tactslip_torch.data import folder as folders
-from tactslip_torch.data.archive import StoredSamples, save_recording
+from tactslip_torch.data.formats import npz
+from tactslip_torch.data.formats.registry import FORMATS, Format
+from tactslip_torch.data.formats.stored_array import StoredSamples
 from tactslip_torch.detect import detect, main
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decider import Decider
@@ -60,7 +61,7 @@ def quiet(duration_s=4.0, **changes):
 
 
 def save(path, content, hand=HAND):
-    save_recording(path, content, hand, {"recording": {"name": "taps"}})
+    npz.save(path, content, hand, {"recording": {"name": "taps"}})
 
 
 @pytest.fixture(scope="module")
@@ -314,7 +315,7 @@ def test_missing_samples_and_dead_channels_are_flagged(model, tmp_path, capsys):
 
 
 def test_a_further_format_is_a_further_line(model, tmp_path, monkeypatch):
-    monkeypatch.setitem(folders.FORMATS, "tac", folders.FORMATS["npz"])
+    monkeypatch.setitem(FORMATS, "tac", Format("npz", ("tac",)))
     save(tmp_path / "a.tac", recording())
     assert len(heard(model, tmp_path, tmp_path / "out", "figure=false")["recordings"]) == 1
 

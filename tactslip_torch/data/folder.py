@@ -5,84 +5,44 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tactslip_torch.data.archive import (
-    Archived,
-    OpenRecording,
-    archived_key,
-    load_recording,
-    open_recording,
-    save_recording,
+from tactslip_torch.data.formats.header import Archived
+from tactslip_torch.data.formats.reading import Opened
+from tactslip_torch.data.formats.registry import (
+    Format,
+    endings,
+    find_format,
+    format_of,
+    named_format,
 )
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
 from tactslip_torch.files import whole_file
 
 MANIFEST = "manifest.csv"
-Opener = Callable[[Path], AbstractContextManager[OpenRecording]]
-
-
-class Format(NamedTuple):
-    """How recordings are kept in files.
-
-    Args:
-        save: writes one.
-        load: reads it.
-        key: reads no more of it than its key.
-        open: leaves the samples in the file, to be read by stretches.
-    """
-
-    save: Callable[..., None]
-    load: Callable[[Path], Archived]
-    key: Callable[[Path], dict[str, Any]]
-    open: Opener
-
-
-FORMATS = {"npz": Format(save_recording, load_recording, archived_key, open_recording)}
-"""By the ending of their files; a further format is a further line."""
-
-ARRAYS: dict[str, Opener] = {"npy": open_recording}
-"""Files of samples alone, which are only read: no truth, no names of channels."""
-
-
-def readers() -> dict[str, Opener]:
-    """How files are opened that hold recordings or samples, by their ending."""
-    return {ending: form.open for ending, form in FORMATS.items()} | ARRAYS
-
-
-def reader(path: Path) -> Opener:
-    """How a file is opened, by its ending; one of ``recording_files``."""
-    return readers()[_ending(path)]
 
 
 def recording_files(place: Path) -> list[Path]:
-    """The file, or those of a folder that ``readers`` know, by name.
+    """The file, or those of a folder that are of a known format, by name.
 
     Raises:
         FileNotFoundError: if there is no such file or folder.
         ValueError: if the ending is unknown, or the folder holds no such file.
     """
-    endings = readers()
-    known = " or ".join(f".{ending}" for ending in endings)
-    if place.is_dir():
-        found = [path for path in sorted(place.iterdir()) if _ending(path) in endings]
+    if place.is_dir() and find_format(place) is None:
+        found = [p for p in sorted(place.iterdir()) if p.name != MANIFEST and find_format(p)]
         if not found:
+            known = " or ".join(f".{ending}" for ending in endings())
             raise ValueError(f"no recording in {place}; give a folder of {known} files")
         return found
-    if not place.exists():
-        raise FileNotFoundError(f"no file or folder at {place}")
-    if _ending(place) not in endings:
-        raise ValueError(f"{place} must end in {known} to be read as a recording")
+    format_of(place)
     return [place]
 
 
-def refuse_other_channels(
-    path: Path, opened: OpenRecording, rows: Sequence[Mapping[str, str]]
-) -> None:
+def refuse_other_channels(path: Path, opened: Opened, rows: Sequence[Mapping[str, str]]) -> None:
     """Raise if a recording is not of the hand with these channels, in this order.
 
     Of samples alone only the number of channels is known.
@@ -120,10 +80,6 @@ def has_truth(recording: Recording) -> bool:
     return bool(is_told or recording.provenance.get("simulated"))
 
 
-def _ending(path: Path) -> str:
-    return "" if path.name.startswith(".") else path.suffix[1:].lower()
-
-
 class Written(NamedTuple):
     """A recording that has its file: its line of the manifest, and what that took."""
 
@@ -140,7 +96,7 @@ class RecordingFolder:
     Args:
         source: the recordings.
         folder: where the files are.
-        ending: of the files, one of ``FORMATS``.
+        ending: of the files, one that a format has.
         made_by: what determines the samples beside the source's keys: code and libraries.
 
     Raises:
@@ -153,8 +109,12 @@ class RecordingFolder:
     made_by: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if self.ending not in FORMATS:
-            raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {self.ending!r}")
+        _ = self.format  # refuses an unknown one
+
+    @property
+    def format(self) -> Format:
+        """How its files are written and read."""
+        return named_format(self.ending)
 
     def path(self, recording: RecordingId) -> Path:
         """The recording's file."""
@@ -183,7 +143,7 @@ class RecordingFolder:
             raise ValueError("two recordings would have one file; give a scene another name")
         for path in filter(Path.exists, paths):
             try:
-                FORMATS[self.ending].key(path)
+                self.format.key(path)
             except ValueError as error:
                 raise ValueError(f"{error}; move it away, or give another folder") from error
 
@@ -194,7 +154,7 @@ class RecordingFolder:
             FileNotFoundError: if there is none.
             ValueError: if it is damaged.
         """
-        return FORMATS[self.ending].load(self.path(recording))
+        return self.format.load(self.path(recording))
 
     def write(self, recording: RecordingId) -> Written:
         """Make the recording's file, unless it is there, whole, and of the same key."""
@@ -203,7 +163,7 @@ class RecordingFolder:
         made = content is None
         if content is None:
             content = self.source.load(recording)
-            FORMATS[self.ending].save(path, content, self.source.hand, key)
+            self.format.save(path, content, self.source.hand, key)
         line = manifest_line(path.name, recording, content)
         return Written(line, made, content.duration_s, path.stat().st_size)
 

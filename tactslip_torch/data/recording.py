@@ -38,7 +38,7 @@ class Recording:
     """One trial: raw samples and the truth about them.
 
     Args:
-        samples: volts, ``[C, T]``, unfiltered. NaN where a simulation was not asked for a
+        samples: ``[C, T]``, in ``units``, unfiltered. NaN where a simulation was not asked for a
             channel or a stretch of time; never a silent number.
         sample_rate_hz: samples per second and channel.
         material: what the hand slid on.
@@ -50,6 +50,8 @@ class Recording:
         non_slip_s: ``(start, end)`` of stretches without slip that are as telling as the second
             before an onset: the hand is carried, tapped, gripped.
         provenance: where it comes from; simulated recordings say ``{"simulated": True, ...}``.
+        slip_s: ``(start, end)`` of stretches that are slip though nobody knows when it began.
+        units: of the samples.
 
     Raises:
         ValueError: if samples are not ``[C, T]``, the rate is not positive, or the number of
@@ -65,6 +67,8 @@ class Recording:
     annotated_onsets_s: tuple[float, ...] = ()
     non_slip_s: tuple[tuple[float, float], ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    slip_s: tuple[tuple[float, float], ...] = ()
+    units: str = "V"
 
     def __post_init__(self) -> None:
         if self.samples.ndim != 2:
@@ -117,6 +121,14 @@ class Timeline(Protocol):
     @property
     def non_slip_s(self) -> tuple[tuple[float, float], ...]:
         """Stretches without slip in which the hand is handled."""
+
+    @property
+    def slip_s(self) -> tuple[tuple[float, float], ...]:
+        """Stretches that are slip though nobody knows when it began."""
+
+    @property
+    def missing_s(self) -> tuple[tuple[float, float], ...]:
+        """Stretches of which there are no samples; no bin is laid that needs one of them."""
 
 
 class RecordingSource(Protocol):

@@ -36,6 +36,8 @@ class Timeline:
         arm_s: ``(start, stop)`` of every stroke that the arm drives, sliding or not.
         non_slip_s: stretches without slip in which the hand is handled, ascending and apart: what
             a detector of motors or knocks would call slip.
+        slip_s: none: every onset is known.
+        missing_s: none: dropped samples repeat the last, as loggers do.
     """
 
     duration_s: float
@@ -46,6 +48,8 @@ class Timeline:
     sliding_s: tuple[tuple[float, float], ...]
     arm_s: tuple[tuple[float, float], ...]
     non_slip_s: tuple[tuple[float, float], ...] = ()
+    slip_s: tuple[tuple[float, float], ...] = ()
+    missing_s: tuple[tuple[float, float], ...] = ()
 
 
 def timeline(scene: Scene) -> Timeline:

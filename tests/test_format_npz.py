@@ -12,14 +12,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tactslip_torch import HandLayout, Recording
-from tactslip_torch.data.archive import (
-    FORM,
-    archived_key,
-    load_recording,
-    open_recording,
-    save_recording,
-)
-from tactslip_torch.data.folder import FORMATS, readers, recording_files
+from tactslip_torch.data.folder import MANIFEST, recording_files
+from tactslip_torch.data.formats import npz
+from tactslip_torch.data.formats.header import FORM
+from tactslip_torch.data.formats.reading import Reading, pieces
 
 TRUTH = ("onsets_s", "annotated_onsets_s", "sliding_s", "non_slip_s", "speeds_mm_s")
 times = st.floats(0, 100, allow_nan=False)
@@ -94,17 +90,17 @@ def test_what_goes_in_comes_out(tmp_path_factory, data):
     )
     key = data.draw(facts)
     path = tmp_path_factory.mktemp("archive") / "a.npz"
-    save_recording(path, wanted, hand_of(names), key)
-    found = load_recording(path)
+    npz.save(path, wanted, hand_of(names), key)
+    found = npz.load(path)
     assert_same(found.recording, wanted)
     assert found.hand == hand_of(names)
     assert found.key == key
-    assert archived_key(path) == key
+    assert npz.key(path) == key
 
 
 def test_numpy_alone_reads_it(tmp_path):
     wanted, hand = recording(), hand_of(["a", "bc"])
-    save_recording(tmp_path / "a.npz", wanted, hand, KEY)
+    npz.save(tmp_path / "a.npz", wanted, hand, KEY)
     with np.load(tmp_path / "a.npz", allow_pickle=False) as content:
         np.testing.assert_array_equal(content["samples"], wanted.samples.numpy())
         assert content["units"] == "V"
@@ -117,17 +113,17 @@ def test_numpy_alone_reads_it(tmp_path):
 
 
 def test_equal_recordings_are_equal_bytes_at_any_time(tmp_path, monkeypatch):
-    save_recording(tmp_path / "a.npz", recording(), hand_of("ab"), KEY)
+    npz.save(tmp_path / "a.npz", recording(), hand_of("ab"), KEY)
     monkeypatch.setattr(time, "time", lambda: 2e9)
-    save_recording(tmp_path / "b.npz", recording(), hand_of("ab"), dict(reversed(KEY.items())))
+    npz.save(tmp_path / "b.npz", recording(), hand_of("ab"), dict(reversed(KEY.items())))
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
 def test_samples_in_any_layout_are_kept(tmp_path):
     strided = torch.arange(24.0).reshape(12, 2).T
     assert not strided.is_contiguous()
-    save_recording(tmp_path / "a.npz", recording(samples=strided), hand_of("ab"), {})
-    assert torch.equal(load_recording(tmp_path / "a.npz").recording.samples, strided)
+    npz.save(tmp_path / "a.npz", recording(samples=strided), hand_of("ab"), {})
+    assert torch.equal(npz.load(tmp_path / "a.npz").recording.samples, strided)
 
 
 # What cannot be kept -------------------------------------------------------------------------
@@ -149,7 +145,7 @@ def test_what_cannot_be_kept_is_refused_and_nothing_is_lost(tmp_path, changes, n
     path = tmp_path / "a.npz"
     path.write_bytes(b"before")
     with pytest.raises(ValueError, match=said):
-        save_recording(path, recording(**changes), hand_of(names), key)
+        npz.save(path, recording(**changes), hand_of(names), key)
     assert path.read_bytes() == b"before"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -158,7 +154,7 @@ def test_what_cannot_be_kept_is_refused_and_nothing_is_lost(tmp_path, changes, n
 
 
 def assert_refused(path, said="is damaged or no recording of ours"):
-    for read in (load_recording, archived_key):
+    for read in (npz.load, npz.key):
         with pytest.raises(ValueError, match=said) as caught:
             read(path)
         assert "\n" not in str(caught.value)
@@ -179,12 +175,12 @@ def test_foreign_files_are_refused(tmp_path):
 def test_nothing_pickled_is_read(tmp_path):
     """A file like ours whose samples are Python objects: loading those would run code."""
     path = tmp_path / "a.npz"
-    save_recording(path, recording(), hand_of("ab"), KEY)
+    npz.save(path, recording(), hand_of("ab"), KEY)
     with np.load(path) as content:
         parts = dict(content)
     np.savez(path, **(parts | {"samples": np.array([[print], [print]], dtype=object)}))
     with pytest.raises(ValueError, match="is damaged"):
-        load_recording(path)
+        npz.load(path)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +190,6 @@ def test_nothing_pickled_is_read(tmp_path):
         {"samples": np.zeros(9)},
         {"samples": np.zeros((3, 9))},
         {"samples": np.zeros((2, 9), dtype=np.complex64)},
-        {"units": np.array("mV")},
         {"channel_kind": np.array(["SG", "IMU"])},
         {"channel_name": np.array(["a", "a"])},
         {"channel_name": np.array(["a"])},
@@ -207,19 +202,19 @@ def test_nothing_pickled_is_read(tmp_path):
 )
 def test_parts_that_do_not_belong_together_are_refused(tmp_path, changes):
     path = tmp_path / "a.npz"
-    save_recording(path, recording(), hand_of("ab"), KEY)
+    npz.save(path, recording(), hand_of("ab"), KEY)
     with np.load(path) as content:
         parts = dict(content)
     np.savez(path, **parts)
-    assert_same(load_recording(path).recording, recording())  # rewritten, but whole
+    assert_same(npz.load(path).recording, recording())  # rewritten, but whole
     np.savez(path, **(parts | changes))
     with pytest.raises(ValueError, match="is damaged or no recording of ours"):
-        load_recording(path)
+        npz.load(path)
 
 
 def test_a_later_format_is_named(tmp_path):
     path = tmp_path / "a.npz"
-    save_recording(path, recording(), hand_of("ab"), KEY)
+    npz.save(path, recording(), hand_of("ab"), KEY)
     with np.load(path) as content:
         parts = dict(content)
     np.savez(path, **(parts | {"format": np.array("tactslip_torch recording 2")}))
@@ -228,19 +223,19 @@ def test_a_later_format_is_named(tmp_path):
 
 def test_a_part_that_is_missing_is_noticed(tmp_path):
     path = tmp_path / "a.npz"
-    save_recording(path, recording(), hand_of("ab"), KEY)
+    npz.save(path, recording(), hand_of("ab"), KEY)
     with np.load(path) as content:
         parts = dict(content)
     for name in parts:
         np.savez(path, **{other: parts[other] for other in parts if other != name})
         with pytest.raises(ValueError, match="is damaged"):
-            load_recording(path)
+            npz.load(path)
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "a.npz"
-    save_recording(path, recording(), hand_of("ab"), KEY)
+    npz.save(path, recording(), hand_of("ab"), KEY)
     return path.read_bytes()
 
 
@@ -253,7 +248,7 @@ def test_a_damaged_byte_is_noticed_or_does_not_matter(whole, tmp_path_factory, w
     path = tmp_path_factory.mktemp("damaged") / "a.npz"
     path.write_bytes(content)
     try:
-        found = load_recording(path)
+        found = npz.load(path)
     except ValueError:
         return
     assert_same(found.recording, recording())
@@ -270,7 +265,7 @@ def test_a_damaged_sample_is_noticed(whole, tmp_path):
         content[start + offset] ^= 1
         path.write_bytes(content)
         with pytest.raises(ValueError, match="is damaged"):
-            load_recording(path)
+            npz.load(path)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
@@ -281,7 +276,7 @@ def test_a_cut_file_is_refused(whole, tmp_path, share):
 
 
 def test_no_file_is_said_as_such(tmp_path):
-    for read in (load_recording, archived_key):
+    for read in (npz.load, npz.key):
         with pytest.raises(FileNotFoundError, match=r"no file at .*a\.npz"):
             read(tmp_path / "a.npz")
 
@@ -319,16 +314,16 @@ def test_pieces_are_the_samples(
     else:
         getattr(np, write)(folder / "a.npz", samples=stored)
     (path,) = folder.iterdir()
-    with open_recording(path) as (found, rest):
+    with npz.open(path) as (found, rest, *_):
         assert rest is None
         assert (found.num_channels, found.num_samples) == samples.shape
-        pieces = list(found.pieces(size))
+        parts = list(pieces(found, size))
         part = found.read(*stretch)
     native = samples.astype(samples.dtype.newbyteorder("="))
-    assert [piece.shape[1] for piece in pieces] == [
+    assert [piece.shape[1] for piece in parts] == [
         len(native[0, first : first + size]) for first in range(0, num_samples, size)
     ]
-    whole = torch.cat(pieces, 1).numpy() if pieces else native
+    whole = torch.cat(parts, 1).numpy() if parts else native
     assert whole.dtype == part.numpy().dtype == native.dtype
     np.testing.assert_array_equal(whole, native)
     np.testing.assert_array_equal(part.numpy(), native[:, slice(*stretch)])
@@ -337,21 +332,21 @@ def test_pieces_are_the_samples(
 @pytest.mark.parametrize("compressed", [False, True])
 def test_a_recording_of_ours_comes_with_its_truth(tmp_path, compressed):
     path = tmp_path / "a.npz"
-    save_recording(path, recording(), hand_of("ab"), KEY)
+    npz.save(path, recording(), hand_of("ab"), KEY)
     if compressed:
         with np.load(path) as content:
             np.savez_compressed(path, **content)
-    with open_recording(path) as (samples, rest):
+    with npz.open(path) as (samples, rest, *_):
         assert torch.equal(samples.read(0, 400), recording().samples)
-        assert torch.equal(torch.cat(list(samples.pieces(7)), 1), recording().samples)
+        assert torch.equal(torch.cat(list(pieces(samples, 7)), 1), recording().samples)
     assert_same_truth(rest, recording())
 
 
 def test_no_more_of_a_file_is_read_than_was_asked_for(tmp_path, monkeypatch):
     """After the one look for damage, bytes are counted; an archive's members may stand anywhere."""
     path = tmp_path / "a.npz"
-    save_recording(path, recording(samples=torch.randn(2, 100_000)), hand_of("ab"), KEY)
-    with open_recording(path) as (samples, _):
+    npz.save(path, recording(samples=torch.randn(2, 100_000)), hand_of("ab"), KEY)
+    with npz.open(path) as (samples, *_):
         counted = CountedFile(samples.file)
         samples._replace(file=counted).read(60_000, 60_010)
     assert counted.num_bytes == 2 * 10 * 4
@@ -372,7 +367,7 @@ class CountedFile:
 
 def test_a_file_that_is_cut_while_it_is_open_is_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((90_000, 2)))
-    with open_recording(tmp_path / "a.npy") as (samples, _):
+    with npz.open(tmp_path / "a.npy") as (samples, *_):
         with (tmp_path / "a.npy").open("r+b") as file:
             file.truncate(500_000)
         assert samples.read(0, 10).shape == (2, 10)
@@ -384,10 +379,7 @@ def test_opened_in_pieces_the_same_files_are_refused(tmp_path, whole):
     torch.save({"format": FORM}, tmp_path / "torch.npz")
     (tmp_path / "empty.npz").write_bytes(b"")
     (tmp_path / "text.npy").write_text("time,volts\n0,1\n")
-    np.savez(tmp_path / "theirs.npz", samples=np.zeros((2, 9)), time=np.zeros(9))
-    np.savez(tmp_path / "nothing.npz", volts=np.zeros((2, 9)))
     np.savez(tmp_path / "flat.npz", samples=np.zeros(9))
-    np.savez(tmp_path / "whole_numbers.npz", samples=np.zeros((2, 9), dtype=np.int16))
     np.savez(tmp_path / "halves.npz", samples=np.zeros((2, 9), dtype=np.float16))
     np.savez(tmp_path / "no_channel.npz", samples=np.zeros((0, 9)))
     np.savez(tmp_path / "pickled.npz", samples=np.array([[print], [print]], dtype=object))
@@ -399,21 +391,20 @@ def test_opened_in_pieces_the_same_files_are_refused(tmp_path, whole):
     with np.load(io.BytesIO(whole)) as content:
         parts = dict(content)
     np.savez(tmp_path / "hand.npz", **(parts | {"channel_name": np.array(["a"])}))
-    np.savez(tmp_path / "units.npz", **(parts | {"units": np.array("mV")}))
     for path in sorted(tmp_path.iterdir()):
         with (
             pytest.raises(ValueError, match="is damaged or no recording of ours") as caught,
-            open_recording(path),
+            npz.open(path),
         ):
             pass
         assert str(path) in str(caught.value)
     np.savez(tmp_path / "later.npz", **(parts | {"format": np.array("tactslip_torch recording 2")}))
     with (
         pytest.raises(ValueError, match="must be of format"),
-        open_recording(path.parent / "later.npz"),
+        npz.open(path.parent / "later.npz"),
     ):
         pass
-    with pytest.raises(FileNotFoundError, match="no file at"), open_recording(tmp_path / "b.npz"):
+    with pytest.raises(FileNotFoundError, match="no file at"), npz.open(tmp_path / "b.npz"):
         pass
 
 
@@ -425,7 +416,7 @@ def test_a_damaged_byte_is_noticed_in_pieces_as_well(whole, tmp_path_factory, wh
     path = tmp_path_factory.mktemp("damaged") / "a.npz"
     path.write_bytes(content)
     try:
-        with open_recording(path) as (samples, rest):
+        with npz.open(path) as (samples, rest, *_):
             found = samples.read(0, 400)
     except ValueError:
         return
@@ -434,22 +425,53 @@ def test_a_damaged_byte_is_noticed_in_pieces_as_well(whole, tmp_path_factory, wh
 
 
 def test_what_goes_wrong_with_an_open_recording_is_not_called_damage(tmp_path):
-    save_recording(tmp_path / "a.npz", recording(), hand_of("ab"), KEY)
-    with pytest.raises(RuntimeError, match="mine"), open_recording(tmp_path / "a.npz") as (file, _):
+    npz.save(tmp_path / "a.npz", recording(), hand_of("ab"), KEY)
+    with pytest.raises(RuntimeError, match="mine"), npz.open(tmp_path / "a.npz") as (file, *_):
         raise RuntimeError("mine")
     assert file.file.closed
 
 
 def test_a_folder_knows_its_recordings(tmp_path):
-    assert set(readers()) == {*FORMATS, "npy"}
-    for name in ("b.npz", "a.NPY", ".b.1234.tmp.npz", "manifest.csv", "c.png"):
+    for name in ("b.npz", "a.NPY", ".b.1234.tmp.npz", MANIFEST, "c.png"):
         (tmp_path / name).touch()
     assert [path.name for path in recording_files(tmp_path)] == ["a.NPY", "b.npz"]
     assert recording_files(tmp_path / "b.npz") == [tmp_path / "b.npz"]
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=r"no recording in .*empty; give a folder of .npz or .npy"):
+    with pytest.raises(ValueError, match=r"no recording in .*empty; give a folder of \.npz or "):
         recording_files(tmp_path / "empty")
-    with pytest.raises(ValueError, match=r"c\.png must end in .npz or .npy"):
+    with pytest.raises(ValueError, match=r"c\.png must end in \.npz or "):
         recording_files(tmp_path / "c.png")
     with pytest.raises(FileNotFoundError, match="no file or folder at"):
         recording_files(tmp_path / "nowhere")
+
+
+def test_arrays_of_others(tmp_path):
+    volts = np.arange(18, dtype=np.int16).reshape(9, 2)
+    stamps = np.arange(9) * 500_000 + 10**18
+    np.savez(tmp_path / "a.npz", volts=volts, stamp=stamps, fs=2000.0)
+    with (
+        pytest.raises(ValueError, match=r"has no array 'samples', it has volts, stamp, fs; say"),
+        npz.open(tmp_path / "a.npz"),
+    ):
+        pass
+    with npz.open(tmp_path / "a.npz", Reading(samples="volts", time_unit="ns")) as opened:
+        samples, rest, names, times, rate = opened
+        assert (rest, names, rate) == (None, None, 2000.0)
+        assert samples.dtype == torch.float32
+        assert samples.read(2, 4).tolist() == [[4.0, 6.0], [5.0, 7.0]]
+        assert times.read(7, 9).tolist() == pytest.approx([0.0035, 0.004], abs=1e-15)
+    for how, said in (
+        (Reading(samples="volts", time="clock"), "reading.time='clock' is none of volts, stamp"),
+        (Reading(samples="volts", time="volts"), "has 9 samples and 18 times in 'volts'"),
+    ):
+        with pytest.raises(ValueError, match=said), npz.open(tmp_path / "a.npz", how):
+            pass
+    np.savez(tmp_path / "square.npz", volts=np.zeros((3, 3)))
+    with (
+        pytest.raises(ValueError, match="3 by 3, so it does not show which axis is time"),
+        npz.open(tmp_path / "square.npz", Reading(samples="volts")),
+    ):
+        pass
+    np.save(tmp_path / "b.npy", volts.T)
+    with npz.open(tmp_path / "b.npy", Reading(time_first=False)) as opened:
+        assert opened.samples.read(0, 2).tolist() == [[0.0, 2.0], [1.0, 3.0]]

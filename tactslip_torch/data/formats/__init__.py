@@ -1,0 +1,1 @@
+"""Files of recordings: ours, and those that people have; a module a format, one registry."""
