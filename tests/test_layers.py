@@ -36,7 +36,13 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "hand",
         "files",
     ),
+    "data.formats.columns": ("data.formats.reading",),
+    "data.formats.text_layout": ("data.formats.reading",),
+    "data.formats.text_table": ("data.formats.text_layout",),
     "data.formats.text": (
+        "data.formats.columns",
+        "data.formats.text_layout",
+        "data.formats.text_table",
         "data.formats.header",
         "data.formats.reading",
         "data.recording",
