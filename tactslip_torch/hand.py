@@ -6,13 +6,22 @@ kind of channels asks a ``HandLayout``, so another hand is another layout and no
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Literal, get_args
 
-ChannelKind = Literal["SG", "PVDF"]
-"""``"SG"``: strain gauge, slowly adapting. ``"PVDF"``: piezoelectric film, fast adapting."""
+Adapting = Literal["slow", "fast"]
+"""How a channel answers a touch that stays, after the afferents of skin.
+
+``"slow"``: as long as it stays; described by the statistics of its bin. ``"fast"``: as long as it
+changes; described by wavelet branches and their spectra.
+"""
+KNOWN_KINDS: Mapping[str, Adapting] = MappingProxyType({"SG": "slow", "PVDF": "fast"})
+"""The paper's kinds, strain gauges and piezoelectric films: their word says how they adapt."""
+_REQUIRED = ("name", "kind", "finger", "segment")
 
 
 @dataclass(frozen=True)
@@ -21,25 +30,65 @@ class Channel:
 
     Args:
         name: unique in its hand, such as ``"PVDF7"``.
-        kind: ``"SG"`` or ``"PVDF"``; decides the filter and the features of the channel.
+        kind: what it is, in one word, such as ``"SG"``, ``"PVDF"`` or ``"electrode"``; decides the
+            filter of the channel.
         finger: the finger it sits in, such as ``"index"``.
         segment: the part of the finger, such as ``"distal"``.
+        adapting: ``"slow"`` or ``"fast"``; decides the features of the channel. What the kind
+            implies if it is one of ``KNOWN_KINDS`` and nothing else is said; never ``None`` once
+            the channel is made.
 
     Raises:
-        ValueError: if ``kind`` is neither.
+        ValueError: if a name is no text, the kind is no single word, or how the channel adapts
+            is neither said nor known.
+
+    Example:
+        >>> Channel("SG1", "SG", "index", "distal").adapting
+        'slow'
+        >>> Channel("E7", "electrode", "thumb", "distal", adapting="fast").adapting
+        'fast'
     """
 
     name: str
-    kind: ChannelKind
+    kind: str
     finger: str
     segment: str
+    adapting: Adapting | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(ChannelKind):
+        for what in _REQUIRED:
+            if not isinstance(getattr(self, what), str):
+                raise ValueError(
+                    f"channel {self.name!r}: {what} must be text, got {getattr(self, what)!r}; "
+                    "put it in quotes"
+                )
+        if self.kind.split() != [self.kind]:
             raise ValueError(
-                f"channel {self.name!r}: kind must be one of {list(get_args(ChannelKind))}, "
+                f"channel {self.name!r}: kind must be one word, such as SG, PVDF or electrode, "
                 f"got {self.kind!r}"
             )
+        if self.adapting is None:
+            if self.kind not in KNOWN_KINDS:
+                raise ValueError(
+                    f"channel {self.name!r}: of kind {self.kind!r} it is not known how it adapts; "
+                    "say adapting: slow (statistics of the bin) or adapting: fast (wavelet "
+                    "branches and spectra)"
+                )
+            object.__setattr__(self, "adapting", KNOWN_KINDS[self.kind])
+        if self.adapting not in get_args(Adapting):
+            raise ValueError(
+                f"channel {self.name!r}: adapting must be slow or fast, got {self.adapting!r}"
+            )
+
+    def to_row(self) -> dict[str, str]:
+        """The plain row that ``HandLayout.from_rows`` reads.
+
+        It holds ``adapting`` only where that is not what the kind implies.
+        """
+        row = {what: str(getattr(self, what)) for what in _REQUIRED}
+        if self.adapting != KNOWN_KINDS.get(self.kind):
+            row["adapting"] = str(self.adapting)
+        return row
 
 
 @dataclass(frozen=True)
@@ -56,8 +105,8 @@ class HandLayout:
         >>> hand = HandLayout.paper24()
         >>> len(hand), hand.names[0], hand.names[-1]
         (24, 'SG1', 'PVDF10')
-        >>> hand.indices("PVDF")[:3]
-        (14, 15, 16)
+        >>> hand.fast[:3], hand.indices("PVDF")[:3]
+        ((14, 15, 16), (14, 15, 16))
     """
 
     channels: tuple[Channel, ...]
@@ -66,7 +115,7 @@ class HandLayout:
         object.__setattr__(self, "channels", tuple(self.channels))
         if not self.channels:
             raise ValueError("a hand needs at least one channel, got none")
-        twice = sorted({name for name in self.names if self.names.count(name) > 1})
+        twice = sorted(name for name, count in Counter(self.names).items() if count > 1)
         if twice:
             raise ValueError(f"channel names must be unique, got {twice} more than once")
 
@@ -78,8 +127,23 @@ class HandLayout:
         """Channel names in file order."""
         return tuple(channel.name for channel in self.channels)
 
-    def indices(self, kind: ChannelKind) -> tuple[int, ...]:
-        """Positions of the channels of one kind, in file order."""
+    @cached_property
+    def slow(self) -> tuple[int, ...]:
+        """Positions of the slowly adapting channels, in file order."""
+        return tuple(i for i, channel in enumerate(self.channels) if channel.adapting == "slow")
+
+    @cached_property
+    def fast(self) -> tuple[int, ...]:
+        """Positions of the fast adapting channels, in file order."""
+        return tuple(i for i, channel in enumerate(self.channels) if channel.adapting == "fast")
+
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of channels, each once, in file order."""
+        return tuple(dict.fromkeys(channel.kind for channel in self.channels))
+
+    def indices(self, kind: str) -> tuple[int, ...]:
+        """Positions of the channels of one kind, in file order; none if there is no such kind."""
         return tuple(i for i, channel in enumerate(self.channels) if channel.kind == kind)
 
     def channel(self, name: str) -> Channel:
@@ -88,10 +152,13 @@ class HandLayout:
         Raises:
             KeyError: if the hand has no such channel.
         """
-        for channel in self.channels:
-            if channel.name == name:
-                return channel
-        raise KeyError(f"no channel {name!r} in this hand; it has {', '.join(self.names)}")
+        if name not in self._by_name:
+            raise KeyError(f"no channel {name!r} in this hand; it has {', '.join(self.names)}")
+        return self._by_name[name]
+
+    @cached_property
+    def _by_name(self) -> dict[str, Channel]:
+        return {channel.name: channel for channel in self.channels}
 
     @classmethod
     def paper24(cls) -> HandLayout:
@@ -113,23 +180,29 @@ class HandLayout:
 
     @classmethod
     def from_rows(cls, rows: Iterable[Mapping[str, str]]) -> HandLayout:
-        """A hand from plain rows with ``name``, ``kind``, ``finger``, ``segment`` (configuration).
+        """A hand from plain rows of configuration or of a file.
+
+        Args:
+            rows: ``name``, ``kind``, ``finger``, ``segment`` and, where the kind does not say it,
+                ``adapting``.
 
         Raises:
-            ValueError: if a row lacks one of the four or has another key, named with its row.
+            ValueError: if a row lacks one of the four or has another key, or no channel can be
+                made of it; named with its row.
         """
         channels = []
         for number, row in enumerate(rows, 1):
-            if set(row) != {"name", "kind", "finger", "segment"}:
+            if not set(_REQUIRED) <= set(row) <= {*_REQUIRED, "adapting"}:
                 raise ValueError(
-                    f"channel row {number}: expected name, kind, finger, segment, got {sorted(row)}"
+                    f"channel row {number}: expected {', '.join(_REQUIRED)} and, for kinds other "
+                    f"than {' and '.join(KNOWN_KINDS)}, adapting; got {sorted(map(str, row))}"
                 )
-            channels.append(Channel(**row))  # type: ignore[arg-type]  # kind is checked there
+            try:
+                channels.append(Channel(**row))  # type: ignore[arg-type]  # checked there
+            except ValueError as error:
+                raise ValueError(f"channel row {number}: {error}") from None
         return cls(tuple(channels))
 
     def to_rows(self) -> list[dict[str, str]]:
         """The plain rows that ``from_rows`` reads."""
-        return [
-            {"name": c.name, "kind": c.kind, "finger": c.finger, "segment": c.segment}
-            for c in self.channels
-        ]
+        return [channel.to_row() for channel in self.channels]

@@ -201,7 +201,7 @@ def _run_fold(
 
 def _rivals(detector: SlipDetector) -> dict[str, Scorer]:
     """The methods that the paper argues against, on the detector's hand, filter and bins."""
-    if not detector.pool.hand.indices("PVDF"):
+    if not detector.pool.hand.fast:
         return {}
     return {
         name.replace("_", " "): BaselineDetector(name, detector.pool, detector.channel_filter)

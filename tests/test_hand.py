@@ -79,9 +79,52 @@ def test_a_name_that_occurs_twice_is_refused():
         HandLayout.from_rows([ROWS[0], ROWS[1], ROWS[0]])
 
 
-def test_an_unknown_kind_is_refused():
-    with pytest.raises(ValueError, match=r"channel 'pad': kind must be .*'SG', 'PVDF'.*got 'FSR'"):
-        HandLayout.from_rows([ROWS[0] | {"kind": "FSR"}])
+@pytest.mark.parametrize(
+    ("kind", "adapting", "known"), [("SG", None, "slow"), ("PVDF", None, "fast")]
+    + [(kind, way, way) for kind in ("SG", "PVDF", "electrode") for way in ("slow", "fast")],
+)  # fmt: skip
+def test_how_a_channel_adapts_is_said_or_known(kind, adapting, known):
+    assert Channel("a", kind, "index", "distal", adapting).adapting == known
+
+
+def test_slow_and_fast_part_a_hand_whatever_its_kinds():
+    kinds = [("electrode", "fast"), ("SG", "fast"), ("PVDF", None), ("force", "slow"), ("SG", None)]
+    channels = [Channel(f"c{i}", kind, "f", "s", way) for i, (kind, way) in enumerate(kinds)]
+    hand = HandLayout(channels)
+    assert (hand.fast, hand.slow) == ((0, 1, 2), (3, 4))
+    assert hand.kinds == ("electrode", "SG", "PVDF", "force")
+    assert (hand.indices("SG"), hand.indices("IMU")) == ((1, 4), ())
+    paper = HandLayout.paper24()
+    assert (paper.slow, paper.fast) == (paper.indices("SG"), paper.indices("PVDF"))
+
+
+def test_rows_say_how_a_channel_adapts_only_where_its_kind_does_not():
+    own = [ROWS[0] | {"adapting": "fast"}, ROWS[1] | {"kind": "electrode", "adapting": "slow"}]
+    hand = HandLayout.from_rows([own[0], own[1] | {"name": "e"}])
+    assert hand.to_rows() == [own[0], own[1] | {"name": "e"}]
+    assert HandLayout.from_rows(hand.to_rows()) == hand
+    assert HandLayout.from_rows([ROWS[0] | {"adapting": "slow"}]).to_rows() == [ROWS[0]]
+    assert HandLayout.from_rows([ROWS[0] | {"adapting": None}]).to_rows() == [ROWS[0]]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "FSR"}, "channel 'film': of kind 'FSR' .* say adapting: slow .* or .*fast"),
+        ({"kind": "FSR", "adapting": "quick"}, "adapting must be slow or fast, got 'quick'"),
+        ({"adapting": ""}, "adapting must be slow or fast, got ''"),
+        ({"kind": "two words"}, "kind must be one word, .* got 'two words'"),
+        ({"kind": ""}, "kind must be one word, .* got ''"),
+        ({"kind": " SG"}, "kind must be one word, .* got ' SG'"),
+        ({"kind": 3}, "kind must be text, got 3"),
+        ({"finger": None}, "finger must be text, got None"),
+        ({"name": 7}, "channel 7: name must be text, got 7"),
+    ],
+)
+def test_what_is_no_channel_is_refused_with_its_row(change, message):
+    with pytest.raises(ValueError, match=f"^channel row 2: .*{message}") as refused:
+        HandLayout.from_rows([ROWS[0], ROWS[1] | change])
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("row", [{"name": "pad", "kind": "SG"}, ROWS[0] | {"gain": "2"}])

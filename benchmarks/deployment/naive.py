@@ -24,7 +24,7 @@ from benchmarks.deployment.definitions import described
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.files import whole_file
-from tactslip_torch.hand import ChannelKind
+from tactslip_torch.hand import Adapting
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -34,7 +34,7 @@ from tactslip_torch.signals.wavelet import branch_names, wavelet_branches
 
 OPSET = 20
 _RATIO = "band_energy_ratio"
-_KINDS: tuple[ChannelKind, ...] = ("SG", "PVDF")
+_WAYS: tuple[Adapting, ...] = ("slow", "fast")
 
 
 class _Block(NamedTuple):
@@ -102,10 +102,10 @@ class NaivePipeline(nn.Module):
             "width": scaler.maximum - scaler.minimum,
             "knee": scaler.knee,
         }
-        for kind in _KINDS:
-            length = channel_filter.window_lengths[pool.hand.indices(kind)[0]]
+        for way in _WAYS:
+            length = channel_filter.window_lengths[_places(pool, way)[0]]
             kernel = edge_matrices(length, channel_filter.polyorder, "centred")[1]
-            constants[f"kernel_{kind}"] = kernel[None, None]  # symmetric, as it is centred
+            constants[f"kernel_{way}"] = kernel[None, None]  # symmetric, as it is centred
         for name, value in constants.items():
             self.register_buffer(name, None if value is None else value.clone())
         self.machine = KernelSum(machine.support, machine.beta, machine.kernel)
@@ -119,21 +119,21 @@ class NaivePipeline(nn.Module):
         return score
 
     def _features(self, samples: Tensor) -> Tensor:
-        films = self._filtered(samples, "PVDF")
+        films = self._filtered(samples, "fast")
         flat = wavelet_branches(films.flatten(0, 1), self._pool.wavelet, self._pool.level)
         branches = flat.unflatten(0, (-1, films.shape[1]))  # [B, films, branches, n]
         spectra = amplitude_spectrum(branches, self._pool.spectrum)
         parts = []
         for block in self._blocks:
             if block.components == ("raw",):
-                gauges = _taken(self._filtered(samples, "SG"), 1, self._rows("SG", block))
+                gauges = _taken(self._filtered(samples, "slow"), 1, self._rows("slow", block))
                 values = described(gauges[:, :, None], gauges.abs().amax(-1)[..., None])
             elif block.descriptors == (_RATIO,):
                 energies = (spectra * spectra).sum(-1)
                 shares = energies / energies.sum(-1, keepdim=True)
                 values = {_RATIO: self._chosen(shares, block)}
             else:
-                raw = _taken(films, 1, self._rows("PVDF", block))[:, :, None]
+                raw = _taken(films, 1, self._rows("fast", block))[:, :, None]
                 scale = raw.abs().amax(-1)
                 x = self._chosen(branches if block.domain == "time" else spectra, block)
                 if block.domain == "time":
@@ -143,11 +143,11 @@ class NaivePipeline(nn.Module):
             parts.append(torch.stack([values[name] for name in block.descriptors], -1).flatten(1))
         return torch.cat(parts, -1)
 
-    def _filtered(self, samples: Tensor, kind: ChannelKind) -> Tensor:
-        """All channels of a kind, ``[B, channels, n]``."""
-        kernel = self.get_buffer(f"kernel_{kind}")
+    def _filtered(self, samples: Tensor, way: Adapting) -> Tensor:
+        """All channels that adapt so, ``[B, channels, n]``."""
+        kernel = self.get_buffer(f"kernel_{way}")
         start = self._context - kernel.shape[-1] // 2
-        rows = _taken(samples, 1, list(self._pool.hand.indices(kind)))
+        rows = _taken(samples, 1, list(_places(self._pool, way)))
         rows = rows.narrow(-1, start, self._pool.bin_samples + kernel.shape[-1] - 1)
         num = rows.shape[1]
         filtered: Tensor = conv1d(rows.flatten(0, 1)[:, None], kernel)
@@ -157,13 +157,16 @@ class NaivePipeline(nn.Module):
         """Of all films and branches, ``[B, films, branches, *]``, those of a block."""
         order = branch_names(self._pool.level)
         components = [order.index(name) for name in block.components]
-        return _taken(_taken(x, 1, self._rows("PVDF", block)), 2, components)
+        return _taken(_taken(x, 1, self._rows("fast", block)), 2, components)
 
-    def _rows(self, kind: ChannelKind, block: _Block) -> list[int]:
-        """Places of a block's channels among those of its kind."""
-        hand = self._pool.hand
-        order = [hand.names[index] for index in hand.indices(kind)]
+    def _rows(self, way: Adapting, block: _Block) -> list[int]:
+        """Places of a block's channels among those that adapt as they do."""
+        order = [self._pool.hand.names[index] for index in _places(self._pool, way)]
         return [order.index(name) for name in block.channels]
+
+
+def _places(pool: FeaturePool, way: Adapting) -> tuple[int, ...]:
+    return pool.hand.slow if way == "slow" else pool.hand.fast
 
 
 def export_naive(module: NaivePipeline, samples: Tensor, path: Path) -> None:

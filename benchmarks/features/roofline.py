@@ -69,7 +69,7 @@ def work(pool: FeaturePool, dtype: str) -> dict[str, float]:
     """Bytes and operations of a bin, by the model above."""
     num = pool.bin_samples
     lines = len(frequency_axis_hz(num, pool.sample_rate_hz, pool.spectrum))
-    films, gauges = len(pool.hand.indices("PVDF")), len(pool.hand.indices("SG"))
+    films, gauges = len(pool.hand.fast), len(pool.hand.slow)
     names = branch_names(pool.level)
     ranks = torch.linalg.matrix_rank(branch_matrix(num, pool.wavelet, pool.level)).tolist()
     products = 0.0

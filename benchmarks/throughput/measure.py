@@ -120,7 +120,7 @@ def channels(timed: Timed, sizes: Sizes) -> dict[str, Any]:
     rows = []
     for num in sizes.channels:
         pool = FeaturePool(hand_of(num), arithmetic="native")
-        films = len(pool.hand.indices("PVDF"))
+        films = len(pool.hand.fast)
         rows += _curve(pool, sizes, f"{num} channels", {"channels": num, "films": films})
     return {"rows": rows}
 

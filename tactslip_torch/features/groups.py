@@ -23,19 +23,21 @@ def allowed(
 ) -> Tensor:
     """Which features are of a group of channels and of a group of components, ``[F]``, bool.
 
+    Gauges are the channels that adapt slowly, films those that adapt fast, whatever their kind.
+
     Raises:
         ValueError: for an unknown group.
     """
-    kinds = {"all": ("SG", "PVDF"), "films": ("PVDF",), "gauges": ("SG",)}
-    if channels.split(" without ")[0] not in kinds or components not in get_args(Components):
+    ways = {"all": ("slow", "fast"), "films": ("fast",), "gauges": ("slow",)}
+    if channels.split(" without ")[0] not in ways or components not in get_args(Components):
         raise ValueError(
             f"unknown group {channels!r} or {components!r}, expected one of "
             f"{', '.join(get_args(Channels))} and one of {', '.join(get_args(Components))}"
         )
-    kind_of = {channel.name: channel.kind for channel in hand.channels}
+    adapting = {channel.name: channel.adapting for channel in hand.channels}
     return torch.tensor(
         [
-            kind_of[name.channel] in kinds[channels.split(" without ")[0]]
+            adapting[name.channel] in ways[channels.split(" without ")[0]]
             and _is_of(name, components)
             for name in names
         ]

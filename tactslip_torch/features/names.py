@@ -18,7 +18,7 @@ class FeatureName:
 
     Args:
         channel: channel name, such as ``"PVDF3"``.
-        component: ``"raw"`` (SG) or a branch, ``"A1"`` to ``"D4"``.
+        component: ``"raw"`` (of a slowly adapting channel) or a branch, ``"A1"`` to ``"D4"``.
         domain: ``"time"`` or ``"freq"``.
         descriptor: name in ``descriptors.py``, or ``"band_energy_ratio"``.
 
@@ -40,11 +40,11 @@ def pool_names(hand: HandLayout, level: int) -> tuple[FeatureName, ...]:
     """Names of all features of a hand, in the paper's order (REFERENCE.md section 4)."""
     names = [
         FeatureName(hand.names[i], "raw", "time", descriptor)
-        for i in hand.indices("SG")
+        for i in hand.slow
         for descriptor in COMMON_DESCRIPTORS
     ]
     domains = (("time", TIME_DESCRIPTORS), ("freq", SPECTRUM_DESCRIPTORS))
-    for channel in (hand.names[i] for i in hand.indices("PVDF")):
+    for channel in (hand.names[i] for i in hand.fast):
         names += [
             FeatureName(channel, f"{kind}{m}", domain, descriptor)
             for m in range(1, level + 1)

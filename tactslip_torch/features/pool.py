@@ -1,7 +1,8 @@
 """The pool: every descriptor of every channel, branch and spectrum (REFERENCE.md section 4).
 
 For the paper's hand 14 gauges x 13 descriptors + 10 films x (8 branches x (14 time + 15 frequency)
-+ 8 band energy ratios) = 2582 features of one 50 ms bin.
++ 8 band energy ratios) = 2582 features of a 50 ms bin. Of any hand, a gauge is a channel that
+adapts slowly, a film one that adapts fast.
 """
 
 from __future__ import annotations
@@ -18,12 +19,7 @@ from tactslip_torch.features.descriptors import (
     band_energy_ratio,
     describe,
 )
-from tactslip_torch.features.guards import (
-    are_positive,
-    bounded_gradient,
-    is_constant,
-    settle,
-)
+from tactslip_torch.features.guards import are_positive, bounded_gradient, is_constant, settle
 from tactslip_torch.features.names import pool_names
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.plain import is_recorded
@@ -99,8 +95,8 @@ class FeaturePool(nn.Module):
         self.level = level
         self.spectrum: SpectrumMethod = spectrum
         self.arithmetic: Arithmetic = arithmetic
-        self._gauges = list(hand.indices("SG"))
-        self._films = list(hand.indices("PVDF"))
+        self._gauges = list(hand.slow)
+        self._films = list(hand.fast)
         self._inverses: dict[torch.dtype, Tensor] = {}
         self.names = pool_names(hand, level)
         lines = spectrum_matrix(bin_samples, spectrum)

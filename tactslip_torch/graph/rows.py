@@ -96,7 +96,7 @@ class Front:
         self._missing: list[Value] = []
         self._trusted: list[Value] = []
         frames: dict[tuple[int, bool], list[int]] = {}
-        films = set(detector.pool.hand.indices("PVDF"))
+        films = set(detector.pool.hand.fast)
         lengths = detector.channel_filter.window_lengths
         for channel in self.window.channels:
             frames.setdefault((lengths[channel], channel in films), []).append(channel)

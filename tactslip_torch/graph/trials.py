@@ -26,7 +26,7 @@ def noise_bins(hand: HandLayout, num: int, length: int, seed: int, dtype: torch.
     size = 10 ** torch.linspace(0, -3, num, dtype=torch.float64)[:, None, None]
     noise = torch.randn(num, len(hand), length, generator=generator, dtype=torch.float64)
     samples = size * noise
-    samples[:, list(hand.indices("SG"))] += 1.0
+    samples[:, list(hand.slow)] += 1.0
     return samples.to(dtype)
 
 
@@ -55,11 +55,11 @@ def degenerate_bins(
 def simulated_stream(hand: HandLayout, sample_rate_hz: float, dtype: torch.dtype) -> Tensor:
     """A slip as the simulator records it, ``[C, T]``, volts; 1 s before its onset, .5 s behind.
 
-    Of another hand than the simulated one, each channel is the next of its kind.
+    Of another hand than the simulated one, each channel is the next that adapts as it does.
     """
     simulated = HandLayout.paper24()
-    places = {kind: cycle(simulated.indices(kind)) for kind in ("SG", "PVDF")}
-    rows = [next(places[channel.kind]) for channel in hand.channels]
+    places = {"slow": cycle(simulated.slow), "fast": cycle(simulated.fast)}
+    rows = [next(places[str(channel.adapting)]) for channel in hand.channels]
     return _simulated(sample_rate_hz)[rows].to(dtype)
 
 

@@ -51,7 +51,7 @@ def film_band_power(
 
     Args:
         bins: filtered, in volts.
-        films: positions of the PVDF channels, or a mask of them.
+        films: positions of the films, the fast adapting channels, or a mask of them.
         sample_rate_hz: of the bins.
         band_hz: least and largest frequency, both in it.
 
@@ -82,7 +82,7 @@ def largest_detail(
 
     Args:
         bins: filtered, in volts.
-        films: positions of the PVDF channels, or a mask of them.
+        films: positions of the films, the fast adapting channels, or a mask of them.
         wavelet: of the branches, as features have it.
         level: number of levels.
         levels: whose details count; default all.
@@ -143,13 +143,13 @@ class BaselineDetector:
     @property
     def needed_index(self) -> Tensor:
         """Channels in use, ``[films]``."""
-        return torch.tensor(self.pool.hand.indices("PVDF"), dtype=torch.int64)
+        return torch.tensor(self.pool.hand.fast, dtype=torch.int64)
 
     @property
     def look_ahead(self) -> int:
         """Samples behind a bin that the filter of the films takes in."""
         reaches = self.channel_filter.reaches
-        return max(reaches[film][1] for film in self.pool.hand.indices("PVDF"))
+        return max(reaches[film][1] for film in self.pool.hand.fast)
 
     def judge(self, bins: Tensor, *, given: torch.dtype | None = None) -> Judgement:
         """Score filtered bins. A film that is missing counts as silent, and the score as not valid.
@@ -212,7 +212,7 @@ def _places(films: Sequence[int] | Tensor, num_channels: int) -> list[int]:
     index = torch.as_tensor(films)
     places: list[int] = torch.arange(num_channels)[index.cpu()].tolist() if index.numel() else []
     if not places:
-        raise ValueError("a film's score needs a film; give positions of PVDF channels")
+        raise ValueError("a film's score needs a film; give positions of fast adapting channels")
     return places
 
 

@@ -195,7 +195,7 @@ def _draw_bursts(scene: Scene, duration_s: float) -> tuple[Array, Array, Array, 
     omegas = 2 * np.pi * 15.0 * 10.0 ** rng.random(num)
     decays = 1.0 / (0.005 * 10.0 ** rng.random(num))
     reach = rng.random((num, len(scene.hand))) < 0.5
-    kind = np.array([1.0 if c.kind == "PVDF" else 0.3 for c in scene.hand.channels])
+    share = np.array([1.0 if c.adapting == "fast" else 0.3 for c in scene.hand.channels])
     sizes = 1e-3 * knobs.burst_mv * lognormal(rng, 0.5, (num, 1))
-    sizes = sizes * lognormal(rng, 0.5, (num, len(scene.hand))) * kind * reach
+    sizes = sizes * lognormal(rng, 0.5, (num, len(scene.hand))) * share * reach
     return times, omegas, decays, sizes

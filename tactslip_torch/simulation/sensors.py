@@ -61,7 +61,7 @@ def draw_front(scene: Scene) -> Front:
     sg_offset = knobs.sg_session_offset_v * session.standard_normal(num)
     sg_offset = sg_offset + knobs.sg_offset_v * rng.standard_normal(num)
     pvdf_offset = 1e-3 * knobs.pvdf_offset_mv * rng.uniform(-1.0, 1.0, num)
-    is_sg = np.array([channel.kind == "SG" for channel in scene.hand.channels])
+    is_sg = np.array([channel.adapting == "slow" for channel in scene.hand.channels])
     return Front(
         gain=gain,
         white_v=1e-3 * floor_mv * lognormal(session, 0.2, num),
@@ -126,8 +126,8 @@ def film_volts(
 
 def drift(scene: Scene, index: int, grid: Grid) -> Array:
     """Slow drift of one channel in volts, ``[K, B]``: a few slow sines."""
-    kind = scene.hand.channels[index].kind
-    size_mv = scene.sensors.sg_drift_mv if kind == "SG" else scene.sensors.pvdf_drift_mv
+    is_sg = scene.hand.channels[index].adapting == "slow"
+    size_mv = scene.sensors.sg_drift_mv if is_sg else scene.sensors.pvdf_drift_mv
     rng = generator(*recording_key(scene, "drift"), index)
     hertz = 0.05 * 40.0 ** rng.random(DRIFT_TONES)
     phase = 2 * np.pi * rng.random(DRIFT_TONES)
@@ -150,7 +150,7 @@ def warming(scene: Scene, index: int, grid: Grid, duration_s: float) -> Array:
     channel's own; a film moves a fiftieth as far as a gauge.
     """
     rng = generator(*recording_key(scene, "warming"), index)
-    share = 1.0 if scene.hand.channels[index].kind == "SG" else FILM_WARMING_SHARE
+    share = 1.0 if scene.hand.channels[index].adapting == "slow" else FILM_WARMING_SHARE
     sign = 1.0 if rng.random() < 0.5 else -1.0
     far_v = 1e-3 * scene.sensors.warming_mv * share * sign * float(lognormal(rng, 0.5))
     since = np.maximum(grid.time_s, 0.0) / duration_s

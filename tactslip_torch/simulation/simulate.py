@@ -128,7 +128,7 @@ def _volts(
         for index in indices:
             if grasp.element_of_channel[index] != element:
                 continue
-            if scene.hand.channels[index].kind == "SG":
+            if scene.hand.channels[index].adapting == "slow":
                 felt = gauge_volts(scene, normal_n[now], shear_n[now], vibration)
             else:
                 felt = film_volts(scene, grid, shear_n, vibration, press_n)
