@@ -161,5 +161,6 @@ def common_facts(source: RecordingSource, pool: FeaturePool, config: DictConfig)
         "seed": config.seed,
         "labels": OmegaConf.to_container(config.labels, resolve=True),
         "num_features_pool": len(pool.names),
+        "is_papers_hand": pool.hand == HandLayout.paper24(),
         "versions": versions(),
     }

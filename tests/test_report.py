@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.image import imread
+from matplotlib.text import Text
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, recall_score
 from sklearn.metrics import confusion_matrix as oracle_confusion
 
@@ -27,6 +28,7 @@ from tactslip_torch.report import (
     timing_table,
 )
 from tactslip_torch.report.scores import merged_metrics
+from tactslip_torch.report.tables import PAPER_LINE
 
 SCORE_KEYS = {
     "accuracy",
@@ -390,6 +392,11 @@ def test_the_papers_numbers_stand_beside_its_own_scenes_alone(
     (panel,) = drawn[0].axes
     assert ("paper: non-slip 93.8" in panel.get_xlabel()) == is_papers
     assert any(row[0] == "paper" for row in rows_of(splits_table(metrics))) == is_papers
+    elsewhere = metrics | {"is_papers_hand": False}
+    confusion_figure(elsewhere, tmp_path / "confusion.png")
+    assert drawn[1].axes[0].get_xlabel() == "prediction\n\n"
+    assert PAPER_LINE in splits_table(metrics)
+    assert PAPER_LINE not in splits_table(elsewhere)
 
 
 def test_confusion_figure_with_many_splits_and_an_absent_class(tmp_path: Path) -> None:
@@ -403,11 +410,27 @@ def test_selected_features_figure(tmp_path: Path, selected: list[dict[str, str]]
     assert_drawn_atomically(tmp_path / "selected.png")
 
 
-def test_selected_features_figure_of_another_hand(tmp_path: Path) -> None:
-    row = {"channel": "X1", "component": "raw", "domain": "time", "descriptor": "mean"}
-    rows = [row | {"name": "X1", "kind": "SG", "finger": "palm"}]
+@pytest.mark.parametrize("kinds", [("SG",), ("electrode",), ("IMU", "SG"), tuple("abcdefghi")])
+def test_selected_features_of_another_hand_stand_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kinds: tuple[str, ...]
+) -> None:
+    row = {"channel": "X1", "component": "D6", "domain": "freq", "descriptor": "mean"}
+    rows = [row | {"name": "X1", "kind": kind, "finger": "palm"} for kind in kinds]
     selected_features_figure(rows, tmp_path / "selected.png", simulated=False)
     assert_drawn_atomically(tmp_path / "selected.png")
+    drawn = []
+    monkeypatch.setattr(
+        "matplotlib.figure.Figure.savefig",
+        lambda figure, target, **_: drawn.append(figure) or Path(target).touch(),
+    )
+    selected_features_figure(rows, tmp_path / "again.png", simulated=False)
+    bars = drawn[0].axes[0]
+    heights = {layer.get_label(): sum(b.get_height() for b in layer) for layer in bars.containers}
+    assert {kind: heights[kind] for kind in kinds} == dict.fromkeys(kinds, 1)
+    words = [text.get_text() for axes in drawn[0].axes for text in axes.findobj(Text)]
+    assert not any("paper" in word or "[" in word for word in words)
+    assert "paper" not in selected_table(rows)
+    assert {row[0] for row in rows_of(selected_table(rows))} >= {"kind", "all"}
 
 
 def test_pipeline_figure(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_rgba
 from PIL import Image
 
-from tactslip_torch.hand import HandLayout
+from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.report.envelope import envelope
 from tactslip_torch.report.signals import SignalRow, channel_colours, draw_signals, signals_figure
 
@@ -221,6 +221,32 @@ def test_a_hand_of_films_alone_is_drawn():
     drawn = SignalRow("a", torch.randn(10, 200), RATE_HZ)
     (axes,) = draw_signals([drawn], films, title="").axes
     assert tuple(lines_of(axes)) == FILMS
+
+
+def test_other_kinds_stand_in_columns_by_how_they_adapt():
+    ways = {"electrode": "fast", "force": "slow", "SG": None, "PVDF": None}
+    channels = [
+        Channel(f"{kind}{i}", kind, "index", "distal", way)
+        for i in range(2)
+        for kind, way in ways.items()
+    ]
+    volts = torch.randn(8, 200)
+    rows = HandLayout(channels).to_rows()
+    axes = draw_signals([SignalRow("a", volts, RATE_HZ, units="counts")], rows, title="").axes
+    kinds = ["force", "force", "SG", "SG", "electrode", "PVDF"]
+    assert [one.get_title().split(",")[0] for one in axes] == kinds
+    for one, kind in zip(axes, kinds, strict=True):
+        names = [line.get_label() for line in one.lines]
+        assert [name for name in names if name.startswith(kind)] == [f"{kind}0", f"{kind}1"]
+    assert axes[0].get_ylabel() == "a\ncounts"
+    assert {text.get_text().split()[1] for one in axes for text in one.texts} == {"counts"}
+
+
+def test_a_figure_of_many_channels_has_room_for_their_names():
+    channels = [Channel(f"e{i}", "electrode", "index", "distal", "fast") for i in range(40)]
+    drawn = SignalRow("a", torch.randn(40, 200), RATE_HZ)
+    figure = draw_signals([drawn], HandLayout(channels).to_rows(), title="")
+    assert figure.get_figheight() > 40 * 7 / 72  # names are 6.5 points high
 
 
 def test_rows_that_do_not_fit_are_refused():

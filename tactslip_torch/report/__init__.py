@@ -1,12 +1,9 @@
 """What a run tells a person: scores per bin, tables, figures, and the paper's numbers beside."""
 
-from tactslip_torch.report.figures import (
-    confusion_figure,
-    pipeline_figure,
-    selected_features_figure,
-)
+from tactslip_torch.report.figures import confusion_figure, pipeline_figure
 from tactslip_torch.report.published import PublishedSplit
 from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
+from tactslip_torch.report.selected import selected_features_figure
 from tactslip_torch.report.tables import (
     materials_table,
     selected_table,

@@ -11,8 +11,9 @@ from tactslip_torch.files import whole_file
 from tactslip_torch.report.alarm import alarm_figure, alarm_table, scenes_table
 from tactslip_torch.report.confound import by_detector, confound_figure, confound_table
 from tactslip_torch.report.events import events_figure, events_table, has_events
-from tactslip_torch.report.figures import confusion_figure, selected_features_figure
+from tactslip_torch.report.figures import confusion_figure
 from tactslip_torch.report.reliability import reliability_figure, reliability_table
+from tactslip_torch.report.selected import selected_features_figure
 from tactslip_torch.report.tables import (
     materials_table,
     selected_table,

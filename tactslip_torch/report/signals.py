@@ -1,9 +1,10 @@
 """Recordings as a figure: gauges left, films right, one recording a row, onsets marked.
 
-What the paper's signal figure shows (section V-A), of any scene. Gauges stand overlaid in volts, so
-that their offsets before the onset can be read, and again in a lane each, so that their changes
-can; films have lanes, so that every burst is seen. Colours are fingers, of a palette that the
-colour-blind can tell apart, paler towards the palm.
+What the paper's signal figure shows (section V-A), of any scene and any hand. Gauges, and other
+slowly adapting channels, stand overlaid as measured, so that their offsets before the onset can be
+read, and again in a lane each, so that their changes can; films, and others that adapt fast, have
+lanes, so that every burst is seen. Colours are fingers, of a palette that the colour-blind can tell
+apart, paler towards the palm.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from tactslip_torch.files import whole_file
 from tactslip_torch.report.envelope import Array, envelope
 
 Channels = Sequence[Mapping[str, str]]
-"""Rows of ``name``, ``kind``, ``finger``, ``segment``, as ``HandLayout.to_rows`` gives them."""
+"""Rows of ``name``, ``kind``, ``finger``, ``segment``, ``adapting`` where the kind does not say it,
+as ``HandLayout.to_rows`` gives them."""
 
 _STRETCHES = 1200  # of each line, of which the least and the greatest sample are drawn
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#AA4488", "#E69F00", "#444444", "#56B4E9")
@@ -42,19 +44,17 @@ _HANDLED: dict[str, Any] = {
     "zorder": 0,
 }
 _ONSET: dict[str, Any] = {"color": _INK, "linestyle": "-.", "linewidth": 1.0, "zorder": 1}
+_LANE = 0.13  # least height of one, in inches, for its name to be read
 _SMALL, _TEXT, _TITLE = 6.5, 9, 12  # font sizes in points
 _NUM_COLOURS = 255  # of the PNG: a third of the bytes, and nobody sees it
 
 
 class _Column(NamedTuple):
-    """One column of the figure."""
+    """One column of the figure: the channels of a kind that adapt alike."""
 
     kind: str
+    channels: list[int]
     in_lanes: bool
-    width: float
-
-
-_COLUMNS = (_Column("SG", False, 0.75), _Column("SG", True, 1.0), _Column("PVDF", True, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +63,12 @@ class SignalRow:
 
     Args:
         title: stands beside the row.
-        volts: filtered samples, ``[C, T]``; what is not finite is left out.
+        volts: filtered samples, ``[C, T]``, in ``units``; what is not finite is left out.
         sample_rate_hz: samples per second.
         onsets_s: exact onsets.
         sliding_s: start and end of each slide.
         non_slip_s: stretches without slip in which the hand is handled.
+        units: of the samples.
     """
 
     title: str
@@ -76,6 +77,7 @@ class SignalRow:
     onsets_s: Sequence[float] = ()
     sliding_s: Sequence[tuple[float, float]] = ()
     non_slip_s: Sequence[tuple[float, float]] = ()
+    units: str = "V"
 
     def around(self, stroke: int, before_s: float, after_s: float) -> tuple[float, float]:
         """Where to look for a stroke: around its onset or, where nothing slips, its start.
@@ -134,22 +136,25 @@ def draw_signals(
             raise ValueError(f"{row.title} has {len(row.volts)} channels, not {len(channels)}")
     if views is not None and len(views) != len(rows):
         raise ValueError(f"views must be one per row, got {len(views)} for {len(rows)}")
-    present = {channel["kind"] for channel in channels}
-    columns = [column for column in _COLUMNS if column.kind in present]
-    figure = Figure(figsize=(13.0, 1.9 * len(rows) + 1.3), layout="constrained")
-    widths = {"width_ratios": [column.width for column in columns]}
+    columns = _columns(channels)
+    height = max(1.9, *(_LANE * len(column.channels) for column in columns))
+    figure = Figure(figsize=(13.0, height * len(rows) + 1.3), layout="constrained")
+    widths = {"width_ratios": [1.0 if column.in_lanes else 0.75 for column in columns]}
     grid = figure.subplots(len(rows), len(columns), squeeze=False, gridspec_kw=widths)
     colours = channel_colours(channels)
     for place, row in enumerate(rows):
         view = (0.0, row.volts.shape[-1] / row.sample_rate_hz) if views is None else views[place]
         for axes, column in zip(grid[place], columns, strict=True):
-            own = [i for i, channel in enumerate(channels) if channel["kind"] == column.kind]
+            own = column.channels
             time_s, volts = _seen(row, own, view)
             names = [channels[i]["name"] for i in own]
-            draw = _in_lanes if column.in_lanes else _overlaid
-            draw(axes, time_s, volts, names, [colours[i] for i in own])
+            if column.in_lanes:
+                _in_lanes(axes, time_s, volts, names, [colours[i] for i in own], row.units)
+            else:
+                _overlaid(axes, time_s, volts, names, [colours[i] for i in own])
             _mark(axes, row, view)
-        grid[place][0].set_ylabel(f"{row.title}\nvolts", fontsize=_TEXT, color=_INK)
+        unit = "volts" if row.units == "V" else row.units
+        grid[place][0].set_ylabel(f"{row.title}\n{unit}", fontsize=_TEXT, color=_INK)
     for axes, column in zip(grid[0], columns, strict=True):
         how = "in lanes, offsets removed" if column.in_lanes else "as measured"
         axes.set_title(f"{column.kind}, {how}", fontsize=_TEXT, color=_GREY)
@@ -164,6 +169,20 @@ def draw_signals(
         fontsize=_TEXT,
     )
     return figure
+
+
+def _columns(channels: Channels) -> list[_Column]:
+    """Of every kind that adapts slowly two, as measured and in lanes; then of every other one."""
+    found: dict[tuple[bool, str], list[int]] = {}
+    for place, channel in enumerate(channels):
+        kind = channel["kind"]
+        is_fast = channel.get("adapting", "slow" if kind == "SG" else "fast") == "fast"
+        found.setdefault((is_fast, kind), []).append(place)
+    return [
+        _Column(kind, places, in_lanes)
+        for (is_fast, kind), places in sorted(found.items(), key=lambda item: item[0][0])
+        for in_lanes in ((True,) if is_fast else (False, True))
+    ]
 
 
 def channel_colours(channels: Channels) -> list[tuple[float, float, float]]:
@@ -195,9 +214,9 @@ def _overlaid(
 
 
 def _in_lanes(
-    axes: Axes, time_s: Array, volts: Array, names: list[str], colours: list[Any]
+    axes: Axes, time_s: Array, volts: Array, names: list[str], colours: list[Any], units: str
 ) -> None:
-    """A lane per channel around its median, the first at the top, and a bar of volts."""
+    """A lane per channel around its median, the first at the top, and a bar of so many units."""
     known = [v[np.isfinite(v)] for v in volts]
     rest = np.array([np.median(v) if v.size else 0.0 for v in known])
     lane_v = _lane_height([v for v in known if v.size])
@@ -219,7 +238,7 @@ def _in_lanes(
         clip_on=False,
     )
     axes.annotate(
-        f"{bar_v:g} V",
+        f"{bar_v:g} {units}",
         (1.02, middles[-1] + bar_v / 2),
         xycoords=("axes fraction", "data"),
         fontsize=_SMALL + 1,

@@ -27,8 +27,8 @@ _SCORES = {
 def splits_table(metrics: Mapping[str, Any]) -> str:
     """Accuracy, balanced accuracy, both recalls and bins of each split, the paper's row below.
 
-    The paper's row is left out where scenes are not its own. The first line says SIMULATED where
-    the data is.
+    The paper's row is left out where hand or scenes are not its own. The first line says SIMULATED
+    where the data is.
 
     Args:
         metrics: the content of ``metrics.json``.
@@ -39,9 +39,10 @@ def splits_table(metrics: Mapping[str, Any]) -> str:
         rows.append([name, *_score_cells(scores), str(scores["num_bins"])])
         if rival and name in rival["splits"]:
             rows.append(["  one feature", *_score_cells(rival["splits"][name]), "-"])
-        if paper := published.beside(name, scores):
+        if paper := published.beside(metrics, name):
             rows.append(["  paper", *_score_cells(vars(paper)), "-"])
-    return _titled(metrics, aligned(["split", *_SCORES.values(), "bins"], rows), PAPER_LINE)
+    source = [PAPER_LINE] if metrics.get("is_papers_hand", True) else []
+    return _titled(metrics, aligned(["split", *_SCORES.values(), "bins"], rows), *source)
 
 
 def materials_table(metrics: Mapping[str, Any]) -> str:
@@ -95,12 +96,14 @@ def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
     """How many selected features come from each kind, component, finger, domain, descriptor.
 
     The paper's counts stand beside where it prints them; for descriptors it gives only an order,
-    so their column holds a rank such as ``#1``, and ``0`` for the two it never selects.
+    so their column holds a rank such as ``#1``, and ``0`` for the two it never selects. Features
+    of another hand than the paper's stand alone.
 
     Args:
         selected: one mapping per feature with ``channel``, ``component``, ``domain``,
             ``descriptor``, ``kind`` and ``finger``.
     """
+    is_papers = published.is_of_papers_hand(selected)
     by_finger: Counter[str] = Counter()
     for counts in published.SELECTED_BY_FINGER.values():
         by_finger.update(counts)
@@ -113,6 +116,8 @@ def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
         "domain": {},
         "descriptor": ranks,
     }
+    if not is_papers:
+        beside = {key: {} for key in beside}
     rows = []
     for key, of_paper in beside.items():
         ours = Counter(feature[key] for feature in selected)
@@ -120,6 +125,8 @@ def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
             first = key if position == 0 else ""
             rows.append([first, value, str(count), str(of_paper.get(value, "-"))])
     rows.append(["all", "", str(len(selected)), str(published.NUM_SELECTED)])
+    if not is_papers:
+        return aligned(["selected by", "", "ours"], [row[:-1] for row in rows], num_left=2)
     table = aligned(["selected by", "", "ours", "paper"], rows, num_left=2)
     return (
         f"{table}\npaper, in words: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
