@@ -55,7 +55,7 @@ def model_facts(
         "layout": form.layout,
         "channels": list(hand.names),
         "kinds": [channel.kind for channel in hand.channels],
-        "unit": "V",
+        "unit": info.get("units", "V"),
         "sample_rate_hz": detector.pool.sample_rate_hz,
         "bin_samples": window.bin,
         "context_before_samples": window.before,
