@@ -1,0 +1,405 @@
+"""Manifests that people write: what they may look like, and that every mistake is named."""
+
+import csv
+import json
+import os
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactslip_torch.data.folder import manifest_line
+from tactslip_torch.data.manifest import COLUMNS, manifest_of, read_manifest
+from tactslip_torch.data.manifest_lines import read_lines
+from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.data.truth import FileTimeline, Truth, on_time, truth_of
+
+FILES = ("a.csv", "b.csv", "c.csv")
+
+
+@pytest.fixture
+def root(tmp_path):
+    """A folder with three files and one in a folder of its own."""
+    folder = tmp_path / "set"
+    (folder / "day 2").mkdir(parents=True)
+    for name in (*FILES, "day 2/d.csv"):
+        (folder / name).write_text("1\n")
+    return folder
+
+
+def listed(root, text, name="manifest.csv"):
+    path = root / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return read_manifest(path, root)
+
+
+def problems(root, text, name="manifest.csv"):
+    return [str(problem) for problem in listed(root, text, name).problems]
+
+
+# What is read --------------------------------------------------------------------------------
+
+
+def test_a_table_of_files_materials_and_labels(root):
+    found = listed(
+        root,
+        "file,material,trial,onsets_s,sliding_s,non_slip_s,speeds_mm_s,label,sample_rate_hz\n"
+        "a.csv,wood,3,2.0; 9.0,2-7; 9-11.5,0-1.5,20; 40,,\n"
+        "\n"
+        "b.csv,wood,4,,,,,slip,1000\n"
+        "day 2/d.csv,iron,1,,,,,,\n",
+    )
+    assert found.problems == found.warnings == ()
+    first, second, third = found.entries
+    assert first.recording == RecordingId("wood", 3)
+    assert first.truth == Truth(
+        onsets_s=(2.0, 9.0),
+        sliding_s=((2.0, 7.0), (9.0, 11.5)),
+        non_slip_s=((0.0, 1.5),),
+        speeds_mm_s=(20.0, 40.0),
+    )
+    assert (first.sample_rate_hz, second.sample_rate_hz) == (None, 1000.0)
+    assert (second.place, second.truth) == ("manifest.csv:4", Truth(label="slip"))
+    assert (third.file, third.truth) == ("day 2/d.csv", None)
+
+
+def test_yaml_says_the_same_as_csv(root):
+    told = {"file": "a.csv", "material": "wood", "trial": "2", "sliding_s": "[[2, 7], [9, 11.5]]"}
+    table = ",".join(told) + "\n" + ",".join(f'"{value}"' for value in told.values()) + "\n"
+    (of_csv,) = listed(root, table).entries
+    for text in (
+        "- {file: a.csv, material: wood, trial: 2, sliding_s: [[2, 7], [9, 11.5]]}\n",
+        "recordings:\n  - file: a.csv\n    object: wood\n    cycle: 2\n"
+        "    sliding_s: [2-7, 9 to 11.5]\n    label:\n",
+    ):
+        (of_yaml,) = listed(root, text, "manifest.yaml").entries
+        assert of_yaml.truth == of_csv.truth
+        assert of_yaml.recording == of_csv.recording
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_columns_are_separated_as_spreadsheets_do_it(root, separator):
+    text = separator.join(["File", "Object", "Onsets s"]) + "\r\n"
+    text += separator.join(["a.csv", "wood", '"2.0; 9.0"']) + "\r\n"
+    found = listed(root, b"\xef\xbb\xbf" + text.encode())
+    assert found.problems == ()
+    assert found.entries[0].truth.onsets_s == (2.0, 9.0)
+
+
+def test_what_generate_writes_is_read(root):
+    import torch
+
+    content = Recording(
+        torch.zeros(2, 10),
+        2000.0,
+        "wood",
+        (20.0,),
+        (2.25,),
+        ((2.25, 7.5),),
+        (2.2,),
+        ((0.0, 1.0), (8.0, 9.0)),
+        {"simulated": True, "fidelity": "kinematic", "seed": 0},
+    )
+    line = manifest_line("a.csv", RecordingId("wood", 5, "taps"), content)
+    with (root / "manifest.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, list(line))
+        table.writeheader()
+        table.writerow(line)
+    found = read_manifest(root / "manifest.csv", root)
+    assert found.problems == found.warnings == ()
+    (entry,) = found.entries
+    assert entry.recording == RecordingId("wood", 5, "taps")
+    for name in ("onsets_s", "annotated_onsets_s", "sliding_s", "non_slip_s", "speeds_mm_s"):
+        assert getattr(entry.truth, name) == getattr(content, name)
+
+
+def test_trials_that_nobody_numbered_are_numbered_in_order(root):
+    found = listed(
+        root, "file,material,trial\na.csv,wood,\nb.csv,wood,0\nc.csv,wood,\nday 2/d.csv,iron,\n"
+    )
+    assert [str(e.recording) for e in found.entries] == ["wood/1", "wood/0", "wood/2", "iron/0"]
+
+
+def test_the_manifest_is_found_or_asked_for(root):
+    with pytest.raises(FileNotFoundError, match=r"no manifest\.csv or .*action=label_template"):
+        manifest_of(root)
+    (root / "manifest.yml").write_text("")
+    assert manifest_of(root) == root / "manifest.yml"
+    (root / "manifest.csv").write_text("")
+    with pytest.raises(ValueError, match=r"has manifest\.csv and manifest\.yml; say which"):
+        manifest_of(root)
+    assert manifest_of(root, "manifest.csv") == root / "manifest.csv"
+    with pytest.raises(FileNotFoundError, match="no folder at"):
+        manifest_of(root / "nowhere")
+    with pytest.raises(FileNotFoundError, match=r"no manifest at .*other\.csv"):
+        read_manifest(manifest_of(root, "other.csv"), root)
+
+
+# What is wrong -------------------------------------------------------------------------------
+
+
+def test_every_problem_of_every_line_is_listed_at_once(root):
+    found = problems(
+        root,
+        "file,material,trial,onsets,onset_s,label,non_slip_s\n"
+        "a.csv,wood,0,,,,\n"
+        "aa.csv,,x,,,maybe,5-2\n"
+        "b.csv,wood,0,,,slip,1-2\n"
+        "a.csv,iron,1,,,\n"
+        "a.csv,iron,2,,,,\n",
+    )
+    assert found == [
+        "manifest.csv:5: has 6 cells, the header 7; put in quotes what holds a ','",
+        "manifest.csv:1: unknown column 'onsets'; did you mean 'onsets_s'?",
+        "manifest.csv:1: unknown column 'onset_s'; did you mean 'onsets_s'?",
+        "manifest.csv:3: no file 'aa.csv' in the folder; did you mean 'a.csv'?",
+        "manifest.csv:3: no material",
+        "manifest.csv:3: trial must be a whole number from 0, got 'x'; empty ones are numbered in "
+        "their order",
+        "manifest.csv:3: label: must be slip, non-slip or empty, got 'maybe'",
+        "manifest.csv:4: label slip says all of it, and onsets or stretches are given as well; "
+        "give one of both",
+        "manifest.csv:6: file 'a.csv' was listed in manifest.csv:2",
+    ]
+
+
+def test_a_trial_that_is_listed_twice_is_named(root):
+    found = problems(root, "file,material,trial\na.csv,wood,0\nb.csv,wood,0\n")
+    line = "manifest.csv:3: trial 0 of wood, scene paper, was listed in manifest.csv:2"
+    assert found == [line]
+    scenes = "file,material,trial,scene\na.csv,wood,0,\nb.csv,wood,0,taps\n"
+    assert problems(root, scenes) == []
+
+
+def test_other_columns_are_said_not_to_be_read_and_likely_twins_are_named(root):
+    found = listed(root, "file,material,weather\na.csv,wood,fine\nb.csv,Wood,fine\n")
+    assert found.problems == ()
+    assert [str(doubt) for doubt in found.warnings] == [
+        "manifest.csv:1: column 'weather' is not read",
+        "manifest.csv:3: material 'Wood' is not the 'wood' of manifest.csv:2",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("cells", "line"),
+    [
+        ({"onsets_s": "2,5"}, "'2,5' is no number; write decimals with a point"),
+        ({"onsets_s": "9; 2"}, "onsets_s must ascend, got 9; 2"),
+        ({"onsets_s": "[2.0, NaN]"}, "'NaN' is no number"),
+        ({"onsets_s": "[2.0"}, r"'\[2.0' is no list; write \[2.0, 9.0\] or 2.0; 9.0"),
+        ({"onsets_s": "[" * 100_000}, "is no list"),
+        ({"onsets_s": "1e999"}, "'1e999' is no number"),
+        ({"onsets_s": "-1"}, "must not lie before the start"),
+        ({"speeds_mm_s": "-20", "onsets_s": "2"}, "speeds_mm_s must not be negative"),
+        ({"sliding_s": "7-2"}, "7-2 must end behind its start"),
+        ({"sliding_s": "2-7; 5-9"}, "sliding_s: 2-7 and 5-9 overlap or stand in the wrong order"),
+        ({"slip_s": "5-9; 2-4"}, "5-9 and 2-4 overlap or stand in the wrong order"),
+        ({"sliding_s": "2 7"}, "'2 7' is no stretch; write 2-7; 9-11.5"),
+        ({"sliding_s": "[[2, 7, 9]]"}, "is no stretch"),
+        ({"sliding_s": "2-7", "non_slip_s": "6.5-9"}, "slip and non-slip overlap: 2-7 and 6.5-9"),
+        ({"slip_s": "0-3", "non_slip_s": "2-4"}, "slip and non-slip overlap: 0-3 and 2-4"),
+        ({"slip_s": "0-3", "sliding_s": "2-4"}, "sliding_s and slip_s overlap: 2-4 and 0-3"),
+        ({"onsets_s": "2; 9", "sliding_s": "2-7"}, "1 sliding_s for 2 onsets"),
+        ({"onsets_s": "2; 9", "speeds_mm_s": "1; 2; 3"}, "3 speeds_mm_s for 2 onsets"),
+        ({"onsets_s": "8", "sliding_s": "2-7"}, "the onset at 8 s is not before the end"),
+        ({"label": "slip", "onsets_s": "2"}, "label slip says all of it"),
+        ({"label": ["slip", "slip"]}, "must be slip, non-slip or empty"),
+    ],
+)
+def test_a_truth_that_cannot_be_is_named(cells, line):
+    _, wrong = truth_of(cells)
+    assert len(wrong) == 1
+    with pytest.raises(ValueError, match=line):
+        raise ValueError(wrong[0])
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("", "manifest.csv: is empty"),
+        ("file,trial\na.csv,1\n", "manifest.csv:1: no column material"),
+        ("1,2\n3,4\n", "manifest.csv:1: no column file and no material"),
+        ("file,material\n", "manifest.csv: lists no recording"),
+        ("file,material,file\na.csv,wood,b\n", "manifest.csv:1: column 'file' is there twice"),
+        ('file,material\n"a.csv,wood\n', "manifest.csv:2: cannot be read as CSV"),
+        ("file,material\n" + "x" * 200_000 + ",wood\n", "manifest.csv:2: cannot be read as CSV"),
+        ("file,material,sample_rate_hz\na.csv,wood,-5\n", "must be a positive number, got '-5'"),
+        ("file,material,trial\na.csv,wood,\N{SUPERSCRIPT TWO}\n", "must be a whole number from 0"),
+    ],
+)
+def test_a_table_that_cannot_be_read_is_named(root, text, line):
+    assert any(line in problem for problem in problems(root, text))
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("a: b: c\n", "manifest.yaml:1: cannot be read as YAML"),
+        ("just words\n", "manifest.yaml:1: must be a list of recordings"),
+        ("- a.csv\n", "manifest.yaml:1: must be a mapping"),
+        ("- file: a.csv\n  file: b.csv\n  material: wood\n", "manifest.yaml:2: 'file' is there"),
+        ("- file: a.csv\n  material: {a: b}\n", "manifest.yaml:2: material must be a value"),
+        ("- file: [a.csv]\n  material: wood\n", "manifest.yaml:1: file must be one value"),
+        ("a: &x [1]\nb: *x\n", "manifest.yaml:2: aliases, as *name, are not read"),
+        ("&x [*x]\n", "aliases, as *name, are not read"),
+        ("!!python/object/apply:os.system [echo]\n", "must be a mapping"),
+        ("[" * 5000 + "]" * 5000, "manifest.yaml: is nested too deeply"),
+        ("\x01", "cannot be read as YAML"),
+    ],
+)
+def test_yaml_that_cannot_be_read_is_named(root, text, line):
+    assert any(line in problem for problem in problems(root, text, "manifest.yaml"))
+
+
+def test_nothing_in_yaml_is_executed(root):
+    text = f"- !!python/object/apply:os.mkdir ['{root / 'made'}']\n"
+    assert problems(root, text, "manifest.yaml")
+    assert not (root / "made").exists()
+
+
+def test_what_is_no_text_is_refused(root):
+    with pytest.raises(ValueError, match=r"manifest\.csv:2: no UTF-8 text; save it as UTF-8"):
+        listed(root, "file,material\na.csv,caf\xe9\n".encode("latin-1"))
+    with pytest.raises(ValueError, match=r"must end in \.csv, \.yaml or \.yml"):
+        listed(root, "file,material\n", "manifest.txt")
+    with (root / "manifest.csv").open("wb") as file:
+        file.truncate(10 * 2**30)  # sparse
+    with pytest.raises(ValueError, match=r"is no manifest: it has 10737418240 bytes"):
+        read_manifest(root / "manifest.csv", root)
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        ("../outside.csv", "must lie inside the folder"),
+        ("day 2/../../outside.csv", "must lie inside the folder"),
+        ("/etc/passwd", "must lie inside the folder"),
+        (r"C:\data\a.csv", "must lie inside the folder"),
+        (r"\\server\share\a.csv", "must lie inside the folder"),
+        (r"..\outside.csv", "must lie inside the folder"),
+        ("link.csv", "is a link out of the folder"),
+        ("linked/outside.csv", "is a link out of the folder"),
+        ("loop.csv", "no file 'loop.csv'|cannot be opened"),
+        ("x" * 5000, "cannot be opened|no file"),
+        ("day 2/e.csv", "no file 'day 2/e.csv' in the folder; did you mean 'd.csv'"),
+        ("", "no file"),
+    ],
+)
+def test_a_path_out_of_the_folder_is_refused(root, file, line):
+    (root.parent / "outside.csv").write_text("1\n")
+    (root / "link.csv").symlink_to(root.parent / "outside.csv")
+    (root / "linked").symlink_to(root.parent)
+    (root / "loop.csv").symlink_to(root / "loop.csv")
+    found = problems(root, f'file,material\n"{file}",wood\n')
+    assert len(found) == 1
+    with pytest.raises(ValueError, match=line):
+        raise ValueError(found[0])
+
+
+def test_a_path_inside_may_be_written_as_windows_does_and_be_a_link(root):
+    (root / "link.csv").symlink_to(root / "a.csv")
+    found = listed(root, 'file,material\n"day 2\\d.csv",wood\n./b.csv,wood\nlink.csv,wood\n')
+    assert found.problems == ()
+    assert [entry.file for entry in found.entries] == ["day 2/d.csv", "b.csv", "link.csv"]
+
+
+# On the time of the recording ------------------------------------------------------------------
+
+
+def test_a_label_stands_for_all_but_the_start():
+    for label in ("slip", "non-slip"):
+        times, wrong = on_time(Truth(label=label), 3.0, skip_s=0.5)
+        assert not wrong
+        rest = ((0.5, 3.0),)
+        assert (times.slip_s, times.non_slip_s) == ((rest, ()) if label == "slip" else ((), rest))
+    _, wrong = on_time(Truth(label="slip"), 0.4, skip_s=0.5)
+    assert wrong == ["label: of 0.4 s nothing is left behind the first 0.5 s; lower skip_s"]
+
+
+def test_a_slide_of_which_only_the_onset_is_known_ends_with_what_comes_first():
+    truth, _ = truth_of({"onsets_s": "2.0; 2.25; 5.0; 9.75", "non_slip_s": "5.1-6"})
+    times, wrong = on_time(truth, 10.0, slide_s=0.5)
+    assert not wrong
+    assert times.sliding_s == ((2.0, 2.25), (2.25, 2.75), (5.0, 5.1), (9.75, 10.0))
+    assert times.speeds_mm_s == (0.0,) * 4
+    assert times.annotated_onsets_s == times.onsets_s
+
+
+def test_onsets_are_taken_from_slides_or_annotations_where_there_are_no_others():
+    slides, _ = truth_of({"sliding_s": "2-7; 9-end", "speeds_mm_s": "20"})
+    times, _ = on_time(slides, 12.0)
+    assert times.onsets_s == (2.0, 9.0)
+    assert times.sliding_s == ((2.0, 7.0), (9.0, 12.0))
+    assert times.speeds_mm_s == (20.0, 20.0)
+    marked, _ = truth_of({"annotated_onsets_s": "2.5"})
+    assert on_time(marked, 12.0)[0].onsets_s == (2.5,)
+
+
+def test_what_leaves_the_recording_is_named_and_what_is_off_by_a_sample_is_cut():
+    truth = Truth(
+        onsets_s=(2.0, 9.0), sliding_s=((2.0, 7.0), (9.0, 11.5)), non_slip_s=((0.0, 1.0),)
+    )
+    _, wrong = on_time(truth, 8.0)
+    assert wrong == [
+        "sliding_s: 9-11.5 s leaves the recording of 8 s",
+        "onsets_s: 9 s is behind the end, 8 s",
+    ]
+    assert on_time(truth, 11.4995)[1] == ["sliding_s: 9-11.5 s leaves the recording of 11.5 s"]
+    times, wrong = on_time(truth, 11.4995, slack_s=0.0005, missing_s=[(4.0, 4.1)])
+    assert not wrong
+    assert times == FileTimeline(
+        11.4995,
+        (2.0, 9.0),
+        (2.0, 9.0),
+        ((2.0, 7.0), (9.0, 11.4995)),
+        (0.0, 0.0),
+        ((0.0, 1.0),),
+        (),
+        ((4.0, 4.1),),
+    )
+
+
+# Whatever is in it -----------------------------------------------------------------------------
+
+WORDS = st.text(st.characters(codec="utf-8"), max_size=30)
+NEAR = st.sampled_from(
+    [*COLUMNS, *FILES, "2-7; 9", "[[1,2]]", "[", "slip", ",", ";", '"', "\n", ": "]
+)
+
+
+@given(st.lists(st.one_of(NEAR, WORDS, st.binary(max_size=20)), max_size=30), st.booleans())
+def test_no_manifest_ends_in_another_error_than_one_line(tmp_path_factory, parts, is_yaml):
+    folder = tmp_path_factory.mktemp("any")
+    path = folder / ("manifest.yaml" if is_yaml else "manifest.csv")
+    head = [] if is_yaml else ["file", ",", "material", ",", "sliding_s", "\n"]
+    path.write_bytes(b"".join(p if isinstance(p, bytes) else p.encode() for p in [*head, *parts]))
+    try:
+        found = read_manifest(path, folder)
+    except ValueError as error:
+        lines = [str(error)]
+    else:
+        assert not found.entries  # none of the files is there
+        lines = [str(problem) for problem in found.problems]
+    assert lines
+    assert all("\n" not in line and path.name in line for line in lines)
+
+
+@given(
+    st.lists(st.floats(0, 1e6, allow_nan=False), unique=True, min_size=1, max_size=5).map(sorted),
+)
+def test_numbers_are_read_as_they_are_written(moments):
+    for text in (json.dumps(moments), "; ".join(map(repr, moments)), [repr(m) for m in moments]):
+        truth, wrong = truth_of({"onsets_s": text})
+        assert not wrong
+        assert truth.onsets_s == tuple(moments)
+
+
+def test_lines_keep_their_numbers_behind_cells_of_several_lines(root):
+    (root / "manifest.csv").write_text('file,material,note\na.csv,wood,"two\nlines"\nb.csv,iron,\n')
+    places = [line.place for line in read_lines(root / "manifest.csv").lines]
+    assert places == ["manifest.csv:2", "manifest.csv:4"]
+
+
+def test_a_folder_can_be_a_recording(root):
+    os.mkdir(root / "bag")  # noqa: PTH102  # rosbag2 keeps a recording in one
+    assert listed(root, "file,material\nbag,wood\n").entries[0].file == "bag"
