@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from tactslip_torch.data.formats.reading import SECONDS, TIME_NAMES, Reading, TimeUnit
 
-_NAME_AND_UNIT = re.compile(r"(.*?)[\s_/]*[(\[]?(s|ms|us|ns)[)\]]?")  # "Time (ms)", "t_us", "t/s"
+_NAME_AND_UNIT = re.compile(r"(.*?)[\s_/(\[]+(s|ms|us|ns)[)\]]?")  # "Time (ms)", "t_us", "t/s"
 _MOST_NAMED = 20  # in a message
 
 
@@ -56,26 +56,27 @@ def chosen_columns(
             f"{os.fspath(path)} has one column, and it is taken for times; say reading.time=null "
             "and reading.sample_rate_hz if it holds samples"
         )
-    unit = _unit_of(names[time]) if names is not None and time is not None else None
+    unit = unit_of_time_name(names[time]) if names is not None and time is not None else None
     return Columns(time, SECONDS[unit or how.time_unit], channels)
 
 
 def _likely_time(names: Sequence[str] | None, num_columns: int, how: Reading) -> int | None:
     if names is None:
         return 0 if how.sample_rate_hz is None and num_columns > 1 else None
-    return next((place for place, name in enumerate(names) if _is_time(name)), None)
+    return next((place for place, name in enumerate(names) if is_time_name(name)), None)
 
 
-def _is_time(name: str) -> bool:
+def is_time_name(name: str) -> bool:
+    """Whether something called so is taken for times: ``t``, ``Timestamp``, ``time (ms)``."""
     plain = name.strip().lower()
     found = _NAME_AND_UNIT.fullmatch(plain)
     return plain in TIME_NAMES or (found is not None and found[1] in TIME_NAMES)
 
 
-def _unit_of(name: str) -> TimeUnit | None:
+def unit_of_time_name(name: str) -> TimeUnit | None:
     """The unit a time's name ends in, if it has one."""
     found = _NAME_AND_UNIT.fullmatch(name.strip().lower())
-    if found is None or not _is_time(name) or found[1] not in TIME_NAMES:
+    if found is None or not is_time_name(name) or found[1] not in TIME_NAMES:
         return None
     return next(unit for unit in SECONDS if unit == found[2])
 
