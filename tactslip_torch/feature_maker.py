@@ -13,6 +13,7 @@ from torch import Tensor
 from tactslip_torch.data.labels import (
     LabelledBins,
     LabelRule,
+    clear_of,
     label_bins,
     needed_windows,
     shuffled,
@@ -159,16 +160,25 @@ class FeatureMaker:
         return self._filter(recording, self._load(recording, times, bins), bins), bins
 
     def lay_bins(self, times: Timeline) -> LabelledBins:
-        """Where the bins of a recording lie, and what they are; no sample is needed for that."""
+        """Where the bins of a recording lie, and what they are; no sample is needed for that.
+
+        Bins that would need missing samples are left out.
+        """
         onsets = times.annotated_onsets_s if self.rule.onsets == "annotated" else times.onsets_s
-        return label_bins(
+        rate = self.source.sample_rate_hz
+        bins = label_bins(
             self.rule,
             onsets,
             times.sliding_s,
             times.duration_s,
-            self.source.sample_rate_hz,
+            rate,
             times.non_slip_s,
+            times.slip_s,
         )
+        if not times.missing_s:
+            return bins
+        before, after = (max(reach) for reach in zip(*self.channel_filter.reaches, strict=True))
+        return clear_of(bins, times.missing_s, before, after, rate)
 
     def _features(
         self,

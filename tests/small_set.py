@@ -33,6 +33,8 @@ class SmallTimeline:
     sliding_s: tuple[tuple[float, float], ...] = ((1.1, 1.95),)
     speeds_mm_s: tuple[float, ...] = (20.0,)
     non_slip_s: tuple[tuple[float, float], ...] = ()
+    slip_s: tuple[tuple[float, float], ...] = ()
+    missing_s: tuple[tuple[float, float], ...] = ()
 
 
 class SmallSet:

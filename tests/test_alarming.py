@@ -52,6 +52,7 @@ class Times:
         self.sliding_s = ((2.1, 2.9),) if slides else ()
         self.speeds_mm_s = (20.0,) if slides else ()
         self.non_slip_s = () if slides else ((0.0, 3.0),)
+        self.slip_s = self.missing_s = ()
 
 
 class Streams:

@@ -65,6 +65,8 @@ class TinyRecordings:
             sliding_s=tuple((onset, onset + slide_s) for onset in onsets),
             speeds_mm_s=(20.0, 40.0),
             non_slip_s=(),
+            slip_s=(),
+            missing_s=(),
         )
 
     def key(self, recording):

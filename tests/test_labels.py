@@ -12,6 +12,7 @@ from tactslip_torch import FeaturePool, HandLayout, Recording
 from tactslip_torch.data.labels import (
     NO_POSITION,
     LabelRule,
+    clear_of,
     label_bins,
     needed_windows,
     shuffled,
@@ -260,7 +261,7 @@ def test_a_recording_of_nothing_has_no_bins():
 
 @pytest.mark.parametrize("stretch", [(15.0, 15.6), (-0.1, 1.0)])
 def test_a_stretch_that_leaves_the_recording_is_refused(stretch):
-    with pytest.raises(ValueError, match=r"the non-slip stretch from .* leaves the recording of"):
+    with pytest.raises(ValueError, match=r"the stretch from .* leaves the recording of"):
         lay(non_slip=(stretch,))
 
 
@@ -486,3 +487,33 @@ def test_shuffled_labels_keep_their_number_and_depend_on_seed_and_place():
     assert not torch.equal(once, is_slip)
     assert not torch.equal(once, shuffled(is_slip, 3, 6))
     assert not torch.equal(once, shuffled(is_slip, 4, 5))
+
+
+def test_stretches_of_slip_come_last_and_belong_to_no_stroke():
+    bins = label_bins(
+        LabelRule(hop_ms=25.0), (), (), 3.0, RATE, non_slip_s=((0.0, 0.2),), slip_s=((1.0, 1.1),)
+    )
+    assert bins.is_slip.tolist() == [False] * 7 + [True] * 3
+    assert bins.starts[-3:].tolist() == [round(s * RATE) for s in (1.0, 1.025, 1.05)]
+    assert set(bins.stroke.tolist()) == {-1}
+    told_twice = label_bins(
+        LabelRule(), (), (), 3.0, RATE, non_slip_s=((0.0, 1.0),), slip_s=((0.0, 2.0),)
+    )
+    starts = (told_twice.starts / RATE)[told_twice.is_slip]
+    assert starts.min() == 1.0  # what is said to be no slip stays so
+    with pytest.raises(ValueError, match=r"the stretch from .* leaves the recording of"):
+        label_bins(LabelRule(), (), (), 3.0, RATE, slip_s=((1.0, 3.5),))
+
+
+def test_bins_that_need_missing_samples_are_left_out():
+    bins = label_bins(LabelRule(), (), (), 3.0, RATE, non_slip_s=((0.0, 3.0),))
+    gap = (1.0, 1.0 + 1 / RATE)
+    kept = clear_of(bins, [gap], 0, 0, RATE)
+    assert set(bins.starts.tolist()) - set(kept.starts.tolist()) == {round(RATE)}
+    before, after = 25, 11
+    kept = clear_of(bins, [gap], before, after, RATE)
+    lost = sorted(set(bins.starts.tolist()) - set(kept.starts.tolist()))
+    assert lost == [round(RATE) - bins.bin_samples, round(RATE)]
+    assert len(kept.starts) == len(kept.is_slip) == len(kept.stroke) == len(kept.position)
+    moved = clear_of(bins, [(1.0 + 11 / RATE, 1.1)], 25, 11, RATE)
+    assert round(RATE) - bins.bin_samples in moved.starts.tolist()

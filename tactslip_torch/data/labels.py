@@ -3,7 +3,8 @@
 ``whole_slide`` is what the authors' scripts do and the published confusion matrices fit: one second
 of non-slip before each onset, the whole slide as slip, the onset moved 10 ms earlier.
 ``half_second`` is what the paper's text says: half a second on either side of each onset. Stretches
-in which the hand is handled without slip, which the paper did not record, are non-slip in both.
+in which the hand is handled without slip, which the paper did not record, are non-slip in both, and
+those that are known to be slip, but not since when, are slip in both.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ class LabelledBins:
     Args:
         starts: ``[N]``, first sample of each bin, ascending within a stroke or stretch.
         is_slip: ``[N]``, bool.
-        stroke: ``[N]``, index of the stroke each bin belongs to; -1 for bins of a stretch without
-            slip, which are behind those of all strokes.
+        stroke: ``[N]``, index of the stroke each bin belongs to; -1 for bins of a stretch, which
+            are behind those of all strokes.
         position: ``[N]``, int64, place of the bin beside its onset: -1 is the last bin before it,
             0 the first slip bin. ``NO_POSITION`` where the stroke is -1.
         bin_samples: length of every bin.
@@ -86,8 +87,9 @@ def label_bins(
     duration_s: float,
     sample_rate_hz: float,
     non_slip_s: Sequence[tuple[float, float]] = (),
+    slip_s: Sequence[tuple[float, float]] = (),
 ) -> LabelledBins:
-    """Lay bins around the onsets of a recording, and in its stretches without slip.
+    """Lay bins around the onsets of a recording, and in its stretches of slip or of none.
 
     A slip bin lies wholly before the end of its slide, a non-slip bin wholly between the end of the
     slide before and the onset, or wholly inside a stretch. Bins of a stretch start with it, a hop
@@ -101,6 +103,7 @@ def label_bins(
         duration_s: length of the recording.
         sample_rate_hz: of the recording.
         non_slip_s: start and end of each stretch that is non-slip beside what is around onsets.
+        slip_s: the same of slip; its bins come last.
 
     Raises:
         ValueError: if a bin would lie outside the recording, a stretch does, or a bin is no whole
@@ -140,11 +143,12 @@ def label_bins(
     within = torch.arange(bin_samples)
     for part in parts:
         is_taken[part.starts[:, None] + within] = True
-    for stretch in non_slip_s:
+    told = [(stretch, False) for stretch in non_slip_s] + [(stretch, True) for stretch in slip_s]
+    for stretch, is_slip in told:
         starts = _starts_inside(stretch, bin_samples, hop, duration_s, sample_rate_hz)
         free = starts[~is_taken[starts[:, None] + within].any(-1)]
         is_taken[free[:, None] + within] = True
-        parts.append(_Part(free, torch.full_like(free, NO_POSITION), -1, is_slip=False))
+        parts.append(_Part(free, torch.full_like(free, NO_POSITION), -1, is_slip))
     return _joined(parts, bin_samples)
 
 
@@ -185,10 +189,41 @@ def _starts_inside(
     last = math.floor(stretch[1] * sample_rate_hz + 1e-6)
     if first < 0 or last > round(duration_s * sample_rate_hz):
         raise ValueError(
-            f"the non-slip stretch from {stretch[0]:.3f} s to {stretch[1]:.3f} s leaves the "
+            f"the stretch from {stretch[0]:.3f} s to {stretch[1]:.3f} s leaves the "
             f"recording of {duration_s:.3f} s"
         )
     return torch.arange(first, max(last - bin_samples + 1, first), hop)
+
+
+def clear_of(
+    bins: LabelledBins,
+    missing_s: Sequence[tuple[float, float]],
+    before: int,
+    after: int,
+    sample_rate_hz: float,
+) -> LabelledBins:
+    """The bins of which no sample is missing that their filter needs.
+
+    Args:
+        bins: of a recording.
+        missing_s: start and end of each stretch without samples.
+        before: samples that the filter reads before a bin.
+        after: and behind it.
+        sample_rate_hz: of the recording.
+    """
+    first = bins.starts - before
+    stop = bins.starts + bins.bin_samples + after
+    is_whole = torch.ones_like(bins.is_slip)
+    for start_s, end_s in missing_s:
+        start, end = round(start_s * sample_rate_hz), round(end_s * sample_rate_hz)
+        is_whole &= (stop <= start) | (first >= end)
+    return LabelledBins(
+        bins.starts[is_whole],
+        bins.is_slip[is_whole],
+        bins.stroke[is_whole],
+        bins.position[is_whole],
+        bins.bin_samples,
+    )
 
 
 def needed_windows(

@@ -94,6 +94,11 @@ class Recording:
         """Length in seconds."""
         return self.samples.shape[-1] / self.sample_rate_hz
 
+    @property
+    def missing_s(self) -> tuple[tuple[float, float], ...]:
+        """None: what is missing is NaN among the samples. So it is a ``Timeline`` itself."""
+        return ()
+
 
 class Timeline(Protocol):
     """When things happen in a recording, known before any sample is."""

@@ -1,0 +1,134 @@
+"""An even clock through timestamps: what is late, what is missing, and what cannot be."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tactslip_torch.data import clock as module
+from tactslip_torch.data.clock import EvenSamples, Gap, even_clock, nominal_rate, refuse_gaps
+from tactslip_torch.data.formats.reading import KeptTimes
+
+RATE = 2000.0
+
+
+class Kept:
+    """Samples in memory."""
+
+    def __init__(self, values):
+        self.values = values
+        self.num_channels, self.num_samples = values.shape
+        self.dtype = values.dtype
+
+    def read(self, first, stop):
+        assert 0 <= first <= stop <= self.num_samples
+        return self.values[:, first:stop].clone()
+
+
+def ticks(num, dropped=(), rate=RATE):
+    """Times of ``num`` ticks without the dropped ones, and the ticks that are left."""
+    left = torch.tensor([tick for tick in range(num) if tick not in set(dropped)])
+    return (left - left[0]).double() / rate, left
+
+
+drops = st.lists(
+    st.tuples(st.integers(20, 900), st.integers(1, 30)), max_size=4, unique_by=lambda gap: gap[0]
+)
+
+
+@settings(max_examples=60)
+@given(drops, st.sampled_from([0.0, 0.05, 0.2]), st.integers(0, 99), st.sampled_from([64, 10**6]))
+def test_what_was_dropped_is_found_and_filled(gaps, jitter, seed, piece):
+    dropped = {tick for start, count in gaps for tick in range(start, start + count)}
+    seconds, left = ticks(1000, dropped)
+    generator = torch.Generator().manual_seed(seed)
+    late = torch.rand(len(seconds), generator=generator).double() * jitter / RATE
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_PIECE", max(piece, 700))
+        found = even_clock(KeptTimes(seconds + late - late[0]), len(seconds), RATE)
+    assert found.num_samples == 1000
+    missing = [tick for gap in found.gaps for tick in range(gap.start, gap.start + gap.missing)]
+    assert missing == sorted(dropped)
+    assert found.jitter_s <= jitter / RATE + 1e-12
+    values = torch.stack([left.double(), -left.double()])
+    even = EvenSamples(Kept(values), found, most_bridged=0)
+    whole = even.read(0, 1000)
+    expected = torch.arange(1000).double()
+    expected[sorted(dropped)] = torch.nan
+    torch.testing.assert_close(whole, torch.stack([expected, -expected]), equal_nan=True)
+    bridged = EvenSamples(Kept(values), found, most_bridged=1000)  # a ramp is its own bridge
+    ramp = torch.arange(1000).double()
+    for first, stop in ((0, 1000), (17, 333), (500, 501), (990, 2000), (40, 40)):
+        part = bridged.read(first, stop)
+        torch.testing.assert_close(part, torch.stack([ramp, -ramp])[:, first:stop])
+
+
+def test_long_gaps_are_not_bridged():
+    seconds, left = ticks(100, {30, 31, 60})
+    found = even_clock(KeptTimes(seconds), len(seconds))
+    assert found.gaps == (Gap(30, 2, 30), Gap(60, 1, 58))
+    assert found.missing_s == ((0.015, 0.016), (0.03, 0.0305))
+    read = EvenSamples(Kept(left.double()[None]), found, most_bridged=1).read(0, 100)[0]
+    assert read[60] == 60
+    assert read[30:32].isnan().all()
+    with pytest.raises(
+        ValueError, match=r"a\.csv: 3 samples are missing in 2 gaps, first 2 at 0\.0"
+    ):
+        refuse_gaps(found, "a.csv")
+    refuse_gaps(even_clock(KeptTimes(ticks(100)[0]), 100), "a.csv")
+
+
+@pytest.mark.parametrize("rate", [92.3, 1000.0, 2000.0, 12345.6])
+def test_the_rate_is_measured(rate):
+    seconds, _ = ticks(3000, {500, 501, 1500}, rate)
+    found = even_clock(KeptTimes(seconds), len(seconds))
+    assert found.sample_rate_hz == pytest.approx(rate, rel=1e-9)
+
+
+def test_stamps_rounded_to_milliseconds_are_no_gaps_and_do_not_round_the_rate():
+    seconds, _ = ticks(20_000, set(range(7000, 7040)))
+    stamps = (seconds * 1000).floor() / 1000
+    found = even_clock(KeptTimes(stamps), len(stamps))
+    assert found.sample_rate_hz == pytest.approx(RATE, rel=1e-4)
+    assert (len(found.gaps), found.num_samples) == (1, 20_000)
+    assert abs(found.gaps[0].start - 7000) <= 1
+
+
+def test_a_clock_that_runs_a_little_otherwise_loses_nothing_in_an_hour():
+    num = 400_000
+    seconds = torch.arange(num).double() / 2000.7
+    assert even_clock(KeptTimes(seconds), num, stated_hz=RATE).num_samples == num
+
+
+def test_a_sample_that_comes_late_is_no_gap():
+    seconds, _ = ticks(200)
+    seconds[50] += 0.9 / RATE
+    seconds[90:94] += torch.tensor([3.2, 2.2, 1.2, 0.3]).double() / RATE
+    found = even_clock(KeptTimes(seconds), 200)
+    assert found.gaps == ()
+    assert found.jitter_s == pytest.approx(3.2 / RATE, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("change", "stated", "said"),
+    [
+        (lambda t: t.flip(0), None, "time goes back at sample 1"),
+        (lambda t: t.index_fill(0, torch.tensor([7]), torch.nan), None, "time of sample 7 is nan"),
+        (lambda t: t, 1000.0, r"its times are 2000 Hz, but 1000 Hz is stated"),
+        (lambda t: (t * RATE / 32).floor() * 32 / RATE, None, "32 samples share a time"),
+        (lambda t: torch.zeros_like(t), None, "200 samples share a time"),
+        (lambda t: t[:2], None, "has 2 times, too few"),
+        (lambda t: torch.cat([t[:100], t[60:]]), None, "time goes back at sample 100"),
+        (lambda t: torch.cat([t[:100], t[99:]]), None, "samples 100 and before come 1 steps clos"),
+    ],
+)
+def test_times_that_tell_no_clock_are_refused(change, stated, said):
+    seconds = change(ticks(200)[0])
+    with pytest.raises(ValueError, match=said) as caught:
+        even_clock(KeptTimes(seconds), len(seconds), stated, "a.csv")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_rate_is_called_by_its_round_number():
+    measured = (1999.7, 92.31, 1e3 / 3, 0.25, 48_010.0)
+    assert [nominal_rate(rate) for rate in measured] == [2000.0, 92.0, 333.0, 0.25, 48_000.0]
