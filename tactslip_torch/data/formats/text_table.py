@@ -169,12 +169,9 @@ def _carefully(
         if layout.has_tail and not cells[-1]:
             cells.pop()
         if len(cells) != layout.num_columns:
-            raise wrong_line(
-                path,
-                number,
-                f"{len(cells)} columns, the row at line {layout.first_line} has "
-                f"{layout.num_columns}; mend the line or take it out",
-            )
+            count = f"{len(cells)} cell" if len(cells) == 1 else f"{len(cells)} cells"
+            wanted = f"the row at line {layout.first_line} has {layout.num_columns}"
+            raise wrong_line(path, number, f"{count}, {wanted}; mend the line or take it out")
         rows.append([_number(path, number, cell, layout) for cell in cells])
     return np.array(rows, dtype=np.float64).reshape(-1, layout.num_columns)
 
