@@ -12,7 +12,8 @@ from tactslip_torch.data.folder import manifest_line
 from tactslip_torch.data.manifest import COLUMNS, manifest_of, read_manifest
 from tactslip_torch.data.manifest_lines import read_lines
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.data.truth import FileTimeline, Truth, on_time, truth_of
+from tactslip_torch.data.timeline import FileTimeline, on_time, scaled
+from tactslip_torch.data.truth import Truth, truth_of
 
 FILES = ("a.csv", "b.csv", "c.csv")
 
@@ -357,6 +358,15 @@ def test_what_leaves_the_recording_is_named_and_what_is_off_by_a_sample_is_cut()
         (),
         ((4.0, 4.1),),
     )
+
+
+def test_a_truth_can_be_told_by_a_clock_that_is_a_little_fast():
+    truth = Truth((2.0,), (2.2,), (20.0,), ((2.0, 6.0),), ((7.0, 8.0),), ((0.0, 1.0),), ((9.0, 9.5),))
+    assert scaled(truth, 1.0) == truth
+    assert scaled(truth, 0.5) == Truth(
+        (1.0,), (1.1,), (20.0,), ((1.0, 3.0),), ((3.5, 4.0),), ((0.0, 0.5),), ((4.5, 4.75),)
+    )
+    assert scaled(Truth(label="slip"), 2.0) == Truth(label="slip")
 
 
 # Whatever is in it -----------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What a person says of a recording: when it slips and when not, and how that lies on its time.
+"""What a person says of a recording: when it slips and when not.
 
 Times are seconds from the first sample. They are written as JSON lists, ``[2.0, 9.0]`` and
 ``[[2, 7], [9, 11.5]]``, or as people do: ``2.0; 9.0`` and ``2-7; 9-end``.
@@ -57,20 +57,6 @@ class Truth:
         return bool(self.onsets_s or self.slip_s or self.non_slip_s or self.label)
 
 
-@dataclass(frozen=True)
-class FileTimeline:
-    """A truth on the time of its recording: every part is known and lies inside; a ``Timeline``."""
-
-    duration_s: float
-    onsets_s: tuple[float, ...] = ()
-    annotated_onsets_s: tuple[float, ...] = ()
-    sliding_s: tuple[Stretch, ...] = ()
-    speeds_mm_s: tuple[float, ...] = ()
-    non_slip_s: tuple[Stretch, ...] = ()
-    slip_s: tuple[Stretch, ...] = ()
-    missing_s: tuple[Stretch, ...] = ()
-
-
 def truth_of(cells: Mapping[str, Cell]) -> tuple[Truth | None, list[str]]:
     """The truth that the cells of a line tell, ``None`` if they are all empty, and what is wrong.
 
@@ -99,70 +85,6 @@ def truth_of(cells: Mapping[str, Cell]) -> tuple[Truth | None, list[str]]:
         return None, problems
     truth = _completed(Truth(**parts))  # type: ignore[arg-type]  # by name
     return truth, _contradictions(truth)
-
-
-def on_time(
-    truth: Truth,
-    duration_s: float,
-    *,
-    skip_s: float = 0.0,
-    slide_s: float = 0.5,
-    slack_s: float = 0.0,
-    missing_s: Iterable[Stretch] = (),
-) -> tuple[FileTimeline, list[str]]:
-    """A truth on the time of its recording, and what does not fit there.
-
-    Args:
-        truth: as somebody said it.
-        duration_s: of the recording.
-        skip_s: at the start that a label of all of it does not stand for.
-        slide_s: how long a slide lasts of which only the onset is known; it ends before that with
-            the next onset, stretch without slip, or the recording.
-        slack_s: by which a stretch may leave the recording; it is cut then.
-        missing_s: further stretches without samples, of the file.
-    """
-    problems = []
-    named: list[tuple[str, Stretch]] = [
-        (name, stretch) for name in STRETCHES for stretch in getattr(truth, name)
-    ]
-    for name, (start, end) in named:
-        if start >= duration_s or (end > duration_s + slack_s and end != math.inf):
-            span = f"{start:g}-{'end' if end == math.inf else format(end, 'g')} s"
-            problems.append(f"{name}: {span} leaves the recording of {duration_s:.4g} s")
-    for name in ("onsets_s", "annotated_onsets_s"):
-        for onset in getattr(truth, name):
-            if onset >= duration_s:
-                problems.append(f"{name}: {onset:g} s is behind the end, {duration_s:.4g} s")
-    if truth.label and skip_s >= duration_s:
-        problems.append(
-            f"label: of {duration_s:.4g} s nothing is left behind the first {skip_s:g} s; "
-            "lower skip_s"
-        )
-    if problems:
-        return FileTimeline(duration_s), problems
-
-    def cut(stretches: Iterable[Stretch]) -> tuple[Stretch, ...]:
-        return tuple((start, min(end, duration_s)) for start, end in stretches)
-
-    onsets = truth.onsets_s
-    sliding = truth.sliding_s
-    if not sliding:
-        stops = [*onsets, duration_s, *(start for start, _ in truth.non_slip_s)]
-        sliding = tuple((t, min([t + slide_s, *(s for s in stops if s > t)])) for t in onsets)
-    all_of_it = ((skip_s, duration_s),)
-    return (
-        FileTimeline(
-            duration_s,
-            onsets,
-            truth.annotated_onsets_s or onsets,
-            cut(sliding),
-            truth.speeds_mm_s if len(truth.speeds_mm_s) == len(onsets) else (0.0,) * len(onsets),
-            all_of_it if truth.label == "non-slip" else cut(truth.non_slip_s),
-            all_of_it if truth.label == "slip" else cut(truth.slip_s),
-            tuple(sorted({*cut(truth.missing_s), *missing_s})),
-        ),
-        [],
-    )
 
 
 def _completed(truth: Truth) -> Truth:

@@ -1,0 +1,138 @@
+"""From the samples in a file to those of a recording: laid evenly, chosen, tared, resampled.
+
+In that order, and each only as it was asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.data.clock import GAP_RULES, EvenSamples, GapRule
+from tactslip_torch.data.formats.reading import Samples
+from tactslip_torch.data.formats.registry import open_file
+from tactslip_torch.data.stream import Found, Stream
+from tactslip_torch.data.truth import Stretch
+
+REACH = 16
+"""Samples of the lower rate on either side that a resampled one may hang on."""
+
+
+@dataclass(frozen=True)
+class Treatment:
+    """What is done to the samples of every file of a set.
+
+    Args:
+        gaps: ``"refuse"`` files in which samples are missing, let them be ``"missing"`` (bins that
+            need them are left out), or ``"bridge"`` short gaps by a straight line.
+        bridge_ms: the longest gap that is bridged; longer ones are missing.
+        resample_hz: the rate wanted; ``None`` for that of the files.
+        tare_s: start and end of the stretch whose mean is taken off each channel.
+
+    Raises:
+        ValueError: for a value that cannot be.
+    """
+
+    gaps: GapRule = "refuse"
+    bridge_ms: float = 10.0
+    resample_hz: float | None = None
+    tare_s: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.gaps not in GAP_RULES:
+            known = ", ".join(GAP_RULES)
+            raise ValueError(f"data.gaps must be one of {known}, got {self.gaps!r}")
+        if self.gaps == "bridge" and not self.bridge_ms > 0:
+            raise ValueError(f"data.bridge_ms must be positive, got {self.bridge_ms!r}")
+        rate = self.resample_hz
+        if rate is not None and not (isinstance(rate, (int, float)) and 0 < rate < math.inf):
+            raise ValueError(f"data.resample_hz must be a positive number or null, got {rate!r}")
+        if self.tare_s is not None:
+            parts = tuple(self.tare_s)
+            if len(parts) != 2 or not 0 <= parts[0] < parts[1]:
+                raise ValueError(f"data.tare_s must be [start, end] in seconds, got {list(parts)}")
+            object.__setattr__(self, "tare_s", parts)
+
+    def most_bridged(self, rate_hz: float) -> int:
+        """The most samples of a gap that is bridged."""
+        return int(self.bridge_ms * rate_hz / 1000 + 1e-6) if self.gaps == "bridge" else 0
+
+
+def num_recorded(found: Found, rate_hz: float, how: Treatment) -> int:
+    """How many samples of a stream the recording has."""
+    if how.resample_hz is None:
+        return found.clock.num_samples
+    return int(found.clock.num_samples * how.resample_hz / rate_hz + 1e-6)
+
+
+def missing_of(found: Found, rate_hz: float, how: Treatment) -> tuple[Stretch, ...]:
+    """The stretches of a recording without samples, wider by what resampling draws from them."""
+    most, to_hz = how.most_bridged(rate_hz), how.resample_hz
+    reach_s = REACH / min(rate_hz, to_hz) if to_hz else 0.0
+    return tuple(
+        (max(gap.start / rate_hz - reach_s, 0.0), (gap.start + gap.count) / rate_hz + reach_s)
+        for gap in found.clock.gaps
+        if gap.count > most
+    )
+
+
+def recorded(
+    path: Path,
+    stream: Stream,
+    found: Found,
+    rows: Sequence[int],
+    rate_hz: float,
+    how: Treatment,
+    windows: Sequence[Stretch] | None = None,
+) -> Tensor:
+    """The samples of a stream as the recording has them.
+
+    What is resampled is read whole; of the rest no more than the windows and what is tared on.
+
+    Args:
+        path: of the file.
+        stream: how it is read.
+        found: what the file said when it was looked at.
+        rows: of the file, in the order of the hand.
+        rate_hz: of the file.
+        how: samples are treated.
+        windows: start and end of what is wanted, seconds; ``None`` for all.
+
+    Shape:
+        - output: ``[C, T]``, NaN where nothing is known and outside the windows
+
+    Raises:
+        ValueError: if the file is damaged, or is not what it was when it was looked at.
+    """
+    with open_file(path, stream.reading) as opened:
+        samples: Samples = opened.samples
+        gaps = sum(gap.count for gap in found.clock.gaps)
+        shape = (samples.num_channels, samples.num_samples + gaps)
+        if shape != (found.num_channels, found.clock.num_samples):
+            raise ValueError(f"{path} has changed since it was looked at; start again")
+        if gaps:
+            samples = EvenSamples(samples, found.clock, how.most_bridged(rate_hz))
+        chosen = list(rows)
+        num = samples.num_samples
+        level = torch.zeros(len(chosen), 1, dtype=torch.float64)
+        if how.tare_s is not None:
+            first, stop = (round(moment * rate_hz) for moment in how.tare_s)
+            level = samples.read(first, stop)[chosen].double().nanmean(-1, keepdim=True)
+        if how.resample_hz is not None and how.resample_hz != rate_hz:
+            from tactslip_torch.signals.resampling import resample
+
+            whole = samples.read(0, num)[chosen] - level
+            even = resample(whole, rate_hz, how.resample_hz)
+            return even[:, : num_recorded(found, rate_hz, how)].to(samples.dtype)
+        kept = torch.full((len(chosen), num), torch.nan, dtype=samples.dtype)
+        for start, end in windows if windows is not None else [(0.0, num / rate_hz)]:
+            first, stop = math.floor(start * rate_hz), math.ceil(end * rate_hz)
+            first, stop = max(first, 0), min(stop, num)
+            read = samples.read(first, stop)[chosen]
+            kept[:, first:stop] = read if how.tare_s is None else (read - level).to(samples.dtype)
+        return kept
