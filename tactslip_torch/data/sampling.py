@@ -75,9 +75,9 @@ def missing_of(found: Found, rate_hz: float, how: Treatment) -> tuple[Stretch, .
     most, to_hz = how.most_bridged(rate_hz), how.resample_hz
     reach_s = REACH / min(rate_hz, to_hz) if to_hz else 0.0
     return tuple(
-        (max(gap.start / rate_hz - reach_s, 0.0), (gap.start + gap.count) / rate_hz + reach_s)
+        (max(gap.start / rate_hz - reach_s, 0.0), (gap.start + gap.missing) / rate_hz + reach_s)
         for gap in found.clock.gaps
-        if gap.count > most
+        if gap.missing > most
     )
 
 
@@ -111,7 +111,7 @@ def recorded(
     """
     with open_file(path, stream.reading) as opened:
         samples: Samples = opened.samples
-        gaps = sum(gap.count for gap in found.clock.gaps)
+        gaps = sum(gap.missing for gap in found.clock.gaps)
         shape = (samples.num_channels, samples.num_samples + gaps)
         if shape != (found.num_channels, found.clock.num_samples):
             raise ValueError(f"{path} has changed since it was looked at; start again")

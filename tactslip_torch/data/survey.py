@@ -164,7 +164,7 @@ def _doubts(recording: Surveyed) -> list[str]:
     for number, part in enumerate(parts):
         clock = part.found.clock
         if clock.gaps:
-            lost = sum(gap.count for gap in clock.gaps)
+            lost = sum(gap.missing for gap in clock.gaps)
             doubts.append(
                 f"lacks {lost} samples in {len(clock.gaps)} gaps, first at "
                 f"{clock.gaps[0].start / part.rate_hz:.4g} s"
