@@ -54,7 +54,7 @@ class Fields:
         """So many bytes."""
         stop = self._place + size
         if stop > len(self._content):
-            raise ValueError("a record shorter than its fields")
+            raise ValueError("damaged: a record shorter than its fields")
         part = self._content[self._place : stop]
         self._place = stop
         return part

@@ -105,12 +105,12 @@ def samples_of(path: str, bag: Bag, how: Reading) -> Opened:
     A message's time is the number that ``reading.time`` names or, for ``"log_time"``, that of its
     recording. ``"auto"``: its stamp, unless all stamps are zero; else a number that is called a
     time; else that of its recording. Messages go by their times, those of one time in the order of
-    the file; since no sensor gives two samples at once, such times are refused, unless
-    ``reading.time=null`` has them go by recording and have no times.
+    the file; nothing is left out, so what was recorded twice shows in the times (``data.clock``
+    refuses it). With ``reading.time=null`` messages go by recording and have no times.
 
     Raises:
-        ValueError: if no topic or more than one holds samples, the messages are damaged or hold
-            not the same channels throughout, or two have one time.
+        ValueError: if no topic or more than one holds samples, or the messages are damaged or hold
+            not the same channels throughout.
     """
     with named(path):
         topic, decoder = decoder_of(bag, how.samples)
@@ -121,7 +121,7 @@ def samples_of(path: str, bag: Bag, how: Reading) -> Opened:
     return Opened(
         MessageSamples(pages, index),
         names=None if names is None else tuple(names[place] for place in columns.channels),
-        times=None if how.time is None else _times(path, topic, index, how),
+        times=None if how.time is None else _times(index, how),
     )
 
 
@@ -194,24 +194,22 @@ def _index(pages: _Pages, how: Reading) -> Index:
 def _nanoseconds(times: NDArray[Any], seconds: float) -> NDArray[np.int64]:
     """Times of a unit of so many seconds; of whole numbers nothing is lost."""
     unit = round(seconds * _SECOND)
-    if times.dtype.kind == "f" and not np.isfinite(times).all():
+    if times.dtype.kind not in "iuf" or not np.isfinite(times).all():
         raise ValueError("a time that is no number")
-    since = times - times.min()
-    if float(since.max()) * unit > _LONGEST:
-        raise ValueError(f"times {float(since.max()) * seconds:g} s apart; see reading.time_unit")
-    exact = np.round(since * unit) if since.dtype.kind == "f" else since * unit
-    found: NDArray[np.int64] = exact.astype(np.int64)
+    first, last = times.min().item(), times.max().item()
+    if (last - first) * unit > _LONGEST:
+        raise ValueError(f"times {(last - first) * seconds:g} s apart; see reading.time_unit")
+    if times.dtype.kind == "f":
+        whole: NDArray[Any] = np.round((times.astype(np.float64) - first) * unit)
+    else:
+        whole = (times - times.dtype.type(first)).astype(np.int64) * unit
+    found: NDArray[np.int64] = whole.astype(np.int64)
     return found
 
 
-def _times(path: str, topic: str, index: Index, how: Reading) -> MessageTimes | None:
+def _times(index: Index, how: Reading) -> MessageTimes | None:
     """The times of all samples; of a single block none, where nobody gives the rate."""
     steps = np.diff(index.times)
-    if num_twice := int((steps == 0).sum()):
-        raise ValueError(
-            f"{path}: {num_twice} messages of {topic} have the time of the one before; remove "
-            "what is double, or say reading.time=null and reading.sample_rate_hz"
-        )
     spacings = steps / index.num_rows[:-1]
     if how.sample_rate_hz is not None:
         usual = _SECOND / how.sample_rate_hz

@@ -1,0 +1,181 @@
+"""Bags as other people's programs write them: by the ``mcap`` and ``rosbags`` libraries."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
+
+from tactslip_torch import HandLayout, Recording
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+WRENCH, JOINTS = "geometry_msgs/msg/WrenchStamped", "sensor_msgs/msg/JointState"
+START_NS = 1_700_000_000_123_456_789
+STEP_NS = 500_000
+PACKINGS = {
+    "none": CompressionType.NONE,
+    "lz4": CompressionType.LZ4,
+    "zstd": CompressionType.ZSTD,
+}
+
+
+@dataclass
+class Sent:
+    """Messages of one topic: what is written of each is ``(log_time, bytes)``."""
+
+    topic: str
+    kind: str
+    messages: list[tuple[int, bytes]]
+    encoding: str = "cdr"
+    schema_encoding: str = "ros2msg"
+    schema: str | None = None
+
+    def definition(self) -> str:
+        if self.schema is not None:
+            return self.schema
+        return STORE.generate_msgdef(self.kind, ros_version=2)[0]
+
+
+@dataclass
+class How:
+    """How an MCAP file is written."""
+
+    packing: str = "zstd"
+    is_chunked: bool = True
+    is_indexed: bool = True
+    chunk_size: int = 4096
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+
+
+def write_mcap(path: Path, topics: list[Sent], how: How = How()) -> Path:  # noqa: B008
+    """All topics, their messages by turns, in the order they are given."""
+    with path.open("wb") as file:
+        writer = Writer(
+            file,
+            chunk_size=how.chunk_size,
+            compression=PACKINGS[how.packing],
+            use_chunking=how.is_chunked,
+            index_types=IndexType.ALL if how.is_indexed else IndexType.NONE,
+            use_statistics=how.is_indexed,
+            repeat_channels=how.is_indexed,
+            repeat_schemas=how.is_indexed,
+        )
+        writer.start()
+        for name, content in how.metadata.items():
+            writer.add_metadata(name, content)
+        channels = []
+        for sent in topics:
+            text = sent.definition() if sent.schema_encoding else ""
+            schema = writer.register_schema(sent.kind, sent.schema_encoding, text.encode())
+            channels.append(writer.register_channel(sent.topic, sent.encoding, schema))
+        for place in range(max(len(sent.messages) for sent in topics)):
+            for sent, channel in zip(topics, channels, strict=True):
+                if place < len(sent.messages):
+                    log_time, message = sent.messages[place]
+                    writer.add_message(channel, log_time, bytes(message), log_time, place)
+        writer.finish()
+    return path
+
+
+def write_bag(path: Path, topics: list[Sent], storage: str = "sqlite3", mode: str = "none") -> Path:
+    """A folder of rosbag2; ``mode`` is how it is packed."""
+    writer = BagWriter(path, version=8, storage_plugin=StoragePlugin[storage.upper()])
+    if mode != "none":
+        writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
+    with writer:
+        for sent in topics:
+            channel = writer.add_connection(sent.topic, sent.kind, typestore=STORE)
+            for log_time, message in sent.messages:
+                writer.write(channel, log_time, message)
+    return path
+
+
+def times(count: int) -> list[int]:
+    """Of that many samples at 2 kHz, in nanoseconds since 1970."""
+    return [START_NS + STEP_NS * place for place in range(count)]
+
+
+def stamp(nanoseconds: int):
+    return STORE.types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 10**9))
+
+
+def header(nanoseconds: int, frame: str = "hand"):
+    return STORE.types["std_msgs/msg/Header"](stamp(nanoseconds), frame)
+
+
+def wrench(values, nanoseconds: int, frame: str = "hand", *, is_little: bool = True) -> bytes:
+    vector = STORE.types["geometry_msgs/msg/Vector3"]
+    whole = STORE.types["geometry_msgs/msg/Wrench"](vector(*values[:3]), vector(*values[3:]))
+    message = STORE.types[WRENCH](header(nanoseconds, frame), whole)
+    return bytes(STORE.serialize_cdr(message, WRENCH, little_endian=is_little))
+
+
+def joints(values, nanoseconds: int, names=("a", "bcd")) -> bytes:
+    """Positions and velocities of two joints, no efforts."""
+    message = STORE.types[JOINTS](
+        header(nanoseconds),
+        list(names),
+        np.array(values[:2], float),
+        np.array(values[2:], float),
+        np.zeros(0),
+    )
+    return bytes(STORE.serialize_cdr(message, JOINTS))
+
+
+def array(values, labels=(), sizes=(), kind: str = "Float64MultiArray", skipped: int = 0) -> bytes:
+    """An array of ``std_msgs`` with a layout."""
+    dimension = STORE.types["std_msgs/msg/MultiArrayDimension"]
+    layout = STORE.types["std_msgs/msg/MultiArrayLayout"]
+    name = f"std_msgs/msg/{kind}"
+    dims = [dimension(label, size, 0) for label, size in zip(labels, sizes, strict=True)]
+    message = STORE.types[name](layout(dims, skipped), np.asarray(values))
+    return bytes(STORE.serialize_cdr(message, name))
+
+
+def json_message(content) -> bytes:
+    return json.dumps(content).encode()
+
+
+def noise(*shape: int, seed: int = 0):
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+def wrenches(count: int, topic: str = "/ft", seed: int = 0) -> tuple[Sent, np.ndarray]:
+    """Wrenches at 2 kHz, stamped, logged some time later; and their numbers ``[6, n]``."""
+    values = noise(count, 6, seed=seed)
+    messages = [
+        (time + 10_000_000, wrench(row, time))
+        for time, row in zip(times(count), values, strict=True)
+    ]
+    return Sent(topic, WRENCH, messages), values.T
+
+
+def recording(samples=None, **changes) -> Recording:
+    """One of ours, of two channels unless samples say otherwise."""
+    if samples is None:
+        samples = torch.from_numpy(noise(2, 1234, seed=3))
+    values = {
+        "samples": samples,
+        "sample_rate_hz": 2000.0,
+        "material": "Stahl ü \u2028 'x: y' #",
+        "speeds_mm_s": (20.0,),
+        "onsets_s": (1 / 3,),
+        "sliding_s": ((0.1, 0.2 + 1e-9),),
+        "non_slip_s": ((0.01, 0.02),),
+        "slip_s": ((0.25, 0.3),),
+        "provenance": {"simulated": True, "note": 'a\nb: [c, {d}] & *e \\ "f" \''},
+        "units": "mV",
+    }
+    return Recording(**(values | changes))
+
+
+def hand_of(count: int) -> HandLayout:
+    return HandLayout.from_rows(
+        {"name": f"E{n}", "kind": "electrode", "finger": "tip", "segment": "s", "adapting": "slow"}
+        for n in range(count)
+    )
