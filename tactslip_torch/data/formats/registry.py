@@ -58,7 +58,18 @@ class Format:
         return function
 
 
-FORMATS = {form.name: form for form in (Format("npz", ("npz", "npy")),)}
+FORMATS = {
+    form.name: form
+    for form in (
+        Format("npz", ("npz", "npy")),
+        Format("text", ("csv", "tsv", "txt", "dat", "lvm")),
+        Format("hdf5", ("h5", "hdf5", "he5")),
+        Format("mat", ("mat",)),
+        Format("mcap", ("mcap",)),
+        Format("parquet", ("parquet",)),
+        Format("rosbag2", ("bag2",), is_folder=True),
+    )
+}
 """By name; each is imported when it is first used."""
 
 
