@@ -57,8 +57,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "data.formats.reading",
         "data.formats.refusing",
     ),
+    "data.formats.hdf5_heap": (),
     "data.formats.hdf5_tree": (
         "data.formats.arrays",
+        "data.formats.hdf5_heap",
         "data.formats.header",
         "data.formats.reading",
         "data.formats.refusing",
@@ -196,6 +198,9 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "data.agreement": ("data.clock", "data.stream", "hand"),
     "data.survey": ("data.*", "workers"),
     "data.datasets": ("data.*", "hand"),
+    "data.inspection": ("data.*",),
+    "data.conversion": ("data.*", "files"),
+    "data.template": ("data.formats.registry", "data.manifest", "files"),
     "data.authors_raw": ("data.*", "hand"),
     "data.labels": ("data.recording",),
     "data.splits": ("data.recording",),
@@ -480,6 +485,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "bracket": (),
     "calibrate": ("*",),
     "generate": ("*",),
+    "data_tool": ("*",),
     "config": ("*",),
 }
 
@@ -495,6 +501,7 @@ ENTRY = (
     "pareto",
     "calibrate",
     "generate",
+    "data_tool",
     "detect",
     "config",
 )
@@ -521,6 +528,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
         "report.alarm",
         "report.reliability",
         "report.onset",
+        "report.dataset",
     ),
     "numba": ("features.compiled.*", "simulation.dynamics.compiled"),
 }

@@ -15,13 +15,14 @@ from typing import Any
 
 import torch
 
+from tactslip_torch.data.agreement import Part
 from tactslip_torch.data.clock import GapRule
 from tactslip_torch.data.digest import file_digest
 from tactslip_torch.data.manifest import Entry, Listing, manifest_of, read_manifest
 from tactslip_torch.data.manifest_lines import Problem
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.data.sampling import Treatment, recorded
-from tactslip_torch.data.stream import stream_of
+from tactslip_torch.data.stream import Stream, stream_of
 from tactslip_torch.data.survey import Plan, Surveyed, survey
 from tactslip_torch.data.timeline import FileTimeline
 from tactslip_torch.hand import Adapting, HandLayout
@@ -143,6 +144,10 @@ class FileRecordings:
     def entry(self, recording: RecordingId) -> Entry:
         """Where a recording is, and what was said of it."""
         return self._recordings[recording].entry
+
+    def parts(self, recording: RecordingId) -> list[tuple[Stream, Part]]:
+        """How each stream of a recording is read, and what its file says of it."""
+        return list(zip(self._plan.streams, self._recordings[recording].parts, strict=True))
 
     def timeline(self, recording: RecordingId) -> FileTimeline:
         """When things happen in a recording; nothing is read for it."""

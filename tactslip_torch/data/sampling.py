@@ -6,7 +6,8 @@ In that order, and each only as it was asked for.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,6 +82,24 @@ def missing_of(found: Found, rate_hz: float, how: Treatment) -> tuple[Stretch, .
     )
 
 
+@contextmanager
+def even_samples(
+    path: Path, stream: Stream, found: Found, most_bridged: int = 0
+) -> Iterator[Samples]:
+    """All channels of a file on their clock, to be read by stretches; NaN in gaps.
+
+    Raises:
+        ValueError: if the file is damaged, or is not what it was when it was looked at.
+    """
+    with open_file(path, stream.reading) as opened:
+        samples: Samples = opened.samples
+        missing = sum(gap.missing for gap in found.clock.gaps)
+        shape = (samples.num_channels, samples.num_samples + missing)
+        if shape != (found.num_channels, found.clock.num_samples):
+            raise ValueError(f"{path} has changed since it was looked at; start again")
+        yield EvenSamples(samples, found.clock, most_bridged) if missing else samples
+
+
 def recorded(
     path: Path,
     stream: Stream,
@@ -109,14 +128,7 @@ def recorded(
     Raises:
         ValueError: if the file is damaged, or is not what it was when it was looked at.
     """
-    with open_file(path, stream.reading) as opened:
-        samples: Samples = opened.samples
-        gaps = sum(gap.missing for gap in found.clock.gaps)
-        shape = (samples.num_channels, samples.num_samples + gaps)
-        if shape != (found.num_channels, found.clock.num_samples):
-            raise ValueError(f"{path} has changed since it was looked at; start again")
-        if gaps:
-            samples = EvenSamples(samples, found.clock, how.most_bridged(rate_hz))
+    with even_samples(path, stream, found, how.most_bridged(rate_hz)) as samples:
         chosen = list(rows)
         num = samples.num_samples
         level = torch.zeros(len(chosen), 1, dtype=torch.float64)
