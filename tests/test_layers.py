@@ -202,6 +202,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "data.conversion": ("data.*", "files"),
     "data.template": ("data.formats.registry", "data.manifest", "files"),
     "data.authors_raw": ("data.*", "hand"),
+    "data.named": ("data.*",),
     "data.labels": ("data.recording",),
     "data.splits": ("data.recording",),
     "simulation.*": ("hand", "engines", "data.recording", "simulation.*"),
@@ -375,6 +376,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "report.reliability",
         "progress",
     ),
+    "alarming.debounced": ("onset.*", "model.detector", "data.labels"),
     "alarming.stage": (
         "alarming.*",
         "onset.*",
@@ -404,6 +406,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "progress",
         "ranks",
     ),
+    "folds": ("judging", "report.scores"),
     "judging": (
         "feature_maker",
         "data.*",

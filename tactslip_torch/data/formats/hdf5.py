@@ -65,11 +65,11 @@ def save(
         how = {"chunks": (num_channels, min(max(instants, 1), num_samples)), "fletcher32": True}
     # HDF5 of 2008 and later: before, more than some 4000 names would not fit
     with whole_file(path) as temporary, h5py.File(temporary, "w", libver="v108") as file:
-        file.attrs["header"] = header
+        file.attrs["header"] = header.encode("ascii")  # of one length: see hdf5_heap
         stored = file.create_dataset("samples", data=samples, **how)
         stored.attrs["sample_rate_hz"] = float(recording.sample_rate_hz)
-        stored.attrs["units"] = recording.units
-        stored.attrs.create("channel_name", list(hand.names), dtype=h5py.string_dtype())
+        stored.attrs["units"] = recording.units.encode() or b"\0"
+        stored.attrs["channel_name"] = [name.encode() for name in hand.names]
 
 
 def load(path: str | os.PathLike[str]) -> Archived:

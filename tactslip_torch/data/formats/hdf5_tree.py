@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats.arrays import why_not_numbers, why_not_plausible
+from tactslip_torch.data.formats.arrays import FREE_BYTES, why_not_numbers, why_not_plausible
+from tactslip_torch.data.formats.hdf5_heap import has_sound_heaps
 from tactslip_torch.data.formats.header import damaged
 from tactslip_torch.data.formats.reading import TimeUnit
 from tactslip_torch.data.formats.refusing import Refused
@@ -171,19 +172,22 @@ def numbers_said(thing: Any) -> dict[str, float]:
 
 def words_said(thing: Any, name: str) -> tuple[str, ...]:
     """The words of an attribute, none if it holds none."""
-    return _words(thing.attrs.get_id(name), lambda: thing.attrs[name])
+    return _words(thing.attrs.get_id(name), thing.file.filename, lambda: thing.attrs[name])
 
 
 def words_in(dataset: Any) -> tuple[str, ...]:
     """The words of a dataset, none if it holds none."""
-    return _words(dataset, lambda: dataset[()])
+    return _words(dataset, dataset.file.filename, lambda: dataset[()])
 
 
-def _words(kept: Any, read: Callable[[], Any]) -> tuple[str, ...]:
+def _words(kept: Any, path: str, read: Callable[[], Any]) -> tuple[str, ...]:
     count = math.prod(kept.shape) if kept.shape is not None and len(kept.shape) < 2 else 0
-    if kept.dtype.kind not in "OS" or max(count, count * kept.dtype.itemsize / 2**10) > MOST_WORDS:
+    dtype = kept.dtype
+    if dtype.kind not in "OS" or not count or count > MOST_WORDS:
         return ()
-    values = np.atleast_1d(read()) if count else []
+    if count * dtype.itemsize > FREE_BYTES or (dtype.kind == "O" and not has_sound_heaps(path)):
+        return ()
+    values = np.atleast_1d(read())
     words = [word.decode("utf-8") if isinstance(word, bytes) else word for word in values]
     return tuple(words) if all(isinstance(word, str) for word in words) else ()
 

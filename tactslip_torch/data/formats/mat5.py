@@ -172,4 +172,6 @@ def _rows(flat: Flat, text: Element, num_rows: int) -> tuple[str, ...]:
         words = flat.content(text).decode(_CODECS[text.kind] + ending)
     else:
         words = flat.numbers(text).astype("<u2").tobytes().decode("utf-16-le")
+    if num_rows > len(words):
+        raise ValueError("a text must have as many rows as it says")
     return tuple(words[row::num_rows].rstrip(" \0") for row in range(num_rows))

@@ -8,7 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from tactslip_torch.data.formats.hdf5_tree import DatasetArray, objects, why_elsewhere, why_not
+from tactslip_torch.data.formats.hdf5_tree import (
+    DatasetArray,
+    objects,
+    why_elsewhere,
+    why_not,
+    words_said,
+)
 from tactslip_torch.data.formats.reading import needs
 
 _NUMBERS = {"double", "single"} | {f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)}
@@ -63,8 +69,9 @@ def _class(thing: Any) -> str | None:
     """MATLAB's name for what a dataset holds; None if something else wrote it."""
     if "MATLAB_object_decode" in thing.attrs:
         return "object"
-    kind = thing.attrs.get("MATLAB_class")
-    return kind.decode("ascii", "replace") if isinstance(kind, bytes) else kind
+    if "MATLAB_class" not in thing.attrs:
+        return None
+    return "".join(words_said(thing, "MATLAB_class")) or "unknown"
 
 
 def _why_not_matrix(thing: Any) -> str | None:
