@@ -29,7 +29,10 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.progress import RecordingProgressBar
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.spectrum import SpectrumMethod
+from tactslip_torch.signals.wavelet import highest_level
 
+MOST_LEVELS = 4
+"""Wavelet levels of the paper, and of ``features.level=null`` at most."""
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
@@ -37,36 +40,86 @@ def feature_parts(
     source: RecordingSource,
     bin_ms: float,
     *,
-    frames: Mapping[str, int],
+    frames: Mapping[str, int | None],
     polyorder: int,
     wavelet: str,
-    level: int,
+    level: int | None,
     spectrum: SpectrumMethod,
     dtype: str,
     engine: EngineName,
     align: Align = "centred",
 ) -> tuple[FeaturePool, ChannelFilter, torch.dtype, EngineName]:
-    """Pool, filter, dtype and engine from the ``features`` section.
+    """Pool, filter, dtype and engine from the ``features`` section; no recording is read for it.
+
+    Args:
+        source: of the recordings, whose hand and rate they are for.
+        bin_ms: length of a bin.
+        frames: as ``frame_lengths`` takes them.
+        polyorder: of the filter.
+        wavelet: of the branches.
+        level: number of levels; ``None``: as many as bin and wavelet allow, at most the paper's 4.
+        spectrum: of the branches.
+        dtype: in which features are computed.
+        engine: what computes them.
+        align: of the filter.
 
     Raises:
-        ValueError: if a kind of channel has no frame, or a value is none that exists.
+        ValueError: if a kind of channel has no frame, a bin allows no such level, or a value is
+            none that exists.
     """
     if dtype not in DTYPES:
         raise ValueError(f"features.dtype must be one of {', '.join(DTYPES)}, got {dtype!r}")
-    missing = sorted({channel.kind for channel in source.hand.channels} - set(frames))
-    if missing:
-        raise ValueError(f"features.frames has no frame for {', '.join(missing)} channels")
+    lengths = frame_lengths(source.hand, frames)
+    bin_samples = round(bin_ms * source.sample_rate_hz / 1000)
     pool = FeaturePool(
         source.hand,
         source.sample_rate_hz,
-        bin_samples=round(bin_ms * source.sample_rate_hz / 1000),
+        bin_samples=bin_samples,
         wavelet=wavelet,
-        level=level,
+        level=_checked_level(level, bin_samples, wavelet),
         spectrum=spectrum,
         arithmetic="native" if dtype == "float32" else "double",
     )
-    lengths = [frames[channel.kind] for channel in source.hand.channels]
     return pool, ChannelFilter(lengths, polyorder, align), DTYPES[dtype], resolved(engine)
+
+
+def frame_lengths(hand: HandLayout, frames: Mapping[str, int | None]) -> list[int]:
+    """The frame of each channel, from ``features.frames``.
+
+    Args:
+        hand: the channels.
+        frames: an odd number of samples by kind of channel; 1 or ``None`` leaves the kind as it is.
+
+    Raises:
+        ValueError: if a kind has no frame, or one that is even or no number.
+    """
+    if missing := [kind for kind in hand.kinds if kind not in frames]:
+        raise ValueError(
+            f"features.frames has no frame for {', '.join(missing)} channels; give an odd number "
+            f"of samples, as +features.frames.{missing[0]}=11, or null to leave them unfiltered"
+        )
+    lengths = {kind: 1 if frames[kind] is None else frames[kind] for kind in hand.kinds}
+    for kind, length in lengths.items():
+        if not isinstance(length, int) or length < 1 or length % 2 == 0:
+            raise ValueError(
+                f"features.frames.{kind} must be an odd number of samples, or null to leave such "
+                f"channels unfiltered, got {length!r}"
+            )
+    return [int(lengths[channel.kind] or 1) for channel in hand.channels]
+
+
+def _checked_level(level: int | None, bin_samples: int, wavelet: str) -> int:
+    """``features.level`` for bins of such a length."""
+    highest = highest_level(bin_samples, wavelet)
+    if level is None:
+        return min(MOST_LEVELS, highest)
+    if not isinstance(level, int) or not 1 <= level <= highest:
+        raise ValueError(
+            f"features.level must lie in 1..{highest} for bins of {bin_samples} samples and "
+            f"features.wavelet={wavelet}, got {level!r}; give fewer levels, longer bins "
+            "(labels.bin_ms), or null for as many as there can be"
+        )
+    return level
 
 
 @contextmanager

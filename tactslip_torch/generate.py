@@ -32,7 +32,7 @@ from tactslip_torch.config import (
 )
 from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written
 from tactslip_torch.data.recording import RecordingId, RecordingSource
-from tactslip_torch.experiment import save_config
+from tactslip_torch.experiment import frame_lengths, save_config
 from tactslip_torch.features.cache import source_digest
 from tactslip_torch.progress import bar
 from tactslip_torch.report.signals import SignalRow, signals_figure
@@ -119,10 +119,7 @@ def _shown(config: DictConfig, source: RecordingSource) -> dict[str, list[Record
 def _filter(config: DictConfig, source: RecordingSource) -> ChannelFilter:
     """The filter of the ``features`` section."""
     features = config.features
-    missing = sorted({channel.kind for channel in source.hand.channels} - set(features.frames))
-    if missing:
-        raise ValueError(f"features.frames has no frame for {', '.join(missing)} channels")
-    lengths = [features.frames[channel.kind] for channel in source.hand.channels]
+    lengths = frame_lengths(source.hand, features.frames)
     return ChannelFilter(lengths, features.polyorder, features.align)
 
 

@@ -140,7 +140,8 @@ class Recipe:
         """
         if self.sizes[-1] > num_features:
             raise ValueError(
-                f"recipe.num_features={self.sizes[-1]} exceeds the pool's {num_features}"
+                f"recipe.num_features={self.sizes[-1]} exceeds the pool's {num_features}; give at "
+                f"most {num_features}"
             )
 
     def allowed(self, pool: FeaturePool) -> Tensor | None:

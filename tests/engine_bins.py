@@ -129,7 +129,7 @@ def rows_of(pool: FeaturePool, bins: Tensor) -> dict[tuple[str, str, str], Tenso
     rows = {}
     for channel in pool.hand.channels:
         x = bins[:, pool.hand.names.index(channel.name)]
-        if channel.kind == "SG":
+        if channel.adapting == "slow":
             rows[channel.name, "raw", "time"] = x
             continue
         for branch, values in zip(

@@ -155,3 +155,7 @@ def test_a_file_of_a_usual_head_has_700_kb():
     assert size_limit("float32", 0, frames=2) == 1_400_000
     assert size_limit("float32", 0, shares=1) == 700_000
     assert size_limit("float64", 0, shares=3) == 1_700_000
+    assert size_limit("float32", 0, blocks=9) == 700_000
+    assert size_limit("float32", 0, blocks=16) == 1_200_000
+    assert size_limit("float32", 0, bin_samples=64) == 700_000
+    assert size_limit("float32", 0, bin_samples=200) == 2_800_000

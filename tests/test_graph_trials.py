@@ -29,6 +29,16 @@ def test_simulated_bins_are_of_each_channel_its_kind():
     assert stream.isfinite().all()
     assert (stream[:2].std(1) > 0).all()
     assert not torch.equal(stream[0], stream[1])
+    assert torch.equal(simulated_stream(HAND, 2000.0, torch.float64, 2900), stream)
     bins = simulated_bins(HAND, 2000.0, 56, 110, torch.float64)
     assert torch.equal(bins[0], stream[:, :110])
     assert torch.equal(bins[-1], stream[:, -110:])
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 20.0, 92.3])
+def test_a_slow_hand_is_tried_on_a_slip_that_fills_its_bins(rate_hz):
+    stream = simulated_stream(HAND, rate_hz, torch.float64, 400)
+    assert 400 <= stream.shape[1] <= 420
+    bins = simulated_bins(HAND, rate_hz, 56, 100, torch.float64)
+    assert bins.shape == (56, 4, 100)
+    assert len(bins.unique(dim=0)) == 56

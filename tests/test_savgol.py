@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.savgol import (
     convolve_valid,
     edge_matrices,
@@ -11,9 +12,23 @@ from tactslip_torch.signals.savgol import (
     reach,
     savgol_filter,
 )
+from tactslip_torch.signals.stream import FilterStream
 
 ALIGNMENTS = ("centred", "causal", "trailing")
-FRAMES = [(1, 0), (3, 0), (3, 1), (3, 2), (5, 2), (5, 4), (11, 1), (11, 3), (51, 1), (51, 2)]
+FRAMES = [
+    (1, 0),
+    (1, 1),
+    (1, 3),
+    (3, 0),
+    (3, 1),
+    (3, 2),
+    (5, 2),
+    (5, 4),
+    (11, 1),
+    (11, 3),
+    (51, 1),
+    (51, 2),
+]
 
 
 def with_past(x, window_length, polyorder, align):
@@ -63,6 +78,26 @@ def test_a_hole_in_the_first_frame_is_in_all_of_the_past_and_a_later_one_in_none
         broken = x.clone()
         broken[place] = torch.inf
         assert not with_past(broken, 51, 1, align)[:-60].isfinite().any()
+
+
+@pytest.mark.parametrize("align", ALIGNMENTS)
+@pytest.mark.parametrize("polyorder", [0, 1, 4])
+def test_a_frame_of_one_sample_leaves_a_signal_as_it_is(polyorder, align):
+    x = torch.tensor([1.0, -0.0, 3.0, torch.nan, torch.inf], dtype=torch.float64)
+    found = savgol_filter(x, 1, polyorder, align)
+    assert found.numpy().tobytes() == x.numpy().tobytes()
+    assert found.data_ptr() != x.data_ptr()
+    layer = ChannelFilter([1, 5, 1], polyorder, align)
+    whole = torch.randn(3, 40, dtype=torch.float64)
+    stream = FilterStream(layer)
+    pieces = [stream.push(whole[:, :17]), stream.push(whole[:, 17:]), stream.flush()]
+    bins = layer.valid(whole[:, :24])  # 20 samples in the context of the longest frame
+    assert torch.equal(
+        bins[[0, 2]], whole[[0, 2], layer.context_before : layer.context_before + 20]
+    )
+    for filtered in (layer(whole), torch.cat(pieces, dim=-1)):
+        assert torch.equal(filtered[[0, 2]], whole[[0, 2]])
+        torch.testing.assert_close(filtered[1], savgol_filter(whole[1], 5, polyorder, align))
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,15 @@
 import numpy as np
 import oracles
 import pytest
+import pywt
 import torch
 
-from tactslip_torch.signals.wavelet import branch_matrix, branch_names, wavelet_branches
+from tactslip_torch.signals.wavelet import (
+    branch_matrix,
+    branch_names,
+    highest_level,
+    wavelet_branches,
+)
 
 LENGTHS = [80, 99, 100, 101, 128]
 
@@ -106,6 +112,17 @@ def test_nan_stays_where_its_filters_reach():
     assert branches[1].isfinite().all()
 
 
+@pytest.mark.parametrize("wavelet", ["haar", "db3", "rbio2.2", "sym8", "dmey"])
+def test_the_highest_level_is_pywavelets(wavelet):
+    length = pywt.Wavelet(wavelet).dec_len
+    shortest = 2 * (length - 1)
+    for num_samples in (shortest, shortest + 1, 100 + shortest, 1000):
+        highest = highest_level(num_samples, wavelet)
+        assert highest == pywt.dwt_max_level(num_samples, length) >= 1
+    with pytest.raises(ValueError, match=f"{wavelet}, which needs {shortest}"):
+        highest_level(shortest - 1, wavelet)
+
+
 @pytest.mark.parametrize(
     ("num_samples", "options", "message"),
     [
@@ -113,6 +130,12 @@ def test_nan_stays_where_its_filters_reach():
         (100, {"level": 0}, r"1\.\.4.*got 0"),
         (50, {}, r"1\.\.3.*50 samples.*got 4"),
         (100, {"wavelet": "rbio9.9"}, r"rbio9\.9"),
+        (
+            9,
+            {"level": 1},
+            r"bins of 9 samples .* rbio2\.2, which needs 10; use longer",
+        ),
+        (0, {"level": 1}, r"bins of 0 samples are too short"),
     ],
 )
 def test_errors_name_the_value(num_samples, options, message):

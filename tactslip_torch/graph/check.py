@@ -93,6 +93,8 @@ def check_file(
         sum(buffer.numel() for buffer in detector.head.buffers()),
         len({lengths[channel] for channel in plan.channels}),
         len(plan.share_channels),
+        len({(row.branch, row.kind) for row in plan.rows}),
+        detector.pool.bin_samples,
     )
     if size > limit:
         raise ValueError(f"its file has {size} bytes, more than {limit}")
@@ -114,7 +116,8 @@ def _inputs(kind: GraphKind, detector: SlipDetector, form: Form) -> Arrays:
     if kind == "bin":
         bins = noise_bins(hand, 7, Window.of(detector).length, 0, dtype)
         return {"samples": bins.numpy()}
-    samples = simulated_stream(hand, rate, dtype).T[: round(rate / 2)]
+    first = 2 * Window.of(detector).length  # enough for a decision at any rate
+    samples = simulated_stream(hand, rate, dtype, first).T[: max(round(rate / 2), first)]
     return {
         "samples": np.ascontiguousarray(samples.numpy()),
         "tail": np.empty((0, len(hand)), form.dtype),

@@ -29,6 +29,7 @@ FLAGS = ("valid", "alarm", "on")
 TIMES = ("time_s", "onset_s")
 NUMBERS = ("score", "probability", "statistic")
 _DECISIONS = 12  # that are made at least
+_FEWEST_BINS = 4  # that a slip lasts at least
 _LONGEST_HOP = 20_000  # samples; of more, a stream of that many decisions takes much memory
 _LATE_S = 1e-9  # by which times may differ
 _STATISTIC = {"float32": 1e-3, "float64": 1e-8}  # share of its range by which one may differ
@@ -52,7 +53,8 @@ def check_stream(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]
     settings = AlarmSettings.of(detector)
     dtype = torch.float32 if form.precision == "float32" else torch.float64
     timing = Timing.of(detector, settings)
-    slip = simulated_stream(detector.pool.hand, detector.pool.sample_rate_hz, dtype).T
+    hand, rate = detector.pool.hand, detector.pool.sample_rate_hz
+    slip = simulated_stream(hand, rate, dtype, _FEWEST_BINS * max(timing.first, timing.frame)).T
     whole = slowed(slip, timing)
     expected = _columns(double, settings, whole)
     sd = float(expected["score"].std()) or 1.0

@@ -38,21 +38,34 @@ Guard = tuple[str, tuple[float, ...]]
 """An operator, and the numbers that it is given as constants."""
 
 
-def size_limit(precision: str, head_numbers: int, frames: int = 1, shares: int = 0) -> int:
+def size_limit(
+    precision: str,
+    head_numbers: int,
+    frames: int = 1,
+    shares: int = 0,
+    blocks: int = 0,
+    bin_samples: int = 100,
+) -> int:
     """Bytes that a file may have: 700 kB in float32 where films alone are in use, or gauges alone.
 
     As much again for each further length of filter, as branches and spectra are fused with it; for
     each film but one of whose energy the detector wants shares, 75 kB; for the numbers of a head
-    beyond the first 25 000, their own. Twice that in float64.
+    beyond the first 25 000, their own. Where one film has to give all, its branches and spectra
+    take up to 75 kB each. All but the head grows with the square of the bin's length beyond the
+    paper's. Twice that in float64.
 
     Args:
         precision: of the graph.
         head_numbers: that the head is made of.
         frames: different lengths of filter among the channels in use.
         shares: films of whose energy shares are wanted.
+        blocks: different branches, and spectra of branches, in use.
+        bin_samples: length of a bin.
     """
     head = 4 * max(0, head_numbers - 25_000)
-    single = 700_000 * frames + 75_000 * max(0, shares - 1) + head
+    growth = max(1.0, (bin_samples / 100) ** 2)
+    front = max(700_000, 75_000 * blocks) * frames + 75_000 * max(0, shares - 1)
+    single = round(growth * front) + head
     return single if precision == "float32" else 2 * single
 
 

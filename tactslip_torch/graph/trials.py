@@ -18,6 +18,8 @@ KINDS: tuple[str, ...] = (*EXTREMES, *BROKEN)
 """Degenerate bins by name."""
 
 _BEFORE_S, _AFTER_S = 1.0, 0.5  # of the simulated onset
+_SPARE = 10  # samples that the simulator may leave out at the ends
+_FEWEST_BINS = 4  # that a simulated slip lasts at least, whatever the rate
 
 
 def noise_bins(hand: HandLayout, num: int, length: int, seed: int, dtype: torch.dtype) -> Tensor:
@@ -52,22 +54,27 @@ def degenerate_bins(
     return samples
 
 
-def simulated_stream(hand: HandLayout, sample_rate_hz: float, dtype: torch.dtype) -> Tensor:
+def simulated_stream(
+    hand: HandLayout, sample_rate_hz: float, dtype: torch.dtype, at_least: int = 0
+) -> Tensor:
     """A slip as the simulator records it, ``[C, T]``, volts; 1 s before its onset, .5 s behind.
 
-    Of another hand than the simulated one, each channel is the next that adapts as it does.
+    Of another hand than the simulated one, each channel is the next that adapts as it does. Where
+    that makes fewer samples than ``at_least``, the rate is that at which it makes so many: what a
+    model is tried on must fill bins, not keep time.
     """
     simulated = HandLayout.paper24()
     places = {"slow": cycle(simulated.slow), "fast": cycle(simulated.fast)}
     rows = [next(places[str(channel.adapting)]) for channel in hand.channels]
-    return _simulated(sample_rate_hz)[rows].to(dtype)
+    fewest = (at_least + _SPARE) / (_BEFORE_S + _AFTER_S)
+    return _simulated(max(sample_rate_hz, fewest))[rows].to(dtype)
 
 
 def simulated_bins(
     hand: HandLayout, sample_rate_hz: float, num: int, length: int, dtype: torch.dtype
 ) -> Tensor:
     """Bins of the simulated slip, evenly spread over it: ``[num, C, length]``, volts."""
-    samples = simulated_stream(hand, sample_rate_hz, dtype)
+    samples = simulated_stream(hand, sample_rate_hz, dtype, _FEWEST_BINS * length)
     starts = torch.linspace(0, samples.shape[-1] - length, num).long()
     return samples.unfold(-1, length, 1)[:, starts].movedim(1, 0).contiguous()
 

@@ -24,7 +24,7 @@ class ChannelFilter(nn.Module):
     behind: as many on each side if centred, else all of them before, ``2 * context`` in all.
 
     Args:
-        window_lengths: one odd frame per channel, in samples.
+        window_lengths: one odd frame per channel, in samples; 1 leaves a channel as it is.
         polyorder: order of the fitted polynomial.
         align: where in its frame a sample lies.
 

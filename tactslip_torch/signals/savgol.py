@@ -29,13 +29,16 @@ def fit_matrix(window_length: int, polyorder: int) -> Tensor:
 
     Shape:
         - output: ``[window_length, window_length]``, float64; row ``i`` times the frame is the
-          fitted polynomial at sample ``i``. The middle row is the Savitzky-Golay kernel.
+          fitted polynomial at sample ``i``. The middle row is the Savitzky-Golay kernel. A frame
+          of one sample is that sample, whatever the order: nothing is smoothed.
 
     Raises:
-        ValueError: if the frame is even or does not exceed the order.
+        ValueError: if the frame is even or, of more than one sample, does not exceed the order.
     """
     if window_length < 1 or window_length % 2 == 0:
         raise ValueError(f"window_length must be odd and positive, got {window_length}")
+    if window_length == 1 and polyorder >= 0:
+        return torch.ones(1, 1, dtype=torch.float64)
     if not 0 <= polyorder < window_length:
         raise ValueError(
             f"polyorder must lie in 0..{window_length - 1} for window_length {window_length}, "
@@ -94,7 +97,7 @@ def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
     """
     head, kernel, _ = edge_matrices(window_length, polyorder, align)
     before = len(head)
-    if polyorder == window_length - 1:  # goes through all samples: nothing is smoothed
+    if polyorder >= window_length - 1:  # goes through all samples: nothing is smoothed
         return torch.eye(window_length, dtype=torch.float64)[:1].repeat(before, 1)
     rows = torch.zeros(before, before + window_length, dtype=torch.float64)
     for i, row in enumerate(rows):
@@ -116,7 +119,8 @@ def savgol_filter(
 
     Args:
         x: signal in any unit.
-        window_length: frame in samples, odd; 11 for PVDF and 51 for SG in the paper.
+        window_length: frame in samples, odd; 11 for PVDF and 51 for SG in the paper; 1 leaves the
+            signal as it is.
         polyorder: order of the fitted polynomial, 1 in the paper.
         align: ``"centred"``; or ``"causal"``: the frame ends with the sample, as
             ``scipy.signal.savgol_coeffs(pos=window_length - 1)``; or ``"trailing"``: it ends with

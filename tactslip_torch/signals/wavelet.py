@@ -29,6 +29,33 @@ def branch_names(level: int) -> tuple[str, ...]:
     return tuple(f"{kind}{m}" for m in range(1, level + 1) for kind in "AD")
 
 
+def highest_level(num_samples: int, wavelet: str = "rbio2.2") -> int:
+    """How many levels a bin allows: so many that its ends do not reach all coefficients.
+
+    Raises:
+        ValueError: if the wavelet is unknown, or the bin too short for a single level.
+
+    Reference:
+        ``pywt.dwt_max_level``.
+
+    Example:
+        >>> highest_level(100, "rbio2.2"), highest_level(30, "db3")
+        (4, 2)
+    """
+    if wavelet not in pywt.wavelist(kind="discrete"):
+        raise ValueError(
+            f"unknown wavelet {wavelet!r}; pywt.wavelist(kind='discrete') lists the known ones"
+        )
+    length = pywt.Wavelet(wavelet).dec_len
+    highest = int(pywt.dwt_max_level(num_samples, length)) if num_samples > 0 else 0
+    if highest < 1:
+        raise ValueError(
+            f"bins of {num_samples} samples are too short for a level of {wavelet}, which needs "
+            f"{2 * (length - 1)}; use longer bins or a shorter wavelet, such as haar"
+        )
+    return highest
+
+
 def wavelet_branches(
     x: Tensor, wavelet: str = "rbio2.2", level: int = 4, mode: ExtensionMode = "symmetric"
 ) -> Tensor:
@@ -54,11 +81,7 @@ def wavelet_branches(
         ``pywt.wavedec`` and ``pywt.waverec`` with all but one coefficient array zeroed.
     """
     num_samples = x.shape[-1]
-    if wavelet not in pywt.wavelist(kind="discrete"):
-        raise ValueError(
-            f"unknown wavelet {wavelet!r}; pywt.wavelist(kind='discrete') lists the known ones"
-        )
-    highest = pywt.dwt_max_level(num_samples, pywt.Wavelet(wavelet).dec_len)
+    highest = highest_level(num_samples, wavelet)
     if not 1 <= level <= highest:
         raise ValueError(
             f"level must lie in 1..{highest} for bins of {num_samples} samples and {wavelet}, "

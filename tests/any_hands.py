@@ -1,0 +1,180 @@
+"""Hands unlike the paper's, noise that they feel, and detectors trained on it."""
+
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+
+import torch
+
+from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.experiment import frame_lengths
+from tactslip_torch.features.extractor import EngineName
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
+from tactslip_torch.hand import Channel, HandLayout
+from tactslip_torch.model.calibration import Platt
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.onset.sequential import Cusum
+from tactslip_torch.onset.settings import KEY, AlarmSettings
+from tactslip_torch.signals.filtering import Align, ChannelFilter
+from tactslip_torch.signals.wavelet import highest_level
+
+
+@dataclass(frozen=True)
+class AnyHand:
+    """A hand and how its bins are laid.
+
+    Args:
+        channels: number of them by kind and by how they adapt.
+        rate_hz: samples per second.
+        bin_samples: length of a bin.
+        hop: samples between decisions.
+        frames: as ``features.frames``.
+        wavelet: of the branches.
+        level: of the branches, ``None`` for as many as there can be.
+        align: of the filter.
+        size: of the noise, in whatever unit.
+        offset: that it stands on.
+        num_features: to select.
+        polyorder: of the filter.
+    """
+
+    channels: dict[tuple[str, str], int]
+    rate_hz: float
+    bin_samples: int
+    hop: int
+    frames: dict[str, int | None]
+    wavelet: str = "rbio2.2"
+    level: int | None = None
+    align: Align = "centred"
+    size: float = 0.1
+    offset: float = 0.0
+    num_features: int = 12
+    polyorder: int = 1
+
+    def layout(self) -> HandLayout:
+        """The channels, kinds by turns."""
+        rows = [
+            (place / num, Channel(f"{kind}{place}", kind, f"finger{place % 3}", "tip", adapting))
+            for (kind, adapting), num in self.channels.items()
+            for place in range(num)
+        ]
+        return HandLayout([channel for _, channel in sorted(rows, key=lambda row: row[0])])
+
+    def pool(self) -> FeaturePool:
+        highest = min(4, highest_level(self.bin_samples, self.wavelet))
+        return FeaturePool(
+            self.layout(),
+            self.rate_hz,
+            bin_samples=self.bin_samples,
+            wavelet=self.wavelet,
+            level=self.level or highest,
+        )
+
+    def channel_filter(self) -> ChannelFilter:
+        return ChannelFilter(frame_lengths(self.layout(), self.frames), self.polyorder, self.align)
+
+    def noise(self, num: int, num_samples: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Raw bins, every other one slip, louder and smoother: ``[N, C, T]`` and ``[N]``."""
+        generator = torch.Generator().manual_seed(seed)
+        num_channels = sum(self.channels.values())
+        shape = (num, num_channels, num_samples + 1)
+        x = torch.randn(shape, generator=generator, dtype=torch.float64)
+        loudness = 10 ** (torch.rand(num, 1, 1, generator=generator, dtype=torch.float64) - 0.5)
+        is_slip = torch.arange(num) % 2 == 1
+        rough, smooth = x[..., 1:], (x[..., 1:] + x[..., :-1]) / 2**0.5
+        x = torch.where(is_slip[:, None, None], 3.0 * smooth, rough) * loudness
+        return self.size * x + self.offset, is_slip
+
+
+HANDS = {
+    "24 electrodes at 100 Hz": AnyHand(
+        {("electrode", "fast"): 24}, 100.0, 64, 32, {"electrode": 3}, size=40.0, offset=2000.0
+    ),
+    "one fast": AnyHand({("PVDF", "fast"): 1}, 2000.0, 100, 20, {"PVDF": 11}),
+    "one slow": AnyHand({("force", "slow"): 1}, 50.0, 16, 8, {"force": None}, num_features=6),
+    "five slow": AnyHand(
+        {("SG", "slow"): 3, ("force", "slow"): 2}, 500.0, 50, 25, {"SG": 7, "force": None}
+    ),
+    "40 at 1 kHz": AnyHand(
+        {("taxel", "fast"): 30, ("thermistor", "slow"): 10},
+        1000.0,
+        30,
+        10,
+        {"taxel": 5, "thermistor": 1},
+        "db3",
+        2,
+        "causal",
+        num_features=40,
+    ),
+    "64 unfiltered": AnyHand(
+        {("barometer", "fast"): 64}, 92.0, 41, 20, {"barometer": None}, "sym4", align="trailing"
+    ),
+}
+
+
+@cache
+def detector_of(name: str, engine: EngineName = "eager") -> SlipDetector:
+    """A detector of one of ``HANDS``, trained on its noise."""
+    hand = HANDS[name]
+    pool, channel_filter = hand.pool(), hand.channel_filter()
+    samples, is_slip = hand.noise(400, hand.bin_samples + 2 * channel_filter.context, seed=1)
+    features = pool(channel_filter.valid(samples))
+    moments = ClassMoments(len(pool.names))
+    moments.update(features.float(), is_slip)
+    selected = rank_features(t_scores(moments), hand.num_features).tolist()
+    scaler = FeatureScaler.fit(features[:, selected])
+    machine = fit_machine(TrainingBins(scaler(features[:, selected]), is_slip), 1.0)
+    rule = Cusum(0.5, 0.4, 8.0)
+    settings = AlarmSettings(
+        hand.hop, Platt(4.0, 0.0), rule, threshold=2.0137, target_per_hour=1.0, rearm_s=0.0
+    )
+    info = {"simulated": False, KEY: settings.to_dict()}
+    return SlipDetector(pool, channel_filter, selected, scaler, machine, info, engine=engine)
+
+
+class AnyRecordings:
+    """A ``RecordingSource`` of one of ``HANDS``: two slips a recording, louder and smoother.
+
+    Args:
+        hand: which, by name.
+        cycles: recordings of each material.
+        materials: of the recordings.
+        units: of the samples.
+    """
+
+    is_simulated = False
+
+    def __init__(self, hand: str, cycles: int, materials: list[str], units: str = "V", **_: object):
+        self._name, self._hand = hand, HANDS[hand]
+        self.hand, self.sample_rate_hz, self.units = self._hand.layout(), self._hand.rate_hz, units
+        self.ids = tuple(RecordingId(m, c) for m in materials for c in range(cycles))
+
+    def timeline(self, recording: RecordingId) -> SimpleNamespace:
+        bin_s = max(0.3, self._hand.bin_samples / self.sample_rate_hz)
+        onsets = (6 * bin_s, 18 * bin_s)
+        return SimpleNamespace(
+            duration_s=30 * bin_s,
+            onsets_s=onsets,
+            annotated_onsets_s=onsets,
+            sliding_s=tuple((onset, onset + 6 * bin_s) for onset in onsets),
+            speeds_mm_s=(20.0, 40.0),
+            non_slip_s=((bin_s, 5 * bin_s), (14 * bin_s, 17 * bin_s)),
+            slip_s=(),
+            missing_s=(),
+        )
+
+    def key(self, recording: RecordingId) -> dict[str, str]:
+        return {"any hand": self._name, "recording": str(recording)}
+
+    def load(self, recording: RecordingId, windows: object = None) -> Recording:
+        times = self.timeline(recording)
+        num_samples = round(times.duration_s * self.sample_rate_hz)
+        quiet, loud = self._hand.noise(2, num_samples, seed=sum(str(recording).encode()))[0]
+        time_s = torch.arange(num_samples) / self.sample_rate_hz
+        for start, end in times.sliding_s:
+            quiet = torch.where((time_s >= start) & (time_s < end), loud, quiet)
+        truth = times.speeds_mm_s, times.onsets_s, times.sliding_s
+        return Recording(quiet, self.sample_rate_hz, recording.material, *truth, units=self.units)

@@ -1,0 +1,241 @@
+"""Hands of other channels, kinds, rates, bins and wavelets: from noise to an exported detector."""
+
+import json
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from any_hands import HANDS, detector_of
+from engine_bins import DEGENERATE_KINDS, PLAIN_KINDS, assert_equals_reference, bins_of
+from hypothesis import given
+from hypothesis import strategies as st
+from test_commands import composed
+
+from tactslip_torch.experiment import feature_parts
+from tactslip_torch.export import export_detector
+from tactslip_torch.features.extractor import FeatureExtractor
+from tactslip_torch.graph.form import Window
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.recipe import Recipe
+from tactslip_torch.train import train
+
+any_hand = pytest.mark.parametrize("name", HANDS)
+
+
+def stream_of(name, num_bins=12, seed=3):
+    """A recording ``[C, T]`` of quiet and loud stretches by turns."""
+    hand = HANDS[name]
+    pieces, _ = hand.noise(num_bins, 3 * hand.bin_samples, seed)
+    return torch.cat(list(pieces), dim=-1)
+
+
+@any_hand
+def test_the_pool_is_sized_by_the_hand(name):
+    pool = HANDS[name].pool()
+    of_fast = 2 * pool.level * (14 + 15 + 1)
+    assert len(pool.names) == 13 * len(pool.hand.slow) + of_fast * len(pool.hand.fast)
+    assert len({str(each) for each in pool.names}) == len(pool.names)
+    samples, _ = HANDS[name].noise(3, pool.bin_samples, seed=0)
+    features = pool(samples)
+    assert features.shape == (3, len(pool.names))
+    assert features.isfinite().all()
+
+
+@any_hand
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
+@pytest.mark.parametrize("kinds", [PLAIN_KINDS, DEGENERATE_KINDS], ids=["plain", "degenerate"])
+def test_engines_give_the_reference(name, engine, kinds):
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    pool, generator = HANDS[name].pool(), torch.Generator().manual_seed(0)
+    bins = torch.cat([bins_of(kind, 6, pool.hand, pool.bin_samples, generator) for kind in kinds])
+    found = FeatureExtractor(pool, engine=engine)(bins)
+    assert_equals_reference(found, pool(bins), pool.names, mixed=False)
+
+
+@any_hand
+def test_a_detector_tells_slip_and_comes_back_from_its_file(name, tmp_path):
+    hand, detector = HANDS[name], detector_of(name)
+    num = hand.bin_samples + 2 * detector.channel_filter.context
+    samples, is_slip = hand.noise(200, num, seed=2)
+    score = detector.score_raw(samples)
+    assert ((score >= 0) == is_slip).double().mean() > 0.7  # one channel knows little
+    path = tmp_path / "detector.pt"
+    detector.save(path)
+    loaded = SlipDetector.load(path, engine="eager")
+    assert loaded.pool.hand == detector.pool.hand == hand.layout()
+    assert loaded.pool.facts() == detector.pool.facts()
+    assert torch.equal(loaded.score_raw(samples), score)
+    again = tmp_path / "again.pt"
+    loaded.save(again)
+    assert again.read_bytes() == path.read_bytes()
+
+
+@any_hand
+@given(data=st.data())
+def test_a_stream_in_pieces_is_the_recording_scored_whole(name, data):
+    detector, samples = detector_of(name), stream_of(name)
+    num = samples.shape[-1]
+    cuts = data.draw(st.lists(st.integers(0, num), max_size=8))
+    hop = data.draw(st.integers(1, 2 * HANDS[name].bin_samples))
+    settings = AlarmSettings.of(detector)
+    settings = AlarmSettings(**{**vars(settings), "hop_samples": hop})
+    stream = StreamingDetector(detector, settings, dtype=torch.float64)
+    pieces = [samples[:, a:b].T for a, b in pairwise([0, *sorted(cuts), num])]
+    found = [stream.push(piece) for piece in pieces] + [stream.flush()]
+    expected = score_stream(detector, samples, hop)
+    score = torch.cat([part.score for part in found])
+    assert len(score) == len(expected.score) > 0
+    torch.testing.assert_close(score, expected.score, rtol=1e-9, atol=1e-9)
+    assert torch.equal(torch.cat([part.is_valid for part in found]), expected.is_valid)
+
+
+@pytest.mark.onnx
+@any_hand
+def test_exported_graphs_give_the_detectors_scores(name, tmp_path):
+    hand, detector = HANDS[name], detector_of(name)
+    bin_path, stream_path = export_detector(detector, tmp_path, alone=False)  # checks itself, too
+    facts = json.loads((tmp_path / "model.onnx.json").read_text())
+    assert facts["kinds"] == [channel.kind for channel in hand.layout().channels]
+    assert (facts["sample_rate_hz"], facts["bin_samples"]) == (hand.rate_hz, hand.bin_samples)
+    window, context = Window.of(detector), detector.channel_filter.context
+    samples, _ = hand.noise(50, hand.bin_samples + 2 * context, seed=4)
+    samples = samples.float()
+    expected = detector.score_raw(samples.double())
+    start = detector.context_before - window.before
+    (score,) = session(bin_path).run(
+        ["score"], {"samples": samples[..., start : start + window.length].numpy()}
+    )
+    assert np.abs(score - expected.numpy()).max() < 1e-3 * float(expected.std())
+
+    whole = stream_of(name).float()
+    settings = AlarmSettings.of(detector)
+    decided = StreamingDetector(detector, settings, dtype=torch.float64).push(whole.double().T)
+    given = {"samples": np.ascontiguousarray(whole.T.numpy()), "threshold": np.empty(0)}
+    given |= {"tail": np.empty((0, len(detector.pool.hand)), np.float32), "state": np.empty(0)}
+    found, alarm = session(stream_path).run(["score", "alarm"], given)
+    assert len(found) == len(decided.score) > 3
+    assert np.abs(found - decided.score.numpy()).max() < 1e-3 * float(decided.score.std())
+    assert alarm.tolist() == decided.is_alarm.tolist()
+
+
+def session(path):
+    return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+
+
+@pytest.mark.parametrize(
+    ("name", "units", "changes"),
+    [
+        (
+            "24 electrodes at 100 Hz",
+            "counts",
+            ("labels.bin_ms=640", "labels.hop_ms=320", "features.level=null",
+             "+features.frames.electrode=3"),
+        ),
+        (
+            "five slow",
+            "V",
+            ("labels.bin_ms=100", "features.level=null", "features.frames.SG=7",
+             "+features.frames.force=null"),
+        ),
+        (
+            "40 at 1 kHz",
+            "kPa",
+            ("labels.bin_ms=30", "+features.frames.taxel=5", "+features.frames.thermistor=1",
+             "features.wavelet=db3", "features.level=2", "features.align=causal"),
+        ),
+    ],
+)  # fmt: skip
+def test_train_takes_a_hand_from_its_configuration(name, units, changes, tmp_path):
+    config = composed(
+        f"name={name.replace(' ', '_')}",
+        "data._target_=any_hands.AnyRecordings",
+        f"+data.hand={name}",
+        f"+data.units={units}",
+        "data.materials=[A,B,C]",
+        "data.cycles=3",
+        "split.seen=[A,B]",
+        "split.unseen=[C]",
+        "recipe.num_features=10",
+        "recipe.penalties=[0.1,1.0]",
+        "num_workers=0",
+        f"cache={tmp_path / 'cache'}",
+        *changes,
+    )
+    found = train(config, tmp_path / "run")
+    assert found["unseen/balanced_accuracy"] > 0.6
+    detector = SlipDetector.load(tmp_path / "run" / "detector.pt")
+    hand = HANDS[name]
+    assert detector.pool.hand == hand.layout()
+    assert detector.pool.facts() == hand.pool().facts()
+    assert detector.channel_filter.window_lengths == hand.channel_filter().window_lengths
+    facts = json.loads((tmp_path / "run" / "model.onnx.json").read_text())
+    assert facts["unit"] == units
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert not metrics["is_papers_hand"]
+
+
+# From the configuration ----------------------------------------------------------------------
+
+
+def parts_of(bin_ms=50.0, **changes):
+    """Pool and filter from the ``features`` section, which no recording is read for."""
+    source = SimpleNamespace(hand=HANDS["five slow"].layout(), sample_rate_hz=1000.0)
+    features = {"frames": {"SG": 5, "PVDF": 5, "force": None}, **changes}
+    return feature_parts(source, bin_ms, **{**composed().features, **features})[:2]
+
+
+@pytest.mark.parametrize(
+    ("bin_ms", "wavelet", "expected"),
+    [(50, "rbio2.2", 3), (200, "rbio2.2", 4), (30, "db3", 2), (10, "rbio2.2", 1), (1000, "db1", 4)],
+)
+def test_a_level_of_null_is_as_many_as_there_can_be(bin_ms, wavelet, expected):
+    pool, _ = parts_of(bin_ms, wavelet=wavelet, level=None)
+    assert pool.level == expected
+
+
+def test_a_frame_of_null_or_one_filters_nothing():
+    _, channel_filter = parts_of(level=3)
+    assert sorted(channel_filter.window_lengths) == [1, 1, 5, 5, 5]
+    same = parts_of(level=3, frames={"SG": 5, "force": 1})[1]
+    assert same.window_lengths == channel_filter.window_lengths
+
+
+@pytest.mark.parametrize(
+    ("bin_ms", "changes", "message"),
+    [
+        (50, {"level": 4}, r"features.level must lie in 1\.\.3 for bins of 50 samples and "
+                           r"features.wavelet=rbio2.2, got 4; .* or null"),
+        (50, {"level": 0}, r"1\.\.3 .* got 0"),
+        (50, {"level": 1.5}, r"1\.\.3 .* got 1.5"),
+        (9, {}, "bins of 9 samples are too short for a level of rbio2.2, which needs 10"),
+        (0.1, {}, "bins of 0 samples are too short"),
+        (50, {"wavelet": "db99"}, "unknown wavelet 'db99'"),
+        (50, {"level": 3, "frames": {"SG": 5}}, r"no frame for force channels; .*"
+                                                r"\+features.frames.force=11, or null"),
+        (50, {"level": 3, "frames": {"SG": 4, "force": 1}}, "frames.SG must be an odd .* got 4"),
+        (50, {"level": 3, "frames": {"SG": 5, "force": -1}}, "frames.force must be an odd .*-1"),
+        (50, {"level": 3, "frames": {"SG": 5.0, "force": 1}}, "frames.SG must be an odd .*5.0"),
+        (50, {"level": 3, "frames": {"SG": "x", "force": 1}}, "frames.SG must be an odd .*'x'"),
+    ],
+)  # fmt: skip
+def test_features_that_a_hand_cannot_have_are_refused_in_one_line(bin_ms, changes, message):
+    with pytest.raises(ValueError, match=message) as refused:
+        parts_of(bin_ms, **changes)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "num"), [("one slow", 13), ("five slow", 65), ("one fast", 240), ("40 at 1 kHz", 3730)]
+)
+def test_more_features_than_a_small_hand_has_are_refused(name, num):
+    assert len(HANDS[name].pool().names) == num
+    Recipe(num_features=num).check_pool(num)
+    with pytest.raises(ValueError, match=f"={num + 1} exceeds the pool's {num}; give at most"):
+        Recipe(num_features=[5, num + 1]).check_pool(num)
