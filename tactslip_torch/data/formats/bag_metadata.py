@@ -14,7 +14,7 @@ from tactslip_torch.data.formats.header import MOST_HEADER
 from tactslip_torch.data.formats.reading import needs
 
 METADATA = "metadata.yaml"
-_MOST_BYTES = MOST_HEADER + 2**20
+_MOST_BYTES = 3 * MOST_HEADER + 2**20
 _MOST_EVENTS = 200_000  # values and brackets
 _MOST_DEPTH = 32
 _STORAGES = ("sqlite3", "mcap")
@@ -27,13 +27,13 @@ class BagMetadata(NamedTuple):
         storage: ``sqlite3`` or ``mcap``.
         files: with the messages, in their order.
         is_packed: whether each message is packed by itself.
-        custom: whatever its writer added.
+        custom: texts that its writer added.
     """
 
     storage: str
     files: tuple[Path, ...]
     is_packed: bool
-    custom: Mapping[str, object]
+    custom: Mapping[str, str]
 
 
 def read_metadata(folder: Path) -> BagMetadata:
@@ -59,13 +59,17 @@ def read_metadata(folder: Path) -> BagMetadata:
         raise ValueError(f"storage {storage!r}; {' and '.join(_STORAGES)} are read")
     if not isinstance(files, list) or not all(isinstance(name, str) for name in files):
         raise ValueError(f"{METADATA} without relative_file_paths")
-    custom = facts.get("custom_data")
     return BagMetadata(
         storage,
         tuple(_inside(folder, name) for name in files),
         _is_packed(facts),
-        custom if isinstance(custom, dict) else {},
+        _texts(facts.get("custom_data")),
     )
+
+
+def _texts(custom: object) -> dict[str, str]:
+    pairs = custom.items() if isinstance(custom, dict) else ()
+    return {name: text for name, text in pairs if isinstance(name, str) and isinstance(text, str)}
 
 
 def _is_packed(facts: Mapping[str, Any]) -> bool:
@@ -89,7 +93,8 @@ def _inside(folder: Path, name: str) -> Path:
     path = folder / name
     if not path.exists() and Path(name).parent == Path(folder.name):
         path = folder / Path(name).name
-    if not path.resolve().is_relative_to(folder.resolve()) or ".." in Path(name).parts:
+    is_plain = not Path(name).is_absolute() and ".." not in Path(name).parts
+    if not is_plain or not path.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"{METADATA} names {name!r}, which is not in the folder")
     if not path.is_file():
         raise ValueError(f"{METADATA} names {name!r}, which is not there")

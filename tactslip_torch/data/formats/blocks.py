@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.data.formats.cdr import MOST_CHANNELS
-from tactslip_torch.data.formats.header import DTYPES, Archived, archived_from, facts_of
+from tactslip_torch.data.formats.header import (
+    DTYPES,
+    MOST_HEADER,
+    Archived,
+    archived_from,
+    facts_of,
+)
 from tactslip_torch.data.formats.message_samples import samples_of
 from tactslip_torch.data.formats.messages import Bag, named
 from tactslip_torch.data.formats.reading import Opened, Reading, Samples
@@ -99,7 +105,16 @@ def _dimension(label: bytes, size: int, stride: int) -> bytes:
 
 
 def metadata_of(header: str) -> dict[str, str]:
-    """The header as a file's metadata, with a checksum."""
+    """The header as a file's metadata, with a checksum.
+
+    Raises:
+        ValueError: if it is longer than is read.
+    """
+    if len(header) > MOST_HEADER:
+        raise ValueError(
+            f"provenance, key and the rest are {len(header)} characters, at most {MOST_HEADER} "
+            "are read; keep less in them"
+        )
     return {_HEADER: header, _CHECKSUM: sum_text(zlib.crc32(header.encode()))}
 
 
@@ -108,16 +123,14 @@ def sum_text(checksum: int) -> str:
     return f"crc32 {checksum:08x}"
 
 
-def header_in(metadata: Mapping[str, object]) -> str | None:
+def header_in(metadata: Mapping[str, str]) -> str | None:
     """The header in a file's metadata; ``None`` if the file is another's.
 
     Raises:
         ValueError: if it fails its checksum.
     """
     header = metadata.get(_HEADER)
-    if not isinstance(header, str):
-        return None
-    if metadata.get(_CHECKSUM) != metadata_of(header)[_CHECKSUM]:
+    if header is not None and metadata.get(_CHECKSUM) != metadata_of(header)[_CHECKSUM]:
         raise ValueError("damaged: the header of the recording fails its checksum")
     return header
 

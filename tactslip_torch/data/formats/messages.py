@@ -106,6 +106,8 @@ def named(path: str) -> Iterator[None]:
     """Errors of what is in a file become one line that names it."""
     try:
         yield
+    except FileNotFoundError:
+        raise
     except ValueError as error:
         text = " ".join(str(error).split())
         raise ValueError(f"{path}: {text}") from error

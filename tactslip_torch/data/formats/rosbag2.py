@@ -1,8 +1,8 @@
 """Recordings as rosbag2 folders, which ROS 2 plays and ``rosbags`` reads without it.
 
 Ours hold the messages that ``mcap`` describes in a ``.db3`` file, written by ``rosbags``; the rest
-stands in ``metadata.yaml``. Folders of others are read with ``.db3`` or ``.mcap`` files, one or
-split into many.
+stands in ``metadata.yaml``, quoted as in URLs. Folders of others are read with ``.db3`` or
+``.mcap`` files, one or split into many.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
-from tactslip_torch.data.formats.bag_metadata import METADATA, BagMetadata, read_metadata
+from tactslip_torch.data.formats.bag_metadata import METADATA, read_metadata
 from tactslip_torch.data.formats.blocks import (
     TOPIC,
     blocks,
@@ -39,6 +40,7 @@ from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
 
 _SUM = "tactslip_torch_message_sum"
+_SAFE = "{}[]:,"  # all else is written as in URLs: YAML writers wrap quoted text, and may err there
 _FILES = (".db3", ".mcap", ".yaml")
 
 
@@ -68,7 +70,7 @@ def save(
             writer.write(channel, time, message)
             total = zlib.crc32(message, total)
         for name, text in (metadata_of(header) | {_SUM: sum_text(total)}).items():
-            writer.set_custom_data(name, text)
+            writer.set_custom_data(name, quote(text, safe=_SAFE))
 
 
 def load(path: str | os.PathLike[str]) -> Archived:
@@ -78,12 +80,12 @@ def load(path: str | os.PathLike[str]) -> Archived:
         FileNotFoundError: if there is no such folder.
         ValueError: if it is damaged or none of ours.
     """
-    with _opened(path) as (bag, metadata, header):
+    with _opened(path) as (bag, facts, header):
         if header is None:
             raise damaged(path)
         name = os.fspath(path)
         with named(name):
-            _check_sum(bag, metadata)
+            _check_sum(bag, facts)
         return whole(name, bag, header)
 
 
@@ -110,28 +112,29 @@ def open(path: str | os.PathLike[str], how: Reading = AS_IT_SAYS) -> Iterator[Op
         FileNotFoundError: if there is no such folder.
         ValueError: if it is damaged, or no topic or more than one holds samples.
     """
-    with _opened(path) as (bag, metadata, header):
+    with _opened(path) as (bag, facts, header):
         name = os.fspath(path)
         is_ours = header is not None and how.samples in (None, TOPIC)
         if is_ours:
             with named(name):
-                _check_sum(bag, metadata)
+                _check_sum(bag, facts)
         yield ours(name, bag, header) if is_ours and header else samples_of(name, bag, how)
 
 
 @contextmanager
 def _opened(
     path: str | os.PathLike[str],
-) -> Iterator[tuple[Bag, BagMetadata, str | None]]:
-    """The messages of a folder, what it says of itself, and the header if it is one of ours."""
+) -> Iterator[tuple[Bag, dict[str, str], str | None]]:
+    """The messages of a folder, what its writer added, and the header if it is one of ours."""
     if not Path(path).is_dir():
         raise FileNotFoundError(f"no folder at {os.fspath(path)}")
     with ExitStack() as stack:
         with named(os.fspath(path)):
             metadata = read_metadata(Path(path))
-            header = header_in(metadata.custom)
+            facts = {name: unquote(text) for name, text in metadata.custom.items()}
+            header = header_in(facts)
             bag: Bag = Joined([_bag(file, metadata.storage, stack) for file in metadata.files])
-        yield Packed(bag) if metadata.is_packed else bag, metadata, header
+        yield Packed(bag) if metadata.is_packed else bag, facts, header
 
 
 def _bag(file: Path, storage: str, stack: ExitStack) -> Bag:
@@ -142,13 +145,13 @@ def _bag(file: Path, storage: str, stack: ExitStack) -> Bag:
     return bag
 
 
-def _check_sum(bag: Bag, metadata: BagMetadata) -> None:
+def _check_sum(bag: Bag, facts: Mapping[str, str]) -> None:
     """Hold the messages against the sum that was written beside them; SQLite keeps none."""
     total = 0
     for number in range(bag.num_pages):
         for message in bag.page(number, TOPIC).messages:
             total = zlib.crc32(message, total)
-    if metadata.custom.get(_SUM) != sum_text(total):
+    if facts.get(_SUM) != sum_text(total):
         raise ValueError("damaged: the messages fail their checksum")
 
 
