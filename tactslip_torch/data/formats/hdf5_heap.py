@@ -28,9 +28,9 @@ def has_sound_heaps(path: str | os.PathLike[str]) -> bool:
             return False
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             base = max(content.find(_FILE), 0)
-            starts = [at for at in _places(content, _HEAP) if (at - base) % 8 == 0]
+            starts = list(_places(content, _HEAP))
             try:
-                return all(_is_sound(content, at, at - base) for at in starts)
+                return bool(starts) and all(_is_sound(content, at, at - base) for at in starts)
             except struct.error:
                 return False
 
@@ -40,7 +40,7 @@ def _is_sound(content: mmap.mmap, start: int, address: int) -> bool:
     sizes: dict[int, int] = {}
     _, version, size = _HEAD.unpack_from(content, start)
     at, end = start + _HEAD.size, start + size
-    if version != 1 or end > len(content):
+    if version != 1 or address % 8 or end > len(content):
         return False
     while at + _OBJECT.size <= end:
         number, _, num_bytes = _OBJECT.unpack_from(content, at)
@@ -54,7 +54,7 @@ def _is_sound(content: mmap.mmap, start: int, address: int) -> bool:
             claimed, _, number = _REFERENCE.unpack_from(content, place - 4)
             if claimed > sizes.get(number, claimed):
                 return False
-    return at <= end
+    return bool(at <= end)
 
 
 def _places(content: mmap.mmap, wanted: bytes) -> Iterator[int]:
