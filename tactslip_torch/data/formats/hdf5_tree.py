@@ -24,7 +24,8 @@ from tactslip_torch.data.formats.refusing import Refused
 
 MOST_OBJECTS = 10_000
 MOST_WORDS = 10_000
-_DEFLATE = 1
+_DEFLATE, _SHUFFLE, _FLETCHER = 1, 2, 3  # filters of HDF5
+_SUM_BYTES = 4
 _MOST_INFLATION = 1032  # of zlib, in bytes per byte
 _SUSPECT_BYTES = 64 * 2**20 // _MOST_INFLATION
 
@@ -136,22 +137,37 @@ class DatasetArray:
         return values.T if self.is_turned else values
 
     def _check_chunks(self, axis: int, first: int, stop: int) -> None:
-        """Refuse compressed chunks that hold more than they should: HDF5 would unpack it all."""
+        """Refuse chunks that are not what they should be: HDF5 reads beyond, or unpacks it all."""
         chunks, shape = self.dataset.chunks, self.dataset.shape
-        if self.dataset.compression != "gzip" or not self.dataset.size or first >= stop:
+        if chunks is None or not self.dataset.size or first >= stop:
             return
         ranges = [range(0, length, step) for length, step in zip(shape, chunks, strict=True)]
         step = chunks[axis]
         ranges[axis] = range(first // step * step, stop, step)
-        most = math.prod(chunks) * self.dtype.itemsize
         for corner in itertools.product(*ranges):
-            if corner in self._sound:
-                continue
-            if self.dataset.id.get_chunk_info_by_coord(corner).size > _SUSPECT_BYTES:
-                packed = self.dataset.id.read_direct_chunk(corner)[1]
-                if len(zlib.decompressobj().decompress(packed, most + 1)) > most:
-                    raise ValueError(f"the chunk at {corner} holds more than {most} bytes")
-            self._sound.add(corner)
+            if corner not in self._sound:
+                check_chunk(self.dataset.id, corner, math.prod(chunks) * self.dtype.itemsize)
+                self._sound.add(corner)
+
+
+def check_chunk(dataset: Any, corner: tuple[int, ...], num_bytes: int) -> None:
+    """Hold what is stored of a chunk against the bytes that it must unpack to.
+
+    Raises:
+        ValueError: if it is too short or unpacks to more.
+    """
+    plan, stored = dataset.get_create_plist(), dataset.get_chunk_info_by_coord(corner)
+    if stored.byte_offset is None:  # never written
+        return
+    filters = [plan.get_filter(number)[0] for number in range(plan.get_nfilters())]
+    sums = _SUM_BYTES * filters.count(_FLETCHER)
+    is_packed = not set(filters) <= {_SHUFFLE, _FLETCHER}
+    if stored.size <= sums or not (is_packed or num_bytes <= stored.size <= num_bytes + sums):
+        raise ValueError(f"the chunk at {corner} is stored in {stored.size} bytes")
+    if _DEFLATE in filters and stored.size > _SUSPECT_BYTES:
+        packed = dataset.read_direct_chunk(corner)[1]
+        if len(zlib.decompressobj().decompress(packed, num_bytes + 1)) > num_bytes:
+            raise ValueError(f"the chunk at {corner} holds more than {num_bytes} bytes")
 
 
 def around(file: Any, name: str) -> list[Any]:
