@@ -14,12 +14,13 @@ import math
 import sys
 import time
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.config import (
     conf_dir,
@@ -33,11 +34,12 @@ from tactslip_torch.data.folder import (
     file_facts,
     has_truth,
     recording_files,
-    refuse_other_channels,
 )
-from tactslip_torch.data.formats.reading import Opened, pieces
+from tactslip_torch.data.formats.reading import Reading, pieces
 from tactslip_torch.data.formats.registry import open_file
+from tactslip_torch.data.hand_file import HandFile, hand_file
 from tactslip_torch.data.recording import Recording
+from tactslip_torch.data.stream import stream_of
 from tactslip_torch.experiment import save_config, versions
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
@@ -77,6 +79,7 @@ class Listener(NamedTuple):
     settings: AlarmSettings
     config: DictConfig
     folder: Path
+    reading: Reading
 
 
 def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
@@ -96,12 +99,12 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
     """
     started = time.perf_counter()
     detector = SlipDetector.load(config.model, engine=config.engine)
-    listener = Listener(detector, _settings(config, detector), config, folder)
+    listener = Listener(detector, _settings(config, detector), config, folder, _reading(config))
     paths = recording_files(Path(str(config.input)))
     save_config(config, folder)
     content = _origin(listener) | {"events": None, "recordings": [], "failed": []}
     judged: list[RecordingEvents] = []
-    total = sum(_num_pieces(path, detector) for path in paths)
+    total = sum(_num_pieces(path, listener) for path in paths)
     for _ in bar(_hear_all(paths, listener, content, judged), "onsets", "s of signal", total):
         pass
     if content["recordings"]:
@@ -143,14 +146,13 @@ def _hear(
     path: Path, name: str, listener: Listener
 ) -> Generator[None, None, tuple[dict[str, Any], RecordingEvents | None]]:
     """Listen to a recording and draw it: its entry, and its events where the truth is known."""
-    detector, settings, config, folder = listener
+    detector, settings, config, folder, _ = listener
     table = folder / f"{name}_decisions.csv"
     with (
-        open_file(path) as opened,
+        _opened(path, listener) as (samples, archived),
         decisions_file(table, Decisions._fields, wanted=config.decisions) as keep,
     ):
-        samples, archived = opened.samples, opened.archived
-        rate = _checked_rate(path, opened, listener)
+        rate = detector.pool.sample_rate_hz
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
         stream = StreamingDetector(detector, settings, dtype=samples.dtype)
         view = view_of(config.view, entry["duration_s"])
@@ -225,18 +227,10 @@ def _settings(config: DictConfig, detector: SlipDetector) -> AlarmSettings:
     return dataclasses.replace(settings, threshold=float(config.threshold))
 
 
-def _checked_rate(path: Path, opened: Opened, listener: Listener) -> float:
-    """Samples per second of what was opened, which the detector must fit."""
-    pool, archived = listener.detector.pool, opened.archived
-    refuse_other_channels(path, opened, pool.hand.to_rows())
-    rate = archived.recording.sample_rate_hz if archived else listener.config.sample_rate_hz
-    if rate is None:
-        raise ValueError(f"{path} holds samples alone; say their rate, as sample_rate_hz=2000")
-    if rate != pool.sample_rate_hz:
-        raise ValueError(
-            f"{path} is of {rate} Hz, the detector of {pool.sample_rate_hz:g} Hz; resample it"
-        )
-    return pool.sample_rate_hz
+def _opened(path: Path, listener: Listener) -> AbstractContextManager[HandFile]:
+    """A recording of the detector's hand, open."""
+    pool, config = listener.detector.pool, listener.config
+    return hand_file(path, pool.hand, pool.sample_rate_hz, listener.reading, config.tare_s)
 
 
 def _drawn(hand: HandLayout) -> dict[str, int]:
@@ -248,18 +242,23 @@ def _piece_samples(detector: SlipDetector) -> int:
     return round(PIECE_S * detector.pool.sample_rate_hz)
 
 
-def _num_pieces(path: Path, detector: SlipDetector) -> int:
+def _num_pieces(path: Path, listener: Listener) -> int:
     """For the bar; of a file that cannot be read, as will be said, none."""
     try:
-        with open_file(path) as opened:
-            return -(-opened.samples.num_samples // _piece_samples(detector))
+        with open_file(path, listener.reading) as opened:
+            return -(-opened.samples.num_samples // _piece_samples(listener.detector))
     except (ValueError, OSError):
         return 0
 
 
+def _reading(config: DictConfig) -> Reading:
+    """What is said of files that do not say it."""
+    return stream_of({"reading": OmegaConf.to_container(config.reading, resolve=True)}).reading
+
+
 def _origin(listener: Listener) -> dict[str, Any]:
     """What was listened with."""
-    detector, settings, config, _ = listener
+    detector, settings, config, _, _ = listener
     pool, rate = detector.pool, detector.pool.sample_rate_hz
     facts = {
         "format": FORMAT,

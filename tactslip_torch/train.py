@@ -20,6 +20,7 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig
 
+from tactslip_torch.alarming.debounced import Debounced
 from tactslip_torch.alarming.stage import Alarming
 from tactslip_torch.config import (
     conf_dir,
@@ -44,8 +45,8 @@ from tactslip_torch.export import export_detector, sidecar_facts, worst_error
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.files import whole_file
+from tactslip_torch.folds import combined
 from tactslip_torch.graph.facts import GraphKind
-from tactslip_torch.judging import event_numbers, together
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
@@ -53,7 +54,6 @@ from tactslip_torch.onset.scoring import Scorer
 from tactslip_torch.onset.settings import KEY
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.report.results import print_results, write_results
-from tactslip_torch.report.scores import merged_metrics, summed_metrics
 
 log = logging.getLogger(__name__)
 
@@ -102,11 +102,11 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
     recipe.check_pool(len(pool.names))
-    alarming: Alarming | None = instantiate(config.onset, _convert_="all") or None
-    if alarming is not None and len(folds) > 1:
+    alarming: Alarming | Debounced | None = instantiate(config.onset, _convert_="all") or None
+    if isinstance(alarming, Alarming) and len(folds) > 1:
         raise ValueError(
             f"onset=alarms sets the alarm of one detector, this split makes {len(folds)}; take "
-            "split=unseen4 or split=seen6"
+            "split=unseen4 or split=seen6, or onset=debounced"
         )
     is_first = is_first_process()
     if is_first:
@@ -119,7 +119,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             data = SlipDataModule(maker, fold, config.num_workers)
             learner = SlipLearner(pool, channel_filter, recipe)
             fold_metrics[fold.name] = _run_fold(config, place, data, learner, alarming)
-    metrics = common_facts(source, pool, config) | _combined(fold_metrics, are_rivals(folds))
+    metrics = common_facts(source, pool, config) | combined(fold_metrics, are_rivals(folds))
     metrics["timing_s"]["total"] = time.perf_counter() - started
     by_name = {str(name): name for name in pool.names}
     rows = feature_rows([by_name[name] for name in metrics["selected"]], source.hand)
@@ -143,7 +143,7 @@ def _run_fold(
     folder: Path,
     data: SlipDataModule,
     learner: SlipLearner,
-    alarming: Alarming | None,
+    alarming: Alarming | Debounced | None,
 ) -> dict[str, Any]:
     """Fit, test, set the alarm of, save and export one fold; what it found."""
     source = data.maker.source
@@ -162,6 +162,7 @@ def _run_fold(
     trained = data.split.having("train")
     detector.info |= {
         "simulated": source.is_simulated,
+        **_units(source),
         "experiment": config.name,
         "seed": config.seed,
         "split": data.split.name,
@@ -190,13 +191,19 @@ def _run_fold(
         **learner.metrics,
         "events": events,
         **({"alarm": alarm} if alarm else {}),
-        "recording_events": learner.events,  # for _combined
+        "recording_events": learner.events,  # for combined
         **learner.facts,
         "selected": [str(name) for name in detector.selected_names],
         "onnx": onnx,
         "timing_s": seconds,
         "worker_s": learner.worker_seconds,
     }
+
+
+def _units(source: RecordingSource) -> dict[str, str]:
+    """The unit of samples, where it is not volts."""
+    units = getattr(source, "units", "V")  # sources that do not say record volts
+    return {} if units == "V" else {"units": units}
 
 
 def _rivals(detector: SlipDetector) -> dict[str, Scorer]:
@@ -239,53 +246,6 @@ def _checkpoint(given: str | None, fold: Split) -> Path | None:
         return path
     found = [path / fold.name / "last.ckpt", path / "last.ckpt"]
     return next((candidate for candidate in found if candidate.is_file()), None)
-
-
-def _combined(folds: dict[str, dict[str, Any]], of_rivals: bool) -> dict[str, Any]:
-    """One fold as it is; of several, bins and events are pooled, and the shared selection named.
-
-    Rivals are judged on the same bins, so theirs are not summed: ``splits`` then has each role of
-    each fold, such as ``"protocol/unseen"``.
-    """
-    found = {name: part.pop("recording_events") for name, part in folds.items()}
-    if len(folds) == 1:
-        return next(iter(folds.values()))
-    parts = list(folds.values())
-    events = [
-        {f"{name}/{role}" if of_rivals else role: by_rule for role, by_rule in by_role.items()}
-        for name, by_role in found.items()
-    ]
-    splits: dict[str, list[dict[str, Any]]] = {}
-    singles: dict[str, list[dict[str, Any]]] = {}
-    for name, part in folds.items():
-        before = f"{name}/" if of_rivals else ""
-        for role, scores in part["splits"].items():
-            splits.setdefault(before + role, []).append(scores)
-        for role, scores in part["baselines"]["best_single_feature"]["splits"].items():
-            singles.setdefault(before + role, []).append(scores)
-    shared = set.intersection(*(set(part["selected"]) for part in parts))
-    return {
-        "splits": {role: merged_metrics(scores) for role, scores in splits.items()},
-        "baselines": {
-            "best_single_feature": {
-                "feature": "each fold's own",
-                "splits": {role: summed_metrics(scores) for role, scores in singles.items()},
-            }
-        },
-        "events": event_numbers(together(events)),
-        "selected": [name for name in parts[0]["selected"] if name in shared],
-        "timing_s": _summed([part.pop("timing_s") for part in parts]),
-        "worker_s": _summed([part.pop("worker_s") for part in parts]),
-        "folds": folds,
-    }
-
-
-def _summed(parts: list[dict[str, float]]) -> dict[str, float]:
-    total: dict[str, float] = {}
-    for part in parts:
-        for stage, seconds in part.items():
-            total[stage] = total.get(stage, 0.0) + seconds
-    return total
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="train")

@@ -469,21 +469,21 @@ def whole(place):
 
 
 def nothing(place):
-    (place / "notes.txt").write_text("no recording")
+    (place / "notes.md").write_text("no recording")
 
 
 REFUSED = {
     "no file": (nothing, ["input=nowhere.npz"], "no file or folder at nowhere.npz"),
-    "empty folder": (nothing, [], "no recording in {place}; give a folder of .npz or .npy files"),
-    "no recording": (nothing, ["input=in/notes.txt"], "in/notes.txt must end in .npz or .npy"),
+    "empty folder": (nothing, [], "no recording in {place}; give a folder of .npz or .npy or "),
+    "no recording": (nothing, ["input=in/notes.md"], "in/notes.md must end in .npz or .npy"),
     "no input": (nothing, ["~input"], "input"),
     "names": (of_other_names, [], "channel 2 of {place}/a.npz is PVDF1 (SG), not SG2 (SG); give"),
     "kinds": (of_other_kinds, [], "channel 3 of {place}/a.npz is PVDF1 (SG), not PVDF1 (PVDF)"),
     "channels": (of_fewer_channels, [], "{place}/a.npz has 3 channels, not 4"),
     "rate": (of_another_rate, [], "a.npz is of 1999.5 Hz, the detector of 2000 Hz; resample it"),
     "short": (too_short, [], "{place}/a.npz has 98 samples, too few for a decision"),
-    "empty": (empty, [], "{place}/a.npz has 0 samples, too few"),
-    "no rate": (arrays, [], "{place}/a.npy holds samples alone; say their rate, as sample_rate_hz"),
+    "empty": (empty, [], "{place}/a.npz holds no samples"),
+    "no rate": (arrays, [], "{place}/a.npy says no rate and has no times; give"),
     "other rate": (arrays, ["sample_rate_hz=500"], "is of 500 Hz, the detector of 2000 Hz"),
     "turned": (turned, ["sample_rate_hz=2000"], "{place}/a.npy has 16000 channels, not 4"),
     "damaged": (damaged, [], "{place}/a.npz is damaged or no recording of ours"),
@@ -532,3 +532,59 @@ def test_an_error_of_ours_is_not_called_a_bad_recording(model, tmp_path, monkeyp
     monkeypatch.setattr(module.StreamingDetector, "push", broken)
     with pytest.raises(ZeroDivisionError):
         detect(composed(f"model={model}", f"input={tmp_path}"), tmp_path / "out")
+
+
+# Files of others ---------------------------------------------------------------------------------
+
+
+def write_table(path, samples, order, times_s=None):
+    """Samples ``[C, T]`` as text, columns in some order and one more that is none of the hand's."""
+    names = [HAND.names[i] for i in order]
+    columns = [samples[i] for i in order] + [torch.zeros(samples.shape[1])]
+    header = [*names, "spare"]
+    if times_s is not None:
+        header, columns = ["time", *header], [times_s, *columns]
+    table = torch.stack([column.double() for column in columns], dim=1).numpy()
+    np.savetxt(path, table, delimiter=",", header=",".join(header), comments="", fmt="%.17g")
+
+
+def test_a_table_of_others_gives_the_same_onsets(model, tmp_path):
+    content = recording()
+    save(tmp_path / "ours" / "a.npz", content)
+    (tmp_path / "theirs").mkdir()
+    times_s = 1e6 + torch.arange(content.samples.shape[1]).double() / RATE_HZ
+    write_table(tmp_path / "theirs" / "a.csv", content.samples, [2, 0, 3, 1], times_s)
+    ours = heard(model, tmp_path / "ours", tmp_path / "out1", "figure=false")
+    theirs = heard(model, tmp_path / "theirs", tmp_path / "out2", "figure=false")
+    (mine,), (other,) = ours["recordings"], theirs["recordings"]
+    assert mine["alarms"]
+    times = [[alarm["alarm_s"] for alarm in each["alarms"]] for each in (mine, other)]
+    assert times[0] == times[1]
+    assert other["simulated"] is None
+    assert other["duration_s"] == mine["duration_s"]
+
+
+def test_a_gap_in_the_times_is_missing_samples(model, tmp_path):
+    content = recording()
+    times_s = torch.arange(content.samples.shape[1]).double() / RATE_HZ
+    kept = torch.ones(len(times_s), dtype=torch.bool)
+    kept[6000:6040] = False
+    write_table(tmp_path / "a.csv", content.samples[:, kept], [0, 1, 2, 3], times_s[kept])
+    whole = content.samples.clone()
+    whole[:, 6000:6040] = torch.nan
+    save(tmp_path / "b.npz", recording(samples=whole))
+    found = heard(model, tmp_path, tmp_path / "out", "figure=false")
+    of_table, of_ours = found["recordings"]
+    assert of_table["decisions"] == of_ours["decisions"]
+    assert of_table["decisions"]["invalid"] > 0
+
+
+def test_what_training_tared_is_tared(model, tmp_path):
+    content = recording()
+    level = torch.tensor([3.0, -2.0, 0.5, 1.0])[:, None]
+    save(tmp_path / "a.npz", content)
+    save(tmp_path / "b.npz", recording(samples=content.samples + level))
+    found = heard(model, tmp_path, tmp_path / "out", "figure=false", "tare_s=[0,0.5]")
+    first, second = found["recordings"]
+    assert first["alarms"]
+    assert [a["alarm_s"] for a in first["alarms"]] == [a["alarm_s"] for a in second["alarms"]]

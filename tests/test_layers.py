@@ -203,6 +203,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "data.template": ("data.formats.registry", "data.manifest", "files"),
     "data.authors_raw": ("data.*", "hand"),
     "data.named": ("data.*",),
+    "data.hand_file": ("data.*", "hand"),
     "data.labels": ("data.recording",),
     "data.splits": ("data.recording",),
     "simulation.*": ("hand", "engines", "data.recording", "simulation.*"),

@@ -24,7 +24,8 @@ class AlarmSettings:
         calibration: from a score to a log likelihood ratio.
         rule: from these to a statistic.
         threshold: at which the statistic raises an alarm.
-        target_per_hour: false alarms an hour that the threshold was set for.
+        target_per_hour: false alarms an hour that the threshold was set for; ``None``: for no rate,
+            so nothing is promised.
         slip_share: how much of a stream is slip; the balance that probabilities are stated for.
         rearm_s: how long the statistic must stay low before the next alarm.
         refractory_s: shortest time between two alarms.
@@ -41,7 +42,7 @@ class AlarmSettings:
     calibration: Calibration
     rule: Rule
     threshold: float
-    target_per_hour: float
+    target_per_hour: float | None
     slip_share: float = 0.5
     rearm_s: float = 0.1
     refractory_s: float = 0.2
@@ -53,7 +54,7 @@ class AlarmSettings:
             raise ValueError(f"hop_samples must be at least 1, got {self.hop_samples}")
         if not 0 < self.slip_share < 1:
             raise ValueError(f"slip_share must lie between 0 and 1, got {self.slip_share}")
-        if not self.target_per_hour > 0:
+        if self.target_per_hour is not None and not self.target_per_hour > 0:
             raise ValueError(f"target_per_hour must be positive, got {self.target_per_hour}")
         if math.isfinite(self.threshold) and self.threshold > self.rule.ceiling:
             raise ValueError(
@@ -100,8 +101,8 @@ class AlarmSettings:
         """
         if KEY not in detector.info:
             raise ValueError(
-                "this detector has no alarm threshold; train with +exp=onset, which sets one, or "
-                "give alarm settings"
+                "this detector has no alarm threshold; train with +exp=onset, which sets one, or with "
+                "onset=debounced, which promises nothing"
             )
         return cls.from_dict(detector.info[KEY])
 
