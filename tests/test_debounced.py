@@ -63,8 +63,8 @@ def test_numbers_that_cannot_be(options, said):
 def test_scores_without_a_calibration_are_refused():
     detector = small_detector(3)
     detector.info.pop("calibration", None)
-    with pytest.raises(ValueError, match="training chose nothing; give several recipe.penalties"):
+    with pytest.raises(ValueError, match=r"training chose nothing; give several recipe\.penalties"):
         Debounced()(detector)
     detector = calibrated()
-    with pytest.raises(ValueError, match="onset.hop_ms=0.3 is 0.6 samples"):
+    with pytest.raises(ValueError, match=r"onset\.hop_ms=0\.3 is 0\.6 samples"):
         Debounced(hop_ms=0.3)(detector)
