@@ -19,8 +19,9 @@ from tactslip_torch.data.formats.reading import Samples
 from tactslip_torch.data.formats.registry import open_file
 from tactslip_torch.data.stream import Found, Stream
 from tactslip_torch.data.truth import Stretch
+from tactslip_torch.signals.resampling import resample
 
-REACH = 16
+REACH = 11
 """Samples of the lower rate on either side that a resampled one may hang on."""
 
 
@@ -69,6 +70,16 @@ def num_recorded(found: Found, rate_hz: float, how: Treatment) -> int:
     if how.resample_hz is None:
         return found.clock.num_samples
     return int(found.clock.num_samples * how.resample_hz / rate_hz + 1e-6)
+
+
+def refuse_ratio(rate_hz: float, how: Treatment) -> None:
+    """Raise if samples of that rate cannot be resampled as it was asked for.
+
+    Raises:
+        ValueError: as ``resample``.
+    """
+    if how.resample_hz is not None:
+        resample(torch.zeros(1, 1), rate_hz, how.resample_hz)
 
 
 def missing_of(found: Found, rate_hz: float, how: Treatment) -> tuple[Stretch, ...]:
@@ -136,8 +147,6 @@ def recorded(
             first, stop = (round(moment * rate_hz) for moment in how.tare_s)
             level = samples.read(first, stop)[chosen].double().nanmean(-1, keepdim=True)
         if how.resample_hz is not None and how.resample_hz != rate_hz:
-            from tactslip_torch.signals.resampling import resample
-
             whole = samples.read(0, num)[chosen] - level
             even = resample(whole, rate_hz, how.resample_hz)
             return even[:, : num_recorded(found, rate_hz, how)].to(samples.dtype)

@@ -17,10 +17,11 @@ from tactslip_torch.data.agreement import Part, agreed
 from tactslip_torch.data.clock import refuse_gaps
 from tactslip_torch.data.manifest import Entry
 from tactslip_torch.data.manifest_lines import Problem
-from tactslip_torch.data.sampling import Treatment, missing_of, num_recorded
+from tactslip_torch.data.sampling import Treatment, missing_of, num_recorded, refuse_ratio
 from tactslip_torch.data.stream import Found, Stream, look
 from tactslip_torch.data.timeline import FileTimeline, on_time, scaled
 from tactslip_torch.data.truth import Truth
+from tactslip_torch.signals.resampling import MOST_CUT_S
 from tactslip_torch.workers import in_processes
 
 BEFORE_ONSET_S = 1.01
@@ -124,17 +125,28 @@ def _timed(plan: Plan, entry: Entry, parts: tuple[Part, ...]) -> tuple[Surveyed,
     how = plan.treatment
     wrong = []
     for part in parts:
-        if how.gaps == "refuse" and part.found.clock.gaps:
-            try:
+        try:
+            refuse_ratio(part.rate_hz, how)
+            if how.gaps == "refuse":
                 refuse_gaps(part.found.clock, "it")
-            except ValueError as error:
-                wrong.append(str(error).removeprefix("it: "))
-    duration_s = min(
+        except ValueError as error:
+            wrong.append(str(error).removeprefix("it: "))
+    ends_s = [
         num_recorded(part.found, part.rate_hz, how) / (how.resample_hz or part.rate_hz)
         for part in parts
-    )
-    if how.tare_s is not None and how.tare_s[1] > duration_s:
-        wrong.append(f"lasts {duration_s:.4g} s, tare_s wants {how.tare_s[1]:g} s")
+    ]
+    duration_s = min(ends_s)
+    if max(ends_s) - duration_s > MOST_CUT_S:
+        wrong.append(
+            f"its streams last {duration_s:.4g} to {max(ends_s):.4g} s; cut the longer one"
+        )
+    missing_s = [gap for part in parts for gap in missing_of(part.found, part.rate_hz, how)]
+    if how.tare_s is not None:
+        first_s, last_s = how.tare_s
+        if last_s > duration_s:
+            wrong.append(f"lasts {duration_s:.4g} s, tare_s wants {last_s:g} s")
+        if any(start <= first_s and last_s <= end for start, end in missing_s):
+            wrong.append(f"nothing is there to tare on from {first_s:g} to {last_s:g} s")
     found, rate_hz = parts[0].found, parts[0].rate_hz
     truth = entry.truth or found.truth or Truth()
     if found.is_measured:  # a person read the file's own times
@@ -145,7 +157,7 @@ def _timed(plan: Plan, entry: Entry, parts: tuple[Part, ...]) -> tuple[Surveyed,
         skip_s=plan.skip_s,
         slide_s=plan.slide_s,
         slack_s=math.inf if entry.is_nominal else 1.0 / rate_hz,
-        missing_s=[gap for part in parts for gap in missing_of(part.found, part.rate_hz, how)],
+        missing_s=missing_s,
     )
     return Surveyed(entry, parts, times), [*wrong, *misfits]
 
