@@ -1,0 +1,158 @@
+"""Samples at another rate, and channels of several rates brought to one. Only on request.
+
+A polyphase low-pass over 20 samples of the lower rate, Kaiser-windowed: SciPy's ``resample_poly``.
+Up to .8 of half the lower rate tones stay within .5 %, in phase; beyond 1.2 of it at most .5 % of
+one is left to fold back. A constant stays one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+MOST = 50_000
+"""Largest numerator and denominator of a ratio of rates."""
+NEAREST = 1e-7
+"""Relative error that a ratio may be off: a sample in ten million."""
+MOST_CUT_S = 0.1
+"""By so much parts that belong together may end apart."""
+_HALF = 10  # samples of the lower rate on either side, as SciPy has it
+
+
+def resample(samples: Tensor, from_hz: float, to_hz: float) -> Tensor:
+    """The same signals at another rate.
+
+    Sample ``k`` of the output is what was at ``k / to_hz`` seconds. Beyond its ends a signal is
+    taken to stand still. No gradient flows. A NaN or Inf makes NaN what its filter reaches, 10
+    samples of the lower rate on either side, and nothing else.
+
+    Args:
+        samples: in any unit.
+        from_hz: their rate.
+        to_hz: the rate wanted.
+
+    Shape:
+        - samples: ``[C, T]``, float32 or float64
+        - output: ``[C, ceil(T * to_hz / from_hz)]``, dtype of ``samples``, memory of its own
+
+    Raises:
+        ValueError: if samples are none, a rate is not positive, their ratio is none of two whole
+            numbers up to ``MOST``, or SciPy is not installed.
+
+    Example:
+        >>> resample(torch.ones(1, 5), 100.0, 50.0)
+        tensor([[1., 1., 1.]])
+    """
+    if samples.ndim != 2 or samples.dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"expected float32 or float64 samples [C, T] to resample, got {samples.dtype} "
+            f"{tuple(samples.shape)}"
+        )
+    ratio = _ratio(from_hz, to_hz)
+    up, down = ratio.numerator, ratio.denominator
+    if up == down:
+        return samples.detach().clone()
+    num = -(-samples.shape[-1] * up // down)
+    if not samples.numel():
+        return samples.new_zeros(len(samples), num)
+    x = samples.detach().cpu().double().numpy()
+    is_good = np.isfinite(x)
+    offset = np.sum(x, -1, keepdims=True, where=is_good) / np.maximum(is_good.sum(-1), 1)[:, None]
+    blocks = -(-_HALF * max(up, down) // (up * down))  # of ``down`` samples, which become ``up``
+    margin = ((0, 0), (blocks * down, blocks * down))
+    padded = np.pad(np.where(is_good, x - offset, 0.0), margin, mode="edge")
+    found = _scipy_signal().resample_poly(padded, up, down, axis=-1)
+    found = found[:, blocks * up : blocks * up + num] + offset  # which would ripple a little
+    for row in np.flatnonzero(~is_good.all(-1)):
+        found[row, _is_reached(~is_good[row], num, up, down)] = np.nan
+    return torch.from_numpy(found).to(samples)
+
+
+def bring_together(parts: Sequence[tuple[Tensor, float]], to_hz: float | None = None) -> Tensor:
+    """Channels that were sampled at rates of their own, as one set of samples.
+
+    All begin at once. The set ends with the part that ends first.
+
+    Args:
+        parts: samples ``[C_i, T_i]`` and their rate in hertz, at least one.
+        to_hz: the rate wanted; ``None`` if all have one.
+
+    Shape:
+        - output: ``[sum C, T]``, in the finest dtype of the parts
+
+    Raises:
+        ValueError: if rates differ and none is asked for, parts end more than ``MOST_CUT_S`` apart,
+            or one cannot be resampled.
+
+    Example:
+        >>> bring_together([(torch.zeros(2, 10), 100.0), (torch.ones(1, 5), 50.0)], 100.0).shape
+        torch.Size([3, 10])
+    """
+    if not parts:
+        raise ValueError("there is nothing to bring together; give at least one set of channels")
+    rates = [float(rate) for _, rate in parts]
+    _refuse_no_rates(*rates)
+    if to_hz is None and len(set(rates)) > 1:
+        named = ", ".join(f"{rate:g}" for rate in dict.fromkeys(rates))
+        raise ValueError(
+            f"channels come at {named} Hz; say to which rate to resample them, as "
+            f"data.resample_hz={max(rates):g}"
+        )
+    ends_s = [samples.shape[-1] / rate for (samples, _), rate in zip(parts, rates, strict=True)]
+    if max(ends_s) - min(ends_s) > MOST_CUT_S:
+        raise ValueError(
+            f"sets of channels that belong together last {min(ends_s):g} to {max(ends_s):g} s; "
+            f"cut them to lengths within {MOST_CUT_S:g} s of each other"
+        )
+    wanted = rates[0] if to_hz is None else to_hz
+    made = [resample(samples, rate, wanted) for samples, rate in parts]
+    num = min(samples.shape[-1] for samples in made)
+    dtype = torch.float64 if any(m.dtype == torch.float64 for m in made) else torch.float32
+    return torch.cat([samples[:, :num].to(dtype) for samples in made])
+
+
+def _ratio(from_hz: float, to_hz: float) -> Fraction:
+    """Of the wanted rate to the given one, as near as whole numbers up to ``MOST`` come."""
+    _refuse_no_rates(from_hz, to_hz)
+    exact = Fraction(repr(float(to_hz))) / Fraction(repr(float(from_hz)))  # as they are written
+    least = min(exact, 1 / exact)  # so that it is the larger of the two numbers that is limited
+    nearest = least.limit_denominator(MOST)
+    if nearest == 0 or abs(nearest / least - 1) > NEAREST:
+        raise ValueError(
+            f"from {from_hz:.10g} to {to_hz:.10g} Hz is no ratio of whole numbers up to {MOST}; "
+            "resample to a rate further away, or less so, or state the rate that is meant"
+        )
+    return nearest if least == exact else 1 / nearest
+
+
+def _refuse_no_rates(*rates: float) -> None:
+    for rate in rates:
+        if not (math.isfinite(rate) and rate > 0):
+            raise ValueError(f"a rate must be positive to resample, got {rate:g} Hz")
+
+
+def _is_reached(is_bad: NDArray[Any], num: int, up: int, down: int) -> NDArray[np.bool_]:
+    """Which samples of the output take in one of the input that is not finite."""
+    before = np.concatenate([[0], np.cumsum(is_bad)])
+    places = np.arange(num, dtype=np.int64) * down
+    reach = _HALF * max(up, down)
+    first = np.clip(-((reach - places) // up), 0, len(is_bad))
+    last = np.clip((places + reach) // up + 1, 0, len(is_bad))
+    return np.asarray(before[last] > before[first])
+
+
+def _scipy_signal() -> Any:
+    if find_spec("scipy") is None:
+        raise ValueError(
+            'resampling needs scipy, which is not installed; pip install "tactslip_torch[formats]"'
+        )
+    return import_module("scipy.signal")
