@@ -80,7 +80,7 @@ def test_words_at_every_place_of_a_line_of_yaml(tmp_path):
 def test_equal_input_gives_equal_bytes(tmp_path):
     for parent in ("a", "b"):
         rosbag2.save(tmp_path / parent / "bag", recording(), hand_of(2), KEY)
-    for name in ("bag.db3", "metadata.yaml"):
+    for name in ("recording.db3", "metadata.yaml"):
         one, other = ((tmp_path / parent / "bag" / name).read_bytes() for parent in ("a", "b"))
         assert one == other
 
@@ -97,7 +97,7 @@ def test_rosbags_opens_it(tmp_path):
 
 
 def test_a_bag_is_replaced_and_nothing_else_is(tmp_path):
-    path = tmp_path / "bag"
+    path = tmp_path / "bag #1?%41 ü.bag2"
     rosbag2.save(path, recording(), hand_of(2), {"n": 1})
     rosbag2.save(path, recording(), hand_of(2), {"n": 2})
     assert rosbag2.key(path) == {"n": 2}
@@ -353,6 +353,15 @@ ENDLESS = (
         (statements("UPDATE messages SET data = 'text' WHERE id = 7"), "not bytes"),
         (statements("UPDATE messages SET data = 7 WHERE id = 7"), "not bytes"),
         (statements("UPDATE messages SET data = zeroblob(9) WHERE id = 7"), "too few"),
+        (statements("UPDATE messages SET data = x'' WHERE id = 1"), "not the plain CDR"),
+        (
+            statements(
+                "CREATE TABLE other AS SELECT NULL AS id, topic_id, timestamp, data FROM messages",
+                "DROP TABLE messages",
+                "ALTER TABLE other RENAME TO messages",
+            ),
+            "no topic with samples .no messages.",
+        ),
         (statements("DELETE FROM messages"), "no topic with samples .no messages."),
         (statements("UPDATE topics SET type = 'a/msg/B'"), "no topic with samples"),
         (statements("UPDATE topics SET serialization_format = 'x'"), "messages in 'x'"),
@@ -361,7 +370,7 @@ ENDLESS = (
             "is no ros2msg",
         ),
     ],
-    ids=range(16),
+    ids=range(18),
 )
 def test_a_database_that_is_none_is_one_line(bag, act, wanted):
     act(bag / "bag.db3")

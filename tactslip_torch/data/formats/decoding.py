@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tactslip_torch.data.formats.cdr import MOST_CHANNELS, Form, Group, form_of
 
-_MOST_FORMS = 256
+_MOST_FORMS = 256  # of one size
 _MOST_DEPTH = 16
 _SECONDS, _NANOSECONDS = ("sec", "secs"), ("nanosec", "nsec", "nsecs")
 
@@ -121,9 +121,10 @@ class CdrDecoder:
                 f"a message with {form.num_channels} channels after one with {self.num_channels}, "
                 "or with others"
             )
-        self._forms[len(message)].append(form)
-        if sum(map(len, self._forms.values())) > _MOST_FORMS:
-            raise ValueError(f"messages of more than {_MOST_FORMS} forms")
+        forms = self._forms[len(message)]
+        forms.append(form)
+        if len(forms) > _MOST_FORMS:
+            raise ValueError(f"messages of {len(message)} bytes in more than {_MOST_FORMS} forms")
         return form
 
 
@@ -200,6 +201,8 @@ def _collect(part: Any, name: str, numbers: dict[str, float], depth: int) -> Non
         for place, value in enumerate(part):
             _collect(value, f"{name}[{place}]", numbers, depth - 1)
     elif part is None or isinstance(part, (int, float)):
+        if name in numbers:
+            raise ValueError(f"JSON with two numbers called {name}")
         numbers[name] = float("nan") if part is None else part
 
 

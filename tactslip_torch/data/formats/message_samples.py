@@ -177,7 +177,9 @@ def _index(pages: _Pages, how: Reading) -> Index:
         if decoded.column is not None:
             columns.append(decoded.column)
     times = np.concatenate(logged)
-    if columns and len(times):
+    if not len(times):  # though one was met before
+        raise ValueError(f"{pages.path}: damaged: no page holds a message of {pages.topic}")
+    if columns:
         with named(pages.path):
             times = _nanoseconds(np.concatenate(columns), pages.columns.seconds)
     elif stamped and how.time == "auto":
@@ -215,7 +217,7 @@ def _times(index: Index, how: Reading) -> MessageTimes | None:
         usual = _SECOND / how.sample_rate_hz
     elif len(spacings):
         usual = float(np.median(spacings))
-    elif len(index.times) and index.num_rows[0] > 1:
+    elif index.num_rows[0] > 1:
         return None
     else:
         usual = 0.0

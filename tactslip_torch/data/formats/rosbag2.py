@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
+import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -39,6 +40,7 @@ from tactslip_torch.data.formats.sqlite_bag import SqliteBag
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
 
+_NAME = "recording"  # of the database in the folder
 _SUM = "tactslip_torch_message_sum"
 _SAFE = "{}[]:,"  # all else is written as in URLs: YAML writers wrap quoted text, and may err there
 _FILES = (".db3", ".mcap", ".yaml")
@@ -47,7 +49,7 @@ _FILES = (".db3", ".mcap", ".yaml")
 def save(
     path: str | os.PathLike[str], recording: Recording, hand: HandLayout, key: Mapping[str, Any]
 ) -> None:
-    """Write a recording to one folder, whole or not at all.
+    """Write a recording to one folder, whole or not at all; equal input, equal bytes.
 
     Raises:
         ValueError: if samples are neither float32 nor float64, the hand has another number of
@@ -58,19 +60,22 @@ def save(
     typesys = needs("rosbags.typesys", "writing folders of rosbag2")
     header = header_of(recording, hand, key)
     kind = kind_of(recording.samples)
-    with _whole_folder(Path(path)) as folder, bags.Writer(folder, version=8) as writer:
-        channel = writer.add_connection(
-            TOPIC,
-            kind,
-            msgdef=definition_of(recording.samples),
-            rihs01=typesys.get_typestore(typesys.Stores.ROS2_JAZZY).hash_rihs01(kind),
-        )
-        total = 0
-        for time, message in blocks(recording):
-            writer.write(channel, time, message)
-            total = zlib.crc32(message, total)
-        for name, text in (metadata_of(header) | {_SUM: sum_text(total)}).items():
-            writer.set_custom_data(name, quote(text, safe=_SAFE))
+    with _whole_folder(Path(path)) as folder, tempfile.TemporaryDirectory() as elsewhere:
+        plain = Path(elsewhere) / _NAME  # the library takes "#" and "?" in a path for parts of URLs
+        with bags.Writer(plain, version=8) as writer:
+            channel = writer.add_connection(
+                TOPIC,
+                kind,
+                msgdef=definition_of(recording.samples),
+                rihs01=typesys.get_typestore(typesys.Stores.ROS2_JAZZY).hash_rihs01(kind),
+            )
+            total = 0
+            for time, message in blocks(recording):
+                writer.write(channel, time, message)
+                total = zlib.crc32(message, total)
+            for name, text in (metadata_of(header) | {_SUM: sum_text(total)}).items():
+                writer.set_custom_data(name, quote(text, safe=_SAFE))
+        shutil.copytree(plain, folder)
 
 
 def load(path: str | os.PathLike[str]) -> Archived:

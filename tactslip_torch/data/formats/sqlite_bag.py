@@ -113,11 +113,11 @@ class SqliteBag:
         if self._columns("message_definitions").issuperset(_DEFINITIONS):
             rows = self._all(f"SELECT {', '.join(_DEFINITIONS)} FROM message_definitions")
             definitions = {str(kind): (str(code), str(text)) for kind, code, text in rows}
+        firsts = dict(self._all("SELECT topic_id, min(id) FROM messages GROUP BY topic_id"))
         question = "SELECT id, name, type, serialization_format FROM topics ORDER BY id LIMIT ?"
         for number, name, kind, encoding in self._all(question, _MOST_TOPICS):
             ids.setdefault(str(name), []).append(number)
-            question = "SELECT data FROM messages WHERE topic_id = ? ORDER BY id LIMIT 1"
-            first = self._all(question, number)
+            first = self._all("SELECT data FROM messages WHERE id = ?", firsts.get(number))
             if first and type(first[0][0]) is bytes:
                 code, text = definitions.get(str(kind), ("", ""))
                 topic = Topic(str(name), str(kind), str(encoding), code, text, first[0][0])
@@ -127,11 +127,11 @@ class SqliteBag:
     def _list_pages(self) -> list[tuple[int, int]]:
         """First and last row of each page."""
         pages: list[tuple[int, int]] = []
-        size = _PAGE
+        size = 0
         try:
             rows = self._connection.execute("SELECT id, length(data) FROM messages ORDER BY id")
             for number, length in rows:
-                if size + (length or 0) > _PAGE:
+                if not pages or size + (length or 0) > _PAGE:
                     pages.append((number, number))
                     size = 0
                 pages[-1] = (pages[-1][0], number)
