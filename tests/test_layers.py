@@ -28,7 +28,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "data.formats.header": ("data.recording", "hand"),
     "data.formats.reading": ("data.formats.header",),
     "data.formats.stored_array": (),
+    "data.formats.npz_members": ("data.formats.refusing",),
     "data.formats.npz": (
+        "data.formats.npz_members",
+        "data.formats.refusing",
         "data.formats.header",
         "data.formats.reading",
         "data.formats.stored_array",
@@ -49,7 +52,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "hand",
         "files",
     ),
-    "data.formats.refusing": ("data.formats.header",),
+    "data.formats.refusing": ("data.formats.header", "data.formats.reading"),
     "data.formats.arrays": ("data.formats.reading",),
     "data.formats.choosing": (
         "data.formats.arrays",
@@ -82,7 +85,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "data.formats.mat5_elements",
         "data.formats.reading",
     ),
-    "data.formats.mat73": ("data.formats.hdf5_tree", "data.formats.reading"),
+    "data.formats.mat73": ("data.formats.hdf5_tree", "data.formats.refusing"),
     "data.formats.mat": (
         "data.formats.arrays",
         "data.formats.choosing",
@@ -130,6 +133,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     ),
     "data.formats.mcap_records": ("data.formats.packing",),
     "data.formats.mcap_bag": (
+        "data.formats.definitions",
         "data.formats.header",
         "data.formats.mcap_records",
         "data.formats.messages",
@@ -271,6 +275,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "plain",
         "threads",
     ),
+    "features.rounding": ("features.pool", "signals.*", "hand"),
     "features.ranking": ("features.selection", "features.names", "features.plan"),
     "features.groups": ("features.names", "hand"),
     "features.cache": ("files",),

@@ -12,6 +12,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tactslip_torch.data.formats.arrays import Contents, MatrixSamples
 from tactslip_torch.data.formats.choosing import LABEL_NAMES, choose
 from tactslip_torch.data.formats.hdf5_tree import (
@@ -65,11 +68,11 @@ def save(
         how = {"chunks": (num_channels, min(max(instants, 1), num_samples)), "fletcher32": True}
     # HDF5 of 2008 and later: before, more than some 4000 names would not fit
     with whole_file(path) as temporary, h5py.File(temporary, "w", libver="v108") as file:
-        file.attrs["header"] = header.encode("ascii")  # of one length: see hdf5_heap
+        file.attrs["header"] = _fixed(header)[0]
         stored = file.create_dataset("samples", data=samples, **how)
         stored.attrs["sample_rate_hz"] = float(recording.sample_rate_hz)
-        stored.attrs["units"] = recording.units.encode() or b"\0"
-        stored.attrs["channel_name"] = [name.encode() for name in hand.names]
+        stored.attrs["units"] = _fixed(recording.units)[0]
+        stored.attrs["channel_name"] = _fixed(*hand.names)
 
 
 def load(path: str | os.PathLike[str]) -> Archived:
@@ -126,6 +129,12 @@ def _opened(path: str | os.PathLike[str], file: Any, h5py: Any, how: Reading) ->
     archived = archived_from(_our_header(file, path), samples.read(0, 0))
     rate = archived.recording.sample_rate_hz
     return Opened(samples, archived, archived.hand.names, None, rate)
+
+
+def _fixed(*words: str) -> NDArray[np.bytes_]:
+    """UTF-8 of one length, filled up with NULs: no heap is needed (``hdf5_heap``)."""
+    encoded = [word.encode() for word in words]
+    return np.array(encoded, dtype=f"S{max(1, *map(len, encoded))}")
 
 
 def _library(path: str | os.PathLike[str]) -> Any:

@@ -98,7 +98,7 @@ def _sort(flat: Flat, matrix: Element, name: str, found: Found, depth: int) -> N
     said = int(flat.numbers(flags)[0])
     kind, shape = said & 0xFF, tuple(flat.numbers(dims).tolist())
     name = name or flat.content(own).decode("latin-1")
-    if min(shape, default=0) < 1:
+    if min(shape, default=0) < 1 and kind not in _CLASSES:
         return
     why = _why_not(kind, said >> 8, shape, depth)
     if why is not None:

@@ -5,6 +5,7 @@ Format: "MAT-File Format", The MathWorks, level 5.
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
 import tempfile
@@ -20,6 +21,7 @@ from tactslip_torch.data.formats.arrays import why_not_plausible
 from tactslip_torch.data.formats.refusing import Refused
 
 HEADER_BYTES = 128
+MOST_VARIABLES = 10_000
 MATRIX = 14
 STORED = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 9: "d", 12: "q", 13: "Q"}
 """NumPy's code of what numbers are written as, by the element's type."""
@@ -71,13 +73,17 @@ def unpacked(file: IO[bytes], stack: ExitStack) -> tuple[Flat, list[Element]]:
         stack: closes the temporary file.
 
     Raises:
-        Refused: if compressed variables claim more than ``why_not_plausible`` believes.
+        Refused: if there are more than ``MOST_VARIABLES``, or compressed ones claim more than
+            ``why_not_plausible`` believes.
         ValueError: if the file is damaged.
     """
     file.seek(HEADER_BYTES - 2)
     order = "<" if file.read(2) == b"IM" else ">"
     size = file.seek(0, os.SEEK_END)
-    elements = list(_elements(file, HEADER_BYTES, size, order))
+    found = _elements(file, HEADER_BYTES, size, order)
+    elements = list(itertools.islice(found, MOST_VARIABLES + 1))
+    if len(elements) > MOST_VARIABLES:  # eight zeros are an element, in a sparse file too
+        raise Refused(f"{file.name} holds more than {MOST_VARIABLES} variables")
     packed = [element for element in elements if element.kind == _COMPRESSED]
     if not packed:
         return Flat(file, order), [element for element in elements if element.kind == MATRIX]

@@ -15,7 +15,7 @@ from tactslip_torch.data.formats.hdf5_tree import (
     why_not,
     words_said,
 )
-from tactslip_torch.data.formats.reading import needs
+from tactslip_torch.data.formats.refusing import library
 
 _NUMBERS = {"double", "single"} | {f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)}
 _MOST_WORDS = 10_000
@@ -34,10 +34,10 @@ def look_through_73(
         stack: closes it.
 
     Raises:
-        ValueError: if h5py is absent.
+        Refused: if h5py is absent.
         Exception: whatever h5py raises of a damaged file.
     """
-    h5py = needs("h5py", "reading .mat of version 7.3")
+    h5py = library("h5py", "reading .mat of version 7.3")
     file = stack.enter_context(h5py.File(path, "r"))
     arrays: list[DatasetArray] = []
     words: dict[str, tuple[str, ...]] = {}

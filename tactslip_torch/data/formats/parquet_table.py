@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from tactslip_torch.data.formats.arrays import why_not_plausible
 from tactslip_torch.data.formats.header import MOST_HEADER
-from tactslip_torch.data.formats.reading import TimeUnit, needs
-from tactslip_torch.data.formats.refusing import Refused
+from tactslip_torch.data.formats.reading import TimeUnit
+from tactslip_torch.data.formats.refusing import Refused, library
 
 EXTRA = "parquet"
 MOST_GROUP_BYTES = 2**30
@@ -35,8 +35,8 @@ class Table:
     """
 
     def __init__(self, path: str | os.PathLike[str], stack: ExitStack) -> None:
-        self.pa = needs("pyarrow", "reading .parquet", EXTRA)
-        parquet = needs("pyarrow.parquet", "reading .parquet", EXTRA)
+        self.pa = library("pyarrow", "reading .parquet", EXTRA)
+        parquet = library("pyarrow.parquet", "reading .parquet", EXTRA)
         self.path = os.fspath(path)
         self.file = stack.enter_context(
             parquet.ParquetFile(

@@ -6,8 +6,10 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 from tactslip_torch.data.formats.header import FORM, damaged
+from tactslip_torch.data.formats.reading import needs
 
 _FORMS = FORM.rpartition(" ")[0]
 
@@ -34,6 +36,18 @@ def refusing(path: str | os.PathLike[str]) -> Iterator[None]:
         raise
     except Exception as error:  # HDF5, Arrow, zlib, struct and JSON raise many kinds
         raise damaged(path) from error
+
+
+def library(module: str, what: str, extra: str = "formats") -> ModuleType:
+    """A library (``needs``), also while a file is open.
+
+    Raises:
+        Refused: in one line, if it is absent.
+    """
+    try:
+        return needs(module, what, extra)
+    except ValueError as error:
+        raise Refused(str(error)) from None
 
 
 def is_ours(header: str | None) -> bool:

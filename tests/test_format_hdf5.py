@@ -1,0 +1,304 @@
+"""Recordings as HDF5: ours to the bit, the datasets people have, and nothing that is a trap."""
+
+import zlib
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from format_cases import (
+    KEY,
+    assert_comes_back,
+    assert_equal_bytes,
+    assert_hint,
+    assert_same,
+    hand_of,
+    hide,
+    kept,
+    read,
+    read_all,
+    recording,
+    refused,
+    survived,
+)
+from hypothesis import given, settings
+
+from tactslip_torch.data.formats import hdf5
+from tactslip_torch.data.formats.hdf5_heap import has_sound_heaps
+from tactslip_torch.data.formats.reading import Reading
+
+NUM_DAMAGED = 400
+
+# Ours ----------------------------------------------------------------------------------------
+
+
+@given(kept())
+@settings(max_examples=40)
+def test_what_goes_in_comes_out(tmp_path_factory, drawn):
+    assert_comes_back(hdf5, tmp_path_factory.mktemp("kept") / "a.h5", *drawn)
+
+
+def test_a_recording_of_many_chunks_comes_out(tmp_path):
+    wanted, hand = recording(24, 7000), hand_of(f"c{i}" for i in range(24))
+    assert_comes_back(hdf5, tmp_path / "a.h5", wanted, hand, KEY)
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["samples"].id.get_num_chunks() == 3
+
+
+def test_thousands_of_channels_and_a_long_header_fit(tmp_path):
+    names = [f"channel {i}" for i in range(5000)]
+    assert_comes_back(hdf5, tmp_path / "a.h5", recording(5000, 3), hand_of(names), KEY)
+
+
+def test_equal_recordings_are_equal_bytes(tmp_path, monkeypatch):
+    assert_equal_bytes(hdf5, tmp_path, "h5", monkeypatch)
+
+
+def test_h5py_alone_reads_it(tmp_path):
+    wanted = recording()
+    hdf5.save(tmp_path / "a.h5", wanted, hand_of(["a", "Fö"]), KEY)
+    with h5py.File(tmp_path / "a.h5") as file:
+        samples = file["samples"]
+        np.testing.assert_array_equal(samples[()], wanted.samples.numpy())
+        assert samples.attrs["sample_rate_hz"] == 2000.0
+        assert samples.attrs["units"].decode() == "V"
+        assert [name.decode() for name in samples.attrs["channel_name"]] == ["a", "Fö"]
+
+
+def test_what_cannot_be_kept_is_refused_and_nothing_is_lost(tmp_path):
+    path = tmp_path / "a.h5"
+    path.write_bytes(b"before")
+    for names, changes, said in (
+        ("abc", {}, "the hand has 3 channels, the recording 2"),
+        (["a", "b\0"], {}, "must not hold a NUL"),
+        ("ab", {"provenance": {"by": object()}}, "provenance must be plain JSON"),
+        ("ab", {"samples": torch.zeros(2, 9, dtype=torch.int32)}, "float32 or float64"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            hdf5.save(path, recording(**changes), hand_of(names), KEY)
+    assert path.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_damaged_sample_is_noticed(tmp_path):
+    path = tmp_path / "a.h5"
+    hdf5.save(path, recording(), hand_of("ab"), KEY)
+    whole = path.read_bytes()
+    start = whole.index(recording().samples.numpy().tobytes())
+    for offset in (0, 1000, 3199):
+        content = bytearray(whole)
+        content[start + offset] ^= 1
+        path.write_bytes(content)
+        for way in (hdf5.load, lambda path: read_all(hdf5, path)):
+            with pytest.raises(ValueError, match="is damaged or no recording of ours"):
+                way(path)
+    path.write_bytes(whole)
+    assert_same(hdf5.load(path), recording(), hand_of("ab"))
+
+
+# Other people's ------------------------------------------------------------------------------
+
+
+def made(path, **datasets):
+    with h5py.File(path, "w") as file:
+        for name, values in datasets.items():
+            file[name] = values
+    return path
+
+
+def test_the_only_matrix_is_the_samples_whichever_way_it_lies(tmp_path):
+    volts = np.random.default_rng(0).standard_normal((60, 3)).astype(np.float32)
+    for values in (volts, volts.T):
+        path = made(tmp_path / "a.h5", **{"trial/volts": values, "fs": 250, "note": "hello"})
+        samples, names, times, rate = read(hdf5, path)
+        np.testing.assert_array_equal(samples.numpy(), volts.T)
+        assert (names, times, rate) == (None, None, 250.0)
+
+
+def test_datasets_of_one_length_are_channels_by_name(tmp_path):
+    path = made(tmp_path / "a.h5", **{"imu/x": np.arange(9.0), "imu/y": np.arange(9, dtype="i2")})
+    stamps = 10**18 + 2_000_000 * np.arange(9)  # nanoseconds since 1970: no float64 holds them
+    with h5py.File(path, "a") as file:
+        file["imu/Timestamp"] = stamps
+        file["imu"].attrs["Rate"] = 500.0
+        file.attrs["rate"] = 1.0
+    samples, names, times, rate = read(hdf5, path, Reading(time_unit="ns"))
+    assert names == ("x", "y")
+    assert samples.tolist() == [list(range(9))] * 2
+    assert times.tolist() == [2_000_000 * i * 1e-9 for i in range(9)]
+    assert rate == 500.0  # what is said nearest
+    assert read(hdf5, path, Reading(channels=("y",), time=None))[0].dtype == torch.float32
+
+
+def test_names_of_channels_are_read_where_they_stand(tmp_path):
+    volts = np.zeros((60, 3))
+    path = made(tmp_path / "a.h5", volts=volts, labels=["a", "b", "time_ms"])
+    samples, names, times, _ = read(hdf5, path)
+    assert names == ("a", "b")  # the third column is times by its name
+    assert samples.shape == (2, 60)
+    assert times.tolist() == [0.0] * 60
+    with h5py.File(path, "a") as file:
+        file["volts"].attrs["channel_name"] = ["q", "r", "s"]
+    assert read(hdf5, path)[1] == ("q", "r", "s")
+    assert read(hdf5, path, Reading(channels=("s", 0)))[1] == ("s", "q")
+
+
+def test_what_is_not_clear_is_said_with_what_could_be_meant(tmp_path):
+    both = {"a/volts": np.zeros((60, 3)), "b/volts": np.ones((50, 2))}
+    path = made(tmp_path / "a.h5", **both, square=np.zeros((4, 4)), t=np.zeros(7))
+    assert "'/a/volts' 60 by 3, '/b/volts' 50 by 2" in refused(hdf5, path)
+    assert refused(hdf5, path).endswith("say reading.samples")
+    assert read(hdf5, path, Reading(samples="/b/volts"))[0].shape == (2, 50)
+    assert read(hdf5, path, Reading(samples="b"))[0].shape == (2, 50)
+    assert "has no 'c'" in refused(hdf5, path, Reading(samples="c"))
+    assert "reading.time_first" in refused(hdf5, path, Reading(samples="square"))
+    assert "'/t' 7 for 60" in refused(hdf5, path, Reading(samples="a", time="t"))
+    line = refused(hdf5, path, Reading(samples="a", channels=(0, 3)))
+    assert "has no column 3" in line
+    assert "columns 0 to 2" in line
+    lengths = made(tmp_path / "b.h5", x=np.zeros(9), y=np.zeros(8))
+    assert "'/x' 9, '/y' 8; say reading.channels" in refused(hdf5, lengths)
+    assert read(hdf5, lengths, Reading(channels=("y",)))[0].shape == (1, 8)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (np.zeros(9, dtype=[("x", "f8"), ("y", "f8")]), "compound"),
+        (np.zeros((9, 2), dtype=complex), "complex"),
+        (np.array([b"a", b"b"]), "text"),
+        (["a", "b"], "objects or text"),
+        (np.zeros((9, 2), dtype=bool), "true or false"),
+        (np.zeros((2, 3, 4)), "3 dimensions"),
+        (3.0, "no samples"),
+    ],
+)
+def test_what_is_no_samples_is_named(tmp_path, values, said):
+    line = refused(hdf5, made(tmp_path / "a.h5", it=values))
+    assert said in line
+
+
+# Traps ---------------------------------------------------------------------------------------
+
+
+def test_nothing_outside_the_file_is_opened(tmp_path):
+    outside = made(tmp_path / "outside.h5", secret=np.ones((60, 3)))
+    (tmp_path / "raw").write_bytes(np.ones(180).tobytes())
+    layout = h5py.VirtualLayout((60, 3), "f8")
+    layout[:] = h5py.VirtualSource(outside, "secret", (60, 3))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["link"] = h5py.ExternalLink(str(outside), "/secret")
+        file["alias"] = h5py.SoftLink("/alias")
+        file.create_virtual_dataset("virtual", layout)
+        file.create_dataset("raw", (60, 3), "f8", external=[(str(tmp_path / "raw"), 0, 1440)])
+    line = refused(hdf5, tmp_path / "a.h5")
+    assert "holds no samples" in line
+    for name, said in (
+        ("link", "is a link"),
+        ("alias", "is a link"),
+        ("virtual", "is virtual"),
+        ("raw", "other files"),
+    ):
+        assert said in refused(hdf5, tmp_path / "a.h5", Reading(samples=name))
+
+
+def test_groups_in_a_circle_end(tmp_path):
+    path = made(tmp_path / "a.h5", volts=np.zeros((60, 3)))
+    with h5py.File(path, "a") as file:
+        file["a/b/back"] = file["/"]
+        file["again"] = file["volts"]  # one dataset by two names is one
+    assert read(hdf5, path)[0].shape == (3, 60)
+
+
+def test_claims_of_gigabytes_are_not_believed(tmp_path):
+    with h5py.File(tmp_path / "sparse.h5", "w") as file:
+        file.create_dataset("volts", (10**10 // 8, 3), "f8", chunks=(1000, 3))
+    assert (tmp_path / "sparse.h5").stat().st_size < 10_000
+    assert "claims 30000000000 bytes" in refused(hdf5, tmp_path / "sparse.h5")
+    with h5py.File(tmp_path / "chunk.h5", "w") as file:
+        file.create_dataset("volts", (100, 3), "f8", chunks=(10**8, 3), maxshape=(None, 3))
+    assert "claims 2400000000 bytes" in refused(hdf5, tmp_path / "chunk.h5")
+    with h5py.File(tmp_path / "begun.h5", "w") as file:  # as much as is believed reads as fill
+        file.create_dataset("volts", (1000, 3), "f8", chunks=(100, 3), fillvalue=7)[:5] = 1
+    assert read(hdf5, tmp_path / "begun.h5")[0].sum() == 15 + 7 * 995 * 3
+
+
+def test_a_chunk_that_unpacks_to_more_than_it_is_is_refused(tmp_path):
+    bomb = zlib.compress(bytes(200 * 2**20), 9)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        volts = file.create_dataset("volts", (1000, 3), "f8", chunks=(1000, 3), compression="gzip")
+        volts.id.write_direct_chunk((0, 0), bomb)
+    assert "is damaged" in refused(hdf5, tmp_path / "a.h5")
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        values = np.random.default_rng(0).standard_normal((40_000, 3))
+        file.create_dataset("volts", data=values, chunks=(20_000, 3), compression="gzip")
+    np.testing.assert_array_equal(read(hdf5, tmp_path / "b.h5")[0].numpy(), values.T)
+
+
+def test_a_chunk_of_no_bytes_is_refused(tmp_path):
+    """HDF5 2.0 looks for its check sum before it and ends the process."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        volts = file.create_dataset("volts", (100, 3), "f8", chunks=(100, 3), fletcher32=True)
+        volts.id.write_direct_chunk((0, 0), b"1234")
+    assert "is damaged" in refused(hdf5, tmp_path / "a.h5")
+
+
+def test_a_heap_that_never_ends_is_not_walked(tmp_path):
+    """HDF5 2.0 never returns from it."""
+    path = made(tmp_path / "a.h5", volts=np.zeros((60, 2)), labels=["left", "right"])
+    assert read(hdf5, path)[1] == ("left", "right")
+    whole = path.read_bytes()
+    first = whole.index(b"GCOL") + 16
+    path.write_bytes(whole[:first] + bytes(16) + whole[first + 16 :])
+    assert not has_sound_heaps(path)
+    assert read(hdf5, path)[1] is None
+    place = whole.index((4).to_bytes(4, "little") + whole.index(b"GCOL").to_bytes(8, "little"))
+    path.write_bytes(whole[:place] + b"\xff\xff\xff\x7f" + whole[place + 4 :])
+    assert not has_sound_heaps(path)  # a text of 2 GB
+    assert read(hdf5, path)[1] is None
+
+
+def test_damaged_files_are_read_or_refused_in_one_line(tmp_path):
+    hdf5.save(tmp_path / "ours.h5", recording(), hand_of("ab"), KEY)
+    with h5py.File(tmp_path / "theirs.h5", "w") as file:
+        volts = np.random.default_rng(0).standard_normal((500, 3))
+        file.create_dataset("g/volts", data=volts, chunks=(100, 3), compression="gzip")
+        file["g/t"] = np.arange(500.0)
+        file["labels"] = ["a", "b", "c"]
+        file.attrs["fs"] = 100.0
+    contents = [(tmp_path / name).read_bytes() for name in ("ours.h5", "theirs.h5")]
+    ends = survived(hdf5, tmp_path / "damaged.h5", contents, NUM_DAMAGED)
+    assert ends.total() == 3 * NUM_DAMAGED
+    assert min(ends["read"], ends["refused"]) > NUM_DAMAGED // 4  # neither all nor nothing
+
+
+@pytest.mark.parametrize("content", [b"", b"time,volts\n0,1\n", b"\x89HDF\r\n\x1a\n" + bytes(99)])
+def test_what_is_no_hdf5_is_refused(tmp_path, content):
+    (tmp_path / "a.h5").write_bytes(content)
+    assert refused(hdf5, tmp_path / "a.h5") == "is damaged or no recording of ours"
+    for way in (hdf5.load, hdf5.key):
+        with pytest.raises(ValueError, match="is damaged or no recording of ours"):
+            way(tmp_path / "a.h5")
+
+
+def test_what_is_not_there_is_said_as_such(tmp_path):
+    for way in (hdf5.load, hdf5.key, lambda path: read(hdf5, path)):
+        with pytest.raises(FileNotFoundError, match=r"no file at .*a\.h5"):
+            way(tmp_path / "a.h5")
+        with pytest.raises(ValueError, match="must be a file"):
+            way(tmp_path)
+
+
+def test_theirs_is_not_loaded_as_ours(tmp_path):
+    path = made(tmp_path / "a.h5", samples=np.zeros((2, 9)))
+    for way in (hdf5.load, hdf5.key):
+        with pytest.raises(ValueError, match="no recording of ours"):
+            way(path)
+
+
+def test_without_h5py_a_line_says_what_to_install(tmp_path, monkeypatch):
+    path = made(tmp_path / "a.h5", volts=np.zeros((60, 2)))
+    hide(monkeypatch, "h5py")
+    save = lambda: hdf5.save(path, recording(), hand_of("ab"), KEY)  # noqa: E731
+    calls = (save, lambda: hdf5.load(path), lambda: hdf5.key(path), lambda: read(hdf5, path))
+    assert_hint("h5py", "formats", *calls)
