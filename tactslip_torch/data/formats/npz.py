@@ -33,6 +33,7 @@ from tactslip_torch.data.formats.header import (
     damaged,
     plain_json,
 )
+from tactslip_torch.data.formats.npz_members import MOST_CHANNELS, check_members
 from tactslip_torch.data.formats.reading import (
     AS_IT_SAYS,
     RATE_NAMES,
@@ -43,12 +44,15 @@ from tactslip_torch.data.formats.reading import (
     is_time_first,
     time_name,
 )
+from tactslip_torch.data.formats.refusing import Refused, refusing
 from tactslip_torch.data.formats.stored_array import StoredSamples, array_head, stored_samples
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.files import whole_file
 from tactslip_torch.hand import HandLayout
 
 _LOCAL_HEADER = struct.Struct("<26xHH")  # of a ZIP member: lengths of its name and extra field
+_ZIP = b"PK\3\4"
+_MOST_NAMED = 8
 _COLUMNS = ("name", "kind", "finger", "segment", "adapting")
 _Read = TypeVar("_Read")
 
@@ -131,29 +135,14 @@ def open(path: str | os.PathLike[str], how: Reading = AS_IT_SAYS) -> Iterator[Op
         ValueError: if it is damaged or holds no such samples.
     """
     with ExitStack() as stack:
-        file = stack.enter_context(_opened(path))
-        try:
+        with refusing(path):
+            file = stack.enter_context(Path(path).open("rb"))
             samples, is_ours = _stored(file, stack, how, path)
             times, rate = (None, None) if is_ours else _beside(file, samples, how, path)
-        except _Unclear as error:
-            raise ValueError(str(error)) from None
-        except Exception as error:
-            raise damaged(path) from error
-        none = samples.read(0, 0)
+            none = samples.read(0, 0)
         rest = _read(path, lambda content: _archived(content, none)) if is_ours else None
         rate = rest.recording.sample_rate_hz if rest else rate
         yield Opened(samples, rest, rest.hand.names if rest else None, times, rate)
-
-
-class _Unclear(Exception):
-    """A file that is whole, of which somebody must say more."""
-
-
-def _opened(path: str | os.PathLike[str]) -> IO[bytes]:
-    try:
-        return Path(path).open("rb")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"no file at {os.fspath(path)}") from None
 
 
 def _stored(
@@ -171,10 +160,11 @@ def _stored(
         there = archive.namelist()
         is_ours = "format.npy" in there and wanted == "samples"
         if f"{wanted}.npy" not in there and all(name.endswith(".npy") for name in there):
-            arrays = ", ".join(name.removesuffix(".npy") for name in there)
-            raise _Unclear(
+            arrays = ", ".join(name.removesuffix(".npy") for name in there[:_MOST_NAMED])
+            raise Refused(
                 f"{os.fspath(path)} has no array {wanted!r}, it has {arrays}; say reading.samples"
             )
+        check_members(archive, path)
         member = archive.getinfo(f"{wanted}.npy")
         is_packed = member.compress_type != zipfile.ZIP_STORED
         copied = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115  # by the stack
@@ -187,13 +177,16 @@ def _stored(
         file.seek(member.header_offset)
         name, extra = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
         file.seek(name + extra, os.SEEK_CUR)
+    end = file.tell() + member.file_size
     head = array_head(file)
+    if head.end > end:
+        raise ValueError("samples must be all there")
     is_first = how.time_first is True
     if how.samples is not None and how.time_first is None:
         try:
             is_first = is_time_first((head.shape[0], head.shape[1]), how, path, wanted)
         except ValueError as error:
-            raise _Unclear(str(error)) from None
+            raise Refused(str(error)) from None
     return stored_samples(file, head, is_time_first=is_first and not is_ours), is_ours
 
 
@@ -209,14 +202,14 @@ def _beside(
         try:
             name = time_name(content.files, how)
         except ValueError as error:
-            raise _Unclear(f"{os.fspath(path)}: {error}") from None
+            raise Refused(f"{os.fspath(path)}: {error}") from None
         rates = [content[n] for n in content.files if n.lower() in RATE_NAMES]
         rate = float(rates[0]) if len(rates) == 1 and rates[0].size == 1 else None
         if name is None:
             return None, rate
         times = np.asarray(content[name]).reshape(-1)
     if times.dtype.kind not in "iuf" or len(times) != samples.num_samples:
-        raise _Unclear(
+        raise Refused(
             f"{os.fspath(path)} has {samples.num_samples} samples and {len(times)} times in "
             f"{name!r}; give reading.time=null to go without"
         )
@@ -227,16 +220,17 @@ def _beside(
 def _read(
     path: str | os.PathLike[str], what: Callable[[Mapping[str, NDArray[Any]]], _Read]
 ) -> _Read:
-    with _opened(path) as file:
-        try:
-            with np.load(file, allow_pickle=False) as content:
-                form = str(content["format"])
-                found = what(content) if form == FORM else None
-        except Exception as error:  # zip, zlib, NumPy's header and JSON raise many kinds
-            raise damaged(path) from error
-    if found is None:
-        raise ValueError(f"{os.fspath(path)} must be of format {FORM!r}, got {form!r}")
-    return found
+    """What can be made of an archive's arrays, each read when it is asked for."""
+    with refusing(path), Path(path).open("rb") as file:
+        if file.read(len(_ZIP)) != _ZIP:  # NumPy would read an array whole
+            raise damaged(path)
+        with zipfile.ZipFile(file) as archive:
+            check_members(archive, path)
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as content:
+            if (form := str(content["format"])) != FORM:
+                raise Refused(f"{os.fspath(path)} must be of format {FORM!r}, got {form[:80]!r}")
+            return what(content)
 
 
 def _archived(content: Mapping[str, NDArray[Any]], samples: Tensor) -> Archived:
@@ -244,6 +238,8 @@ def _archived(content: Mapping[str, NDArray[Any]], samples: Tensor) -> Archived:
     if samples.dtype not in DTYPES.values():
         raise ValueError("samples must be floating")
     columns = [column for column in _COLUMNS if f"channel_{column}" in content]
+    if len(samples) > MOST_CHANNELS:
+        raise ValueError(f"{len(samples)} channels, at most {MOST_CHANNELS} are read")
     words = [content[f"channel_{column}"].tolist() for column in columns]
     rows = (dict(zip(columns, row, strict=True)) for row in zip(*words, strict=True))
     hand = HandLayout.from_rows(

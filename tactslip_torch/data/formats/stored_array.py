@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy.lib import format as npy
 from torch import Tensor
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+
+MOST_SAMPLES = 2**40  # an array without channels could claim any number
 
 
 class StoredSamples(NamedTuple):
@@ -60,6 +63,11 @@ class ArrayHead(NamedTuple):
     dtype: np.dtype[Any]
     start: int
 
+    @property
+    def end(self) -> int:
+        """Where its values end."""
+        return self.start + math.prod(self.shape) * self.dtype.itemsize
+
 
 def array_head(file: IO[bytes]) -> ArrayHead:
     """The header of the array that begins where the file is.
@@ -69,12 +77,13 @@ def array_head(file: IO[bytes]) -> ArrayHead:
     """
     version = npy.read_magic(file)  # type: ignore[no-untyped-call]
     shape, is_fortran, dtype = _HEADERS[version](file)  # type: ignore[no-untyped-call]
-    start, is_float = file.tell(), dtype.kind == "f" and dtype.itemsize in (4, 8)
-    if len(shape) != 2 or not (is_float or dtype.kind in "iu") or not any(shape):
+    head = ArrayHead(shape, is_fortran, dtype, file.tell())
+    is_number = dtype.kind in "iu" or (dtype.kind == "f" and dtype.itemsize in (4, 8))
+    if len(shape) != 2 or not is_number or not any(shape) or min(shape) < 0:
         raise ValueError("samples must be numbers in two dimensions")
-    if shape[0] * shape[1] * dtype.itemsize > file.seek(0, 2) - start:
+    if head.end > file.seek(0, 2) or max(shape) > MOST_SAMPLES:
         raise ValueError("samples must be all there")
-    return ArrayHead(shape, is_fortran, dtype, start)
+    return head
 
 
 def stored_samples(file: IO[bytes], head: ArrayHead, *, is_time_first: bool) -> StoredSamples:

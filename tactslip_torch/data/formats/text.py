@@ -212,10 +212,11 @@ def _copy_as_utf8(path: str | os.PathLike[str], file: IO[bytes], copied: IO[byte
 
 
 def _opened(path: str | os.PathLike[str]) -> IO[bytes]:
-    try:
-        return Path(path).open("rb")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"no file at {os.fspath(path)}") from None
+    if not Path(path).exists():
+        raise FileNotFoundError(f"no file at {os.fspath(path)}")
+    if not Path(path).is_file():  # reading a pipe would wait for ever
+        raise ValueError(f"{os.fspath(path)} must be a file")
+    return Path(path).open("rb")
 
 
 def _is_ours(file: IO[bytes]) -> bool:
