@@ -14,7 +14,7 @@ from pathlib import Path
 
 import hydra
 import numpy as np
-from hydra.utils import instantiate
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig
 
 import tactslip_torch
@@ -112,9 +112,14 @@ def convert(config: DictConfig) -> list[Converted]:
         try:
             return job.convert(recording)
         except (ValueError, OSError) as error:
-            if not config.skip_failed:
-                raise
-            return one_line(error)
+            entry = source.entry(recording)
+            what = str(Problem(entry.place, f"{entry.file}: {one_line(error)}"))
+            if config.skip_failed:
+                return what
+            raise ValueError(
+                f"{what}; those that were finished are kept in {job.folder}, skip_failed=true "
+                "goes on without this one"
+            ) from error
 
     found = list(in_processes(one, source.ids, "converting", "recording", config.num_workers))
     done = [each for each in found if isinstance(each, Converted)]
@@ -151,11 +156,9 @@ ACTIONS: dict[str, Callable[[DictConfig], object]] = {
 
 def _source(config: DictConfig, **options: bool) -> FileRecordings:
     """The set of the ``data`` section, which must be one of files."""
-    source = (
-        instantiate(config.data, _convert_="all", **options) if "manifest" in config.data else 0
-    )
-    if not isinstance(source, FileRecordings):
+    if getattr(get_object(config.data._target_), "is_simulated", False) is True:
         raise ValueError("data must be a set of files, such as data=files or data=authors_raw")
+    source: FileRecordings = instantiate(config.data, _convert_="all", **options)
     return source
 
 

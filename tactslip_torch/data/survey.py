@@ -27,6 +27,7 @@ from tactslip_torch.workers import in_processes
 BEFORE_ONSET_S = 1.01
 """What ``labels=whole_slide`` takes as non-slip before an onset."""
 _PATIENCE_S = 2.0
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,9 @@ def survey(plan: Plan, entries: Sequence[Entry]) -> Survey:
         wrong = list(dict.fromkeys(part for part in parts if isinstance(part, str)))
         if not wrong:
             recording, wrong = _timed(plan, entry, whole)
-            recordings += [] if wrong else [recording]
-            warnings += [_at(entry, doubt) for doubt in _doubts(recording)]
+            if not wrong:
+                recordings.append(recording)
+                warnings += [_at(entry, doubt) for doubt in _doubts(recording)]
         problems += [_at(entry, what) for what in wrong]
     _refuse_several_rates(plan, recordings)
     return Survey(tuple(recordings), tuple(problems), tuple(warnings))
@@ -149,8 +151,9 @@ def _timed(plan: Plan, entry: Entry, parts: tuple[Part, ...]) -> tuple[Surveyed,
             wrong.append(f"nothing is there to tare on from {first_s:g} to {last_s:g} s")
     found, rate_hz = parts[0].found, parts[0].rate_hz
     truth = entry.truth or found.truth or Truth()
-    if found.is_measured:  # a person read the file's own times
-        truth = scaled(truth, found.clock.sample_rate_hz / rate_hz)
+    pace = found.clock.sample_rate_hz / rate_hz
+    if found.is_measured and abs(pace - 1) > _ROUNDING:  # a person read the file's own times
+        truth = scaled(truth, pace)
     times, misfits = on_time(
         truth,
         duration_s,

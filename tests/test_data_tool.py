@@ -1,0 +1,485 @@
+"""The command for sets of files: what it lists, prints, draws and writes."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from test_commands import BAD_INPUT, composed
+from test_datasets import HAND, RATE_HZ, broken, manifest, ours, samples, table
+
+from tactslip_torch import data_tool
+from tactslip_torch.config import one_line
+from tactslip_torch.data.datasets import FileRecordings
+from tactslip_torch.data.formats.registry import FORMATS, format_of
+from tactslip_torch.data.inspection import inspected, oddities
+from tactslip_torch.data.template import guessed, guesser, write_template
+from tactslip_torch.report.dataset import (
+    Example,
+    Trial,
+    draw_dataset,
+    ranges_table,
+    trials_table,
+)
+from tactslip_torch.train import train
+
+
+def run(action, root, *overrides):
+    """What an action returns."""
+    config = composed(
+        f"action={action}", f"root={root}", "num_workers=0", *overrides, name="data_tool"
+    )
+    return data_tool.ACTIONS[action](config)
+
+
+@pytest.fixture
+def root(tmp_path):
+    """Four recordings: two of ours, two tables."""
+    folder = tmp_path / "set"
+    (folder / "day 2").mkdir(parents=True)
+    ours(folder / "a.npz")
+    ours(folder / "b.csv", samples(1, dtype=torch.float32))
+    table(folder / "c.csv", samples(2), names=("t", *HAND.names))
+    table(folder / "day 2" / "d.csv", samples(3), names=("t", *HAND.names))
+    manifest(
+        folder,
+        "a.npz,wood,0,,,",
+        "b.csv,wood,1,1.5,1.5-2.0,",
+        "c.csv,iron,0,,,slip",
+        "day 2/d.csv,iron,1,,,non-slip",
+    )
+    return folder
+
+
+ROWS = (
+    "data.channels=["
+    + ",".join(
+        "{" + ",".join(f"{key}: {value}" for key, value in row.items()) + "}"
+        for row in HAND.to_rows()
+    )
+    + "]"
+)
+
+
+# check ---------------------------------------------------------------------------------------
+
+
+def test_check_lists_every_problem_and_warning(tmp_path, capsys):
+    expected = broken(tmp_path)
+    flat = samples(0)
+    flat[1] = 2.5
+    flat[2, 40:50] = torch.nan
+    table(tmp_path / "0.csv", flat)
+    assert run("check", tmp_path) == len(expected)
+    lines = capsys.readouterr().out.splitlines()
+    for line, (place, what) in zip(lines, expected, strict=False):
+        assert line.startswith(f"problem: {place}: ")
+        assert what in line
+    assert lines[len(expected) :] == [
+        "warning: manifest.csv:2: 0.csv: c is not finite in 10 samples, first at 0.2000 s; leave "
+        "the stretch out as missing_s, or repair it",
+        "warning: manifest.csv:2: 0.csv: b never changes, it is 2.5 throughout",
+        "3 recordings of 2 materials, 9.0 s, 3 channels at 200 Hz in V: 6 problems, 2 warnings",
+    ]
+
+
+def test_check_of_a_fine_set_finds_nothing(root, capsys):
+    assert run("check", root, ROWS) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("4 recordings of 2 materials, 12.0 s, 3 channels at 200 Hz in V: 0 prob")
+
+
+def test_a_file_that_is_damaged_in_its_samples_is_a_problem(root, capsys, monkeypatch):
+    def fails(source, recording):
+        raise ValueError("the block at byte 7 is damaged")
+
+    monkeypatch.setattr(data_tool, "inspected", fails)
+    assert run("check", root, ROWS) == 4
+    assert "problem: manifest.csv:5: day 2/d.csv: the block" in capsys.readouterr().out
+    assert run("check", root, ROWS, "samples=false") == 0
+
+
+def test_nothing_can_be_read(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("")
+    manifest(tmp_path, "a.csv,wood,0,,,")
+    assert run("check", tmp_path) == 1
+    assert capsys.readouterr().out.splitlines()[-1].startswith("no recording can be read: 1 prob")
+    with pytest.raises(ValueError, match=r"no recording of .* can be read"):
+        run("summary", tmp_path)
+
+
+def test_what_is_missing_by_rule_is_not_called_broken(tmp_path):
+    content = samples(0)
+    content[:, 100:120] = torch.nan
+    content[0, 300] = torch.inf
+    table(tmp_path / "a.csv", content)
+    manifest(tmp_path, "a.csv,wood,0.5-0.6", columns="file,material,missing_s")
+    source = FileRecordings(tmp_path)
+    found = inspected(source, source.ids[0])
+    assert found.broken == {0: (1, 1.5)}
+    assert oddities(source, found)[0].startswith("a is not finite in 1 samples, first at 1.5000 s")
+    finite = content.where(content.isfinite(), 0.0)
+    assert found.least == finite.amin(-1).tolist()
+    assert found.greatest == finite.amax(-1).tolist()
+
+
+# summary -------------------------------------------------------------------------------------
+
+
+def test_summary_tells_and_draws_what_there_is(root, tmp_path, capsys):
+    trials = run("summary", root, ROWS, f"output={tmp_path / 'set.png'}")
+    assert [(t.material, t.slip_s, t.non_slip_s, t.num_onsets) for t in trials] == [
+        ("wood", 1.0, 0.25, 1),
+        ("wood", 0.5, 0.0, 1),
+        ("iron", 3.0, 0.0, 0),
+        ("iron", 0.0, 3.0, 0),
+    ]
+    out = capsys.readouterr().out
+    rows = [line.split() for line in out.splitlines()]
+    assert ["wood", "paper", "2", "3.00", "3.00", "6.0", "2", "1.5", "0.2"] in rows
+    assert ["iron", "paper", "2", "3.00", "3.00", "6.0", "0", "3.0", "3.0"] in rows
+    whole = torch.cat(
+        [samples(), samples(1, dtype=torch.float32).double(), samples(2), samples(3)], 1
+    )
+    films = whole[1:]
+    assert ["PVDF", "2", f"{films.min():.6g}", f"{films.max():.6g}"] in rows
+    assert "SIMULATED" not in out
+    with Image.open(tmp_path / "set.png") as image:
+        assert image.width > 1000
+        assert len(image.convert("RGB").getcolors(1 << 24)) > 10
+
+
+def test_a_simulated_set_is_called_so(tmp_path, capsys):
+    ours(tmp_path / "a.npz", provenance={"simulated": True})
+    manifest(tmp_path, "a.npz,wood,0,,,")
+    run("summary", tmp_path, f"output={tmp_path / 'a.png'}", "samples=false")
+    assert capsys.readouterr().out.count("SIMULATED") == 2
+    run("check", tmp_path)
+    assert "SIMULATED" in capsys.readouterr().out
+
+
+def drawn(num_channels=3, **changes):
+    example = {
+        "title": "wood/0",
+        "samples": samples(0, channels=num_channels).numpy(),
+        "names": [f"E{i}" for i in range(num_channels)],
+        "sample_rate_hz": RATE_HZ,
+        "units": "V",
+        "onsets_s": (1.0,),
+        "slip_s": ((1.0, 2.0),),
+        "non_slip_s": ((0.0, 0.5),),
+    }
+    trials = [Trial("wood", "paper", 3.0, 1.0, 0.5, 1), Trial("iron", "paper", 6.0, 0.0, 0.0, 0)]
+    return draw_dataset(trials, Example(**(example | changes)), title="a set")
+
+
+def test_the_figure_shows_seconds_and_labels():
+    bars, traces = drawn().axes
+    widths = [patch.get_width() for patch in bars.patches]
+    assert widths == [1.0, 0.5, 1.5, 0.0, 0.0, 6.0]
+    spans = [patch.get_x() for patch in traces.patches]
+    assert spans == [1.0, 0.0]
+    assert [text.get_text().split()[0] for text in traces.get_yticklabels()] == ["E0", "E1", "E2"]
+    dashed = [line for line in traces.lines if line.get_linestyle() == "-."]
+    assert [line.get_xdata()[0] for line in dashed] == [1.0]
+
+
+def test_of_many_channels_so_many_are_drawn_and_said():
+    traces = drawn(60).axes[1]
+    assert len(traces.get_yticklabels()) == 24
+    assert "24 of 60 channels" in traces.get_title()
+    nothing = drawn(samples=np.full((3, 600), np.nan)).axes[1]
+    assert len(nothing.get_yticklabels()) == 3
+    with pytest.raises(ValueError, match="no recording to draw"):
+        draw_dataset([], None, title="nothing")
+
+
+def test_tables_say_what_is_simulated_and_what_is_not_known():
+    trials = [Trial("wood", "paper", 3.0, 1.0, 0.5, 1)]
+    assert trials_table(trials, simulated=True).startswith("SIMULATED")
+    assert len(trials_table(trials, simulated=False).splitlines()) == 2  # no sum of one row
+    unknown = ranges_table(HAND.to_rows(), np.full((3, 2), np.nan), "counts")
+    assert unknown.splitlines()[0].split()[-2:] == ["greatest,", "counts"]
+    assert unknown.splitlines()[1].split() == ["SG", "1", "nan", "nan"]
+
+
+# convert -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS))
+def test_a_set_becomes_one_of_another_format(root, tmp_path, name, capsys):
+    before = FileRecordings(root, channels=HAND.to_rows())
+    (root / "b.csv").rename(root / "bb.csv")
+    text = (root / "manifest.csv").read_text()
+    (root / "manifest.csv").write_text(text.replace("b.csv", "bb.csv"))
+    done = run("convert", root, ROWS, f"to={name}", f"output={tmp_path / 'out'}")
+    assert [one.made for one in done] == [True] * 4
+    after = FileRecordings(tmp_path / "out")
+    assert after.problems == after.warnings == ()
+    assert after.ids == before.ids
+    assert after.hand == before.hand
+    (root / "bb.csv").rename(root / "b.csv")
+    for recording in before.ids:
+        one, other = before.load(recording), after.load(recording)
+        assert torch.equal(one.samples, other.samples)
+        assert one.samples.dtype == other.samples.dtype
+        assert before.timeline(recording) == after.timeline(recording)
+        assert one.units == other.units
+        assert dict(other.provenance)["simulated"] is False
+    told = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["4", "4", "0", "12.0"] in [row[:4] for row in told]
+    assert sorted(p.name for p in (tmp_path / "out" / "day 2").iterdir())
+
+
+def converted(root, out, *overrides):
+    return [one.made for one in run("convert", root, ROWS, "to=npz", f"output={out}", *overrides)]
+
+
+def test_what_was_finished_is_kept_and_what_changed_is_made_again(root, tmp_path):
+    out = tmp_path / "out"
+    assert converted(root, out) == [True] * 4
+    stamps = {path: path.stat().st_mtime_ns for path in out.rglob("*.npz")}
+    os.utime(root / "a.npz", ns=(1, 1))  # the same content
+    assert converted(root, out) == [False] * 4
+    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+    (out / "c.npz").unlink()
+    table(root / "day 2" / "d.csv", samples(9), names=("t", *HAND.names))
+    text = (root / "manifest.csv").read_text()
+    (root / "manifest.csv").write_text(text.replace("1.5-2.0", "1.5-1.75"))
+    assert converted(root, out) == [False, True, True, True]
+    assert converted(root, out, "data.tare_s=[0,1]") == [True] * 4
+
+
+def test_the_first_that_fails_stops_it_and_what_was_finished_stays(root, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    whole = FileRecordings.load
+
+    def fails(self, recording, windows=None):
+        if str(recording) == "iron/0":
+            raise ValueError("it is damaged at byte 7")
+        return whole(self, recording, windows)
+
+    monkeypatch.setattr(FileRecordings, "load", fails)
+    with pytest.raises(ValueError, match=r"manifest\.csv:4: c\.csv: it is damaged .* are kept in"):
+        converted(root, out)
+    assert sorted(path.name for path in out.rglob("*.*")) == ["a.npz", "b.npz"]
+    monkeypatch.setattr(FileRecordings, "load", whole)
+    assert converted(root, out) == [False, False, True, True]
+
+
+def test_what_fails_is_left_out_on_request_and_said(root, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    whole = FileRecordings.load
+
+    def fails(self, recording, windows=None):
+        if str(recording) == "iron/0":
+            raise ValueError("it is damaged at byte 7")
+        return whole(self, recording, windows)
+
+    monkeypatch.setattr(FileRecordings, "load", fails)
+    (root / "b.csv").write_text("no table\n")
+    assert converted(root, out, "skip_failed=true") == [True, True]
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("left out")]
+    assert len(said) == 2
+    assert said[0].startswith("left out: manifest.csv:3: b.csv: ")
+    assert said[1] == "left out: manifest.csv:4: c.csv: it is damaged at byte 7"
+    with (out / "manifest.csv").open(newline="") as file:
+        assert [line["file"] for line in csv.DictReader(file)] == ["a.npz", "day 2/d.npz"]
+
+
+def test_gaps_are_missing_in_the_copy_as_well(tmp_path):
+    times = np.delete(np.arange(600), slice(100, 120)) / RATE_HZ
+    folder = tmp_path / "set"
+    folder.mkdir()
+    table(folder / "a.csv", samples(0, 580), times=times)
+    manifest(folder, "a.csv,wood,0,,,slip")
+    run("convert", folder, "data.gaps=missing", "to=npz", f"output={tmp_path / 'out'}")
+    copy = FileRecordings(tmp_path / "out")
+    assert copy.timeline(copy.ids[0]).missing_s == ((0.5, 0.6),)
+    assert copy.load(copy.ids[0]).samples[:, 100:120].isnan().all()
+    assert run("check", tmp_path / "out") == 0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (["to=npz"], "no value for output; give to=FORMAT and output=FOLDER"),
+        (["output=out"], "no value for to"),
+        (["to=doc", "output=out"], "format must be one of .* got 'doc'"),
+        (["to=npz", "output={root}"], "output must be another folder than root"),
+        (["to=npz", "output={root}/../set"], "output must be another folder than root"),
+        (["to=npz", "output={there}"], r"a\.npz .*; move it away, or give another output"),
+    ],
+)
+def test_a_conversion_that_cannot_be_is_refused_before_any_work(root, tmp_path, overrides, line):
+    there = tmp_path / "there"
+    there.mkdir()
+    (there / "a.npz").write_text("a letter")
+    given = [override.format(root=root, there=there) for override in overrides]
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match=line):
+        run("convert", root, ROWS, *given)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == before
+    assert (there / "a.npz").read_text() == "a letter"
+
+
+def test_two_files_that_would_become_one_are_refused(root, tmp_path):
+    ours(root / "c.npz")
+    with (root / "manifest.csv").open("a") as file:
+        file.write("c.npz,wood,5,,,\n")
+    with pytest.raises(ValueError, match=r"c\.csv and c\.npz would both become c\.h5"):
+        run("convert", root, ROWS, "to=h5", f"output={tmp_path / 'out'}")
+    assert not (tmp_path / "out").exists()
+
+
+# label_template ------------------------------------------------------------------------------
+
+
+def test_a_template_lists_every_recording_with_what_names_tell(root, capsys):
+    (root / "manifest.csv").unlink()
+    for name in ("oil paper-slip_07.csv", "notes.doc", ".hidden.csv", "x1.yaml"):
+        (root / name).write_text("1\n")
+    path = run("label_template", root)
+    assert path == root / "manifest.csv"
+    with path.open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [line["file"] for line in lines] == [
+        "a.npz",
+        "b.csv",
+        "c.csv",
+        "day 2/d.csv",
+        "oil paper-slip_07.csv",
+    ]
+    assert (lines[4]["material"], lines[4]["trial"]) == ("oil paper-slip", "07")
+    assert {line["label"] for line in lines} == {lines[0]["material"]} == {""}
+    assert "lists 5 recordings, 1 of them with what" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"manifest\.csv is there already; move it away"):
+        run("label_template", root)
+
+
+def test_a_template_that_is_filled_in_is_a_manifest(tmp_path):
+    for name in ("wood_1.csv", "wood_2.csv", "iron_1.csv"):
+        table(tmp_path / name, samples(1))
+    path = write_template(tmp_path, "{material}{trial}").path
+    source = FileRecordings(tmp_path)
+    assert [str(r) for r in source.ids] == ["iron/1", "wood/1", "wood/2"]
+    assert len(source.warnings) == 3  # nothing is labelled yet
+    text = path.read_text().replace(",,,,,,\n", ",,,,,,slip\n")
+    path.write_text(text.replace("wood_2.csv,wood,2,,,,,,slip", "wood_2.csv,wood,2,,1.5; 2,,,0-1,"))
+    filled = FileRecordings(tmp_path)
+    assert filled.warnings == ()
+    assert [filled.timeline(r).onsets_s for r in filled.ids] == [(), (), (1.5, 2.0)]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "file", "found"),
+    [
+        ("{material}{trial}", "wood12.csv", {"material": "wood", "trial": "12"}),
+        ("{material}{trial}", "sub/wood - 12.csv", {"material": "wood", "trial": "12"}),
+        ("{material}{trial}", "wood.csv", {}),
+        ("{material}-slip{trial}", "abs-slip3.txt", {"material": "abs", "trial": "3"}),
+        (
+            "{scene}/{material}{trial}",
+            "taps/iron_4.h5",
+            {"scene": "taps", "material": "iron", "trial": "4"},
+        ),
+        ("{label}/{material}_*", "slip/iron_x.h5", {"label": "slip", "material": "iron"}),
+        ("{scene}/{material}{trial}", "iron_4.h5", {}),
+        ("*_{material}.v1", "run7_oil paper.v1.csv", {"material": "oil paper"}),
+    ],
+)
+def test_a_pattern_tells_what_names_mean(pattern, file, found):
+    assert guessed(file, pattern) == found
+
+
+@pytest.mark.parametrize("pattern", ["", "wood", "{thing}", "{material}{material}", "{}"])
+def test_a_pattern_that_means_nothing_is_refused(pattern):
+    with pytest.raises(ValueError, match=r"pattern must name each of \{material\}, \{trial\}"):
+        guesser(pattern)
+
+
+def test_an_empty_folder_has_no_template(tmp_path):
+    with pytest.raises(ValueError, match=r"no recording in .*; files that can be read end in"):
+        write_template(tmp_path, "{material}{trial}")
+    with pytest.raises(FileNotFoundError, match="no folder at"):
+        write_template(tmp_path / "nowhere", "{material}{trial}")
+
+
+# The command ---------------------------------------------------------------------------------
+
+
+def command(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "tactslip_torch.data_tool", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        check=False,
+    )
+
+
+@pytest.mark.slow
+def test_the_command_ends_with_two_where_there_are_problems(tmp_path):
+    broken(tmp_path)
+    found = command("action=check", f"root={tmp_path}", "num_workers=0", cwd=tmp_path)
+    assert found.returncode == 2
+    assert found.stderr.splitlines()[-1] == f"error: 6 problems in {tmp_path}, listed above"
+    assert found.stdout.count("problem: ") == 6
+    assert not (tmp_path / "outputs").exists()
+    other = command("action=chek", f"root={tmp_path}", cwd=tmp_path)
+    assert other.returncode == 2
+    assert re.fullmatch(r"error: action must be one of check, .* got 'chek'\n", other.stderr)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (["data=simulated"], "data must be a set of files, such as data=files or data=authors_raw"),
+        (["data=authors_raw"], r"no file in .* is named as the authors' are"),
+        (["data.gaps=often"], r"data\.gaps must be one of refuse, missing, bridge"),
+    ],
+)
+def test_bad_input_is_one_line(root, overrides, line):
+    with pytest.raises(BAD_INPUT) as caught:
+        run("check", root, *overrides)
+    assert re.search(line, one_line(caught.value))
+
+
+# From files to a detector ----------------------------------------------------------------------
+
+
+def test_what_generate_writes_trains_as_the_simulation_does(tmp_path):
+    """Of a hand of four channels; the same bins, features and scores, read and simulated."""
+    from tactslip_torch.generate import generate
+
+    tiny = ("data._target_=test_commands.TinyRecordings", "materials=[A,B,C]", "cycles=4")
+    generate(composed(*tiny, "num_workers=0", "figure=false", name="generate"), tmp_path / "set")
+    common = (
+        "split.seen=[A,B]",
+        "split.unseen=[C]",
+        "split.train_share=0.5",
+        "recipe.num_features=10",
+        "recipe.penalties=[0.1,1.0]",
+        "num_workers=0",
+        "export=false",
+        "cache=off",
+    )
+    made = composed(
+        "data._target_=test_commands.TinyRecordings",
+        "data.materials=[A,B,C]",
+        "data.cycles=4",
+        *common,
+    )
+    read = composed("data=files", f"data.root={tmp_path / 'set'}", *common)
+    assert not {"scene", "others", "seed", "fidelity"} & set(read.data)
+    scores = [train(made, tmp_path / "made"), train(read, tmp_path / "read")]
+    assert scores[0] == scores[1]
+    metrics = json.loads((tmp_path / "read" / "metrics.json").read_text())
+    assert metrics["simulated"] is False
+    assert format_of(next((tmp_path / "set").glob("*.npz"))).name == "npz"
