@@ -19,12 +19,8 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.groups import checked_attributes, matching
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.selection import (
-    ScoreVariance,
-    rank_distinct,
-    rank_features,
-    t_scores,
-)
+from tactslip_torch.features.rounding import is_rounding
+from tactslip_torch.features.selection import ScoreVariance, rank_distinct, rank_features, t_scores
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.kernels import Kernel, Polynomial, RadialBasis
 from tactslip_torch.model.scaling import FeatureScaler
@@ -147,15 +143,21 @@ class Recipe:
     def allowed(self, pool: FeaturePool) -> Tensor | None:
         """Which features of a pool may be selected, ``[F]``, bool; ``None`` if all.
 
+        Those that rounding decides, as some wavelets have them, never may.
+
         Raises:
             ValueError: if ``among`` names a value that no feature has, or nothing matches.
         """
+        is_firm = ~is_rounding(pool)
         if self.among is None:
-            return None
+            return None if bool(is_firm.all()) else is_firm
         try:
-            return matching(pool.hand, pool.names, self.among)
+            mask = matching(pool.hand, pool.names, self.among) & is_firm
         except ValueError as error:
             raise ValueError(f"recipe.among: {error}") from None
+        if not bool(mask.any()):
+            raise ValueError(f"recipe.among: of {pool.wavelet}, rounding decides all that match")
+        return mask
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:

@@ -18,6 +18,7 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.sequential import Cusum
 from tactslip_torch.onset.settings import KEY, AlarmSettings
+from tactslip_torch.recipe import Recipe
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.wavelet import highest_level
 
@@ -109,6 +110,9 @@ HANDS = {
         "causal",
         num_features=40,
     ),
+    "one of 120 features by haar": AnyHand(
+        {("electrode", "fast"): 1}, 2000.0, 100, 50, {"electrode": 11}, "haar", num_features=120
+    ),
     "64 unfiltered": AnyHand(
         {("barometer", "fast"): 64}, 92.0, 41, 20, {"barometer": None}, "sym4", align="trailing"
     ),
@@ -124,7 +128,10 @@ def detector_of(name: str, engine: EngineName = "eager") -> SlipDetector:
     features = pool(channel_filter.valid(samples))
     moments = ClassMoments(len(pool.names))
     moments.update(features.float(), is_slip)
-    selected = rank_features(t_scores(moments), hand.num_features).tolist()
+    scores, allowed = t_scores(moments), Recipe().allowed(pool)
+    if allowed is not None:
+        scores[~allowed] = 0.0
+    selected = rank_features(scores, hand.num_features).tolist()
     scaler = FeatureScaler.fit(features[:, selected])
     machine = fit_machine(TrainingBins(scaler(features[:, selected]), is_slip), 1.0)
     rule = Cusum(0.5, 0.4, 8.0)

@@ -133,7 +133,6 @@ ARROWS: dict[str, tuple[str, ...]] = {
     ),
     "data.formats.mcap_records": ("data.formats.packing",),
     "data.formats.mcap_bag": (
-        "data.formats.definitions",
         "data.formats.header",
         "data.formats.mcap_records",
         "data.formats.messages",

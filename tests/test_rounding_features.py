@@ -1,0 +1,88 @@
+"""Features that rounding decides are found for the wavelets that have them, and never selected."""
+
+import numpy as np
+import pytest
+import torch
+from any_hands import AnyHand
+
+from tactslip_torch.features.extractor import FeatureExtractor
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.rounding import is_rounding
+from tactslip_torch.hand import Channel, HandLayout
+from tactslip_torch.recipe import Recipe
+
+HAND = AnyHand({("PVDF", "fast"): 2, ("SG", "slow"): 1}, 2000.0, 64, 20, {}).layout()
+
+
+def pool_of(wavelet, bin_samples=64, **options):
+    level = options.pop("level", 2)
+    return FeaturePool(HAND, bin_samples=bin_samples, wavelet=wavelet, level=level, **options)
+
+
+@pytest.mark.parametrize("wavelet", ["rbio2.2", "db2", "db3", "sym4", "bior2.2"])
+@pytest.mark.parametrize("bin_samples", [41, 64, 100])
+@pytest.mark.parametrize("spectrum", ["reference", "clean"])
+def test_most_wavelets_have_none(wavelet, bin_samples, spectrum):
+    pool = pool_of(wavelet, bin_samples, spectrum=spectrum)
+    assert not is_rounding(pool).any()
+    assert Recipe().allowed(pool) is None
+
+
+def test_the_papers_pool_has_none():
+    pool = FeaturePool(HandLayout.paper24())
+    assert is_rounding(pool).tolist() == [False] * 2582
+
+
+@pytest.mark.parametrize("bin_samples", [64, 100])
+def test_of_haars_details_the_mean_is_rounding_and_with_it_what_hangs_on_it(bin_samples):
+    """Each detail is a, -a by turns (of its level's length): its mean and third moment are zero."""
+    pool = pool_of("haar", bin_samples)
+    found = {
+        str(name) for name, is_one in zip(pool.names, is_rounding(pool), strict=True) if is_one
+    }
+    for channel in ("PVDF0", "PVDF1"):
+        for detail in ("D1", "D2"):
+            zero = {f"{channel} {detail} time {what}" for what in ("mean", "cv", "skewness")}
+            assert zero <= found
+    assert not {name for name in found if name.startswith("SG")}
+    assert not {name for name in found if name.split()[-1] in ("std", "range", "energy", "entropy")}
+    bins = torch.randn(50, 3, bin_samples, generator=torch.Generator().manual_seed(1)).double()
+    values = pool(bins)
+    by_name = dict(zip(map(str, pool.names), values.T, strict=True))
+    assert by_name["PVDF0 D1 time mean"].abs().max() < 1e-15 * float(bins.abs().max())
+
+
+def test_what_is_not_rounding_is_the_same_in_every_engine():
+    pool = pool_of("haar")
+    firm = (~is_rounding(pool)).nonzero().flatten().tolist()
+    bins = torch.randn(60, 3, 64, generator=torch.Generator().manual_seed(2)).double()
+    reference = pool(bins)[:, firm]
+    found = FeatureExtractor(pool, firm, engine="eager")(bins)
+    error = (found - reference).abs() / reference.std(0).clamp(min=1e-12)
+    is_off = np.asarray(error > 1e-6).mean(0)  # a mode or an entropy may step in some bins
+    assert is_off.max() < 0.1
+    steps = {str(pool.names[firm[i]]).split()[-1] for i in np.flatnonzero(is_off)}
+    assert steps <= {"mode", "entropy"}
+
+
+def test_a_recipe_leaves_them_out():
+    pool = pool_of("haar")
+    mask = Recipe().allowed(pool)
+    assert torch.equal(mask, ~is_rounding(pool))
+    among = Recipe(among={"component": "D1", "descriptor": ["mean", "std"]}).allowed(pool)
+    assert [str(pool.names[i]) for i in among.nonzero().flatten()] == [
+        "PVDF0 D1 time std",
+        "PVDF0 D1 freq mean",
+        "PVDF0 D1 freq std",
+        "PVDF1 D1 time std",
+        "PVDF1 D1 freq mean",
+        "PVDF1 D1 freq std",
+    ]
+    nothing = Recipe(among={"component": "D1", "domain": "time", "descriptor": "mean"})
+    with pytest.raises(ValueError, match="among: of haar, rounding decides all that match"):
+        nothing.allowed(pool)
+
+
+def test_a_hand_without_fast_channels_has_none():
+    hand = HandLayout((Channel("a", "SG", "index", "distal"),))
+    assert is_rounding(FeaturePool(hand, wavelet="haar")).tolist() == [False] * 13
