@@ -156,7 +156,8 @@ def _hear(
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
         stream = StreamingDetector(detector, settings, dtype=samples.dtype)
         view = view_of(config.view, entry["duration_s"])
-        traces = Traces(_drawn(detector.pool.hand), rate, stream.hop_s, view)
+        units = str(detector.info.get("units", "V"))
+        traces = Traces(_drawn(detector.pool.hand), rate, stream.hop_s, view, units)
         tally = Tally(archived.recording.onsets_s if archived else ())
 
         def take(decisions: Decisions) -> None:

@@ -98,7 +98,7 @@ def _draw_films(axes: Axes, heard: Heard, slips: Stretches) -> None:
         axes.plot(seen, [1.0] * len(seen), "v", color=ALARM, transform=above, clip_on=False)
     axes.set_yticks(middles, list(heard.films), fontsize=7)
     axes.set_ylim(middles[-1] - 0.8 * lane_v, 0.8 * lane_v)
-    axes.set_ylabel(f"films, lanes {lane_v:.2g} V apart", fontsize=8)
+    axes.set_ylabel(f"channels, lanes {lane_v:.2g} {heard.units} apart", fontsize=8)
 
 
 def _lane_height(known: Sequence[Array]) -> float:

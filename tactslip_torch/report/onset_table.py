@@ -80,7 +80,8 @@ def onsets_title(entry: Mapping[str, Any], *, of_simulated: bool) -> str:
     kind = "SIMULATED recording" if entry["simulated"] else "Recording"
     parts = [f"{kind} {entry['file']}"]
     parts += [f"material {entry['material']}"] if entry["material"] else []
-    parts += [f"{len(entry['alarms'])} alarms"]
+    count = len(entry["alarms"])
+    parts += [f"{count} alarm{'s' * (count != 1)}"]
     if truth := entry["truth"]:
         found = sum(onset["outcome"] == "found" for onset in truth["onsets"])
         parts += [f"{found} of {len(truth['onsets'])} slips found"]

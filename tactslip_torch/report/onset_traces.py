@@ -32,6 +32,7 @@ class Heard:
         onsets_s: exact onsets, where they are known.
         sliding_s: start and end of each slide.
         is_known: whether the truth is.
+        units: of the samples.
     """
 
     view: tuple[float, float]
@@ -43,6 +44,7 @@ class Heard:
     onsets_s: Sequence[float] = ()
     sliding_s: Stretches = ()
     is_known: bool = False
+    units: str = "V"
 
 
 @dataclass(eq=False)
@@ -54,12 +56,14 @@ class Traces:
         sample_rate_hz: of the samples.
         hop_s: distance of two decisions.
         view: start and end of what is drawn, in seconds.
+        units: of the samples.
     """
 
     films: Mapping[str, int]
     sample_rate_hz: float
     hop_s: float
     view: tuple[float, float]
+    units: str = "V"
     _num_samples: int = field(default=0, init=False)
     _first_s: float | None = field(default=None, init=False)
 
@@ -97,7 +101,7 @@ class Traces:
         decided_s = (self._first_s or 0.0) + number * self.hop_s
         lines = [(decided_s[row], values[row]) for row in range(3)]
         truth = (alarms, onsets_s, sliding_s, is_known)
-        return Heard(self.view, films, lines[0], lines[1], lines[2], *truth)
+        return Heard(self.view, films, lines[0], lines[1], lines[2], *truth, self.units)
 
 
 def view_of(given: Any, duration_s: float) -> tuple[float, float]:
