@@ -172,15 +172,22 @@ def test_a_length_is_held_against_the_message():
         form_of(texts, b"\0\1\0\0" + (10**9).to_bytes(4, "little") + bytes(10**6))
 
 
+def test_what_ros_brings_does_where_the_text_is_not_read():
+    values = noise(6)
+    kind = definition(WRENCH, "ros2idl", "module a { const long x = ((1)); };")
+    found = CdrDecoder(kind, wrench(values, 5)).decode([wrench(values, 5)])
+    np.testing.assert_array_equal(found.values, values[None])
+
+
 @pytest.mark.parametrize(
     ("encoding", "text", "wanted"),
     [
         ("ros2msg", "test_msgs/A next\nfloat64 x", "holds itself"),
         ("ros2msg", "test_msgs/Nowhere next", "no definition of test_msgs/msg/Nowhere"),
-        ("ros2msg", "float64 x y z\n((", "is no ros2msg"),
+        ("ros2msg", "float64 x y z\n((", "of test_msgs/msg/A is no ros2msg"),
         ("ros2msg", "wstring text", "wstring"),
         ("ros2msg", "float64 x\n" * 50_000, "at most"),
-        ("ros2idl", "module { struct", "is no ros2idl"),
+        ("ros2idl", "module a { const long x = ((1)); };", "as ros2msg, and ROS brings none"),
         ("", "", "no definition of test_msgs/msg/A"),
     ],
 )

@@ -1,8 +1,9 @@
 """What the definition of a ROS 2 message says, as fields that ``cdr`` can walk.
 
-Definitions are texts beside the messages (``.msg`` or ``.idl``); where an old bag has none, those
-that ROS brings are taken. ``rosbags`` parses them; the Python code it could make of them is not
-asked for, since a definition comes from a file that anybody may have written.
+Definitions are texts beside the messages; where a bag has none, those that ROS brings are taken.
+``rosbags`` parses them; the Python code it could make of them is not asked for, since a definition
+comes from a file that anybody may have written. For the same reason IDL is not parsed: a short one
+can keep the parser of ``rosbags`` busy for ever.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ ARRAYS = {
     )
 }  # fmt: skip
 """Arrays of ``std_msgs``, ours among them: known without a text, and so without ``rosbags``."""
-MOST_TEXT = 256 * 1024
+MOST_TEXT = 128 * 1024
 """Bytes of a definition; the longest of ROS have some ten thousand."""
 _DTYPES = {
     "bool": "u1", "byte": "u1", "char": "u1", "float32": "f4", "float64": "f8", "int8": "i1",
@@ -37,8 +38,8 @@ def definition(name: str, encoding: str, text: str) -> Group:
 
     Args:
         name: of its type, such as ``std_msgs/msg/Header``.
-        encoding: of the text: ``ros2msg``, ``ros2idl``, or nothing if there is no text.
-        text: what defines it.
+        encoding: of the text; ``ros2msg`` is read.
+        text: what defines it; if it is empty or not read, what ROS brings must do.
 
     Raises:
         ValueError: if it cannot be understood, or ``rosbags`` is needed and absent.
@@ -50,14 +51,14 @@ def definition(name: str, encoding: str, text: str) -> Group:
     if len(text) > MOST_TEXT:
         raise ValueError(f"a definition of {len(text)} characters, at most {MOST_TEXT} are read")
     try:
-        if encoding == "ros2msg":
+        if text and encoding == "ros2msg":
             types = typesys.get_types_from_msg(text, full)
-        elif encoding == "ros2idl":
-            types = typesys.get_types_from_idl(text)
         else:
             types = typesys.get_typestore(typesys.Stores.LATEST).fielddefs
-    except (typesys.TypesysError, RecursionError) as error:
-        raise ValueError(f"a definition of {name} that is no {encoding}: {error}") from None
+    except (typesys.TypesysError, AssertionError, KeyError, ValueError, RecursionError):
+        raise ValueError(f"the definition of {full} is no {encoding}") from None
+    if full not in types:
+        raise ValueError(f"no definition of {full} as ros2msg, and ROS brings none")
     return _group(full, types, {}, 0)
 
 

@@ -139,6 +139,6 @@ class McapBag:
             raise ValueError(f"damaged: a message of channel {channel}, which is not there")
         self._met.add(channel)
         name, encoding, text = self._schemas.get(known.schema, ("", "", b""))
-        schema = text.decode(errors="replace") if encoding in ("ros2msg", "ros2idl") else ""
+        schema = text.decode(errors="replace") if encoding == "ros2msg" else ""
         topic = Topic(known.topic, name, known.encoding, encoding, schema, message)
         self._topics.setdefault(known.topic, topic)
