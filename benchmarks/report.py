@@ -21,6 +21,8 @@ from benchmarks.deployment import report as deployment
 from benchmarks.features import figure as features_figure
 from benchmarks.features import report as features
 from benchmarks.features.guards import measure as guards
+from benchmarks.formats import figure as formats_figure
+from benchmarks.formats import report as formats
 from benchmarks.latency import figure as latency_figure
 from benchmarks.latency import report as latency
 from benchmarks.model import measure as model_measure
@@ -123,6 +125,14 @@ SECTIONS = {
         onset_figure.figure,
         onset.about,
         needs=onset.SECTIONS,
+    ),
+    "formats": Section(
+        "Files",
+        formats.tables,
+        formats.report_text,
+        formats_figure.figure,
+        formats.about,
+        needs=("formats",),
     ),
     "train": Section("Training", None, train.report_text, keys=("experiment", "stages", "wholes")),
     "model": Section(

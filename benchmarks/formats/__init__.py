@@ -1,0 +1,1 @@
+"""What reading and writing a recording costs in every format."""
