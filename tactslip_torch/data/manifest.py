@@ -93,7 +93,7 @@ def read_manifest(path: Path, root: Path) -> Listing:
         if wrong := _misspelt(column):
             problems.append(Problem(place, wrong))
         elif ALIASES.get(column, column) not in (*COLUMNS, *_IGNORED):
-            warnings.append(Problem(place, f"column {column!r} is not read"))
+            warnings.append(Problem(place, f"column {column[:60]!r} is not read"))
     known = {ALIASES.get(column, column) for column in columns}
     if missing := [column for column in ("file", "material") if column not in known]:
         if columns:
@@ -236,7 +236,7 @@ def _misspelt(column: str) -> str | None:
     close = difflib.get_close_matches(column, known, 1, cutoff=0.8)
     if column in (*known, *_IGNORED) or not close:
         return None
-    return f"unknown column {column!r}; did you mean {close[0]!r}?"
+    return f"unknown column {column[:60]!r}; did you mean {close[0]!r}?"
 
 
 def _is_rate(text: str) -> bool:

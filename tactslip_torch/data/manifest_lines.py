@@ -17,6 +17,8 @@ Cell = str | list["Cell"]
 
 MOST_BYTES = 64 * 2**20
 """Of a manifest; a larger file is none."""
+MOST_YAML_BYTES = 4 * 2**20  # which takes a hundred times longer to read
+MOST_DEPTH = 16  # of lists and mappings in YAML; one in another takes a stack, and ever longer
 _SEPARATORS = (",", ";", "\t")
 _YAML = (".yaml", ".yml")
 
@@ -68,8 +70,10 @@ def read_lines(path: Path) -> Lines:
         raise FileNotFoundError(f"no manifest at {path}")
     if path.suffix.lower() not in (".csv", *_YAML):
         raise ValueError(f"{path} must end in .csv, .yaml or .yml to be read as a manifest")
-    if (size := path.stat().st_size) > MOST_BYTES:
-        raise ValueError(f"{path} is no manifest: it has {size} bytes, at most {MOST_BYTES} do")
+    most = MOST_YAML_BYTES if path.suffix.lower() in _YAML else MOST_BYTES
+    if (size := path.stat().st_size) > most:
+        hint = "; write it as .csv" if most < size <= MOST_BYTES else ""
+        raise ValueError(f"{path} is no manifest: it has {size} bytes, at most {most} do{hint}")
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -102,7 +106,7 @@ def _csv_lines(text: str, name: str) -> Lines:
         if not columns:
             columns = [_column(cell) for cell in row]
             twice = {c for c in columns if c and columns.count(c) > 1}
-            problems += [Problem(place, f"column {c!r} is there twice") for c in sorted(twice)]
+            problems += [Problem(place, f"column {c[:60]!r} is there twice") for c in sorted(twice)]
         elif len(row) != len(columns):
             problems.append(
                 Problem(
@@ -120,21 +124,25 @@ def _csv_lines(text: str, name: str) -> Lines:
 def _yaml_lines(text: str, name: str) -> Lines:
     """A list of mappings, alone or under ``recordings``."""
     found = Lines({}, (), ())
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    depth = 0
     try:
-        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        for event in yaml.parse(text, Loader=loader):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if depth > MOST_DEPTH:
+                return found._replace(problems=(Problem(name, "is nested too deeply"),))
             if isinstance(event, yaml.AliasEvent):  # a few stand for more than memory holds
                 what = "aliases, as *name, are not read"
                 return found._replace(
                     problems=(Problem(f"{name}:{event.start_mark.line + 1}", what),)
                 )
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        node = yaml.compose(text, Loader=loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         what = getattr(error, "problem", None) or error
         place = f"{name}:{mark.line + 1}" if mark else name
         return found._replace(problems=(Problem(place, f"cannot be read as YAML: {what}"),))
-    except RecursionError:
-        return found._replace(problems=(Problem(name, "is nested too deeply"),))
     if isinstance(node, yaml.MappingNode) and len(node.value) == 1:
         key, inner = node.value[0]
         node = inner if key.value == "recordings" else node
@@ -155,9 +163,9 @@ def _yaml_lines(text: str, name: str) -> Lines:
             column, cell = _column(str(key.value)), _cell(value)
             columns.setdefault(column, here)
             if column in cells:
-                problems.append(Problem(here, f"{column!r} is there twice"))
+                problems.append(Problem(here, f"{column[:60]!r} is there twice"))
             if cell is None:
-                problems.append(Problem(here, f"{column} must be a value or a list of values"))
+                problems.append(Problem(here, f"{column[:60]} must be a value or a list of values"))
             cells[column] = cell or ""
         lines.append(Line(place, cells))
     return Lines(columns, tuple(lines), tuple(problems))
