@@ -6,13 +6,14 @@ import logging
 import os
 import pickle
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.data import digest
+from tactslip_torch.data import digest, look_memory, survey
 from tactslip_torch.data.datasets import FileRecordings
 from tactslip_torch.data.formats.registry import named_format
 from tactslip_torch.data.labels import LabelRule
@@ -549,12 +550,71 @@ def test_a_file_that_changed_since_is_refused(tables):
         source.load(source.ids[1])
 
 
-def test_many_slow_files_are_looked_at_in_processes(tables, monkeypatch, capfd):
-    from tactslip_torch.data import survey
+# Slow files ----------------------------------------------------------------------------------
 
-    whole = FileRecordings(tables)
+
+@pytest.fixture
+def impatient(tmp_path_factory, monkeypatch):
+    """Every file counts as slow; what they said is kept in a folder of the test's own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
     monkeypatch.setattr(survey, "_PATIENCE_S", 0.0)
-    again = FileRecordings(tables)
-    assert again.ids == whole.ids
-    assert [again.timeline(r) for r in again.ids] == [whole.timeline(r) for r in whole.ids]
+    looked = []
+
+    def counted(path, *rest):
+        looked.append(path.name)
+        return look(path, *rest)
+
+    look = survey.look
+    monkeypatch.setattr(survey, "look", counted)
+    monkeypatch.setattr(survey, "in_processes", lambda function, items, *_: map(function, items))
+    return looked
+
+
+def of_set(source):
+    return [(source.parts(name)[0][1], source.timeline(name)) for name in source.ids]
+
+
+def test_many_slow_files_are_looked_at_in_processes(tables, monkeypatch, tmp_path, capfd):
+    whole = FileRecordings(tables)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(survey, "_PATIENCE_S", 0.0)
+    assert of_set(FileRecordings(tables)) == of_set(whole)
     assert re.search(r"looking at files .* 3/3", capfd.readouterr().err)
+
+
+def test_slow_files_are_looked_at_once_until_they_change(tables, impatient):
+    first = FileRecordings(tables)
+    assert impatient == ["0.csv", "1.csv", "2.csv", "3.csv"]
+    assert of_set(FileRecordings(tables)) == of_set(first)
+    assert len(impatient) == 4
+    FileRecordings(tables, reading={"channels": ["a"]})  # another way to read them
+    assert len(impatient) == 8
+    table(tables / "2.csv", samples(2, 400))
+    changed = FileRecordings(tables)
+    assert impatient[8:] == ["2.csv"]
+    assert changed.timeline(RecordingId("iron", 0)).duration_s == 2.0
+
+
+def test_what_files_of_ours_and_gaps_said_is_kept_to_the_bit(tmp_path, impatient):
+    content, _ = gappy(tmp_path)
+    ours(tmp_path / "a.npz", samples(3), provenance={"simulated": True, "seeds": [1, 2]})
+    ours(tmp_path / "b.npz")
+    manifest(tmp_path, "gaps.csv,wood,0,,,non-slip", "a.npz,wood,1,,,", "b.npz,wood,2,,,")
+    options = {"gaps": "missing", "strict": False}
+    first = FileRecordings(tmp_path, **options)
+    again = FileRecordings(tmp_path, **options)
+    assert len(impatient) == 3
+    assert of_set(again) == of_set(first)
+    assert [str(p) for p in again.problems] == [str(p) for p in first.problems]
+    assert content.shape[1] == 600
+
+
+def test_a_damaged_memory_is_none(tables, impatient):
+    first = FileRecordings(tables)
+    memory = look_memory.memory_of(tables, [stream for stream, _ in first.parts(first.ids[0])])
+    for text in ("", "[1]", '{"0.csv": 5}', '{"0.csv": [[], []]}', "{" * 9, '"a"'):
+        memory.write_text(text)
+        assert of_set(FileRecordings(tables)) == of_set(first)
+    shutil.rmtree(memory.parent)
+    memory.parent.write_text("no folder")
+    assert of_set(FileRecordings(tables)) == of_set(first)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from tactslip_torch.data.agreement import Part, agreed
 from tactslip_torch.data.clock import refuse_gaps
+from tactslip_torch.data.look_memory import keep, memory_of, recall
 from tactslip_torch.data.manifest import Entry
 from tactslip_torch.data.manifest_lines import Problem
 from tactslip_torch.data.sampling import Treatment, missing_of, num_recorded, refuse_ratio
@@ -26,7 +27,7 @@ from tactslip_torch.workers import in_processes
 
 BEFORE_ONSET_S = 1.01
 """What ``labels=whole_slide`` takes as non-slip before an onset."""
-_PATIENCE_S = 2.0
+_PATIENCE_S = 2.0  # what takes longer is done by several processes, and not again
 _ROUNDING = 1e-9
 
 
@@ -115,11 +116,22 @@ def _look_at_all(plan: Plan, entries: Sequence[Entry]) -> Iterable[tuple[Found, 
         except (ValueError, OSError) as error:
             return str(error).replace(f"{plan.root}{os.sep}", "")
 
+    memory = memory_of(plan.root, plan.streams)
+    stated_hz = {entry.file: entry.sample_rate_hz for entry in entries}
+    known = recall(memory, plan.root, stated_hz)
+    unknown = [entry for entry in entries if entry.file not in known]
     started = time.perf_counter()
-    first = [look_at(entry) for entry in entries[:1]]
-    if (time.perf_counter() - started) * len(entries) < _PATIENCE_S:
-        return first + [look_at(entry) for entry in entries[1:]]
-    return first + list(in_processes(look_at, entries[1:], "looking at files", "file"))
+    looked = [look_at(entry) for entry in unknown[:1]]
+    is_slow = (time.perf_counter() - started) * len(unknown) >= _PATIENCE_S
+    if is_slow:
+        looked += in_processes(look_at, unknown[1:], "looking at files", "file")
+    else:
+        looked += map(look_at, unknown[1:])
+    seen = {entry.file: found for entry, found in zip(unknown, looked, strict=True)}
+    if is_slow:
+        whole = {file: found for file, found in seen.items() if not isinstance(found, str)}
+        keep(memory, plan.root, stated_hz, whole)
+    return [(seen | known)[entry.file] for entry in entries]
 
 
 def _timed(plan: Plan, entry: Entry, parts: tuple[Part, ...]) -> tuple[Surveyed, list[str]]:
