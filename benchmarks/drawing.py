@@ -68,7 +68,7 @@ def finish(drawing: Figure, report: Mapping[str, Any], about: str, path: Path) -
 
     Args:
         drawing: with its axes drawn.
-        report: tells whether it was quick.
+        report: tells whether it was quick, and whether bins are simulated.
         about: the title; that bins are simulated is added.
         path: of the PNG.
     """
@@ -77,6 +77,7 @@ def finish(drawing: Figure, report: Mapping[str, Any], about: str, path: Path) -
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
     quick = "; QUICK, means nothing" if report["quick"] else ""
-    drawing.suptitle(f"{about}, simulated bins{quick}", fontsize=11)
+    simulated = ", simulated bins" if report.get("simulated", True) else ""
+    drawing.suptitle(f"{about}{simulated}{quick}", fontsize=11)
     with whole_file(path) as temporary:
         drawing.savefig(temporary, dpi=160, format="png", facecolor="white")

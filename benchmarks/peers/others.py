@@ -45,20 +45,21 @@ def tsfel_features(sample_rate_hz: float = 2000.0) -> Callable[[Array], Array]:
     return features
 
 
-def mini_rocket(windows: Array, threads: int, num_kernels: int = 10_000) -> Any:
+def mini_rocket(windows: Array, threads: int, num_kernels: int = 10_000, seed: int = 0) -> Any:
     """MiniRocket's transform, fitted and compiled.
 
     Args:
         windows: ``[N, C, n]``; it takes quantiles of their convolutions.
         threads: of its transform.
         num_kernels: about as many features.
+        seed: of the kernels' biases.
     """
     with quiet():
         import numba
 
         numba.config.THREADING_LAYER = "workqueue"  # that by OpenMP sets the threads of torch too
         transform = import_module(_MINI_ROCKET).MiniRocket(
-            n_kernels=num_kernels, n_jobs=threads, random_state=0
+            n_kernels=num_kernels, n_jobs=threads, random_state=seed
         )
         transform.fit(windows.astype(np.float32))
         transform.transform(windows[:2].astype(np.float32))

@@ -1,0 +1,1 @@
+"""The benchmark on real recordings: ours and rivals, each object left out in turn."""
