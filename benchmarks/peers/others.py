@@ -52,7 +52,7 @@ def mini_rocket(windows: Array, threads: int, num_kernels: int = 10_000, seed: i
         windows: ``[N, C, n]``; it takes quantiles of their convolutions.
         threads: of its transform.
         num_kernels: about as many features.
-        seed: of the kernels' biases.
+        seed: of what it draws: channels of a kernel, and windows for the quantiles.
     """
     with quiet():
         import numba
