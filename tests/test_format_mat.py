@@ -293,6 +293,16 @@ def test_what_claims_more_than_there_is_is_refused(tmp_path, one):
     assert "is damaged" in refused(mat, made_5(tmp_path / "a.mat", one))
 
 
+def test_characters_of_version_73_in_a_chunk_of_no_bytes_are_refused(tmp_path):
+    """HDF5 2.0 looks for its check sum before it and ends the process."""
+    path = made_73(tmp_path / "a.mat", volts=np.zeros((60, 3)))
+    with h5py.File(path, "a") as file:
+        labels = file.create_dataset("labels", (1, 3), "u2", chunks=(1, 3), fletcher32=True)
+        labels.attrs["MATLAB_class"] = np.bytes_("char")
+        labels.id.write_direct_chunk((0, 0), b"1234")
+    assert "is damaged" in refused(mat, path)
+
+
 def test_damaged_files_are_read_or_refused_in_one_line(tmp_path):
     mat.save(tmp_path / "ours.mat", recording(), hand_of("ab"), KEY)
     content = {
@@ -304,6 +314,8 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path):
         theirs = BytesIO()
         scipy.io.savemat(theirs, content, do_compression=is_compressed)
         contents.append(theirs.getvalue())
+    later = made_73(tmp_path / "later.mat", volts=numbers("f8", (50, 3)), labels=["a", "b", "c"])
+    contents.append(later.read_bytes())
     ends = survived(mat, tmp_path / "damaged.mat", contents, NUM_DAMAGED)
     assert ends.total() == 3 * NUM_DAMAGED
     assert min(ends["read"], ends["refused"]) > NUM_DAMAGED // 4  # neither all nor nothing

@@ -44,6 +44,7 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
     axes.set_yticks(range(len(rows)), [f".{row['ending']}" for row in rows], fontsize=9)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xscale("log")
+    axes.set_xlim(left=0.3)
     limit_line(axes, 1e3 * MOST_S, "npz, h5, mcap: 100 ms", 0.97)
     plain_decades(axes.xaxis)
     axes.grid(axis="x", color=LIGHT)

@@ -192,7 +192,9 @@ def words_said(thing: Any, name: str) -> tuple[str, ...]:
 
 
 def words_in(dataset: Any) -> tuple[str, ...]:
-    """The words of a dataset, none if it holds none."""
+    """The words of a dataset, none if it holds none or holds them in chunks."""
+    if dataset.chunks is not None:  # nobody's few words are, and nothing looks through them
+        return ()
     return _words(dataset, dataset.file.filename, lambda: dataset[()])
 
 

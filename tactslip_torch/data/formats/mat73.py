@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactslip_torch.data.formats.hdf5_tree import (
     DatasetArray,
@@ -82,7 +83,7 @@ def _rows(thing: Any) -> tuple[str, ...]:
     """The rows of a character array, without the blanks that fill them up."""
     if thing.ndim != 2 or thing.dtype != np.uint16 or not 0 < thing.size <= _MOST_CHARACTERS:
         return ()
-    rows = np.ascontiguousarray(thing[()].T).astype("<u2")
+    rows = np.ascontiguousarray(_all_of(thing).T).astype("<u2")
     return tuple(row.tobytes().decode("utf-16-le", "replace").rstrip(" \0") for row in rows)
 
 
@@ -92,7 +93,7 @@ def _cell_words(file: Any, thing: Any, h5py: Any) -> tuple[str, ...] | None:
     if h5py.check_ref_dtype(thing.dtype) is not h5py.Reference or not is_short:
         return None
     words: list[str] = []
-    for reference in thing[()].reshape(-1):
+    for reference in _all_of(thing).reshape(-1):
         cell = file[reference]
         if not isinstance(cell, h5py.Dataset) or why_elsewhere(cell, h5py) is not None:
             return None
@@ -100,3 +101,8 @@ def _cell_words(file: Any, thing: Any, h5py: Any) -> tuple[str, ...] | None:
             return None
         words += ("",) if "MATLAB_empty" in cell.attrs else _rows(cell)[:1]
     return tuple(words)
+
+
+def _all_of(thing: Any) -> NDArray[Any]:
+    """Everything in a dataset of two dimensions, looked at before HDF5 reads it."""
+    return DatasetArray(thing.name, "", thing).read(0, 0, len(thing))

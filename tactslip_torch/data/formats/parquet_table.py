@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from bisect import bisect_right
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +55,8 @@ class Table:
             for name, value in (facts.metadata or {}).items()
         }
         rows = [facts.row_group(group).num_rows for group in range(facts.num_row_groups)]
-        self.ends = np.cumsum(rows, dtype=np.int64)
-        self.num_rows = int(self.ends[-1]) if rows else 0
+        self.ends = list(accumulate(rows))
+        self.num_rows = self.ends[-1] if rows else 0
         claimed = self.num_rows * len(self.names) * 8
         why = why_not_plausible(claimed, Path(path).stat().st_size)
         if why is None and max(rows, default=0) * len(self.names) * 8 > MOST_GROUP_BYTES:
@@ -103,12 +105,11 @@ class Column:
         """
         if stop <= first:
             return np.empty(0, self.dtype)
-        first_group, last_group = np.searchsorted(self.table.ends, [first, stop - 1], "right")
-        parts = []
-        for group in range(int(first_group), int(last_group) + 1):
-            start = int(self.table.ends[group - 1]) if group else 0
+        ends, parts = self.table.ends, []
+        for group in range(bisect_right(ends, first), bisect_right(ends, stop - 1) + 1):
+            start = ends[group - 1] if group else 0
             parts.append(self._values(group)[max(first - start, 0) : stop - start])
-        return np.concatenate(parts)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _values(self, group: int) -> NDArray[Any]:
         if group != self._group:
