@@ -1,12 +1,17 @@
 """No file makes reading crash, run code, take memory or say more than a line, whatever is in it."""
 
 import itertools
+import json
 import os
+import pickle
 import shutil
 
+import fuzzing
 import pytest
+from fuzz_harm import Runs
+from fuzz_manifests import MANIFEST_TRAPS
 from fuzz_seeds import write_seeds
-from fuzz_traps import MANIFEST_TRAPS, TRAPS
+from fuzz_traps import TRAPS
 from fuzzing import (
     Prober,
     assert_read_or_refused,
@@ -53,7 +58,7 @@ def place(tmp_path_factory):
 
 @pytest.mark.parametrize("name", FORMATS)
 @given(data=st.data())
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damaged_files(name, data, prober, seeds, place):
     seed = data.draw(st.sampled_from(seeds[name]))
     others = [part for path in seeds[name] for part in content_of(path).values()]
@@ -166,7 +171,7 @@ def test_whole_manifests_are_read(name, prober, tmp_path):
 
 @pytest.mark.parametrize("name", MANIFESTS)
 @given(data=st.data())
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damaged_manifests(name, data, prober, place):
     whole = MANIFESTS[name].encode()
     content = data.draw(damage(whole, [other.encode() for other in MANIFESTS.values()]))
@@ -188,3 +193,20 @@ def test_manifest_traps(trap, prober, tmp_path):
 
 def test_nothing_was_said_beside_the_line(prober):
     assert prober.said() == ""
+
+
+def test_the_canary_sings(tmp_path):
+    """The code in the traps would be seen if it ran."""
+    pickle.loads(pickle.dumps(Runs(tmp_path / "canary")))
+    assert (tmp_path / "canary").exists()
+
+
+def test_files_are_counted_once(monkeypatch):
+    monkeypatch.setattr(fuzzing, "_tried", {})
+    for content in (b"a", b"b", b"a"):
+        count("npz", {".": content})
+    count("text", {".": b"a"})
+    assert fuzzing.summary() == "fuzzed files: 3 (npz 2, text 1)"
+    fuzzing.hear(json.loads(json.dumps(fuzzing.told())))
+    fuzzing.hear({"mat": [5]})
+    assert fuzzing.summary() == "fuzzed files: 4 (mat 1, npz 2, text 1)"
