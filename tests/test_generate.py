@@ -258,7 +258,7 @@ def test_a_file_that_is_not_ours_is_never_replaced(tmp_path, content):
         (["figure=true", "cycle=3"], r"cycle must lie in 0\.\.2 to be drawn, got 3"),
         (["figure=true", "stroke=0"], "stroke counts from 1, got 0"),
         (["~features.frames.PVDF"], "features.frames has no frame for PVDF channels"),
-        (["features.frames.SG=50"], "window_length must be odd"),
+        (["features.frames.SG=50"], "frames.SG must be an odd number"),
         (["features.align=late"], "align must be one of"),
     ],
 )
