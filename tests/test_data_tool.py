@@ -142,8 +142,8 @@ def test_summary_tells_and_draws_what_there_is(root, tmp_path, capsys):
     ]
     out = capsys.readouterr().out
     rows = [line.split() for line in out.splitlines()]
-    assert ["wood", "paper", "2", "3.00", "3.00", "6.0", "2", "1.5", "0.2"] in rows
-    assert ["iron", "paper", "2", "3.00", "3.00", "6.0", "0", "3.0", "3.0"] in rows
+    assert ["wood", "2", "3.00", "3.00", "6.0", "2", "1.5", "0.2"] in rows
+    assert ["iron", "2", "3.00", "3.00", "6.0", "0", "3.0", "3.0"] in rows
     whole = torch.cat(
         [samples(), samples(1, dtype=torch.float32).double(), samples(2), samples(3)], 1
     )
@@ -204,6 +204,10 @@ def test_tables_say_what_is_simulated_and_what_is_not_known():
     trials = [Trial("wood", "paper", 3.0, 1.0, 0.5, 1)]
     assert trials_table(trials, simulated=True).startswith("SIMULATED")
     assert len(trials_table(trials, simulated=False).splitlines()) == 2  # no sum of one row
+    both = trials_table([*trials, Trial("wood", "taps", 4.0, 0.0, 0.0, 0)], simulated=False)
+    rows = [line.split() for line in both.splitlines()]
+    assert ["wood", "2", "3.00", "4.00", "7.0", "1", "1.0", "0.5"] in rows
+    assert ["taps", "1", "4.00", "4.00", "4.0", "0", "0.0", "0.0"] in rows
     unknown = ranges_table(HAND.to_rows(), np.full((3, 2), np.nan), "counts")
     assert unknown.splitlines()[0].split()[-2:] == ["greatest,", "counts"]
     assert unknown.splitlines()[1].split() == ["SG", "1", "nan", "nan"]

@@ -120,13 +120,16 @@ def _look_at_all(plan: Plan, entries: Sequence[Entry]) -> Iterable[tuple[Found, 
     stated_hz = {entry.file: entry.sample_rate_hz for entry in entries}
     known = recall(memory, plan.root, stated_hz)
     unknown = [entry for entry in entries if entry.file not in known]
-    started = time.perf_counter()
-    looked = [look_at(entry) for entry in unknown[:1]]
-    is_slow = (time.perf_counter() - started) * len(unknown) >= _PATIENCE_S
+    looked, seconds = [], 0.0
+    for entry in unknown[:2]:  # the first waits for libraries that are not yet loaded
+        started = time.perf_counter()
+        looked.append(look_at(entry))
+        seconds = time.perf_counter() - started
+    is_slow = seconds * len(unknown) >= _PATIENCE_S
     if is_slow:
-        looked += in_processes(look_at, unknown[1:], "looking at files", "file")
+        looked += in_processes(look_at, unknown[2:], "looking at files", "file")
     else:
-        looked += map(look_at, unknown[1:])
+        looked += map(look_at, unknown[2:])
     seen = {entry.file: found for entry, found in zip(unknown, looked, strict=True)}
     if is_slow:
         whole = {file: found for file, found in seen.items() if not isinstance(found, str)}

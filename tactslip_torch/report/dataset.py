@@ -71,17 +71,27 @@ class Example:
 
 
 def trials_table(trials: Sequence[Trial], *, simulated: bool) -> str:
-    """How many recordings of each material and scene there are, how long, and what is told."""
-    groups: dict[tuple[str, str], list[Trial]] = {}
-    for trial in trials:
-        groups.setdefault((trial.material, trial.scene), []).append(trial)
-    rows = [[material, scene, *_cells(own)] for (material, scene), own in groups.items()]
-    if len(groups) > 1:
-        rows.append(["all", "", *_cells(trials)])
-    header = ["material", "scene", "recordings", "shortest s", "longest s", "seconds"]
-    header += ["onsets", "slip s", "non-slip s"]
-    table = aligned(header, rows, num_left=2)
-    return "\n".join([*([SIMULATED_LINE] if simulated else []), table])
+    """How many recordings of each material there are, how long, and what is told of them.
+
+    Of several scenes the same follows for each scene.
+    """
+    tables = [_grouped("material", trials, [trial.material for trial in trials])]
+    scenes = [trial.scene for trial in trials]
+    if len(set(scenes)) > 1:
+        tables.append(_grouped("scene", trials, scenes))
+    return "\n".join([*([SIMULATED_LINE] if simulated else []), "\n\n".join(tables)])
+
+
+def _grouped(what: str, trials: Sequence[Trial], groups: Sequence[str]) -> str:
+    """A row a group, in the order in which they come, and of several one of all."""
+    rows = []
+    for name in dict.fromkeys(groups):
+        own = [trial for trial, group in zip(trials, groups, strict=True) if group == name]
+        rows.append([name, *_cells(own)])
+    if len(rows) > 1:
+        rows.append(["all", *_cells(trials)])
+    header = [what, "recordings", "shortest s", "longest s", "seconds"]
+    return aligned([*header, "onsets", "slip s", "non-slip s"], rows)
 
 
 def _cells(own: Sequence[Trial]) -> list[str]:
@@ -204,7 +214,7 @@ def _draw_traces(axes: Axes, example: Example) -> None:
         drawn = np.clip(0.8 * (values - (low + high) / 2) / height, -1.2, 1.2)
         axes.plot(places / example.sample_rate_hz, drawn - lane, color=_INK, linewidth=0.45)
     labels = [
-        f"{example.names[i]}  {height:.2g} {example.units}"
+        f"{example.names[i]}  {height:.3g} {example.units}"
         for i, height in zip(chosen, heights, strict=True)
     ]
     axes.set_yticks(-np.arange(len(chosen)), labels, fontsize=_SMALL)
