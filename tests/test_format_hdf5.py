@@ -50,6 +50,20 @@ def test_thousands_of_channels_and_a_long_header_fit(tmp_path):
     assert_comes_back(hdf5, tmp_path / "a.h5", recording(5000, 3), hand_of(names), KEY)
 
 
+def test_no_more_chunks_are_touched_than_asked_for(tmp_path):
+    path = tmp_path / "a.h5"
+    hdf5.save(path, recording(24, 100_000), hand_of(f"c{i}" for i in range(24)), KEY)
+    content = bytearray(path.read_bytes())
+    with h5py.File(path) as file:
+        content[file["samples"].id.get_chunk_info_by_coord((0, 0)).byte_offset] ^= 1
+    path.write_bytes(content)
+    with hdf5.open(path) as opened:  # of the first chunk, which is damaged, nothing is seen
+        wanted = recording(24, 100_000).samples[:, 60_000:60_200]
+        assert torch.equal(opened.samples.read(60_000, 60_200), wanted)
+        with pytest.raises(ValueError, match="is damaged"):
+            opened.samples.read(0, 200)
+
+
 def test_equal_recordings_are_equal_bytes(tmp_path, monkeypatch):
     assert_equal_bytes(hdf5, tmp_path, "h5", monkeypatch)
 

@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet as pq
 
 from tactslip_torch.data.formats import parquet
+from tactslip_torch.data.formats.parquet_table import Table
 from tactslip_torch.data.formats.reading import Reading
 
 NUM_DAMAGED = 400
@@ -106,6 +107,22 @@ def test_any_stretch_of_any_groups_is_the_columns(
     assert (names, times, rate) == (("left", "right"), None, None)
     with parquet.open(path) as opened:
         assert torch.equal(opened.samples.read(*stretch), samples[:, slice(*stretch)])
+
+
+def test_no_more_groups_are_read_than_asked_for(tmp_path, monkeypatch):
+    path = made(tmp_path / "a.parquet", 10, x=np.arange(100.0), y=np.arange(100.0))
+    asked = []
+    values = Table.values
+
+    def counted(table, group, name):
+        asked.append((group, name))
+        return values(table, group, name)
+
+    monkeypatch.setattr(Table, "values", counted)
+    with parquet.open(path) as opened:
+        for first in (31, 35, 39):
+            assert opened.samples.read(first, first + 2)[0].tolist() == [first, first + 1]
+    assert asked == [(3, "x"), (3, "y"), (4, "x"), (4, "y")]
 
 
 def test_times_are_found_by_name_or_by_being_stamps(tmp_path):
