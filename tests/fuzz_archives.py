@@ -64,6 +64,9 @@ def saved(array: np.ndarray) -> bytes:
     return held.getvalue()
 
 
+BOMB = 3 * GIBI // 8  # so that a process allowed half a GiB would read it all
+
+
 NPZ: dict[str, Trap] = {
     "sparse.npy": lambda path, canary: sparse(path),
     "sparse_claims.npy": lambda path, canary: sparse(path, claims(f"({2**40}, 24)")),
@@ -97,20 +100,20 @@ NPZ: dict[str, Trap] = {
     ),
     "our_bomb.npz": lambda path, canary: bomb(
         path,
-        claims(f"(8, {GIBI // 64})"),
-        GIBI,
+        claims(f"(8, {BOMB // 64})"),
+        BOMB,
         "samples.npy",
         {"format.npy": saved(np.array(FORM)), "key.npy": saved(np.array("{}"))},
     ),
     "key_bomb.npz": lambda path, canary: bomb(
         path,
-        claims("()", f"'<U{GIBI // 4}'"),
-        GIBI,
+        claims("()", f"'<U{BOMB // 4}'"),
+        BOMB,
         "key.npy",
         {"format.npy": saved(np.array(FORM)), "samples.npy": saved(np.zeros((2, 9)))},
     ),
     "format_bomb.npz": lambda path, canary: bomb(
-        path, claims("()", f"'<U{GIBI // 4}'"), GIBI, "format.npy", {}
+        path, claims("()", f"'<U{BOMB // 4}'"), BOMB, "format.npy", {}
     ),
     "other_packing.npz": lambda path, canary: zipped(
         path, {"samples.npy": saved(np.zeros((2, 9)))}, zipfile.ZIP_LZMA

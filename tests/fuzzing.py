@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 WORKER = Path(__file__).with_name("fuzz_worker.py")
 MOST_BYTES = 512 * 2**20
 """Of address space beyond what the libraries themselves take."""
+MOST_TAKEN = 200 * 2**20
+"""Of memory really touched; less, so that what fails for want of the other is not all there is."""
 PATIENCE_S = 120  # a file that takes longer hangs
 LONGEST = 1000  # characters of a line for people, beside the path
 _tried: dict[str, set[int]] = {}
@@ -51,7 +53,7 @@ class Prober:
     """A process that reads files; if one ends it, another takes its place."""
 
     def __init__(self, folder: Path, seeds: list[tuple[str, Path]]) -> None:
-        self.folder, self.seeds, self.process = folder, seeds, None
+        self.seeds, self.process, self.before = seeds, None, 0
         self.errors = (folder / "stderr").open("w+b")
 
     def start(self) -> None:
@@ -68,14 +70,17 @@ class Prober:
         for form, path in self.seeds:
             for what, (kind, said) in self.ask(form, path).items():
                 assert kind == "read" or what != "open", said
-        self._send({"allow": MOST_BYTES})
+        self.before = self._send({"allow": MOST_BYTES})["peak"]
 
     def ask(self, form: str, path: Path) -> dict[str, tuple[str, str]]:
         """What came of a file, by what was tried."""
         if self.process is None:
             self.start()
         answer = self._send({"format": form, "path": str(path)})
-        answer.pop("peak")
+        taken = answer.pop("peak") - self.before
+        if self.before and taken > MOST_TAKEN:
+            self.end()
+            raise AssertionError(f"{path} took {taken >> 20} MiB")
         return {what: (kind, said) for what, (kind, said) in answer.items()}
 
     def said(self) -> str:
@@ -86,9 +91,14 @@ class Prober:
     def stop(self) -> None:
         self.errors.close()
         if self.process is not None:
-            self.process.stdin.close()
-            self.process.stdout.close()
-            self.process.wait()
+            self.end()
+
+    def end(self) -> None:
+        """The next file gets another process."""
+        self.process.stdin.close()
+        self.process.stdout.close()
+        self.process.wait()
+        self.process, self.before = None, 0
 
     def _send(self, request: dict[str, object]) -> dict[str, object]:
         process = self.process
@@ -98,8 +108,8 @@ class Prober:
             process.kill()
         line = process.stdout.readline()
         if not line:
-            self.process = None
-            raise AssertionError(f"{request} ended the process with {process.wait()}")
+            self.end()
+            raise AssertionError(f"{request} ended the process with {process.returncode}")
         return json.loads(line)
 
 
