@@ -95,7 +95,8 @@ def _of_columns(
 ) -> Opened:
     """Columns that stand alone; by number they are counted as the file has them."""
     counted = contents.columns or [array.name for array in several if _is_column(array)]
-    time = counted[how.time] if isinstance(how.time, int) and how.time < len(counted) else None
+    is_there = isinstance(how.time, int) and 0 <= how.time < len(counted)
+    time = counted[how.time] if isinstance(how.time, int) and is_there else None
     if how.channels is None:
         chosen = [column for column in columns if column.name != time]
     else:
