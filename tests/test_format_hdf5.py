@@ -1,4 +1,4 @@
-"""Recordings as HDF5: ours to the bit, the datasets people have, and nothing that is a trap."""
+"""Recordings as HDF5: ours to the bit, the datasets people have in slices."""
 
 import h5py
 import numpy as np
@@ -20,7 +20,6 @@ from hypothesis import given, settings
 
 from tactslip_torch.data.formats import hdf5
 from tactslip_torch.data.formats.reading import Reading
-
 
 # Ours ----------------------------------------------------------------------------------------
 

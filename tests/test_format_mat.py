@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 from tactslip_torch.data.formats import mat
 from tactslip_torch.data.formats.reading import Reading
 
-
 # Ours ----------------------------------------------------------------------------------------
 
 
