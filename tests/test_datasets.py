@@ -164,6 +164,9 @@ def test_rows_of_channels_find_their_columns_by_name_or_by_place(tables):
     assert torch.equal(placed.load(placed.ids[0]).samples, samples(0))
     with pytest.raises(ValueError, match=r"has the channels a, b, c, not the 2 of data\.channels"):
         FileRecordings(tables, channels=ROWS[:2])
+    half = [rows[0], ROWS[1], ROWS[2]]  # as many, but who knows which is which
+    with pytest.raises(ValueError, match=r"has no channel PVDF1, PVDF2 of .*; it has a, b, c"):
+        FileRecordings(tables, channels=half)
 
 
 def test_samples_outside_the_windows_are_not_read(tables):

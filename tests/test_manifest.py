@@ -361,7 +361,8 @@ def test_what_leaves_the_recording_is_named_and_what_is_off_by_a_sample_is_cut()
 
 
 def test_a_truth_can_be_told_by_a_clock_that_is_a_little_fast():
-    truth = Truth((2.0,), (2.2,), (20.0,), ((2.0, 6.0),), ((7.0, 8.0),), ((0.0, 1.0),), ((9.0, 9.5),))
+    stretches = ((2.0, 6.0),), ((7.0, 8.0),), ((0.0, 1.0),), ((9.0, 9.5),)
+    truth = Truth((2.0,), (2.2,), (20.0,), *stretches)
     assert scaled(truth, 1.0) == truth
     assert scaled(truth, 0.5) == Truth(
         (1.0,), (1.1,), (20.0,), ((1.0, 3.0),), ((3.5, 4.0),), ((0.0, 0.5),), ((4.5, 4.75),)

@@ -139,8 +139,8 @@ def look(path: Path, stream: Stream, stated_hz: float | None = None) -> Found:
 def hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
     """The channels of a stream, and in which row of a file each of them is.
 
-    Rows that a person gave are found by the names the file has, if it has all of them, and else
-    stand in the order of the file.
+    Rows that a person gave are found by the names the file has and, if it has none of them, stand
+    in the order of the file.
 
     Raises:
         ValueError: if channels are given and the file has others, or names are none or twice.
@@ -148,12 +148,17 @@ def hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
     own = list(found.names or ())
     if stream.channels is not None:
         wanted = stream.channels
-        if own and set(wanted.names) <= set(own):
+        lacking = [name for name in wanted.names if name not in own]
+        if not lacking:
             return wanted, [own.index(name) for name in wanted.names]
-        if found.hand is not None or len(wanted) != found.num_channels:
-            names = _some(own) if own else f"{found.num_channels} without names"
+        if 0 < len(lacking) < len(wanted):
             raise ValueError(
-                f"has the channels {names}, not the {len(wanted)} of data.channels, "
+                f"has no channel {_some(lacking)} of data.channels; it has {_some(own)}"
+            )
+        if found.hand is not None or len(wanted) != found.num_channels:
+            has = _some(own) if own else f"{found.num_channels} without names"
+            raise ValueError(
+                f"has the channels {has}, not the {len(wanted)} of data.channels, "
                 f"{_some(wanted.names)}"
             )
         return wanted, list(range(len(wanted)))
