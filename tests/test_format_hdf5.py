@@ -1,4 +1,4 @@
-"""Recordings as HDF5: ours to the bit, the datasets people have in slices."""
+"""Recordings as HDF5: ours to the bit, the datasets people have, by slices."""
 
 import h5py
 import numpy as np
