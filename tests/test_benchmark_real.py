@@ -287,6 +287,12 @@ def test_limits_say_by_how_much(kept: Path, tmp_path: Path) -> None:
     assert made["limits"][0]["measured"] == "94.88 %, +2.88 points"
     assert made["limits"][1]["measured"] == "94.88 %, -0.12 points"
     assert "3 of 5 limits are met" in page(made, tmp_path / "f.png", tmp_path / "p.md")
+    gap = {"value": 0.01, "low": -0.01, "high": 0.03, "share": 0.9}
+    gaps = {"sure": gap | {"low": 0.001}, "unsure": gap}
+    made["sections"]["differences"] = {
+        n: {"balanced_accuracy": g, "auc": g} for n, g in gaps.items()
+    }
+    assert "nothing is settled, beside:** unsure." in page(made, tmp_path / "f.png", tmp_path / "p")
     figure(made, tmp_path / "f.png")
     assert (tmp_path / "f.png").stat().st_size > 30_000
 

@@ -149,8 +149,22 @@ def _bootstrap(report: Report) -> str:
         f"Recordings are drawn anew within slip and within stable touch, "
         f"{report['settings']['draws']:,} times with a fixed seed, the same for both methods; "
         f"brackets hold {100 * COVERAGE:g} % of the differences. Scores are held, so this says "
-        "nothing of other training recordings or other objects."
+        f"nothing of other training recordings or other objects. {_open(report)}"
     )
+
+
+def _open(report: Report) -> str:
+    """Which differences in balanced accuracy the draws leave open."""
+    gaps = report["sections"]["differences"]
+    unsure = [
+        name
+        for name, found in gaps.items()
+        if found["balanced_accuracy"]["low"] <= 0 <= found["balanced_accuracy"]["high"]
+    ]
+    if not unsure:
+        return "No interval of balanced accuracy holds 0."
+    named = "; ".join(unsure)
+    return f"**The interval of balanced accuracy holds 0, so nothing is settled, beside:** {named}."
 
 
 def _times(report: Report) -> str:
@@ -171,5 +185,6 @@ def _before(report: Report) -> str:
         "folds unless a row says otherwise; prototypes of ours and settings of rivals. The best "
         f"of {len(rows)} of ours ({best['what']}) reached {100 * best['balanced_accuracy']:.2f} % "
         f"balanced accuracy and {100 * best['auc']:.2f} % AUC. It is no result: to take it would "
-        "be to choose by the objects that were left out."
+        "be to choose by the objects that were left out. MiniRocket draws windows by their place, "
+        "so the order of recordings, which differs here, is another draw as a seed is."
     )
