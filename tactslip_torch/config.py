@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -49,18 +50,26 @@ def unknown_choice(arguments: Sequence[str]) -> str | None:
         >>> unknown_choice(["split=seen7"])
         'unknown split seen7; known: confound, leave_one_material_out, random_bins, seen6, unseen4'
     """
+    folders = [conf_dir(), *_further_folders(arguments)]
     for argument in arguments:
         key, found, value = argument.lstrip("+").partition("=")
-        group = conf_dir() / key
-        if argument.startswith("-") or not found or not key or not group.is_dir():
+        groups = [folder / key for folder in folders]
+        if argument.startswith("-") or not found or not key or not groups[0].is_dir():
             continue
-        known = sorted(path.stem for path in group.glob("*.yaml"))
+        known = sorted(path.stem for group in groups for path in group.glob("*.yaml"))
         for name in value.split(","):
             if name and name not in known:
                 return f"unknown {key} {name}; known: {', '.join(known)}"
         if key == "exp" and not argument.startswith("+"):
             return f"write +exp={value}: experiments are added to the configuration"
     return None
+
+
+def _further_folders(arguments: Sequence[str]) -> list[Path]:
+    """Folders of configuration of the user's own, ``--config-dir``."""
+    given = [value for name, value in pairwise(arguments) if name in ("--config-dir", "-cd")]
+    given += [a.partition("=")[2] for a in arguments if a.startswith("--config-dir=")]
+    return [Path(value) for value in given]
 
 
 def folder_problem(arguments: Sequence[str]) -> str | None:

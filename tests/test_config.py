@@ -50,12 +50,13 @@ def test_no_conf_is_an_error_that_says_where(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["+exp=nope"], "unknown exp nope; known: confound, leave_one_material_out, onset, quick"),
+        (["+exp=nope"], "unknown exp nope; known: biotacsp_dos, confound, leave_one_mat"),
         (["seed=3", "split=seen7"], "unknown split seen7; known: confound, leave_one_material_out"),
         (["labels=whole"], "unknown labels whole; known: half_second, whole_slide"),
-        (["data=real"], "unknown data real; known: simulated"),
+        (["data=real"], "unknown data real; known: authors_raw, biotacsp_dos, files, named, simulated"),
         (["-m", "split=seen6,seen7"], "unknown split seen7"),
         (["exp=unseen4"], "write +exp=unseen4"),
+        (["data=mine", "--config-dir", "nowhere"], "unknown data mine; known: authors_raw"),
     ],
 )
 def test_a_choice_that_does_not_exist_is_one_line(arguments, message):
@@ -76,10 +77,16 @@ def test_a_choice_that_does_not_exist_is_one_line(arguments, message):
         ["--cfg", "job", "--help"],
         ["model=out/a=b.pt"],
         ["--config-dir=nowhere"],
+        ["data=mine", "--config-dir", "{folder}"],
+        ["--config-dir={folder}", "data=mine,files"],
+        ["-cd", "{folder}", "+own=thing"],
     ],
 )
-def test_choices_that_exist_pass(arguments):
-    assert unknown_choice(arguments) is None
+def test_choices_that_exist_pass(arguments, tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "mine.yaml").touch()
+    given = [argument.format(folder=tmp_path) for argument in arguments]
+    assert unknown_choice(given) is None
 
 
 def test_every_option_there_is_passes():

@@ -252,7 +252,7 @@ def test_a_file_that_is_not_ours_is_never_replaced(tmp_path, content):
             ["scene=paper", "scene.name=a/b", "materials=[M1]"],
             "cannot name a file; give the scene",
         ),
-        (["format=csv"], "format must be one of npz, got 'csv'"),
+        (["format=xls"], "format must be one of npz, text, "),
         (["num_workers=-1"], "num_workers must be null or a number of processes, got -1"),
         (["num_workers=many"], "num_workers must be null or a number of processes, got 'many'"),
         (["figure=true", "cycle=3"], r"cycle must lie in 0\.\.2 to be drawn, got 3"),

@@ -76,7 +76,7 @@ def file_facts(path: Path, archived: Archived | None) -> dict[str, Any]:
 
 def has_truth(recording: Recording) -> bool:
     """Whether it says where slip is and where not; one that nobody annotated does not."""
-    is_told = recording.onsets_s or recording.non_slip_s
+    is_told = recording.onsets_s or recording.non_slip_s or recording.slip_s
     return bool(is_told or recording.provenance.get("simulated"))
 
 
@@ -197,6 +197,7 @@ def manifest_line(file: str, recording: RecordingId, content: Recording) -> dict
         "annotated_onsets_s": json.dumps(content.annotated_onsets_s),
         "sliding_s": json.dumps(content.sliding_s),
         "non_slip_s": json.dumps(content.non_slip_s),
+        "slip_s": json.dumps(content.slip_s),
         "speeds_mm_s": json.dumps(content.speeds_mm_s),
         "sample_rate_hz": content.sample_rate_hz,
         "simulated": str(bool(origin.get("simulated"))).lower(),
