@@ -53,7 +53,7 @@ def test_no_conf_is_an_error_that_says_where(monkeypatch, tmp_path):
         (["+exp=nope"], "unknown exp nope; known: biotacsp_dos, confound, leave_one_mat"),
         (["seed=3", "split=seen7"], "unknown split seen7; known: confound, leave_one_material_out"),
         (["labels=whole"], "unknown labels whole; known: half_second, whole_slide"),
-        (["data=real"], "unknown data real; known: authors_raw, biotacsp_dos, files, named, simulated"),
+        (["data=real"], "unknown data real; known: authors_raw, biotacsp_dos, files"),
         (["-m", "split=seen6,seen7"], "unknown split seen7"),
         (["exp=unseen4"], "write +exp=unseen4"),
         (["data=mine", "--config-dir", "nowhere"], "unknown data mine; known: authors_raw"),

@@ -101,8 +101,8 @@ class AlarmSettings:
         """
         if KEY not in detector.info:
             raise ValueError(
-                "this detector has no alarm threshold; train with +exp=onset, which sets one, or with "
-                "onset=debounced, which promises nothing"
+                "this detector has no alarm threshold; train with +exp=onset, which sets one, or "
+                "with onset=debounced, which promises nothing"
             )
         return cls.from_dict(detector.info[KEY])
 

@@ -185,7 +185,8 @@ class MatrixColumn:
 
     def read(self, axis: int, first: int, stop: int) -> NDArray[Any]:
         """A stretch of it."""
-        return self.array.read(self.time_axis, first, stop).take(self.number, 1 - self.time_axis)
+        part: NDArray[Any] = self.array.read(self.time_axis, first, stop)
+        return np.take(part, self.number, axis=1 - self.time_axis)
 
 
 @dataclass(frozen=True)
