@@ -185,8 +185,9 @@ class MatrixColumn:
 
     def read(self, axis: int, first: int, stop: int) -> NDArray[Any]:
         """A stretch of it."""
-        part: NDArray[Any] = self.array.read(self.time_axis, first, stop)
-        return np.take(part, self.number, axis=1 - self.time_axis)
+        part = self.array.read(self.time_axis, first, stop)
+        column: NDArray[Any] = np.take(part, self.number, axis=1 - self.time_axis)
+        return column
 
 
 @dataclass(frozen=True)
