@@ -19,12 +19,12 @@ from omegaconf import DictConfig
 
 import tactslip_torch
 from tactslip_torch.config import conf_dir, errors_in_one_line, fail, one_line, run_entry_point
-from tactslip_torch.data.conversion import Conversion, Converted
-from tactslip_torch.data.datasets import FileRecordings
-from tactslip_torch.data.inspection import Inspected, inspected, oddities
-from tactslip_torch.data.manifest_lines import Problem
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.template import write_template
+from tactslip_torch.data.sets.conversion import Conversion, Converted
+from tactslip_torch.data.sets.datasets import FileRecordings
+from tactslip_torch.data.sets.inspection import Inspected, inspected, oddities
+from tactslip_torch.data.sets.manifest_lines import Problem
+from tactslip_torch.data.sets.template import write_template
 from tactslip_torch.report.dataset import (
     Example,
     Trial,

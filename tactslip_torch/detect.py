@@ -37,9 +37,9 @@ from tactslip_torch.data.folder import (
 )
 from tactslip_torch.data.formats.reading import Reading, pieces
 from tactslip_torch.data.formats.registry import open_file
-from tactslip_torch.data.hand_file import HandFile, hand_file
 from tactslip_torch.data.recording import Recording
-from tactslip_torch.data.stream import stream_of
+from tactslip_torch.data.sets.hand_file import HandFile, hand_file
+from tactslip_torch.data.sets.stream import stream_of
 from tactslip_torch.experiment import save_config, versions
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector

@@ -7,16 +7,16 @@ import pytest
 import torch
 from test_commands import composed
 
-from tactslip_torch.data.authors_raw import (
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.sets.authors_raw import (
     STEMS,
     authors_raw,
     better_told,
     named_files,
     nominal,
 )
-from tactslip_torch.data.manifest import read_manifest
-from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.truth import Truth
+from tactslip_torch.data.sets.manifest import read_manifest
+from tactslip_torch.data.sets.truth import Truth
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.train import train
 

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactslip_torch.data.folder import manifest_line
-from tactslip_torch.data.manifest import COLUMNS, manifest_of, read_manifest
-from tactslip_torch.data.manifest_lines import read_lines
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.data.timeline import FileTimeline, on_time, scaled
-from tactslip_torch.data.truth import Truth, truth_of
+from tactslip_torch.data.sets.manifest import COLUMNS, manifest_of, read_manifest
+from tactslip_torch.data.sets.manifest_lines import read_lines
+from tactslip_torch.data.sets.timeline import FileTimeline, on_time, scaled
+from tactslip_torch.data.sets.truth import Truth, truth_of
 
 FILES = ("a.csv", "b.csv", "c.csv")
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import NamedTuple
 
-from tactslip_torch.data.manifest_lines import Line, Problem, read_lines
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.truth import TRUTH_COLUMNS, Truth, truth_of
+from tactslip_torch.data.sets.manifest_lines import Line, Problem, read_lines
+from tactslip_torch.data.sets.truth import TRUTH_COLUMNS, Truth, truth_of
 
 NAMES = ("manifest.csv", "manifest.yaml", "manifest.yml")
 ALIASES = {"object": "material", "cycle": "trial"}

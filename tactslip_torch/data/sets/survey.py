@@ -13,15 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from tactslip_torch.data.agreement import Part, agreed
 from tactslip_torch.data.clock import refuse_gaps
-from tactslip_torch.data.look_memory import keep, memory_of, recall
-from tactslip_torch.data.manifest import Entry
-from tactslip_torch.data.manifest_lines import Problem
-from tactslip_torch.data.sampling import Treatment, missing_of, num_recorded, refuse_ratio
-from tactslip_torch.data.stream import Found, Stream, look
-from tactslip_torch.data.timeline import FileTimeline, on_time, scaled
-from tactslip_torch.data.truth import Truth
+from tactslip_torch.data.sets.agreement import Part, agreed
+from tactslip_torch.data.sets.look_memory import keep, memory_of, recall
+from tactslip_torch.data.sets.manifest import Entry
+from tactslip_torch.data.sets.manifest_lines import Problem
+from tactslip_torch.data.sets.sampling import Treatment, missing_of, num_recorded, refuse_ratio
+from tactslip_torch.data.sets.stream import Found, Stream, look
+from tactslip_torch.data.sets.timeline import FileTimeline, on_time, scaled
+from tactslip_torch.data.sets.truth import Truth
 from tactslip_torch.signals.resampling import MOST_CUT_S
 from tactslip_torch.workers import in_processes
 

@@ -9,11 +9,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tactslip_torch.data.datasets import FileRecordings
 from tactslip_torch.data.folder import MANIFEST
 from tactslip_torch.data.formats.registry import Format, named_format
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.truth import MOMENTS, STRETCHES
+from tactslip_torch.data.sets.datasets import FileRecordings
+from tactslip_torch.data.sets.truth import MOMENTS, STRETCHES
 from tactslip_torch.files import whole_file
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, cast
 
-from tactslip_torch.data.manifest_lines import Cell
+from tactslip_torch.data.sets.manifest_lines import Cell
 
 Stretch = tuple[float, float]
 Label = Literal["slip", "non-slip"]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from tactslip_torch.data.truth import STRETCHES, Stretch, Truth
+from tactslip_torch.data.sets.truth import STRETCHES, Stretch, Truth
 
 
 @dataclass(frozen=True)

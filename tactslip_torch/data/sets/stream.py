@@ -16,7 +16,7 @@ from tactslip_torch.data.clock import Clock, even_clock
 from tactslip_torch.data.formats.reading import AS_IT_SAYS, Reading
 from tactslip_torch.data.formats.registry import open_file
 from tactslip_torch.data.recording import Recording
-from tactslip_torch.data.truth import Truth
+from tactslip_torch.data.sets.truth import Truth
 from tactslip_torch.hand import KNOWN_KINDS, Adapting, Channel, HandLayout
 
 NOWHERE = "unknown"

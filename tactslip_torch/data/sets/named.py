@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tactslip_torch.data.datasets import FileRecordings
-from tactslip_torch.data.manifest import Entry, Listing
-from tactslip_torch.data.manifest_lines import Problem
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.truth import Label, Truth
+from tactslip_torch.data.sets.datasets import FileRecordings
+from tactslip_torch.data.sets.manifest import Entry, Listing
+from tactslip_torch.data.sets.manifest_lines import Problem
+from tactslip_torch.data.sets.truth import Label, Truth
 
 GROUPS = ("material", "trial", "scene", "label")
 _LABELS: Mapping[str, Label] = {"slip": "slip", "non-slip": "non-slip"}

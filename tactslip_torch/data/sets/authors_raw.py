@@ -14,11 +14,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tactslip_torch.data.datasets import FileRecordings
-from tactslip_torch.data.manifest import Entry, Listing, manifest_of, read_manifest
-from tactslip_torch.data.manifest_lines import Problem
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.truth import Truth
+from tactslip_torch.data.sets.datasets import FileRecordings
+from tactslip_torch.data.sets.manifest import Entry, Listing, manifest_of, read_manifest
+from tactslip_torch.data.sets.manifest_lines import Problem
+from tactslip_torch.data.sets.truth import Truth
 from tactslip_torch.hand import HandLayout
 
 STEMS: Mapping[str, str] = {

@@ -15,16 +15,16 @@ from typing import Any
 
 import torch
 
-from tactslip_torch.data.agreement import Part
 from tactslip_torch.data.clock import GapRule
-from tactslip_torch.data.digest import file_digest
-from tactslip_torch.data.manifest import Entry, Listing, manifest_of, read_manifest
-from tactslip_torch.data.manifest_lines import Problem
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.data.sampling import Treatment, recorded
-from tactslip_torch.data.stream import Stream, stream_of
-from tactslip_torch.data.survey import Plan, Surveyed, survey
-from tactslip_torch.data.timeline import FileTimeline
+from tactslip_torch.data.sets.agreement import Part
+from tactslip_torch.data.sets.digest import file_digest
+from tactslip_torch.data.sets.manifest import Entry, Listing, manifest_of, read_manifest
+from tactslip_torch.data.sets.manifest_lines import Problem
+from tactslip_torch.data.sets.sampling import Treatment, recorded
+from tactslip_torch.data.sets.stream import Stream, stream_of
+from tactslip_torch.data.sets.survey import Plan, Surveyed, survey
+from tactslip_torch.data.sets.timeline import FileTimeline
 from tactslip_torch.hand import Adapting, HandLayout
 
 log = logging.getLogger(__name__)

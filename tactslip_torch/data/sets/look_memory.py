@@ -17,8 +17,8 @@ from typing import Any
 
 from tactslip_torch.data.clock import Clock, Gap
 from tactslip_torch.data.formats.header import DTYPES
-from tactslip_torch.data.stream import Found, Stream
-from tactslip_torch.data.truth import STRETCHES, Truth
+from tactslip_torch.data.sets.stream import Found, Stream
+from tactslip_torch.data.sets.truth import STRETCHES, Truth
 from tactslip_torch.files import whole_file
 from tactslip_torch.hand import HandLayout
 
@@ -30,7 +30,7 @@ def memory_of(root: Path, streams: Iterable[Stream]) -> Path:
     """Where looks at a set are kept, for one way of reading it."""
     readings = [asdict(stream.reading) for stream in streams]
     code = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         code.update(path.read_bytes())
     facts = json.dumps([str(root.resolve()), readings, code.hexdigest()], sort_keys=True)
     cache = os.environ.get("XDG_CACHE_HOME")

@@ -15,7 +15,7 @@ from tactslip_torch.data.folder import refuse_other_channels
 from tactslip_torch.data.formats.header import Archived
 from tactslip_torch.data.formats.reading import Reading, Samples
 from tactslip_torch.data.formats.registry import open_file
-from tactslip_torch.data.stream import Stream, hand_of, look
+from tactslip_torch.data.sets.stream import Stream, hand_of, look
 from tactslip_torch.hand import HandLayout
 
 _RATE_ERR = 0.01  # of a rate that timestamps tell; a stated one must be the hand's own

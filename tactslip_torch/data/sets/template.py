@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tactslip_torch.data.formats.registry import endings, find_format
-from tactslip_torch.data.manifest import NAMES
+from tactslip_torch.data.sets.manifest import NAMES
 from tactslip_torch.files import whole_file
 
 FIELDS = {"material": r"[^/]+?", "trial": r"\d+", "scene": r"[^/]+?", "label": r"[^/]+?"}

@@ -11,7 +11,7 @@ from statistics import median
 from typing import NamedTuple, TypeVar
 
 from tactslip_torch.data.clock import nominal_rate
-from tactslip_torch.data.stream import Found, Stream, hand_of
+from tactslip_torch.data.sets.stream import Found, Stream, hand_of
 from tactslip_torch.hand import HandLayout
 
 RATE_ERROR = 0.01

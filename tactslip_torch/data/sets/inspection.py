@@ -9,13 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tactslip_torch.data.agreement import Part
-from tactslip_torch.data.datasets import FileRecordings
 from tactslip_torch.data.formats.reading import pieces
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.sampling import even_samples
-from tactslip_torch.data.stream import Stream
-from tactslip_torch.data.truth import Stretch
+from tactslip_torch.data.sets.agreement import Part
+from tactslip_torch.data.sets.datasets import FileRecordings
+from tactslip_torch.data.sets.sampling import even_samples
+from tactslip_torch.data.sets.stream import Stream
+from tactslip_torch.data.sets.truth import Stretch
 
 PIECE = 1 << 16
 """Samples that are looked at at a time."""
