@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -39,6 +40,7 @@ from benchmarks.real.page import page
 from benchmarks.real.report import limit_rows, report_text
 from benchmarks.real.scores import judged
 from benchmarks.real.sizes import QUICK, Sizes
+from benchmarks.real.watched import drawn, watched, watched_figure
 from benchmarks.real.windows import composed, read_windows, recipe_of
 from tactslip_torch.config import errors_in_one_line
 from tactslip_torch.files import whole_file
@@ -75,6 +77,8 @@ def measure(overrides: Sequence[str], sizes: Sizes, folder: Path, quick: bool) -
             table = np.stack(list(scores.values()))
             names = np.array(list(scores))
             np.savez(file, scores=table, methods=names, is_slip=windows.is_slip)
+        own = found[paired[0]].method.rows
+        heard = watched(windows, folds, recipes[0], own, config, folder)
         named = {name: scores[name] for name in paired}
         told = (windows.is_slip, windows.recording, sizes.draws)
         gaps = differences(named, paired[0], *told)
@@ -83,7 +87,7 @@ def measure(overrides: Sequence[str], sizes: Sizes, folder: Path, quick: bool) -
         | {"fit_s": median(of.fit_s), "chosen": of.chosen, "time": times.get(name)}
         for name, of in found.items()
     }
-    sections = {"methods": rows, "differences": gaps}
+    sections = {"methods": rows, "differences": gaps, "watched": heard}
     return {
         "simulated": False,  # read_windows refuses those
         "quick": quick,
@@ -142,6 +146,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             return EXIT_INTERRUPTED
         keep_numbers(report, parsed.json)
+        with whole_file(watched_figure(parsed.figure)) as temporary:
+            shutil.copy(drawn(report["sections"]["watched"], folder), temporary)
     print(report_text(report))
     keep_figure(figure, report, parsed.figure)
     with whole_file(parsed.page) as temporary:

@@ -65,7 +65,7 @@ def detector_of(windows: Windows, recipe: Recipe, training: Training) -> SlipDet
         plan.frame.selected,
         plan.frame.scaler,
         head,
-        {"penalty": plan.penalty},
+        {"penalty": plan.penalty, "calibration": plan.calibration},
         plan.typical,
     )
 

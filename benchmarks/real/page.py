@@ -12,6 +12,7 @@ from benchmarks.outcome import QUICK_LINE
 from benchmarks.real.bootstrap import COVERAGE
 from benchmarks.real.report import tables
 from benchmarks.real.tried import tried, tried_table
+from benchmarks.real.watched import watched_figure
 from benchmarks.reproduction.page import shown
 
 COMMAND = "python -m benchmarks.real"
@@ -54,6 +55,10 @@ def page(report: Report, figure: Path, place: Path) -> str:
         *_shown(of, "objects"),
         "### Each direction of slip",
         *_shown(of, "slips"),
+        "### As streams",
+        _watched(report),
+        *_shown(of, "watched"),
+        f"![One recording through detect]({watched_figure(Path(image)).as_posix()})",
         "### How sure the differences are",
         _bootstrap(report),
         *_shown(of, "differences"),
@@ -165,6 +170,17 @@ def _open(report: Report) -> str:
         return "No interval of balanced accuracy holds 0."
     named = "; ".join(unsure)
     return f"**The interval of balanced accuracy holds 0, so nothing is settled, beside:** {named}."
+
+
+def _watched(report: Report) -> str:
+    found = report["sections"]["watched"]
+    return (
+        "Each whole recording through `StreamingDetector`, by the machine of the fold that left "
+        f"its object out: a decision every {found['hop_ms']:g} ms, an alarm when {found['k']} of "
+        f"{found['n']} decisions say slip (`onset=debounced`). Nothing was set on alarms, and no "
+        "rate of false alarms is promised; when slip begins nobody knows, so there are no delays. "
+        f"The picture is what `detect` leaves of one of them, `{found['shown']}`."
+    )
 
 
 def _times(report: Report) -> str:

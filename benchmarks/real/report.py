@@ -67,6 +67,7 @@ def tables(report: Report) -> dict[str, list[Table]]:
         "objects": [objects_table(report)],
         "slips": [scenes_table(report)],
         "differences": [differences_table(report)],
+        "watched": [watched_table(report)],
         "times": [times_table(report)],
         "choices": [choices_table(report)],
     }
@@ -128,6 +129,17 @@ def scenes_table(report: Report) -> Table:
         [name, *(f"{100 * row['scenes'][of]:.1f}" for of in names)] for name, row in rows.items()
     ]
     return Table(["windows told right, %", *(SCENES[name] for name in names)], cells)
+
+
+def watched_table(report: Report) -> Table:
+    """Recordings with an alarm, by direction of slip."""
+    found = report["sections"]["watched"]["by_scene"]
+    names = [name for name in SCENES if name in found]
+    cells = [
+        [SCENES[name], str(found[name]["recordings"]), str(found[name]["with_alarm"])]
+        for name in names
+    ]
+    return Table(["watched as streams", "recordings", "with an alarm"], cells)
 
 
 def differences_table(report: Report) -> Table:
