@@ -237,6 +237,18 @@ def test_a_run_judges_every_method_on_the_same_windows(kept: Path, root: Path) -
     assert str(root) not in json.dumps(made)  # no path of a machine in what is kept
 
 
+def test_whole_recordings_of_slip_raise_alarms_and_no_others(kept: Path) -> None:
+    found = json.loads((kept / "real.json").read_text())["sections"]["watched"]
+    touch = found["by_scene"].pop("t")
+    assert touch["recordings"] > 0
+    assert touch["with_alarm"] == 0  # a vibration is easily told from none
+    for of in found["by_scene"].values():
+        assert of["with_alarm"] == of["recordings"] > 0
+    assert (kept / "real_watched.png").stat().st_size > 10_000
+    onsets = json.loads((kept / "watched" / "onsets.json").read_text())
+    assert onsets["recordings"][0]["file"] == Path(found["shown"]).name
+
+
 def test_an_interrupted_run_finds_its_rows_again(
     kept: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -267,7 +279,7 @@ def test_the_page_is_written_anew_from_what_is_kept(kept: Path, tmp_path: Path) 
     given = [str(part) for pair in paths.items() for part in pair]
     assert bench.main(["--report", *given]) == 0
     text, before = (tmp_path / "p").read_text(), (kept / "REAL_DATA.md").read_text()
-    assert text.replace("r.png", "real.png") == before
+    assert text.replace("(r.png", "(real.png").replace("(r_watched", "(real_watched") == before
     assert (tmp_path / "r.png").stat().st_size > 30_000
     for word in ("Sensors 19(3):523", "states no licence", "development data", "QUICK", "95.50"):
         assert word in text.replace("**", "")

@@ -1,4 +1,4 @@
-"""Whole recordings as a stream would bring them: who raises an alarm, and one of them through detect.
+"""Whole recordings as streams: which raise an alarm, and one of them through ``detect``.
 
 Each recording is watched by the machine of the fold that left its object out, with an alarm that
 was set on nothing (``onset=debounced``). Nobody knows when slip begins in this set, so there are no
@@ -53,6 +53,7 @@ def watched(
     source = windows.maker.source
     assert isinstance(source, FileRecordings)
     alarm = Debounced(HOP_MS)
+    slips = dict(zip(windows.recording.tolist(), windows.is_slip.tolist(), strict=True))
     counts: dict[str, dict[str, int]] = {}
     shown = ""
     for fold in bar(folds, "watched as streams", "fold"):
@@ -69,10 +70,7 @@ def watched(
             of = counts.setdefault(recording.scene, {"recordings": 0, "with_alarm": 0})
             of["recordings"] += 1
             of["with_alarm"] += alarms > 0
-            is_slip = bool(
-                windows.is_slip[windows.recording == windows.recordings.index(recording)][0]
-            )
-            if not shown and is_slip:
+            if not shown and slips[windows.recordings.index(recording)]:
                 shown = source.entry(recording).file
                 _through_detect(detector, source.root / shown, config, folder / "watched")
     settings = {"hop_ms": HOP_MS, "k": alarm.k, "n": alarm.n}
