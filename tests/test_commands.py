@@ -10,6 +10,7 @@ import onnx
 import pytest
 import torch
 import yaml
+from biotac_layout import write_biotac
 from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -476,7 +477,7 @@ def assert_one_line(error, expected):
         (["split.train_share=1.2"], "split.train_share must lie between 0 and 1, got 1.2"),
         (["features.dtype=float16"], "features.dtype must be one of float64, float32"),
         (["features.frames={SG: 51}", "~features.frames.PVDF"], "no frame for PVDF channels"),
-        (["features.frames.SG=50"], "window_length must be odd"),
+        (["features.frames.SG=50"], "features.frames.SG must be an odd number of samples"),
         (["+features.misspelt=1"], "misspelt"),
         (["recipe.num_features=3000"], "recipe.num_features=3000 exceeds the pool's 2582"),
         (["recipe.num_features=0"], "recipe.num_features must be at least 1"),
@@ -542,7 +543,7 @@ def test_strokes_can_be_configured():
 # Real processes --------------------------------------------------------------------------------
 
 FAILURES = {
-    "unknown experiment": (["train", "+exp=nope"], "unknown exp nope; known: confound, leave_one"),
+    "unknown experiment": (["train", "+exp=nope"], "unknown exp nope; known: biotacsp_dos, conf"),
     "unknown material": (
         ["train", "+exp=quick", "data.materials=[M1,Foo]", "split.seen=[M1]", "split.unseen=[Foo]"],
         "unknown material 'Foo'; known are M1",
@@ -652,8 +653,9 @@ def test_every_experiment_runs_fast(name, tmp_path):
     """One recording of each pass, or two; the whole set is named, not simulated."""
     overrides = (f"+exp={name}", "num_workers=0", f"cache={tmp_path / 'cache'}", "export=false")
     # the first recordings of these are of scenes without slip
-    num = {"confound": 2, "onset": 4}.get(name, 1)
-    _, metrics = run_train(tmp_path / "run", *overrides, f"trainer.fast_dev_run={num}")
+    num = {"confound": 2, "onset": 4, "biotacsp_dos": 2}.get(name, 1)
+    told = write_biotac(tmp_path / "biotac") if name == "biotacsp_dos" else []
+    _, metrics = run_train(tmp_path / "run", *overrides, *told, f"trainer.fast_dev_run={num}")
     assert metrics["splits"]
 
 

@@ -1,8 +1,8 @@
 """Every file of ``conf/``: it composes, what it names exists, and nothing in it is misspelt."""
 
-import numpy as np
 import pytest
 import yaml
+from biotac_layout import write_biotac
 from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from hydra.utils import get_object, instantiate
@@ -36,14 +36,7 @@ def composed(*overrides, name="train"):
 @pytest.fixture(scope="module")
 def layouts(tmp_path_factory):
     """What an experiment on recordings needs to be told, by name."""
-    root = tmp_path_factory.mktemp("biotacsp_dos")
-    for name in ("n/pen1", "t/pen2", "cw/strippes3", "t/striped4"):
-        path = root / "csvs" / f"{name}.csv"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        header = ",".join(f"ff_e{number}" for number in range(1, 25))
-        counts = np.random.default_rng(0).integers(1900, 3800, (280, 24))
-        np.savetxt(path, counts, fmt="%d", delimiter=",", header=header, comments="")
-    return {"biotacsp_dos": [f"data.root={root}"]}
+    return {"biotacsp_dos": write_biotac(tmp_path_factory.mktemp("biotacsp_dos"))}
 
 
 def folds_of(config):

@@ -110,7 +110,7 @@ def calibration_figure(found: Mapping[str, Any], path: str | Path) -> None:
     axes.set_ylabel("test accuracy on seen materials, %")
     axes.set_title(f"SIMULATED hand\nkept: {_kept(found)}", fontsize=9)
     axes.grid(color="#DDDDDD")
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(frameon=False, fontsize=9, loc="upper right")
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=150)
 

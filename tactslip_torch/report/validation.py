@@ -79,7 +79,7 @@ def validation_figure(
     kind = " (simulated data)" if simulated else ""
     axes.set_title(f"Choice on training groups left out one at a time{kind}", fontsize=11)
     axes.grid(color="#DDDDDD")
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, loc="lower left")
     with whole_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=160, facecolor="white")
 
