@@ -148,7 +148,7 @@ def test_a_manifest_can_say_onsets_better(tmp_path):
     )
     assert [e.is_nominal for e in found.entries] == [True, False, True]
     assert [str(problem) for problem in found.problems] == [
-        "marked.csv:4: file 'other.txt' is not named as the authors' are"
+        "marked.csv:4: file 'other.txt' has no name that says what it is"
     ]
 
 

@@ -100,3 +100,12 @@ def test_no_folder_and_links_out_of_it(folder, tmp_path_factory):
     (folder / "n" / "pen9.csv").symlink_to(outside)
     with pytest.raises(ValueError, match=r"n/pen9.csv: is a link out of the folder"):
         source(folder)
+
+
+def test_a_manifest_tells_what_names_do_not(folder):
+    lines = ["file,material,trial,onsets_s", "n/pen0.csv,pen,0,0.75"]
+    (folder / "onsets.csv").write_text("\n".join(lines))
+    found = source(folder, manifest="onsets.csv", slide_s=0.5)
+    told, other = (found.timeline(RecordingId("pen", trial, "n")) for trial in (0, 7))
+    assert (told.onsets_s, told.slip_s) == ((0.75,), ())
+    assert (other.onsets_s, other.slip_s) == ((), ((0.5, 1.5),))

@@ -10,13 +10,18 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.sets.datasets import FileRecordings
-from tactslip_torch.data.sets.manifest import Entry, Listing, manifest_of, read_manifest
+from tactslip_torch.data.sets.manifest import (
+    Entry,
+    Listing,
+    better_told,
+    manifest_of,
+    read_manifest,
+)
 from tactslip_torch.data.sets.manifest_lines import Problem
 from tactslip_torch.data.sets.truth import Truth
 from tactslip_torch.hand import HandLayout
@@ -133,23 +138,3 @@ def named_files(root: Path, stems: Mapping[str, str], truth: Truth) -> Listing:
         entries.append(Entry(file, file, recording, truth, is_nominal=True))
     entries.sort(key=lambda entry: (order.index(entry.recording.material), entry.recording))
     return Listing(tuple(entries), tuple(problems))
-
-
-def better_told(listing: Listing, told: Listing) -> Listing:
-    """A listing in which files that another tells of have its truth; the others keep theirs."""
-    by_file = {entry.file: entry for entry in told.entries}
-    entries = []
-    for entry in listing.entries:
-        other = by_file.pop(entry.file, None)
-        if other is not None and other.truth is not None:
-            entry = replace(entry, place=other.place, truth=other.truth, is_nominal=False)
-        entries.append(entry)
-    strangers = [
-        Problem(other.place, f"file {file!r} is not named as the authors' are")
-        for file, other in by_file.items()
-    ]
-    return Listing(
-        tuple(entries),
-        (*listing.problems, *told.problems, *strangers),
-        (*listing.warnings, *told.warnings),
-    )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import NamedTuple
 
@@ -244,3 +244,23 @@ def _is_rate(text: str) -> bool:
         return 0 < float(text) < math.inf
     except ValueError:
         return False
+
+
+def better_told(listing: Listing, told: Listing) -> Listing:
+    """A listing in which files that another tells of have its truth; the others keep theirs."""
+    by_file = {entry.file: entry for entry in told.entries}
+    entries = []
+    for entry in listing.entries:
+        other = by_file.pop(entry.file, None)
+        if other is not None and other.truth is not None:
+            entry = replace(entry, place=other.place, truth=other.truth, is_nominal=False)
+        entries.append(entry)
+    strangers = [
+        Problem(other.place, f"file {file!r} has no name that says what it is")
+        for file, other in by_file.items()
+    ]
+    return Listing(
+        tuple(entries),
+        (*listing.problems, *told.problems, *strangers),
+        (*listing.warnings, *told.warnings),
+    )

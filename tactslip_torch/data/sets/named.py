@@ -13,7 +13,13 @@ from typing import Any
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.sets.datasets import FileRecordings
-from tactslip_torch.data.sets.manifest import Entry, Listing
+from tactslip_torch.data.sets.manifest import (
+    Entry,
+    Listing,
+    better_told,
+    manifest_of,
+    read_manifest,
+)
 from tactslip_torch.data.sets.manifest_lines import Problem
 from tactslip_torch.data.sets.truth import Label, Truth
 
@@ -27,6 +33,7 @@ def named_recordings(
     pattern: str,
     labels: Mapping[str, str] | None = None,
     rename: Mapping[str, str] | None = None,
+    manifest: str | None = None,
     **options: Any,
 ) -> FileRecordings:
     """The recordings of a folder and its folders whose paths match a pattern.
@@ -39,10 +46,12 @@ def named_recordings(
         labels: ``slip`` or ``non-slip`` for each text of the group ``label``, or of ``scene`` if
             there is no such group; ``None``: the text is one of the two, or nothing is known.
         rename: materials that names spell otherwise.
+        manifest: a file that says of some or all files what names do not, relative to the folder;
+            ``None`` for none.
         options: further ones of ``FileRecordings``.
 
     Raises:
-        FileNotFoundError: if there is no such folder.
+        FileNotFoundError: if there is no such folder or manifest.
         ValueError: if the pattern is none or no path matches it, or as ``FileRecordings``.
     """
     folder = Path(root)
@@ -51,6 +60,8 @@ def named_recordings(
     listing = listed(folder, _checked(pattern), _known(labels), rename or {})
     if not listing.entries and not listing.problems:
         raise ValueError(f"no file in {folder} has a path that matches data.pattern={pattern!r}")
+    if manifest is not None:
+        listing = better_told(listing, read_manifest(manifest_of(folder, manifest), folder))
     return FileRecordings(folder, manifest=listing, **options)
 
 
