@@ -159,7 +159,7 @@ def test_rows_of_channels_find_their_columns_by_name_or_by_place(tables):
     source = FileRecordings(tables, channels=rows)
     assert source.hand.names == ("c", "a")
     assert torch.equal(source.load(source.ids[0]).samples, samples(0)[[2, 0]])
-    placed = FileRecordings(tables, channels=ROWS)
+    placed = FileRecordings(tables, channels=ROWS, reading={"channels": ["a", "b", "c"]})
     assert placed.hand == HAND
     assert torch.equal(placed.load(placed.ids[0]).samples, samples(0))
     with pytest.raises(ValueError, match=r"has the channels a, b, c, not the 2 of data\.channels"):
@@ -167,6 +167,38 @@ def test_rows_of_channels_find_their_columns_by_name_or_by_place(tables):
     half = [rows[0], ROWS[1], ROWS[2]]  # as many, but who knows which is which
     with pytest.raises(ValueError, match=r"has no channel PVDF1, PVDF2 of .*; it has a, b, c"):
         FileRecordings(tables, channels=half)
+
+
+def test_names_that_are_not_those_of_the_hand_are_refused(tables):
+    with pytest.raises(
+        ValueError, match=r"channels a, b, c, not the 3 .* as reading\.channels="
+    ) as e:
+        FileRecordings(tables, channels=ROWS)
+    assert "\n" not in str(e.value)
+    assert "0.csv" in str(e.value)
+    reading = {"channels": ["a", "b"]}
+    with pytest.raises(ValueError, match=r"has the channels a, b, not the 3 of data\.channels"):
+        FileRecordings(tables, channels=ROWS, reading=reading)
+
+
+def test_case_and_a_unit_make_no_other_name(tmp_path):
+    table(tmp_path / "a.csv", samples(0), names=("t", "pvdf1 (mV)", "PVDF2[mV]", " Sg1 (a.u.)"))
+    manifest(tmp_path, "a.csv,wood,0,,,slip")
+    source = FileRecordings(tmp_path, channels=ROWS)
+    assert torch.equal(source.load(source.ids[0]).samples, samples(0)[[2, 0, 1]])
+    table(tmp_path / "a.csv", samples(0), names=("t", "sg1 (V)", "sg1 (mV)", "PVDF1"))
+    with pytest.raises(ValueError, match=r"has no channel SG1, PVDF2 of data\.channels"):
+        FileRecordings(tmp_path, channels=ROWS)
+
+
+def test_columns_without_names_go_by_their_place(tmp_path):
+    rows = np.column_stack([np.arange(600) / RATE_HZ, samples(0).numpy().T])
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", fmt="%.17g")
+    manifest(tmp_path, "a.csv,wood,0,,,slip")
+    source = FileRecordings(tmp_path, channels=ROWS)
+    assert torch.equal(source.load(source.ids[0]).samples, samples(0))
+    with pytest.raises(ValueError, match=r"has the channels 3 without names, not the 2 of"):
+        FileRecordings(tmp_path, channels=ROWS[:2])
 
 
 def test_samples_outside_the_windows_are_not_read(tables):

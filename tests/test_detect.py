@@ -468,6 +468,11 @@ def whole(place):
     save(place / "a.npz", recording())
 
 
+def of_foreign_names(place):
+    table = torch.cat([torch.arange(16000)[None] / RATE_HZ, volts()]).T.numpy()
+    np.savetxt(place / "a.csv", table, delimiter=",", header="t,F2,F1,G2,G1", comments="")
+
+
 def nothing(place):
     (place / "notes.md").write_text("no recording")
 
@@ -480,6 +485,11 @@ REFUSED = {
     "names": (of_other_names, [], "channel 2 of {place}/a.npz is PVDF1 (SG), not SG2 (SG); give"),
     "kinds": (of_other_kinds, [], "channel 3 of {place}/a.npz is PVDF1 (SG), not PVDF1 (PVDF)"),
     "channels": (of_fewer_channels, [], "{place}/a.npz has 3 channels, not 4"),
+    "columns": (
+        of_foreign_names,
+        [],
+        "has the channels F2, F1, G2, G1, not the 4 of data.",
+    ),
     "rate": (of_another_rate, [], "a.npz is of 1999.5 Hz, the detector of 2000 Hz; resample it"),
     "short": (too_short, [], "{place}/a.npz has 98 samples, too few for a decision"),
     "empty": (empty, [], "{place}/a.npz holds no samples"),

@@ -5,6 +5,7 @@ Most files hold one. Where a hand has sensors of several rates, each rate is a s
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,6 +22,8 @@ from tactslip_torch.hand import KNOWN_KINDS, Adapting, Channel, HandLayout
 
 NOWHERE = "unknown"
 """The finger and segment of a channel of which nobody said them."""
+_UNIT = re.compile(r"\s*(?:\([^()]*\)|\[[^\[\]]*\])$")
+_NAME_THEM = "name its columns so, or list them in the order of the hand as reading.channels"
 
 
 @dataclass(frozen=True)
@@ -139,29 +142,16 @@ def look(path: Path, stream: Stream, stated_hz: float | None = None) -> Found:
 def hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
     """The channels of a stream, and in which row of a file each of them is.
 
-    Rows that a person gave are found by the names the file has and, if it has none of them, stand
-    in the order of the file.
+    Rows that a person gave are found by the names the file has, whatever their case and the unit
+    in brackets behind them. If it has no names, or a person said which columns they are, they
+    stand in that order.
 
     Raises:
         ValueError: if channels are given and the file has others, or names are none or twice.
     """
     own = list(found.names or ())
     if stream.channels is not None:
-        wanted = stream.channels
-        lacking = [name for name in wanted.names if name not in own]
-        if not lacking:
-            return wanted, [own.index(name) for name in wanted.names]
-        if 0 < len(lacking) < len(wanted):
-            raise ValueError(
-                f"has no channel {_some(lacking)} of data.channels; it has {_some(own)}"
-            )
-        if found.hand is not None or len(wanted) != found.num_channels:
-            has = _some(own) if own else f"{found.num_channels} without names"
-            raise ValueError(
-                f"has the channels {has}, not the {len(wanted)} of data.channels, "
-                f"{_some(wanted.names)}"
-            )
-        return wanted, list(range(len(wanted)))
+        return stream.channels, _rows_of(stream.channels, own, found, stream)
     every = list(range(found.num_channels))
     if found.hand is not None:
         return found.hand, every
@@ -170,6 +160,39 @@ def hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
     before = f"{stream.name}_" if stream.name else ""
     channels = [Channel(before + n, stream.kind, NOWHERE, NOWHERE, adapting) for n in names]
     return HandLayout(tuple(channels)), every
+
+
+def _rows_of(hand: HandLayout, own: Sequence[str], found: Found, stream: Stream) -> list[int]:
+    """In which row of a file each channel of a hand is."""
+    places = [_place_of(name, own) for name in hand.names]
+    rows = [place for place in places if place is not None]
+    if len(rows) == len(hand) == len(set(rows)):
+        return rows
+    is_ordered = not own or (found.hand is None and stream.reading.channels is not None)
+    if is_ordered and len(hand) == found.num_channels:
+        return list(range(len(hand)))
+    has = _some(own) if own else f"{found.num_channels} without names"
+    if rows and not is_ordered:
+        lacking = [name for name, place in zip(hand.names, places, strict=True) if place is None]
+        what = f"no channel {_some(lacking)}" if lacking else "a column that is two channels"
+        raise ValueError(f"has {what} of data.channels; it has {has}")
+    how = "" if is_ordered or found.hand is not None else f"; {_NAME_THEM}"
+    raise ValueError(
+        f"has the channels {has}, not the {len(hand)} of data.channels, {_some(hand.names)}{how}"
+    )
+
+
+def _place_of(name: str, own: Sequence[str]) -> int | None:
+    """Where a name stands among others: as it is written or, if one alone is alike, by that."""
+    if name in own:
+        return list(own).index(name)
+    alike = [place for place, other in enumerate(own) if _bare(other) == _bare(name)]
+    return alike[0] if len(alike) == 1 else None
+
+
+def _bare(name: str) -> str:
+    """A name without its case and the unit behind it: ``"G1 (mV)"`` is ``"g1"``."""
+    return _UNIT.sub("", name.strip()).casefold()
 
 
 def _truth(recording: Recording) -> Truth | None:
