@@ -57,6 +57,8 @@ def check(config: DictConfig) -> int:
                 warnings += [Problem(entry.place, f"{entry.file}: {what}") for what in odd]
     for line in (*(f"problem: {p}" for p in problems), *(f"warning: {w}" for w in warnings)):
         print(line)
+    if source.ids:
+        print(f"channels: {', '.join(source.hand.names)}")
     print(_headline(source, problems, warnings))
     return len(problems)
 

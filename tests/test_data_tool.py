@@ -85,13 +85,15 @@ def test_check_lists_every_problem_and_warning(tmp_path, capsys):
         "warning: manifest.csv:2: 0.csv: c is not finite in 10 samples, first at 0.2000 s; leave "
         "the stretch out as missing_s, or repair it",
         "warning: manifest.csv:2: 0.csv: b never changes, it is 2.5 throughout",
+        "channels: a, b, c",
         "3 recordings of 2 materials, 9.0 s, 3 channels at 200 Hz in V: 6 problems, 2 warnings",
     ]
 
 
 def test_check_of_a_fine_set_finds_nothing(root, capsys):
     assert run("check", root, ROWS) == 0
-    (line,) = capsys.readouterr().out.splitlines()
+    channels, line = capsys.readouterr().out.splitlines()
+    assert channels == f"channels: {', '.join(HAND.names)}"
     assert line.startswith("4 recordings of 2 materials, 12.0 s, 3 channels at 200 Hz in V: 0 prob")
 
 

@@ -170,12 +170,10 @@ def test_rows_of_channels_find_their_columns_by_name_or_by_place(tables):
 
 
 def test_names_that_are_not_those_of_the_hand_are_refused(tables):
-    with pytest.raises(
-        ValueError, match=r"channels a, b, c, not the 3 .* as reading\.channels="
-    ) as e:
+    said = r"0\.csv: has the channels a, b, c, not the 3 .* as reading\.channels"
+    with pytest.raises(ValueError, match=said) as caught:
         FileRecordings(tables, channels=ROWS)
-    assert "\n" not in str(e.value)
-    assert "0.csv" in str(e.value)
+    assert "\n" not in str(caught.value)
     reading = {"channels": ["a", "b"]}
     with pytest.raises(ValueError, match=r"has the channels a, b, not the 3 of data\.channels"):
         FileRecordings(tables, channels=ROWS, reading=reading)
@@ -189,6 +187,20 @@ def test_case_and_a_unit_make_no_other_name(tmp_path):
     table(tmp_path / "a.csv", samples(0), names=("t", "sg1 (V)", "sg1 (mV)", "PVDF1"))
     with pytest.raises(ValueError, match=r"has no channel SG1, PVDF2 of data\.channels"):
         FileRecordings(tmp_path, channels=ROWS)
+
+
+@pytest.mark.parametrize("name", ["slip", "is_slip", "Label", "material", "contact [0/1]"])
+def test_a_column_that_may_be_the_label_is_no_channel_unless_said(tmp_path, name):
+    table(tmp_path / "a.csv", samples(0), names=("t", "a", "b", name))
+    manifest(tmp_path, "a.csv,wood,0,,,slip")
+    with pytest.raises(ValueError, match=r"a\.csv: has a column .* as reading\.channels") as caught:
+        FileRecordings(tmp_path)
+    assert repr(name) in str(caught.value)
+    assert FileRecordings(tmp_path, reading={"channels": ["a", "b"]}).hand.names == ("a", "b")
+    said = FileRecordings(tmp_path, reading={"channels": ["a", name]})
+    assert said.hand.names == ("a", name)
+    rows = [row | {"name": n} for row, n in zip(ROWS[:2], ("b", "a"), strict=True)]
+    assert FileRecordings(tmp_path, channels=rows).hand.names == ("b", "a")
 
 
 def test_columns_without_names_go_by_their_place(tmp_path):
@@ -251,7 +263,7 @@ def test_a_key_is_of_what_a_file_holds_and_how_it_is_read(tables):
     assert moved.key(moved.ids[0]) == keys[0]
     for options in (
         {"tare_s": [0.0, 1.0]},
-        {"channels": ROWS},
+        {"channels": [row | {"name": name} for row, name in zip(ROWS, "abc", strict=True)]},
         {"reading": {"time": None, "sample_rate_hz": 100.0, "channels": ["a", "b", "c"]}},
         {"gaps": "missing"},
     ):
@@ -342,7 +354,9 @@ def test_short_gaps_are_bridged_and_long_ones_stay_missing(tmp_path):
 
 def test_bins_that_need_missing_samples_are_left_out(tmp_path):
     gappy(tmp_path)
-    source = FileRecordings(tmp_path, channels=ROWS, gaps="missing")
+    source = FileRecordings(
+        tmp_path, channels=ROWS, reading={"channels": ["a", "b", "c"]}, gaps="missing"
+    )
     pool = FeaturePool(HAND, RATE_HZ, bin_samples=20, level=2)
     maker = FeatureMaker(source, pool, ChannelFilter([5, 5, 5]), LabelRule(bin_ms=100.0))
     cut, bins = maker.filtered_bins(source.ids[0])

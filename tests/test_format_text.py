@@ -377,3 +377,25 @@ def test_a_table_beyond_the_memory(tmp_path):
     total, mebibytes = found.stdout.split()
     assert float(total) == 60_000.0
     assert int(mebibytes) < 6  # the numbers are 10
+
+
+@pytest.mark.parametrize("start", [0, 7])
+def test_the_number_of_a_row_and_further_times_are_no_channels(tmp_path, start):
+    path = tmp_path / "a.csv"
+    rows = [f"{start + i},{i / 100},{i * 10**7},{i % 3},{i}" for i in range(50)]
+    path.write_text("\n".join([",time,timestamp_ns,g1,g2", *rows]) + "\n")
+    with text.open(path) as opened:
+        assert opened.names == ("g1", "g2")  # a ramp that has a name is a channel
+        assert opened.samples.read(0, 50)[1].tolist() == list(range(50))
+        assert opened.times.read(0, 50)[49] == pytest.approx(0.49)
+    with text.open(path, Reading(time="timestamp_ns", time_unit="ns")) as opened:
+        assert opened.names == ("g1", "g2")
+    with text.open(path, Reading(channels=[0, "g1"])) as opened:
+        assert opened.samples.num_channels == 2
+
+
+def test_a_column_without_a_name_that_does_not_count_is_a_channel(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(",time,g1\n" + "".join(f"{i * 2},{i / 100},{i % 3}\n" for i in range(50)))
+    with text.open(path) as opened:
+        assert opened.names == ("column 0", "g1")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from tactslip_torch.data.formats.reading import SECONDS, TIME_NAMES, Reading, TimeUnit
@@ -28,15 +28,23 @@ class Columns(NamedTuple):
 
 
 def chosen_columns(
-    path: str | os.PathLike[str], names: Sequence[str] | None, num_columns: int, how: Reading
+    path: str | os.PathLike[str],
+    names: Sequence[str] | None,
+    num_columns: int,
+    how: Reading,
+    is_count: Callable[[int], bool] = lambda place: False,
 ) -> Columns:
     """The columns that ``how`` asks for; a name such as ``time_ms`` goes before its unit.
+
+    If it does not say which hold samples, all do but times, further times, and the number of the
+    row that some libraries write before the others without a name.
 
     Args:
         path: of the file, for messages.
         names: of all columns, if the file says.
         num_columns: how many there are.
         how: what a person says of the file.
+        is_count: whether the column there rises by one from row to row.
 
     Raises:
         ValueError: if there is no such column, or none is left for samples.
@@ -46,7 +54,11 @@ def chosen_columns(
     else:
         time = None if how.time is None else _position(path, names, num_columns, how.time, "time")
     if how.channels is None:
-        channels = tuple(place for place in range(num_columns) if place != time)
+        channels = tuple(
+            place
+            for place in range(num_columns)
+            if place != time and not _is_beside(names, place, time, is_count)
+        )
     else:
         channels = tuple(
             _position(path, names, num_columns, one, "channels") for one in how.channels
@@ -64,6 +76,16 @@ def _likely_time(names: Sequence[str] | None, num_columns: int, how: Reading) ->
     if names is None:
         return 0 if how.sample_rate_hz is None and num_columns > 1 else None
     return next((place for place, name in enumerate(names) if is_time_name(name)), None)
+
+
+def _is_beside(
+    names: Sequence[str] | None, place: int, time: int | None, is_count: Callable[[int], bool]
+) -> bool:
+    """Whether a column is none of samples: times in another unit, or the number of the row."""
+    if names is None:
+        return False
+    is_nameless = names[place] in ("", f"column {place}", f"Unnamed: {place}")
+    return (time is not None and is_time_name(names[place])) or (is_nameless and is_count(place))
 
 
 def is_time_name(name: str) -> bool:

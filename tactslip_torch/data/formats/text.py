@@ -41,6 +41,7 @@ from tactslip_torch.hand import HandLayout
 
 _OURS = f"# {FORM[:-1]}".encode()  # without its version
 _TO_WRITE = 4096  # rows at a time
+_TO_COUNT = 1024  # rows that show whether a column is their number
 _CHUNK = 2**20
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
@@ -175,7 +176,12 @@ def open(path: str | os.PathLike[str], how: Reading = AS_IT_SAYS) -> Iterator[Op
 
 def _opened_table(path: str | os.PathLike[str], table: TextTable, how: Reading) -> Opened:
     layout = table.layout
-    time, seconds, columns = chosen_columns(path, layout.names, layout.num_columns, how)
+
+    def is_count(column: int) -> bool:
+        values = table.read(0, _TO_COUNT)[:, column]
+        return len(values) > 2 and bool((np.diff(values) == 1).all())
+
+    time, seconds, columns = chosen_columns(path, layout.names, layout.num_columns, how, is_count)
     names = layout.names and tuple(layout.names[column] for column in columns)
     has_times = time is not None and not (layout.is_time_empty and time == 0)
     times = TextTimes(table, time, seconds) if has_times and time is not None else None

@@ -22,6 +22,8 @@ from tactslip_torch.hand import KNOWN_KINDS, Adapting, Channel, HandLayout
 
 NOWHERE = "unknown"
 """The finger and segment of a channel of which nobody said them."""
+LABEL_NAMES = ("label", "labels", "slip", "is_slip", "contact", "trial", "material", "class")
+"""Names of columns, in small letters, that are no channel unless a person says so."""
 _UNIT = re.compile(r"\s*(?:\([^()]*\)|\[[^\[\]]*\])$")
 _NAME_THEM = "name its columns so, or list them in the order of the hand as reading.channels"
 
@@ -155,6 +157,12 @@ def hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
     every = list(range(found.num_channels))
     if found.hand is not None:
         return found.hand, every
+    told = [name for name in own if _bare(name) in LABEL_NAMES]
+    if told and stream.reading.channels is None:
+        raise ValueError(
+            f"has a column {told[0]!r}, which may be what a detector is to find out; list the "
+            "columns that are channels as reading.channels"
+        )
     adapting = stream.adapting or KNOWN_KINDS.get(stream.kind, "slow")
     names: Sequence[str] = own or [f"ch{number + 1}" for number in every]
     before = f"{stream.name}_" if stream.name else ""
