@@ -109,7 +109,7 @@ class Reading:
 
     def __post_init__(self) -> None:
         rate = self.sample_rate_hz
-        if rate is not None and not (_is_number(rate) and 0 < rate < math.inf):
+        if rate is not None and not (is_number(rate) and 0 < rate < math.inf):
             raise ValueError(f"reading.sample_rate_hz must be positive, got {rate!r}")
         if self.time_unit not in get_args(TimeUnit):
             known = ", ".join(get_args(TimeUnit))
@@ -190,5 +190,6 @@ def needs(module: str, what: str, extra: str = "formats") -> ModuleType:
     return importlib.import_module(module)
 
 
-def _is_number(value: object) -> bool:
+def is_number(value: object) -> bool:
+    """Whether a setting is a number; ``True`` is none."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)

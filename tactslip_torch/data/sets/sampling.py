@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.data.clock import GAP_RULES, EvenSamples, GapRule
-from tactslip_torch.data.formats.reading import Samples
+from tactslip_torch.data.formats.reading import Samples, is_number
 from tactslip_torch.data.formats.registry import open_file
 from tactslip_torch.data.sets.stream import Found, Stream
 from tactslip_torch.data.sets.truth import Stretch
@@ -43,26 +43,37 @@ class Treatment:
     gaps: GapRule = "refuse"
     bridge_ms: float = 10.0
     resample_hz: float | None = None
-    tare_s: Sequence[float] | None = None
+    tare_s: Stretch | None = None
 
     def __post_init__(self) -> None:
         if self.gaps not in GAP_RULES:
             known = ", ".join(GAP_RULES)
             raise ValueError(f"data.gaps must be one of {known}, got {self.gaps!r}")
-        if self.gaps == "bridge" and not self.bridge_ms > 0:
-            raise ValueError(f"data.bridge_ms must be positive, got {self.bridge_ms!r}")
+        if not (is_number(self.bridge_ms) and self.bridge_ms > 0):
+            raise ValueError(f"data.bridge_ms must be a positive number, got {self.bridge_ms!r}")
         rate = self.resample_hz
-        if rate is not None and not (isinstance(rate, (int, float)) and 0 < rate < math.inf):
+        if rate is not None and not (is_number(rate) and 0 < rate < math.inf):
             raise ValueError(f"data.resample_hz must be a positive number or null, got {rate!r}")
-        if self.tare_s is not None:
-            parts = tuple(self.tare_s)
-            if len(parts) != 2 or not 0 <= parts[0] < parts[1]:
-                raise ValueError(f"data.tare_s must be [start, end] in seconds, got {list(parts)}")
-            object.__setattr__(self, "tare_s", parts)
+        object.__setattr__(self, "tare_s", tare_of(self.tare_s, "data.tare_s"))
 
     def most_bridged(self, rate_hz: float) -> int:
         """The most samples of a gap that is bridged."""
         return int(self.bridge_ms * rate_hz / 1000 + 1e-6) if self.gaps == "bridge" else 0
+
+
+def tare_of(value: object, name: str) -> Stretch | None:
+    """The stretch that is tared on, as somebody said it.
+
+    Raises:
+        ValueError: naming the setting, if that is no start and end of a stretch.
+    """
+    if value is None:
+        return None
+    parts = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else []
+    if len(parts) != 2 or not all(map(is_number, parts)) or not 0 <= parts[0] < parts[1] < math.inf:
+        got = parts or value
+        raise ValueError(f"{name} must be [start, end] in seconds, got {got!r}")
+    return float(parts[0]), float(parts[1])
 
 
 def num_recorded(found: Found, rate_hz: float, how: Treatment) -> int:
@@ -142,10 +153,7 @@ def recorded(
     with even_samples(path, stream, found, how.most_bridged(rate_hz)) as samples:
         chosen = list(rows)
         num = samples.num_samples
-        level = torch.zeros(len(chosen), 1, dtype=torch.float64)
-        if how.tare_s is not None:
-            first, stop = (round(moment * rate_hz) for moment in how.tare_s)
-            level = samples.read(first, stop)[chosen].double().nanmean(-1, keepdim=True)
+        level = tare_level(samples, chosen, rate_hz, how.tare_s, path)
         if how.resample_hz is not None and how.resample_hz != rate_hz:
             whole = samples.read(0, num)[chosen] - level
             even = resample(whole, rate_hz, how.resample_hz)
@@ -157,3 +165,39 @@ def recorded(
             read = samples.read(first, stop)[chosen]
             kept[:, first:stop] = read if how.tare_s is None else (read - level).to(samples.dtype)
         return kept
+
+
+def tare_level(
+    samples: Samples, rows: Sequence[int], rate_hz: float, tare_s: Stretch | None, path: Path
+) -> Tensor:
+    """What is taken off each channel: the mean of what is finite in a stretch.
+
+    Args:
+        samples: of the file.
+        rows: of the channels.
+        rate_hz: of the samples.
+        tare_s: start and end of the stretch; ``None`` for nothing to take off.
+        path: of the file, for messages.
+
+    Shape:
+        - output: ``[C, 1]``, float64
+
+    Raises:
+        ValueError: if the file ends before the stretch, or a channel has nothing finite in it.
+    """
+    if tare_s is None:
+        return torch.zeros(len(rows), 1, dtype=torch.float64)
+    first, stop = (round(moment * rate_hz) for moment in tare_s)
+    if not first < stop <= samples.num_samples:
+        raise ValueError(
+            f"{path} has {samples.num_samples} samples, too few for tare_s={list(tare_s)}"
+        )
+    read = samples.read(first, stop)[list(rows)].double()
+    level = read.where(read.isfinite(), torch.nan).nanmean(-1, keepdim=True)
+    dead = level.isnan().flatten().nonzero().flatten().tolist()
+    if dead:
+        raise ValueError(
+            f"{path} has nothing finite in its column {rows[dead[0]] + 1} to tare on from "
+            f"{tare_s[0]:g} to {tare_s[1]:g} s; give another tare_s"
+        )
+    return level
