@@ -262,6 +262,17 @@ def test_what_was_finished_is_kept_and_what_changed_is_made_again(root, tmp_path
     assert converted(root, out, "data.tare_s=[0,1]") == [True] * 4
 
 
+def test_files_of_other_units_are_made_anew(tmp_path):
+    (tmp_path / "in").mkdir()
+    table(tmp_path / "in" / "a.csv", samples(0))
+    manifest(tmp_path / "in", "a.csv,wood,0,,,slip")
+    output = (f"output={tmp_path / 'out'}", "to=npz")
+    assert run("convert", tmp_path / "in", *output)[0].made
+    assert not run("convert", tmp_path / "in", *output)[0].made
+    assert run("convert", tmp_path / "in", *output, "data.units=counts")[0].made
+    assert FileRecordings(tmp_path / "out").units == "counts"
+
+
 def test_the_first_that_fails_stops_it_and_what_was_finished_stays(root, tmp_path, monkeypatch):
     out = tmp_path / "out"
     whole = FileRecordings.load

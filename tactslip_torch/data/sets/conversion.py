@@ -76,6 +76,7 @@ class Conversion:
             "recording": {"name": recording.scene, **self.source.key(recording)},
             "material": recording.material,
             "truth": asdict(self.source.timeline(recording)),
+            "units": self.source.units,
             "made_by": self.made_by,
         }
         plain: dict[str, Any] = json.loads(json.dumps(facts, allow_nan=False))
