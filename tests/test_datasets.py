@@ -388,6 +388,23 @@ def test_a_tared_stretch_is_told_from_what_is_missing_in_it(tmp_path):
     assert "nothing is there to tare on" in lines_of(lost)[0]
 
 
+def test_a_channel_with_nothing_finite_to_tare_on_is_refused(tmp_path):
+    content = samples(0)
+    content[1, 100:200] = torch.nan
+    content[2, 110:190] = torch.inf
+    table(tmp_path / "a.csv", content)
+    manifest(tmp_path, "a.csv,wood,0,,,slip")
+    source = FileRecordings(tmp_path, tare_s=[0.5, 1.0])
+    with pytest.raises(
+        ValueError, match=r"a\.csv has nothing finite in its column 2 .* 0\.5 to 1 s"
+    ):
+        source.load(source.ids[0])
+    part = FileRecordings(tmp_path, tare_s=[0.25, 0.6])
+    level = [content[0, 50:120].mean(), content[1, 50:100].mean(), content[2, 50:110].mean()]
+    read = part.load(part.ids[0]).samples
+    assert torch.allclose(read[:, 300:], content[:, 300:] - torch.tensor(level)[:, None].double())
+
+
 def test_files_of_several_rates_are_brought_to_one(tmp_path):
     """A slow tone is the same tone at any rate."""
     for name, rate in (("a.csv", 200.0), ("b.csv", 500.0)):
@@ -544,6 +561,19 @@ def test_units_and_kinds_must_agree(tmp_path):
         assert what in line
 
 
+def test_most_others_are_more_than_half(tmp_path):
+    for place in range(2):
+        ours(tmp_path / f"{place}.npz", units=["V", "counts"][place])
+    files = [f"{place}.npz,wood,{place},,," for place in range(2)]
+    manifest(tmp_path, *files)
+    (line,) = lines_of(FileRecordings(tmp_path, strict=False))
+    assert line.endswith("is in counts, manifest.csv:2 in V")
+    ours(tmp_path / "2.npz")
+    manifest(tmp_path, *files, "2.npz,wood,2,,,")
+    (line,) = lines_of(FileRecordings(tmp_path, strict=False))
+    assert line.endswith("is in counts, manifest.csv:2 and most others in V")
+
+
 def test_what_is_worth_a_look_is_said(tables):
     manifest(tables, "0.csv,wood,0,,,", "1.csv,wood,1,0.5,0.5-1.5,")
     source = FileRecordings(tables)
@@ -572,7 +602,11 @@ def test_a_rate_that_nobody_says_is_asked_for(tmp_path):
     [
         ({"skip_s": -1.0}, r"data\.skip_s must be seconds from 0, got -1"),
         ({"slide_s": "long"}, r"data\.slide_s must be seconds from 0, got 'long'"),
-        ({"bridge_ms": 0.0, "gaps": "bridge"}, r"data\.bridge_ms must be positive"),
+        ({"bridge_ms": 0.0, "gaps": "bridge"}, r"data\.bridge_ms must be a positive number, got 0"),
+        ({"bridge_ms": "abc"}, r"data\.bridge_ms must be a positive number, got 'abc'"),
+        ({"tare_s": [0, "a"]}, r"data\.tare_s must be \[start, end\] in seconds, got \[0, 'a'\]"),
+        ({"tare_s": 0.5}, r"data\.tare_s must be \[start, end\] in seconds, got 0\.5"),
+        ({"tare_s": "ab"}, r"data\.tare_s must be \[start, end\] in seconds, got 'ab'"),
         ({"resample_hz": 199.9999}, "is no ratio of whole numbers up to 50000"),
         ({"resample_hz": -5}, r"data\.resample_hz must be a positive number or null"),
         ({"reading": {"rate": 5}}, "reading must be of sample_rate_hz, time"),

@@ -58,14 +58,14 @@ def agreed(
         if isinstance(part, str):
             checked.append(part)
         elif part.hand != hand:
-            checked.append(f"{_difference(part.hand, hand)} as in {at_hand} and most others")
+            checked.append(f"{_difference(part.hand, hand)} as in {at_hand}")
         elif part.rate_hz != rate and not any_rate:
             checked.append(
-                f"is of {part.rate_hz:g} Hz, {at_rate} and most others of {rate:g} Hz; "
+                f"is of {part.rate_hz:g} Hz, {at_rate} of {rate:g} Hz; "
                 "data.resample_hz=... brings all to one"
             )
         elif part.units != units:
-            checked.append(f"is in {part.units}, {at_units} and most others in {units}")
+            checked.append(f"is in {part.units}, {at_units} in {units}")
         else:
             checked.append(part)
     return checked
@@ -95,12 +95,13 @@ def _rates(founds: Sequence[Found]) -> list[float]:
 
 
 def _most(values: Sequence[_Value | None], places: Sequence[str]) -> tuple[_Value | None, str]:
-    """What most have, and where it is found first."""
+    """What most have, and who: where it is found first, and whether that is more than half."""
     known = Counter(value for value in values if value is not None)
     if not known:
         return None, ""
-    most = known.most_common(1)[0][0]
-    return most, places[values.index(most)]
+    most, count = known.most_common(1)[0]
+    others = " and most others" if 2 * count > known.total() else ""
+    return most, f"{places[values.index(most)]}{others}"
 
 
 def _difference(own: HandLayout, others: HandLayout | None) -> str:
