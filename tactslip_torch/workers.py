@@ -40,8 +40,11 @@ def in_processes(
         num_workers: ``None`` for as many as there are processors, at most 8.
 
     Raises:
+        ValueError: if there is no such number of processes.
         Exception: what ``function`` raised; what was not begun is left out.
     """
+    if num_workers is not None and (type(num_workers) is not int or num_workers < 0):
+        raise ValueError(f"num_workers must be null or a number from 0, got {num_workers!r}")
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     count = min(min(available, 8) if num_workers is None else num_workers, len(items))
     if count < 2 or "fork" not in multiprocessing.get_all_start_methods():

@@ -28,3 +28,9 @@ def test_an_error_in_a_worker_is_raised_here(capsys):
 
     with pytest.raises(ValueError, match="item 2 is bad"):
         list(in_processes(fails, range(5), "w", "item", 2))
+
+
+@pytest.mark.parametrize("num_workers", [-1, 1.5, "two", True])
+def test_what_is_no_number_of_processes_is_refused(num_workers):
+    with pytest.raises(ValueError, match="num_workers must be null or a number from 0, got"):
+        list(in_processes(abs, range(4), "w", "item", num_workers))
