@@ -156,8 +156,8 @@ def _hear(
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
         stream = StreamingDetector(detector, settings, dtype=samples.dtype)
         view = view_of(config.view, entry["duration_s"])
-        units = str(detector.info.get("units", "V"))
-        traces = Traces(_drawn(detector.pool.hand), rate, stream.hop_s, view, units)
+        drawn = _drawn(detector.pool.hand)
+        traces = Traces(drawn, rate, stream.hop_s, view, units_of(detector))
         tally = Tally(archived.recording.onsets_s if archived else ())
 
         def take(decisions: Decisions) -> None:
@@ -231,7 +231,13 @@ def _settings(config: DictConfig, detector: SlipDetector) -> AlarmSettings:
 def _opened(path: Path, listener: Listener) -> AbstractContextManager[HandFile]:
     """A recording of the detector's hand, open."""
     pool, config = listener.detector.pool, listener.config
-    return hand_file(path, pool.hand, pool.sample_rate_hz, listener.reading, config.tare_s)
+    units = units_of(listener.detector)
+    return hand_file(path, pool.hand, pool.sample_rate_hz, listener.reading, units, config.tare_s)
+
+
+def units_of(detector: SlipDetector) -> str:
+    """Of the samples that a detector was trained on."""
+    return str(detector.info.get("units", "V"))
 
 
 def _drawn(hand: HandLayout) -> dict[str, int]:

@@ -468,6 +468,21 @@ def whole(place):
     save(place / "a.npz", recording())
 
 
+def in_counts(place):
+    save(place / "a.npz", recording(units="counts"))
+
+
+def of_a_slow_clock(place):
+    times_s = torch.arange(16000).double() / 1994.0  # 0.3 %: what is told in seconds would err so
+    write_table(place / "a.csv", volts(), [0, 1, 2, 3], times_s)
+
+
+def silent(place):
+    samples = volts()
+    samples[0, :1000] = torch.nan
+    save(place / "a.npz", recording(samples))
+
+
 def of_foreign_names(place):
     table = torch.cat([torch.arange(16000)[None] / RATE_HZ, volts()]).T.numpy()
     np.savetxt(place / "a.csv", table, delimiter=",", header="t,F2,F1,G2,G1", comments="")
@@ -499,6 +514,15 @@ REFUSED = {
     "damaged": (damaged, [], "{place}/a.npz is damaged or no recording of ours"),
     "threshold": (whole, ["threshold=high"], "threshold must be a finite number, got 'high'"),
     "infinite": (whole, ["threshold=inf"], "threshold must be a finite number, got inf"),
+    "units": (in_counts, [], "a.npz is in counts, the detector was trained on V; give"),
+    "clock": (of_a_slow_clock, [], "Hz, the detector of 2000 Hz; resample it"),
+    "tare": (whole, ["tare_s=[0,a]"], "tare_s must be [start, end] in seconds, got [0, 'a']"),
+    "tare of a number": (whole, ["tare_s=0.5"], "tare_s must be [start, end] in seconds, got 0.5"),
+    "nothing to tare on": (
+        silent,
+        ["tare_s=[0,0.5]"],
+        "a.npz has nothing finite in its column 1 to",
+    ),
     "view": (whole, ["view=3"], "view must be [start, end] in seconds, got 3"),
     "view of nothing": (whole, ["view=[9,10]"], "shows nothing of 8 s"),
     "engine": (whole, ["engine=steam"], "steam"),
@@ -598,3 +622,22 @@ def test_what_training_tared_is_tared(model, tmp_path):
     first, second = found["recordings"]
     assert first["alarms"]
     assert [a["alarm_s"] for a in first["alarms"]] == [a["alarm_s"] for a in second["alarms"]]
+
+
+def test_a_detector_of_counts_hears_counts_and_what_says_no_units(model, tmp_path):
+    detector = small_detector(SEED)
+    detector.info |= {"alarm": SETTINGS.to_dict(), "units": "counts"}
+    detector.save(tmp_path / "counts.pt")
+    (tmp_path / "in").mkdir()
+    save(tmp_path / "in" / "a.npz", recording(units="counts"))
+    write_table(tmp_path / "in" / "b.csv", volts(), [0, 1, 2, 3], torch.arange(16000) / RATE_HZ)
+    save(tmp_path / "in" / "c.npz", recording())
+    with pytest.raises(ValueError, match=r"1 of 3 .*c\.npz is in V, the detector was .* counts"):
+        heard(tmp_path / "counts.pt", tmp_path / "in", tmp_path / "out", "figure=false")
+
+
+def test_a_clock_a_little_off_is_heard(model, tmp_path):
+    times_s = torch.arange(16000).double() / (RATE_HZ * 1.0005)
+    write_table(tmp_path / "a.csv", volts(), [0, 1, 2, 3], times_s)
+    (entry,) = heard(model, tmp_path / "a.csv", tmp_path / "out", "figure=false")["recordings"]
+    assert entry["alarms"]

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from tactslip_torch.data.clock import EvenSamples
@@ -15,10 +14,11 @@ from tactslip_torch.data.folder import refuse_other_channels
 from tactslip_torch.data.formats.header import Archived
 from tactslip_torch.data.formats.reading import Reading, Samples
 from tactslip_torch.data.formats.registry import open_file
+from tactslip_torch.data.sets.sampling import tare_level, tare_of
 from tactslip_torch.data.sets.stream import Stream, hand_of, look
 from tactslip_torch.hand import HandLayout
 
-_RATE_ERR = 0.01  # of a rate that timestamps tell; a stated one must be the hand's own
+_RATE_ERR = 0.001  # of a measured rate, as what is told in seconds errs; a stated one has none
 
 
 class HandFile(NamedTuple):
@@ -39,6 +39,7 @@ def hand_file(
     hand: HandLayout,
     sample_rate_hz: float,
     reading: Reading,
+    units: str,
     tare_s: Sequence[float] | None = None,
 ) -> Iterator[HandFile]:
     """Open a recording of a hand, ours or another's, to watch it by stretches.
@@ -48,13 +49,15 @@ def hand_file(
         hand: its channels; a file that names them all may have them in another order, and more.
         sample_rate_hz: that is wanted.
         reading: what the file does not say.
+        units: that are wanted; of a file that does not say its own, they are taken for granted.
         tare_s: start and end of the stretch whose mean is taken off each channel, as it was for
             training.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, of another hand or rate, or nobody says its rate.
+        ValueError: if it is damaged, of another hand, rate or unit, or nobody says its rate.
     """
+    tare = tare_of(tare_s, "tare_s")
     with open_file(path, reading) as opened:
         if opened.archived is not None or (opened.names is None and reading.channels is None):
             refuse_other_channels(path, opened, hand.to_rows())
@@ -67,6 +70,11 @@ def hand_file(
         raise ValueError(
             f"{path} is of {rate} Hz, the detector of {sample_rate_hz:g} Hz; resample it"
         )
+    if found.units not in (None, units):
+        raise ValueError(
+            f"{path} is in {found.units}, the detector was trained on {units}; give it recordings "
+            f"in {units}, or train one on {found.units}"
+        )
     try:
         _, rows = hand_of(found, stream)
     except ValueError as error:
@@ -75,29 +83,10 @@ def hand_file(
         samples: Samples = opened.samples
         if found.clock.gaps:
             samples = EvenSamples(samples, found.clock)
-        if rows != list(range(samples.num_channels)) or tare_s is not None:
-            samples = _Chosen(samples, rows, _level(samples, rows, sample_rate_hz, tare_s, path))
+        if rows != list(range(samples.num_channels)) or tare is not None:
+            level = tare_level(samples, rows, sample_rate_hz, tare, path)
+            samples = _Chosen(samples, rows, level)
         yield HandFile(samples, opened.archived)
-
-
-def _level(
-    samples: Samples,
-    rows: list[int],
-    rate_hz: float,
-    tare_s: Sequence[float] | None,
-    path: Path,
-) -> Tensor:
-    """What is taken off each channel, ``[C, 1]``, float64."""
-    if tare_s is None:
-        return torch.zeros(len(rows), 1, dtype=torch.float64)
-    if len(tare_s) != 2 or not 0 <= tare_s[0] < tare_s[1]:
-        raise ValueError(f"tare_s must be [start, end] in seconds, got {list(tare_s)}")
-    first, stop = (round(moment * rate_hz) for moment in tare_s)
-    if not first < stop <= samples.num_samples:
-        raise ValueError(
-            f"{path} has {samples.num_samples} samples, too few for tare_s={list(tare_s)}"
-        )
-    return samples.read(first, stop)[rows].double().nanmean(-1, keepdim=True)
 
 
 class _Chosen:
