@@ -1,9 +1,9 @@
 """Real recordings, ours and rivals: ``python -m benchmarks.real data.root=FOLDER [--quick]``.
 
 On the BioTac SP set (``+exp=biotacsp_dos``), with every object left out in turn. In one run, on the
-same windows and folds: the machine of two recipes, MiniRocket with ridge, TSFEL with a random
-forest, an RBF SVC on our pool, and logistic regression on simple statistics. All that is fitted or
-chosen is so inside the fold. Prints tables and limits, keeps numbers and figure in
+same windows and folds: the machine of two recipes, MiniRocket with ridge in two ways, TSFEL with a
+random forest, an RBF SVC on our pool, and logistic regression on simple statistics. All that is
+fitted or chosen is so inside the fold. Prints tables and limits, keeps numbers and figure in
 ``benchmarks/results``, and writes ``REAL_DATA.md``. TSFEL's features, which take long, are kept in
 ``--runs``, so a run that was interrupted goes on from there. ``--report`` writes from what is kept.
 ``--quick`` looks whether all of it runs, and leaves its results in a folder in ``outputs``.
@@ -35,7 +35,7 @@ from benchmarks.outcome import (
 )
 from benchmarks.real.bootstrap import differences
 from benchmarks.real.figure import figure
-from benchmarks.real.measure import clocked, methods_of, middle_rocket, on_folds
+from benchmarks.real.measure import clocked, methods_of, middle_rockets, on_folds
 from benchmarks.real.page import page
 from benchmarks.real.report import limit_rows, report_text
 from benchmarks.real.scores import judged
@@ -68,9 +68,9 @@ def measure(overrides: Sequence[str], sizes: Sizes, folder: Path, quick: bool) -
     windows, folds = read_windows(config, sizes)
     with on_threads(1):
         found = on_folds(windows, folds, methods_of(windows, recipes, sizes, folder))
-        middle = middle_rocket(found, windows.is_slip)
-        paired = [name for name, of in found.items() if name == middle or "Rocket" not in name]
-        times = clocked(windows, found, paired, middle, sizes)
+        middle = middle_rockets(found, windows.is_slip)
+        paired = [name for name in found if name in middle or "Rocket" not in name]
+        times = clocked(windows, found, paired, middle[0], sizes)
         folder.mkdir(parents=True, exist_ok=True)
         scores = {name: of.scores for name, of in found.items()}
         with whole_file(folder / "scores.npz") as temporary, temporary.open("wb") as file:
@@ -105,7 +105,7 @@ def measure(overrides: Sequence[str], sizes: Sizes, folder: Path, quick: bool) -
             "pool": len(windows.maker.pool.names),
         },
         "ours": paired[0],
-        "rocket": middle,
+        "rockets": middle,
         "sections": sections,
         "limits": limit_rows(rows, paired[0], middle),
     }

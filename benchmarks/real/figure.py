@@ -11,7 +11,13 @@ from matplotlib.figure import Figure
 
 from benchmarks.drawing import GREY, LIGHT, OURS, PEER, SECOND, THIRD, finish
 
-_RIVALS = (PEER, THIRD, "#cc79a7", "#56b4e9")  # Okabe and Ito, as the others
+_RIVALS = (
+    PEER,
+    "#f0a07a",
+    THIRD,
+    "#cc79a7",
+    "#56b4e9",
+)  # Okabe and Ito, as the others; the second MiniRocket lighter
 _CORNER = 0.3
 
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -17,12 +18,15 @@ from benchmarks.clocks import on_threads, paired_ratio, shuffled_rounds
 from benchmarks.real import rivals
 from benchmarks.real.method import Fitted, Method, Training
 from benchmarks.real.ours import ours, pool_rows
+from benchmarks.real.rocket import BY_OBJECTS, BY_WINDOWS, rocket
 from benchmarks.real.scores import balanced
 from benchmarks.real.sizes import Sizes
 from benchmarks.real.windows import Array, Windows
 from tactslip_torch.data.splits import Split
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
+
+_ROCKETS = (BY_WINDOWS, BY_OBJECTS)
 
 
 @dataclass(eq=False)
@@ -58,7 +62,7 @@ def methods_of(
     pool = pool_rows(windows)
     return [
         *(ours(windows, recipe, *pool) for recipe in recipes),
-        *(rivals.rocket(windows, seed, sizes) for seed in sizes.rocket_seeds),
+        *(rocket(windows, *of, sizes) for of in product(_ROCKETS, sizes.rocket_seeds)),
         rivals.forest(windows, sizes, folder / "tsfel"),
         rivals.svc(windows, sizes, *pool),
         rivals.regression(windows, sizes),
@@ -96,11 +100,18 @@ def on_folds(
     return found
 
 
-def middle_rocket(found: Mapping[str, Found], is_slip: Array) -> str:
-    """The MiniRocket whose balanced accuracy is the middle one; of an even number, the upper."""
-    names = [name for name in found if name.startswith(rivals.ROCKET)]
-    names.sort(key=lambda name: balanced(found[name].scores, is_slip))
-    return names[len(names) // 2]
+def middle_rockets(found: Mapping[str, Found], is_slip: Array) -> tuple[str, str]:
+    """By windows and by objects, the MiniRocket whose balanced accuracy is the middle one.
+
+    Of an even number of seeds it is the upper.
+    """
+    middle = []
+    for way in _ROCKETS:
+        names = [name for name in found if name.startswith(way)]
+        names.sort(key=lambda name: balanced(found[name].scores, is_slip))
+        middle.append(names[len(names) // 2])
+    by_windows, by_objects = middle
+    return by_windows, by_objects
 
 
 def clocked(

@@ -84,8 +84,10 @@ def _introduction(report: Report) -> str:
     facts = ", ".join(report["machine"].values())
     versions = ", ".join(f"{name} {of}" for name, of in report["versions"].items())
     return (
-        f"Written by `{COMMAND} {command}`; no result is typed by hand. Nothing here is simulated, "
-        f"and everything was measured in one run, on {facts}; {versions}."
+        f"Written by `{COMMAND} {command}`. Nothing here is simulated. All was measured in that "
+        f"one run, on {facts}; {versions}. But for two things: the figures of 'What was tried "
+        "before' are a log that exploration scripts left, and TSFEL's rows, with the time that "
+        "they took, are kept, so they may come from an earlier run."
     )
 
 
@@ -130,16 +132,24 @@ def _protocol(report: Report) -> str:
         "Each object is left out in turn; a method is fitted to the windows of the others and "
         "scores those of that object. Scores of all folds are pooled as they are, with the "
         "decision at 0: no threshold is set afterwards.",
-        "Ranking, scaling, K, C, ridge's penalty, trees and widths are fitted or chosen inside the "
-        f"fold, on training objects that are left out in turn (in {settings['inner']} groups for "
-        "forest and SVC). Features that look at no label are made once for all windows. All "
-        "methods balance the classes.",
+        "Everything is fitted and chosen inside the fold. The choices of all but one method are "
+        "by balanced accuracy on training objects that are left out in turn. Ours takes the mean "
+        "over these objects, with ranking and scaling held, as `train` does (K and C); forest and "
+        f"SVC leave out {settings['inner']} groups of objects and refit all; logistic regression "
+        "leaves out one object at a time. MiniRocket's ridge is here in two ways, of which the "
+        "first leaves out windows. Features that look at no label are made once, for all windows "
+        "or, MiniRocket's, for those of the fold. All methods balance the classes.",
         f"Ours: `recipe=robust` and `recipe=paper` on the pool of {data['pool']} features, by the "
         "parts that `tactslip_torch.train` uses. What is timed is `SlipDetector.judge`.",
-        f"MiniRocket (aeon, {settings['rocket_kernels']:,} kernels), standardised, "
-        "`RidgeClassifierCV`; it draws at random, so "
-        f"{len(settings['rocket_seeds'])} seeds are shown, and the one in the middle by balanced "
-        "accuracy is what ours stands beside.",
+        f"MiniRocket (aeon, {settings['rocket_kernels']:,} kernels, fitted to the training "
+        "windows), standardised, and ridge, whose penalty alpha is chosen in two ways from one "
+        "grid. **By windows**: `RidgeClassifierCV`, which leaves one window out and takes the "
+        "least squared error. So do MiniRocket's authors, though without class weights and with "
+        "a shorter grid; half of the window left out is in its neighbours, so alpha comes out too "
+        "small for another object. **By objects**: one training object left out at a time, by "
+        "balanced accuracy, all but MiniRocket's features refitted, as the other rivals choose. "
+        f"It draws at random, so {len(settings['rocket_seeds'])} seeds are shown, and in each way "
+        "the one in the middle by balanced accuracy is what ours stands beside.",
         f"TSFEL, all features, and a random forest of {settings['trees']} trees "
         f"({settings['inner_trees']} while choosing). RBF SVC: features by the t-test on our pool, "
         "compressed and scaled as `robust` does. Logistic regression: mean, standard deviation, "

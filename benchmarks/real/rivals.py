@@ -1,4 +1,4 @@
-"""Rivals on the same windows and folds; what they choose, they choose inside the fold."""
+"""Rivals beside MiniRocket; what they choose, they choose inside the fold."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.peers.others import mini_rocket, quiet, tsfel_features
+from benchmarks.peers.others import tsfel_features
 from benchmarks.real.inner import best_choice
 from benchmarks.real.method import Fitted, Method, Training
 from benchmarks.real.sizes import Sizes
@@ -21,36 +21,6 @@ from benchmarks.real.windows import Array, Windows
 from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
 from tactslip_torch.model.scaling import FeatureScaler
-
-RIDGE_PENALTIES = np.logspace(-3, 5, 17)
-ROCKET = "MiniRocket, ridge"
-
-
-def rocket(windows: Windows, seed: int, sizes: Sizes) -> Method:
-    """MiniRocket's features, standardised, and ridge that finds its own penalty."""
-    rows = windows.samples.astype(np.float32)
-    return Method(f"{ROCKET}, seed {seed}", rows, 0.0, partial(_fit_rocket, seed, sizes))
-
-
-def _fit_rocket(seed: int, sizes: Sizes, training: Training) -> Fitted:
-    from sklearn.linear_model import RidgeClassifierCV
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-
-    transform = mini_rocket(training.rows, 1, sizes.rocket_kernels, seed)
-    with quiet():
-        ridge = make_pipeline(
-            StandardScaler(), RidgeClassifierCV(RIDGE_PENALTIES, class_weight="balanced")
-        )
-        ridge.fit(np.asarray(transform.transform(training.rows)), training.is_slip)
-
-    def judge(samples: Array) -> Array:
-        with quiet():
-            rows = np.asarray(transform.transform(samples.astype(np.float32)))
-            found: Array = ridge.decision_function(rows)
-        return found
-
-    return Fitted(judge, judge, {"alpha": float(ridge[-1].alpha_)})
 
 
 # ------------------------------------------------------------------------------------------- TSFEL
