@@ -329,6 +329,9 @@ def test_the_page_is_written_anew_from_what_is_kept(kept: Path, tmp_path: Path) 
     assert (tmp_path / "r.png").stat().st_size > 30_000
     for word in ("Sensors 19(3):523", "states no licence", "development data", "QUICK", "95.50"):
         assert word in text.replace("**", "")
+    first = text.split("\n\n")[1]
+    assert "What was tried before" in first  # not of this run
+    assert "earlier run" in first
     assert f"{len(tried())} variants" in text
 
 

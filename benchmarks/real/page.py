@@ -145,8 +145,8 @@ def _protocol(report: Report) -> str:
         "windows), standardised, and ridge, whose penalty alpha is chosen in two ways from one "
         "grid. **By windows**: `RidgeClassifierCV`, which leaves one window out and takes the "
         "least squared error. So do MiniRocket's authors, though without class weights and with "
-        "a shorter grid; half of the window left out is in its neighbours, so alpha comes out too "
-        "small for another object. **By objects**: one training object left out at a time, by "
+        "a shorter grid. Half of the window left out is in its neighbours, so this tells little "
+        "of another object. **By objects**: one training object left out at a time, by "
         "balanced accuracy, all but MiniRocket's features refitted, as the other rivals choose. "
         f"It draws at random, so {len(settings['rocket_seeds'])} seeds are shown, and in each way "
         "the one in the middle by balanced accuracy is what ours stands beside.",
