@@ -108,6 +108,8 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             f"onset=alarms sets the alarm of one detector, this split makes {len(folds)}; take "
             "split=unseen4 or split=seen6, or onset=debounced"
         )
+    if isinstance(alarming, Debounced):
+        alarming.hop_samples(pool.sample_rate_hz, pool.bin_samples)  # refused before the fit
     is_first = is_first_process()
     if is_first:
         save_config(config, folder)

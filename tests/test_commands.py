@@ -483,6 +483,8 @@ def assert_one_line(error, expected):
         (["recipe.num_features=0"], "recipe.num_features must be at least 1"),
         (["recipe.penalties=[]"], "recipe.penalties must be positive, got []"),
         (["recipe.balance=smote"], "recipe.balance must be one of undersample, weights"),
+        (["onset=debounced", "onset.hop_ms=0.3"], "onset.hop_ms=0.3 is 0.6 samples at 2000 Hz"),
+        (["onset=debounced", "onset.k=a"], "onset.k must be a whole number, got 'a'"),
         (["+scene.misspelt=1"], "unknown override misspelt"),
         (["data.channels=[{name: film, kind: FSR, finger: index, segment: distal}]"], "FSR"),
     ],

@@ -53,6 +53,13 @@ def test_two_of_three_say_when():
         ({"probability": 1.0}, "onset.probability must lie between 0 and 1, got 1.0"),
         ({"slip_share": 0.0}, "onset.slip_share must lie between 0 and 1"),
         ({"hop_ms": 0.0}, "onset.hop_ms must be positive"),
+        ({"hop_ms": "abc"}, "onset.hop_ms must be positive, or null, got 'abc'"),
+        ({"k": "a"}, "onset.k must be a whole number, got 'a'"),
+        ({"n": 2.5}, "onset.n must be a whole number, got 2.5"),
+        ({"probability": "abc"}, "onset.probability must lie between 0 and 1, got 'abc'"),
+        ({"rearm_s": "abc"}, "onset.rearm_s must be seconds from 0, got 'abc'"),
+        ({"rearm_s": -1.0}, "onset.rearm_s must be seconds from 0, got -1.0"),
+        ({"refractory_s": math.inf}, "onset.refractory_s must be seconds from 0, got inf"),
     ],
 )
 def test_numbers_that_cannot_be(options, said):
@@ -68,3 +75,11 @@ def test_scores_without_a_calibration_are_refused():
     detector = calibrated()
     with pytest.raises(ValueError, match=r"onset\.hop_ms=0\.3 is 0\.6 samples"):
         Debounced(hop_ms=0.3)(detector)
+
+
+def test_a_hop_is_half_a_bin_or_so_many_milliseconds():
+    assert Debounced().hop_samples(2000.0, 100) == 50
+    assert Debounced().hop_samples(2000.0, 1) == 1
+    assert Debounced(hop_ms=2.5).hop_samples(2000.0, 100) == 5
+    with pytest.raises(ValueError, match=r"onset\.hop_ms=0\.3 is 0\.6 samples"):
+        Debounced(hop_ms=0.3).hop_samples(2000.0, 100)

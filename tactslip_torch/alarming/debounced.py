@@ -44,14 +44,33 @@ class Debounced:
     refractory_s: float = 0.2
 
     def __post_init__(self) -> None:
-        for name in ("probability", "slip_share"):
-            if not 0 < getattr(self, name) < 1:
+        for name in ("k", "n"):
+            if type(getattr(self, name)) is not int:
                 raise ValueError(
-                    f"onset.{name} must lie between 0 and 1, got {getattr(self, name)}"
+                    f"onset.{name} must be a whole number, got {getattr(self, name)!r}"
                 )
-        if self.hop_ms is not None and not 0 < self.hop_ms < math.inf:
-            raise ValueError(f"onset.hop_ms must be positive, got {self.hop_ms}")
+        for name in ("probability", "slip_share"):
+            value = getattr(self, name)
+            if type(value) not in (int, float) or not 0 < value < 1:
+                raise ValueError(f"onset.{name} must lie between 0 and 1, got {value!r}")
+        for name in ("rearm_s", "refractory_s"):
+            value = getattr(self, name)
+            if type(value) not in (int, float) or not 0 <= value < math.inf:
+                raise ValueError(f"onset.{name} must be seconds from 0, got {value!r}")
+        hop_ms = self.hop_ms
+        if hop_ms is not None and (type(hop_ms) not in (int, float) or not 0 < hop_ms < math.inf):
+            raise ValueError(f"onset.hop_ms must be positive, or null, got {hop_ms!r}")
         _ = KOfN(self.k, self.n)
+
+    def hop_samples(self, sample_rate_hz: float, bin_samples: int) -> int:
+        """The distance of two decisions in samples.
+
+        Raises:
+            ValueError: if it is no whole number of them.
+        """
+        if self.hop_ms is None:
+            return max(bin_samples // 2, 1)
+        return whole_samples(self.hop_ms, sample_rate_hz, "onset.hop_ms")
 
     def __call__(
         self,
@@ -71,11 +90,8 @@ class Debounced:
                 "nothing; give several recipe.penalties"
             )
         pool = detector.pool
-        hop = max(pool.bin_samples // 2, 1)
-        if self.hop_ms is not None:
-            hop = whole_samples(self.hop_ms, pool.sample_rate_hz, "onset.hop_ms")
         settings = AlarmSettings(
-            hop_samples=hop,
+            hop_samples=self.hop_samples(pool.sample_rate_hz, pool.bin_samples),
             calibration=known[0],
             rule=KOfN(self.k, self.n),
             threshold=_log_odds(self.probability) - _log_odds(self.slip_share),
