@@ -350,7 +350,11 @@ def test_limits_say_by_how_much(kept: Path, tmp_path: Path) -> None:
     assert made["limits"][1]["measured"] == "94.88 %, -0.22 points"
     assert made["limits"][1]["what"] == f"balanced accuracy above that of {rockets[1]}"
     assert made["limits"][2]["measured"] == "94.88 %, -0.12 points"
-    assert "3 of 6 limits are met" in page(made, tmp_path / "f.png", tmp_path / "p.md")
+    text = page(made, tmp_path / "f.png", tmp_path / "p.md")
+    assert "3 of 6 limits are met" in text
+    higher = text.split("of all methods and seeds: ")[1].split(".\n")[0].split("; ")
+    assert rockets[1] in higher
+    assert not {name, rockets[0]} & set(higher)
     gap = {"value": 0.01, "low": -0.01, "high": 0.03, "share": 0.9}
     gaps = {"sure": gap | {"low": 0.001}, "unsure": gap}
     made["sections"]["differences"] = {

@@ -93,7 +93,12 @@ def _introduction(report: Report) -> str:
 
 def _verdict(report: Report) -> str:
     judged = [row["ok"] for row in report["limits"]]
-    return f"{sum(judged)} of {len(judged)} limits are met, by {report['ours']}."
+    rows = {name: row["balanced_accuracy"] for name, row in report["sections"]["methods"].items()}
+    above = [name for name, value in rows.items() if value > rows[report["ours"]]]
+    return (
+        f"{sum(judged)} of {len(judged)} limits are met, by {report['ours']}. Higher in balanced "
+        f"accuracy, of all methods and seeds: {'; '.join(above) or 'none'}."
+    )
 
 
 def _data(report: Report) -> str:
