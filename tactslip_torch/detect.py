@@ -260,7 +260,9 @@ def _num_pieces(path: Path, listener: Listener) -> int:
 
 def _reading(config: DictConfig) -> Reading:
     """What is said of files that do not say it."""
-    return stream_of({"reading": OmegaConf.to_container(config.reading, resolve=True)}).reading
+    said = config.reading
+    plain_said = OmegaConf.to_container(said, resolve=True) if OmegaConf.is_config(said) else said
+    return stream_of({"reading": plain_said}).reading
 
 
 def _origin(listener: Listener) -> dict[str, Any]:

@@ -516,6 +516,8 @@ REFUSED = {
     "infinite": (whole, ["threshold=inf"], "threshold must be a finite number, got inf"),
     "units": (in_counts, [], "a.npz is in counts, the detector was trained on V; give"),
     "clock": (of_a_slow_clock, [], "Hz, the detector of 2000 Hz; resample it"),
+    "reading": (whole, ["reading=3"], "reading must be of sample_rate_hz, time"),
+    "reading.channels": (whole, ["reading.channels=3"], "reading.channels must be a list of"),
     "tare": (whole, ["tare_s=[0,a]"], "tare_s must be [start, end] in seconds, got [0, 'a']"),
     "tare of a number": (whole, ["tare_s=0.5"], "tare_s must be [start, end] in seconds, got 0.5"),
     "nothing to tare on": (

@@ -80,6 +80,16 @@ class Opened(NamedTuple):
     sample_rate_hz: float | None = None
 
 
+def is_number(value: object) -> bool:
+    """Whether a setting is a number; ``True`` is none."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _is_column(value: object) -> bool:
+    """Whether a setting says a column, by name or number."""
+    return isinstance(value, (str, int)) and not isinstance(value, bool)
+
+
 @dataclass(frozen=True)
 class Reading:
     """How to read files that do not say it themselves; files of ours need none of it.
@@ -115,14 +125,27 @@ class Reading:
             known = ", ".join(get_args(TimeUnit))
             raise ValueError(f"reading.time_unit must be one of {known}, got {self.time_unit!r}")
         if self.channels is not None:
-            if isinstance(self.channels, str) or not self.channels:
+            is_list = isinstance(self.channels, Sequence) and not isinstance(self.channels, str)
+            if not (is_list and self.channels and all(map(_is_column, self.channels))):
                 raise ValueError(
-                    f"reading.channels must be a list of columns, got {self.channels!r}"
+                    "reading.channels must be a list of columns, by name or number, got "
+                    f"{self.channels!r}"
                 )
             object.__setattr__(self, "channels", tuple(self.channels))
             if len(set(self.channels)) < len(self.channels):
                 raise ValueError(f"reading.channels names a column twice: {list(self.channels)}")
-        if self.delimiter is not None and len(self.delimiter) != 1:
+        for name, kind, wanted in (
+            ("samples", str, "the name of a dataset, variable or topic"),
+            ("time_first", bool, "true, false"),
+        ):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise ValueError(f"reading.{name} must be {wanted} or null, got {value!r}")
+        if self.time is not None and not _is_column(self.time):
+            raise ValueError(f"reading.time must be a name, a number or null, got {self.time!r}")
+        if self.delimiter is not None and not (
+            isinstance(self.delimiter, str) and len(self.delimiter) == 1
+        ):
             raise ValueError(f"reading.delimiter must be one character, got {self.delimiter!r}")
 
 
@@ -188,8 +211,3 @@ def needs(module: str, what: str, extra: str = "formats") -> ModuleType:
             f'{what} needs {name}, which is not installed; pip install "tactslip_torch[{extra}]"'
         )
     return importlib.import_module(module)
-
-
-def is_number(value: object) -> bool:
-    """Whether a setting is a number; ``True`` is none."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool)

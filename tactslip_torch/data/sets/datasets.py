@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from tactslip_torch.data.clock import GapRule
+from tactslip_torch.data.formats.reading import is_number
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.data.sets.agreement import Part
 from tactslip_torch.data.sets.digest import file_digest
@@ -94,8 +95,15 @@ class FileRecordings:
     ) -> None:
         self.root = Path(root)
         for name, value in (("skip_s", skip_s), ("slide_s", slide_s)):
-            if not (isinstance(value, (int, float)) and value >= 0):
+            if not (is_number(value) and value >= 0):
                 raise ValueError(f"data.{name} must be seconds from 0, got {value!r}")
+        if not (reading is None or isinstance(reading, Mapping)):
+            raise ValueError(f"data.reading must be what is said of files, got {reading!r}")
+        if streams is not None and not _is_of_mappings(streams):
+            raise ValueError(
+                "data.streams must be sets of channels by name, each with a reading, channels, "
+                f"kind, adapting or units of its own, got {streams!r}"
+            )
         shared = {"channels": channels, "kind": kind, "adapting": adapting, "units": units}
         self._plan = Plan(
             self.root,
@@ -244,6 +252,10 @@ def chosen(
 def _joined(reading: Mapping[str, Any] | None, own: Mapping[str, Any]) -> dict[str, Any]:
     """What is said of all streams, and over it what is said of one."""
     return {**(reading or {}), **(own.get("reading") or {})}
+
+
+def _is_of_mappings(value: object) -> bool:
+    return isinstance(value, Mapping) and all(isinstance(one, Mapping) for one in value.values())
 
 
 def _is_simulated(one: Surveyed) -> bool:

@@ -43,7 +43,7 @@ class Treatment:
     gaps: GapRule = "refuse"
     bridge_ms: float = 10.0
     resample_hz: float | None = None
-    tare_s: Stretch | None = None
+    tare_s: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         if self.gaps not in GAP_RULES:
@@ -168,7 +168,11 @@ def recorded(
 
 
 def tare_level(
-    samples: Samples, rows: Sequence[int], rate_hz: float, tare_s: Stretch | None, path: Path
+    samples: Samples,
+    rows: Sequence[int],
+    rate_hz: float,
+    tare_s: Sequence[float] | None,
+    path: Path,
 ) -> Tensor:
     """What is taken off each channel: the mean of what is finite in a stretch.
 

@@ -6,7 +6,7 @@ Most files hold one. Where a hand has sensors of several rates, each rate is a s
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -92,8 +92,20 @@ def stream_of(own: Mapping[str, Any], name: str = "") -> Stream:
     options = [field.name for field in fields(Stream) if field.name != "name"]
     if unknown := set(given) - set(options):
         raise ValueError(f"a stream has {', '.join(options)}, got {', '.join(sorted(unknown))}")
-    channels = None if rows is None else HandLayout.from_rows(rows)
-    return Stream(name, Reading(**reading), channels, **given)
+    return Stream(name, Reading(**reading), _hand_from(rows), **given)
+
+
+def _hand_from(rows: object) -> HandLayout | None:
+    """The channels that a person gave, if any."""
+    if rows is None:
+        return None
+    listed: list[Any] = list(rows) if isinstance(rows, Iterable) else [rows]
+    if not all(isinstance(row, Mapping) for row in listed):
+        raise ValueError(
+            "data.channels must be a list of rows of name, kind, finger, segment and adapting, "
+            f"got {rows!r}"
+        )
+    return HandLayout.from_rows(listed)
 
 
 def look(path: Path, stream: Stream, stated_hz: float | None = None) -> Found:
