@@ -129,6 +129,96 @@ def test_times_that_tell_no_clock_are_refused(change, stated, said):
     assert "\n" not in str(caught.value)
 
 
-def test_a_rate_is_called_by_its_round_number():
-    measured = (1999.7, 92.31, 1e3 / 3, 0.25, 48_010.0)
-    assert [nominal_rate(rate) for rate in measured] == [2000.0, 92.0, 333.0, 0.25, 48_000.0]
+RATES = (92.31, 98.0, 101.0, 700.0, 900.0, 1000.0, 1024.0, 1300.0, 2000.0)
+UNITS = (0.0, 1e-6, 1e-3, 1e-2)
+ROUNDED = [(r, u) for r in RATES for u in UNITS if u * r <= (2.2 if u < 1e-2 else 1.2)]
+
+
+def rounded(rate, unit, left, seed):
+    """Times of ticks, from any moment on, rounded down to a unit."""
+    start = torch.rand(1, generator=torch.Generator().manual_seed(seed)).double() / 100
+    seconds = left.double() / rate + start
+    return (seconds / unit).floor() * unit if unit else seconds
+
+
+@pytest.mark.parametrize(("rate", "unit"), ROUNDED)
+@pytest.mark.parametrize("stated", [True, False])
+def test_rounded_stamps_neither_round_the_rate_nor_lose_or_invent_samples(rate, unit, stated):
+    num = int(12 * rate)
+    stamps = rounded(rate, unit, torch.arange(num), 0)
+    found = even_clock(KeptTimes(stamps), num, rate if stated else None)
+    assert (found.num_samples, found.gaps) == (num, ())
+    # least squares of evenly spread rounding: 3 sigma of the slope
+    error = 3 * unit * (num**-0.5) / 12 if unit else 1e-9
+    assert found.sample_rate_hz == pytest.approx(rate, rel=max(error, 1e-9))
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    st.sampled_from([(r, u) for r, u in ROUNDED if u * r < 0.45]),
+    st.sampled_from([0.005, 0.02, 0.05]),
+    st.integers(1, 6),
+    st.booleans(),
+    st.integers(0, 999),
+)
+def test_random_losses_are_all_found(kind, share, longest, stated, seed):
+    rate, unit = kind
+    generator = torch.Generator().manual_seed(seed)
+    is_left = torch.rand(3000, generator=generator) > share / longest
+    for place in (~is_left).nonzero().flatten().tolist():
+        length = int(torch.randint(1, longest + 1, (1,), generator=generator))
+        is_left[place : place + length] = False
+    is_left[0] = is_left[-1] = True
+    left = is_left.nonzero().flatten()
+    stamps = rounded(rate, unit, left, seed)
+    found = even_clock(KeptTimes(stamps), len(stamps), rate if stated else None)
+    missing = [tick for gap in found.gaps for tick in range(gap.start, gap.start + gap.missing)]
+    assert missing == (~is_left).nonzero().flatten().tolist()
+    assert found.sample_rate_hz == pytest.approx(rate, rel=1e-5)
+
+
+@pytest.mark.parametrize("after", [1, 2, 5, 7, 8, 9, 500, 992, 995, 998, 999])
+def test_a_pause_is_found_at_any_place(after):
+    seconds, _ = ticks(1000)
+    seconds[after:] += 1.0
+    found = even_clock(KeptTimes(seconds), 1000)
+    assert found.gaps == (Gap(after, 2000, after),)
+    assert found.jitter_s < 1e-9
+
+
+def test_many_short_gaps_between_coarse_stamps_add_up():
+    dropped = {tick + n for tick in range(200, 39_800, 390) for n in range(3)}
+    seconds, _ = ticks(40_000, dropped)
+    stamps = ((seconds + 1e-7) * 1000).floor() / 1000
+    found = even_clock(KeptTimes(stamps), len(stamps))
+    assert found.num_samples == 40_000
+    assert found.num_samples / found.sample_rate_hz == pytest.approx(20.0, abs=5e-4)
+
+
+def test_a_clock_that_drifts_loses_nothing_and_says_how_far_it_is_off():
+    num, most = 300_000, 20.0  # steps off a straight line, at the middle
+    place = torch.linspace(0, 1, num).double()
+    seconds = (torch.arange(num) + 4 * most * place * (1 - place)).double() / RATE
+    found = even_clock(KeptTimes(seconds - seconds[0]), num)
+    assert (found.num_samples, found.gaps) == (num, ())
+    assert 0.3 * most / RATE < found.jitter_s < most / RATE
+
+
+def test_times_that_come_at_random_tell_no_gaps():
+    late = torch.rand(4000, generator=torch.Generator().manual_seed(0)).double() * 4
+    seconds = (torch.arange(4000) + late).sort().values / RATE
+    with pytest.raises(ValueError, match=r"come so unevenly|steps closer than"):
+        even_clock(KeptTimes(seconds), 4000)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "ms"), (1e6, "us"), (1e9, "ns")])
+def test_times_of_another_unit_are_hinted_at(factor, unit):
+    with pytest.raises(ValueError, match=f"reading.time_unit={unit}"):
+        even_clock(KeptTimes(ticks(200)[0] * factor), 200, RATE)
+
+
+def test_a_rate_is_called_by_its_round_number_only_if_it_may_be_that():
+    measured = (1999.97, 92.31, 0.25, 1024.0, 2048.0, 1017.25, 999.0, 48_000.02)
+    said = [2000.0, 92.31, 0.25, 1024.0, 2048.0, 1017.25, 999.0, 48_000.0]
+    assert [nominal_rate(rate) for rate in measured] == said
+    assert [nominal_rate(199.6, 0.003), nominal_rate(1023.0, 0.004)] == [200.0, 1024.0]

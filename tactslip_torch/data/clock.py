@@ -1,12 +1,13 @@
 """An even clock laid through timestamps: the rate, and where samples were dropped.
 
-A sample that comes late is no gap if one of the next few makes up for it; what stays late by at
-least half a step is one. What to do with a gap is the caller's rule: refuse the file, let the
-missing samples be NaN, or draw a straight line across it.
+A sample that comes late is no gap if one of the next few makes up for it; what stays late by more
+than half a step, or than stamps are rounded, is one. What to do with a gap is the caller's rule:
+refuse the file, let the missing samples be NaN, or draw a straight line across it.
 """
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Iterator
 from typing import Literal, NamedTuple, get_args
@@ -14,16 +15,17 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
+from tactslip_torch.data.clock_step import step_of
+from tactslip_torch.data.clock_ticks import BLOCK, MAKES_UP, Ticks, settled
 from tactslip_torch.data.formats.reading import Samples, Times
 
 GapRule = Literal["refuse", "missing", "bridge"]
 GAP_RULES: tuple[str, ...] = get_args(GapRule)
-MAKES_UP = 8
-"""So many samples may pass until a late one must have been made up for."""
 _MOST_TOGETHER = 4
-_SPAN = 64
-_SHARE_ROUNDED = 0.05
 _RATE_ERR = 0.01
+_FEW_GAPS = 1e-3
+_OSCILLATOR_ERR = 1e-4  # of three digits at most are what people mean
+_FIT_ERR = 2e-6
 _PIECE = 1 << 18
 
 
@@ -67,7 +69,7 @@ class Clock(NamedTuple):
 def even_clock(
     times: Times, num_samples: int, stated_hz: float | None = None, name: str = "times"
 ) -> Clock:
-    """The clock of a file's samples, from their timestamps read once by stretches.
+    """The clock of a file's samples, from their timestamps read by stretches.
 
     Args:
         times: of the samples.
@@ -76,48 +78,74 @@ def even_clock(
         name: of the file, for errors.
 
     Raises:
-        ValueError: if times are not finite, go back, come in bursts, or contradict the rate.
+        ValueError: if times are not finite, go back, come in bursts, contradict the rate, or are
+            too coarse to tell it.
     """
     if num_samples < 3:
         raise ValueError(f"{name} has {num_samples} times, too few to tell a rate")
-    step, least = _step(times, num_samples, name)
-    if stated_hz is not None and abs(stated_hz * step - 1) > _RATE_ERR:
+    start = times.read(0, min(num_samples, _PIECE)).double()
+    start = start - start[0]
+    _refuse_bursts(_checked_steps(start, 0, name), name)
+    step = step_of(start, stated_hz)
+    if step is None:
         raise ValueError(
-            f"{name}: its times are {1 / step:.6g} Hz, but {stated_hz:g} Hz is stated; correct "
-            "it, or go without the times: reading.time=null"
+            f"{name}: its times are rounded so coarsely and so many samples are missing that they "
+            "tell no rate; state it: reading.sample_rate_hz=..."
         )
+    if stated_hz is not None and abs(stated_hz * step.seconds - 1) > _RATE_ERR:
+        raise ValueError(
+            f"{name}: its times are {1 / step.seconds:.6g} Hz, but {stated_hz:g} Hz is stated; "
+            f"{_unit_hint(stated_hz * step.seconds)}"
+            "correct it, or go without the times: reading.time=null"
+        )
+    ticks = Ticks(step, start)
+    del start
     gaps: list[Gap] = []
-    missing, jitter = 0, 0.0
-    for first, steps, seconds in _overlapping(times, num_samples, name):
-        late = seconds - step * torch.arange(len(seconds), dtype=torch.float64)
-        settled = _settled(late)
-        jitter = max(jitter, float((late - settled).abs().max()))
-        jumps = settled.diff()[steps]
-        jumps = torch.where(jumps.abs() > least, (jumps / step).round(), 0).long()
+    jitter = 0.0
+    for first, own, seconds in _blocks(times, num_samples, name):
+        before = ticks.missing
+        missing, rest, early = ticks.take(seconds, first, own)
+        if early >= 0:
+            raise ValueError(
+                f"{name}: samples {first + own.start + early} and before come 1 steps closer than "
+                f"{1 / step.seconds:.6g} Hz; remove what is there twice, or state the rate and go "
+                "without the times: reading.sample_rate_hz=..., reading.time=null"
+            )
+        jumps = missing.diff(prepend=torch.tensor([before]))
         for place in jumps.nonzero().flatten().tolist():
-            count, before = int(jumps[place]), first + place + 1
-            if count < 0:
-                raise ValueError(
-                    f"{name}: samples {before} and before come {-count} steps closer than "
-                    f"{1 / step:.6g} Hz; remove what is there twice, or state the rate and go "
-                    "without the times: reading.sample_rate_hz=..., reading.time=null"
-                )
-            gaps.append(Gap(before + missing, count, before))
-            missing += count
-    rate = stated_hz if stated_hz is not None else 1 / step
-    return Clock(rate, num_samples + missing, tuple(gaps), jitter)
+            count, at = int(jumps[place]), first + own.start + place
+            gaps.append(Gap(at + int(missing[place]) - count, count, at))
+        jitter = max(jitter, float((rest - settled(rest)).abs().max()))
+    if ticks.is_uneven and len(gaps) > num_samples * _FEW_GAPS:
+        raise ValueError(
+            f"{name}: its times come so unevenly, by up to {jitter * step.seconds:.3g} s, that "
+            "missing samples cannot be told from late ones; state the rate and go without the "
+            "times: reading.sample_rate_hz=..., reading.time=null"
+        )
+    step_s = ticks.fitted_s()
+    drift = ticks.drift(step_s)
+    rate = stated_hz if stated_hz is not None else 1 / step_s
+    jitter_s = step.seconds * max(jitter, drift if drift > 1 else 0.0)
+    return Clock(rate, num_samples + ticks.missing, tuple(gaps), jitter_s)
 
 
-def nominal_rate(measured_hz: float) -> float:
-    """The roundest rate within half a percent of a measured one.
+def nominal_rate(measured_hz: float, spread: float = 0.0) -> float:
+    """The round rate that a measured one is, as far as oscillators and fits are good; or itself.
+
+    Args:
+        measured_hz: the rate.
+        spread: by what share the rates of files that are of one rate differ from it.
 
     Example:
-        >>> nominal_rate(1999.7), nominal_rate(92.31), nominal_rate(0.5)
-        (2000.0, 92.0, 0.5)
+        >>> nominal_rate(1999.97), nominal_rate(1024.0), nominal_rate(92.31), nominal_rate(1017.25)
+        (2000.0, 1024.0, 92.31, 1017.25)
     """
-    for digits in range(6):
-        rounded = float(f"{measured_hz:.{digits}e}")
-        if abs(rounded / measured_hz - 1) <= 0.005:
+    coarse = max(_OSCILLATOR_ERR, spread)
+    candidates = [(2.0 ** round(math.log2(measured_hz)), coarse)]
+    for digits in range(7):
+        candidates.append((float(f"{measured_hz:.{digits}e}"), coarse if digits < 3 else _FIT_ERR))
+    for rounded, err in candidates:
+        if abs(rounded / measured_hz - 1) <= err:
             return rounded
     return measured_hz
 
@@ -184,15 +212,7 @@ def refuse_gaps(clock: Clock, name: str) -> None:
         )
 
 
-def _step(times: Times, num_samples: int, name: str) -> tuple[float, float]:
-    """Seconds from a sample to the next, gaps apart, and what a gap must exceed.
-
-    From at most a piece of the times. Spans of many samples, so that rounded stamps do not round
-    the rate; the mean of those near the median span, which hold no gap. Where many samples share
-    times, stamps are rounded to some unit, and up to one and a half of it nothing is a gap.
-    """
-    seconds = times.read(0, min(num_samples, _PIECE)).double()
-    steps = _checked_steps(seconds, 0, name)
+def _refuse_bursts(steps: Tensor, name: str) -> None:
     forward = steps[steps > 0]
     together = (steps < forward.median() / 4) if len(forward) else steps == 0
     if _longest_run(together) >= _MOST_TOGETHER:
@@ -201,13 +221,14 @@ def _step(times: Times, num_samples: int, name: str) -> tuple[float, float]:
             "bursts; state the rate and go without the times: reading.sample_rate_hz=..., "
             "reading.time=null"
         )
-    span = max(min(_SPAN, len(steps) // 8), 1)
-    spans = seconds[span:] - seconds[:-span]
-    typical = spans.median()
-    near = (spans - typical).abs() < 0.5 * typical / span
-    step = float(spans[near].mean()) / span
-    is_rounded = float((steps == 0).double().mean()) > _SHARE_ROUNDED
-    return step, 1.5 * float(forward.min()) if is_rounded else 0.5 * step
+
+
+def _unit_hint(off: float) -> str:
+    """What to try if a rate is off by about a unit of time."""
+    for unit, factor in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
+        if abs(off / factor - 1) <= 0.05:
+            return f"as if times were in {unit}: reading.time_unit={unit}; or "
+    return ""
 
 
 def _longest_run(flags: Tensor) -> int:
@@ -217,36 +238,23 @@ def _longest_run(flags: Tensor) -> int:
     return int((stops - starts).max()) if len(starts) else 0
 
 
-def _overlapping(times: Times, num_samples: int, name: str) -> Iterator[tuple[int, slice, Tensor]]:
-    """Times in pieces: number of the first own one, which steps are the piece's own, the times.
+def _blocks(times: Times, num_samples: int, name: str) -> Iterator[tuple[int, slice, Tensor]]:
+    """Times by blocks: number of the first time, which are the block's own, times from the first.
 
     On both sides of its own are those that may make up for a late or an early one.
     """
     margin = 2 * MAKES_UP
-    for first in range(0, num_samples - 1, _PIECE):
-        low = max(first - margin, 0)
-        own = min(_PIECE, num_samples - 1 - first)
-        seconds = times.read(low, min(first + own + margin, num_samples)).double()
+    start_s = times.read(0, 1).double()
+    for piece in range(0, num_samples, _PIECE):
+        low = max(piece - margin, 0)
+        stop = min(piece + _PIECE, num_samples)
+        seconds = times.read(low, min(stop + margin, num_samples)).double()
         _checked_steps(seconds, low, name)
-        yield first, slice(first - low, first - low + own), seconds
-
-
-def _settled(late: Tensor) -> Tensor:
-    """Lateness without what is made up for in time: late samples first, then early ones.
-
-    A morphological opening and closing, which leave steps that last where they are.
-    """
-    opened = -_most(-late, behind=False)
-    opened = _most(opened, behind=True)
-    closed = _most(opened, behind=False)
-    return -_most(-closed, behind=True)
-
-
-def _most(values: Tensor, *, behind: bool) -> Tensor:
-    """The most of each value and the next few, or the few behind it."""
-    reach = MAKES_UP - 1
-    ends = (values[:1].expand(reach), values) if behind else (values, values[-1:].expand(reach))
-    return torch.cat(ends).unfold(0, MAKES_UP, 1).amax(-1)
+        seconds = seconds - start_s
+        for first in range(piece, stop, BLOCK):
+            near = max(first - margin, 0)
+            own = slice(first - near, min(first + BLOCK, stop) - near)
+            yield near, own, seconds[near - low : near - low + own.stop + margin]
 
 
 def _checked_steps(seconds: Tensor, first: int, name: str) -> Tensor:

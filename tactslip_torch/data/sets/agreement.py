@@ -85,7 +85,10 @@ def _rates(founds: Sequence[Found]) -> list[float]:
     stated = [found.clock.sample_rate_hz for found in founds if not found.is_measured]
     if not measured:
         return stated
-    common = Counter(stated).most_common(1)[0][0] if stated else nominal_rate(median(measured))
+    middle = median(measured)
+    apart = [abs(own / middle - 1) for own in measured]
+    spread = max((share for share in apart if share <= RATE_ERROR), default=0.0)
+    common = Counter(stated).most_common(1)[0][0] if stated else nominal_rate(middle, spread)
     rates = []
     for found in founds:
         own = found.clock.sample_rate_hz
