@@ -195,6 +195,25 @@ def test_many_short_gaps_between_coarse_stamps_add_up():
     assert found.num_samples / found.sample_rate_hz == pytest.approx(20.0, abs=5e-4)
 
 
+@pytest.mark.parametrize("rate", [700.0, 900.0, 1300.0, 2000.0])
+@pytest.mark.parametrize("share", [0.005, 0.02, 0.05])
+def test_losses_between_stamps_as_coarse_as_steps_shift_the_end_by_a_stamp_at_most(rate, share):
+    num = int(12 * rate)
+    is_left = torch.rand(num, generator=torch.Generator().manual_seed(1)) > share
+    is_left[0] = is_left[-1] = True
+    stamps = rounded(rate, 1e-3, is_left.nonzero().flatten(), 1)
+    found = even_clock(KeptTimes(stamps), len(stamps))
+    assert abs(found.num_samples - num) <= max(1, 1e-3 * rate)
+    assert found.sample_rate_hz == pytest.approx(rate, rel=1e-5)
+
+
+def test_coarse_stamps_and_losses_that_leave_the_rate_open_are_refused():
+    is_left = torch.rand(12_288, generator=torch.Generator().manual_seed(1)) > 0.005
+    stamps = rounded(1024.0, 1e-3, is_left.nonzero().flatten(), 1)
+    with pytest.raises(ValueError, match=r"they tell no rate; state it: reading\.sample_rate_hz"):
+        even_clock(KeptTimes(stamps), len(stamps))
+
+
 def test_a_clock_that_drifts_loses_nothing_and_says_how_far_it_is_off():
     num, most = 300_000, 20.0  # steps off a straight line, at the middle
     place = torch.linspace(0, 1, num).double()

@@ -106,10 +106,11 @@ def even_clock(
         before = ticks.missing
         missing, rest, early = ticks.take(seconds, first, own)
         if early >= 0:
+            coarse = "its stamps may be too coarse for its losses: " if step.is_coarse else ""
             raise ValueError(
                 f"{name}: samples {first + own.start + early} and before come 1 steps closer than "
-                f"{1 / step.seconds:.6g} Hz; remove what is there twice, or state the rate and go "
-                "without the times: reading.sample_rate_hz=..., reading.time=null"
+                f"{1 / step.seconds:.6g} Hz; {coarse}remove what is there twice, or state the rate "
+                "and go without the times: reading.sample_rate_hz=..., reading.time=null"
             )
         jumps = missing.diff(prepend=torch.tensor([before]))
         for place in jumps.nonzero().flatten().tolist():
