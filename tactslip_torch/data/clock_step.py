@@ -15,7 +15,8 @@ _MOST_SEEN = 8192
 _NEAR, _TURNS, _FEWEST = 0.7, 4, 4  # spans without a gap: how near, found how often, how many
 _SAME = 1e-5  # differences of stamps that are this near, by their median, are one
 WINDOW = 64
-_BEAT, _FEWEST_BEATS = 0.06, 5
+"""Samples over which neighbours are compared."""
+_BEAT, _FEWEST_BEATS = 0.06, 5  # stamps that near to a step slip against it, seen so often
 _OTHER = 1e-4  # by so much the stated rate is not that of the stamps
 _PEAK = 4.0  # a periodic component must exceed chance by so much
 

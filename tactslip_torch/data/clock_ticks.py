@@ -16,9 +16,9 @@ MAKES_UP = 8
 """So many samples may pass until a late one must have been made up for."""
 BLOCK = 1024
 """Samples after which the phase is told anew."""
-_BLOCKS = 8
+_BLOCKS = 8  # the phase is expected on a line through that of so many blocks
 _BEATS = 0.06  # stamps that are so near to whole steps shift against them slowly
-_LEAST_EVEN = 0.3
+_LEAST_EVEN = 0.3  # the mean resultant length of phases, below which they say nothing
 _SLACK = 0.05  # steps, where stamps are as coarse as steps
 
 
