@@ -84,7 +84,7 @@ class Ticks:
         """The step by least squares of all times against their ticks."""
         num, tick, late, tick2, both = self._sums.tolist()
         spread = tick2 - tick * tick / num
-        return self.step.seconds * (1 + (both - tick * late / num) / spread)
+        return float(self.step.seconds * (1 + (both - tick * late / num) / spread))
 
     @property
     def is_uneven(self) -> bool:
