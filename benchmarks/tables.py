@@ -88,3 +88,14 @@ def number(value: float, digits: int = 3) -> str:
     if abs(value) >= 10**digits:
         return f"{value:,.0f}"
     return f"{value:.{digits}g}"
+
+
+def limits_last(by_title: Mapping[str, Sequence[Table]], *, titled: bool = False) -> list[str]:
+    """Tables as text, each under its title if ``titled``; those of ``"Limits"`` last, without."""
+    others = {title: of for title, of in by_title.items() if title != "Limits"}
+    texts = [
+        f"{title}\n{table.text()}" if titled else table.text()
+        for title, of in others.items()
+        for table in of
+    ]
+    return [*texts, *(table.text() for table in by_title["Limits"])]

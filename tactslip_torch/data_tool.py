@@ -19,8 +19,9 @@ from omegaconf import DictConfig
 
 import tactslip_torch
 from tactslip_torch.config import conf_dir, errors_in_one_line, fail, one_line, run_entry_point
+from tactslip_torch.data.folder import Written, write_manifest
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.sets.conversion import Conversion, Converted
+from tactslip_torch.data.sets.conversion import Conversion
 from tactslip_torch.data.sets.datasets import FileRecordings
 from tactslip_torch.data.sets.inspection import Inspected, inspected, oddities
 from tactslip_torch.data.sets.manifest_lines import Problem
@@ -93,7 +94,7 @@ def summary(config: DictConfig) -> list[Trial]:
     return trials
 
 
-def convert(config: DictConfig) -> list[Converted]:
+def convert(config: DictConfig) -> list[Written]:
     """Write a set in another format; what was written or found finished.
 
     Raises:
@@ -110,7 +111,7 @@ def convert(config: DictConfig) -> list[Converted]:
     job = Conversion(source, Path(str(config.output)), str(config.to), version)
     job.check()
 
-    def one(recording: RecordingId) -> Converted | str:
+    def one(recording: RecordingId) -> Written | str:
         try:
             return job.convert(recording)
         except (ValueError, OSError) as error:
@@ -124,13 +125,13 @@ def convert(config: DictConfig) -> list[Converted]:
             ) from error
 
     found = list(in_processes(one, source.ids, "converting", "recording", config.num_workers))
-    done = [each for each in found if isinstance(each, Converted)]
+    done = [each for each in found if isinstance(each, Written)]
     failed = [*map(str, source.problems), *(each for each in found if isinstance(each, str))]
     for what in failed:
         print(f"left out: {what}")
     if not done:
         raise ValueError(f"no recording could be converted, first: {failed[0]}")
-    job.write_manifest(done)
+    write_manifest(job.folder, done)
     print("\n" + _converted_table(done, failed, time.perf_counter() - started))
     print(f"\nrecordings in {job.folder}")
     return done
@@ -233,7 +234,7 @@ def _example(source: FileRecordings) -> Example:
     )
 
 
-def _converted_table(done: Sequence[Converted], failed: Sequence[str], seconds: float) -> str:
+def _converted_table(done: Sequence[Written], failed: Sequence[str], seconds: float) -> str:
     cells = [
         str(len(done)),
         str(sum(one.made for one in done)),

@@ -30,7 +30,7 @@ from tactslip_torch.config import (
     folder_problem,
     run_entry_point,
 )
-from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written
+from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written, write_manifest
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.experiment import frame_lengths, save_config
 from tactslip_torch.features.cache import source_digest
@@ -74,7 +74,7 @@ def generate(config: DictConfig, folder: Path) -> list[Written]:
     save_config(config, folder)
     (folder / MANIFEST).unlink(missing_ok=True)  # it must not speak of files that are replaced
     written = list(in_processes(files.write, source.ids, "recordings", "recording", count))
-    files.write_manifest(written)
+    write_manifest(folder, written)
     seconds = time.perf_counter() - started
     for scene in bar(shown, "figures", "scene") if shown else ():
         _draw(files, shown[scene], smooth, scene, config.stroke)

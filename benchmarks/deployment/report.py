@@ -15,7 +15,7 @@ from benchmarks.engines import FLOAT32
 from benchmarks.outcome import heading
 from benchmarks.rates import NOT_MEASURED, at_least, information, not_measured, rate
 from benchmarks.selection import source_text
-from benchmarks.tables import Spread, Table, limits, number
+from benchmarks.tables import Spread, Table, limits, limits_last, number
 
 SECTIONS = ("single", "bulk", "errors", "stream", "files", "starts")
 TIMES_NAIVE, TIMES_LOOP = 4.0, 300.0  # p50 of one bin on one thread
@@ -129,10 +129,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     Args:
         report: as ``--json`` keeps it.
     """
-    by_title = tables(report)
-    last = by_title.pop("Limits")
-    parts = [f"{title}\n{table.text()}" for title, of in by_title.items() for table in of]
-    return heading(report, about(report), [*parts, *(table.text() for table in last)])
+    return heading(report, about(report), limits_last(tables(report), titled=True))
 
 
 def about(report: Mapping[str, Any]) -> str:

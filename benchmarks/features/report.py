@@ -9,7 +9,7 @@ from benchmarks.features.guards import report as guards
 from benchmarks.features.guards.measure import SECTIONS as GUARDED
 from benchmarks.features.pool_report import fractions, limit_rows, pool_tables, roofline_tables
 from benchmarks.outcome import heading
-from benchmarks.tables import Table, limits
+from benchmarks.tables import Table, limits, limits_last
 
 ABOUT = "features and scores"
 
@@ -48,8 +48,5 @@ def report_text(report: Mapping[str, Any]) -> str:
     Args:
         report: as ``--json`` keeps it.
     """
-    by_title = tables(report)
-    last = by_title.pop("Limits")
-    parts = [table.text() for of in by_title.values() for table in of]
     replaced = "guards off replaces " + ", ".join(report["replaced"])
-    return heading(report, ABOUT, [*parts, *(table.text() for table in last), replaced])
+    return heading(report, ABOUT, [*limits_last(tables(report)), replaced])

@@ -9,7 +9,7 @@ from benchmarks.clocks import paired_ratio
 from benchmarks.formats.measure import LOAD, PEER, SAVE, STREAM
 from benchmarks.outcome import heading
 from benchmarks.rates import not_measured
-from benchmarks.tables import Spread, Table, limits, number
+from benchmarks.tables import Spread, Table, limits, limits_last, number
 
 MOST_S = 0.1
 LIMITED = ("npz", "hdf5", "mcap")
@@ -54,10 +54,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     Args:
         report: as ``--json`` keeps it.
     """
-    by_title = tables(report)
-    last = by_title.pop("Limits")
-    parts = [table.text() for of in by_title.values() for table in of]
-    return heading(report, about(report), [*parts, *(table.text() for table in last)])
+    return heading(report, about(report), limits_last(tables(report)))
 
 
 def about(report: Mapping[str, Any]) -> str:

@@ -12,7 +12,7 @@ from benchmarks.latency.ways import LOOP, PRUNED_LOOP
 from benchmarks.outcome import heading
 from benchmarks.rates import NOT_MEASURED, at_least, information
 from benchmarks.selection import source_text
-from benchmarks.tables import Spread, Table, limits, number
+from benchmarks.tables import Spread, Table, limits, limits_last, number
 
 TIMES_THE_LOOP = 200.0  # p50 of the eager engine and the quadratic head
 Rows = Sequence[Mapping[str, Any]]
@@ -70,10 +70,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     Args:
         report: as ``--json`` keeps it.
     """
-    by_title = tables(report)
-    last = by_title.pop("Limits")
-    parts = [table.text() for of in by_title.values() for table in of]
-    return heading(report, about(report), [*parts, *(table.text() for table in last)])
+    return heading(report, about(report), limits_last(tables(report)))
 
 
 def about(report: Mapping[str, Any]) -> str:

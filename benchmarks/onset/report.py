@@ -8,7 +8,7 @@ from typing import Any
 from benchmarks.onset.front import JUDGED, compute
 from benchmarks.outcome import heading
 from benchmarks.rates import information
-from benchmarks.tables import Table, limits, number
+from benchmarks.tables import Table, limits, limits_last, number
 from tactslip_torch.alarming.stage import FIRST_TRANSITION, OURS
 
 SECTIONS = ("trained", "front", "rivals")
@@ -80,10 +80,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     Args:
         report: as ``--json`` keeps it.
     """
-    by_title = tables(report)
-    last = by_title.pop("Limits")
-    shown = [f"{title}\n{table.text()}" for title, of in by_title.items() for table in of]
-    return heading(report, about(report), [*shown, *(table.text() for table in last)])
+    return heading(report, about(report), limits_last(tables(report), titled=True))
 
 
 def about(report: Mapping[str, Any]) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.outcome import heading
 from benchmarks.rates import NOT_MEASURED, information, not_measured
-from benchmarks.tables import Table, limits, number
+from benchmarks.tables import Table, limits, limits_last, number
 
 SECTIONS = ("cost", "errors", "accuracy", "parts", "needed")
 
@@ -151,10 +151,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     Args:
         report: as ``--json`` keeps it.
     """
-    by_title = tables(report)
-    last = by_title.pop("Limits")
-    shown = [table.text() for of in by_title.values() for table in of]
-    return heading(report, about(report), [*shown, *(table.text() for table in last)])
+    return heading(report, about(report), limits_last(tables(report)))
 
 
 def about(report: Mapping[str, Any]) -> str:

@@ -14,7 +14,7 @@ from benchmarks.selection import source_text
 from benchmarks.streaming.measure import NAIVE, STREAM
 from benchmarks.streaming.sizes import CHUNK, HOP
 from benchmarks.streaming.ways import RATE_HZ
-from benchmarks.tables import Spread, Table, limits, number
+from benchmarks.tables import Spread, Table, limits, limits_last, number
 
 TIMES_REAL_TIME = 50.0
 GROWTH_MIB = 1.0  # of resident memory from the settled stream to the end of the hour
@@ -107,10 +107,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     Args:
         report: as ``--json`` keeps it.
     """
-    by_title = tables(report)
-    last = by_title.pop("Limits")
-    parts = [f"{title}\n{table.text()}" for title, of in by_title.items() for table in of]
-    return heading(report, about(report), [*parts, *(table.text() for table in last)])
+    return heading(report, about(report), limits_last(tables(report), titled=True))
 
 
 def about(report: Mapping[str, Any]) -> str:

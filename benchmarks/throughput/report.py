@@ -10,7 +10,7 @@ from benchmarks.exported import ORT
 from benchmarks.outcome import heading
 from benchmarks.rates import at_least, not_measured, rate
 from benchmarks.selection import source_text
-from benchmarks.tables import Spread, Table, limits, number
+from benchmarks.tables import Spread, Table, limits, limits_last, number
 from benchmarks.throughput.measure import FILTERED, RAW, held_bytes
 from benchmarks.throughput.worker import IN_ONE_PIECE
 
@@ -87,10 +87,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     Args:
         report: as ``--json`` keeps it.
     """
-    by_title = tables(report)
-    last = by_title.pop("Limits")
-    parts = [table.text() for of in by_title.values() for table in of]
-    return heading(report, about(report), [*parts, *(table.text() for table in last)])
+    return heading(report, about(report), limits_last(tables(report)))
 
 
 def about(report: Mapping[str, Any]) -> str:

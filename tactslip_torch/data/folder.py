@@ -81,12 +81,54 @@ def has_truth(recording: Recording) -> bool:
 
 
 class Written(NamedTuple):
-    """A recording that has its file: its line of the manifest, and what that took."""
+    """A recording that has its file.
+
+    Args:
+        line: of the manifest.
+        made: whether it was made now, or found finished.
+        duration_s: of the recording.
+        num_bytes: of the file.
+    """
 
     line: dict[str, Any]
     made: bool
     duration_s: float
     num_bytes: int
+
+
+def as_kept(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Facts as JSON gives them back, to be held against the key in a file."""
+    plain: dict[str, Any] = json.loads(json.dumps(facts, allow_nan=False))
+    return plain
+
+
+def refuse_to_replace(path: Path, form: Format, given: str) -> None:
+    """Raise if there is a file that is not ours.
+
+    Args:
+        path: of the file that is to be written.
+        form: its format.
+        given: what else could be given, such as ``"folder"``.
+
+    Raises:
+        ValueError: naming it.
+    """
+    if path.exists():
+        try:
+            form.key(path)
+        except ValueError as error:
+            raise ValueError(f"{error}; move it away, or give another {given}") from error
+
+
+def write_manifest(folder: Path, written: Sequence[Written]) -> None:
+    """Write the lines of recordings to ``manifest.csv``, whole or not at all."""
+    with (
+        whole_file(folder / MANIFEST) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
+        table = csv.DictWriter(file, list(written[0].line), lineterminator="\n")
+        table.writeheader()
+        table.writerows(one.line for one in written)
 
 
 @dataclass(frozen=True)
@@ -123,9 +165,7 @@ class RecordingFolder:
 
     def key(self, recording: RecordingId) -> dict[str, Any]:
         """What determines the recording's file, as JSON gives it back."""
-        facts = {"recording": dict(self.source.key(recording)), **self.made_by}
-        plain: dict[str, Any] = json.loads(json.dumps(facts, allow_nan=False))
-        return plain
+        return as_kept({"recording": dict(self.source.key(recording)), **self.made_by})
 
     def check(self) -> None:
         """Refuse names that files cannot have, and to replace a file that is not ours.
@@ -141,11 +181,8 @@ class RecordingFolder:
                 raise ValueError(f"{path.name!r} cannot name a file; give the scene another name")
         if len(set(paths)) < len(paths):
             raise ValueError("two recordings would have one file; give a scene another name")
-        for path in filter(Path.exists, paths):
-            try:
-                self.format.key(path)
-            except ValueError as error:
-                raise ValueError(f"{error}; move it away, or give another folder") from error
+        for path in paths:
+            refuse_to_replace(path, self.format, "folder")
 
     def load(self, recording: RecordingId) -> Archived:
         """What the recording's file holds.
@@ -166,16 +203,6 @@ class RecordingFolder:
             self.format.save(path, content, self.source.hand, key)
         line = manifest_line(path.name, recording, content)
         return Written(line, made, content.duration_s, path.stat().st_size)
-
-    def write_manifest(self, written: Sequence[Written]) -> None:
-        """Write the lines of recordings to ``manifest.csv``, whole or not at all."""
-        with (
-            whole_file(self.folder / MANIFEST) as temporary,
-            temporary.open("w", newline="", encoding="utf-8") as file,
-        ):
-            table = csv.DictWriter(file, list(written[0].line), lineterminator="\n")
-            table.writeheader()
-            table.writerows(one.line for one in written)
 
     def _found(self, recording: RecordingId, key: Mapping[str, Any]) -> Recording | None:
         try:

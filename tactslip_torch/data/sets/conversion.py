@@ -2,35 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from tactslip_torch.data.folder import MANIFEST
+from tactslip_torch.data.folder import Written, as_kept, refuse_to_replace
 from tactslip_torch.data.formats.registry import Format, named_format
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.sets.datasets import FileRecordings
 from tactslip_torch.data.sets.truth import MOMENTS, STRETCHES
-from tactslip_torch.files import whole_file
-
-
-class Converted(NamedTuple):
-    """A recording that has its file.
-
-    Args:
-        line: of the manifest.
-        made: whether it was made now, or found finished.
-        duration_s: of the recording.
-        num_bytes: of the file.
-    """
-
-    line: dict[str, Any]
-    made: bool
-    duration_s: float
-    num_bytes: int
 
 
 @dataclass(frozen=True)
@@ -79,8 +60,7 @@ class Conversion:
             "units": self.source.units,
             "made_by": self.made_by,
         }
-        plain: dict[str, Any] = json.loads(json.dumps(facts, allow_nan=False))
-        return plain
+        return as_kept(facts)
 
     def check(self) -> None:
         """Refuse to write over the recordings themselves, or over what is not ours.
@@ -99,13 +79,9 @@ class Conversion:
                     f"{first[path]} and {file} would both become {path.name}; rename one of them"
                 )
             first[path] = file
-            if path.exists():
-                try:
-                    self.format.key(path)
-                except ValueError as error:
-                    raise ValueError(f"{error}; move it away, or give another output") from error
+            refuse_to_replace(path, self.format, "output")
 
-    def convert(self, recording: RecordingId) -> Converted:
+    def convert(self, recording: RecordingId) -> Written:
         """Write the file of a recording, unless it is there and of the same key.
 
         Raises:
@@ -117,22 +93,12 @@ class Conversion:
             path.parent.mkdir(parents=True, exist_ok=True)
             self.format.save(path, self.source.load(recording), self.source.hand, key)
         inner = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
-        return Converted(
+        return Written(
             self._line(path, recording),
             made,
             self.source.timeline(recording).duration_s,
             sum(file.stat().st_size for file in inner),
         )
-
-    def write_manifest(self, converted: Sequence[Converted]) -> None:
-        """Write the lines of recordings, whole or not at all."""
-        with (
-            whole_file(self.folder / MANIFEST) as temporary,
-            temporary.open("w", newline="", encoding="utf-8") as file,
-        ):
-            table = csv.DictWriter(file, list(converted[0].line), lineterminator="\n")
-            table.writeheader()
-            table.writerows(one.line for one in converted)
 
     def _line(self, path: Path, recording: RecordingId) -> dict[str, Any]:
         """A recording's line of the manifest; of what there may be several it holds a JSON list."""

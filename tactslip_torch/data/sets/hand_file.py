@@ -15,7 +15,7 @@ from tactslip_torch.data.formats.header import Archived
 from tactslip_torch.data.formats.reading import Reading, Samples
 from tactslip_torch.data.formats.registry import open_file
 from tactslip_torch.data.sets.sampling import tare_level, tare_of
-from tactslip_torch.data.sets.stream import Stream, hand_of, look
+from tactslip_torch.data.sets.stream import Found, Stream, hand_of, look_at
 from tactslip_torch.hand import HandLayout
 
 _RATE_ERR = 0.001  # of a measured rate, as what is told in seconds errs; a stated one has none
@@ -58,11 +58,27 @@ def hand_file(
         ValueError: if it is damaged, of another hand, rate or unit, or nobody says its rate.
     """
     tare = tare_of(tare_s, "tare_s")
+    stream = Stream(reading=reading, channels=hand)
     with open_file(path, reading) as opened:
         if opened.archived is not None or (opened.names is None and reading.channels is None):
             refuse_other_channels(path, opened, hand.to_rows())
-    stream = Stream(reading=reading, channels=hand)
-    found = look(path, stream)
+        found = look_at(opened, path, stream)
+        _refuse_others(path, found, sample_rate_hz, units)
+        try:
+            _, rows = hand_of(found, stream)
+        except ValueError as error:
+            raise ValueError(f"{path} {error}") from None
+        samples: Samples = opened.samples
+        if found.clock.gaps:
+            samples = EvenSamples(samples, found.clock)
+        if rows != list(range(samples.num_channels)) or tare is not None:
+            level = tare_level(samples, rows, sample_rate_hz, tare, path)
+            samples = _Chosen(samples, rows, level)
+        yield HandFile(samples, opened.archived)
+
+
+def _refuse_others(path: Path, found: Found, sample_rate_hz: float, units: str) -> None:
+    """Raise for another rate or unit than is wanted."""
     rate = found.clock.sample_rate_hz
     if rate != sample_rate_hz and not (
         found.is_measured and abs(rate / sample_rate_hz - 1) <= _RATE_ERR
@@ -75,18 +91,6 @@ def hand_file(
             f"{path} is in {found.units}, the detector was trained on {units}; give it recordings "
             f"in {units}, or train one on {found.units}"
         )
-    try:
-        _, rows = hand_of(found, stream)
-    except ValueError as error:
-        raise ValueError(f"{path} {error}") from None
-    with open_file(path, reading) as opened:
-        samples: Samples = opened.samples
-        if found.clock.gaps:
-            samples = EvenSamples(samples, found.clock)
-        if rows != list(range(samples.num_channels)) or tare is not None:
-            level = tare_level(samples, rows, sample_rate_hz, tare, path)
-            samples = _Chosen(samples, rows, level)
-        yield HandFile(samples, opened.archived)
 
 
 class _Chosen:

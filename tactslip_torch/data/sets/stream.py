@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 
 from tactslip_torch.data.clock import Clock, even_clock
-from tactslip_torch.data.formats.reading import AS_IT_SAYS, Reading
+from tactslip_torch.data.formats.reading import AS_IT_SAYS, Opened, Reading
 from tactslip_torch.data.formats.registry import open_file
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.data.sets.truth import Truth
@@ -122,35 +122,44 @@ def look(path: Path, stream: Stream, stated_hz: float | None = None) -> Found:
             its rate.
     """
     with open_file(path, stream.reading) as opened:
-        samples, archived = opened.samples, opened.archived
-        num = samples.num_samples
-        if not num:
-            raise ValueError(f"{path} holds no samples")
-        if archived:
-            recording = archived.recording
-            return Found(
-                Clock(recording.sample_rate_hz, num),
-                False,
-                samples.num_channels,
-                samples.dtype,
-                archived.hand.names,
-                archived.hand,
-                recording.units,
-                _truth(recording),
-                recording.material,
-                recording.provenance,
-            )
-        stated = stated_hz or opened.sample_rate_hz or stream.reading.sample_rate_hz
-        if opened.times is not None:
-            clock = even_clock(opened.times, num, stated, str(path))
-        elif stated is not None:
-            clock = Clock(stated, num)
-        else:
-            raise ValueError(
-                f"{path} says no rate and has no times; give reading.sample_rate_hz=..., or name "
-                "the column of times as reading.time=..."
-            )
-        return Found(clock, stated is None, samples.num_channels, samples.dtype, opened.names)
+        return look_at(opened, path, stream, stated_hz)
+
+
+def look_at(opened: Opened, path: Path, stream: Stream, stated_hz: float | None = None) -> Found:
+    """``look`` at a file that is open.
+
+    Raises:
+        ValueError: as ``look``.
+    """
+    samples, archived = opened.samples, opened.archived
+    num = samples.num_samples
+    if not num:
+        raise ValueError(f"{path} holds no samples")
+    if archived:
+        recording = archived.recording
+        return Found(
+            Clock(recording.sample_rate_hz, num),
+            False,
+            samples.num_channels,
+            samples.dtype,
+            archived.hand.names,
+            archived.hand,
+            recording.units,
+            _truth(recording),
+            recording.material,
+            recording.provenance,
+        )
+    stated = stated_hz or opened.sample_rate_hz or stream.reading.sample_rate_hz
+    if opened.times is not None:
+        clock = even_clock(opened.times, num, stated, str(path))
+    elif stated is not None:
+        clock = Clock(stated, num)
+    else:
+        raise ValueError(
+            f"{path} says no rate and has no times; give reading.sample_rate_hz=..., or name "
+            "the column of times as reading.time=..."
+        )
+    return Found(clock, stated is None, samples.num_channels, samples.dtype, opened.names)
 
 
 def hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
