@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tactslip_torch.model import downdate, held_out
+from tactslip_torch.model import downdate, held_out, left_out
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.held_out import HeldOut
 from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, RadialBasis
@@ -81,8 +81,9 @@ def primal(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 def tiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tiles and chunks as they are, and so small that groups and chunks take several."""
     if request.param:
-        monkeypatch.setattr(held_out, "_TILE", request.param)
-        monkeypatch.setattr(held_out, "_CHUNK", 3 * request.param - 1)
+        monkeypatch.setattr(held_out, "TILE", request.param)
+        monkeypatch.setattr(left_out, "TILE", request.param)
+        monkeypatch.setattr(left_out, "_CHUNK", 3 * request.param - 1)
 
 
 # Scores --------------------------------------------------------------------------------------

@@ -13,29 +13,32 @@ Reference:
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.model.cholesky import cholesky_, cholesky_solve, forward_solve
+from tactslip_torch.model.cholesky import forward_solve
 from tactslip_torch.model.downdate import Monomials, residuals_by_block, residuals_by_iteration
 from tactslip_torch.model.fit import Route, TrainingBins, takes_dual
-from tactslip_torch.model.kernel_elm import solve_kernel_elm_, solve_normal_equations_
+from tactslip_torch.model.kernel_elm import solve_normal_equations_
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, lower_gram
+from tactslip_torch.model.left_out import (
+    MOST_CONDITION,
+    TILE,
+    Groups,
+    check_penalty,
+    chunks_of,
+    leave_out_,
+    order_groups,
+    products_within,
+)
 from tactslip_torch.model.quadratic import QuadraticForm, collapse
 from tactslip_torch.threads import for_each
 
-MOST_CONDITION = 1e10  # of all bins; above, the scores of a group left out lose their digits
-_TILE = 256  # bins whose columns one thread solves at a time
-_CHUNK = 1024  # bins in whole groups that are treated together, unless one group is larger
 _ITERATIONS = 60  # that conjugate gradients usually take
 _WAIT = 30  # groups whose triangular solves take as long as reading a factor does
-
-Groups = Sequence[tuple[int, int]]  # name and number of bins of each
 
 
 class HeldOutFit(NamedTuple):
@@ -78,12 +81,7 @@ class HeldOut:
         route: Route = "auto",
     ) -> None:
         bins = bins.double()
-        _check_bins(bins, groups)
-        names, member, counts = torch.unique(groups, return_inverse=True, return_counts=True)
-        _check_groups(names, member, bins.is_slip)
-        rank = counts.argsort(stable=True)  # large groups last: the later, the cheaper
-        order = rank.argsort()[member].argsort(stable=True)
-        self._groups = list(zip(names[rank].tolist(), counts[rank].tolist(), strict=True))
+        order, self._groups = order_groups(groups, bins.is_slip)
         self._order, self._kernel = order, kernel
         self._z, self._targets = bins.features[order], bins.targets[order]
         weights = torch.ones_like(bins.targets) if bins.weights is None else bins.weights
@@ -106,11 +104,7 @@ class HeldOut:
             ValueError: if the penalty is not that, the condition is above ``MOST_CONDITION``, or
                 the machine without a group (named) cannot be told in float64.
         """
-        if not 0 < penalty < math.inf:
-            raise ValueError(
-                f"held-out scores in closed form need a positive and finite penalty (the paper's "
-                f"C), got {penalty}; refit without each group for another"
-            )
+        check_penalty(penalty)
         if self._monomials is None:
             head, residuals = self._dual(penalty)
         else:
@@ -120,24 +114,13 @@ class HeldOut:
         return HeldOutFit(head, scores)
 
     def _dual(self, penalty: float) -> tuple[QuadraticForm | KernelSum, Tensor]:
-        factor, targets = self._system.clone(), self._targets
-        beta, report = solve_kernel_elm_(
-            factor, targets, penalty, self._weights, most_condition=MOST_CONDITION
+        left_out = leave_out_(
+            self._system.clone(), self._targets, penalty, self._weights, self._groups
         )
-        residuals = torch.empty_like(beta)
-        for groups, part in _chunks(self._groups):
-            if len(groups) == 1 and part.stop == len(beta):  # the last group's answer is in L
-                before = targets[: part.start, None]
-                known = forward_solve(factor[: part.start, : part.start], before)
-                residuals[part] = targets[part] - (factor[part, : part.start] @ known)[:, 0]
-            else:
-                inverse = _inverse_within(factor, part, groups)
-                cholesky_(inverse)
-                residuals[part] = cholesky_solve(inverse, beta[part])
         fold = collapse if self._kernel.collapses else KernelSum
-        head = fold(self._z, beta, self._kernel)
-        head.solved = report
-        return head, residuals
+        head = fold(self._z, left_out.beta, self._kernel)
+        head.solved = left_out.report
+        return head, left_out.residuals
 
     def _primal(self, penalty: float, monomials: Monomials) -> tuple[QuadraticForm, Tensor]:
         factor, z = self._system.clone(), self._z
@@ -151,7 +134,7 @@ class HeldOut:
         right = roots * (self._targets - head(z))
         solved = torch.empty_like(right)
         small = _num_small(self._groups, monomials.number)
-        for groups, part in _chunks(self._groups[:small]):
+        for groups, part in chunks_of(self._groups[:small]):
             left = _left_within(factor, monomials, z[part], roots[part], groups)
             solved[part] = residuals_by_block(left, right[part], groups)
         if small < len(self._groups):
@@ -189,38 +172,6 @@ def _num_small(groups: Groups, num_monomials: int) -> int:
     return len(groups) - (len(large) if sum(large) > _ITERATIONS * 2 * _WAIT else 0)
 
 
-def _chunks(groups: Groups) -> Iterator[tuple[Groups, slice]]:
-    """Whole groups and their bins: as many as fit a chunk, at least one."""
-    first = start = width = 0
-    for last, (_, size) in enumerate(groups):
-        if last > first and width + size > _CHUNK:
-            yield groups[first:last], slice(start, start + width)
-            first, start, width = last, start + width, 0
-        width += size
-    if width:
-        yield groups[first:], slice(start, start + width)
-
-
-def _inverse_within(factor: Tensor, part: slice, groups: Groups) -> Tensor:
-    """``(L L')^-1`` between bins of one group, 0 across groups; lower triangle.
-
-    From columns of ``L^-1``, which are 0 above the diagonal, so ``L`` is read from there on.
-
-    Shape:
-        - factor: ``[N, N]``; output: ``[n, n]`` for the n bins of ``part``
-    """
-    columns = factor.new_zeros(part.stop - part.start, len(factor) - part.start)  # one a row
-
-    def fill(start: int) -> None:
-        stop, shift = min(start + _TILE, part.stop), part.start
-        ones = factor.new_zeros(len(factor) - start, stop - start).fill_diagonal_(1)
-        solved = forward_solve(factor[start:, start:], ones)
-        columns[start - shift : stop - shift, start - shift :] = solved.mT
-
-    for_each(fill, range(part.start, part.stop, _TILE))
-    return _products_within(columns, groups, triangular=True)
-
-
 def _left_within(
     factor: Tensor, monomials: Monomials, z: Tensor, roots: Tensor, groups: Groups
 ) -> Tensor:
@@ -232,63 +183,11 @@ def _left_within(
     columns = factor.new_empty(len(z), len(factor))
 
     def fill(start: int) -> None:
-        tile = slice(start, start + _TILE)
+        tile = slice(start, start + TILE)
         scaled = monomials.of(z[tile]) * roots[tile, None]
         columns[tile] = forward_solve(factor, scaled.mT).mT
 
-    for_each(fill, range(0, len(z), _TILE))
-    left = _products_within(columns, groups, triangular=False).neg_()
+    for_each(fill, range(0, len(z), TILE))
+    left = products_within(columns, groups, triangular=False).neg_()
     left.diagonal().add_(1)
     return left
-
-
-def _products_within(columns: Tensor, groups: Groups, *, triangular: bool) -> Tensor:
-    """Products of columns of one group, 0 across groups; lower triangle.
-
-    Args:
-        columns: one a row.
-        groups: that the columns are of.
-        triangular: whether column ``i`` is 0 before its entry ``i``.
-
-    Shape:
-        - columns: ``[n, m]``; output: ``[n, n]``
-    """
-    sizes = torch.tensor([size for _, size in groups])
-    group = torch.repeat_interleave(sizes)
-    ends = sizes.cumsum(0)[group].tolist()  # of the group of each column
-    products = columns.new_zeros(len(columns), len(columns))
-
-    def multiply(start: int) -> None:
-        tile = columns[start : start + _TILE, start if triangular else 0 :]
-        stop, last = start + len(tile), ends[min(start + _TILE, len(ends)) - 1]
-        products[start:last, start:stop] = (
-            columns[start:last, start if triangular else 0 :] @ tile.mT
-        )
-        products[start:last, start:stop] *= group[start:last, None] == group[start:stop]
-
-    for_each(multiply, range(0, len(columns), _TILE))
-    return products
-
-
-def _check_bins(bins: TrainingBins, groups: Tensor) -> None:
-    if groups.shape != bins.is_slip.shape or groups.is_floating_point():
-        raise ValueError(
-            f"expected a whole number for the group of each of {len(bins.is_slip)} bins, got "
-            f"{tuple(groups.shape)} {groups.dtype}"
-        )
-
-
-def _check_groups(names: Tensor, member: Tensor, is_slip: Tensor) -> None:
-    if len(names) < 2:
-        raise ValueError(
-            f"held-out scores need at least two groups, all {len(is_slip)} bins are in "
-            f"{names.tolist()}"
-        )
-    for kind, own in (("slip", is_slip), ("non-slip", ~is_slip)):
-        counts = torch.bincount(member[own], minlength=len(names))
-        lost = (counts == own.sum()).nonzero().flatten().tolist()
-        if lost:
-            raise ValueError(
-                f"without group {int(names[lost[0]])} no {kind} bin is left to train on; take "
-                "smaller groups, or other bins"
-            )
