@@ -397,6 +397,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "onset.decider": ("onset.latch", "onset.sequential", "onset.settings", "model.calibration"),
     "onset.settings": ("onset.sequential", "model.*"),
     "onset.streaming": ("onset.*", "model.*", "signals.*"),
+    "onset.differentiable": ("onset.*", "model.*"),
     "report.*": ("report.*", "files"),
     "alarming.watching": ("onset.*", "data.*", "workers"),
     "alarming.curve": ("alarming.watching", "onset.*"),
@@ -434,6 +435,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "model.*",
         "recipe",
         "planning",
+        "abstaining",
         "fitting",
         "judging",
         "onset.events",
@@ -444,6 +446,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "judging": (
         "feature_maker",
         "data.*",
+        "report.answers",
         "report.scores",
         "onset.events",
         "onset.latch",

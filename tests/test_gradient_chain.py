@@ -1,0 +1,230 @@
+"""Gradients from the score and the alarm's statistic back to raw volts, through a fit as well.
+
+Which test holds the derivatives of each stage against finite differences:
+
+======================================  =====================================================
+filter of recordings, and of bins       here; ``savgol_filter``: test_filtering
+wavelet branches, amplitude spectra     test_wavelet, test_spectrum
+each descriptor, first and second       test_descriptors, test_descriptors_mended
+the whole pool                          test_pool; smooth stand-ins: test_smooth
+scaling, with its knee                  test_scaling; the fit of the scaler: here
+kernels, both solves, quadratic form    test_kernels, test_kernel_elm, test_quadratic
+log likelihood ratio, each rule         test_calibration, test_sequential
+probability                             here
+all of it at once                       here: training volts and stream to statistic, twice
+======================================  =====================================================
+
+Mode and entropy step: they are left out by name.
+"""
+
+import pytest
+import torch
+from streams import detector_of, signal
+from torch.autograd import gradcheck, gradgradcheck
+
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.calibration import Isotonic, Platt, probability
+from tactslip_torch.model.kernel_elm import solve_kernel_elm
+from tactslip_torch.model.kernels import PAPER_KERNEL
+from tactslip_torch.model.quadratic import collapse
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.onset.decider import Decider, is_usable
+from tactslip_torch.onset.differentiable import stream_statistic
+from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.sequential import BayesFilter, Cusum, KOfN
+from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.signals.filtering import ChannelFilter
+
+STEPPING = ("mode", "entropy")
+SAMPLES, HOP = 12, 4
+HAND = HandLayout.from_rows(
+    {"name": f"{kind}1", "kind": kind, "finger": "index", "segment": "distal"}
+    for kind in ("SG", "PVDF")
+)
+POOL = FeaturePool(HAND, bin_samples=SAMPLES, level=1)
+FILTER = ChannelFilter([5, 3])
+IN_USE = (
+    "SG1 raw time median",
+    "SG1 raw time iqr",
+    "SG1 raw time range",
+    "SG1 raw time mean_deviation",
+    "PVDF1 A1 time cv",
+    "PVDF1 A1 time peak_factor",
+    "PVDF1 D1 time kurtosis",
+    "PVDF1 D1 time correlation",
+    "PVDF1 D1 freq median",
+    "PVDF1 A1 freq spectral_spread",
+    "PVDF1 D1 freq band_energy_ratio",
+)
+SELECTED = [[str(name) for name in POOL.names].index(name) for name in IN_USE]
+RULES = [Cusum(drift=-1.0, evidence=0.5), BayesFilter(0.5, 0.3, 0.01, 0.4)]
+
+
+# ---------------------------------------------------------------------- stages not held elsewhere
+@pytest.mark.parametrize("align", ["centred", "causal", "trailing"])
+def test_the_filter_of_recordings_and_of_bins(align, rng):
+    of_hand = ChannelFilter([5, 3, 1], align=align)
+    x = torch.from_numpy(rng.standard_normal((2, 3, 9))).requires_grad_()
+    for operator in (of_hand, of_hand.valid, lambda x: of_hand(x, [1]), lambda x: of_hand.valid(x)):
+        assert gradcheck(operator, x)
+        assert gradgradcheck(operator, x)
+
+
+@pytest.mark.parametrize(("compress", "tail"), [(False, 0.0), (True, 0.0), (True, 0.1)])
+def test_the_fit_of_the_scaler(compress, tail, rng):
+    features = torch.from_numpy(rng.permutation(21).reshape(7, 3) + rng.uniform(0.5, 1, (7, 3)))
+    new = torch.from_numpy(rng.uniform(5, 15, (2, 3))).requires_grad_()
+
+    def scaled(features, new):
+        return FeatureScaler.fit(features, compress=compress, tail=tail)(new)
+
+    assert gradcheck(scaled, (features.requires_grad_(), new))
+    assert gradgradcheck(scaled, (features, new))
+
+
+@pytest.mark.parametrize("calibration", [Platt(2.0, -0.3), Isotonic((-1.0, 0, 2), (-3.0, 0.5, 4))])
+def test_the_probability_of_a_score(calibration, rng):
+    score = torch.from_numpy(rng.uniform(-0.9, 1.9, 6)).requires_grad_()
+
+    def stated(score):
+        return probability(calibration.llr(score), 0.2)
+
+    assert gradcheck(stated, score)
+    assert gradgradcheck(stated, score)
+
+
+# ------------------------------------------------------------------------------------ end to end
+def statistic_of(raw, stream, rule, compress, tail):
+    """The statistic over a stream, by a machine that is fitted to raw bins on the way."""
+    features = POOL(FILTER.valid(raw))[:, SELECTED]
+    scaler = FeatureScaler.fit(features, compress=compress, tail=tail)
+    z = scaler(features)
+    targets = torch.tensor([1.0, -1.0], dtype=z.dtype).repeat(len(z) // 2)
+    form = collapse(z, solve_kernel_elm(PAPER_KERNEL(z, z), targets, penalty=10.0))
+    bins = FILTER(stream).unfold(-1, SAMPLES, HOP).movedim(-3, -2)
+    score = form(scaler(POOL(bins)[..., SELECTED]))
+    llr = Platt(1.5, 0.2).llr(score)
+    statistic, _ = rule.scan(llr, rule.start(llr[..., 0]))
+    return score, probability(llr, 0.3), statistic
+
+
+@pytest.fixture
+def volts():
+    generator = torch.Generator().manual_seed(0)
+    raw = torch.randn(6, 2, SAMPLES + 2 * FILTER.context, generator=generator, dtype=torch.float64)
+    stream = torch.randn(2, SAMPLES + 3 * HOP, generator=generator, dtype=torch.float64)
+    return raw.requires_grad_(), stream.requires_grad_()
+
+
+def test_none_of_the_features_in_use_steps():
+    assert {POOL.names[i].descriptor for i in SELECTED}.isdisjoint(STEPPING)
+
+
+@pytest.mark.parametrize(
+    ("rule", "compress", "tail"), [(RULES[0], False, 0.0), (RULES[1], True, 0.1)]
+)
+def test_from_training_volts_and_stream_to_statistic(rule, compress, tail, volts):
+    def chain(raw, stream):
+        return statistic_of(raw, stream, rule, compress, tail)
+
+    pulls = torch.autograd.grad(chain(*volts)[-1][-1], volts)
+    assert all(bool((pull.flatten(0, -2).abs().amax(-1) > 0).any()) for pull in pulls)
+    assert gradcheck(chain, volts, atol=1e-6)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_second_derivatives_from_volts_to_statistic(rule, volts):
+    def chain(raw, stream):
+        return statistic_of(raw, stream, rule, True, 0.1)
+
+    assert gradgradcheck(chain, volts, atol=1e-5, fast_mode=True)
+
+
+# ------------------------------------------------------------------------------ a detector's stream
+DETECTOR = detector_of()
+USUAL = score_stream(DETECTOR, signal(8000, 7), 20).score
+CALIBRATION = Platt(0.5, -0.5 * float(USUAL.median()))
+
+
+def settings_of(rule, hop=20, calibration=CALIBRATION):
+    return AlarmSettings(hop, calibration, rule, 1.0, target_per_hour=1.0, slip_share=0.3)
+
+
+def decided(detector, settings, samples):
+    scores = score_stream(detector, samples, settings.hop_samples)
+    decider = Decider(settings, 2000.0, 100, detector.look_ahead)
+    tells = is_usable(scores.score, scores.is_missing, detector.needed_index)
+    return decider.decide(scores.score, scores.is_valid, tells)
+
+
+@pytest.mark.parametrize("kind", ["all", "PVDF"])
+@pytest.mark.parametrize("align", ["centred", "causal"])
+@pytest.mark.parametrize("rule", [*RULES, KOfN(2, 3)])
+def test_values_are_those_of_a_stream(kind, align, rule):
+    detector, settings, samples = detector_of(kind, align), settings_of(rule), signal(700, 3)
+    samples[2, 450:455] = torch.nan
+    found = stream_statistic(detector, settings, samples.clone().requires_grad_())
+    expected = decided(detector, settings, samples)
+    assert found.score.shape == (31,)
+    for name, value in found._asdict().items():
+        close = {"rtol": 1e-8, "atol": 1e-8 * float(USUAL.std())}
+        torch.testing.assert_close(value.detach(), getattr(expected, name), **close)
+
+
+def test_several_streams_at_once_and_float32():
+    settings = settings_of(RULES[0])
+    streams = torch.stack([signal(400, seed) for seed in (1, 2)])
+    together = stream_statistic(DETECTOR, settings, streams)
+    for row, stream in enumerate(streams):
+        alone = stream_statistic(DETECTOR, settings, stream)
+        torch.testing.assert_close(together.statistic[row], alone.statistic)
+    narrow = stream_statistic(DETECTOR, settings, streams.float())
+    assert {part.dtype for part in narrow} == {torch.float32}
+
+
+def test_gradients_of_a_stream_are_slopes(rng):
+    """Along random directions of some volts each, against a central difference."""
+    settings = settings_of(BayesFilter(0.5, 0.3, 0.01, 0.4))
+    samples = signal(300, 5).requires_grad_()
+
+    def statistic(samples):
+        return stream_statistic(DETECTOR, settings, samples).statistic[-1]
+
+    (pull,) = torch.autograd.grad(statistic(samples), samples)
+    for _ in range(3):
+        way = torch.from_numpy(rng.standard_normal(samples.shape))
+        step = 1e-7
+        with torch.no_grad():
+            slope = (statistic(samples + step * way) - statistic(samples - step * way)) / (2 * step)
+        torch.testing.assert_close((pull * way).sum(), slope, rtol=1e-4, atol=1e-6)
+
+
+def test_what_a_statistic_rests_on():
+    """No gradient to channels that are not in use or missing, nor to later samples."""
+    detector, settings = detector_of("PVDF"), settings_of(RULES[1])
+    samples = signal(600, 4)
+    samples[0, 100] = torch.nan  # a gauge: nobody reads it
+    samples[3, 50] = torch.inf  # the first film bins
+    samples.requires_grad_()
+    found = stream_statistic(detector, settings, samples)
+    (pull,) = torch.autograd.grad(found.statistic[0], samples)
+    assert not pull[[0, 1, 3]].any()
+    assert pull[2].any()
+    assert not pull[:, 100 + detector.look_ahead :].any()
+
+
+def test_a_stream_without_any_sensor_says_nothing():
+    samples = torch.full((4, 300), torch.nan, dtype=torch.float64, requires_grad=True)
+    found = stream_statistic(DETECTOR, settings_of(RULES[0]), samples)
+    assert not found.llr.any()
+    (pull,) = torch.autograd.grad(found.statistic.sum(), samples)
+    assert not pull.any()
+
+
+def test_what_is_no_recording_is_refused():
+    settings = settings_of(RULES[0])
+    with pytest.raises(ValueError, match=r"at least 100 samples.*got 99"):
+        stream_statistic(DETECTOR, settings, signal(99))
+    with pytest.raises(ValueError, match=r"expected samples \[\*, 4, T\]"):
+        stream_statistic(DETECTOR, settings, signal(300)[:3])
