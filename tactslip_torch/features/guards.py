@@ -120,3 +120,11 @@ def bounded_gradient(x: Tensor, headroom: float = 1.0) -> Tensor:
     # autograd hands on None for a gradient that is undefined
     x.register_hook(lambda g: None if g is None else g.clamp(-largest, largest))
     return x
+
+
+def saturating(x: Tensor, dtype: torch.dtype) -> Tensor:
+    """``x`` in another dtype; what is beyond its range becomes its largest finite number."""
+    most = torch.finfo(dtype).max
+    if torch.finfo(x.dtype).max <= most:
+        return x.to(dtype)
+    return x.clamp(-most, most).to(dtype)

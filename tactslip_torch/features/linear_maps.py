@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.signals.filter_bank import Wavelet
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names
 
@@ -68,7 +69,7 @@ class LinearMaps:
 
 @lru_cache(maxsize=16)
 def _made(
-    num: int, sample_rate_hz: float, wavelet: str, level: int, method: SpectrumMethod
+    num: int, sample_rate_hz: float, wavelet: Wavelet, level: int, method: SpectrumMethod
 ) -> LinearMaps:
     spectrum = spectrum_matrix(num, method)
     dense_lines = torch.cat([spectrum.real, spectrum.imag]).contiguous()

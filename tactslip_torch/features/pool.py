@@ -7,6 +7,8 @@ adapts slowly, a film one that adapts fast.
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 import torch
@@ -19,10 +21,13 @@ from tactslip_torch.features.descriptors import (
     band_energy_ratio,
     describe,
 )
-from tactslip_torch.features.guards import are_positive, bounded_gradient, is_constant, settle
+from tactslip_torch.features.guards import bounded_gradient, settle
+from tactslip_torch.features.guards import saturating as saturating
 from tactslip_torch.features.names import pool_names
+from tactslip_torch.features.transforms import amplitudes_by, branches_by
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.plain import is_recorded
+from tactslip_torch.signals.filter_bank import WaveletFilters, as_wavelet, wavelet_fact
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names
 
@@ -55,7 +60,7 @@ class FeaturePool(nn.Module):
         hand: the channels, in the order in which bins hold them.
         sample_rate_hz: of the bins.
         bin_samples: length of a bin; 100 (50 ms at 2 kHz) in the paper.
-        wavelet: name of the wavelet.
+        wavelet: its name or, of a learned one, its filters (or their ``to_dict``).
         level: number of wavelet levels.
         spectrum: ``"reference"`` (the authors') or ``"clean"`` (ours).
         arithmetic: ``"double"``, or ``"native"`` to compute in the dtype of the bins.
@@ -76,7 +81,7 @@ class FeaturePool(nn.Module):
         sample_rate_hz: float = 2000.0,
         *,
         bin_samples: int = 100,
-        wavelet: str = "rbio2.2",
+        wavelet: str | WaveletFilters | Mapping[str, Any] = "rbio2.2",
         level: int = 4,
         spectrum: SpectrumMethod = "reference",
         arithmetic: Arithmetic = "double",
@@ -91,7 +96,7 @@ class FeaturePool(nn.Module):
         self.hand = hand
         self.sample_rate_hz = float(sample_rate_hz)
         self.bin_samples = bin_samples
-        self.wavelet = wavelet
+        self.wavelet = as_wavelet(wavelet)
         self.level = level
         self.spectrum: SpectrumMethod = spectrum
         self.arithmetic: Arithmetic = arithmetic
@@ -101,7 +106,7 @@ class FeaturePool(nn.Module):
         self.names = pool_names(hand, level)
         lines = spectrum_matrix(bin_samples, spectrum)
         self._constants = {  # float64; cast to the bins' dtype on use, so they never lose digits
-            "branches": branch_matrix(bin_samples, wavelet, level),
+            "branches": branch_matrix(bin_samples, self.wavelet, level),
             "cosine": lines.real.contiguous(),
             "sine": lines.imag.contiguous(),
             "frequency_hz": frequency_axis_hz(bin_samples, sample_rate_hz, spectrum),
@@ -113,11 +118,29 @@ class FeaturePool(nn.Module):
         return {
             "sample_rate_hz": self.sample_rate_hz,
             "bin_samples": self.bin_samples,
-            "wavelet": self.wavelet,
+            "wavelet": wavelet_fact(self.wavelet),
             "level": self.level,
             "spectrum": self.spectrum,
             "arithmetic": self.arithmetic,
         }
+
+    def with_branches(self, matrix: Tensor) -> FeaturePool:
+        """A light copy with other wavelet branches, to which gradients flow.
+
+        It is for learning: its ``wavelet`` and what is made of that know nothing of the matrix.
+
+        Shape:
+            - matrix: ``[2 * level, n, n]``, as ``LiftedWavelet.branch_matrix`` gives it
+
+        Raises:
+            ValueError: if the shape is another.
+        """
+        if matrix.shape != self._constants["branches"].shape:
+            expected = tuple(self._constants["branches"].shape)
+            raise ValueError(f"expected branches {expected}, got {tuple(matrix.shape)}")
+        pool = copy.copy(self)
+        pool._constants = self._constants | {"branches": matrix}
+        return pool
 
     def forward(self, bins: Tensor) -> Tensor:
         """Features of filtered bins.
@@ -180,18 +203,8 @@ class FeaturePool(nn.Module):
             - films: ``[*, n]``
             - output: ``[*, 2 * level, n]`` in the order of ``branch_names``
         """
-        matrix = self._constant("branches", films)  # [branches, n, n]
-        is_approximation = self._constant("is_approximation", films)[:, None]
-        first = films[..., None, :1].detach()  # keeps a small vibration on a large offset exact
-        shifted = (films[..., None, :] - first).squeeze(-2) @ matrix.flatten(0, 1).T
-        shifted = shifted.unflatten(-1, matrix.shape[:2])
-        branches = shifted + torch.where(is_approximation, first, 0.0)
-        scale = films.detach().abs().amax(-1)[..., None].expand(branches.shape[:-1])
-        settled = settle(branches, scale)
-        if settled is branches:
-            return branches
-        constant = is_constant(branches, scale)[..., None]
-        return torch.where(constant & ~is_approximation, 0.0, settled)
+        matrix = self._constant("branches", films)
+        return branches_by(films, matrix, self._constant("is_approximation", films))
 
     def amplitudes(self, branches: Tensor) -> Tensor:
         """Amplitude spectrum of each branch; the gradient of a line that is zero is 0.
@@ -200,17 +213,8 @@ class FeaturePool(nn.Module):
             - branches: ``[*, n]``
             - output: ``[*, lines]``
         """
-        size = branches.detach().abs().amax(-1, keepdim=True)
-        if not are_positive(size):
-            size = torch.where(size == 0, 1.0, size)
-        scaled = branches / size  # squares of 1e30 or 1e-30 stay in range
-        real = scaled @ self._constant("cosine", branches).T
-        imaginary = scaled @ self._constant("sine", branches).T
-        square = real * real + imaginary * imaginary
-        if are_positive(square):
-            return size * square.sqrt()
-        is_zero = square.detach() == 0
-        return size * torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
+        cosine, sine = (self._constant(name, branches) for name in ("cosine", "sine"))
+        return amplitudes_by(branches, cosine, sine)
 
     def validity(self, bins: Tensor) -> Tensor:
         """Which channels can be trusted.
@@ -286,11 +290,3 @@ class FeaturePool(nn.Module):
             )
         if bins.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"expected float32 or float64 bins in volts, got {bins.dtype}")
-
-
-def saturating(x: Tensor, dtype: torch.dtype) -> Tensor:
-    """``x`` in another dtype; what is beyond its range becomes its largest finite number."""
-    most = torch.finfo(dtype).max
-    if torch.finfo(x.dtype).max <= most:
-        return x.to(dtype)
-    return x.clamp(-most, most).to(dtype)

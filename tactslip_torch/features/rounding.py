@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
+from tactslip_torch.signals.filter_bank import Wavelet
 from tactslip_torch.signals.spectrum import SpectrumMethod
 
 _BINS = 128  # of noise
@@ -37,7 +38,7 @@ def is_rounding(pool: FeaturePool) -> Tensor:
 
 @lru_cache(maxsize=16)
 def _of_fast_channel(
-    bin_samples: int, wavelet: str, level: int, spectrum: SpectrumMethod
+    bin_samples: int, wavelet: Wavelet, level: int, spectrum: SpectrumMethod
 ) -> Tensor:
     """The same of the features of one channel that adapts fast."""
     hand = HandLayout((Channel("noise", "noise", "none", "none", "fast"),))

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from tactslip_torch.plain import is_plain
+from tactslip_torch.signals.kernel_edges import checked_kernels, edges_by
 from tactslip_torch.signals.savgol import Align as Align
-from tactslip_torch.signals.savgol import edge_matrices, reach, savgol_filter
+from tactslip_torch.signals.savgol import Edges, edge_matrices, filter_by, overlap_matrix, reach
 
 _MOST_MATRICES = 16
 _FEW_BINS = 4
@@ -27,6 +29,9 @@ class ChannelFilter(nn.Module):
         window_lengths: one odd frame per channel, in samples; 1 leaves a channel as it is.
         polyorder: order of the fitted polynomial.
         align: where in its frame a sample lies.
+        kernels: other weights than Savitzky-Golay's, by length of the frame, as
+            ``LearnableSmoothing.frozen`` gives them; each sums to 1. The ends of a signal get what
+            ``kernel_edges`` says.
 
     Attributes:
         context: half the longest frame; a bin comes with twice as many samples around it.
@@ -35,20 +40,24 @@ class ChannelFilter(nn.Module):
         reaches: samples before and after its own that each channel's frame takes in.
 
     Raises:
-        ValueError: if a frame is even or does not exceed the order, or the alignment is unknown.
+        ValueError: if a frame is even or does not exceed the order, the alignment is unknown, or a
+            kernel fits no frame or does not sum to 1.
     """
 
     def __init__(
-        self, window_lengths: Sequence[int], polyorder: int = 1, align: Align = "centred"
+        self,
+        window_lengths: Sequence[int],
+        polyorder: int = 1,
+        align: Align = "centred",
+        kernels: Mapping[int, Sequence[float]] | None = None,
     ) -> None:
         super().__init__()
         self.window_lengths = tuple(int(length) for length in window_lengths)
         self.polyorder = polyorder
         self.align: Align = align
+        self.kernels = checked_kernels(kernels or {}, self.window_lengths)
         # float64 and outside the state: cast on use, so they never lose digits
-        self._kernels = {
-            length: edge_matrices(length, polyorder, align)[1] for length in self.window_lengths
-        }
+        self._edges = {length: self._edges_of(length) for length in self.window_lengths}
         self.reaches = tuple(reach(length, align) for length in self.window_lengths)
         self.context = max(self.window_lengths) // 2
         self.context_before, self.context_after = reach(max(self.window_lengths), align)
@@ -58,6 +67,17 @@ class ChannelFilter(nn.Module):
             (length, [i for i, own in enumerate(self.window_lengths) if own == length])
             for length in dict.fromkeys(self.window_lengths)
         ]
+
+    def facts(self) -> dict[str, Any]:
+        """All arguments as JSON-able values; ``ChannelFilter(**facts)``. Kernels only if given."""
+        facts: dict[str, Any] = {
+            "window_lengths": list(self.window_lengths),
+            "polyorder": self.polyorder,
+            "align": self.align,
+        }
+        if self.kernels:
+            facts["kernels"] = {str(length): list(own) for length, own in self.kernels.items()}
+        return facts
 
     def forward(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:
         """Filter whole recordings.
@@ -78,7 +98,7 @@ class ChannelFilter(nn.Module):
             order += chosen
             part = _channels(samples, chosen)
             if is_wanted:
-                part = savgol_filter(part, length, self.polyorder, self.align)
+                part = filter_by(part, self._edges[length])
             parts.append(part)
         return _in_order(parts, order)
 
@@ -151,7 +171,21 @@ class ChannelFilter(nn.Module):
 
     def kernel(self, channel: int) -> Tensor:
         """Weights of the frame that a channel is filtered by, ``[W]``, float64."""
-        return self._kernels[self.window_lengths[channel]]
+        return self.edges(channel)[1]
+
+    def edges(self, channel: int) -> Edges:
+        """What makes a channel's first samples, those in between and its last; float64.
+
+        Shape:
+            - output: as ``edge_matrices`` has them
+        """
+        return self._edges[self.window_lengths[channel]]
+
+    def _edges_of(self, length: int) -> Edges:
+        if length not in self.kernels:
+            return edge_matrices(length, self.polyorder, self.align)
+        kernel = torch.tensor(self.kernels[length], dtype=torch.float64)
+        return edges_by(kernel, self.polyorder, self.align)
 
     def check(self, samples: Tensor) -> None:
         """Refuse what are no samples of this hand.
@@ -171,14 +205,14 @@ class ChannelFilter(nn.Module):
         A trace makes its own: what is made in one must not outlive it.
         """
         if torch.compiler.is_compiling():
-            return overlap_matrix(self._kernels[length].to(like), num_kept)
+            return overlap_matrix(self._edges[length][1].to(like), num_kept)
         key = (length, num_kept, like.dtype, like.device)
         matrix = self._matrices.get(key)
         if matrix is None:
             if len(self._matrices) >= _MOST_MATRICES:
                 self._matrices.clear()
             with torch.inference_mode(False):  # it may be needed for a gradient later
-                matrix = overlap_matrix(self._kernels[length].to(like), num_kept)
+                matrix = overlap_matrix(self._edges[length][1].to(like), num_kept)
             self._matrices[key] = matrix
         return matrix
 
@@ -196,15 +230,3 @@ def _channels(samples: Tensor, chosen: Sequence[int]) -> Tensor:
     if chosen[-1] - chosen[0] + 1 == len(chosen):
         return samples.narrow(-2, chosen[0], len(chosen))
     return samples[..., list(chosen), :]
-
-
-def overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
-    """``convolve_valid`` as a matrix, for short signals: ``convolve_valid(x) = x @ matrix``.
-
-    Shape:
-        - kernel: ``[W]``
-        - output: ``[num_kept + W - 1, num_kept]``
-    """
-    margin = kernel.new_zeros(num_kept - 1)
-    padded = torch.cat([margin, kernel, margin])
-    return padded.unfold(0, num_kept + len(kernel) - 1, 1).flip(0).T

@@ -22,6 +22,8 @@ Align = Literal["centred", "causal", "trailing"]
 ``"centred"``: the middle of the frame around it; ``"causal"``: the end of the frame behind it;
 ``"trailing"``: the middle of the frame behind it.
 """
+Edges = tuple[Tensor, Tensor, Tensor]
+"""Head, kernel and tail of a filter: see ``edge_matrices``."""
 
 
 def fit_matrix(window_length: int, polyorder: int) -> Tensor:
@@ -51,9 +53,7 @@ def fit_matrix(window_length: int, polyorder: int) -> Tensor:
     return basis @ basis.T
 
 
-def edge_matrices(
-    window_length: int, polyorder: int, align: Align
-) -> tuple[Tensor, Tensor, Tensor]:
+def edge_matrices(window_length: int, polyorder: int, align: Align) -> Edges:
     """What makes the first samples, one in between, and the last ones, from a frame each.
 
     Returns:
@@ -141,7 +141,20 @@ def savgol_filter(
         >>> savgol_filter(torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0]), 3, align="trailing")
         tensor([-0.5000, -0.5000,  1.0000,  1.0000,  1.0000])
     """
-    head, kernel, tail = (part.to(x) for part in edge_matrices(window_length, polyorder, align))
+    return filter_by(x, edge_matrices(window_length, polyorder, align))
+
+
+def filter_by(x: Tensor, edges: Edges) -> Tensor:
+    """Filter along the last axis by head, kernel and tail.
+
+    Shape:
+        - x, output: ``[*, T]``, with ``T`` at least the kernel's length
+
+    Raises:
+        ValueError: if the signal is shorter than the kernel.
+    """
+    head, kernel, tail = (part.to(x) for part in edges)
+    window_length = len(kernel)
     if x.shape[-1] < window_length:
         raise ValueError(
             f"a signal of {x.shape[-1]} samples is shorter than window_length {window_length}"
@@ -180,3 +193,17 @@ def convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
     for shift, weight in enumerate(rest, 1):
         total.add_(x.narrow(-1, shift, num_kept), alpha=weight)
     return total
+
+
+def overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
+    """``convolve_valid`` as a matrix, for short signals: ``convolve_valid(x) = x @ matrix``.
+
+    Gradients flow to the kernel.
+
+    Shape:
+        - kernel: ``[W]``
+        - output: ``[num_kept + W - 1, num_kept]``
+    """
+    margin = kernel.new_zeros(num_kept - 1)
+    padded = torch.cat([margin, kernel, margin])
+    return padded.unfold(0, num_kept + len(kernel) - 1, 1).flip(0).T

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.signals.savgol import convolve_valid, edge_matrices
+from tactslip_torch.signals.savgol import Edges, convolve_valid
 
 Array = NDArray[Any]
 
@@ -56,13 +56,10 @@ class FilterStream:
         reaches = [channel_filter.reaches[channel] for channel in wanted]
         self.frame = max(lengths[channel] for channel in wanted)
         self.look_ahead = max(after for _, after in reaches)
-        self._groups = [
-            (
-                _as_slice([channel for channel in wanted if lengths[channel] == length]),
-                edge_matrices(length, channel_filter.polyorder, channel_filter.align),
-            )
-            for length in dict.fromkeys(lengths[channel] for channel in wanted)
-        ]
+        self._groups = list[tuple[slice | list[int], Edges]]()
+        for length in dict.fromkeys(lengths[channel] for channel in wanted):
+            own = [channel for channel in wanted if lengths[channel] == length]
+            self._groups.append((_as_slice(own), channel_filter.edges(own[0])))
         self.reset()
 
     def reset(self) -> None:
@@ -140,9 +137,7 @@ class FilterStream:
                 settled[chosen] = self._piece(self._held[chosen], start, stop, matrices)
         return settled
 
-    def _piece(
-        self, held: Tensor, start: int, stop: int, matrices: tuple[Tensor, Tensor, Tensor]
-    ) -> Tensor:
+    def _piece(self, held: Tensor, start: int, stop: int, matrices: Edges) -> Tensor:
         """Samples from ``start`` up to ``stop`` of channels that share a frame."""
         head, kernel, tail = (matrix.to(held) for matrix in matrices)
         before, length, after = len(head), len(kernel), len(tail)
