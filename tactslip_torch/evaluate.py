@@ -39,6 +39,7 @@ from tactslip_torch.features.cache import cache_key
 from tactslip_torch.judging import event_numbers, together
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.report.answers import merged_answers
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.report.scores import merged_metrics
 
@@ -67,6 +68,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
         save_config(config, folder)
     parts: dict[str, dict[str, Any]] = {}
     events: list[dict[str, Any]] = []
+    answers: dict[str, dict[str, Any]] = {}
     overlaps = {fold.name: overlap(detector, source, fold) for fold in folds}
     with feature_cache(config.cache) as cache:
         filters = detector.channel_filter
@@ -83,6 +85,8 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             trainer.test(learner, datamodule=data, verbose=False)
             parts[fold.name] = learner.metrics["splits"]
             events.append(learner.events)
+            for role, of_role in learner.metrics.get("answers", {}).items():
+                answers.setdefault(role, {})[fold.name] = of_role
     roles = list(dict.fromkeys(role for splits in parts.values() for role in splits))
     metrics = common_facts(source, detector.pool, config) | {
         "splits": {
@@ -91,6 +95,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
         },
         "baselines": learner.metrics["baselines"] if len(folds) == 1 else {},
         "events": event_numbers(together(events)),
+        "answers": {role: merged_answers(of_role) for role, of_role in answers.items()},
         "selected": [str(name) for name in detector.selected_names],
         "timing_s": {"total": time.perf_counter() - started},
         "overlap": overlaps,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tactslip_torch.judging import event_numbers, together
+from tactslip_torch.report.answers import merged_answers
 from tactslip_torch.report.scores import merged_metrics, summed_metrics
 
 
@@ -30,6 +31,10 @@ def combined(folds: dict[str, dict[str, Any]], of_rivals: bool) -> dict[str, Any
             splits.setdefault(before + role, []).append(scores)
         for role, scores in part["baselines"]["best_single_feature"]["splits"].items():
             singles.setdefault(before + role, []).append(scores)
+    answers: dict[str, dict[str, Any]] = {}
+    for name, part in folds.items():
+        for role, found_of in part.get("answers", {}).items():
+            answers.setdefault(f"{name}/{role}" if of_rivals else role, {})[name] = found_of
     shared = set.intersection(*(set(part["selected"]) for part in parts))
     return {
         "splits": {role: merged_metrics(scores) for role, scores in splits.items()},
@@ -40,6 +45,7 @@ def combined(folds: dict[str, dict[str, Any]], of_rivals: bool) -> dict[str, Any
             }
         },
         "events": event_numbers(together(events)),
+        "answers": {role: merged_answers(of) for role, of in answers.items()},
         "selected": [name for name in parts[0]["selected"] if name in shared],
         "timing_s": _summed([part.pop("timing_s") for part in parts]),
         "worker_s": _summed([part.pop("worker_s") for part in parts]),

@@ -29,6 +29,7 @@ from tactslip_torch.onset.events import (
 )
 from tactslip_torch.onset.latch import latch, latch_start
 from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.report.answers import answer_counts, answer_metrics
 from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
 
 RULES: Mapping[str, KOfN] = MappingProxyType(
@@ -46,9 +47,11 @@ class JudgedBins(NamedTuple):
 
     Attributes:
         is_whole: whether these are all bins of the recording.
+        answer: slip, non-slip or unsure (``model.conformal``); None of a detector that is never
+            unsure.
 
     Shape:
-        - truth, says_slip, rival_says_slip, speed_mm_s, position, stroke, ends_s: ``[N]``
+        - truth, says_slip, rival_says_slip, speed_mm_s, position, stroke, ends_s, answer: ``[N]``
     """
 
     recording: RecordingId
@@ -62,10 +65,14 @@ class JudgedBins(NamedTuple):
     strokes: tuple[Stroke, ...]
     hop_s: float
     is_whole: bool
+    answer: Tensor | None = None
 
 
 def judged_bins(
-    batch: RecordingFeatures, says_slip: Tensor, rival_says_slip: Tensor
+    batch: RecordingFeatures,
+    says_slip: Tensor,
+    rival_says_slip: Tensor,
+    answer: Tensor | None = None,
 ) -> dict[str, JudgedBins]:
     """Decisions ``[N]`` on the bins of a recording, for each role that some of them have."""
     return {
@@ -81,6 +88,7 @@ def judged_bins(
             batch.strokes,
             batch.hop_s,
             bool(mask.all()),
+            None if answer is None else answer[mask],
         )
         for role, mask in batch.roles.items()
         if bool(mask.any())
@@ -101,6 +109,16 @@ def bin_scores(parts: Sequence[JudgedBins]) -> tuple[dict[str, Any], dict[str, A
     )
     rival = torch.cat([part.rival_says_slip for part in parts])
     return scores, split_metrics(confusion_matrix(truth, rival))
+
+
+def answer_scores(parts: Sequence[JudgedBins], coverage: float) -> dict[str, Any]:
+    """``answer_metrics`` of bins that a detector with thresholds for unsure answers judged."""
+    counts = {
+        str(part.recording): answer_counts(part.truth, part.answer)
+        for part in parts
+        if part.answer is not None
+    }
+    return answer_metrics(counts, coverage)
 
 
 def events_by_rule(

@@ -17,6 +17,7 @@ import lightning as L
 import torch
 from torch import nn
 
+from tactslip_torch.abstaining import Abstaining
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.feature_maker import RecordingFeatures
@@ -25,11 +26,13 @@ from tactslip_torch.features.survey import Survey
 from tactslip_torch.fitting import TrainingPass, solve_facts
 from tactslip_torch.judging import (
     JudgedBins,
+    answer_scores,
     bin_scores,
     event_numbers,
     events_by_rule,
     judged_bins,
 )
+from tactslip_torch.model.abstention import KEY, abstention_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import FeatureThreshold
@@ -49,11 +52,13 @@ class SlipLearner(L.LightningModule):
         channel_filter: of those bins, kept with the detector.
         recipe: how the machine is made.
         detector: a finished one, to be judged only.
+        abstaining: how thresholds for unsure answers are set; by default none are.
 
     Attributes:
         detector: the result, after the second epoch.
         facts: what the recipe found, such as the penalty.
-        metrics: ``{"splits": ..., "baselines": ..., "events": ...}`` after a test.
+        metrics: ``{"splits": ..., "baselines": ..., "events": ...}`` after a test; ``"answers"`` of
+            a detector that may be unsure.
         events: what the test found in each recording, by role and rule; to be pooled with others.
         seconds: time of each stage of the fit.
         worker_seconds: what workers spent on each stage of making features, summed over them.
@@ -65,12 +70,14 @@ class SlipLearner(L.LightningModule):
         channel_filter: ChannelFilter,
         recipe: Recipe | None = None,
         detector: SlipDetector | None = None,
+        abstaining: Abstaining | None = None,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
         self.pool = pool
         self.channel_filter = channel_filter
         self.recipe = recipe or Recipe()
+        self.abstaining = abstaining or Abstaining()
         self._allowed = self.recipe.allowed(pool)
         self.detector = detector
         self.threshold: FeatureThreshold | None = None
@@ -130,9 +137,7 @@ class SlipLearner(L.LightningModule):
         self._survey = parts[0]
         for part in parts[1:]:
             self._survey.merge(part)
-        self._plan = from_first_rank(
-            lambda: plan_detector(self.recipe, self._survey, bar, allowed=self._allowed)
-        )
+        self._plan = from_first_rank(self._planned)
         self.seconds["validation"] = time.perf_counter() - passed
         if self._is_single_pass:
             self._second = self._sampled()
@@ -178,9 +183,12 @@ class SlipLearner(L.LightningModule):
         self._count_seconds(batch)
         chosen = batch.features[:, list(self.detector.selected)].double()
         device = next(self.detector.buffers()).device  # Lightning may have moved it
-        says_slip = self.detector.score_features(chosen.to(device)).cpu() >= 0
+        score = self.detector.score_features(chosen.to(device)).cpu()
+        says_slip = score >= 0
         rival = self.threshold(chosen) if self.threshold else torch.zeros_like(says_slip)
-        for role, part in judged_bins(batch, says_slip, rival).items():
+        abstention = abstention_of(self.detector)
+        answer = abstention.answer(score) if abstention else None
+        for role, part in judged_bins(batch, says_slip, rival, answer).items():
             self._judged[role].append(part)
 
     def on_test_epoch_end(self) -> None:
@@ -203,6 +211,9 @@ class SlipLearner(L.LightningModule):
             scores, rivals[role] = bin_scores(parts)
             self.metrics["splits"][role] = scores
             self.events[role] = events_by_rule(parts, latency)
+            if abstention := abstention_of(self.detector):
+                answers = answer_scores(parts, abstention.coverage)
+                self.metrics.setdefault("answers", {})[role] = answers
             for name in ("accuracy", "balanced_accuracy"):
                 if scores[name] is not None:
                     self.log(f"{role}/{name}", scores[name], batch_size=1)
@@ -220,7 +231,11 @@ class SlipLearner(L.LightningModule):
 
     def _fingerprint(self) -> str:
         data: SlipDataModule = self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning's
-        return f"{data.fingerprint()} by {self.recipe}"
+        return f"{data.fingerprint()} by {self.recipe}, {self.abstaining}"
+
+    def _planned(self) -> Plan:
+        plan = plan_detector(self.recipe, self._survey, bar, allowed=self._allowed)
+        return self.abstaining.settle(plan, self.recipe, self._survey)
 
     def _sampled(self) -> TrainingPass:
         """What a second pass would gather, of the bins the first one sampled."""
@@ -250,7 +265,9 @@ class SlipLearner(L.LightningModule):
             plan.frame.selected,
             plan.frame.scaler,
             head,
-            self.facts | {"rival": plan.threshold.to_dict(), "calibration": plan.calibration},
+            self.facts
+            | {"rival": plan.threshold.to_dict(), "calibration": plan.calibration}
+            | {KEY: plan.abstain},
             plan.typical,
         )
 

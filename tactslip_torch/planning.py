@@ -57,6 +57,7 @@ class Plan:
             held-out group, and the calibration of held-out scores.
         among: of a recipe that restricts the ranking: to what, how many features that leaves
             (``matching``), and the numbers chosen from after cutting them to it; else ``None``.
+        abstain: thresholds for unsure answers, as ``Abstention.to_dict`` has them, if set.
     """
 
     frame: Frame
@@ -70,6 +71,7 @@ class Plan:
     typical: tuple[float, ...]
     validation: list[dict[str, Any]] = field(default_factory=list)
     among: dict[str, Any] | None = None
+    abstain: dict[str, Any] | None = None
 
     @property
     def adds_up(self) -> bool:
@@ -100,6 +102,7 @@ class Plan:
             "typical": list(self.typical),
             "validation": self.validation,
             "among": self.among,
+            "abstain": self.abstain,
         }
 
     @classmethod
@@ -117,6 +120,7 @@ class Plan:
             typical=tuple(facts["typical"]),
             validation=list(facts["validation"]),
             among=facts.get("among"),  # older plans know no such restriction
+            abstain=facts.get("abstain"),  # nor unsure answers
         )
 
 

@@ -26,6 +26,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig
 
+from tactslip_torch.abstaining import Abstaining
 from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
@@ -127,6 +128,7 @@ def _plan(config: DictConfig) -> str:
     recipe = Recipe(**survey.about["recipe"])
     pool = FeaturePool(HandLayout.from_rows(survey.about["channels"]), **survey.about["pool"])
     plan = plan_detector(recipe, survey, bar, allowed=recipe.allowed(pool))
+    plan = Abstaining(config.coverage, config.coverage_by).settle(plan, recipe, survey)
     scaler = dict(plan.frame.scaler.state_dict())
     save_table(config.out, PLAN_FORM, {"plan": plan.facts(), "about": survey.about}, scaler)
     return f"{len(plan.frame.selected)} features, C={plan.penalty:g}"
@@ -143,7 +145,9 @@ def _solve(config: DictConfig) -> str:
     about, head = sums.about, solve_sums(plan, sums)
     detector = SlipDetector(
         FeaturePool(HandLayout.from_rows(about["channels"]), **about["pool"]),
-        ChannelFilter(about["window_lengths"], about["polyorder"], about["align"]),
+        ChannelFilter(
+            about["window_lengths"], about["polyorder"], about["align"], about.get("kernels")
+        ),
         plan.frame.selected,
         plan.frame.scaler,
         head,

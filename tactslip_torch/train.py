@@ -20,6 +20,7 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig
 
+from tactslip_torch.abstaining import Abstaining
 from tactslip_torch.alarming.debounced import Debounced
 from tactslip_torch.alarming.stage import Alarming
 from tactslip_torch.config import (
@@ -102,6 +103,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
     recipe.check_pool(len(pool.names))
+    abstaining = Abstaining(config.coverage, config.coverage_by)
     alarming: Alarming | Debounced | None = instantiate(config.onset, _convert_="all") or None
     if isinstance(alarming, Alarming) and len(folds) > 1:
         raise ValueError(
@@ -119,7 +121,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         for fold in folds:
             place = folder if len(folds) == 1 else folder / fold.name
             data = SlipDataModule(maker, fold, config.num_workers)
-            learner = SlipLearner(pool, channel_filter, recipe)
+            learner = SlipLearner(pool, channel_filter, recipe, abstaining=abstaining)
             fold_metrics[fold.name] = _run_fold(config, place, data, learner, alarming)
     metrics = common_facts(source, pool, config) | combined(fold_metrics, are_rivals(folds))
     metrics["timing_s"]["total"] = time.perf_counter() - started

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tactslip_torch.files import whole_file
+from tactslip_torch.report.abstaining import answers_figure, answers_table
 from tactslip_torch.report.alarm import alarm_figure, alarm_table, scenes_table
 from tactslip_torch.report.confound import by_detector, confound_figure, confound_table
 from tactslip_torch.report.events import events_figure, events_table, has_events
@@ -30,7 +31,8 @@ def write_results(
     """Write ``metrics.json`` and the figures of a run into a folder.
 
     Results on several kinds of scenes also get ``confound.png``, those with events ``events.png``,
-    those that set an alarm ``alarm.png`` and ``reliability.png``.
+    those of a detector that may be unsure ``answers.png``, those that set an alarm ``alarm.png``
+    and ``reliability.png``.
 
     Args:
         folder: made if it is not there.
@@ -47,6 +49,8 @@ def write_results(
         confound_figure(metrics, folder / "confound.png")
     if has_events(metrics):
         events_figure(metrics, folder / "events.png")
+    if metrics.get("answers"):
+        answers_figure(metrics, folder / "answers.png")
     if alarm := metrics.get("alarm"):
         alarm_figure(metrics, folder / "alarm.png")
         if alarm["reliability"]:
@@ -62,6 +66,8 @@ def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, st
     parts = [splits_table(metrics), materials_table(metrics)]
     if metrics.get("events"):
         parts.append(events_table(metrics))
+    if metrics.get("answers"):
+        parts.append(answers_table(metrics))
     if alarm := metrics.get("alarm"):
         parts += [alarm_table(metrics), scenes_table(metrics)]
         parts.append(reliability_table(alarm["reliability"], simulated=metrics["simulated"]))
