@@ -16,6 +16,7 @@ from torch import Tensor
 
 from tactslip_torch.model.cholesky import check_finite, in_dtype
 from tactslip_torch.model.condition import conditions_of
+from tactslip_torch.model.differentiable_solve import DENSE, solve_by_factor
 from tactslip_torch.model.symmetric_solve import (
     Solution,
     largest_condition,
@@ -38,7 +39,8 @@ def solve_kernel_elm(
 ) -> Tensor:
     """Output weights of the kernel machine: ``(gram + diag(1 / (penalty * weights)))^-1 targets``.
 
-    One Cholesky factorisation, no inverse. Differentiable in ``gram`` and ``targets``. Where the
+    One Cholesky factorisation, no inverse. Differentiable in ``gram``, ``targets`` and ``weights``
+    any number of times, by solves with the same factor (``differentiable_solve``). Where the
     system is too close to singular for that (``symmetric_solve`` has the rule), components of the
     weighted Gram matrix that are rounding noise are left out: null ones add nothing to a score, and
     derivatives are those at constant rank. With ``penalty=inf`` that is the minimum-norm (weighted)
@@ -211,12 +213,11 @@ def _solve(
         plain = light_bins(system.detach().diagonal(dim1=-2, dim2=-1), weights, eps).any(-1)
     singular = ~plain
     if bool(plain.any()):
-        factor, info = torch.linalg.cholesky_ex(ridged)
-        conditions = torch.tensor(conditions_of(ridged.detach(), factor.detach(), info))
+        factor, info = torch.linalg.cholesky_ex(ridged.detach())
+        conditions = torch.tensor(conditions_of(ridged.detach(), factor, info))
         singular |= ~(conditions <= largest_condition(right.shape[-1], eps)).view(info.shape)
     if not bool(singular.any()):
-        solved = torch.cholesky_solve(right[..., None], factor).squeeze(-1)
-        return in_dtype(solved, given, name)
+        return in_dtype(solve_by_factor(DENSE, factor, right, ridged), given, name)
     if eps > _EPS and bool((plain & singular).any()):
         raise ValueError(
             f"{name} + I/C at penalty={penalty:g} has condition {float(conditions.max()):.1e}, too "
@@ -226,9 +227,8 @@ def _solve(
     escalated = _pseudo_solve(system[singular], *terms, given, in_span=in_span, name=name)
     solved = torch.zeros_like(right)
     if not bool(singular.all()):
-        solved[~singular] = torch.cholesky_solve(
-            right[~singular][..., None], torch.linalg.cholesky(ridged[~singular])
-        ).squeeze(-1)
+        others = factor[~singular], right[~singular], ridged[~singular]
+        solved[~singular] = solve_by_factor(DENSE, *others)
     solved[singular] = escalated
     return in_dtype(solved, given, name)
 
