@@ -50,9 +50,7 @@ class SlipDataModule(L.LightningDataModule):
         return {
             "channels": pool.hand.to_rows(),
             "pool": pool.facts(),
-            "window_lengths": list(self.maker.channel_filter.window_lengths),
-            "polyorder": self.maker.channel_filter.polyorder,
-            "align": self.maker.channel_filter.align,
+            **self.maker.channel_filter.facts(),
             "features_dtype": str(self.maker.dtype).removeprefix("torch."),
             "training_bins": self.fingerprint(),
         }

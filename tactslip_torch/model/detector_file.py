@@ -49,9 +49,7 @@ def write_detector(
     facts = {
         "channels": pool.hand.to_rows(),
         "pool": pool.facts(),
-        "window_lengths": list(channel_filter.window_lengths),
-        "polyorder": channel_filter.polyorder,
-        "align": channel_filter.align,
+        **channel_filter.facts(),
         "selected": list(selected),
         "kernel": head.kernel.to_dict() if isinstance(head, KernelSum) else None,
         "info": dict(info),
@@ -107,6 +105,7 @@ def _parts(facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> DetectorPar
             facts["window_lengths"],
             facts["polyorder"],
             facts.get("align", "centred"),  # as all were before it was a choice
+            facts.get("kernels"),  # only of filters that were learned
         ),
         facts["selected"],
         FeatureScaler(**part("scaler.")),

@@ -20,6 +20,7 @@ from torch import Tensor
 from tactslip_torch.features.guards import are_ordinary, is_nowhere, stretch
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.judgement import Judgement
+from tactslip_torch.signals.filter_bank import Wavelet
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import branch_matrix, branch_names
@@ -74,7 +75,7 @@ def film_band_power(
 def largest_detail(
     bins: Tensor,
     films: Sequence[int] | Tensor,
-    wavelet: str = "rbio2.2",
+    wavelet: Wavelet = "rbio2.2",
     level: int = 4,
     levels: Sequence[int] | None = None,
 ) -> Tensor:
@@ -83,7 +84,7 @@ def largest_detail(
     Args:
         bins: filtered, in volts.
         films: positions of the films, the fast adapting channels, or a mask of them.
-        wavelet: of the branches, as features have it.
+        wavelet: of the branches, as features have it; a name or filters.
         level: number of levels.
         levels: whose details count; default all.
 
@@ -242,7 +243,7 @@ def _band_lines(num_samples: int, sample_rate_hz: float, band_hz: tuple[float, .
 
 
 @lru_cache(maxsize=16)
-def _detail_rows(num_samples: int, wavelet: str, level: int, levels: tuple[int, ...]) -> Tensor:
+def _detail_rows(num_samples: int, wavelet: Wavelet, level: int, levels: tuple[int, ...]) -> Tensor:
     """The detail branches of some levels, below each other, ``[levels * n, n]``."""
     names = branch_names(level)
     if not levels or not {f"D{m}" for m in levels} <= set(names):
