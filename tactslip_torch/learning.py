@@ -21,6 +21,7 @@ from tactslip_torch.abstaining import Abstaining
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.feature_maker import RecordingFeatures
+from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.fitting import TrainingPass, solve_facts
@@ -223,6 +224,12 @@ class SlipLearner(L.LightningModule):
             self.metrics["baselines"] = {
                 "best_single_feature": {"feature": feature, "splits": rivals}
             }
+
+    @property
+    def gathered(self) -> tuple[TrainingPass, SampledBins]:
+        """What the machine was solved from, and the first pass's sample of its bins."""
+        assert self._second is not None  # fitted
+        return self._second, self._survey.sample.bins()
 
     @property
     def _is_single_pass(self) -> bool:

@@ -21,6 +21,8 @@ from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig
 
 from tactslip_torch.abstaining import Abstaining
+from tactslip_torch.adapting.gathering import check_recipe, gathered_statistics
+from tactslip_torch.adapting.statistics import FILE as STATISTICS
 from tactslip_torch.alarming.debounced import Debounced
 from tactslip_torch.alarming.stage import Alarming
 from tactslip_torch.config import (
@@ -103,6 +105,8 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
     recipe.check_pool(len(pool.names))
+    if config.statistics:
+        _check_statistics(config, recipe)
     abstaining = Abstaining(config.coverage, config.coverage_by)
     alarming: Alarming | Debounced | None = instantiate(config.onset, _convert_="all") or None
     if isinstance(alarming, Alarming) and len(folds) > 1:
@@ -184,6 +188,8 @@ def _run_fold(
     told = time.perf_counter()
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")
+        if config.statistics:
+            _save_statistics(config, learner, detector, data.split, folder / STATISTICS)
         onnx = _export(detector, folder) if config.export else {}
     seconds = dict(learner.seconds)
     seconds["test_pass"] = tested - started
@@ -202,6 +208,25 @@ def _run_fold(
         "timing_s": seconds,
         "worker_s": learner.worker_seconds,
     }
+
+
+def _check_statistics(config: DictConfig, recipe: Recipe) -> None:
+    """Refuse before any work what would leave no statistics."""
+    check_recipe(recipe)
+    if config.ckpt_path is not None:
+        raise ValueError(
+            "statistics=true needs the first pass, which ckpt_path skips; train without ckpt_path "
+            "(features come from the cache)"
+        )
+
+
+def _save_statistics(
+    config: DictConfig, learner: SlipLearner, detector: SlipDetector, fold: Split, path: Path
+) -> None:
+    """What ``adapt`` solves again from, beside the detector."""
+    materials = {str(recording): recording.material for recording in fold.having("train")}
+    labels = {str(key): value for key, value in config.labels.items() if key != "_target_"}
+    gathered_statistics(*learner.gathered, materials, labels, detector).save(path)
 
 
 def _units(source: RecordingSource) -> dict[str, str]:

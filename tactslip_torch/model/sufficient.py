@@ -199,7 +199,7 @@ class SufficientStats:
         Reference:
             Zong, Huang and Chen (2013), Neurocomputing 101, 229-242 (weighted ELM).
         """
-        normal, moment, noise = self._normal_equations(penalty, offset, num_features, balance)
+        normal, moment, noise = self.normal_equations(penalty, offset, num_features, balance)
         weights, report = solve_symmetric_(
             normal,
             moment,
@@ -213,10 +213,13 @@ class SufficientStats:
         machine.solved = report
         return machine
 
-    def _normal_equations(
+    def normal_equations(
         self, penalty: float, offset: float, num_features: int | None, balance: str
     ) -> tuple[Tensor, Tensor, float]:
-        """``X' W X``, ``X' W t``, and what the grid does to the first."""
+        """``X' W X``, ``[P, P]``, ``X' W t``, ``[P]``, and what the grid does to the first.
+
+        Arguments and errors are those of ``solve``.
+        """
         if not penalty > 0:
             raise ValueError(f"penalty (the paper's C) must be positive, got {penalty}")
         if not 0 <= offset < math.inf:

@@ -1,0 +1,213 @@
+"""What a detector is solved again from, in one file beside it: ``statistics.pt``.
+
+Exact sums over all training bins, a bounded sample of these bins, and all that came later:
+recordings with their bins and weights, and every step with the detector it replaced. Sums on a grid
+of whole numbers take bins out as exactly as they took them in, so any step can be taken back.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.adapting.bins import KnownBins, RecordingBins, Witnesses, known_bins
+from tactslip_torch.files import load_table, save_table
+from tactslip_torch.ledger import Ledger, content_digest
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.sufficient import SufficientStats
+
+FILE = "statistics.pt"
+FORMAT = "tactslip_torch statistics 1"
+
+
+@dataclass(frozen=True)
+class Machine:
+    """How sums become a machine.
+
+    Args:
+        penalty: the paper's ``C``.
+        offset: the kernel's ``c``.
+        balance: of the classes, as ``SufficientStats.solve`` takes it.
+    """
+
+    penalty: float
+    offset: float
+    balance: Literal["weights", "none"]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One change of a detector.
+
+    Args:
+        entry: of the journal, JSON-able.
+        weights: of ``Statistics``, before it.
+        changed: weight before it of each recording that it changed.
+        detector: digest of the detector before it.
+        file: that detector's file, bytes.
+    """
+
+    entry: Mapping[str, Any]
+    weights: Mapping[str, float]
+    changed: Mapping[str, float]
+    detector: str
+    file: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Sums, witnesses, and what changed since training.
+
+    Args:
+        sums: over all bins that are in.
+        machine: how they are solved.
+        labels: how bins were laid and labelled, arguments of ``LabelRule``.
+        witnesses: of the training bins.
+        detector: digest of the detector that these sums make.
+        bins: of recordings that were added, or trained on and taken out, by name.
+        weights: of a bin of each recording of ``bins``; 0 where it is out.
+        steps: in their order.
+    """
+
+    sums: SufficientStats
+    machine: Machine
+    labels: Mapping[str, Any]
+    witnesses: Witnesses
+    detector: str
+    bins: Mapping[str, RecordingBins]
+    weights: Mapping[str, float]
+    steps: Sequence[Step] = ()
+
+    def weight_of(self, recording: str) -> float:
+        """Of a bin of a recording: 1 as trained, 0 if it is not in."""
+        return self.weights.get(recording, float(recording in self.sums.ledger.entries))
+
+    def known(self) -> KnownBins:
+        """Bins that are in the sums and known one by one."""
+        return known_bins(self.witnesses, self.bins, self.weights)
+
+    def reweighed(
+        self, weights: Mapping[str, float], bins: Mapping[str, RecordingBins] | None = None
+    ) -> Statistics:
+        """The same with other weights of some recordings; exact, whatever was before.
+
+        Args:
+            weights: by recording; 0 takes it out.
+            bins: of recordings that are not known yet.
+
+        Raises:
+            ValueError: if a recording that is taken out holds something else than was put in, or
+                the sums have no room.
+        """
+        known = {**self.bins, **(bins or {})}
+        sums = copy.deepcopy(self.sums)
+        for name, weight in weights.items():
+            own, before = known[name], self.weight_of(name)
+            if weight == before:
+                continue
+            for value, change in ((before, sums.remove), (weight, sums.update)):
+                if value > 0:
+                    change(name, own.z, own.is_slip, torch.full_like(own.z[:, 0], value))
+        return replace(self, sums=sums, bins=known, weights={**self.weights, **weights})
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a file, whole or not at all."""
+        facts = {
+            "sums": {
+                "num_features": self.sums.num_features,
+                "about": self.sums.about,
+                "grid_bits": self.sums.grid_bits,
+            },
+            "batches": self.sums.ledger.entries,
+            "machine": vars(self.machine),
+            "labels": dict(self.labels),
+            "witnesses": self.witnesses.facts(),
+            "detector": self.detector,
+            "bins": [[name, own.material, own.key] for name, own in self.bins.items()],
+            "weights": dict(self.weights),
+            "steps": [
+                [step.entry, dict(step.weights), dict(step.changed), step.detector]
+                for step in self.steps
+            ],
+        }
+        tensors = {"sums": self.sums.sums, "count": self.sums.count}
+        tensors |= {f"witnesses.{name}": t for name, t in self.witnesses.tensors().items()}
+        for number, own in enumerate(self.bins.values()):
+            tensors |= {f"bins.{number}.z": own.z, f"bins.{number}.is_slip": own.is_slip}
+        tensors |= {f"steps.{number}": step.file for number, step in enumerate(self.steps)}
+        save_table(path, FORMAT, facts, tensors)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Statistics:
+        """What ``save`` wrote; nothing in the file is executed.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is another kind of file, or damaged.
+        """
+        facts, tensors = load_table(path, FORMAT)
+        sums = SufficientStats(**facts["sums"])
+        sums.ledger = Ledger(facts["batches"])
+        sums.sums, sums.count = tensors["sums"], tensors["count"]
+        of_witnesses = {n.partition(".")[2]: t for n, t in tensors.items() if n[:9] == "witnesses"}
+        names = {name: tuple(of) for name, of in facts["witnesses"].items()}
+        return cls(
+            sums,
+            Machine(**facts["machine"]),
+            facts["labels"],
+            Witnesses(**of_witnesses, **names),
+            facts["detector"],
+            {
+                name: RecordingBins(
+                    material, tensors[f"bins.{number}.z"], tensors[f"bins.{number}.is_slip"], key
+                )
+                for number, (name, material, key) in enumerate(facts["bins"])
+            },
+            facts["weights"],
+            tuple(
+                Step(*plain, tensors[f"steps.{number}"])
+                for number, plain in enumerate(facts["steps"])
+            ),
+        )
+
+
+def detector_digest(detector: SlipDetector) -> str:
+    """Of what a detector computes with: scaling and machine, whatever else its file says."""
+    state = detector.state_dict()
+    names = sorted(name for name in state if name.startswith(("scaler.", "head.")))
+    places = torch.tensor(detector.selected)
+    return content_digest(places, *(state[name] for name in names))
+
+
+def statistics_of(model: str | os.PathLike[str], detector: SlipDetector) -> Statistics:
+    """The statistics beside a detector's file.
+
+    Args:
+        model: where the detector is.
+        detector: what is there.
+
+    Raises:
+        FileNotFoundError: if there are none.
+        ValueError: if they are damaged, or of another detector.
+    """
+    path = Path(model).with_name(FILE)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no {FILE} beside {model}; train with statistics=true, which leaves it there"
+        )
+    found = Statistics.load(path)
+    if found.detector != (digest := detector_digest(detector)):
+        if found.steps and found.steps[-1].detector == digest:
+            raise ValueError(
+                f"{path} is one step ahead of {model}, as when writing was cut off between the "
+                "two; action=undo takes that step back"
+            )
+        raise ValueError(f"{path} belongs to another detector than {model}; train again")
+    return found
