@@ -242,7 +242,7 @@ def test_a_rival_judges_filtered_bins(name, rng):
     assert detector.needed_index.tolist() == films
     assert detector.look_ahead == 5  # half the films' frame, not the gauges' 25
     bins = ChannelFilter([51, 51, 11, 11]).valid(raw_bins(20))
-    score, is_valid, is_missing = detector.judge(bins)
+    score, is_valid, is_missing, _ = detector.judge(bins)
     assert torch.equal(score, SCORES[name](bins, films))
     assert is_valid.all()
     assert not is_missing.any()

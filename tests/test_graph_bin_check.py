@@ -42,7 +42,7 @@ def bin_run(detector, change=lambda samples, out: out):
     def run(inputs):
         samples = torch.from_numpy(inputs["samples"])
         with torch.no_grad():
-            score, is_valid, _ = single.judge_raw(pad(samples, (before, after)))
+            score, is_valid, *_ = single.judge_raw(pad(samples, (before, after)))
         stated = probability(settings.calibration.llr(score), settings.slip_share)
         out = {"score": score.numpy(), "probability": stated.numpy(), "valid": is_valid.numpy()}
         return change(samples, out)

@@ -76,7 +76,8 @@ def loud_detector(kind="all", align="centred"):
         is_missing = ~bins.isfinite().all(-1)
         loud = bins.var(-1, correction=0).masked_fill(is_missing, 0.0)[:, used].sum(-1)
         score = (loud + FLOOR).log() - detector.usual
-        return Judgement(score.to(given), ~is_missing[:, used].any(-1), is_missing)
+        score = score.to(given)
+        return Judgement(score, ~is_missing[:, used].any(-1), is_missing, torch.zeros_like(score))
 
     detector.judge = judge
     return detector

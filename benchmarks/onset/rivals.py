@@ -77,7 +77,8 @@ class MiniRocketDetector:
         is_valid = (self.pool.is_alive(bins) & ~is_missing).all(-1)
         windows = torch.where(is_missing[..., None], 0.0, bins).float().contiguous()
         scores = torch.from_numpy(np.asarray(self.scores(windows.numpy())))
-        return Judgement(scores.reshape(len(bins)).to(given), is_valid, is_missing)
+        score = scores.reshape(len(bins)).to(given)
+        return Judgement(score, is_valid, is_missing, torch.zeros_like(score))
 
 
 def rivals_of(sizes: Sizes, trained: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -16,9 +16,12 @@ from tactslip_torch.features.extractor import EngineName, FeatureExtractor, reso
 from tactslip_torch.features.guards import is_nowhere
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool, saturating
+from tactslip_torch.model.agreement import check_parts
+from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector_file import Head, damaged, read_detector, write_detector
 from tactslip_torch.model.few_bins import FEW_BINS, FEW_FILTERED, FewBins
 from tactslip_torch.model.judgement import Judgement, Nonfinite, check_nonfinite, judged_in_parts
+from tactslip_torch.model.missing import Dead, MissingScores, without
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.plain import is_plain
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -38,6 +41,8 @@ class SlipDetector(nn.Module):
         head: the machine on scaled features.
         info: JSON-able facts about the training, kept in the file.
         typical: scaled features that stand in for those of a missing channel; default 0.
+        gaussians: of the scaled features; with them, what is missing leaves the expected score and
+            its variance (``ExpectedScore``), instead of the score of ``typical`` features.
         engine: what features are made by where no gradient is asked for (``FeatureExtractor``).
 
     Shape:
@@ -64,35 +69,20 @@ class SlipDetector(nn.Module):
         head: Head,
         info: Mapping[str, Any] | None = None,
         typical: Tensor | Sequence[float] | None = None,
+        gaussians: ClassGaussians | None = None,
         *,
         engine: EngineName = "auto",
     ) -> None:
         super().__init__()
-        if not len(selected) == len(scaler.minimum) == head.num_features:
-            raise ValueError(
-                f"{len(selected)} selected features, a scaler of {len(scaler.minimum)} and a head "
-                f"of {head.num_features}: the three must agree"
-            )
-        extractor = FeatureExtractor(pool, selected, engine)
-        if len(channel_filter.window_lengths) != len(pool.hand):
-            raise ValueError(
-                f"a filter of {len(channel_filter.window_lengths)} channels does not fit a hand "
-                f"of {len(pool.hand)}"
-            )
         typical = torch.as_tensor([0.0] * len(selected) if typical is None else typical)
-        if typical.shape != scaler.minimum.shape or not bool((typical.abs() <= 1).all()):
-            raise ValueError(
-                f"typical must be {len(scaler.minimum)} scaled features in [-1, 1], got "
-                f"{tuple(typical.shape)} of at most {float(typical.abs().max()):g}"
-            )
-        self.pool = pool
-        self.extractor = extractor
-        self.channel_filter = channel_filter
-        self.scaler = scaler
-        self.head = head
-        self.selected = extractor.selected
+        check_parts(pool, channel_filter, selected, scaler, head, typical, gaussians)
+        self.pool, self.channel_filter = pool, channel_filter
+        self.extractor = FeatureExtractor(pool, selected, engine)
+        self.selected = self.extractor.selected
+        self.scaler, self.head, self.gaussians = scaler, head, gaussians
         self.info = dict(info or {})
         self._few: FewBins | None = None
+        self._missing: MissingScores | None = None
         self.register_buffer("typical", typical.to(next(head.buffers()), copy=True))
         channels = [pool.hand.names.index(name.channel) for name in self.selected_names]
         indices = {"channel": channels, "needed": sorted(set(channels))}
@@ -152,35 +142,39 @@ class SlipDetector(nn.Module):
         return judged_in_parts(self._score_raw, samples)
 
     def judge(
-        self, bins: Tensor, nonfinite: Nonfinite = "mask", given: torch.dtype | None = None
+        self,
+        bins: Tensor,
+        nonfinite: Nonfinite = "mask",
+        given: torch.dtype | None = None,
+        dead: Dead | None = None,
     ) -> Judgement:
         """Score filtered bins of a hand whose sensors may fail: a finite score, and its validity.
 
         Args:
             bins: in volts.
-            nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing,
-                ``typical`` features stand in for its own, and the score is not valid.
-                ``"raise"``: refuse.
+            nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing, the
+                score is the one expected without it, and not valid. ``"raise"``: refuse.
             given: dtype of the samples that the bins were filtered from, by default theirs; that of
                 the score, and what a sensor must resolve to be trusted.
+            dead: channels that count as missing whatever they say.
 
         Shape:
             - bins: ``[*, C, n]``
 
         Raises:
-            ValueError: if the number of channels or samples is another, or under ``"raise"`` for
-                a NaN or Inf, naming bin, channel and sample.
+            ValueError: if the number of channels or samples is another, for a dead channel that the
+                hand does not have, or under ``"raise"`` for a NaN or Inf, naming where it is.
         """
         self.pool.check(bins)
         check_nonfinite(nonfinite, bins, self.pool.hand.names)
+        bins = without(bins, dead, self.pool.hand.names)
         dtype = given or bins.dtype
         return judged_in_parts(lambda part: self._judge(part, dtype, FEW_FILTERED), bins)
 
-    def judge_raw(self, samples: Tensor, nonfinite: Nonfinite = "mask") -> Judgement:
-        """``judge`` for raw bins that come with their context.
-
-        A NaN or Inf in the context of a bin makes the channel missing as well, if the frame of its
-        filter reaches that far; under ``"raise"`` any is refused.
+    def judge_raw(
+        self, samples: Tensor, nonfinite: Nonfinite = "mask", dead: Dead | None = None
+    ) -> Judgement:
+        """``judge`` for raw bins with their context, where NaN and Inf count as filters reach it.
 
         Shape:
             - samples: ``[*, C, context_before + n + context_after]``, volts
@@ -190,6 +184,7 @@ class SlipDetector(nn.Module):
         """
         self.channel_filter.check(samples)
         check_nonfinite(nonfinite, samples, self.pool.hand.names)
+        samples = without(samples, dead, self.pool.hand.names)
         return judged_in_parts(self._judge_raw, samples)
 
     def validity(self, bins: Tensor) -> Tensor:
@@ -225,7 +220,8 @@ class SlipDetector(nn.Module):
     def _judge(self, bins: Tensor, given: torch.dtype, most: int = FEW_BINS) -> Judgement:
         """Scores of filtered bins, valid by the dtype they were given in, which is the score's."""
         if (few := self._few_bins(bins, most)) is not None:
-            return few.judge(self._features, self.pool.widen(bins.detach()), given)
+            wide = self.pool.widen(bins.detach())
+            return few.judge(self._features, wide, given, self._without)
         is_alive = self.pool.is_alive(bins.to(given))  # sensors resolve no more than they give
         bins = self.pool.widen(bins)
         is_missing = self.pool.is_missing(bins)
@@ -233,12 +229,19 @@ class SlipDetector(nn.Module):
         if not is_whole:
             bins = torch.where(is_missing[..., None], 0.0, bins)
         scaled = self._scale(self._features(bins))
-        if not is_whole:
-            is_typical = is_missing.index_select(-1, self.channel_index)
-            scaled = torch.where(is_typical, self.typical, scaled)
         score = saturating(self.head(scaled), given)
+        variance = torch.zeros_like(score)
+        if not is_whole:
+            score, variance = self._without(score, scaled, is_missing)
         is_valid = self._needed(is_alive & ~is_missing) & score.isfinite()
-        return Judgement(score, is_valid, is_missing)
+        return Judgement(score, is_valid, is_missing, variance)
+
+    def _without(self, score: Tensor, *missing: Tensor) -> tuple[Tensor, Tensor]:
+        """Scores and variances where channels are missing (``MissingScores``)."""
+        parts = self.head, self.typical, self.channel_index, self.gaussians
+        if self._missing is None or not self._missing.is_of(*parts):
+            self._missing = MissingScores(*parts)
+        return self._missing(score, *missing)
 
     def _few_bins(self, bins: Tensor, most: int) -> FewBins | None:
         """The way for few bins and values alone, if this is one for it."""
@@ -251,7 +254,7 @@ class SlipDetector(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without views of tensors, which in a copy would be of others."""
-        return self.__dict__ | {"_few": None}
+        return self.__dict__ | {"_few": None, "_missing": None}
 
     def _filter(self, samples: Tensor) -> Tensor:
         return self.channel_filter.valid(self.pool.widen(samples), self.extractor.plan.channels)
@@ -264,11 +267,12 @@ class SlipDetector(nn.Module):
         return scaled.to(self.typical.dtype)
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SlipDetector:
-        """``float()`` and ``to()``: ranges of features stay float64, as offsets cancel there."""
-        exact = dict(self.scaler.named_buffers())
+        """``float()`` and ``to()``: what is known of features stays float64, as offsets cancel."""
+        modules = [self.scaler] if self.gaussians is None else [self.scaler, self.gaussians]
+        exact = [(each, *part) for each in modules for part in each.named_buffers()]
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch has no annotations
-        for name, value in exact.items():
-            setattr(self.scaler, name, value.to(getattr(self.scaler, name).device))
+        for module, name, value in exact:
+            setattr(module, name, value.to(getattr(module, name).device))
         return self
 
     def _needed(self, is_trusted: Tensor) -> Tensor:

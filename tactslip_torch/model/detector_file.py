@@ -11,6 +11,7 @@ from torch import Tensor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.files import load_table, save_table, table_form
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.model.quadratic import QuadraticForm
@@ -34,6 +35,7 @@ class DetectorParts(NamedTuple):
     head: Head
     info: Mapping[str, Any]
     typical: Tensor | None
+    gaussians: ClassGaussians | None
 
 
 def write_detector(
@@ -112,4 +114,5 @@ def _parts(facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> DetectorPar
         head,
         facts["info"],
         state.get("typical"),
+        ClassGaussians(**found) if (found := part("gaussians.")) else None,  # of old files none
     )

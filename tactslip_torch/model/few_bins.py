@@ -36,11 +36,6 @@ class Parts(Protocol):
     pool: FeaturePool
     scaler: FeatureScaler
     head: Head
-    typical: Tensor
-
-    @property
-    def channel_index(self) -> Tensor:
-        """Channel of each selected feature, ``[K]``."""
 
     @property
     def needed_index(self) -> Tensor:
@@ -63,8 +58,7 @@ class FewBins:
         self._knee = None if parts.scaler.knee is None else parts.scaler.knee.numpy()
         self._quadratic = head.quadratic.numpy()
         self._linear, self._constant = head.linear.numpy(), head.constant.numpy()
-        self._typical = parts.typical.numpy()
-        self._channel_of, self._needed = parts.channel_index.numpy(), parts.needed_index.numpy()
+        self._needed = parts.needed_index.numpy()
         self._tiny = np.finfo(self._minimum.dtype).tiny
 
     @staticmethod
@@ -88,21 +82,30 @@ class FewBins:
             return self._score(self._scaled(features), dtype)
 
     def judge(
-        self, features_of: Callable[[Tensor], Tensor], bins: Tensor, given: torch.dtype
+        self,
+        features_of: Callable[[Tensor], Tensor],
+        bins: Tensor,
+        given: torch.dtype,
+        without: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
     ) -> Judgement:
-        """Scores of filtered bins ``[*, C, n]``, valid by the dtype they were ``given`` in."""
+        """Scores of filtered bins ``[*, C, n]``, valid by the dtype they were ``given`` in.
+
+        What to make of missing channels, ``without`` is asked (``MissingScores``).
+        """
         with np.errstate(all="ignore"):
             is_alive, is_missing = self._trust(bins, given)
             is_whole = not is_missing.any()
             if not is_whole:
                 bins = bins.masked_fill(torch.from_numpy(is_missing)[..., None], 0.0)
             scaled = self._scaled(features_of(bins))
-            if not is_whole:
-                scaled = np.where(is_missing[..., self._channel_of], self._typical, scaled)
             score = self._score(scaled, given)
+            variance = torch.zeros_like(score)
+            if not is_whole:
+                lost = torch.from_numpy(is_missing)
+                score, variance = without(score, torch.from_numpy(np.asarray(scaled)), lost)
             is_trusted = (is_alive & ~is_missing)[..., self._needed].all(-1)
             is_valid = np.asarray(is_trusted & np.isfinite(score.numpy()))
-        return Judgement(score, torch.from_numpy(is_valid), torch.from_numpy(is_missing))
+        return Judgement(score, torch.from_numpy(is_valid), torch.from_numpy(is_missing), variance)
 
     def _scaled(self, features: Tensor) -> Array:
         """As ``FeatureScaler``, in the dtype of the head."""
@@ -142,5 +145,5 @@ class FewBins:
 
 def _held(parts: Parts) -> tuple[Any, ...]:
     scaler, head = parts.scaler, parts.head
-    tensors = (*scaler._buffers.values(), *head._buffers.values(), parts.typical)
+    tensors = (*scaler._buffers.values(), *head._buffers.values())
     return (parts.pool, scaler, head, *tensors)

@@ -24,12 +24,16 @@ class Judgement(NamedTuple):
         score: ``[*]``, at least 0 means slip; finite, unless the head overflows its dtype.
         is_valid: ``[*]``, bool: every channel that the score depends on can be trusted, and the
             score is finite.
-        is_missing: ``[*, C]``, bool: the channel holds a NaN or Inf and was left out.
+        is_missing: ``[*, C]``, bool: the channel holds a NaN or Inf, or was said to be dead, and
+            was left out.
+        variance: ``[*]``, of the score, which is an expected one where a channel in use is missing;
+            0 where none is.
     """
 
     score: Tensor
     is_valid: Tensor
     is_missing: Tensor
+    variance: Tensor
 
 
 Said = TypeVar("Said", Tensor, Judgement)

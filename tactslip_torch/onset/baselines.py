@@ -178,7 +178,7 @@ class BaselineDetector:
         else:
             score = largest_detail(bins, films, self.pool.wavelet, self.pool.level)
         is_valid = is_trusted.index_select(-1, films.to(bins.device)).all(-1)
-        return Judgement(score, is_valid, is_missing)
+        return Judgement(score, is_valid, is_missing, torch.zeros_like(score))
 
 
 def _log_of_largest(

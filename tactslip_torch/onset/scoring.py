@@ -19,11 +19,13 @@ class Scores(NamedTuple):
         score: ``[N]``, dtype of the samples; at least 0 means slip.
         is_valid: ``[N]``, bool: whether it can be relied on.
         is_missing: ``[N, C]``, bool: the channel holds a NaN or Inf and was left out.
+        variance: ``[N]``, of the score; 0 where no channel in use is missing.
     """
 
     score: Tensor
     is_valid: Tensor
     is_missing: Tensor
+    variance: Tensor
 
 
 class Bins(Protocol):
@@ -110,7 +112,8 @@ def score_filtered(
     length = detector.pool.bin_samples
     if filtered.shape[-1] < length:
         none = filtered.new_empty(0, len(filtered))
-        return Scores(none.new_empty(0, dtype=given), none.bool()[:, 0], none.bool())
+        empty = none.new_empty(0, dtype=given)
+        return Scores(empty, none.bool()[:, 0], none.bool(), empty)
     bins = filtered.unfold(-1, length, hop_samples).transpose(0, 1)  # [N, C, n], a view
     judged = [detector.judge(part.contiguous(), given=given) for part in bins.split(chunk)]
     return Scores(*judged[0]) if len(judged) == 1 else Scores(*_together(judged))

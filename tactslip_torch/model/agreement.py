@@ -1,0 +1,48 @@
+"""The parts of a detector must fit together, or it is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.model.class_gaussians import ClassGaussians
+from tactslip_torch.model.detector_file import Head
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.signals.filtering import ChannelFilter
+
+
+def check_parts(
+    pool: FeaturePool,
+    channel_filter: ChannelFilter,
+    selected: Sequence[int],
+    scaler: FeatureScaler,
+    head: Head,
+    typical: Tensor,
+    gaussians: ClassGaussians | None,
+) -> None:
+    """Refuse parts that disagree; what they are ``SlipDetector`` says.
+
+    Raises:
+        ValueError: if they disagree about the number of channels or features, or typical features
+            are not scaled.
+    """
+    num = len(selected)
+    if not num == len(scaler.minimum) == head.num_features:
+        raise ValueError(
+            f"{num} selected features, a scaler of {len(scaler.minimum)} and a head of "
+            f"{head.num_features}: the three must agree"
+        )
+    if len(channel_filter.window_lengths) != len(pool.hand):
+        raise ValueError(
+            f"a filter of {len(channel_filter.window_lengths)} channels does not fit a hand "
+            f"of {len(pool.hand)}"
+        )
+    if typical.shape != (num,) or not bool((typical.abs() <= 1).all()):
+        raise ValueError(
+            f"typical must be {num} scaled features in [-1, 1], got "
+            f"{tuple(typical.shape)} of at most {float(typical.abs().max()):g}"
+        )
+    if gaussians is not None and gaussians.num_features != num:
+        raise ValueError(f"Gaussians of {gaussians.num_features} features do not fit {num} of them")

@@ -1,0 +1,184 @@
+"""The expected score without some features, against quadrature and SciPy's Gaussians."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+
+from tactslip_torch.model import expected_score
+from tactslip_torch.model.class_gaussians import RESOLUTION, ClassGaussians, shrinkage
+from tactslip_torch.model.expected_score import ExpectedScore
+from tactslip_torch.model.quadratic import QuadraticForm
+
+NUM = 7
+
+
+def head_of(rng, num=NUM):
+    bend = torch.from_numpy(rng.standard_normal((num, num)))
+    linear = torch.from_numpy(rng.standard_normal(num))
+    return QuadraticForm(bend + bend.T, linear, torch.tensor(0.3, dtype=torch.float64))
+
+
+def gaussians_of(rng, num=NUM):
+    factor = torch.from_numpy(rng.standard_normal((2, num, 2 * num)))
+    mean = torch.from_numpy(rng.uniform(-0.5, 0.5, (2, num)))
+    return ClassGaussians(mean, factor @ factor.mT / (8 * num))
+
+
+def by_quadrature(head, gaussians, z, lost):
+    """Mean and variance of the score over both classes' conditionals, from their definitions.
+
+    Three Gauss-Hermite points an axis are exact for the fourth powers of a squared quadratic.
+    """
+    seen = [i for i in range(len(z)) if i not in lost]
+    points, heights = np.polynomial.hermite_e.hermegauss(3)
+    grid = np.stack(np.meshgrid(*[points] * len(lost), indexing="ij"), -1).reshape(-1, len(lost))
+    share = np.prod(np.meshgrid(*[heights] * len(lost), indexing="ij"), 0).reshape(-1)
+    share = share / share.sum()
+    density, moments = [], []
+    for mean, covariance in zip(gaussians.mean.numpy(), gaussians.covariance.numpy(), strict=True):
+        across = covariance[np.ix_(lost, seen)] @ np.linalg.inv(covariance[np.ix_(seen, seen)])
+        middle = mean[lost] + across @ (z[seen] - mean[seen])
+        left = covariance[np.ix_(lost, lost)] - across @ covariance[np.ix_(seen, lost)]
+        bins = np.tile(z, (len(grid), 1))
+        bins[:, lost] = middle + grid @ np.linalg.cholesky(left).T
+        scores = head(torch.from_numpy(bins)).numpy()
+        moments.append((share @ scores, share @ scores**2))
+        of_seen = covariance[np.ix_(seen, seen)]
+        density.append(multivariate_normal(mean[seen], of_seen).pdf(z[seen]) if seen else 1.0)
+    weight = np.array(density) / np.sum(density)
+    first, second = weight @ np.array(moments)
+    return first, second - first**2
+
+
+@pytest.mark.parametrize("lost", [[2], [0, 6], [1, 3, 4, 5], list(range(NUM))], ids=str)
+def test_mean_and_variance_are_those_of_the_mixture(lost, rng):
+    head, gaussians = head_of(rng), gaussians_of(rng)
+    z = torch.from_numpy(rng.uniform(-1, 1, (5, NUM)))
+    is_missing = torch.zeros(5, NUM, dtype=torch.bool)
+    is_missing[:, lost] = True
+    mean, variance = ExpectedScore(head, gaussians)(z, is_missing)
+    for row in range(5):
+        expected = by_quadrature(head, gaussians, z[row].numpy(), lost)
+        np.testing.assert_allclose([mean[row], variance[row]], expected, rtol=1e-9)
+
+
+def test_bins_that_miss_other_features_are_judged_each_by_their_own(rng):
+    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    z = torch.from_numpy(rng.uniform(-1, 1, (40, NUM)))
+    is_missing = torch.from_numpy(rng.integers(0, 4, (40, 1)) == np.arange(NUM) % 4)
+    together = expected(z, is_missing)
+    alone = [expected(z[i : i + 1], is_missing[i : i + 1]) for i in range(40)]
+    for found, each in zip(together, zip(*alone, strict=True), strict=True):
+        torch.testing.assert_close(found, torch.cat(each), rtol=1e-12, atol=1e-12)
+
+
+def test_nothing_missing_is_the_score_itself_and_certain(rng):
+    head = head_of(rng)
+    z = torch.from_numpy(rng.uniform(-1, 1, (4, NUM)))
+    mean, variance = ExpectedScore(head, gaussians_of(rng))(z, torch.zeros(4, NUM).bool())
+    torch.testing.assert_close(mean, head(z), rtol=1e-13, atol=1e-13)
+    assert torch.equal(variance, torch.zeros(4, dtype=torch.float64))
+
+
+def test_what_stands_in_a_missing_feature_does_not_matter(rng):
+    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    z = torch.from_numpy(rng.uniform(-1, 1, (3, NUM)))
+    is_missing = torch.zeros(3, NUM).bool()
+    is_missing[:, 4] = True
+    first = expected(z, is_missing)
+    z[:, 4] = torch.tensor([torch.nan, torch.inf, 1e30])
+    for found, other in zip(first, expected(z, is_missing), strict=True):
+        assert torch.equal(found, other)
+
+
+def test_gradients_in_what_is_observed(rng):
+    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    is_missing = torch.zeros(3, NUM).bool()
+    is_missing[:2, [1, 5]] = True
+    z = torch.from_numpy(rng.uniform(-1, 1, (3, NUM))).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: expected(x, is_missing), z)
+    mean, _ = expected(z, is_missing)
+    (slope,) = torch.autograd.grad(mean.sum(), z)
+    assert torch.equal(slope[:2, [1, 5]], torch.zeros(2, 2, dtype=torch.float64))
+
+
+def test_masks_are_made_once_and_the_oldest_forgotten(rng, monkeypatch):
+    made = []
+    whole = expected_score.sweep
+    monkeypatch.setattr(expected_score, "MOST_KEPT", 2)
+    monkeypatch.setattr(expected_score, "sweep", lambda *a: made.append(a[1]) or whole(*a))
+    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    z = torch.zeros(1, NUM, dtype=torch.float64)
+    for feature in (0, 1, 0, 2, 0, 1):
+        expected(z, torch.arange(NUM)[None] == feature)
+    assert [int(mask.nonzero()) for mask in made] == [0, 1, 2, 1]
+
+
+def test_gaussians_of_many_bins_are_those_they_were_drawn_from(rng):
+    true = gaussians_of(rng, 4)
+    factor = torch.linalg.cholesky(true.covariance)
+    is_slip = torch.from_numpy(rng.integers(0, 2, 200_000) == 1)
+    drawn = torch.from_numpy(rng.standard_normal((200_000, 4)))
+    index = is_slip.long()
+    z = true.mean[index] + (factor[index] @ drawn[..., None]).squeeze(-1)
+    found = ClassGaussians.fit(z, is_slip)
+    torch.testing.assert_close(found.mean, true.mean, atol=0.02, rtol=0)
+    torch.testing.assert_close(found.covariance, true.covariance, atol=0.02, rtol=0)
+
+
+def test_a_bin_of_weight_two_counts_as_two(rng):
+    z = torch.from_numpy(rng.standard_normal((60, 3)))
+    is_slip = torch.arange(60) % 2 == 0
+    weights = torch.ones(60)
+    weights[:10] = 2
+    twice = ClassGaussians.fit(torch.cat([z, z[:10]]), torch.cat([is_slip, is_slip[:10]]))
+    found = ClassGaussians.fit(z, is_slip, weights)
+    torch.testing.assert_close(found.mean, twice.mean)
+    variances = (each.covariance.diagonal(dim1=-2, dim2=-1) for each in (found, twice))
+    torch.testing.assert_close(
+        *variances
+    )  # what is beside them is shrunk by how few bins there are
+
+
+def test_few_bins_constant_and_repeated_features_still_give_gaussians(rng):
+    z = torch.from_numpy(rng.standard_normal((9, 20)))
+    z[:, 3], z[:, 5] = 0.5, z[:, 4]
+    found = ClassGaussians.fit(z, torch.arange(9) < 4)
+    least = torch.linalg.eigvalsh(found.covariance).min()
+    assert float(least) > RESOLUTION / 2
+    assert float(found.covariance[0, 3, 3]) == RESOLUTION
+
+
+def test_shrinkage_vanishes_with_bins_and_is_whole_of_one():
+    correlated = torch.tensor([[1.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
+    assert shrinkage(correlated, 1) == 1.0
+    # (1 - .25)^2 / 99 over .25
+    assert shrinkage(correlated, 100) == pytest.approx(0.5625 / 99 / 0.25)
+    assert shrinkage(torch.eye(2, dtype=torch.float64), 1e6) == 1.0
+
+
+def test_gaussians_come_back_from_json_to_the_bit(rng):
+    found = gaussians_of(rng)
+    again = ClassGaussians.from_dict(found.to_dict())
+    assert torch.equal(again.mean, found.mean)
+    assert torch.equal(again.covariance, found.covariance)
+
+
+@pytest.mark.parametrize(
+    ("mean", "covariance", "said"),
+    [
+        (torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3), "float64"),
+        (torch.zeros(3).double(), torch.eye(3).double(), "mean .2, K. and covariance"),
+        (torch.zeros(2, 3).double(), torch.zeros(2, 3, 3).double(), "positive definite"),
+        (torch.full((2, 3), torch.nan).double(), torch.eye(3).double().expand(2, 3, 3), "finite"),
+    ],
+)
+def test_what_are_no_gaussians_is_refused(mean, covariance, said):
+    with pytest.raises(ValueError, match=said):
+        ClassGaussians(mean, covariance)
+
+
+def test_a_class_without_bins_is_refused():
+    with pytest.raises(ValueError, match="got no slip"):
+        ClassGaussians.fit(torch.zeros(4, 2), torch.zeros(4).bool())
