@@ -111,7 +111,7 @@ def fit_machine(
         raise ValueError("a machine needs training bins, got none; add bins of both classes")
     bins = bins.double()
     if isinstance(kernel, Polynomial) and kernel.collapses:
-        if not _goes_dual(bins, penalty, kernel, route):
+        if not goes_dual(bins, penalty, kernel, route):
             solve = _solve_linear_primal if kernel.degree == 1 else _solve_quadratic_primal
             return solve(bins, penalty, kernel.offset, progress)
     elif route == "primal":
@@ -147,7 +147,7 @@ def takes_dual(kernel: Kernel, num_bins: int, num_features: int) -> bool:
     return num_bins**3 <= num_quadratic_features(num_features) ** 3 + 6 * sums
 
 
-def _goes_dual(bins: TrainingBins, penalty: float, kernel: Polynomial, route: Route) -> bool:
+def goes_dual(bins: TrainingBins, penalty: float, kernel: Polynomial, route: Route) -> bool:
     """Whether the dual is asked for, cheaper, or needed: sums would lose the lightest bin."""
     num_bins, num_features = bins.features.shape
     if route == "dual" or (route == "auto" and takes_dual(kernel, num_bins, num_features)):
