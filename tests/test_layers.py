@@ -514,6 +514,17 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "threads",
     ),
     "sensors": ("*",),
+    "importance.*": (
+        "importance.*",
+        "feature_maker",
+        "data.*",
+        "signals.*",
+        "features.*",
+        "model.*",
+        "hand",
+        "threads",
+    ),
+    "sensors": ("*",),
     "certificate": (
         "feature_maker",
         "data.*",
@@ -634,6 +645,7 @@ ENTRY = (
     "detect",
     "adapt",
     "sensors",
+    "sensors",
     "config",
 )
 
@@ -662,6 +674,8 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
         "report.abstaining",
         "report.onset",
         "report.dataset",
+        "report.hand_drawing",
+        "report.hand_figure",
         "report.hand_drawing",
         "report.hand_figure",
     ),

@@ -1,0 +1,1 @@
+"""Which sensors matter: by gradient, by leaving them out, and by making do with the best few."""

@@ -1,0 +1,311 @@
+"""Which sensors matter: sets whose answer is known, and machines refitted by the slow way."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from small_detector import HAND, raw_bins, small_detector
+
+from tactslip_torch.features.bin_sample import BinSample
+from tactslip_torch.features.selection import ClassMoments, t_scores
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.importance.accuracy import (
+    balanced_accuracy,
+    difference,
+    draw_recordings,
+    tally,
+)
+from tactslip_torch.importance.choosing import (
+    Ranking,
+    best_first,
+    side_by_side,
+    units_of,
+    without,
+)
+from tactslip_torch.importance.gradient import first_order, score_gradients
+from tactslip_torch.importance.refit import HELD_OUT, Refit
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.kernels import PAPER_KERNEL
+from tactslip_torch.model.scaling import FeatureScaler
+
+CHANNELS = ["a", "a", "b", "b", "c", "c"]  # of each feature
+UNITS = {name: frozenset(name) for name in "abc"}
+PENALTIES = (0.01, 0.1, 1.0)
+
+
+def quietly(items, what):
+    return items
+
+
+def sampled(seed, tells, groups="MNO", recordings=4, bins=12):
+    """Bins whose features ``tells`` follow the class, by how much; the others are noise."""
+    rng = np.random.default_rng(seed)
+    sample = BinSample(1000)
+    for group in groups:
+        for number in range(recordings):
+            is_slip = torch.arange(bins) % 2 == 0
+            noise = torch.from_numpy(rng.standard_normal((bins, len(CHANNELS)))).float()
+            signal = torch.tensor([tells.get(i, 0.0) for i in range(len(CHANNELS))])
+            features = noise + torch.where(is_slip, 1.0, -1.0)[:, None] * signal
+            sample.update(f"{group}/{seed}/{number}", group, features, is_slip)
+    return sample.bins()
+
+
+def refit_of(tells):
+    train = sampled(0, tells)
+    scaler = FeatureScaler.fit(train.features.double())
+    judged = {"test": sampled(1, tells), "unseen": sampled(2, tells, groups="PQ")}
+    weights = torch.linspace(0.5, 2.0, len(train.is_slip), dtype=torch.float64)
+    return Refit(train, weights, judged, scaler, PAPER_KERNEL, PENALTIES)
+
+
+def ranking_of(refit, num_features=6, allowed=None, most_correlation=1.0):
+    moments = ClassMoments(len(CHANNELS))
+    moments.update(refit.train.features, refit.train.is_slip)
+    scores = t_scores(moments, "pooled")
+    return Ranking(scores, CHANNELS, allowed, refit.train, num_features, most_correlation)
+
+
+# Accuracy and its draws --------------------------------------------------------------------------
+
+
+def by_hand(is_right, bins, recordings):
+    """Mean over groups of the mean of both recalls, bin by bin; recordings as often as named."""
+    means = []
+    for group in sorted(set(bins.group.tolist())):
+        recalls = []
+        for value in (False, True):
+            hits = [
+                bool(is_right[i])
+                for recording in recordings
+                for i in range(len(bins.is_slip))
+                if bins.recording[i] == recording
+                and bins.group[i] == group
+                and bool(bins.is_slip[i]) is value
+            ]
+            recalls.append(sum(hits) / len(hits))
+        means.append(sum(recalls) / 2)
+    return sum(means) / len(means)
+
+
+def test_accuracy_is_the_mean_over_groups_bin_by_bin():
+    bins = sampled(3, {})
+    is_right = torch.rand(len(bins.is_slip), generator=torch.Generator().manual_seed(0)) < 0.7
+    every = range(len(bins.recording_names))
+    assert float(balanced_accuracy(tally(is_right, bins))) == pytest.approx(
+        by_hand(is_right, bins, every)
+    )
+
+
+def test_a_draw_counts_a_recording_as_often_as_it_was_drawn():
+    bins = sampled(4, {})
+    is_right = torch.rand(len(bins.is_slip), generator=torch.Generator().manual_seed(1)) < 0.7
+    found = tally(is_right, bins)
+    times = draw_recordings(found.group, 5, seed=2)
+    for draw, accuracy in zip(times, balanced_accuracy(found, times), strict=True):
+        drawn = [r for r, count in enumerate(draw.tolist()) for _ in range(int(count))]
+        assert float(accuracy) == pytest.approx(by_hand(is_right, bins, drawn))
+        for group in found.group.unique():  # as many of each group as there are
+            mine = found.group == group
+            assert draw[mine].sum() == mine.sum()
+
+
+def test_a_group_of_one_class_is_passed_over():
+    sample = BinSample(10)
+    sample.update("M/0", "M", torch.zeros(4, 1), torch.tensor([True, True, False, False]))
+    sample.update("N/0", "N", torch.zeros(2, 1), torch.tensor([True, True]))
+    bins = sample.bins()
+    is_right = bins.group == 0
+    assert float(balanced_accuracy(tally(is_right, bins))) == 1.0
+
+
+def test_a_paired_interval_is_nothing_between_equals_and_holds_the_difference():
+    bins = sampled(5, {})
+    draw = torch.rand(len(bins.is_slip), generator=torch.Generator().manual_seed(2))
+    better, worse = tally(draw < 0.9, bins), tally(draw < 0.6, bins)
+    assert difference(better, better, 50, 0) == (0.0, 0.0, 0.0)
+    lost = difference(better, worse, 400, 0)
+    assert 0 < lost.low < lost.lost < lost.high
+    assert lost.lost == pytest.approx(
+        float(balanced_accuracy(better)) - float(balanced_accuracy(worse))
+    )
+    with pytest.raises(ValueError, match="at least one draw, got 0"):
+        difference(better, worse, 0, 0)
+
+
+# Machines refitted -------------------------------------------------------------------------------
+
+
+def test_a_verdict_is_that_of_machines_fitted_without_each_group():
+    refit, features = refit_of({0: 0.8, 2: 0.5}), [0, 2, 5]
+    train = refit.train
+    z = FeatureScaler.fit(train.features[:, features].double())(train.features[:, features])
+    best = None
+    for penalty in PENALTIES:
+        scores = torch.empty(len(z), dtype=torch.float64)
+        for group in train.group.unique():
+            own = train.group == group
+            rest = TrainingBins(z[~own], train.is_slip[~own], refit.weights[~own])
+            scores[own] = fit_machine(rest, penalty)(z[own])
+        accuracy = by_hand((scores >= 0) == train.is_slip, train, range(len(train.recording_names)))
+        error = refit.weights @ (torch.where(train.is_slip, 1.0, -1.0) - scores).square()
+        merit = (accuracy, -float(error / refit.weights.sum()))
+        if best is None or merit > best[0]:
+            best = merit, penalty
+    verdict = refit(features)
+    assert verdict.penalty == best[1]
+    assert verdict.merit == pytest.approx(best[0])
+    head = fit_machine(TrainingBins(z, train.is_slip, refit.weights), verdict.penalty)
+    for role, bins in refit.judged.items():
+        scaled = FeatureScaler.fit(train.features[:, features].double())(bins.features[:, features])
+        is_right = (head(scaled) >= 0) == bins.is_slip
+        assert torch.equal(verdict.tallies[role].right, tally(is_right, bins).right)
+
+
+def test_what_is_judged_chooses_nothing():
+    refit = refit_of({0: 0.8})
+    spoilt = refit_of({0: 0.8})
+    for bins in spoilt.judged.values():
+        bins.features.neg_()
+    before, after = refit([0, 1]), spoilt([0, 1])
+    assert (before.penalty, before.merit) == (after.penalty, after.merit)
+    assert before.accuracy("unseen") != after.accuracy("unseen")
+
+
+def test_without_a_feature_every_bin_is_slip():
+    verdict = refit_of({})([])
+    assert [verdict.accuracy(role) for role in (HELD_OUT, "test", "unseen")] == [0.5] * 3
+
+
+# Sets of channels --------------------------------------------------------------------------------
+
+
+def test_units_are_every_channel_once_by_channel_finger_and_kind():
+    hand = HandLayout.from_rows(
+        {"name": f"E{i}", "kind": kind, "finger": finger, "segment": "s", "adapting": "slow"}
+        for i, (kind, finger) in enumerate([("x", "f"), ("y", "f"), ("x", "g")])
+    )
+    units = units_of(hand)
+    assert units["finger"] == {"f": {"E0", "E1"}, "g": {"E2"}}
+    assert units["kind"] == {"x": {"E0", "E2"}, "y": {"E1"}}
+    assert units["channel"] == {name: {name} for name in hand.names}
+
+
+def test_a_ranking_takes_the_largest_scores_of_the_channels_it_may():
+    refit = refit_of({5: 2.0, 3: 1.5, 1: 1.0})
+    ranking = ranking_of(refit, num_features=2)
+    assert ranking(frozenset("abc")) == [5, 3]
+    assert ranking(frozenset("ab")) == [3, 1]
+    allowed = torch.tensor([True] * 4 + [False] * 2)
+    assert ranking_of(refit, 6, allowed)(frozenset("c")) == []
+    assert ranking_of(refit, 6, allowed)(frozenset("bc"))[0] == 3
+    assert without([5, 3, 1, 0], {"a", "c"}, CHANNELS) == [3]
+
+
+def test_a_ranking_passes_over_what_repeats():
+    refit = refit_of({5: 2.0, 3: 1.5})
+    refit.train.features[:, 4] = 3 * refit.train.features[:, 5]
+    assert ranking_of(refit, 2)(frozenset("abc")) == [4, 5]
+    assert ranking_of(refit, 2, most_correlation=0.99)(frozenset("abc")) == [4, 3]
+
+
+def test_a_shared_ranking_takes_as_many_of_each_channel():
+    refit = refit_of({5: 3.0, 4: 2.5, 3: 1.0, 1: 0.5})
+    shared = replace(ranking_of(refit, num_features=3), is_shared=True)
+    assert ranking_of(refit, num_features=3)(frozenset("abc")) == [5, 4, 3]
+    assert shared(frozenset("abc")) == [5, 3, 1]
+    assert shared(frozenset("c")) == [5, 4]
+    assert replace(shared, num_features=1)(frozenset("bc")) == [5, 3]  # one of each at least
+
+
+def test_the_best_few_begin_with_what_tells_most_and_end_with_all():
+    refit = refit_of({2: 1.5, 4: 0.9})
+    ranking = ranking_of(refit)
+    steps = best_first(refit, ranking, UNITS, 9, quietly, "")
+    assert [name for name, _ in steps] == ["b", "c", "a"]
+    assert [verdict.num_features for _, verdict in steps] == [2, 4, 6]
+    alone = {name: refit(ranking(channels)).merit for name, channels in UNITS.items()}
+    assert steps[0][1].merit == max(alone.values())
+    assert steps[-1][1].tallies["test"].right.equal(refit(ranking("abc")).tallies["test"].right)
+    assert len(best_first(refit, ranking, UNITS, 2, quietly, "")) == 2
+
+
+def test_a_unit_without_a_feature_never_joins():
+    refit = refit_of({2: 1.5})
+    allowed = torch.tensor([False] * 2 + [True] * 4)
+    steps = best_first(refit, ranking_of(refit, 6, allowed), UNITS, 9, quietly, "")
+    assert sorted(name for name, _ in steps) == ["b", "c"]
+
+
+def test_verdicts_come_in_order_and_alike_on_any_number_of_threads():
+    selections = [[0], [1, 2], [2, 3, 4], [5]]
+    before = torch.get_num_threads()
+    found = []
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        found.append(side_by_side(refit_of({2: 1.0}), selections))
+    torch.set_num_threads(before)
+    assert [verdict.num_features for verdict in found[0]] == [1, 2, 3, 1]
+    assert [v.merit for v in found[0]] == [v.merit for v in found[1]]
+
+
+# Gradients ---------------------------------------------------------------------------------------
+
+
+def test_gradients_are_those_of_finite_differences():
+    detector, samples = small_detector(2), raw_bins(3)
+    scores, gradients = score_gradients(detector, samples, quietly)
+    torch.testing.assert_close(scores, detector.score_raw(samples))
+    generator = torch.Generator().manual_seed(0)
+    way = torch.randn(samples.shape, generator=generator, dtype=torch.float64)
+    step = 1e-7  # as entropy and mode step, of which gradients know nothing
+    ahead, back = (detector.score_raw(samples + sign * step * way) for sign in (1, -1))
+    slope = (ahead - back) / (2 * step)
+    torch.testing.assert_close((gradients * way).sum((1, 2)), slope, rtol=1e-6, atol=0)
+
+
+def test_a_channel_that_is_not_in_use_moves_nothing():
+    detector = small_detector()
+    samples = raw_bins(4)
+    _, gradients = score_gradients(detector, samples, quietly)
+    used = {name.channel for name in detector.selected_names}
+    for index, name in enumerate(HAND.names):
+        assert bool(gradients[:, index].any()) is (name in used)
+
+
+def test_first_order_of_a_linear_score_is_the_spread_of_its_parts():
+    # score = sum over channels of w_c x_c: what a channel moves is the spread of its own part
+    generator = torch.Generator().manual_seed(3)
+    samples = torch.randn(400, 3, 5, generator=generator, dtype=torch.float64) + 7.0
+    weights = torch.randn(3, 5, generator=generator, dtype=torch.float64)
+    weights[2] = 0
+    parts = (samples * weights).sum(-1)  # [N, C]
+    scores = parts.sum(-1)
+    is_slip = torch.arange(400) % 3 == 0
+    moved = first_order(scores, weights.expand_as(samples), samples, is_slip)
+    torch.testing.assert_close(moved.slip, parts.std(0) / scores.std())
+    torch.testing.assert_close(moved.non_slip, moved.slip)
+    twice = weights.expand_as(samples) * torch.where(is_slip, 2.0, 1.0)[:, None, None]
+    louder = first_order(scores, twice, samples, is_slip)
+    torch.testing.assert_close(louder.slip, 2 * moved.slip)
+    torch.testing.assert_close(louder.non_slip, moved.non_slip)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"is_slip": torch.ones(4, dtype=torch.bool)}, "give bins of slip and of non-slip"),
+        ({"scores": torch.full((4,), 2.0)}, "all 4 scores are 2; nothing moves them"),
+        ({"gradients": torch.zeros(4, 2, 2)}, r"expected scores and is_slip \[N\]"),
+    ],
+)
+def test_what_no_first_order_can_be_told_of_is_refused(change, words):
+    given = {
+        "scores": torch.arange(4.0),
+        "gradients": torch.zeros(4, 2, 3),
+        "samples": torch.zeros(4, 2, 3),
+        "is_slip": torch.arange(4) < 2,
+    }
+    with pytest.raises(ValueError, match=words):
+        first_order(**(given | change))
