@@ -43,6 +43,7 @@ from tactslip_torch.data.sets.stream import stream_of
 from tactslip_torch.experiment import save_config, versions
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.answering import answer_of
 from tactslip_torch.onset.decider import Decisions
 from tactslip_torch.onset.events import (
     EventRules,
@@ -150,7 +151,7 @@ def _hear(
     table = folder / f"{name}_decisions.csv"
     with (
         _opened(path, listener) as (samples, archived),
-        decisions_file(table, Decisions._fields, wanted=config.decisions) as keep,
+        decisions_file(table, (*Decisions._fields, "answer"), wanted=config.decisions) as keep,
     ):
         rate = detector.pool.sample_rate_hz
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
@@ -161,11 +162,12 @@ def _hear(
         tally = Tally(archived.recording.onsets_s if archived else ())
 
         def take(decisions: Decisions) -> None:
-            found = {name: part.numpy() for name, part in decisions._asdict().items()}
+            parts = decisions._asdict() | {"answer": answer_of(detector, decisions)}
+            found = {name: part.numpy() for name, part in parts.items()}
             times, is_valid, is_on = (found[n] for n in ("available_s", "is_valid", "is_on"))
             alarms = [dataclasses.asdict(alarm) for alarm in decisions.alarms]
             tally.add(times, found["llr"], is_valid, is_on, alarms)
-            traces.add_decisions(times, found["probability"], is_on, is_valid)
+            traces.add_decisions(times, found["probability"], is_on, is_valid, found["answer"] < 0)
             keep(zip(*(part.tolist() for part in found.values()), strict=True))
 
         for piece in pieces(samples, _piece_samples(detector)):

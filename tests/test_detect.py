@@ -19,6 +19,7 @@ from tactslip_torch.data.formats import npz
 from tactslip_torch.data.formats.registry import FORMATS, Format
 from tactslip_torch.data.formats.stored_array import StoredSamples
 from tactslip_torch.detect import detect, main
+from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decider import Decider
 from tactslip_torch.onset.scoring import score_stream
@@ -198,8 +199,27 @@ def test_the_files_agree_with_each_other(run):
         found = [float(row[name]) for row in decided]
         np.testing.assert_allclose(found, getattr(wanted, name), rtol=1e-4, atol=1e-4)
     assert [row["is_on"] == "True" for row in decided] == wanted.is_on.tolist()
+    by_sign = [int(score >= 0) for score in wanted.score.tolist()]  # it has no thresholds
+    assert [int(row["answer"]) for row in decided] == by_sign
+    assert set(by_sign) == {0, 1}
     with Image.open(folder / "a_onsets.png") as image:
         assert image.format == "PNG"
+
+
+def test_a_detector_with_thresholds_is_unsure_between_them(tmp_path):
+    detector = small_detector(SEED)
+    score = offline(volts()).score
+    low, high = (float(score[side].median()) for side in (score < 0, score > 0))
+    detector.info |= {
+        "alarm": SETTINGS.to_dict(),
+        "abstain": Abstention(0.95, low, high).to_dict(),
+    }
+    detector.save(tmp_path / "unsure.pt")
+    save(tmp_path / "a.npz", recording())
+    heard(tmp_path / "unsure.pt", tmp_path / "a.npz", tmp_path / "out", "decisions=true")
+    for row in rows_of(tmp_path / "out" / "a_decisions.csv"):
+        wanted = 1 if float(row["score"]) >= high else 0 if float(row["score"]) < low else -1
+        assert int(row["answer"]) == wanted
 
 
 def test_the_terminal_shows_a_table_a_rate_and_one_bar(model, tmp_path, capsys):

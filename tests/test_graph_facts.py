@@ -21,6 +21,8 @@ from tactslip_torch.graph.facts import (
     sidecar_text,
 )
 from tactslip_torch.graph.form import Form
+from tactslip_torch.model.abstention import KEY as ABSTAIN
+from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.sequential import Cusum
@@ -30,8 +32,8 @@ ORIGIN = Origin("1.2.3", "ab" * 32)
 IN_BOTH = {
     *("format", "version", "graph", "precision", "layout", "channels", "kinds", "unit"),
     *("sample_rate_hz", "bin_samples", "context_before_samples", "context_after_samples"),
-    *("features", "slip_if_score_at_least", "calibration", "slip_share", "experiment"),
-    *("train_materials", "simulated", "detector_sha256", "certificate"),
+    *("features", "slip_if_score_at_least", "calibration", "slip_share", "abstain"),
+    *("experiment", "train_materials", "simulated", "detector_sha256", "certificate"),
 }
 IN_STREAM = {
     *("hop_samples", "first_samples", "frame_samples", "tail_samples", "state_size", "rule"),
@@ -59,8 +61,16 @@ def test_a_bin_graph_says_what_a_host_must_know():
     assert facts["features"] == [str(name) for name in detector.selected_names]
     assert facts["slip_if_score_at_least"] == 0.0
     assert facts["calibration"] is facts["slip_share"] is facts["certificate"] is None
+    assert facts["abstain"] is None
     assert (facts["experiment"], facts["train_materials"], facts["simulated"]) == (None, [], True)
     assert (facts["version"], facts["detector_sha256"]) == ("1.2.3", "ab" * 32)
+
+
+def test_a_graph_says_between_which_scores_a_host_is_unsure():
+    detector = small_detector()
+    detector.info[ABSTAIN] = Abstention(0.9, -0.25, 0.5, {"unit": "recording"}).to_dict()
+    facts = model_facts(detector, Form(), ORIGIN)
+    assert facts["abstain"] == {"coverage": 0.9, "low": -0.25, "high": 0.5, "unit": "recording"}
 
 
 def test_a_stream_graph_says_how_it_decides():

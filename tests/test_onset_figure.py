@@ -69,20 +69,21 @@ def test_an_envelope_of_pieces_keeps_no_more_than_is_drawn():
 def test_short_traces_are_the_stream_itself(rng):
     volts = rng.standard_normal((3, 2400))
     times = 0.07 + HOP_S * np.arange(110)
-    probability, is_slip, is_valid = rng.random(110), rng.random(110) < 0.5, rng.random(110) < 0.9
+    probability = rng.random(110)
+    flags = [rng.random(110) < share for share in (0.5, 0.9, 0.2)]
     traces = Traces({"b": 2, "a": 0}, RATE_HZ, HOP_S, (0.0, 1.2))
     for piece in pieces(rng, 2400, 700):
         traces.add_samples(volts[:, piece])
     for piece in pieces(rng, 110, 30):
-        traces.add_decisions(times[piece], probability[piece], is_slip[piece], is_valid[piece])
+        traces.add_decisions(times[piece], probability[piece], *(flag[piece] for flag in flags))
     heard = traces.heard([(0.5, 0.4)], [0.45], [(0.45, 0.9)], is_known=True)
     assert list(heard.films) == ["b", "a"]
     for name, row in (("b", 2), ("a", 0)):
         np.testing.assert_allclose(heard.films[name][0], np.arange(2400) / RATE_HZ)
         np.testing.assert_array_equal(heard.films[name][1], volts[row])
     for line, wanted in zip(
-        (heard.probability, heard.is_slip, heard.is_valid),
-        (probability, is_slip, is_valid),
+        (heard.probability, heard.is_slip, heard.is_valid, heard.is_unsure),
+        (probability, *flags),
         strict=True,
     ):
         np.testing.assert_allclose(line[0], times, atol=1e-9)
@@ -97,7 +98,8 @@ def test_a_view_takes_its_stretch_and_the_status_it_begins_with(rng):
     for piece in pieces(rng, 4000, 300):
         traces.add_samples(volts[:, piece])
     for piece in pieces(rng, 190, 9):
-        traces.add_decisions(times[piece], times[piece], times[piece] < 1, times[piece] > 0)
+        now = times[piece]
+        traces.add_decisions(now, now, now < 1, now > 0, now < 0)
     heard = traces.heard([], [], [], is_known=False)
     np.testing.assert_allclose(heard.films["a"][0], np.arange(1000, 1600) / RATE_HZ)
     np.testing.assert_array_equal(heard.films["a"][1], volts[0, 1000:1600])
@@ -112,7 +114,7 @@ def test_the_memory_of_traces_does_not_grow_with_the_stream(rng):
         for second in range(seconds):
             traces.add_samples(rng.standard_normal((2, 2000)).astype(np.float32))
             times = second + HOP_S * np.arange(100)
-            traces.add_decisions(times, rng.random(100), times > 3, times > 0)
+            traces.add_decisions(times, rng.random(100), times > 3, times > 0, times < 0)
         running = (traces._volts, traces._decided)
         return sum(p.nbytes for r in running for p in [r._rest, *r._indices, *r._values])
 
@@ -163,7 +165,10 @@ def test_spans_and_status_are_those_of_a_loop(seed, num):
 
 
 def heard(rng, **changes):
-    """Two seconds of three films; slip is decided from 0.5 to 1.2 s, 0.2 s of it not valid."""
+    """Two seconds of three films; slip is decided from 0.5 to 1.2 s, 0.2 s of it not valid.
+
+    From 0.9 to 1 s the answer is unsure.
+    """
     times = np.arange(4000) / RATE_HZ
     decided = np.round(0.07 + HOP_S * np.arange(190), 6)
     slip = (decided >= 0.5) & (decided < 1.2)
@@ -174,6 +179,7 @@ def heard(rng, **changes):
         "probability": (decided, 0.9 * slip + 0.05),
         "is_slip": (decided, slip.astype(float)),
         "is_valid": (decided, valid.astype(float)),
+        "is_unsure": (decided, ((decided >= 0.9) & (decided < 1.0)).astype(float)),
         "alarms": [(0.5, 0.43), (1.9, 1.88)],
         "onsets_s": [0.42],
         "sliding_s": [(0.42, 1.1)],
@@ -249,6 +255,16 @@ def test_marks_stand_where_things_happened(rng):
     assert line.get_drawstyle() == "steps-post"  # a decision holds until the next
     assert {"decided: slip", "onset, true", "not to be relied on"} <= set(legend_of(figure))
     assert chance.get_xlim() == (0.0, 2.0)
+
+
+def test_unsure_answers_lie_behind_the_probability_alone(rng):
+    drawn = heard(rng)
+    films, status, chance = draw_onsets(drawn, title="").axes
+    assert stretches_of(of(chance, "unsure")) == [(0.9, 1.0)]
+    assert "unsure" not in {part.get_gid() for axes in (films, status) for part in axes.collections}
+    assert "unsure" in legend_of(draw_onsets(drawn, title=""))
+    sure = heard(rng, is_unsure=(drawn.is_unsure[0], 0 * drawn.is_unsure[1]))
+    assert "unsure" not in legend_of(draw_onsets(sure, title=""))
 
 
 def test_what_is_out_of_view_is_not_drawn(rng):

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.stream import Timing
+from tactslip_torch.model.abstention import abstention_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import AlarmSettings, calibration_of
 
@@ -46,7 +47,7 @@ def model_facts(
     """
     hand, info = detector.pool.hand, detector.info
     window = Window.of(detector)
-    calibrated = calibration_of(detector)
+    calibrated, abstain = calibration_of(detector), abstention_of(detector)
     facts: dict[str, Any] = {
         "format": FORMAT,
         "version": origin.version,
@@ -64,6 +65,7 @@ def model_facts(
         "slip_if_score_at_least": 0.0,
         "calibration": calibrated and calibrated[0].to_dict(),
         "slip_share": calibrated and calibrated[1],
+        "abstain": abstain and abstain.to_dict(),
         "experiment": info.get("experiment"),
         "train_materials": list(info.get("train_materials", ())),
         "simulated": info.get("simulated"),

@@ -16,6 +16,7 @@ Counts = Sequence[Sequence[int]]
 """Bins of a recording by truth (non-slip, slip) and answer (unsure, non-slip, slip)."""
 
 CLASSES = ("non_slip", "slip")
+_ROUNDING = 1e-12  # of a share
 
 
 def answer_counts(is_slip: Tensor, answer: Tensor) -> list[list[int]]:
@@ -74,7 +75,7 @@ def answer_metrics(recordings: Mapping[str, Counts], coverage: float) -> dict[st
         shares = covered_shares(table, index)
         found[name] = {
             "coverage": _ratio(shares.sum(), len(shares)),
-            "reached": _ratio((shares >= coverage).sum(), len(shares)),
+            "reached": _ratio((shares >= coverage - _ROUNDING).sum(), len(shares)),
             "unsure": _ratio(total[index, 0], total[index].sum()),
             "num_recordings": len(shares),
         }

@@ -2,7 +2,8 @@
 
 The films over time, blue where the status decided is no slip and yellow where it is slip
 (paper section V-D); below them the decided and the true status, and the probability of slip.
-Everything stands at the time at which it was known, so the delay of a decision can be seen.
+Behind it stand the decisions that are unsure, where the detector may be. Everything stands at the
+time at which it was known, so the delay of a decision can be seen.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ _INVALID: dict[str, Any] = {
     "linewidth": 0,
     "zorder": 0.5,
 }
+_UNSURE: dict[str, Any] = {"facecolor": "#DDD6E8", "edgecolor": "none", "zorder": 0.2}
 _ONSET: dict[str, Any] = {"color": _INK, "linestyle": "-."}
 _ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-"}
 _ESTIMATE: dict[str, Any] = {"color": ALARM, "linestyle": ":"}
@@ -60,6 +62,8 @@ def draw_onsets(heard: Heard, *, title: str) -> Figure:
     _draw_films(panels[0], heard, slips)
     _draw_status(panels[1], heard, slips)
     _draw_probability(panels[2], heard)
+    unsure = spans(heard.is_unsure, heard.view[1])
+    _shade(panels[2], unsure, "unsure", **_UNSURE)
     for axes in panels:
         _shade(axes, invalid, "invalid", **_INVALID)
         axes.tick_params(color="#BBBBBB", labelsize=8)
@@ -68,7 +72,7 @@ def draw_onsets(heard: Heard, *, title: str) -> Figure:
     panels[0].set_xlim(*heard.view)
     panels[2].set_xlabel("time, s", fontsize=9, color=_GREY)
     figure.suptitle(title, fontsize=11)
-    handles = _legend(heard, bool(invalid))
+    handles = _legend(heard, bool(invalid), bool(unsure))
     figure.legend(
         handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=8
     )
@@ -136,7 +140,7 @@ def _draw_probability(axes: Axes, heard: Heard) -> None:
     axes.set_ylabel("P(slip)", fontsize=8)
 
 
-def _legend(heard: Heard, has_invalid: bool) -> list[Any]:
+def _legend(heard: Heard, has_invalid: bool, has_unsure: bool) -> list[Any]:
     handles: list[Any] = [
         Line2D([], [], color=REST, linewidth=2, label="decided: no slip"),
         Line2D([], [], color=SLIP, linewidth=2, label="decided: slip"),
@@ -145,6 +149,8 @@ def _legend(heard: Heard, has_invalid: bool) -> list[Any]:
     ]
     if heard.onsets_s:
         handles.append(Line2D([], [], label="onset, true", **_ONSET))
+    if has_unsure:
+        handles.append(Patch(label="unsure", **_UNSURE))
     if has_invalid:
         handles.append(Patch(label="not to be relied on", **_INVALID))
     return handles

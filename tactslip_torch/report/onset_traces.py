@@ -28,6 +28,7 @@ class Heard:
         probability: of slip.
         is_slip: contact status after each decision, 0 or 1.
         is_valid: whether the decision can be relied on, 0 or 1.
+        is_unsure: whether its score is too near the boundary to answer, or not valid, 0 or 1.
         alarms: of each alarm, when it was raised and when its slip is thought to have begun.
         onsets_s: exact onsets, where they are known.
         sliding_s: start and end of each slide.
@@ -40,6 +41,7 @@ class Heard:
     probability: Points
     is_slip: Points
     is_valid: Points
+    is_unsure: Points
     alarms: Stretches = ()
     onsets_s: Sequence[float] = ()
     sliding_s: Stretches = ()
@@ -72,7 +74,7 @@ class Traces:
         length = self._span[1] - self._span[0]
         num_decisions = round((self.view[1] - self.view[0]) / self.hop_s)
         self._volts = RunningEnvelope(len(self.films), length, _STRETCHES)
-        self._decided = RunningEnvelope(3, num_decisions, _STRETCHES)
+        self._decided = RunningEnvelope(4, num_decisions, _STRETCHES)
 
     def add_samples(self, samples: NDArray[np.floating]) -> None:
         """Take the next samples, ``[C, n]``."""
@@ -81,14 +83,19 @@ class Traces:
         self._volts.add(samples[list(self.films.values()), first:stop])
 
     def add_decisions(
-        self, available_s: Array, probability: Array, is_slip: Array, is_valid: Array
+        self,
+        available_s: Array,
+        probability: Array,
+        is_slip: Array,
+        is_valid: Array,
+        is_unsure: Array,
     ) -> None:
         """Take the next decisions, each ``[m]``."""
         since_s = self.view[0] - self.hop_s  # the one before the view tells the status there
         is_seen = (available_s > since_s) & (available_s <= self.view[1])
         if self._first_s is None and is_seen.any():
             self._first_s = float(available_s[is_seen][0])
-        self._decided.add(np.stack([probability, is_slip, is_valid])[:, is_seen])
+        self._decided.add(np.stack([probability, is_slip, is_valid, is_unsure])[:, is_seen])
 
     def heard(
         self, alarms: Stretches, onsets_s: Sequence[float], sliding_s: Stretches, *, is_known: bool
@@ -99,9 +106,9 @@ class Traces:
         films = {name: (times[row], volts[row]) for row, name in enumerate(self.films)}
         number, values = self._decided.points()
         decided_s = (self._first_s or 0.0) + number * self.hop_s
-        lines = [(decided_s[row], values[row]) for row in range(3)]
+        lines = [(decided_s[row], values[row]) for row in range(4)]
         truth = (alarms, onsets_s, sliding_s, is_known)
-        return Heard(self.view, films, lines[0], lines[1], lines[2], *truth, self.units)
+        return Heard(self.view, films, lines[0], lines[1], lines[2], lines[3], *truth, self.units)
 
 
 def view_of(given: Any, duration_s: float) -> tuple[float, float]:
