@@ -439,6 +439,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "onset.baselines": ("signals.*", "features.guards", "features.pool", "model.judgement"),
     "onset.scoring": ("model.*", "signals.*"),
     "onset.decider": ("onset.latch", "onset.sequential", "onset.settings", "model.calibration"),
+    "onset.answering": ("onset.decider", "model.*"),
     "onset.settings": ("onset.sequential", "model.*"),
     "onset.streaming": ("onset.*", "model.*", "signals.*"),
     "onset.differentiable": ("onset.*", "model.*"),
