@@ -65,8 +65,8 @@ def draw_hand(
     fingers = _fingers(channels)
     straight = sum(finger.degrees == 0 for finger in fingers)
     right = max(straight, 1) - 1 + _WIDTH / 2 + 0.04
-    palm = (-_WIDTH / 2 - 0.04, -1.75)
-    _box(axes, palm, right - palm[0], 1.72, axes.transData, rounding=0.3)
+    left, depth = -_WIDTH / 2 - 0.04, 0.5 + 0.31 * max(straight, 1)
+    _box(axes, (left, -0.03 - depth), right - left, depth, axes.transData, rounding=0.3)
     for finger in fingers:
         moved = finger.place + axes.transData
         for number, segment in enumerate(reversed(finger.segments)):
@@ -77,7 +77,7 @@ def draw_hand(
         axes.text(x, y, finger.name, ha="center", va="center", fontsize=9, color=_INK)
     tops = [finger.place.transform((0.0, len(finger.segments) + 0.4)) for finger in fingers]
     axes.set_xlim(-0.75, max(right + 0.2, *(float(x) + 0.55 for x, _ in tops)))
-    axes.set_ylim(-2.45, max(float(y) for _, y in tops))
+    axes.set_ylim(-0.7 - depth, max(float(y) for _, y in tops))
     axes.set_aspect("equal", anchor="N")
     axes.axis("off")
 
@@ -167,7 +167,8 @@ def _marks(
             ink = _PALE if np.dot(fill, (0.299, 0.587, 0.114)) < 0.55 else _INK
             centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": _SMALL}
             centred["transform"] = finger.place + axes.transData
-            text = written.format(values[row["name"]])
+            value = values[row["name"]]
+            text = written.format(value) if value else "0"
             axes.text(x, y, text, color=ink, **centred)
             axes.text(
                 x, y + radius + 0.1, row["name"], color=_GREY, rotation=finger.degrees, **centred

@@ -17,7 +17,7 @@ from tactslip_torch.report.sensors import ANEW_WORDS, ROLE_WORDS
 _ROLE_COLOURS = {"held_out": "#666666", "test": "#009E73", "unseen": "#D55E00"}
 _GREY, _GRID, _INK = "#666666", "#DDDDDD", "#222222"
 _TITLE, _TEXT, _SMALL = 13, 10, 8.5  # points
-_MOST_BARS = 32
+_MOST_CHANNELS = 24  # whose absence is drawn, the dearest first
 
 
 def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
@@ -37,7 +37,7 @@ def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
     channels = {row["name"]: row for row in content["units"] if row["unit"] == "channel"}
     moved = {name: _both(row["gradient"]) for name, row in channels.items()}
     alone = {name: 100 * row["alone"]["held_out"] for name, row in channels.items()}
-    most = max(moved.values())
+    most, num_kinds = max(moved.values()), len(kind_colours(content["channels"]))
     panels = (
         ("(a) the trained detector moves with it", moved, (0.0, most or 1.0), "{:.1f}",
          "gradient times own spread, sd of the score; 0: not in use"),
@@ -48,7 +48,8 @@ def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
         axes = figure.add_subplot(grid[0, column])
         axes.set_title(title, loc="left", fontsize=_TEXT + 1)
         draw_hand(axes, content["channels"], values, limits, written)
-        draw_shades(axes.inset_axes((0.14, 0.0, 0.56, 0.05)), content["channels"], limits, unit)
+        strips = axes.inset_axes((0.14, 0.0, 0.56, 0.026 * num_kinds))
+        draw_shades(strips, content["channels"], limits, unit)
     _absences(figure.add_subplot(grid[0, 2]), content)
     _best_few(figure.add_subplot(grid[1, :]), content)
     with whole_file(path) as unfinished:
@@ -67,8 +68,9 @@ def _absences(axes: Axes, content: Mapping[str, Any]) -> None:
         for row in content["units"]
         if row["features_in_use"] and row["unit"] in ("channel", "finger")
     ]
-    rows.sort(key=lambda row: (row["unit"] != "channel", -row["lost"]["held_out"]["lost"]))
-    rows = rows[:_MOST_BARS]
+    rows.sort(key=lambda row: -row["lost"]["held_out"]["lost"])
+    of_fingers = [row for row in rows if row["unit"] == "finger"]
+    rows = [row for row in rows if row["unit"] == "channel"][:_MOST_CHANNELS] + of_fingers
     roles = [role for role in ("held_out", "unseen") if role in content["num_bins"]]
     for number, role in enumerate(roles):
         at = np.arange(len(rows)) + 0.3 * (number - (len(roles) - 1) / 2)
@@ -81,9 +83,8 @@ def _absences(axes: Axes, content: Mapping[str, Any]) -> None:
     axes.axvline(0, color=_INK, linewidth=0.8)
     axes.set_yticks(range(len(rows)), [row["name"] for row in rows], fontsize=_SMALL)
     axes.set_ylim(len(rows) - 0.4, -0.6)
-    fingers = sum(row["unit"] == "finger" for row in rows)
-    if 0 < fingers < len(rows):
-        axes.axhline(len(rows) - fingers - 0.5, color=_GREY, linewidth=0.8, linestyle=":")
+    if 0 < len(of_fingers) < len(rows):
+        axes.axhline(len(rows) - len(of_fingers) - 0.5, color=_GREY, linewidth=0.8, linestyle=":")
     axes.set_title("(c) lost without it", loc="left", fontsize=_TEXT + 1)
     axes.set_xlabel("points of balanced accuracy, 95 % intervals", fontsize=_SMALL, color=_GREY)
     _tidy(axes, "x")
