@@ -34,6 +34,7 @@ from tactslip_torch.judging import (
     judged_bins,
 )
 from tactslip_torch.model.abstention import KEY, abstention_of
+from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import FeatureThreshold
@@ -151,6 +152,7 @@ class SlipLearner(L.LightningModule):
         checkpoint["fingerprint"] = self._fingerprint()
         checkpoint["plan"] = json.dumps(self._plan.facts())
         checkpoint["scaler"] = dict(self._plan.frame.scaler.state_dict())
+        checkpoint["gaussians"] = self._plan.gaussians and self._plan.gaussians.tensors()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take up what ``on_save_checkpoint`` kept.
@@ -164,7 +166,8 @@ class SlipLearner(L.LightningModule):
                 "data, labels, split, recipe and seed it was made with"
             )
         scaler = FeatureScaler(**checkpoint["scaler"])
-        self._plan = Plan.of(json.loads(checkpoint["plan"]), scaler)
+        gaussians = ClassGaussians.among(checkpoint.get("gaussians") or {})
+        self._plan = Plan.of(json.loads(checkpoint["plan"]), scaler, gaussians)
 
     def on_test_start(self) -> None:
         """Forget what an earlier test judged.
@@ -276,6 +279,7 @@ class SlipLearner(L.LightningModule):
             | {"rival": plan.threshold.to_dict(), "calibration": plan.calibration}
             | {KEY: plan.abstain},
             plan.typical,
+            plan.gaussians,
         )
 
     def rates(self) -> dict[str, str]:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.calibration import fit_platt
+from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.held_out import HeldOut
 from tactslip_torch.model.kernels import Kernel, Polynomial, kernel_from_dict
@@ -58,6 +59,7 @@ class Plan:
         among: of a recipe that restricts the ranking: to what, how many features that leaves
             (``matching``), and the numbers chosen from after cutting them to it; else ``None``.
         abstain: thresholds for unsure answers, as ``Abstention.to_dict`` has them, if set.
+        gaussians: of the scaled features, for sensors that are missing; of a kernel that folds.
     """
 
     frame: Frame
@@ -72,6 +74,7 @@ class Plan:
     validation: list[dict[str, Any]] = field(default_factory=list)
     among: dict[str, Any] | None = None
     abstain: dict[str, Any] | None = None
+    gaussians: ClassGaussians | None = None
 
     @property
     def adds_up(self) -> bool:
@@ -89,7 +92,7 @@ class Plan:
         return None
 
     def facts(self) -> dict[str, Any]:
-        """JSON-able; ``Plan.of`` takes it together with the tensors of the scaler."""
+        """JSON-able; ``Plan.of`` takes it together with the scaler and the Gaussians."""
         return {
             "selected": list(self.frame.selected),
             "kernel": self.kernel.to_dict(),
@@ -105,8 +108,18 @@ class Plan:
             "abstain": self.abstain,
         }
 
+    def tensors(self) -> dict[str, Tensor]:
+        """What ``facts`` leaves out: the scaler, and the Gaussians among it."""
+        of_features = {} if self.gaussians is None else self.gaussians.tensors()
+        return dict(self.frame.scaler.state_dict()) | of_features
+
     @classmethod
-    def of(cls, facts: Mapping[str, Any], scaler: FeatureScaler) -> Plan:
+    def of(
+        cls,
+        facts: Mapping[str, Any],
+        scaler: FeatureScaler,
+        gaussians: ClassGaussians | None = None,
+    ) -> Plan:
         """The plan that ``facts`` described."""
         return cls(
             frame=Frame(tuple(facts["selected"]), scaler),
@@ -121,6 +134,7 @@ class Plan:
             validation=list(facts["validation"]),
             among=facts.get("among"),  # older plans know no such restriction
             abstain=facts.get("abstain"),  # nor unsure answers
+            gaussians=gaussians,
         )
 
 
@@ -184,7 +198,7 @@ def plan_detector(
         shares = [share / stands_for for share in shares]
         num_bins = MOST_KEPT_BINS
     frame = frame.first(size)
-    selected = sample.features[:, list(frame.selected)].double()
+    z = frame(sample.features)
     return Plan(
         frame=frame,
         kernel=kernel,
@@ -193,10 +207,11 @@ def plan_detector(
         shares=(shares[0], shares[1]),
         stands_for=stands_for,
         num_bins=round(num_bins),
-        threshold=best_threshold(selected, sample.is_slip),
-        typical=_typical(frame(sample.features), sample.is_slip, weights),
+        threshold=best_threshold(sample.features[:, list(frame.selected)].double(), sample.is_slip),
+        typical=_typical(z, sample.is_slip, weights),
         validation=rows,
         among=None if allowed is None else _narrowed(recipe, allowed, sizes),
+        gaussians=ClassGaussians.fit(z, sample.is_slip, weights) if kernel.collapses else None,
     )
 
 

@@ -41,6 +41,7 @@ from tactslip_torch.files import load_table, save_table, table_form
 from tactslip_torch.fitting import solve_facts, solve_sums, training_part
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.ledger import first_difference
+from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.sufficient import SufficientStats
@@ -129,8 +130,8 @@ def _plan(config: DictConfig) -> str:
     pool = FeaturePool(HandLayout.from_rows(survey.about["channels"]), **survey.about["pool"])
     plan = plan_detector(recipe, survey, bar, allowed=recipe.allowed(pool))
     plan = Abstaining(config.coverage, config.coverage_by).settle(plan, recipe, survey)
-    scaler = dict(plan.frame.scaler.state_dict())
-    save_table(config.out, PLAN_FORM, {"plan": plan.facts(), "about": survey.about}, scaler)
+    facts = {"plan": plan.facts(), "about": survey.about}
+    save_table(config.out, PLAN_FORM, facts, plan.tensors())
     return f"{len(plan.frame.selected)} features, C={plan.penalty:g}"
 
 
@@ -157,6 +158,7 @@ def _solve(config: DictConfig) -> str:
         | {"features_dtype": about["features_dtype"], "train_recordings": about["recordings"]}
         | {"train_materials": about["materials"]},
         plan.typical,
+        plan.gaussians,
     )
     detector.save(config.out)
     return f"detector of {int(sums.count.sum())} bins, by {head.solved}"
@@ -228,8 +230,9 @@ def _only(given: Any, kind: type[Any]) -> Any:
 
 
 def _read_plan(path: str) -> tuple[Plan, dict[str, Any]]:
-    facts, scaler = load_table(path, PLAN_FORM)
-    return Plan.of(facts["plan"], FeatureScaler(**scaler)), facts["about"]
+    facts, tensors = load_table(path, PLAN_FORM)
+    scaler = FeatureScaler(**{name: x for name, x in tensors.items() if "." not in name})
+    return Plan.of(facts["plan"], scaler, ClassGaussians.among(tensors)), facts["about"]
 
 
 def _check_same(ours: Mapping[str, Any], theirs: Mapping[str, Any], what: str, other: str) -> None:

@@ -10,6 +10,7 @@ from test_recipe import make_parts, surveyed, together
 from tactslip_torch import planning
 from tactslip_torch.fitting import TrainingPass
 from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
+from tactslip_torch.model.class_gaussians import RESOLUTION
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.planning import Plan, plan_detector
 from tactslip_torch.recipe import Recipe, recalls_mean
@@ -201,13 +202,28 @@ def test_typical_features_lie_midway_between_the_classes(rng):
     torch.testing.assert_close(torch.tensor(plan.typical, dtype=torch.float64), expected)
 
 
+def test_gaussians_are_of_the_selected_features_of_either_class(rng):
+    parts = make_parts(rng, share=0.2)
+    plan = planned(Recipe(**FEW), parts)
+    features, is_slip = together(parts)
+    z = plan.frame(features)
+    assert plan.gaussians is not None
+    for place, mine in enumerate((~is_slip, is_slip)):
+        torch.testing.assert_close(plan.gaussians.mean[place], z[mine].mean(0))
+        spread = z[mine].var(0, correction=0) + RESOLUTION
+        torch.testing.assert_close(plan.gaussians.covariance[place].diagonal(), spread)
+    cubic = Recipe(**FEW, degree=3)
+    assert planned(cubic, parts).gaussians is None
+
+
 def test_a_plan_survives_its_facts(rng):
     plan = planned(Recipe(**FEW, compress=True), make_parts(rng))
-    again = Plan.of(json.loads(json.dumps(plan.facts(), allow_nan=False)), plan.frame.scaler)
+    parts = (plan.frame.scaler, plan.gaussians)
+    again = Plan.of(json.loads(json.dumps(plan.facts(), allow_nan=False)), *parts)
     assert again.facts() == plan.facts()
     assert again == plan
     older = {name: fact for name, fact in plan.facts().items() if name != "among"}
-    assert Plan.of(older, plan.frame.scaler) == plan  # written before rankings were restricted
+    assert Plan.of(older, *parts) == plan  # written before rankings were restricted
 
 
 def test_a_recording_counts_once(rng):

@@ -67,6 +67,7 @@ def detector_of(windows: Windows, recipe: Recipe, training: Training) -> SlipDet
         head,
         {"penalty": plan.penalty, "calibration": plan.calibration},
         plan.typical,
+        plan.gaussians,
     )
 
 

@@ -185,6 +185,7 @@ class Workshop:
             head,
             info,
             plan.typical,
+            plan.gaussians,
             engine=data.maker.extractor.engine,
         )
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+PREFIX = "gaussians."
 RESOLUTION = 1e-5
 """Variance that every scaled feature has at least (a sixth of a percent of its range), so that
 constant and repeated features leave a covariance that can be inverted."""
@@ -67,17 +67,15 @@ class ClassGaussians(nn.Module):
         means, covariances = zip(*found, strict=True)
         return cls(torch.stack(means), torch.stack(covariances))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values, the same to the last bit."""
-        return {"mean": self.mean.tolist(), "covariance": self.covariance.tolist()}
+    def tensors(self) -> dict[str, Tensor]:
+        """By the names under which a table of tensors holds them beside others."""
+        return {PREFIX + name: value for name, value in self.state_dict().items()}
 
     @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> ClassGaussians:
-        """What ``to_dict`` wrote."""
-        mean, covariance = (
-            torch.tensor(plain[name], dtype=torch.float64) for name in ("mean", "covariance")
-        )
-        return cls(mean, covariance)
+    def among(cls, tensors: Mapping[str, Tensor]) -> ClassGaussians | None:
+        """Those in a table of tensors, of which older ones hold none."""
+        own = {n.removeprefix(PREFIX): x for n, x in tensors.items() if n.startswith(PREFIX)}
+        return cls(**own) if own else None
 
 
 def _gaussian(z: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

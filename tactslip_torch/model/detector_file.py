@@ -114,5 +114,5 @@ def _parts(facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> DetectorPar
         head,
         facts["info"],
         state.get("typical"),
-        ClassGaussians(**found) if (found := part("gaussians.")) else None,  # of old files none
+        ClassGaussians.among(state),
     )
