@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
+from typing import TypeVar
 
 import torch
 
@@ -19,8 +20,13 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.sequential import Cusum
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.recipe import Recipe
+from tactslip_torch.signals.filter_bank import WaveletFilters
 from tactslip_torch.signals.filtering import Align, ChannelFilter
+from tactslip_torch.signals.learnable import LearnableSmoothing
+from tactslip_torch.signals.lifting import LiftedWavelet
 from tactslip_torch.signals.wavelet import highest_level
+
+Module = TypeVar("Module", LiftedWavelet, LearnableSmoothing)
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,8 @@ class AnyHand:
         offset: that it stands on.
         num_features: to select.
         polyorder: of the filter.
+        learned: how far wavelet and kernels of the filter are away from where learning starts, 0
+            for those themselves.
     """
 
     channels: dict[tuple[str, str], int]
@@ -54,6 +62,7 @@ class AnyHand:
     offset: float = 0.0
     num_features: int = 12
     polyorder: int = 1
+    learned: float = 0.0
 
     def layout(self) -> HandLayout:
         """The channels, kinds by turns."""
@@ -66,16 +75,33 @@ class AnyHand:
 
     def pool(self) -> FeaturePool:
         highest = min(4, highest_level(self.bin_samples, self.wavelet))
+        wavelet: str | WaveletFilters = self.wavelet
+        if self.learned:
+            wavelet = self.moved(LiftedWavelet(self.wavelet)).frozen()
         return FeaturePool(
             self.layout(),
             self.rate_hz,
             bin_samples=self.bin_samples,
-            wavelet=self.wavelet,
+            wavelet=wavelet,
             level=self.level or highest,
         )
 
     def channel_filter(self) -> ChannelFilter:
-        return ChannelFilter(frame_lengths(self.layout(), self.frames), self.polyorder, self.align)
+        lengths = frame_lengths(self.layout(), self.frames)
+        layer = ChannelFilter(lengths, self.polyorder, self.align)
+        if self.learned:
+            kernels = self.moved(LearnableSmoothing(layer)).frozen()
+            layer = ChannelFilter(lengths, self.polyorder, self.align, kernels)
+        return layer
+
+    def moved(self, module: Module) -> Module:
+        """With parameters that someone might have learned."""
+        generator = torch.Generator().manual_seed(7)
+        with torch.no_grad():
+            for parameter in module.parameters():
+                noise = torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)
+                parameter.copy_(self.learned * noise)
+        return module
 
     def noise(self, num: int, num_samples: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Raw bins, every other one slip, louder and smoother: ``[N, C, T]`` and ``[N]``."""
@@ -112,6 +138,26 @@ HANDS = {
     ),
     "one of 120 features by haar": AnyHand(
         {("electrode", "fast"): 1}, 2000.0, 100, 50, {"electrode": 11}, "haar", num_features=120
+    ),
+    "learned filters": AnyHand(
+        {("PVDF", "fast"): 2, ("SG", "slow"): 2},
+        2000.0,
+        100,
+        20,
+        {"PVDF": 11, "SG": 51},
+        offset=1.0,
+        num_features=40,
+        learned=0.1,
+    ),
+    "learned filters, causal": AnyHand(
+        {("PVDF", "fast"): 2, ("SG", "slow"): 1},
+        2000.0,
+        100,
+        20,
+        {"PVDF": 11, "SG": 25},
+        "bior2.2",
+        align="causal",
+        learned=0.1,
     ),
     "64 unfiltered": AnyHand(
         {("barometer", "fast"): 64}, 92.0, 41, 20, {"barometer": None}, "sym4", align="trailing"

@@ -27,6 +27,7 @@ DEGENERATE_KINDS = (
     "dead_channel",
 )
 KINDS = PLAIN_KINDS + DEGENERATE_KINDS
+LARGE_CV = 3e4  # a mean good to 15 eps of the spread is then good to 1e-10 of itself
 FLOOR_CV = 9e5  # beyond it the mean is rounding (descriptors.CV_FLOOR), its sign too
 
 
@@ -84,7 +85,8 @@ def worst_errors(found: Tensor, reference: Tensor, names: Sequence[str]) -> dict
 
     Entropy is in bits, and mode is the share of values that are elsewhere than the reference's by
     1e-4 of that size. A cv beyond ``FLOOR_CV`` in the reference, where only the floor under the
-    mean is left, counts without its sign. A spread below 1e-5 of what is usual is a root of
+    mean is left, counts without its sign; one beyond ``LARGE_CV`` counts by as much less, its mean
+    being that much nearer to rounding. A spread below 1e-5 of what is usual is a root of
     rounding, and counts by its square.
     """
     assert found.shape == reference.shape == (len(found), len(names))
@@ -95,8 +97,10 @@ def worst_errors(found: Tensor, reference: Tensor, names: Sequence[str]) -> dict
     size = torch.maximum(reference.abs(), usual)
     error = (found - reference).abs()
     relative = torch.where(error == 0, 0.0, error / size)
-    has_no_sign = (reference.abs() > FLOOR_CV) & torch.tensor([str(n)[-2:] == "cv" for n in names])
+    is_cv = torch.tensor([str(n)[-2:] == "cv" for n in names])
+    has_no_sign = (reference.abs() > FLOOR_CV) & is_cv
     relative = torch.where(has_no_sign, (found.abs() - reference.abs()).abs() / size, relative)
+    relative = torch.where(is_cv, relative / (reference.abs() / LARGE_CV).clamp(min=1), relative)
     squared = (found.square() - reference.square()).abs() / size.square()
     is_spread = torch.tensor([str(n).endswith("spread") for n in names])
     relative = torch.where(is_spread & (reference < 1e-5 * size), squared, relative)
