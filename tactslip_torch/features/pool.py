@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Literal, get_args
 
 import torch
@@ -24,6 +25,7 @@ from tactslip_torch.features.descriptors import (
 from tactslip_torch.features.guards import bounded_gradient, settle
 from tactslip_torch.features.guards import saturating as saturating
 from tactslip_torch.features.names import pool_names
+from tactslip_torch.features.smooth import stand_ins
 from tactslip_torch.features.transforms import amplitudes_by, branches_by
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.plain import is_recorded
@@ -64,10 +66,12 @@ class FeaturePool(nn.Module):
         level: number of wavelet levels.
         spectrum: ``"reference"`` (the authors') or ``"clean"`` (ours).
         arithmetic: ``"double"``, or ``"native"`` to compute in the dtype of the bins.
+        smooth: temperature of stand-ins for what steps or has kinks (``features.smooth`` has their
+            errors); None for the exact descriptors.
 
     Raises:
         ValueError: if the rate is not positive, the bin is too short for the levels, or the
-            arithmetic is unknown.
+            arithmetic or the temperature none of those there are.
 
     Example:
         >>> pool = FeaturePool(HandLayout.paper24())
@@ -85,6 +89,7 @@ class FeaturePool(nn.Module):
         level: int = 4,
         spectrum: SpectrumMethod = "reference",
         arithmetic: Arithmetic = "double",
+        smooth: float | None = None,
     ) -> None:
         super().__init__()
         if not sample_rate_hz > 0:
@@ -100,8 +105,9 @@ class FeaturePool(nn.Module):
         self.level = level
         self.spectrum: SpectrumMethod = spectrum
         self.arithmetic: Arithmetic = arithmetic
-        self._gauges = list(hand.slow)
-        self._films = list(hand.fast)
+        self.smooth = smooth
+        self._described = partial(describe, stand_ins=stand_ins(smooth))
+        self._gauges, self._films = list(hand.slow), list(hand.fast)
         self._inverses: dict[torch.dtype, Tensor] = {}
         self.names = pool_names(hand, level)
         lines = spectrum_matrix(bin_samples, spectrum)
@@ -115,7 +121,7 @@ class FeaturePool(nn.Module):
 
     def facts(self) -> dict[str, Any]:
         """All arguments but the hand, as JSON-able values; ``FeaturePool(hand, **facts)``."""
-        return {
+        exact = {
             "sample_rate_hz": self.sample_rate_hz,
             "bin_samples": self.bin_samples,
             "wavelet": wavelet_fact(self.wavelet),
@@ -123,6 +129,7 @@ class FeaturePool(nn.Module):
             "spectrum": self.spectrum,
             "arithmetic": self.arithmetic,
         }
+        return exact if self.smooth is None else exact | {"smooth": self.smooth}
 
     def with_branches(self, matrix: Tensor) -> FeaturePool:
         """A light copy with other wavelet branches, to which gradients flow.
@@ -176,13 +183,13 @@ class FeaturePool(nn.Module):
         branches = bounded_gradient(self.branches(films), GAIN)  # [*, films, branches, n]
         spectra = bounded_gradient(self.amplitudes(branches), GAIN)  # [*, films, branches, lines]
         branch_scale = scale[..., None].expand(branches.shape[:-1])
-        in_time = describe(
+        in_time = self._described(
             branches,
             TIME_DESCRIPTORS,
             scale=branch_scale,
             reference=settle(films, scale)[..., None, :],
         )
-        in_frequency = describe(
+        in_frequency = self._described(
             spectra,
             SPECTRUM_DESCRIPTORS,
             scale=branch_scale,
@@ -269,7 +276,8 @@ class FeaturePool(nn.Module):
     def _of_gauges(self, bins: Tensor) -> Tensor:
         gauges = bins[..., self._gauges, :]
         scale = gauges.detach().abs().amax(-1)
-        return describe(settle(gauges, scale), COMMON_DESCRIPTORS, scale=scale).flatten(-2)
+        values = self._described(settle(gauges, scale), COMMON_DESCRIPTORS, scale=scale)
+        return values.flatten(-2)
 
     def _constant(self, name: str, like: Tensor) -> Tensor:
         constant = self._constants[name]

@@ -48,7 +48,15 @@ def judge_bins(graph: Graph, detector: SlipDetector, windows: Value, form: Form)
 
     Shape:
         - windows: ``[B, channels, Window.length]``
+
+    Raises:
+        ValueError: if the detector's pool is smooth.
     """
+    if (smooth := detector.pool.smooth) is not None:
+        raise ValueError(
+            f"there are no nodes for smooth descriptors (smooth={smooth:g}); fit on exact ones to "
+            "export"
+        )
     front = Front(graph, detector, windows, form)
     features = selected_features(graph, detector, front, form)
     z = with_typical(graph, scaled(graph, features, detector.scaler), front.is_missing, detector)
