@@ -37,17 +37,17 @@ coverage of 95 % 19 of them.
 """
 
 
-def held_out_scores(plan: Plan, recipe: Recipe, survey: Survey, left_out: LeftOut) -> Tensor:
+def held_out_scores(plan: Plan, recipe: Recipe, survey: Survey, groups: Tensor) -> Tensor:
     """Scores of the sampled training bins, each by the machine that never met its group.
 
     Args:
         plan: which features, how scaled, with which kernel and C.
         recipe: how the classes are balanced.
         survey: the first pass, whose sample is scored.
-        left_out: what a group is.
+        groups: what each sampled bin is held out with, whole numbers.
 
     Shape:
-        - output: ``[n]``, in the order of the sample
+        - groups, output: ``[n]``, in the order of the sample
 
     Raises:
         ValueError: if there is one group only, a class stands in one alone, or the machine without
@@ -56,7 +56,7 @@ def held_out_scores(plan: Plan, recipe: Recipe, survey: Survey, left_out: LeftOu
     sample = survey.sample.bins()
     weights = stand_for(sample, recipe, survey.moments.count.tolist())
     bins = TrainingBins(plan.frame(sample.features), sample.is_slip, weights)
-    return HeldOut(bins, groups_of(sample, left_out), plan.kernel).at(plan.penalty).scores
+    return HeldOut(bins, groups, plan.kernel).at(plan.penalty).scores
 
 
 def groups_of(sample: SampledBins, left_out: LeftOut) -> Tensor:
@@ -116,7 +116,7 @@ def abstention(
             to be sure of anything.
     """
     sample = survey.sample.bins()
-    scores = held_out_scores(plan, recipe, survey, left_out)
+    scores = held_out_scores(plan, recipe, survey, groups_of(sample, left_out))
     found = thresholds(scores, sample.is_slip, sample.recording, coverage)
     if (fewest := fewest_recordings(coverage)) > min(found.num_slip, found.num_non_slip):
         raise ValueError(

@@ -11,7 +11,7 @@ import torch
 from small_detector import small_detector
 from small_set import SMALL_HAND
 
-from tactslip_torch.abstaining import Abstaining, abstention, held_out_scores
+from tactslip_torch.abstaining import Abstaining, abstention, groups_of, held_out_scores
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.abstention import KEY, Abstention, abstention_of
@@ -56,8 +56,8 @@ def fitted() -> tuple[Plan, Recipe, Survey]:
 @pytest.mark.parametrize("left_out", ["recording", "group"])
 def test_scores_are_those_of_machines_refitted_without_the_bin_s_own(fitted, left_out):
     plan, recipe, survey = fitted
-    scores = held_out_scores(plan, recipe, survey, left_out)
     sample = survey.sample.bins()
+    scores = held_out_scores(plan, recipe, survey, groups_of(sample, left_out))
     weights = stand_for(sample, recipe, survey.moments.count.tolist())
     z = plan.frame(sample.features)
     group = sample.recording if left_out == "recording" else sample.group
@@ -72,7 +72,7 @@ def test_the_unit_is_the_recording_whatever_is_left_out(fitted):
     plan, recipe, survey = fitted
     sample = survey.sample.bins()
     for left_out in ("recording", "group"):
-        scores = held_out_scores(plan, recipe, survey, left_out)
+        scores = held_out_scores(plan, recipe, survey, groups_of(sample, left_out))
         wanted = thresholds(scores, sample.is_slip, sample.recording, 0.9)
         found = abstention(plan, recipe, survey, 0.9, left_out)
         assert (found.low, found.high) == (wanted.low, wanted.high)
