@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks import train
+from benchmarks.abstaining import figure as abstaining_figure
+from benchmarks.abstaining import report as abstaining
 from benchmarks.deployment import figure as deployment_figure
 from benchmarks.deployment import report as deployment
 from benchmarks.features import figure as features_figure
@@ -133,6 +135,14 @@ SECTIONS = {
         formats_figure.figure,
         formats.about,
         needs=("formats",),
+    ),
+    "abstaining": Section(
+        "Answers that may be unsure",
+        abstaining.tables,
+        abstaining.report_text,
+        abstaining_figure.figure,
+        abstaining.about,
+        needs=abstaining.SECTIONS,
     ),
     "train": Section("Training", None, train.report_text, keys=("experiment", "stages", "wholes")),
     "model": Section(
