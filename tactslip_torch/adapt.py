@@ -91,7 +91,8 @@ def _stepped(
         change = add(statistics, before, bins, weight, margin)
     else:
         change = forget(statistics, before, bins)
-    problem = change.verdict.problem(margin)
+    # what is to be taken out goes, whatever that costs
+    problem = change.verdict.problem(margin) if config.action == "add" else None
     entry = _entry(config, bins, change) | {"forced": problem is not None and bool(config.force)}
     is_accepted = problem is None or bool(config.force)
     solved = time.perf_counter()

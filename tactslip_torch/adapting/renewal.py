@@ -49,7 +49,7 @@ def renewed(
     info["solve"] = solve_facts(solved.head)
     info["num_bins"] = int(statistics.sums.count.sum())
     info[JOURNAL] = [*info.get(JOURNAL, []), dict(entry)]
-    info["train_materials"] = sorted(set(solved.known.materials))
+    info["train_materials"] = [solved.known.materials[i] for i in solved.known.material.unique()]
     keys = info.get("train_recordings", {}) | {n: b.key for n, b in statistics.bins.items()}
     entries = statistics.sums.ledger.entries
     out = {name for name in statistics.bins if name not in entries}

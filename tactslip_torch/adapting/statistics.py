@@ -8,8 +8,9 @@ of whole numbers take bins out as exactly as they took them in, so any step can 
 from __future__ import annotations
 
 import copy
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -113,8 +114,9 @@ class Statistics:
             if weight == before:
                 continue
             for value, change in ((before, sums.remove), (weight, sums.update)):
-                if value > 0:
-                    change(name, own.z, own.is_slip, torch.full_like(own.z[:, 0], value))
+                for batch_id, part in _batches(name, len(own.z), value, sums.grid_bits):
+                    z, is_slip = own.z[part], own.is_slip[part]
+                    change(batch_id, z, is_slip, torch.full_like(z[:, 0], value))
         return replace(self, sums=sums, bins=known, weights={**self.weights, **weights})
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -176,6 +178,19 @@ class Statistics:
                 for number, plain in enumerate(facts["steps"])
             ),
         )
+
+
+def _batches(
+    name: str, num_bins: int, weight: float, grid_bits: int
+) -> Iterator[tuple[str, slice]]:
+    """A recording as batches of which the grid has room for each; the first has its name.
+
+    One batch unless the weight is so large that 256 bins are too much, so as training adds it.
+    """
+    room = 2.0 ** (51 - grid_bits)  # of 256 bins or, if a batch has fewer, of those
+    most = max(num_bins, 1) if 256 * weight < room else max(math.ceil(room / weight) - 1, 1)
+    for number, start in enumerate(range(0, num_bins if weight > 0 else 0, most)):
+        yield f"{name} part {number}" if number else name, slice(start, start + most)
 
 
 def detector_digest(detector: SlipDetector) -> str:

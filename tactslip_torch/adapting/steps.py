@@ -19,6 +19,7 @@ FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 Where every training material in turn was new (simulated, ``benchmarks.adapting``), its own accuracy
 kept rising to about the last of these, and what the others lost rose with it.
 """
+MOST_WEIGHT = 8000.0  # of a bin; more has no room on the grid of the sums
 OF_MARGIN = 0.5
 """``auto`` spends this part of the margin: how far old materials fall is itself an estimate."""
 
@@ -70,8 +71,10 @@ def add(
             is not positive, or as ``solve``.
     """
     _check_new(statistics, bins)
-    if weight is not None and not 0 < weight < 1e6:
-        raise ValueError(f"weight must be auto or a positive number below 1e6, got {weight:g}")
+    if weight is not None and not 0 < weight < MOST_WEIGHT:
+        raise ValueError(
+            f"weight must be auto or a positive number below {MOST_WEIGHT:g}, got {weight:g}"
+        )
     material = next(iter(bins.values())).material
     mine = dict(bins) | {
         name: own

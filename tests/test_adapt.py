@@ -1,0 +1,266 @@
+"""``adapt`` as a command: what it leaves, takes back and refuses, on files of a tiny hand."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
+from PIL import Image
+from test_commands import TINY, TinyRecordings, composed
+
+from tactslip_torch import SlipDetector
+from tactslip_torch import adapt as module
+from tactslip_torch.adapt import adapt
+from tactslip_torch.adapting.acceptance import Verdict
+from tactslip_torch.adapting.statistics import Statistics, detector_digest
+from tactslip_torch.adapting.steps import add
+from tactslip_torch.config import conf_dir, one_line
+from tactslip_torch.data.folder import RecordingFolder, write_manifest
+from tactslip_torch.model.calibration import Platt
+from tactslip_torch.model.conformal import answers
+from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.onset.settings import KEY, AlarmSettings
+from tactslip_torch.train import train
+
+TRAINING = (*TINY, "data.seed=0", "statistics=true", "coverage=0.5", "cache=off")
+SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0)
+
+
+def write_files(folder, materials, cycles=4, seed=0):
+    source = TinyRecordings(seed, cycles, materials)
+    folder.mkdir()
+    files = RecordingFolder(source, folder, "npz", {})
+    write_manifest(folder, [files.write(recording) for recording in source.ids])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("trained")
+    train(composed(*TRAINING), folder)
+    detector = SlipDetector.load(folder / "detector.pt")
+    detector.info[KEY] = SETTINGS.to_dict()
+    detector.save(folder / "detector.pt")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return write_files(tmp_path_factory.mktemp("files") / "set", ["A", "B", "C"])
+
+
+@pytest.fixture
+def run(trained, tmp_path):
+    """A copy of the run that may be changed."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("detector.pt", "statistics.pt"):
+        (folder / name).write_bytes((trained / name).read_bytes())
+    return folder
+
+
+def settings(run, *overrides):
+    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+        return compose("adapt", [f"model={run / 'detector.pt'}", "cache=off", *overrides])
+
+
+def content(run):
+    return [(run / name).read_bytes() for name in ("detector.pt", "statistics.pt")]
+
+
+def add_c(run, files, *overrides):
+    chosen = f"recordings={files}", "data.materials=[C]", "margin=0.2"
+    return adapt(settings(run, *chosen, *overrides), run / "results")
+
+
+def test_training_leaves_statistics_that_make_its_detector(trained):
+    found = Statistics.load(trained / "statistics.pt")
+    detector = SlipDetector.load(trained / "detector.pt")
+    assert found.detector == detector_digest(detector)
+    machine = found.machine
+    head = found.sums.solve(machine.penalty, machine.offset, balance=machine.balance)
+    z = found.witnesses.z
+    torch.testing.assert_close(head(z), detector.head(z), rtol=1e-9, atol=1e-12)
+    assert sorted(set(found.witnesses.materials)) == ["A", "B"]
+
+
+def test_a_material_comes_in_and_all_is_said(run, files, trained, capsys):
+    found = add_c(run, files)
+    kept = json.loads((run / "results" / "adaptation.json").read_text())
+    assert kept == json.loads(json.dumps(found))
+    assert kept["accepted"] is True
+    assert kept["simulated"] is False
+    assert sorted(kept["old"]["before"]) == ["A", "B"]
+    Image.open(run / "results" / "adaptation.png").verify()
+    assert "C (new)" in capsys.readouterr().out
+    old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
+    assert not torch.equal(old.head.quadratic, new.head.quadratic)
+    assert torch.equal(old.scaler.minimum, new.scaler.minimum)
+    assert new.info["train_materials"] == ["A", "B", "C"]
+    assert {name for name in new.info["train_recordings"] if name[0] == "C"} == {
+        f"C/{i}" for i in range(4)
+    }
+    (entry,) = new.info["adaptations"]
+    assert entry["weight"] == found["weight"] > 0
+    assert entry["recordings"] == [f"C/{i}" for i in range(4)]
+    alarm = AlarmSettings.of(new)
+    assert (alarm.threshold, alarm.target_per_hour) == (SETTINGS.threshold, None)
+    assert "no rate is promised" in alarm.facts["adapted"]
+    assert new.info["calibration"] != old.info["calibration"]
+    assert new.info["abstain"]["adapted"]
+    assert set(answers(torch.zeros(1), new.info["abstain"]["low"], 1.0).tolist()) <= {-1, 0, 1}
+
+
+def test_undo_restores_both_files_to_the_bit(run, files):
+    states = [content(run)]
+    add_c(run, files, "weight=2")
+    states.append(content(run))
+    adapt(settings(run, "action=forget", "material=C"), run / "results")
+    states.append(content(run))
+    assert states[0] != states[1] != states[2]
+    for state in (states[1], states[0]):
+        adapt(settings(run, "action=undo"), run / "results")
+        assert content(run) == state
+    with pytest.raises(ValueError, match="nothing to undo"):
+        adapt(settings(run, "action=undo"), run / "results")
+
+
+def test_what_is_forgotten_leaves_the_machine_it_came_to(run, files, trained):
+    add_c(run, files, "weight=3")
+    adapt(settings(run, "action=forget", "material=C"), run / "results")
+    old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
+    z = Statistics.load(run / "statistics.pt").witnesses.z
+    torch.testing.assert_close(new.head(z), old.head(z), rtol=1e-9, atol=1e-12)
+    assert new.info["train_materials"] == ["A", "B"]
+
+
+def test_a_training_material_is_forgotten_from_its_files(run, files):
+    before = Statistics.load(run / "statistics.pt")
+    trained_on = [name for name in before.sums.ledger.entries if name.startswith("B")]
+    cycles = f"data.manifest={only(files, trained_on)}"
+    adapt(settings(run, "action=forget", f"recordings={files}", cycles), run / "results")
+    after = Statistics.load(run / "statistics.pt")
+    assert sorted(after.sums.ledger.entries) == sorted(
+        set(before.sums.ledger.entries) - set(trained_on)
+    )
+    assert SlipDetector.load(run / "detector.pt").info["train_materials"] == ["A"]
+
+
+def only(files, recordings):
+    """A manifest of some of the files."""
+    head, *lines = (files / "manifest.csv").read_text().splitlines()
+    wanted = [f"{name.split('/')[0]}_paper_{int(name.split('/')[1]):02d}" for name in recordings]
+    kept = [line for line in lines if any(stem in line for stem in wanted)]
+    assert len(kept) == len(recordings)
+    (files / "some.csv").write_text("\n".join([head, *kept]) + "\n")
+    return "some.csv"
+
+
+def test_what_old_materials_do_not_allow_changes_nothing(run, files, monkeypatch):
+    falling = Verdict({"A": 0.9, "B": 0.9}, {"A": 0.6, "B": 0.6})
+    monkeypatch.setattr(module, "add", lambda *given: replace(add(*given), verdict=falling))
+    state = content(run)
+    with pytest.raises(ValueError, match="refused, nothing is changed: old materials fall"):
+        add_c(run, files, "weight=1")
+    assert content(run) == state
+    kept = json.loads((run / "results" / "adaptation.json").read_text())
+    assert kept["accepted"] is False
+    assert kept["problem"].startswith("old materials fall from 90.00 to 60.00 %")
+    add_c(run, files, "weight=1", "force=true")
+    assert content(run) != state
+    assert Statistics.load(run / "statistics.pt").steps[0].entry["forced"] is True
+
+
+def test_bins_without_slip_alone_are_taken_where_asked_for(run, files):
+    found = add_c(run, files, "slip_free=true", "material=other")
+    assert found["recordings"] == [f"other/{i}" for i in range(4)]
+    kept = Statistics.load(run / "statistics.pt")
+    assert not any(bool(own.is_slip.any()) for own in kept.bins.values())
+    assert found["num_bins"] == sum(len(own.z) for own in kept.bins.values())
+
+
+def test_steps_are_listed(run, files, capsys):
+    adapt(settings(run, "action=list"), run / "results")
+    assert "no step since training" in capsys.readouterr().out
+    add_c(run, files, "weight=2")
+    assert len(adapt(settings(run, "action=list"), run / "results")["steps"]) == 1
+    assert "add" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_a_step_cut_off_between_its_files_is_told_and_taken_back(run, files, trained):
+    add_c(run, files, "weight=2")
+    (run / "detector.pt").write_bytes((trained / "detector.pt").read_bytes())
+    with pytest.raises(ValueError, match=r"one step ahead of .* action=undo"):
+        adapt(settings(run, "action=list"), run / "results")
+    adapt(settings(run, "action=undo"), run / "results")
+    assert content(run) == content(trained)
+
+
+def test_graphs_are_written_anew_where_asked_for(run, files):
+    (run / "model.onnx").write_bytes(b"of the detector before")
+    add_c(run, files, "weight=2")
+    assert (run / "model.onnx").read_bytes() == b"of the detector before"
+    adapt(settings(run, "action=forget", "material=C", "export=true"), run / "results")
+    told = json.loads((run / "model.onnx.json").read_text())
+    sha256 = hashlib.sha256((run / "detector.pt").read_bytes()).hexdigest()
+    assert told["detector_sha256"] == sha256
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["action=learn"], "action must be one of add, forget, undo, list, got 'learn'"),
+        ([], "no value for recordings"),
+        (["recordings=nowhere"], "no folder at nowhere"),
+        (["weight=heavy"], "weight must be auto or a positive number, got 'heavy'"),
+        (["margin=5"], "margin must lie in"),
+        (["action=forget", "material=D"], "forget takes material= one that was added"),
+        (["action=undo"], "nothing to undo"),
+    ],
+)
+def test_bad_input_is_one_line(run, overrides, message):
+    state = content(run)
+    with pytest.raises((ValueError, FileNotFoundError, InstantiationException)) as caught:
+        adapt(settings(run, *overrides), run / "results")
+    assert message in one_line(caught.value)
+    assert "\n" not in one_line(caught.value)
+    assert content(run) == state
+
+
+def test_a_detector_without_its_statistics_says_how_to_get_them(run, trained):
+    other = SlipDetector.load(run / "detector.pt")
+    other.head.constant += 1
+    other.save(run / "detector.pt")
+    with pytest.raises(ValueError, match="belongs to another detector"):
+        adapt(settings(run, "action=list"), run / "results")
+    (run / "statistics.pt").unlink()
+    with pytest.raises(FileNotFoundError, match="train with statistics=true"):
+        adapt(settings(run, "action=list"), run / "results")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["recipe.kernel=rbf", "recipe.gamma=0.1"], "statistics=true needs recipe.kernel="),
+        (["recipe.penalties=[inf]"], "statistics=true needs finite recipe.penalties"),
+        (["ckpt_path=elsewhere"], "statistics=true needs the first pass"),
+    ],
+)
+def test_training_refuses_statistics_that_it_cannot_leave(tmp_path, overrides, message):
+    with pytest.raises(ValueError, match=message):
+        train(composed(*TRAINING, *overrides), tmp_path)
+
+
+def test_the_command_ends_with_status_2_and_one_line(run):
+    command = [sys.executable, "-m", "tactslip_torch.adapt", f"model={run / 'nothing.pt'}"]
+    ended = subprocess.run(
+        [*command, f"hydra.run.dir={run / 'results'}"], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 2
+    assert ended.stderr.startswith("error: no detector at ")
+    assert len(ended.stderr.splitlines()) == 1

@@ -1,0 +1,288 @@
+"""Recordings in and out of a detector's sums: held to refits, to the bit on the way back."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tactslip_torch.adapting.acceptance import OF_ONE, Verdict, compared, mean_recall
+from tactslip_torch.adapting.bins import RecordingBins, Witnesses, known_bins
+from tactslip_torch.adapting.held_out import class_scales, solve
+from tactslip_torch.adapting.statistics import Machine, Statistics
+from tactslip_torch.adapting.steps import FACTORS, OF_MARGIN, add, forget, taken, undo
+from tactslip_torch.features.bin_sample import BinSample
+from tactslip_torch.fitting import training_part
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.model.sufficient import SufficientStats
+from tactslip_torch.model.threshold import FeatureThreshold
+from tactslip_torch.planning import Plan
+from tactslip_torch.recipe import Frame
+
+K, NUM_BINS = 3, 24
+MACHINE = Machine(0.05, 0.5, "weights")
+
+
+def recording(material, seed, num_bins=NUM_BINS, turn=0.0):
+    """Bins whose class hangs on the first feature or, as far as ``turn`` says, on the second."""
+    rng = np.random.default_rng(seed)
+    z = torch.from_numpy(rng.uniform(-1, 1, (num_bins, K)))
+    told = (1 - turn) * z[:, 0] + turn * z[:, 1] + 0.4 * z[:, 0] * z[:, 2]
+    is_slip = told + 0.2 * torch.from_numpy(rng.standard_normal(num_bins)) > -0.3
+    return RecordingBins(material, z, is_slip, f"{material} {seed}")
+
+
+def recordings(material, number, first_seed, turn=0.0):
+    return {
+        f"{material}/{i}": recording(material, first_seed + i, turn=turn) for i in range(number)
+    }
+
+
+def statistics(trained):
+    """Of recordings whose bins are all witnesses."""
+    sums = SufficientStats(K)
+    for name, own in trained.items():
+        sums.update(name, own.z, own.is_slip)
+    sizes = torch.tensor([len(own.z) for own in trained.values()])
+    witnesses = Witnesses(
+        torch.cat([own.z for own in trained.values()]),
+        torch.cat([own.is_slip for own in trained.values()]),
+        torch.ones(int(sizes.sum()), dtype=torch.float64),
+        torch.arange(len(trained)).repeat_interleave(sizes),
+        tuple(trained),
+        tuple(own.material for own in trained.values()),
+    )
+    return Statistics(sums, MACHINE, {"bin_ms": 50.0}, witnesses, "digest", {}, {})
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return recordings("a", 4, 0) | recordings("b", 4, 10) | recordings("c", 4, 20, turn=0.1)
+
+
+@pytest.fixture(scope="module")
+def old(trained):
+    return statistics(trained)
+
+
+@pytest.fixture(scope="module")
+def new():
+    return recordings("new", 3, 100, turn=1.0)
+
+
+def fitted(bins, weights, scales):
+    """The machine of bins at given weights, by another route: from a matrix of bins by bins."""
+    z = torch.cat([own.z for own in bins])
+    is_slip = torch.cat([own.is_slip for own in bins])
+    sizes = torch.tensor([len(own.z) for own in bins])
+    weight = torch.tensor(weights, dtype=torch.float64).repeat_interleave(sizes)
+    training = TrainingBins(z, is_slip, weight * scales[is_slip.long()])
+    return fit_machine(training, MACHINE.penalty, Polynomial(2, MACHINE.offset), route="dual")
+
+
+def test_a_known_bin_scores_as_by_the_machine_refitted_without_its_recording(old, trained, new):
+    after = old.reweighed(dict.fromkeys(new, 2.5), new)
+    solved, scales = solve(after), class_scales(after.sums, MACHINE)
+    everyone = trained | new
+    for name in ("b/2", "new/1"):
+        others = [own for other, own in everyone.items() if other != name]
+        weights = [2.5 if other in new else 1.0 for other in everyone if other != name]
+        expected = fitted(others, weights, scales)(everyone[name].z)
+        found = solved.scores[solved.known.of([name])]
+        torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-9)
+
+
+def test_added_recordings_are_in_the_machine_with_their_weight(old, trained, new):
+    after = old.reweighed(dict.fromkeys(new, 7.0), new)
+    scales = class_scales(after.sums, MACHINE)
+    bins, weights = [*trained.values(), *new.values()], [1.0] * len(trained) + [7.0] * len(new)
+    z = recording("any", 5).z
+    expected = fitted(bins, weights, scales)(z)
+    torch.testing.assert_close(solve(after).head(z), expected, rtol=1e-8, atol=1e-9)
+    total = sum(w * float(own.is_slip.sum()) for own, w in zip(bins, weights, strict=True))
+    assert float(after.sums.weight[1]) == pytest.approx(total, rel=1e-9)
+
+
+@pytest.mark.parametrize("weight", [0.3, 1.0, 31.9, 3000.0])
+def test_what_is_weighed_anew_goes_out_to_the_bit(old, new, weight):
+    there = old.reweighed(dict.fromkeys(new, weight), new)
+    assert not torch.equal(there.sums.sums, old.sums.sums)
+    back = there.reweighed(dict.fromkeys(new, 0.5)).reweighed(dict.fromkeys(new, 0.0))
+    assert torch.equal(back.sums.sums, old.sums.sums)
+    assert torch.equal(back.sums.count, old.sums.count)
+    assert back.sums.ledger.entries == old.sums.ledger.entries
+
+
+def test_an_undone_step_leaves_no_trace(old, trained, new, tmp_path):
+    file = torch.arange(5, dtype=torch.uint8)
+    change = add(old, solve(old), new, 2.0, margin=1.0)
+    first = taken(old, change, {"action": "add"}, file, "one")
+    gone = {"b/1": trained["b/1"], "new/0": new["new/0"]}
+    second = taken(first, forget(first, solve(first), gone), {"action": "forget"}, file + 1, "two")
+    second.save(tmp_path / "second")
+    back, found = undo(Statistics.load(tmp_path / "second"))
+    assert torch.equal(found, file + 1)
+    back.save(tmp_path / "back")
+    first.save(tmp_path / "first")
+    assert (tmp_path / "back").read_bytes() == (tmp_path / "first").read_bytes()
+    back, found = undo(back)
+    assert torch.equal(found, file)
+    back.save(tmp_path / "back")
+    old.save(tmp_path / "old")
+    assert (tmp_path / "back").read_bytes() == (tmp_path / "old").read_bytes()
+    with pytest.raises(ValueError, match="nothing to undo"):
+        undo(back)
+
+
+def test_forgetting_is_never_having_met(old, trained):
+    others = {name: own for name, own in trained.items() if own.material != "c"}
+    mine = {name: own for name, own in trained.items() if own.material == "c"}
+    found = forget(old, solve(old), mine)
+    assert torch.equal(found.statistics.sums.sums, statistics(others).sums.sums)
+    assert sorted(found.verdict.after) == ["a", "b"]
+
+
+def test_only_what_was_put_in_can_be_taken_out(old, trained):
+    other = replace(trained["a/1"], z=trained["a/2"].z)
+    with pytest.raises(ValueError, match="other content"):
+        forget(old, solve(old), {"a/1": other})
+    with pytest.raises(ValueError, match="d/1 is not in"):
+        forget(old, solve(old), {"d/1": trained["a/1"]})
+
+
+def test_auto_takes_the_largest_weight_that_old_materials_allow(old, new):
+    before = solve(old)
+    found = add(old, before, new, None, margin=0.1)
+    factors = list(found.tried)
+    chosen = max(f for f in factors if found.tried[f] == found.verdict.mean_fall)
+    assert found.verdict.problem(OF_MARGIN * 0.1) is None
+    (next_larger,) = [f for f in FACTORS if f > chosen][:1]
+    by_hand = add(old, before, new, found.weight * next_larger / chosen, margin=0.1)
+    assert by_hand.verdict.problem(OF_MARGIN * 0.1) is not None
+    assert found.weight * 3 * NUM_BINS == pytest.approx(chosen * 4 * NUM_BINS)
+
+
+def test_where_nothing_is_allowed_auto_tries_the_smallest_weight(old, new):
+    found = add(old, solve(old), new, None, margin=0.0)
+    assert min(found.tried) == FACTORS[0]
+    assert found.weight * 3 * NUM_BINS == pytest.approx(FACTORS[0] * 4 * NUM_BINS)
+
+
+def test_a_new_material_is_learned_and_later_ones_share_its_weight(old, new):
+    before = solve(old)
+    found = add(old, before, new, 4.0, margin=1.0)
+    assert found.new["after"] > found.new["before"] + 0.1
+    more = {"new/7": recording("new", 107, turn=1.0)}
+    later = add(found.statistics, found.solved, more, 2.0, margin=1.0)
+    assert dict(later.statistics.weights) == dict.fromkeys([*new, *more], 2.0)
+    assert later.new["after"] is None  # nothing else of this recording tells
+    assert "new" in later.verdict.before
+
+
+def test_bins_without_slip_alone_weigh_as_those_of_an_average_material(old, trained):
+    quiet = recording("quiet", 50)
+    quiet = replace(quiet, z=quiet.z[~quiet.is_slip], is_slip=quiet.is_slip[~quiet.is_slip])
+    found = add(old, solve(old), {"quiet/0": quiet}, None, margin=0.0)
+    num_quiet = sum(int((~own.is_slip).sum()) for own in trained.values()) / 3
+    assert found.weight * len(quiet.z) / num_quiet in [pytest.approx(f) for f in found.tried]
+
+
+@pytest.mark.parametrize(
+    ("bins", "weight", "message"),
+    [
+        (recordings("d", 1, 0) | recordings("e", 1, 0), 1.0, "one material at a time, got d, e"),
+        (recordings("a", 1, 0), 1.0, "a/0 is in already"),
+        ({"d/0": recording("d", 0, num_bins=0)}, 1.0, "no labelled bin"),
+        (recordings("d", 1, 0), -1.0, "weight must be auto or a positive number"),
+        (recordings("d", 1, 0), float("nan"), "weight must be auto or a positive number"),
+        ({}, 1.0, "no labelled bin"),
+    ],
+)
+def test_what_cannot_be_added_is_refused(old, bins, weight, message):
+    with pytest.raises(ValueError, match=message):
+        add(old, solve(old), bins, weight, margin=0.1)
+
+
+def test_a_verdict_names_what_falls():
+    same = {"a": 0.9, "b": 0.8}
+    assert Verdict(same, same).problem(0.0) is None
+    mean = Verdict(same, {"a": 0.88, "b": 0.8}).problem(0.005)
+    assert mean.startswith("old materials fall from 85.00 to 84.00 %")
+    one = Verdict(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7}).problem(0.04 / OF_ONE)
+    assert one.startswith("b falls from 80.00 to 75.00 %")
+    assert Verdict(same, {"a": 0.88, "b": 0.8}).problem(0.0101) is None
+    assert Verdict({}, {}).problem(0.0) is None
+
+
+def test_both_machines_are_compared_on_the_bins_that_both_know(old, new):
+    before = solve(old)
+    found = compared(before, add(old, before, new, 1.0, margin=1.0).solved)
+    assert sorted(found.before) == sorted(found.after) == ["a", "b", "c"]
+    known = before.known
+    mine = known.material == known.materials.index("b")
+    assert found.before["b"] == mean_recall(before.scores[mine] >= 0, known.is_slip[mine])
+
+
+def test_mean_recall_is_balanced_accuracy_or_that_of_the_one_class():
+    truth = torch.tensor([True, True, True, False])
+    assert mean_recall(torch.tensor([True, False, True, False]), truth) == pytest.approx(5 / 6)
+    assert mean_recall(truth, ~torch.zeros(4, dtype=torch.bool)) == pytest.approx(3 / 4)
+
+
+def test_witnesses_give_way_to_all_bins_of_a_recording_that_is_taken_out(old, trained, new):
+    known = known_bins(
+        old.witnesses, {"a/0": trained["a/0"]} | new, {"a/0": 0.0} | dict.fromkeys(new, 3.0)
+    )
+    assert not bool(known.of(["a/0"]).any())
+    assert set(known.weight[known.of(new)].tolist()) == {3.0}
+    assert len(known.z) == (len(trained) - 1 + len(new)) * NUM_BINS
+    assert known.materials == ("a", "b", "c", "new")
+    names = [known.recordings[i] for i in known.recording.tolist()]
+    materials = [known.materials[i] for i in known.material.tolist()]
+    assert all(name.startswith(f"{of}/") for name, of in zip(names, materials, strict=True))
+
+
+def test_witnesses_are_bins_that_were_trained_on_under_undersampling(rng):
+    frame = Frame((0, 2), FeatureScaler(torch.zeros(2).double(), torch.ones(2).double()))
+    plan = Plan(
+        frame, Polynomial(2, 0.5), 1.0, "undersample", (1.0, 0.4), 1.0, 60,
+        FeatureThreshold(0, 1, 0.0), (0.0, 0.0),
+    )  # fmt: skip
+    sample, kept = BinSample(30), {}
+    for name in ("m/0", "m/1"):
+        features = torch.from_numpy(rng.uniform(0, 1, (40, 4))).float()
+        is_slip = torch.arange(40) % 2 == 0
+        sample.update(name, "m", features, is_slip)
+        kept[name] = training_part(plan, name, features, is_slip)[0]
+    found = Witnesses.of(plan, sample.bins(), {"m/0": "m", "m/1": "m"})
+    for number, name in enumerate(found.recordings):
+        rows = found.z[found.recording == number]
+        in_training = (rows[:, None] == kept[name]).all(-1).any(-1)
+        assert len(rows) > 0
+        assert bool(in_training.all())
+    num_slip = float(found.represents[found.is_slip].sum())
+    assert 0.5 < num_slip / sum(float(len(z) - 20) for z in kept.values()) < 2.0
+
+
+def test_statistics_come_back_from_their_file_and_damage_is_noticed(old, new, tmp_path):
+    there = replace(old.reweighed(dict.fromkeys(new, 2.0), new), labels={"layout": "whole_slide"})
+    there.save(tmp_path / "statistics.pt")
+    back = Statistics.load(tmp_path / "statistics.pt")
+    assert back.machine == there.machine
+    assert back.labels == there.labels
+    assert torch.equal(solve(back).scores, solve(there).scores)
+    content = bytearray((tmp_path / "statistics.pt").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "statistics.pt").write_bytes(content)
+    with pytest.raises(ValueError, match="damaged"):
+        Statistics.load(tmp_path / "statistics.pt")
+
+
+def test_nothing_that_is_given_is_changed(old, new):
+    sums = copy.deepcopy(old.sums.sums)
+    add(old, solve(old), new, None, margin=0.1)
+    assert torch.equal(old.sums.sums, sums)
+    assert not old.bins
