@@ -84,7 +84,7 @@ def answers_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
     left.set_yticks(range(len(lanes)), [f"{role}, {_WORDS[name]}" for role, name in lanes])
     left.set_ylim(len(lanes) - 0.5, -0.5)
     left.set_xlabel("covered of a recording's bins, %; bar: mean over recordings")
-    right.set_xlabel("of all bins, %")
+    right.set_xlabel("of the bins of a class, %")
     right.set_xlim(0, 100)
     handles = [right.barh(0, 0, color=colour, label=word) for word, colour in _OUTCOMES.items()]
     figure.legend(handles=handles, loc="outside lower right", ncols=3, frameon=False, fontsize=8)
