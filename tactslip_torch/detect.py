@@ -30,11 +30,7 @@ from tactslip_torch.config import (
     one_line,
     run_entry_point,
 )
-from tactslip_torch.data.folder import (
-    file_facts,
-    has_truth,
-    recording_files,
-)
+from tactslip_torch.data.folder import file_facts, has_truth, recording_files
 from tactslip_torch.data.formats.reading import Reading, pieces
 from tactslip_torch.data.formats.registry import open_file
 from tactslip_torch.data.recording import Recording
@@ -43,6 +39,7 @@ from tactslip_torch.data.sets.stream import stream_of
 from tactslip_torch.experiment import save_config, versions
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.missing import dead_names
 from tactslip_torch.onset.answering import answer_of
 from tactslip_torch.onset.decider import Decisions
 from tactslip_torch.onset.events import (
@@ -155,7 +152,7 @@ def _hear(
     ):
         rate = detector.pool.sample_rate_hz
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
-        stream = StreamingDetector(detector, settings, dtype=samples.dtype)
+        stream = StreamingDetector(detector, settings, dtype=samples.dtype, dead=config.dead or ())
         view = view_of(config.view, entry["duration_s"])
         drawn = _drawn(detector.pool.hand)
         traces = Traces(drawn, rate, stream.hop_s, view, units_of(detector))
@@ -282,6 +279,7 @@ def _origin(listener: Listener) -> dict[str, Any]:
             "bin_s": pool.bin_samples / rate,
         },
         "settings": settings.to_dict() | {"is_own_threshold": config.threshold is None},
+        "dead": list(dead_names(config.dead or (), pool.hand.names)),
         "versions": versions(),
     }
     return dict(plain(facts))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -30,13 +30,25 @@ def dead_mask(dead: Dead, names: Sequence[str]) -> Tensor:
                 f"{tuple(dead.shape)}"
             )
         return dead
-    listed = [dead] if isinstance(dead, str) else list(dead)
+    listed = [dead] if isinstance(dead, str) else dead
+    if not isinstance(listed, Iterable):
+        raise ValueError(f"dead must be a list of names of channels, got {dead!r}")
     if unknown := [name for name in listed if name not in names]:
         raise ValueError(
             f"dead names the channel {unknown[0]!r}, which this hand does not have; take some of "
             f"{', '.join(names)}"
         )
     return torch.tensor([name in listed for name in names], dtype=torch.bool)
+
+
+def dead_names(dead: Dead, names: Sequence[str]) -> tuple[str, ...]:
+    """Names of dead channels, in the order of the hand.
+
+    Raises:
+        ValueError: as ``dead_mask``.
+    """
+    mask = dead_mask(dead, names).tolist()
+    return tuple(name for name, is_dead in zip(names, mask, strict=True) if is_dead)
 
 
 def without(samples: Tensor, dead: Dead | None, names: Sequence[str]) -> Tensor:

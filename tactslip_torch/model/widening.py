@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor
 
 from tactslip_torch.model.calibration import Calibration
@@ -32,7 +33,8 @@ def widened_llr(calibration: Calibration, score: Tensor, variance: Tensor) -> Te
         MacKay (1992), Neural Computation 4(5), 720-736.
     """
     llr = calibration.llr(score).double()
-    away = variance.double().sqrt()
+    # 0 gives way to what changes no ratio, and has a finite slope
+    away = variance.double().clamp(min=torch.finfo(torch.float64).tiny).sqrt()
     above, below = (calibration.llr(score.double() + sign * away) for sign in (1, -1))
     spread = (above - below) / 2
     return (llr / (1 + math.pi / 8 * spread.square()).sqrt()).to(score.dtype)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model.calibration import probability
+from tactslip_torch.model.widening import widened_llr
 from tactslip_torch.onset.latch import Latch, latch, latch_start
 from tactslip_torch.onset.sequential import NEUTRAL
 from tactslip_torch.onset.settings import AlarmSettings
@@ -112,7 +113,13 @@ class Decider:
         self._number = 0  # Python's integers do not end
         self._state: tuple[Tensor, Latch, Tensor] | None = None
 
-    def decide(self, score: Tensor, is_valid: Tensor, is_usable: Tensor | None = None) -> Decisions:
+    def decide(
+        self,
+        score: Tensor,
+        is_valid: Tensor,
+        is_usable: Tensor | None = None,
+        variance: Tensor | None = None,
+    ) -> Decisions:
         """The next decisions.
 
         Args:
@@ -120,6 +127,7 @@ class Decider:
             is_valid: whether every channel in use could be trusted; handed on.
             is_usable: whether the score tells anything (``is_usable``); where not, the evidence is
                 ``NEUTRAL``. By default ``is_valid``.
+            variance: of scores that are expected ones; evidence is the weaker for it. Default: 0.
 
         Shape:
             - all: ``[*, m]``; m may be 0, the streams ``*`` are always the same
@@ -130,7 +138,10 @@ class Decider:
             none = torch.zeros(like.shape, dtype=torch.int64)
             self._state = settings.rule.start(like), latch_start(like), none
         of_rule, of_latch, run = self._state
-        llr = settings.calibration.llr(score)
+        if variance is None:
+            llr = settings.calibration.llr(score)
+        else:
+            llr = widened_llr(settings.calibration, score, variance)
         tells = is_valid if is_usable is None else is_usable
         llr = torch.where(tells & llr.isfinite(), llr, NEUTRAL)
         statistic, of_rule = settings.rule.scan(llr, of_rule)
@@ -178,8 +189,9 @@ def _run_starts(llr: Tensor, number: Tensor, before: Tensor) -> Tensor:
 def is_usable(score: Tensor, is_missing: Tensor, needed_index: Tensor) -> Tensor:
     """Whether a score tells anything: it is finite, and some channel in use was there.
 
-    A hand that lost a sensor goes on feeling with the others: typical features stand in, the
-    decision is flagged as not valid and still counts. One that lost them all feels nothing.
+    A hand that lost a sensor goes on feeling with the others: the score is the one expected without
+    it, the decision is flagged as not valid and still counts, the less the less certain the score
+    is. One that lost them all feels nothing.
 
     Shape:
         - score, output: ``[*]``

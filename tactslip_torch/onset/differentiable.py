@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.widening import widened_llr
 from tactslip_torch.onset.decider import is_usable
 from tactslip_torch.onset.sequential import NEUTRAL
 from tactslip_torch.onset.settings import AlarmSettings
@@ -80,8 +81,8 @@ def stream_statistic(
     is_used = torch.zeros(len(detector.pool.hand), 1, dtype=torch.bool, device=bins.device)
     is_used[used] = True
     bins = torch.where(is_used | bins.isfinite(), bins, 0.0)  # or 0 times NaN comes back
-    score, _, is_missing = detector.judge(bins, given=samples.dtype)
-    llr = settings.calibration.llr(score)
+    score, _, is_missing, variance = detector.judge(bins, given=samples.dtype)
+    llr = widened_llr(settings.calibration, score, variance)
     tells = is_usable(score, is_missing, detector.needed_index) & llr.isfinite()
     llr = torch.where(tells, llr, NEUTRAL)
     statistic, _ = settings.rule.scan(llr, settings.rule.start(llr[..., 0]))

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.missing import Dead, dead_names, without
 from tactslip_torch.onset.decider import Decider, Decisions, is_usable
 from tactslip_torch.onset.scoring import score_filtered
 from tactslip_torch.onset.settings import AlarmSettings
@@ -45,13 +46,17 @@ class StreamingDetector:
         detector: fitted on this hand.
         settings: hop, calibration, rule and threshold; by default those in the detector's file.
         dtype: of the samples, float32 or float64, and of the scores; what is pushed is converted.
+        dead: names of channels that are not to be listened to.
         max_gap_s: longest gap that is filled.
 
     Attributes:
         num_gaps: longer gaps since it was made or reset.
+        dead: channels that count as missing whatever they say, in the order of the hand; may be set
+            at any time, for all decisions that are still to be made.
 
     Raises:
-        ValueError: if the detector has no settings, the gap is negative or the dtype another.
+        ValueError: if the detector has no settings, the gap is negative, the dtype another or the
+            hand has no such channel.
 
     Example:
         >>> stream = StreamingDetector(SlipDetector.load("detector.pt"))  # doctest: +SKIP
@@ -66,6 +71,7 @@ class StreamingDetector:
         settings: AlarmSettings | None = None,
         *,
         dtype: torch.dtype = torch.float32,
+        dead: Dead = (),
         max_gap_s: float = 0.05,
     ) -> None:
         if dtype not in _NUMPY:
@@ -77,6 +83,7 @@ class StreamingDetector:
         self.settings = AlarmSettings.of(detector) if settings is None else settings
         self.dtype = dtype
         self.num_gaps = 0
+        self.dead = dead_names(dead, pool.hand.names)
         self._clock = SampleClock(pool.sample_rate_hz)
         self._max_gap = round(max_gap_s * pool.sample_rate_hz)
         wide = pool.widen(torch.empty(0, dtype=dtype)).dtype
@@ -86,6 +93,15 @@ class StreamingDetector:
         parts = (pool.sample_rate_hz, pool.bin_samples, detector.look_ahead)
         self._decider = Decider(self.settings, *parts)
         self._start()
+
+    @property
+    def dead(self) -> tuple[str, ...]:
+        """Channels that are not listened to, in the order of the hand."""
+        return self._dead
+
+    @dead.setter
+    def dead(self, dead: Dead) -> None:
+        self._dead = dead_names(dead, self.detector.pool.hand.names)
 
     @property
     def look_ahead_s(self) -> float:
@@ -228,9 +244,11 @@ class StreamingDetector:
         self._drop()
         hop = self.settings.hop_samples
         with torch.no_grad():
-            scores = score_filtered(self.detector, self._filtered, hop, self.dtype)
+            heard = without(self._filtered, self._dead, self.detector.pool.hand.names)
+            scores = score_filtered(self.detector, heard, hop, self.dtype)
             tells = is_usable(scores.score, scores.is_missing, self.detector.needed_index)
-            decisions = self._decider.decide(scores.score, scores.is_valid, tells)
+            judged = (scores.score, scores.is_valid, tells, scores.variance)
+            decisions = self._decider.decide(*judged)
         self._number += len(decisions.number)
         self._due = int(self._samples_for(np.array(self._number)))
         self._drop()

@@ -1,0 +1,99 @@
+"""Streams of hands with dead sensors: live, whole, and by the command."""
+
+import pytest
+import torch
+from small_detector import HAND, alarming_detector, raw_bins
+
+from tactslip_torch.graph.trials import simulated_stream
+from tactslip_torch.model.calibration import Isotonic, Platt
+from tactslip_torch.model.class_gaussians import ClassGaussians
+from tactslip_torch.model.widening import widened_llr
+from tactslip_torch.onset.decider import Decider
+from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.onset.streaming import StreamingDetector
+
+
+def alarming_with_gaussians():
+    made = alarming_detector()
+    z = made.scaler(made.pool(made.channel_filter.valid(raw_bins(200, 5)))[:, list(made.selected)])
+    made.gaussians = ClassGaussians.fit(z, made.head(z) >= 0)
+    return made
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return alarming_with_gaussians()
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return simulated_stream(HAND, 2000.0, torch.float64)
+
+
+def test_a_dead_channel_of_a_stream_is_as_one_of_nan(detector, samples):
+    broken = samples.clone()
+    broken[2] = torch.nan
+    whole = StreamingDetector(detector, dtype=torch.float64).push(broken.T)
+    live = StreamingDetector(detector, dtype=torch.float64, dead=["PVDF1"])
+    found = live.push(samples.T)
+    assert live.dead == ("PVDF1",)
+    assert len(found.score) > 50
+    for each, expected in zip(found, whole, strict=True):
+        torch.testing.assert_close(each, expected, rtol=1e-9, atol=1e-9)
+    assert not found.is_valid.any()
+
+
+def test_probability_and_statistic_are_of_the_widened_ratio(detector, samples):
+    found = StreamingDetector(detector, dtype=torch.float64, dead="PVDF1").push(samples.T)
+    broken = samples.clone()
+    broken[2] = torch.nan
+    scores = score_stream(detector, broken, AlarmSettings.of(detector).hop_samples)
+    calibration = AlarmSettings.of(detector).calibration
+    llr = widened_llr(calibration, scores.score, scores.variance)
+    torch.testing.assert_close(found.llr, llr[: len(found.llr)], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(found.probability, torch.sigmoid(found.llr), rtol=1e-12, atol=0)
+    assert (found.llr.abs() < calibration.llr(found.score).abs()).all()
+
+
+def test_sensors_die_and_come_back_in_the_middle_of_a_stream(detector, samples):
+    live = StreamingDetector(detector, dtype=torch.float64)
+    thirds = samples.T.tensor_split(3)
+    parts = []
+    for third, dead in zip(thirds, ([], ["SG1", "PVDF2"], []), strict=True):
+        live.dead = dead
+        parts.append(live.push(third))
+    assert [bool(part.is_valid.all()) for part in parts] == [True, False, True]
+    assert not parts[1].is_valid.any()
+    whole = StreamingDetector(detector, dtype=torch.float64).push(samples.T)
+    kept = torch.cat([part.is_valid for part in parts])
+    score = torch.cat([part.score for part in parts])
+    torch.testing.assert_close(score[kept], whole.score[kept], rtol=1e-9, atol=1e-9)
+    assert (score[~kept] != whole.score[~kept]).all()
+
+
+def test_a_hand_that_is_wholly_dead_tells_nothing(detector, samples):
+    found = StreamingDetector(detector, dtype=torch.float64, dead=HAND.names).push(samples.T)
+    assert torch.equal(found.probability, torch.full_like(found.score, 0.5))
+    assert not found.alarms
+
+
+def test_another_hands_channel_is_refused_and_nothing_changes(detector):
+    live = StreamingDetector(detector, dead=["SG1"])
+    with pytest.raises(ValueError, match=r"^dead names the channel 'SG7'"):
+        live.dead = ["SG7"]
+    assert live.dead == ("SG1",)
+    with pytest.raises(ValueError, match=r"^dead names the channel 'SG7'"):
+        StreamingDetector(detector, dead=["SG7"])
+
+
+@pytest.mark.parametrize("calibration", [Platt(2.0, 0.3), Isotonic((-2.0, 2.0), (-5.0, 5.0))])
+def test_certain_scores_are_decided_to_the_bit_as_ever(calibration, detector):
+    settings = AlarmSettings.of(detector)
+    settings = AlarmSettings(20, calibration, settings.rule, 1.0, None)
+    score = torch.linspace(-3, 3, 40, dtype=torch.float64)
+    valid = torch.ones(40).bool()
+    plain = Decider(settings, 2000.0, 100, 25).decide(score, valid)
+    certain = Decider(settings, 2000.0, 100, 25).decide(score, valid, valid, torch.zeros(40))
+    for one, other in zip(plain, certain, strict=True):
+        assert torch.equal(one, other)
