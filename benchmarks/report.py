@@ -25,6 +25,8 @@ from benchmarks.features import report as features
 from benchmarks.features.guards import measure as guards
 from benchmarks.formats import figure as formats_figure
 from benchmarks.formats import report as formats
+from benchmarks.gradients import figure as gradients_figure
+from benchmarks.gradients import report as gradients
 from benchmarks.latency import figure as latency_figure
 from benchmarks.latency import report as latency
 from benchmarks.model import measure as model_measure
@@ -147,6 +149,14 @@ SECTIONS = {
     "train": Section("Training", None, train.report_text, keys=("experiment", "stages", "wholes")),
     "model": Section(
         "Kernel machine at any size", None, model.report_text, needs=tuple(model_measure.SECTIONS)
+    ),
+    "gradients": Section(
+        "Gradients through the fit",
+        gradients.tables,
+        gradients.report_text,
+        gradients_figure.figure,
+        gradients.about,
+        needs=("gradients",),
     ),
     "precision": Section(
         "Precision", None, precision.report_text, keys=("variants", "solves", "ratios")

@@ -1,0 +1,1 @@
+"""What the way back through a fit costs: ``python -m benchmarks.gradients``."""
