@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks import train
+from benchmarks import sensors, train
 from benchmarks.abstaining import figure as abstaining_figure
 from benchmarks.abstaining import report as abstaining
 from benchmarks.deployment import figure as deployment_figure
@@ -168,6 +168,14 @@ SECTIONS = {
         simulation_figure.figure,
         simulation.about,
         needs=simulation.SECTIONS,
+    ),
+    "sensors": Section(
+        "Which sensors matter",
+        sensors.tables,
+        sensors.report_text,
+        sensors.figure,
+        sensors.about,
+        needs=sensors.SECTIONS,
     ),
 }
 """By the name of the benchmark and of its file."""

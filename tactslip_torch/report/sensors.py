@@ -16,6 +16,10 @@ ANEW_WORDS = {
     "ranked": "by the recipe's ranking, in which strong channels crowd out others",
     "shared": "as many of each channel",
 }
+BEST_LINE = (
+    "best few, greedily by held-out accuracy (which is optimistic for it; test and unseen choose "
+    "nothing):"
+)
 
 
 def sensors_table(content: Mapping[str, Any]) -> str:
@@ -25,7 +29,14 @@ def sensors_table(content: Mapping[str, Any]) -> str:
         content: of ``sensors.json``.
     """
     head = [SIMULATED_LINE] if content["simulated"] else []
-    head += [
+    head += [*lines_about(content), with_all_line(content)]
+    tables = [unit_rows(content, unit) for unit in content["best"]]
+    return "\n".join(head) + "\n\n" + "\n\n".join(aligned(rows[0], rows[1:]) for rows in tables)
+
+
+def lines_about(content: Mapping[str, Any]) -> list[str]:
+    """What the columns mean."""
+    return [
         f"balanced accuracy, mean over groups; machines of {content['num_bins']['held_out']} "
         "training bins; held-out: each of the groups "
         f"{', '.join(content['groups']['held_out'])} left out",
@@ -33,17 +44,17 @@ def sensors_table(content: Mapping[str, Any]) -> str:
         "non-slip / slip bins",
         "lost: points of balanced accuracy without it, [95 % of draws of recordings]; anew: "
         f"features selected again among the others, {ANEW_WORDS[content['settings']['anew']]}",
-        with_all_line(content),
     ]
+
+
+def unit_rows(content: Mapping[str, Any], unit: str) -> list[list[str]]:
+    """A header, and a row for each channel, finger or kind."""
     roles = list(content["num_bins"])
-    parts = []
-    for unit in dict.fromkeys(row["unit"] for row in content["units"]):
-        rows = [_cells(row, roles) for row in content["units"] if row["unit"] == unit]
-        header = [unit, "in use", "moves score"]
-        header += [f"lost {ROLE_WORDS[role]}" for role in roles]
-        header += [f"anew {ROLE_WORDS[role]}" for role in roles]
-        parts.append(aligned([*header, "alone, held-out %"], rows))
-    return "\n".join(head) + "\n\n" + "\n\n".join(parts)
+    header = [unit, "in use", "moves score"]
+    header += [f"lost {ROLE_WORDS[role]}" for role in roles]
+    header += [f"anew {ROLE_WORDS[role]}" for role in roles]
+    rows = [_cells(row, roles) for row in content["units"] if row["unit"] == unit]
+    return [[*header, "alone, held-out %"], *rows]
 
 
 def with_all_line(content: Mapping[str, Any]) -> str:
@@ -57,22 +68,23 @@ def with_all_line(content: Mapping[str, Any]) -> str:
 
 def best_table(content: Mapping[str, Any]) -> str:
     """Accuracy kept with the best few, in the order in which they join; of all units."""
-    roles = list(content["num_bins"])
     parts = []
-    for unit, steps in content["best"].items():
-        rows = []
-        for number, step in enumerate(steps, 1):
-            scores = [percent(step["balanced_accuracy"][role]) for role in roles]
-            row = [str(number), step["joins"], str(step["num_features"])]
-            rows.append([*row, *scores, *(_interval(step["lost"][role]) for role in roles)])
-        header = [f"{unit}s", "joins", "features", *(f"{ROLE_WORDS[role]} %" for role in roles)]
-        header += [f"lost {ROLE_WORDS[role]}" for role in roles]
-        parts.append(aligned(header, rows, num_left=2))
-    note = (
-        "best few, greedily by held-out accuracy (which is optimistic for it; test and unseen "
-        "choose nothing):"
-    )
-    return note + "\n\n" + "\n\n".join(parts)
+    for unit in content["best"]:
+        rows = best_rows(content, unit)
+        parts.append(aligned(rows[0], rows[1:], num_left=2))
+    return f"{BEST_LINE}\n\n" + "\n\n".join(parts)
+
+
+def best_rows(content: Mapping[str, Any], unit: str) -> list[list[str]]:
+    """A header, and a row for each step of the best few."""
+    roles = list(content["num_bins"])
+    header = [f"{unit}s", "joins", "features", *(f"{ROLE_WORDS[role]} %" for role in roles)]
+    rows = [[*header, *(f"lost {ROLE_WORDS[role]}" for role in roles)]]
+    for number, step in enumerate(content["best"][unit], 1):
+        scores = [percent(step["balanced_accuracy"][role]) for role in roles]
+        row = [str(number), step["joins"], str(step["num_features"])]
+        rows.append([*row, *scores, *(_interval(step["lost"][role]) for role in roles)])
+    return rows
 
 
 def sensors_csv(content: Mapping[str, Any]) -> str:
