@@ -14,7 +14,7 @@ probability                             here
 all of it at once                       here: training volts and stream to statistic, twice
 ======================================  =====================================================
 
-Mode and entropy step: they are left out by name.
+Mode and entropy step: they are left out by name, except where smooth stand-ins take their place.
 """
 
 import pytest
@@ -95,15 +95,15 @@ def test_the_probability_of_a_score(calibration, rng):
 
 
 # ------------------------------------------------------------------------------------ end to end
-def statistic_of(raw, stream, rule, compress, tail):
+def statistic_of(raw, stream, rule, compress, tail, pool=POOL, selected=SELECTED):
     """The statistic over a stream, by a machine that is fitted to raw bins on the way."""
-    features = POOL(FILTER.valid(raw))[:, SELECTED]
+    features = pool(FILTER.valid(raw))[:, selected]
     scaler = FeatureScaler.fit(features, compress=compress, tail=tail)
     z = scaler(features)
     targets = torch.tensor([1.0, -1.0], dtype=z.dtype).repeat(len(z) // 2)
     form = collapse(z, solve_kernel_elm(PAPER_KERNEL(z, z), targets, penalty=10.0))
     bins = FILTER(stream).unfold(-1, SAMPLES, HOP).movedim(-3, -2)
-    score = form(scaler(POOL(bins)[..., SELECTED]))
+    score = form(scaler(pool(bins)[..., selected]))
     llr = Platt(1.5, 0.2).llr(score)
     statistic, _ = rule.scan(llr, rule.start(llr[..., 0]))
     return score, probability(llr, 0.3), statistic
@@ -139,6 +139,17 @@ def test_second_derivatives_from_volts_to_statistic(rule, volts):
         return statistic_of(raw, stream, rule, True, 0.1)
 
     assert gradgradcheck(chain, volts, atol=1e-5, fast_mode=True)
+
+
+def test_with_smooth_stand_ins_nothing_is_left_out(volts):
+    pool = FeaturePool(HAND, bin_samples=SAMPLES, level=1, smooth=0.1)
+    selected = [*SELECTED, *(i for i, n in enumerate(POOL.names) if n.descriptor in STEPPING)]
+
+    def chain(raw, stream):
+        return statistic_of(raw, stream, RULES[1], True, 0.1, pool, selected)
+
+    assert gradcheck(chain, volts, atol=1e-5, fast_mode=True)
+    assert gradgradcheck(chain, volts, atol=1e-4, fast_mode=True)
 
 
 # ------------------------------------------------------------------------------ a detector's stream

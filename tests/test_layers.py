@@ -244,10 +244,9 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "features.sample": ("features.guards", "plain"),
     "features.descriptors": ("features.guards", "features.runs", "features.sample"),
     "features.exact_sums": (),
-    "features.soft_order": (),
+    "features.soft_order": ("features.guards",),
     "features.smooth": (
         "features.descriptors",
-        "features.guards",
         "features.runs",
         "features.sample",
         "features.soft_order",

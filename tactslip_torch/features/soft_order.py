@@ -22,6 +22,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.guards import looked_at
+
 _BISECTIONS = 8  # then the error is so small beside 1 / curvature that each step squares it
 _STEPS = 4
 
@@ -36,6 +38,19 @@ def share_below(v: Tensor) -> Tensor:
     v = v.clamp(-1, 1)
     square = v.square()
     return 0.5 + v * (15 / 16 + square * (-5 / 8 + square * (3 / 16)))
+
+
+def num_near(ordered: Tensor, distance: float) -> int:
+    """How many sorted values ``[*, n]`` lie at most that far above one, at most in any sample.
+
+    All others where values may not be looked at (compiling, vmap).
+    """
+    last = ordered.shape[-1] - 1
+    for lag in range(1, last + 1):
+        gap = looked_at(ordered[..., lag:] - ordered[..., :-lag])
+        if gap is not None and not (gap <= distance).any():
+            return lag - 1
+    return last
 
 
 def smooth_order(x: Tensor, ranks: Sequence[int], width: float) -> Tensor:
@@ -65,17 +80,22 @@ class _SmoothOrder(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, ranks: tuple[int, ...], width: float) -> Tensor:
-        sought = x.new_tensor(ranks) + 0.5
-        middle = x.sort(-1).values[..., list(ranks)]
+        ordered = x.sort(-1).values
+        reach = num_near(ordered, 2 * width)  # of those further off, each counts wholly or not
+        before = ordered.new_full((*ordered.shape[:-1], reach), -torch.inf)
+        padded = torch.cat([before, ordered, -before], dim=-1)
+        near = torch.stack([padded[..., k : k + 2 * reach + 1] for k in ranks], dim=-2)
+        middle, sought = near[..., reach], reach + 0.5
         low, high = middle - width, middle + width
         for _ in range(_BISECTIONS):
-            is_above = share_below(_distances(x, middle, width)).sum(-1) > sought
+            v = (middle[..., None] - near) / width
+            is_above = share_below(v).sum(-1) > sought
             low, high = torch.where(is_above, low, middle), torch.where(is_above, middle, high)
             middle = (low + high) / 2
         for _ in range(_STEPS):
-            v = _distances(x, middle, width)
-            excess = share_below(v).sum(-1) - sought
-            middle = (middle - width * excess / spread(v).sum(-1)).clamp(low, high)
+            v = (middle[..., None] - near) / width
+            step = (share_below(v).sum(-1) - sought) / spread(v).sum(-1)
+            middle = (middle - width * step).clamp(low, high)
         return middle
 
     @staticmethod
@@ -86,11 +106,6 @@ class _SmoothOrder(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
         x, root = ctx.saved_tensors  # the root is this function again, so this can be derived
-        kernel = spread(_distances(x, root, ctx.width))
+        kernel = spread((root[..., :, None] - x[..., None, :]) / ctx.width)
         weights = kernel / kernel.sum(-1, keepdim=True)
         return (gradients[0][..., None] * weights).sum(-2), None, None
-
-
-def _distances(x: Tensor, places: Tensor, width: float) -> Tensor:
-    """From each value to each place, in widths: ``[*, n]``, ``[*, r]`` to ``[*, r, n]``."""
-    return (places[..., :, None] - x[..., None, :]) / width
