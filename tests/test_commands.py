@@ -19,6 +19,7 @@ from tactslip_torch import HandLayout, Recording, SlipDetector
 from tactslip_torch.config import conf_dir, errors_in_one_line, one_line
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.evaluate import evaluate
+from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.train import train
 
 SCORES = {"accuracy", "balanced_accuracy", "non_slip_recall", "slip_recall"}
@@ -392,6 +393,57 @@ def test_random_bins_have_train_and_test_in_every_recording(tmp_path):
     assert splits["train"]["num_bins"] + splits["test"]["num_bins"] == 2 * 4 * 72
     assert "both sides" in metrics["events"]["test"]["first_transition"]["reason"]
     assert not (tmp_path / "events.png").exists()
+
+
+# Answers that may be unsure --------------------------------------------------------------------
+
+
+def test_a_run_sets_thresholds_and_says_what_answers_cover(tiny, tmp_path, capsys):
+    asked = ("coverage=0.6", f"cache={tiny.cache}")
+    _, metrics = run_train(tmp_path / "run", *TINY, *asked)
+    assert "asked: 60 % covered" in capsys.readouterr().out
+    assert (tmp_path / "run" / "answers.png").read_bytes().startswith(b"\x89PNG")
+    assert list(metrics["answers"]) == ["train", "test", "unseen"]
+    detector = SlipDetector.load(tmp_path / "run" / "detector.pt")
+    kept = Abstention.of(detector)
+    assert (kept.coverage, kept.facts["left_out"]) == (0.6, "recording")
+    assert kept.facts["num_recordings"] == {"slip": 4, "non_slip": 4}
+    for role, found in metrics["answers"].items():
+        assert len(found["recordings"]) == 4
+        (quiet, loud), confusion = found["counts"], metrics["splits"][role]["confusion"]
+        assert sum(quiet + loud) == metrics["splits"][role]["num_bins"]
+        assert quiet[2] <= confusion[0][1]  # a sure answer is that of the sign
+        assert loud[1] <= confusion[1][0]
+    model = f"model={tmp_path / 'run' / 'detector.pt'}"
+    again = evaluate(
+        composed(*TINY_EVALUATE, f"cache={tiny.cache}", model, name="evaluate"), tmp_path / "again"
+    )
+    assert again["answers"] == metrics["answers"]
+    assert timeless(tiny.metrics)["splits"] == metrics["splits"]
+
+
+def test_too_few_recordings_for_a_coverage_cost_no_run(tiny):
+    assert "answers" not in tiny.metrics  # 95 % of 4 recordings
+    assert SlipDetector.load(tiny.folder / "detector.pt").info["abstain"] is None
+
+
+def test_answers_of_several_folds_are_pooled_by_recording(tiny, tmp_path):
+    overrides = [o for o in TINY if not o.startswith("split")]
+    _, metrics = run_train(
+        *(tmp_path, *overrides, f"cache={tiny.cache}", "coverage=0.6"),
+        *("split=leave_one_material_out", "split.materials=[A,B,C]"),
+    )
+    found = metrics["answers"]["unseen"]
+    assert len(found["recordings"]) == 3 * 4
+    assert {name.split("/", 1)[0] for name in found["recordings"]} == set(metrics["folds"])
+    assert (tmp_path / "answers.png").is_file()
+
+
+def test_no_coverage_sets_no_thresholds(tiny, tmp_path):
+    _, metrics = run_train(tmp_path, *TINY, f"cache={tiny.cache}", "coverage=null")
+    assert timeless(metrics) == timeless(tiny.metrics)
+    with pytest.raises(ValueError, match=r"coverage must lie between 0 and 1, .* got 95"):
+        run_train(tmp_path, *TINY, f"cache={tiny.cache}", "coverage=95")
 
 
 # Evaluate --------------------------------------------------------------------------------------
