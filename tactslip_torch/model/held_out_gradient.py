@@ -51,7 +51,7 @@ def held_out_scores(
 
     The scores of ``HeldOut(bins, groups, Polynomial(2, offset), route="dual").at(penalty)``. Once
     differentiable in ``z``, ``penalty``, ``offset`` and ``weights``: a second derivative raises.
-    Memory is that of one matrix of bins by bins, the factor, and of one more for each group's own.
+    Until then it keeps the factor, ``[N, N]``, and one of each group's own bins.
 
     Args:
         z: scaled features of the bins; promoted to float64.
