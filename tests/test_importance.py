@@ -163,6 +163,15 @@ def test_a_verdict_is_that_of_machines_fitted_without_each_group():
         assert torch.equal(verdict.tallies[role].right, tally(is_right, bins).right)
 
 
+def test_of_machines_that_are_all_right_the_one_of_smallest_error_is_taken():
+    refit = refit_of({0: 9.0})
+    each = {penalty: refit.held_out([0], [penalty]) for penalty in PENALTIES}
+    assert {verdict.accuracy() for verdict in each.values()} == {1.0}
+    best = min(each, key=lambda penalty: each[penalty].error)
+    assert best != PENALTIES[0]  # which the first of equal ones would be
+    assert refit([0]).penalty == best
+
+
 def test_what_is_judged_chooses_nothing():
     refit = refit_of({0: 0.8})
     spoilt = refit_of({0: 0.8})

@@ -123,7 +123,7 @@ def _best_few(axes: Axes, content: Mapping[str, Any]) -> None:
     words = "bands: 95 % intervals of the difference to all sensors, over recordings"
     axes.set_xlabel(words, fontsize=_SMALL, color=_GREY)
     _tidy(axes, "y")
-    axes.legend(frameon=False, fontsize=_SMALL, loc="lower right", ncols=2)
+    axes.legend(frameon=False, fontsize=_SMALL, loc="best", ncols=2)
 
 
 def _tidy(axes: Axes, gridded: Any) -> None:
