@@ -9,6 +9,7 @@ each descriptor, first and second       test_descriptors, test_descriptors_mende
 the whole pool                          test_pool; smooth stand-ins: test_smooth
 scaling, with its knee                  test_scaling; the fit of the scaler: here
 kernels, both solves, quadratic form    test_kernels, test_kernel_elm, test_quadratic
+the fit, its settings, held-out scores  test_differentiable_fit, test_held_out_gradient
 log likelihood ratio, each rule         test_calibration, test_sequential
 probability                             here
 all of it at once                       here: training volts and stream to statistic, twice
@@ -25,6 +26,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Isotonic, Platt, probability
+from tactslip_torch.model.differentiable_fit import fit_quadratic
 from tactslip_torch.model.kernel_elm import solve_kernel_elm
 from tactslip_torch.model.kernels import PAPER_KERNEL
 from tactslip_torch.model.quadratic import collapse
@@ -121,24 +123,45 @@ def test_none_of_the_features_in_use_steps():
     assert {POOL.names[i].descriptor for i in SELECTED}.isdisjoint(STEPPING)
 
 
-@pytest.mark.parametrize(
-    ("rule", "compress", "tail"), [(RULES[0], False, 0.0), (RULES[1], True, 0.1)]
-)
-def test_from_training_volts_and_stream_to_statistic(rule, compress, tail, volts):
+def test_from_training_volts_and_stream_to_statistic(volts):
+    """Volt by volt; what follows looks along random directions, which is as good and quick."""
+
     def chain(raw, stream):
-        return statistic_of(raw, stream, rule, compress, tail)
+        return statistic_of(raw, stream, RULES[0], compress=False, tail=0.0)
 
     pulls = torch.autograd.grad(chain(*volts)[-1][-1], volts)
-    assert all(bool((pull.flatten(0, -2).abs().amax(-1) > 0).any()) for pull in pulls)
+    assert all(bool(pull.any(-1).all()) for pull in pulls)  # from every channel of every bin
     assert gradcheck(chain, volts, atol=1e-6)
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_second_derivatives_from_volts_to_statistic(rule, volts):
+def test_first_and_second_derivatives_of_each_rule_in_stream(rule, volts):
     def chain(raw, stream):
         return statistic_of(raw, stream, rule, True, 0.1)
 
+    assert gradcheck(chain, volts, atol=1e-6, fast_mode=True)
     assert gradgradcheck(chain, volts, atol=1e-5, fast_mode=True)
+
+
+@pytest.mark.parametrize("route", ["dual", "primal"])
+def test_by_either_route_of_the_fit_and_to_its_settings(route, volts):
+    """To C, the kernel's c and weights of bins as well."""
+    weights = torch.linspace(0.5, 2, len(volts[0]), dtype=torch.float64)
+    settings = torch.tensor(8.0).double(), torch.tensor(0.7).double(), weights
+
+    def chain(raw, stream, penalty, offset, weights):
+        features = POOL(FILTER.valid(raw))[:, SELECTED]
+        scaler = FeatureScaler.fit(features, compress=True)
+        targets = torch.tensor([1.0, -1.0], dtype=raw.dtype).repeat(len(raw) // 2)
+        form = fit_quadratic(scaler(features), targets, penalty, offset, weights, route)
+        bins = FILTER(stream).unfold(-1, SAMPLES, HOP).movedim(-3, -2)
+        llr = Platt(1.5, 0.2).llr(form(scaler(POOL(bins)[..., SELECTED])))
+        return RULES[1].scan(llr, RULES[1].start(llr[..., 0]))[0]
+
+    inputs = (*volts, *(each.requires_grad_() for each in settings))
+    assert all(bool(pull.any()) for pull in torch.autograd.grad(chain(*inputs)[-1], inputs))
+    assert gradcheck(chain, inputs, atol=1e-5, fast_mode=True)
+    assert gradgradcheck(chain, inputs, atol=1e-4, fast_mode=True)
 
 
 def test_with_smooth_stand_ins_nothing_is_left_out(volts):

@@ -1,9 +1,9 @@
 """Smooth stand-ins for the descriptors that step or have kinks, for those who ask for them.
 
 ``FeaturePool(hand, smooth=0.01)`` makes median, mode, range, iqr, entropy and peak factor by these
-in place of the exact ones, all with two continuous derivatives but where the largest or smallest
-value changes hands; the other eleven are as they were. A detector fitted on exact features must
-not be given smooth ones.
+in place of the exact ones, all with two continuous derivatives but where another value becomes the
+largest or smallest (for entropy, the highest below the top level too); the other eleven are as they
+were. A detector that was fitted on exact features must not be given smooth ones.
 
 The temperature ``t`` is a part of the sample's span ``S``, so nothing depends on the unit. With
 ``n`` values, errors against the exact descriptors are at most the following, beside rounding; each
