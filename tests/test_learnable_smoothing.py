@@ -172,3 +172,9 @@ def test_what_is_no_recording_is_refused():
         extended(torch.zeros(3, 20), plain)
     with pytest.raises(ValueError, match="5 samples of context before and 5 behind, got 10"):
         LearnableSmoothing(plain)(torch.zeros(4, 10))
+
+
+def test_it_follows_its_parameters_to_another_device():
+    smoothing = LearnableSmoothing(ChannelFilter(LENGTHS)).to("meta")
+    assert smoothing(torch.zeros(4, 80, device="meta", dtype=torch.float64)).shape == (4, 70)
+    assert smoothing.kernels[11].device.type == "meta"

@@ -173,3 +173,20 @@ def test_what_went_astray_is_not_frozen():
 def test_branches_of_another_shape_are_refused():
     with pytest.raises(ValueError, match=r"expected branches \(8, 100, 100\), got \(6, 100, 100\)"):
         FeaturePool(HAND).with_branches(torch.zeros(6, 100, 100))
+
+
+def test_it_follows_its_parameters_to_another_device():
+    wavelet = LiftedWavelet().to("meta")
+    assert wavelet.branch_matrix(100).device.type == "meta"
+    assert all(taps.device.type == "meta" for taps in wavelet.filter_bank)
+
+
+@given(name=st.sampled_from(["rbio2.2", "bior2.2"]), seed=st.integers(0, 2**31))
+def test_near_its_start_branches_are_about_as_large_as_the_bin(name, seed):
+    """Also at the far end of what weight decay leaves: parameters of a tenth, in any direction."""
+    wavelet = moved(name, seed, 1.0)
+    with torch.no_grad():
+        for parameter in wavelet.parameters():
+            parameter.clamp_(-0.1, 0.1)
+        matrix = wavelet.branch_matrix(100)
+    assert torch.linalg.matrix_norm(matrix, 2).max() < 3

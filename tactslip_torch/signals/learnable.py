@@ -62,7 +62,7 @@ class LearnableSmoothing(nn.Module):
             step: Tensor = self.steps[str(length)]
             if len(step) < length:
                 step = torch.cat([step[1:].flip(0), step])
-            kernels[length] = start + (step - step.mean()) / length
+            kernels[length] = start.to(step) + (step - step.mean()) / length
         return kernels
 
     def forward(self, samples: Tensor) -> Tensor:

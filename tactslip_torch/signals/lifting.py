@@ -14,11 +14,15 @@ high passes blind to a constant, as a wavelet must be (Cohen, Daubechies and Fea
 built in, with V the exponential of a number. What may be learned is that number and how U and P
 are spread over their taps; three numbers of ``rbio2.2``, whose filters stay six taps long. A gain
 is none of them: branches are reconstructed, so it cancels.
+
+Admissible is not well-conditioned: far from a named wavelet branches of many levels outgrow their
+bin, while the guards of features take for rounding what is rounding beside the bin. Parameters of
+about a tenth, as under weight decay, keep the branches of four levels about as large as the bin.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -35,7 +39,7 @@ class _Steps(NamedTuple):
     Attributes:
         is_low: whether the filter of the first step, the shorter, is the low pass.
         own, other: the middle tap of the shorter and of the longer filter, as a 1 in ``[L]``.
-        first: places of the first step's taps, ``[u]``, whole numbers.
+        first: places of the first step's taps, a 1 in each row, ``[u, L]``.
         shifts: of the second step's taps, by how much they shift the shorter filter, ``[p]``.
         taps, next_taps: of both steps, ``[u]`` and ``[p]``.
         gain, other_gain: of the shorter and the longer filter.
@@ -44,7 +48,7 @@ class _Steps(NamedTuple):
     is_low: bool
     own: Tensor
     other: Tensor
-    first: tuple[int, ...]
+    first: Tensor
     shifts: tuple[int, ...]
     taps: Tensor
     next_taps: Tensor
@@ -80,9 +84,9 @@ class LiftedWavelet(nn.Module):
     def __init__(self, wavelet: str = "rbio2.2") -> None:
         super().__init__()
         self.wavelet = wavelet
-        self._steps = _factored(wavelet)
-        self.spread = nn.Parameter(torch.zeros_like(self._steps.taps))
-        self.next_spread = nn.Parameter(torch.zeros_like(self._steps.next_taps))
+        self._named = _factored(wavelet)
+        self.spread = nn.Parameter(torch.zeros_like(self._named.taps))
+        self.next_spread = nn.Parameter(torch.zeros_like(self._named.next_taps))
         self.log_sum = nn.Parameter(torch.zeros((), dtype=torch.float64))
 
     @property
@@ -92,19 +96,19 @@ class LiftedWavelet(nn.Module):
         Shape:
             - output: four ``[L]``
         """
-        steps = self._steps
+        steps = _moved(self._named, self.log_sum)
         total = self.log_sum.exp()
         sign = 1.0 if steps.is_low else -1.0
         taps = _spread(steps.taps, self.spread, sign * (total - 1))
         next_taps = _spread(steps.next_taps, self.next_spread, sign * (0.5 - 1 / (1 + total)))
-        shorter = steps.own.index_add(0, torch.tensor(steps.first), taps)
+        shorter = steps.own + taps @ steps.first
         shifted = torch.stack([shorter.roll(shift) for shift in steps.shifts])
         longer = steps.other + next_taps @ shifted
         shorter = shorter + sign * (1 - total.square()) / 2 * longer
         shorter = steps.gain * (2 / (1 + total)) * shorter  # as tall as before on a constant
         longer = steps.other_gain * ((1 + total) / 2) * longer
         low, high = (shorter, longer) if steps.is_low else (longer, shorter)
-        turns = torch.ones(len(low), dtype=torch.float64)
+        turns = torch.ones_like(low)
         turns[::2] = -1
         return low, high, turns * high, -turns * low
 
@@ -119,7 +123,7 @@ class LiftedWavelet(nn.Module):
         Raises:
             ValueError: if the bin is too short for the level.
         """
-        identity = torch.eye(num_samples, dtype=torch.float64)
+        identity = torch.eye(num_samples, dtype=torch.float64, device=self.log_sum.device)
         name = f"a learned {self.wavelet}"
         branches = branches_by(identity, self.filter_bank, level, mode, name)
         return branches.movedim(0, -1).contiguous()
@@ -137,6 +141,12 @@ class LiftedWavelet(nn.Module):
         return WaveletFilters(
             f"{self.wavelet}, learned" if name is None else name, low, high, low_back, high_back
         )
+
+
+def _moved(steps: _Steps, like: Tensor) -> _Steps:
+    """The steps where the parameters are."""
+    parts: list[Any] = [part.to(like) if isinstance(part, Tensor) else part for part in steps]
+    return _Steps(*parts)
 
 
 def _spread(taps: Tensor, spread: Tensor, more: Tensor) -> Tensor:
@@ -184,7 +194,7 @@ def _divided(shorter: Tensor, longer: Tensor, *, is_low: bool) -> _Steps | None:
             is_low,
             identity[middle],
             identity[other],
-            tuple(first.tolist()),
+            identity[first],
             shifts,
             unit[first],
             longer[reached] / other_gain,
