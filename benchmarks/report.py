@@ -18,6 +18,8 @@ from typing import Any, NamedTuple
 from benchmarks import sensors, train
 from benchmarks.abstaining import figure as abstaining_figure
 from benchmarks.abstaining import report as abstaining
+from benchmarks.adapting import figure as adapting_figure
+from benchmarks.adapting import report as adapting
 from benchmarks.deployment import figure as deployment_figure
 from benchmarks.deployment import report as deployment
 from benchmarks.features import figure as features_figure
@@ -145,6 +147,14 @@ SECTIONS = {
         abstaining_figure.figure,
         abstaining.about,
         needs=abstaining.SECTIONS,
+    ),
+    "adapting": Section(
+        "A new material from a few recordings",
+        adapting.tables,
+        adapting.report_text,
+        adapting_figure.figure,
+        adapting.about,
+        needs=adapting.SECTIONS,
     ),
     "train": Section("Training", None, train.report_text, keys=("experiment", "stages", "wholes")),
     "model": Section(

@@ -72,7 +72,9 @@ def adaptation_figure(found: Mapping[str, Any], path: str | Path) -> None:
         if after is not None:
             axes.scatter(100 * after, place, color=colour, s=42, zorder=3)
     axes.scatter([], [], color=_BEFORE, s=42, label="before")
-    axes.scatter([], [], color=_AFTER, s=42, label="after")
+    axes.scatter([], [], color=_AFTER, s=42, label="after, old")
+    if found["new"]:
+        axes.scatter([], [], color=_NEW, s=42, label="after, new")
     axes.set_yticks(range(len(rows)), [name for name, _, _ in reversed(rows)])
     axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.set_xlabel("balanced accuracy by the machine without the recording, %")
