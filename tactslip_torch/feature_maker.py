@@ -25,6 +25,7 @@ from tactslip_torch.features.extractor import EngineName, FeatureExtractor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.signals.learnable import extended
 
 
 class Stroke(NamedTuple):
@@ -158,6 +159,29 @@ class FeatureMaker:
         times = self.source.timeline(recording)
         bins = self.lay_bins(times)
         return self._filter(recording, self._load(recording, times, bins), bins), bins
+
+    def raw_bins(self, recording: RecordingId, index: Tensor) -> Tensor:
+        """Some bins of a recording before filtering, with the context that it takes.
+
+        At the ends of a recording the context is what ``extended`` makes of it.
+
+        Args:
+            recording: of the source.
+            index: numbers of bins, ``[m]``, among those that ``__call__`` hands on.
+
+        Shape:
+            - output: ``[m, C, context_before + n + context_after]``, in the maker's dtype
+
+        Raises:
+            ValueError: as ``__call__``.
+        """
+        times = self.source.timeline(recording)
+        bins = self.lay_bins(times)
+        loaded = self._load(recording, times, bins)
+        filtered = self._filter(recording, loaded, bins)  # refuses what is not finite
+        whole = extended(loaded.samples.to(filtered), self.channel_filter)
+        context = self.channel_filter.context_before + self.channel_filter.context_after
+        return bins_at(whole, bins.starts[index], bins.bin_samples + context)
 
     def lay_bins(self, times: Timeline) -> LabelledBins:
         """Where the bins of a recording lie, and what they are; no sample is needed for that.

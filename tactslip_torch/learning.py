@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -39,10 +38,11 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import FeatureThreshold
 from tactslip_torch.onset.events import LatencyParts, RecordingEvents
+from tactslip_torch.pace import Pace
 from tactslip_torch.planning import Plan, plan_detector
 from tactslip_torch.progress import bar
 from tactslip_torch.ranks import from_first_rank, of_all_ranks, sum_over_ranks
-from tactslip_torch.recipe import Recipe
+from tactslip_torch.recipe import Frame, Recipe
 from tactslip_torch.signals.filtering import ChannelFilter
 
 
@@ -56,6 +56,8 @@ class SlipLearner(L.LightningModule):
         detector: a finished one, to be judged only.
         abstaining: how thresholds for unsure answers are set; by default none are.
 
+        frame: features and ranges that were settled elsewhere; by default the recipe finds them.
+
     Attributes:
         detector: the result, after the second epoch.
         facts: what the recipe found, such as the penalty.
@@ -63,7 +65,6 @@ class SlipLearner(L.LightningModule):
             a detector that may be unsure.
         events: what the test found in each recording, by role and rule; to be pooled with others.
         seconds: time of each stage of the fit.
-        worker_seconds: what workers spent on each stage of making features, summed over them.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class SlipLearner(L.LightningModule):
         recipe: Recipe | None = None,
         detector: SlipDetector | None = None,
         abstaining: Abstaining | None = None,
+        frame: Frame | None = None,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -81,6 +83,7 @@ class SlipLearner(L.LightningModule):
         self.recipe = recipe or Recipe()
         self.abstaining = abstaining or Abstaining()
         self._allowed = self.recipe.allowed(pool)
+        self._frame = frame
         self.detector = detector
         self.threshold: FeatureThreshold | None = None
         if detector and "rival" in detector.info:
@@ -89,8 +92,7 @@ class SlipLearner(L.LightningModule):
         self.metrics: dict[str, Any] = {}
         self.events: dict[str, dict[str, list[RecordingEvents]]] = {}
         self.seconds: dict[str, float] = {}
-        self.worker_seconds: dict[str, float] = {}
-        self._worked: dict[str, Counter[str]] = {}
+        self._pace = Pace()
         self._pass_started = 0.0
         self._num_threads = torch.get_num_threads()
         self._survey = Survey(len(pool.names), self.recipe.sample_bins)
@@ -116,7 +118,7 @@ class SlipLearner(L.LightningModule):
         """Survey in the first epoch, gather what the plan needs in the second."""
         if not batch:  # NOTHING
             return
-        self._count_seconds(batch)
+        self._pace.add(batch)
         mask = batch.roles["train"]
         features, is_slip = batch.features[mask], batch.is_slip[mask]
         if self._second is None:
@@ -184,7 +186,7 @@ class SlipLearner(L.LightningModule):
     def test_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
         """Score the bins of one recording."""
         assert self.detector is not None  # on_test_start
-        self._count_seconds(batch)
+        self._pace.add(batch)
         chosen = batch.features[:, list(self.detector.selected)].double()
         device = next(self.detector.buffers()).device  # Lightning may have moved it
         score = self.detector.score_features(chosen.to(device)).cpu()
@@ -229,6 +231,17 @@ class SlipLearner(L.LightningModule):
             }
 
     @property
+    def worker_seconds(self) -> dict[str, float]:
+        """What workers spent on each stage of making features, summed over them."""
+        return self._pace.seconds
+
+    @property
+    def plan(self) -> Plan:
+        """What the first pass decided."""
+        assert self._plan is not None  # fitted
+        return self._plan
+
+    @property
     def gathered(self) -> tuple[TrainingPass, SampledBins]:
         """What the machine was solved from, and the first pass's sample of its bins."""
         assert self._second is not None  # fitted
@@ -244,7 +257,8 @@ class SlipLearner(L.LightningModule):
         return f"{data.fingerprint()} by {self.recipe}, {self.abstaining}"
 
     def _planned(self) -> Plan:
-        plan = plan_detector(self.recipe, self._survey, bar, allowed=self._allowed)
+        parts = (self.recipe, self._survey, bar, self._frame, self._allowed)
+        plan = plan_detector(*parts, is_settled=self._frame is not None)
         return self.abstaining.settle(plan, self.recipe, self._survey)
 
     def _sampled(self) -> TrainingPass:
@@ -265,9 +279,8 @@ class SlipLearner(L.LightningModule):
         self.facts = {"recipe": self.recipe.name} | {
             name: facts[name] for name in ("kernel", "penalty", "balance", "num_bins", "validation")
         }
-        self.facts["head"] = head.cost._asdict()
-        self.facts["among"] = plan.among
-        self.facts["solve"] = solve_facts(head)
+        of_head = {"head": head.cost._asdict(), "solve": solve_facts(head)}
+        self.facts |= of_head | {"among": plan.among}
         self.seconds["solve"] = time.perf_counter() - started
         self.detector = SlipDetector(
             self.pool,
@@ -284,16 +297,4 @@ class SlipLearner(L.LightningModule):
 
     def rates(self) -> dict[str, str]:
         """How fast one worker goes through each stage it has met, for the progress bar."""
-        units = {"simulate": "recordings", "read": "recordings", "features": "bins"}
-        rates = {}
-        for stage, unit in (units | {"read_cache": "recordings"}).items():
-            if stage in self._worked:
-                rate = self._worked[stage][unit] / max(self.worker_seconds[stage], 1e-9)
-                rates[stage] = f"{rate:.0f} {unit}/s"
-        return rates
-
-    def _count_seconds(self, batch: RecordingFeatures) -> None:
-        for stage, seconds in batch.seconds.items():
-            self.worker_seconds[stage] = self.worker_seconds.get(stage, 0.0) + seconds
-            done = self._worked.setdefault(stage, Counter())
-            done.update(recordings=1, bins=len(batch.is_slip))
+        return self._pace.rates()

@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
 from torch import Tensor
 
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.fit import TrainingBins
-from tactslip_torch.model.held_out import HeldOut
 from tactslip_torch.model.kernels import Kernel, Polynomial, kernel_from_dict
 from tactslip_torch.model.quadratic import num_quadratic_features
 from tactslip_torch.model.scaling import FeatureScaler
@@ -27,16 +25,15 @@ from tactslip_torch.recipe import (
     Recipe,
     choose_frame,
     kept_shares,
-    recalls_mean,
     stand_for,
 )
+from tactslip_torch.validation import Progress as Progress
+from tactslip_torch.validation import validate
 
 log = logging.getLogger(__name__)
 
 MOST_KEPT_BINS = 8192
 """So many bins at most for a kernel that does not fold: its machine is a matrix of bins by bins."""
-
-Progress = Callable[[Iterable[Any], str], Iterable[Any]]
 
 
 @dataclass(frozen=True)
@@ -144,11 +141,16 @@ def plan_detector(
     progress: Progress,
     frame: Frame | None = None,
     allowed: Tensor | None = None,
+    *,
+    is_settled: bool = False,
 ) -> Plan:
     """Rank, scale, and choose K, c and C by closed-form validation on held-out groups.
 
     Features that were ranked and scaled elsewhere come as a ``frame``; which ones may be selected
     here, for a recipe that restricts them, as ``allowed``, what ``recipe.allowed`` says.
+
+    Of a recipe that leaves no choice nothing is validated, unless it ``is_settled``, by tuning:
+    then held-out scores are wanted for what follows from them, such as a calibration.
 
     A held-out score is that of the machine refitted without the bin's group, from one
     factorisation per choice (``model.held_out``), with ranking and scaling held. So it chooses,
@@ -173,7 +175,7 @@ def plan_detector(
         for penalty in recipe.penalties_ascending
     ]
     rows: list[dict[str, Any]] = []
-    if len(choices) > 1 and len(sample.group_names) > 1:
+    if (len(choices) > 1 or is_settled) and len(sample.group_names) > 1:
         bins = TrainingBins(frame(sample.features), sample.is_slip, weights)
         rows = validate(bins, sample.group, sample.group_names, choices, progress)
         best = max(row["mean"] for row in rows)
@@ -224,71 +226,6 @@ def _typical(scaled: Tensor, is_slip: Tensor, weights: Tensor) -> tuple[float, .
     """Mean of scaled features ``[N, K]``, both classes counting alike; K numbers."""
     means = [weights[mine] @ scaled[mine] / weights[mine].sum() for mine in (is_slip, ~is_slip)]
     return tuple(((means[0] + means[1]) / 2).tolist())
-
-
-def validate(
-    bins: TrainingBins,
-    groups: Tensor,
-    names: Sequence[str],
-    choices: Sequence[tuple[int, Kernel, float]],
-    progress: Progress,
-) -> list[dict[str, Any]]:
-    """Balanced accuracy of each held-out group for each choice of K, kernel and C, in order.
-
-    Args:
-        bins: training bins, as many features as the largest K, best first.
-        groups: ``[N]``, which group each bin is of, an index into ``names``.
-        names: of the groups.
-        choices: in any order; those of one K and kernel that stand together cost least.
-        progress: wraps what is gone through.
-
-    Returns:
-        One row per choice; ``mean`` is over the groups that have bins of both classes.
-
-    Raises:
-        ValueError: if no group has, or held-out scores cannot be told (``HeldOut``).
-    """
-    rows = []
-    machine: HeldOut | None = None
-    made_of: Any = None
-    for number in progress(range(len(choices)), "choose C on held-out groups"):
-        size, kernel, penalty = choices[number]
-        if made_of != (size, kernel):
-            few = TrainingBins(bins.features[:, :size], bins.is_slip, bins.weights)
-            machine, made_of = HeldOut(few, groups, kernel), (size, kernel)
-        assert machine is not None
-        scores = machine.at(penalty).scores
-        says_slip = scores >= 0
-        by_group = {
-            name: recalls_mean(says_slip[groups == index], bins.is_slip[groups == index])
-            for index, name in enumerate(names)
-        }
-        known = [value for value in by_group.values() if value is not None]
-        if not known:
-            raise ValueError(
-                "no validation group has bins of both classes; take another recipe.group_by, or "
-                "one value of recipe.penalties"
-            )
-        rows.append(
-            {
-                "num_features": size,
-                "kernel": kernel.to_dict(),
-                "penalty": penalty,
-                "mean": sum(known) / len(known),
-                "balanced_accuracy": by_group,
-                "calibration": _calibration(scores, bins),
-            }
-        )
-    return rows
-
-
-def _calibration(scores: Tensor, bins: TrainingBins) -> dict[str, Any] | None:
-    """What held-out scores tell of slip, as plain values; None if they tell it backwards."""
-    try:
-        return fit_platt(scores, bins.is_slip, bins.weights).to_dict()
-    except ValueError as error:
-        log.warning("scores are not calibrated: %s", error)
-        return None
 
 
 def adds_up(kernel: Kernel) -> bool:

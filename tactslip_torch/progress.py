@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Sized
 from typing import Any
 
-from lightning.pytorch.callbacks import TQDMProgressBar
+from lightning.pytorch.callbacks import Callback, LambdaCallback, TQDMProgressBar
 from tqdm.auto import tqdm
 
 LEAD = 31
@@ -22,6 +22,31 @@ def bar(
         items, desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", dynamic_ncols=True
     )
     return shown
+
+
+class Ticker:
+    """A bar that several trainers share, a step an epoch.
+
+    Args:
+        what: is done.
+        unit: of a step.
+        total: number of steps, at most.
+    """
+
+    def __init__(self, what: str, unit: str, total: int) -> None:
+        self._bar = tqdm(
+            desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", dynamic_ncols=True, smoothing=0
+        )
+
+    def __enter__(self) -> Ticker:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.close()
+
+    def callback(self) -> Callback:
+        """For one of the trainers."""
+        return LambdaCallback(on_train_epoch_end=lambda *_: self._bar.update())
 
 
 class RecordingProgressBar(TQDMProgressBar):

@@ -8,7 +8,7 @@ import sys
 import pytest
 from small_detector import alarming_detector, certified, small_detector
 
-from tactslip_torch import export, train
+from tactslip_torch import export, fold_training
 from tactslip_torch.certify import FORMAT as CERTIFICATE_FORMAT
 from tactslip_torch.export import export_detector, sidecar_facts, summary, worst_error
 from tactslip_torch.graph.facts import sidecar_path
@@ -81,7 +81,7 @@ def test_no_other_certificate_is_handed_on(kept):
 
 def test_training_tells_of_each_graph_and_loses_nothing(detector, tmp_path, monkeypatch):
     detector.save(tmp_path / "detector.pt")
-    found = train._export(detector, tmp_path)
+    found = fold_training.export_fold(detector, tmp_path)
     assert found.keys() == {"bin", "stream"}
     for kind, name in export.FILES.items():
         assert found[kind]["bytes"] == (tmp_path / name).stat().st_size
@@ -93,7 +93,7 @@ def test_training_tells_of_each_graph_and_loses_nothing(detector, tmp_path, monk
         raise ValueError("no such descriptor\nas a graph")
 
     monkeypatch.setattr(export, "_graph", failing)
-    found = train._export(small_detector(), tmp_path)
+    found = fold_training.export_fold(small_detector(), tmp_path)
     assert found == {"bin": f"{tmp_path / 'model.onnx'} was not written: no such descriptor"}
 
 

@@ -30,10 +30,10 @@ from tactslip_torch.features.selection import rank_distinct, rank_features, t_sc
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.planning import validate
 from tactslip_torch.recipe import Recipe, fit_frame, stand_for
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.threads import for_each
+from tactslip_torch.validation import validate
 
 Ranking = Literal["t", "ccweighting", "per_cost"]
 _Job = tuple[Align, str, str, Tensor, str, Sequence[int]]  # Searcher._scored takes it

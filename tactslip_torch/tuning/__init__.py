@@ -1,0 +1,1 @@
+"""Settings learned by gradient through the closed-form fit."""
