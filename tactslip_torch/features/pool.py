@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, Literal, get_args
 
 import torch
@@ -106,7 +105,7 @@ class FeaturePool(nn.Module):
         self.spectrum: SpectrumMethod = spectrum
         self.arithmetic: Arithmetic = arithmetic
         self.smooth = smooth
-        self._described = partial(describe, stand_ins=stand_ins(smooth))
+        self._ways: dict[str, Any] = {} if smooth is None else {"stand_ins": stand_ins(smooth)}
         self._gauges, self._films = list(hand.slow), list(hand.fast)
         self._inverses: dict[torch.dtype, Tensor] = {}
         self.names = pool_names(hand, level)
@@ -142,9 +141,8 @@ class FeaturePool(nn.Module):
         Raises:
             ValueError: if the shape is another.
         """
-        if matrix.shape != self._constants["branches"].shape:
-            expected = tuple(self._constants["branches"].shape)
-            raise ValueError(f"expected branches {expected}, got {tuple(matrix.shape)}")
+        if matrix.shape != (expected := self._constants["branches"].shape):
+            raise ValueError(f"expected branches {tuple(expected)}, got {tuple(matrix.shape)}")
         pool = copy.copy(self)
         pool._constants = self._constants | {"branches": matrix}
         return pool
@@ -183,17 +181,19 @@ class FeaturePool(nn.Module):
         branches = bounded_gradient(self.branches(films), GAIN)  # [*, films, branches, n]
         spectra = bounded_gradient(self.amplitudes(branches), GAIN)  # [*, films, branches, lines]
         branch_scale = scale[..., None].expand(branches.shape[:-1])
-        in_time = self._described(
+        in_time = describe(
             branches,
             TIME_DESCRIPTORS,
             scale=branch_scale,
             reference=settle(films, scale)[..., None, :],
+            **self._ways,
         )
-        in_frequency = self._described(
+        in_frequency = describe(
             spectra,
             SPECTRUM_DESCRIPTORS,
             scale=branch_scale,
             frequency_hz=self._constant("frequency_hz", bins),
+            **self._ways,
         )
         ratios = band_energy_ratio(spectra).unflatten(-1, (self.level, 2))  # [*, films, level, 2]
         by_level = torch.cat(
@@ -276,7 +276,7 @@ class FeaturePool(nn.Module):
     def _of_gauges(self, bins: Tensor) -> Tensor:
         gauges = bins[..., self._gauges, :]
         scale = gauges.detach().abs().amax(-1)
-        values = self._described(settle(gauges, scale), COMMON_DESCRIPTORS, scale=scale)
+        values = describe(settle(gauges, scale), COMMON_DESCRIPTORS, scale=scale, **self._ways)
         return values.flatten(-2)
 
     def _constant(self, name: str, like: Tensor) -> Tensor:
