@@ -63,6 +63,6 @@ def _finish_covered(axes: Axes, asked: list[float], role: str) -> None:
 def _finish_cost(axes: Axes, role: str) -> None:
     axes.set_xlabel("unsure, % of bins")
     axes.set_ylabel("wrong, % of the sure")
-    axes.set_title(f"{role}: price (star: never unsure)", fontsize=10)
+    axes.set_title(f"{role}: price (\u2605 never unsure)", fontsize=9)
     axes.set_ylim(bottom=0)
     axes.grid(color=LIGHT)

@@ -28,7 +28,7 @@ class Sizes:
     judged_bins: int = 600
     num_features: int = 60
     penalties: tuple[float, ...] = (1e-4, 1e-3, 1e-2)
-    coverages: tuple[float, ...] = (0.8, 0.9, 0.95, 0.99)
+    coverages: tuple[float, ...] = (0.8, 0.9, 0.95, 0.97, 0.99)
     seed: int = 0
 
 
