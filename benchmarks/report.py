@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks import sensors, train
+from benchmarks import sensors, train, tuning
 from benchmarks.abstaining import figure as abstaining_figure
 from benchmarks.abstaining import report as abstaining
 from benchmarks.adapting import figure as adapting_figure
@@ -155,6 +155,14 @@ SECTIONS = {
         adapting_figure.figure,
         adapting.about,
         needs=adapting.SECTIONS,
+    ),
+    "tuning": Section(
+        "Tuned by gradient",
+        tuning.tables,
+        tuning.report_text,
+        tuning.figure,
+        tuning.about,
+        needs=tuning.SECTIONS,
     ),
     "train": Section("Training", None, train.report_text, keys=("experiment", "stages", "wholes")),
     "model": Section(

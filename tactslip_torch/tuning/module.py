@@ -17,6 +17,10 @@ from tactslip_torch.tuning.bins import TuningBins
 from tactslip_torch.tuning.learned import LearnedSettings
 from tactslip_torch.tuning.objective import GroupedLoss, grouped_loss
 
+WAVELET_ROOM = 0.1
+"""How far a lifting parameter may go: within it the norm of a branch stays below 3 (1.3 at first,
+``tests/test_lifting.py``)."""
+
 
 class Descent(nn.Module):
     """Settings that are learned on some groups, while another that no step meets is looked at.
@@ -111,6 +115,14 @@ class TuningModule(L.LightningModule):
         loss = self.look()
         self.log("stop_loss", self.stop_losses()[-1])
         return loss
+
+    def on_train_batch_end(self, *_: object) -> None:
+        """Keep wavelets near where they start: much further, branches magnify what they are of."""
+        with torch.no_grad():
+            for descent in (*self.rotations, self.final):
+                if (wavelet := descent.settings.wavelet) is not None:
+                    for parameter in wavelet.parameters():
+                        parameter.clamp_(-WAVELET_ROOM, WAVELET_ROOM)
 
     def look(self) -> Tensor:
         """Judge all descents where they are, and write it down."""
