@@ -41,8 +41,9 @@ def bin_run(detector, change=lambda samples, out: out):
 
     def run(inputs):
         samples = torch.from_numpy(inputs["samples"])
+        dead = torch.from_numpy(inputs["dead"]) if "dead" in inputs else None
         with torch.no_grad():
-            score, is_valid, *_ = single.judge_raw(pad(samples, (before, after)))
+            score, is_valid, *_ = single.judge_raw(pad(samples, (before, after)), dead=dead)
         stated = probability(settings.calibration.llr(score), settings.slip_share)
         out = {"score": score.numpy(), "probability": stated.numpy(), "valid": is_valid.numpy()}
         return change(samples, out)
@@ -58,6 +59,7 @@ def test_a_right_bin_graph_passes_and_is_measured(detector):
     for name in ("noise", "simulated_slip"):
         assert 0 < facts[name]["worst_sd"] < 1e-3
     assert set(facts["degenerate"]) == set(KINDS)
+    assert [found["valid"] for found in facts["dead"].values()] == [0, 0, 0]
     assert facts["degenerate"]["constant"]["valid"] == 0
     assert facts["degenerate"]["ramp"]["valid"] == facts["degenerate"]["ramp"]["bins"] == 16
     assert facts["degenerate"]["ramp"]["decided_by_rounding"] == 16  # of the sign of a mean of 0

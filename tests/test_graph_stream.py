@@ -39,7 +39,7 @@ USUAL = {"all": -6.0, "PVDF": -8.0, "long": -6.0}  # log of the mean variance of
 FLOOR = 1e-9  # of a variance, volts squared: what does not move has one score in any arithmetic
 
 
-def judge_loudness(graph, detector, windows, form):
+def judge_loudness(graph, detector, windows, form, dead):
     """The same of raw windows, as nodes; what lies beyond a channel's frame is not looked at."""
     window, layer = Window.of(detector), detector.channel_filter
     parts = []
@@ -55,7 +55,7 @@ def judge_loudness(graph, detector, windows, form):
     filtered = graph.concat(*parts, axis=1)
     moved = filtered - filtered.mean(2, keep=True)
     loud = (moved * moved).mean(2)
-    is_there = loud.is_finite()
+    is_there = loud.is_finite() & ~dead.take(window.channels, 0)
     total = graph.where(is_there, loud, 0.0).sum(1)
     total = (total + FLOOR).log() - detector.usual
     num_there = is_there.cast(F64).sum(1)

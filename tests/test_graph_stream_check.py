@@ -46,7 +46,8 @@ class StreamRun:
             settings = AlarmSettings.of(self.detector)
             if len(inputs["threshold"]):
                 settings = replace(settings, threshold=float(inputs["threshold"][0]))
-            self.stream = StreamingDetector(self.detector, settings)
+            dead = torch.from_numpy(inputs.get("dead", np.zeros(4, bool)))
+            self.stream = StreamingDetector(self.detector, settings, dead=dead)
         made = self.stream.push(samples)
         out = {
             "score": made.score,
@@ -75,6 +76,7 @@ def test_a_right_stream_graph_passes_and_is_measured(detector):
     assert facts["alarms_at_another_threshold"] > 0
     assert 0 < facts["worst_sd"] < 1e-3
     assert 0 < facts["broken"]["not_valid"] < facts["decisions"]
+    assert facts["dead"]["not_valid"] == facts["decisions"]
 
 
 def changed(name, by):

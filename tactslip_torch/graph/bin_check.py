@@ -16,10 +16,17 @@ from torch.nn.functional import pad
 from tactslip_torch.features.extractor import EngineName, FeatureExtractor
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.runs import Run
-from tactslip_torch.graph.trials import KINDS, degenerate_bins, noise_bins, simulated_bins
+from tactslip_torch.graph.trials import (
+    KINDS,
+    dead_masks,
+    degenerate_bins,
+    noise_bins,
+    simulated_bins,
+)
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.judgement import Judgement
+from tactslip_torch.model.widening import widened_llr
 from tactslip_torch.onset.settings import calibration_of
 
 BATCHES = (1, 7, 0, 56)
@@ -108,6 +115,12 @@ def check_bins(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
     mixed = torch.cat([*first, simulated])
     behind = judged.compare([mixed], "degenerate among simulated bins").of(slice(len(first), None))
     judged.refuse_errors(behind, sd, worst, "simulated bins behind degenerate ones")
+    facts["dead"] = {}
+    for name, dead in dead_masks(hand, detector.needed_index).items():
+        judged.dead = dead
+        without = judged.compare([simulated], f"simulated bins without {name}")
+        facts["dead"][name] = _set_facts(without, sd)
+        judged.refuse_errors(without, sd, loose, f"simulated bins without {name}")
     return facts
 
 
@@ -122,22 +135,26 @@ class Judged:
         self.dtype = torch.float32 if form.precision == "float32" else torch.float64
         self.calibrated = calibration_of(detector)
         self.unstated = WORST_PROBABILITY[form.precision]
+        self.dead: Tensor | None = None
 
     def judge(self, samples: Tensor) -> Judgement:
         """By torch, scores in float64."""
         with torch.no_grad():
             # a sensor is trusted by what its samples resolve in the precision they come in
-            judged = self.detector.judge_raw(self._padded(samples))
-        return judged._replace(score=self.score(samples))
+            trusted = self.detector.judge_raw(self._padded(samples), dead=self.dead)
+        return self._exact(samples)._replace(is_valid=trusted.is_valid)
 
     def score(self, samples: Tensor, engine: EngineName | None = None) -> Tensor:
         """Scores ``[N]`` in float64, by another engine if one is named."""
+        return self._exact(samples, engine).score
+
+    def _exact(self, samples: Tensor, engine: EngineName | None = None) -> Judgement:
         detector = self.detector
         if engine is not None:
             detector = copy.copy(detector)
             detector.extractor = FeatureExtractor(detector.pool, detector.selected, engine)
         with torch.no_grad():
-            return detector.judge_raw(self._padded(samples.double())).score
+            return detector.judge_raw(self._padded(samples.double()), dead=self.dead)
 
     def _padded(self, samples: Tensor) -> Tensor:
         """With the context of all channels: what no filter in use takes in is 0."""
@@ -174,7 +191,8 @@ class Judged:
         """
         expected = [self.judge(samples) for samples in batches]
         try:
-            runs = [self.run({"samples": samples.numpy()}) for samples in batches]
+            asked = {} if self.dead is None else {"dead": self.dead.numpy()}
+            runs = [self.run({"samples": samples.numpy(), **asked}) for samples in batches]
         except ValueError as error:
             raise ValueError(f"{what}: {error}") from error
         for samples, given in zip(batches, runs, strict=True):
@@ -190,7 +208,8 @@ class Judged:
         unstated = np.zeros(len(score))
         if self.calibrated is not None:
             calibration, slip_share = self.calibrated
-            llr = calibration.llr(torch.from_numpy(score))
+            variance = torch.cat([judged.variance for judged in expected]).double()
+            llr = widened_llr(calibration, torch.from_numpy(score), variance)
             stated = probability(llr, slip_share).numpy()
             unstated = np.abs(got["probability"] - stated)
         flips = (score >= 0) != (exact >= 0)

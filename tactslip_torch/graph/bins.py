@@ -10,13 +10,16 @@ from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import Plan, Wanted
 from tactslip_torch.graph.descriptors import DESCRIPTORS
 from tactslip_torch.graph.form import Form, Window
-from tactslip_torch.graph.head import machine, scaled, with_typical
+from tactslip_torch.graph.head import lost_features, machine, scaled, with_typical
+from tactslip_torch.graph.missing import expected_scores, widened_llr_of
 from tactslip_torch.graph.rows import EXACT, Front
 from tactslip_torch.graph.sequence import llr_of, probability_of
 from tactslip_torch.graph.shared import Shared
 from tactslip_torch.graph.value import BOOL, F64, I64, Value
 from tactslip_torch.graph.writer import Graph
+from tactslip_torch.model.calibration import Calibration
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.onset.settings import calibration_of
 
 
@@ -27,14 +30,24 @@ class Judged(NamedTuple):
         score: ``[B]``, in the precision of the form; at least 0 is slip.
         is_valid: ``[B]``, bool: every channel in use can be trusted.
         is_usable: ``[B]``, bool: the score tells something (``onset.decider.is_usable``).
+        variance: ``[B]``, float64, of the score; ``None``: of none.
     """
 
     score: Value
     is_valid: Value
     is_usable: Value
+    variance: Value | None = None
+
+    def llr(self, calibration: Calibration) -> Value:
+        """Log likelihood ratios ``[B]``, in the precision of the score."""
+        if self.variance is None:
+            return llr_of(self.score, calibration)
+        return widened_llr_of(self.score, self.variance, calibration)
 
 
-def judge_bins(graph: Graph, detector: SlipDetector, windows: Value, form: Form) -> Judged:
+def judge_bins(
+    graph: Graph, detector: SlipDetector, windows: Value, form: Form, dead: Value
+) -> Judged:
     """Nodes that judge raw bins.
 
     Where samples of a bin differ by more than their precision can hold, or by so little that they
@@ -45,6 +58,7 @@ def judge_bins(graph: Graph, detector: SlipDetector, windows: Value, form: Form)
         detector: whose judgement.
         windows: raw samples in volts, of the channels in use alone, float64 or of the form.
         form: precision and layout.
+        dead: which channels of the hand are missing whatever they say, ``[C]``, bool.
 
     Shape:
         - windows: ``[B, channels, Window.length]``
@@ -59,11 +73,23 @@ def judge_bins(graph: Graph, detector: SlipDetector, windows: Value, form: Form)
         )
     front = Front(graph, detector, windows, form)
     features = selected_features(graph, detector, front, form)
-    z = with_typical(graph, scaled(graph, features, detector.scaler), front.is_missing, detector)
-    score = machine(graph, z, detector.head, form)
+    z = scaled(graph, features, detector.scaler)
+    is_dead = dead.take(front.window.channels, 0)
+    is_missing = front.is_missing | is_dead
+    is_lost = lost_features(is_missing, detector)
+    head, gaussians, variance = detector.head, detector.gaussians, None
+    score = machine(graph, with_typical(graph, z, is_lost, detector), head, form)
+    if gaussians is not None and isinstance(head, QuadraticForm):
+        score, variance = expected_scores(graph, score, z, is_lost, head, gaussians)
     is_finite = score.is_finite()
-    is_valid = _all(front.is_trusted) & is_finite
-    return Judged(score, is_valid, is_finite & ~_all(front.is_missing))
+    is_valid = _all(front.is_trusted & ~is_dead) & is_finite
+    return Judged(score, is_valid, is_finite & ~_all(is_missing), variance)
+
+
+def dead_input(graph: Graph, detector: SlipDetector) -> Value:
+    """The input ``dead [C]``, bool: by default no channel is."""
+    num = len(detector.pool.hand)
+    return graph.input("dead", BOOL, (num,), np.zeros(num, bool))
 
 
 def bin_graph(detector: SlipDetector, form: Form) -> Graph:
@@ -75,19 +101,22 @@ def bin_graph(detector: SlipDetector, form: Form) -> Graph:
 
     Shape:
         - in ``samples``: ``[batch, C, Window.length]``, volts, in the precision of the form
+        - in ``dead``: ``[C]``, bool; may be left out: none is
         - out ``score``, ``valid`` (bool) and, if calibrated, ``probability``: ``[batch]``
     """
     graph, window = Graph(), Window.of(detector)
     calibrated = calibration_of(detector)
     shape = ("batch", len(detector.pool.hand), window.length)
     samples = graph.input("samples", form.dtype, shape)
+    dead = dead_input(graph, detector)
 
     def judged(body: Graph) -> list[Value]:
-        found = judge_bins(body, detector, samples.at(body).take(window.channels, 1), form)
+        windows = samples.at(body).take(window.channels, 1)
+        found = judge_bins(body, detector, windows, form, dead.at(body))
         if calibrated is None:
             return [found.score, found.is_valid]
         calibration, slip_share = calibrated
-        stated = probability_of(llr_of(found.score, calibration), slip_share)
+        stated = probability_of(found.llr(calibration), slip_share)
         return [found.score, found.is_valid, stated]
 
     def nothing(body: Graph) -> list[Value]:  # onnxruntime reduces and reshapes no empty batch

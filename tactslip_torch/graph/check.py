@@ -95,6 +95,7 @@ def check_file(
         len(plan.share_channels),
         len({(row.branch, row.kind) for row in plan.rows}),
         detector.pool.bin_samples,
+        0 if detector.gaussians is None else 4 * detector.head.num_features**2,
     )
     if size > limit:
         raise ValueError(f"its file has {size} bytes, more than {limit}")

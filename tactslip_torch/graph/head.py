@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.graph.form import Form
-from tactslip_torch.graph.value import F32, F64, Value
+from tactslip_torch.graph.value import F32, F64, Nodes, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.detector_file import Head
@@ -38,19 +38,24 @@ def scaled(graph: Graph, features: Value, scaler: FeatureScaler) -> Value:
     return z.clip(-1.0, 1.0)
 
 
-def with_typical(graph: Graph, z: Value, is_missing: Value, detector: SlipDetector) -> Value:
-    """Scaled features, those of missing channels replaced by typical ones.
-
-    Args:
-        graph: to which nodes are added.
-        z: scaled features, ``[B, K]``.
-        is_missing: of the channels in use, ``[B, channels]``.
-        detector: whose typical features.
-    """
+def lost_features(is_missing: Value, detector: SlipDetector) -> Value:
+    """Which features are of missing channels in use: ``[B, channels] -> [B, K]``, bool."""
     used = detector.extractor.plan.channels
     of_channel = np.equal.outer(np.array(used), detector.channel_index.numpy())
-    is_typical = is_missing.cast(F32) @ of_channel > 0.0  # a product is quicker than to pick flags
-    return graph.where(is_typical, graph.constant(_of(detector.typical), F64), z)
+    found: Value = (
+        is_missing.cast(F32) @ of_channel > 0.0
+    )  # a product is quicker than to pick flags
+    return found
+
+
+def with_typical(graph: Graph, z: Value, is_lost: Value, detector: SlipDetector) -> Value:
+    """Scaled features ``[B, K]``, those that are lost replaced by typical ones."""
+    return graph.where(is_lost, matrix(graph, detector.typical), z)
+
+
+def matrix(graph: Nodes, x: Tensor) -> Value:
+    """A tensor as a constant in float64."""
+    return graph.constant(_of(x), F64)
 
 
 def machine(graph: Graph, z: Value, head: Head, form: Form) -> Value:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.graph.bins import Judged, judge_bins
+from tactslip_torch.graph.bins import Judged, dead_input, judge_bins
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.sequence import (
     END,
@@ -18,7 +18,6 @@ from tactslip_torch.graph.sequence import (
     count_up,
     latched,
     latest,
-    llr_of,
     probability_of,
     rule_start,
     statistic_of,
@@ -30,7 +29,7 @@ from tactslip_torch.onset.sequential import NEUTRAL
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.signals.savgol import past_matrix
 
-Judge = Callable[[Graph, SlipDetector, Value, Form], Judged]
+Judge = Callable[[Graph, SlipDetector, Value, Form, Value], Judged]
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,8 @@ def stream_graph(
 ) -> Graph:
     """The graph of a stream: what comes next, and what was kept, to decisions and what is kept.
 
-    Inputs ``samples [n, C]``, ``tail [r, C]``, ``state [s]`` and ``threshold [t]``; outputs
+    Inputs ``samples [n, C]``, ``tail [r, C]``, ``state [s]``, ``threshold [t]`` and ``dead [C]``,
+    which may be left out; outputs
     ``score``, ``probability``, ``statistic``, ``valid``, ``alarm``, ``on``, ``time_s``,
     ``onset_s``, ``[k]`` each, ``next_tail [Timing.tail, C]`` and ``next_state
     [Timing.state_size]``. A stream begins with an empty tail and state; without a threshold that of
@@ -97,6 +97,7 @@ def stream_graph(
     tail = graph.input("tail", form.dtype, ("r", num_channels))
     state = graph.input("state", F64, ("s",))
     threshold = graph.input("threshold", F64, ("t",))
+    dead = dead_input(graph, detector)
 
     nothing = graph.constant([[0.0] * num_channels] * timing.tail, form.dtype)
     held = graph.concat(nothing, tail, samples, axis=0)
@@ -106,7 +107,7 @@ def stream_graph(
     decided = ((seen + float(timing.hop - timing.first)) / float(timing.hop)).floor().max(0.0)
     if timing.frame > timing.first:
         decided = graph.where(seen >= float(timing.frame), decided, 0.0)
-    deciding = _Deciding(detector, settings, form, judge, timing)
+    deciding = _Deciding(detector, settings, form, judge, timing, dead)
     made = graph.if_(
         decided > state.slice(1, 2, 0),
         lambda body: deciding(body, *(x.at(body) for x in (held, state, threshold, seen, decided))),
@@ -142,6 +143,7 @@ class _Deciding:
     form: Form
     judge: Judge
     timing: Timing
+    dead: Value
 
     def __call__(
         self,
@@ -160,9 +162,9 @@ class _Deciding:
         places = count_up((decided - made).cast(I64))
         number = places.cast(F64) + made
         windows = self._windows(graph, held, seen, made, places)
-        judged = self.judge(graph, self.detector, windows, self.form)
+        judged = self.judge(graph, self.detector, windows, self.form, self.dead.at(graph))
 
-        llr = graph.where(judged.is_usable, llr_of(judged.score, settings.calibration), NEUTRAL)
+        llr = graph.where(judged.is_usable, judged.llr(settings.calibration), NEUTRAL)
         statistic, of_rule = statistic_of(graph, settings.rule, llr, of_rule)
         own = graph.constant([settings.threshold], F64)
         level = graph.concat(threshold, own, axis=0).slice(0, 1, 0).cast(self.form.dtype)

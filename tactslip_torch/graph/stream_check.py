@@ -17,9 +17,10 @@ from tactslip_torch.graph.bin_check import WORST_DEGENERATE_SD, WORST_PROBABILIT
 from tactslip_torch.graph.form import Form
 from tactslip_torch.graph.runs import Run
 from tactslip_torch.graph.stream import Timing
-from tactslip_torch.graph.trials import simulated_stream
+from tactslip_torch.graph.trials import dead_masks, simulated_stream
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.missing import Dead
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 
@@ -75,6 +76,11 @@ def check_stream(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]
     got = host.watch(broken.numpy(), ways["by hop"])
     worst = WORST_DEGENERATE_SD[form.precision]
     lost = _compare(got, of_broken, settings, sd, worst, form, "broken sensors")
+    dead = dead_masks(hand, detector.needed_index)["every other"]
+    of_dead = _columns(double, settings, whole, dead)
+    host.dead = dead.numpy()
+    got = host.watch(samples, ways["by hop"])
+    without = _compare(got, of_dead, settings, sd, worst, form, "dead sensors")
     return {
         "score_sd": sd,
         "simulated": True,
@@ -83,6 +89,7 @@ def check_stream(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]
         "alarms_at_another_threshold": int(at_middle["alarm"].sum()),
         "worst_sd": found,
         "broken": {"not_valid": int((~of_broken["valid"]).sum()), "worst_sd": lost},
+        "dead": {"not_valid": int((~of_dead["valid"]).sum()), "worst_sd": without},
     }
 
 
@@ -161,6 +168,7 @@ class _Host:
     def __init__(self, run: Run, num_channels: int, form: Form, timing: Timing) -> None:
         self.run, self.form, self.timing = run, form, timing
         self.num_channels = num_channels
+        self.dead: NDArray[np.bool_] | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -171,7 +179,8 @@ class _Host:
     def push(self, samples: NDArray[Any], threshold: float | None = None) -> Columns:
         given = np.array([] if threshold is None else [threshold], np.float64)
         feeds = {"samples": samples, "tail": self.tail, "state": self.state, "threshold": given}
-        columns = self.run(feeds)
+        asked = {} if self.dead is None else {"dead": self.dead}
+        columns = self.run(feeds | asked)
         wanted = {*FLAGS, *TIMES, *NUMBERS, "next_tail", "next_state"}
         if columns.keys() != wanted:
             found = ", ".join(sorted(columns.keys() ^ wanted))
@@ -209,16 +218,20 @@ def _pieces(samples: NDArray[Any], sizes: Sequence[int]) -> Iterator[NDArray[Any
         yield samples[first:last]
 
 
-def _columns(detector: SlipDetector, settings: AlarmSettings, samples: Tensor) -> Columns:
+def _columns(
+    detector: SlipDetector, settings: AlarmSettings, samples: Tensor, dead: Dead = ()
+) -> Columns:
     """What the streaming detector says of samples ``[T, C]``, under the graph's names."""
-    decisions = StreamingDetector(detector, settings, dtype=torch.float64).push(samples)
+    double = StreamingDetector(detector, settings, dtype=torch.float64, dead=dead)
+    decisions = double.push(samples)
     # a sensor is trusted by what its samples resolve in the precision they come in
-    trusted = StreamingDetector(detector, settings, dtype=samples.dtype).push(samples).is_valid
+    trusted = StreamingDetector(detector, settings, dtype=samples.dtype, dead=dead)
+    is_valid = trusted.push(samples).is_valid
     named = {
         "score": decisions.score,
         "probability": decisions.probability,
         "statistic": decisions.statistic,
-        "valid": trusted,
+        "valid": is_valid,
         "alarm": decisions.is_alarm,
         "on": decisions.is_on,
         "time_s": decisions.available_s,

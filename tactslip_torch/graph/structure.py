@@ -45,6 +45,7 @@ def size_limit(
     shares: int = 0,
     blocks: int = 0,
     bin_samples: int = 100,
+    missing_numbers: int = 0,
 ) -> int:
     """Bytes that a file may have: 700 kB in float32 where films alone are in use, or gauges alone.
 
@@ -61,8 +62,9 @@ def size_limit(
         shares: films of whose energy shares are wanted.
         blocks: different branches, and spectra of branches, in use.
         bin_samples: length of a bin.
+        missing_numbers: in float64, of what is known where channels are missing; their own bytes.
     """
-    head = 4 * max(0, head_numbers - 25_000)
+    head = 4 * max(0, head_numbers - 25_000) + 8 * missing_numbers
     growth = max(1.0, (bin_samples / 100) ** 2)
     front = max(700_000, 75_000 * blocks) * frames + 75_000 * max(0, shares - 1)
     single = round(growth * front) + head

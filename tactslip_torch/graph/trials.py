@@ -54,6 +54,13 @@ def degenerate_bins(
     return samples
 
 
+def dead_masks(hand: HandLayout, used: Tensor) -> dict[str, Tensor]:
+    """Masks ``[C]`` of dead sensors by name: the first in use, every other one, all of them."""
+    none = torch.zeros(len(hand), dtype=torch.bool)
+    chosen = {"the first": used[:1], "every other": used[::2], "all": used}
+    return {name: none.index_fill(0, own, True) for name, own in chosen.items()}
+
+
 def simulated_stream(
     hand: HandLayout, sample_rate_hz: float, dtype: torch.dtype, at_least: int = 0
 ) -> Tensor:

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import onnx
-from onnx import helper
+from numpy.typing import NDArray
+from onnx import helper, numpy_helper
 
 from tactslip_torch.graph.value import Nodes, Value
 
@@ -32,9 +33,17 @@ class Graph(Nodes):
         self._inputs: list[onnx.ValueInfoProto] = []
         self._outputs: list[onnx.ValueInfoProto] = []
 
-    def input(self, name: str, dtype: np.dtype[Any], shape: Shape) -> Value:
-        """An input; axes that are named may have any length."""
+    def input(
+        self,
+        name: str,
+        dtype: np.dtype[Any],
+        shape: Shape,
+        default: NDArray[Any] | None = None,
+    ) -> Value:
+        """An input; axes that are named may have any length. One with a default may be left out."""
         self._inputs.append(_info(name, dtype, shape))
+        if default is not None:
+            self._tensors.append(numpy_helper.from_array(default.astype(dtype), name))
         return Value(self, name, dtype)
 
     def output(self, name: str, value: Value, shape: Shape | None) -> None:
@@ -53,7 +62,7 @@ class Graph(Nodes):
         for make in (then, otherwise):
             body = Graph(self)
             values = [Value(body, value.name, value.dtype) for value in make(body)]
-            body._hand_out(values, None)
+            body._hand_out(values, [None] * len(values))
             dtypes = [value.dtype for value in values]
             bodies.append(body.proto())
         branches = {"then_branch": bodies[0], "else_branch": bodies[1]}
@@ -64,22 +73,29 @@ class Graph(Nodes):
         body: Callable[[Graph, Sequence[Value], Sequence[Value]], tuple[list[Value], list[Value]]],
         state: Sequence[Value],
         rows: Sequence[Value],
+        shapes: Sequence[Shape] | None = None,
     ) -> tuple[list[Value], list[Value]]:
         """Walk along the first axis of ``rows``: a state goes on, and results are put together.
 
         Args:
             body: of a graph, the state ``[]`` and an entry ``[]`` of each row makes the state after
                 it and its results.
-            state: scalars before the first entry.
+            state: before the first entry.
             rows: ``[k]`` each; onnxruntime refuses k = 0, so leave an empty walk out by ``if_``.
+            shapes: of the parts of the state and of an entry of each row; by default scalars.
 
         Returns:
             The state after the last entry, and results ``[k]``.
         """
         inner = Graph(self)
-        taken = [inner.input(self._name(), value.dtype, ()) for value in (*state, *rows)]
+        shapes = [()] * len((*state, *rows)) if shapes is None else shapes
+        taken = [
+            inner.input(self._name(), value.dtype, shape)
+            for value, shape in zip((*state, *rows), shapes, strict=True)
+        ]
         after, results = body(inner, taken[: len(state)], taken[len(state) :])
-        inner._hand_out((*after, *results), ())
+        inner._hand_out(after, shapes[: len(state)])
+        inner._hand_out(results, [()] * len(results))
         dtypes = [value.dtype for value in (*after, *results)]
         made = self.ops(
             "Scan", *state, *rows, dtypes=dtypes, body=inner.proto(), num_scan_inputs=len(rows)
@@ -94,6 +110,7 @@ class Graph(Nodes):
             if needed.intersection(node.output):
                 needed.update(_read_by(node))
                 nodes.insert(0, node)
+        needed.update(given.name for given in self._inputs)  # those of inputs are their defaults
         tensors = [tensor for tensor in self._tensors if tensor.name in needed]
         return helper.make_graph(nodes, "tactslip_torch", self._inputs, self._outputs, tensors)
 
@@ -113,10 +130,11 @@ class Graph(Nodes):
         onnx.checker.check_model(model)
         return model
 
-    def _hand_out(self, values: Sequence[Value], shape: Shape | None) -> None:
+    def _hand_out(self, values: Sequence[Value], shapes: Sequence[Shape | None]) -> None:
         """Make values the results of a body: as they are if it made them, once each."""
         made = {name for node in self._nodes for name in node.output}
-        for value in values:
+        made -= {output.name for output in self._outputs}
+        for value, shape in zip(values, shapes, strict=True):
             handed = value if value.name in made else self.op("Identity", value)
             made.discard(handed.name)
             self._outputs.append(_info(handed.name, handed.dtype, shape))
