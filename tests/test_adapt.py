@@ -1,6 +1,5 @@
 """``adapt`` as a command: what it leaves, takes back and refuses, on files of a tiny hand."""
 
-import hashlib
 import json
 import subprocess
 import sys
@@ -201,14 +200,21 @@ def test_a_step_cut_off_between_its_files_is_told_and_taken_back(run, files, tra
     assert content(run) == content(trained)
 
 
-def test_graphs_are_written_anew_where_asked_for(run, files):
-    (run / "model.onnx").write_bytes(b"of the detector before")
+def test_graphs_are_written_anew_where_asked_for(run, files, monkeypatch):
+    written = []
+
+    def export(detector, folder, graphs, *, source):
+        written.append((detector, folder, graphs, source.read_bytes()))
+
+    monkeypatch.setattr(module, "export_detector", export)
     add_c(run, files, "weight=2")
-    assert (run / "model.onnx").read_bytes() == b"of the detector before"
+    assert not written
     adapt(settings(run, "action=forget", "material=C", "export=true"), run / "results")
-    told = json.loads((run / "model.onnx.json").read_text())
-    sha256 = hashlib.sha256((run / "detector.pt").read_bytes()).hexdigest()
-    assert told["detector_sha256"] == sha256
+    ((detector, folder, graphs, content_of_source),) = written
+    assert folder == run
+    assert graphs == ["bin", "stream"]  # an alarm is set
+    assert content_of_source == (run / "detector.pt").read_bytes()
+    assert detector.info["adaptations"][-1]["action"] == "forget"
 
 
 @pytest.mark.parametrize(
