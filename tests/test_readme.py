@@ -17,7 +17,7 @@ TEXT = (ROOT / "README.md").read_text()
 
 
 def test_the_programs_run(tmp_path, monkeypatch, capsys):
-    first, live, second, third = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    first, live, second, through, third = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     random_detector().save("detector.pt")
     exec(compile(first, "README.md", "exec"), {})
@@ -37,6 +37,8 @@ def test_the_programs_run(tmp_path, monkeypatch, capsys):
     scores, counts = re.fullmatch(r"tensor\((.*), dtype=.*\) tensor\((.*)\)", line).groups()
     assert len(json.loads(scores)) == 3
     assert sum(json.loads(counts)) == 8 * 200
+    exec(compile(through, "README.md", "exec"), {})
+    assert capsys.readouterr().out.splitlines() == ["torch.Size([24, 400])", "torch.Size([5])"]
     exec(compile(third, "README.md", "exec"), {})
     assert capsys.readouterr().out.splitlines() == ["torch.Size([64, 174])"] * 3
 
