@@ -80,8 +80,14 @@ class Witnesses:
         """Those of other recordings."""
         out = torch.tensor([name in recordings for name in self.recordings])
         kept = ~out[self.recording]
-        parts = (part[kept] for part in (self.z, self.is_slip, self.represents, self.recording))
-        return Witnesses(*parts, self.recordings, self.materials)
+        return Witnesses(
+            self.z[kept],
+            self.is_slip[kept],
+            self.represents[kept],
+            self.recording[kept],
+            self.recordings,
+            self.materials,
+        )
 
     def tensors(self) -> dict[str, Tensor]:
         """For a file."""
@@ -90,6 +96,18 @@ class Witnesses:
     def facts(self) -> dict[str, Any]:
         """For a file, JSON-able."""
         return {"recordings": list(self.recordings), "materials": list(self.materials)}
+
+    @classmethod
+    def from_file(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Witnesses:
+        """What ``facts`` and ``tensors`` told."""
+        return cls(
+            tensors["z"],
+            tensors["is_slip"],
+            tensors["represents"],
+            tensors["recording"],
+            tuple(facts["recordings"]),
+            tuple(facts["materials"]),
+        )
 
 
 class KnownBins(NamedTuple):

@@ -19,7 +19,7 @@ from tactslip_torch.adapting.bins import KnownBins
 from tactslip_torch.adapting.statistics import Machine, Statistics
 from tactslip_torch.model.cholesky import forward_solve, from_above
 from tactslip_torch.model.downdate import residuals_by_block
-from tactslip_torch.model.held_out import MOST_CONDITION
+from tactslip_torch.model.left_out import MOST_CONDITION
 from tactslip_torch.model.quadratic import QuadraticForm, from_primal, quadratic_features
 from tactslip_torch.model.sufficient import SufficientStats
 from tactslip_torch.model.symmetric_solve import solve_symmetric_

@@ -159,12 +159,11 @@ class Statistics:
         sums.ledger = Ledger(facts["batches"])
         sums.sums, sums.count = tensors["sums"], tensors["count"]
         of_witnesses = {n.partition(".")[2]: t for n, t in tensors.items() if n[:9] == "witnesses"}
-        names = {name: tuple(of) for name, of in facts["witnesses"].items()}
         return cls(
             sums,
             Machine(**facts["machine"]),
             facts["labels"],
-            Witnesses(**of_witnesses, **names),
+            Witnesses.from_file(facts["witnesses"], of_witnesses),
             facts["detector"],
             {
                 name: RecordingBins(
@@ -174,8 +173,8 @@ class Statistics:
             },
             facts["weights"],
             tuple(
-                Step(*plain, tensors[f"steps.{number}"])
-                for number, plain in enumerate(facts["steps"])
+                Step(entry, weights, changed, digest, tensors[f"steps.{number}"])
+                for number, (entry, weights, changed, digest) in enumerate(facts["steps"])
             ),
         )
 
