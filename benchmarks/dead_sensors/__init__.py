@@ -1,0 +1,1 @@
+"""Dead sensors: what the expected score in closed form keeps, beside what is usually filled in."""
