@@ -20,6 +20,8 @@ from benchmarks.abstaining import figure as abstaining_figure
 from benchmarks.abstaining import report as abstaining
 from benchmarks.adapting import figure as adapting_figure
 from benchmarks.adapting import report as adapting
+from benchmarks.dead_sensors import figure as dead_sensors_figure
+from benchmarks.dead_sensors import report as dead_sensors
 from benchmarks.deployment import figure as deployment_figure
 from benchmarks.deployment import report as deployment
 from benchmarks.features import figure as features_figure
@@ -147,6 +149,14 @@ SECTIONS = {
         abstaining_figure.figure,
         abstaining.about,
         needs=abstaining.SECTIONS,
+    ),
+    "dead_sensors": Section(
+        "Dead sensors",
+        dead_sensors.tables,
+        dead_sensors.report_text,
+        dead_sensors_figure.figure,
+        dead_sensors.about,
+        needs=dead_sensors.SECTIONS,
     ),
     "adapting": Section(
         "A new material from a few recordings",
