@@ -564,7 +564,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "graph.bins": ("graph.*", "features.*", "model.*", "onset.settings"),
     "graph.sequence": ("graph.*", "model.calibration", "onset.*"),
     "graph.stream": ("graph.*", "signals.*", "model.detector", "onset.*"),
-    "graph.facts": ("graph.*", "model.detector", "onset.settings"),
+    "graph.facts": ("graph.*", "model.detector", "model.abstention", "onset.settings"),
     "graph.alone": (),
     "graph.runs": (),
     "graph.structure": (),

@@ -55,7 +55,7 @@ class Naive:
         """The decision on the bin that these samples complete."""
         new = torch.from_numpy(np.ascontiguousarray(samples.T))
         self._held = torch.cat([self._held[:, new.shape[-1] :], new], dim=-1)
-        score, is_valid, _ = self._detector.judge_raw(self._held[None, :, : self._needed])
+        score, is_valid, *_ = self._detector.judge_raw(self._held[None, :, : self._needed])
         return self._decider.decide(score, is_valid)
 
 
