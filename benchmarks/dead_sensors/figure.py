@@ -36,7 +36,7 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
     drawing = Figure(figsize=(11.5, 4.6), layout="constrained")
     panels = drawing.subplots(1, 4)
     for place, (role, part) in enumerate((role, part) for part in _PARTS for role in ROLES):
-        axes = panels[place]
+        axes, seen = panels[place], list[float]()
         for way, (colour, mark) in STYLES.items():
             fingers = rows_of(rows, role, "finger", way)
             halves = rows_of(rows, role, "half", way)
@@ -45,7 +45,10 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
             names = [row["dead"] for row in fingers] + ["half"] * bool(halves)
             values = [100 * row[part] for row in fingers]
             values += [100 * fmean(row[part] for row in halves)] * bool(halves)
-            axes.plot(names, values, mark, color=colour, ms=8, mew=2, label=way)
+            seen += values if way != VOLTS else []
+            axes.plot(names, values, mark, color=colour, ms=6, mew=2, label=way)
+        room = 0.15 * (max(seen) - min(seen)) + 0.2
+        axes.set_ylim(min(seen) - room, max(seen) + room)  # 0 V may lie far outside
         axes.set_title(role, fontsize=10)
         axes.set_ylabel(_PARTS[part])
         axes.grid(color=LIGHT)
@@ -53,4 +56,5 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
     drawing.legend(
         *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False
     )
-    finish(drawing, report, "One finger dead, or a random half of the sensors", path)
+    title = "One finger dead, or a random half of the sensors (0 V: mostly off the scale)"
+    finish(drawing, report, title, path)

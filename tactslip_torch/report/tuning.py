@@ -56,8 +56,8 @@ def tuning_figure(found: Mapping[str, Any], path: str | Path, *, simulated: bool
         path: the PNG to write, replaced as a whole if it exists.
         simulated: whether the data is.
     """
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    losses, scales = figure.subplots(1, 2, width_ratios=(1.25, 1))
+    figure = Figure(figsize=(12.5, 4.2), layout="constrained")
+    losses, scales = figure.subplots(1, 2, width_ratios=(1.1, 1))
     _descents(losses, found)
     _scales(scales, found["scales"])
     figure.suptitle("Tuning through the fit" + (" (simulated data)" if simulated else ""))
@@ -78,27 +78,30 @@ def _notes(found: Mapping[str, Any]) -> Sequence[str]:
 
 
 def _descents(axes: Axes, found: Mapping[str, Any]) -> None:
-    """Losses over steps: dashed of the groups learned on, solid of the one held out."""
+    """Losses over steps: of each held-out group, their mean, which decides, and of what learns."""
     for place, group in enumerate(found["held"]):
         colour = _COLOURS[place % len(_COLOURS)]
-        history = group["history"]
-        axes.plot([row["held_loss"] for row in history], color=colour, label=group["held"])
+        losses = [row["held_loss"] for row in group["history"]]
+        axes.plot(losses, color=colour, lw=1, label=group["held"])
         steps = group["tuned"]["steps"]
-        axes.plot(steps, history[steps]["held_loss"], "o", color=colour, markersize=5)
-    axes.plot(
-        [row["loss"] for row in found["history"]], "k--", lw=2, label="all groups, held-out loss"
+        axes.plot(steps, losses[steps], "o", color=colour, markersize=4)
+    rows = zip(
+        *([row["held_loss"] for row in one["history"]] for one in found["held"]), strict=True
     )
+    axes.plot([mean(row) for row in rows], "k-", lw=2.5, label="their mean, which decides")
+    learning = [row["loss"] for row in found["history"]]
+    axes.plot(learning, "k--", lw=1.5, label="what is learned on")
     axes.axvline(found["steps"], color="#999999", lw=1)
     axes.annotate(
         " steps taken", (found["steps"], 0.99), xycoords=("data", "axes fraction"), va="top",
         fontsize=8, color="#666666",
     )  # fmt: skip
-    axes.set_yscale("log")
+    axes.set_ylim(bottom=0)
     axes.set_xlabel("steps")
     axes.set_ylabel("held-out log loss, nats")
-    axes.set_title("groups held out; dots: steps that the other groups tell to take", fontsize=10)
+    axes.set_title("groups held out; dots: steps that the others tell to take", fontsize=10)
     axes.grid(color="#DDDDDD")
-    axes.legend(frameon=False, fontsize=8, ncols=2)
+    axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _scales(axes: Axes, scales: Mapping[str, float]) -> None:
@@ -106,14 +109,15 @@ def _scales(axes: Axes, scales: Mapping[str, float]) -> None:
     ordered = sorted(scales.items(), key=lambda item: -item[1])
     values = [value for _, value in ordered]
     axes.bar(range(len(values)), values, color="#0072B2", width=0.8)
-    for place in (*range(min(3, len(ordered))), *range(max(len(ordered) - 3, 3), len(ordered))):
-        name, value = ordered[place]
-        axes.annotate(
-            name, (place, value), rotation=90, fontsize=7, ha="center", va="bottom",
-            xytext=(0, 3), textcoords="offset points",
-        )  # fmt: skip
-    axes.set_ylim(0, 1.7 * max(values))
     axes.axhline(1, color="#999999", lw=1)
+    for heading, some in (("largest", ordered[:3]), ("smallest", ordered[-3:][::-1])):
+        lines = [f"{heading}:", *(f"{value:.2f}  {name}" for name, value in some)]
+        left = heading == "largest"
+        axes.text(
+            0.02 if left else 0.98, 0.98, "\n".join(lines), transform=axes.transAxes, va="top",
+            ha="left" if left else "right", fontsize=7,
+        )  # fmt: skip
+    axes.set_ylim(0, 1.5 * max(values))
     axes.set_xlabel("features, by scale")
     axes.set_ylabel("scale in the kernel")
     axes.set_title("learned scales: soft selection", fontsize=10)
