@@ -20,16 +20,16 @@ from benchmarks.machine import machine_facts, versions
 from benchmarks.outcome import add_paths, heading, keep_by_default, refuse_paths, told
 from benchmarks.reproduction.runs import run
 from benchmarks.tables import Table, limits
-from tactslip_torch.report.tuning import held_mean, tuning_figure
+from tactslip_torch.report.tuning import HELD_NOTE, WAYS, held_mean, tuning_figure
 
-WAYS = {
+LEARNED = {
     "C and c": "[penalty,offset]",
     "C, c and scales": "[penalty,offset,scales]",
     "C, c, scales and filters": "[penalty,offset,scales,smoothing,wavelet]",
 }
 _QUICK = ["+exp=quick", "tuning=gradient", "tuning.bins=6", "tuning.steps=2"]
 _QUICK += ["recipe.num_features=8"]
-SECTIONS = tuple(WAYS)
+SECTIONS = tuple(LEARNED)
 
 
 def measure(*, quick: bool) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def measure(*, quick: bool) -> dict[str, Any]:
     sections: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="tactslip-bench-") as folder:
         cache = Path(folder) / "features"
-        for name, learn in WAYS.items():
+        for name, learn in LEARNED.items():
             place = Path(folder) / str(len(sections))
             overrides = [*(_QUICK if quick else ["+exp=tuned"]), f"tuning.learn={learn}"]
             metrics = run(f"tuning {name}", overrides, place, cache)
@@ -87,16 +87,12 @@ def tables(report: Mapping[str, Any]) -> dict[str, list[Table]]:
     header = ["settings", "held-out loss", "held-out %", "test %", "unseen %", "steps", "seconds"]
     rows = []
     for place, (name, found) in enumerate(report["sections"].items()):
+        judged = found["splits"]
         if not place:
-            grid = found["splits"]
-            rows.append(_row("grid, by balanced accuracy", found, "recipe", grid, found["fit_s"]))
-        rows.append(_row(f"{name}: start, grid by loss", found, "grid", None, None))
-        rows.append(_row(f"{name}: tuned", found, "tuned", found["tuned_splits"], found["seconds"]))
-    note = (
-        "held-out: mean log loss (nats) and balanced accuracy of each training material by "
-        "settings chosen without it; ranking and scaling met it. seconds: of tuning; of the grid "
-        "those of the whole first fit"
-    )
+            rows.append(_row(WAYS["recipe"], found, "recipe", judged["recipe"], found["fit_s"]))
+            rows.append(_row(WAYS["grid"], found, "grid", judged["grid"], None))
+        rows.append(_row(f"{name} tuned", found, "tuned", found["tuned_splits"], found["seconds"]))
+    note = f"{HELD_NOTE}; seconds: of tuning, and of the whole first fit for the grid"
     return {
         "Limits": [limits(report["limits"])],
         "Beside the grid": [Table(header, rows, note)],
@@ -151,16 +147,14 @@ def _row(
     name: str,
     found: Mapping[str, Any],
     way: str,
-    splits: Mapping[str, Any] | None,
+    splits: Mapping[str, Any],
     seconds: float | None,
 ) -> list[str]:
-    roles = [] if splits is None else [splits[role] for role in ("test", "unseen")]
     return [
         name,
         f"{held_mean(found, way):.4f}",
         f"{100 * held_mean(found, way, 'balanced_accuracy'):.2f}",
-        *(f"{100 * role['balanced_accuracy']:.2f}" for role in roles or ()),
-        *([""] * (2 - len(roles))),
+        *(f"{100 * splits[role]['balanced_accuracy']:.2f}" for role in ("test", "unseen")),
         str(found["steps"]) if way == "tuned" else "",
         "" if seconds is None else f"{seconds:.0f}",
     ]

@@ -33,8 +33,9 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.scoring import Scorer
 from tactslip_torch.onset.settings import KEY
-from tactslip_torch.recipe import Recipe
-from tactslip_torch.tuning.second_fit import tuned_learner, tuned_maker
+from tactslip_torch.recipe import Recipe, stand_for
+from tactslip_torch.report.tuning import tuning_figure
+from tactslip_torch.tuning.second_fit import settled_learner, tuned_maker
 from tactslip_torch.tuning.stage import Tuning
 
 log = logging.getLogger(__name__)
@@ -65,7 +66,8 @@ def tune_fold(
 ) -> tuple[SlipDataModule, SlipLearner, dict[str, Any]]:
     """Fit as the recipe says, and learn from there; what the second fit takes, and what was found.
 
-    The first detector is kept as ``grid.pt``, and judged as the second one will be.
+    Detectors of the recipe's choice and of the grid's least loss are judged as the tuned one will
+    be, and kept as ``grid.pt`` and ``start.pt``: what is beyond the latter is due to the gradient.
     """
     started = time.perf_counter()
     trainer = make_trainer(config.trainer, folder / "grid")
@@ -75,15 +77,29 @@ def tune_fold(
             "trainer.devices and trainer.num_nodes, or take tuning=none"
         )
     trainer.fit(first, datamodule=data)
-    fitted = time.perf_counter()
-    trained = data.split.having("train")
-    tuned = tuning(first.plan, first.recipe, first.gathered[1], data.maker, trained)
-    trainer.test(first, datamodule=data, verbose=False)
-    if trainer.is_global_zero and first.detector is not None:
-        first.detector.save(folder / "grid.pt")
+    facts: dict[str, Any] = {"fit_s": time.perf_counter() - started}
+    plan, (_, sample) = first.plan, first.gathered
+    counts = [float(sample.represents[sample.is_slip == kind].sum()) for kind in (False, True)]
+    weights = stand_for(sample, first.recipe, counts)
+    tuned = tuning(plan, first.recipe, sample, weights, data.maker, data.split)
+    facts |= tuned.facts
+    start = facts["start"]
+    parts = (data.maker, plan.frame, start["penalty"], start["offset"])
+    by_loss = settled_learner(first, *parts)
+    make_trainer(config.trainer, folder / "start").fit(by_loss, datamodule=data)
+    facts["splits"] = {}
+    for name, way, learner in (("grid", "recipe", first), ("start", "grid", by_loss)):
+        judge = make_trainer(config.trainer, folder / name)
+        judge.test(learner, datamodule=data, verbose=False)
+        facts["splits"][way] = learner.metrics["splits"]
+        if learner.detector is not None:
+            learner.detector.info |= _origin(config, data)
+            learner.detector.save(folder / f"{name}.pt")
+    simulated = data.maker.source.is_simulated
+    tuning_figure(facts, folder / "tuning.png", simulated=simulated)
     maker = tuned_maker(tuned, data.maker)
-    facts = {"splits": first.metrics["splits"], "fit_s": fitted - started, **tuned.facts}
-    learner = tuned_learner(tuned, maker, first)
+    learner = settled_learner(first, maker, tuned.frame, tuned.penalty, tuned.offset)
+    facts["validation"] = first.facts["validation"]
     return SlipDataModule(maker, data.split, config.num_workers), learner, facts
 
 
@@ -93,9 +109,18 @@ def run_fold(
     data: SlipDataModule,
     learner: SlipLearner,
     alarming: Alarming | Debounced | None,
+    tuned: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Fit, test, set the alarm of, save and export one fold; what it found."""
-    source = data.maker.source
+    """Fit, test, set the alarm of, save and export one fold; what it found.
+
+    Args:
+        config: of the experiment.
+        folder: of its results.
+        data: of the fold.
+        learner: of its detector.
+        alarming: the stage behind the fit.
+        tuned: what tuning found, if it did.
+    """
     trainer = make_trainer(config.trainer, folder, [SaveAfterFirstPass(folder)])
     checkpoint = _checkpoint(config.ckpt_path, data.split)
     trainer.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
@@ -108,17 +133,10 @@ def run_fold(
     trainer.test(learner, datamodule=data, verbose=False)
     tested = time.perf_counter()
     detector = learner.detector
-    trained = data.split.having("train")
-    detector.info |= {
-        "simulated": source.is_simulated,
-        **_units(source),
-        "experiment": config.name,
-        "seed": config.seed,
-        "split": data.split.name,
-        "features_dtype": config.features.dtype,
-        "train_materials": sorted({recording.material for recording in trained}),
-        "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
-    }
+    detector.info |= _origin(config, data)
+    if tuned is not None:
+        kept = ("learned", "steps", "bins", "start")
+        detector.info["tuned"] = {name: tuned[name] for name in kept}
     onnx: dict[str, dict[str, float] | str] = {}
     alarm: dict[str, Any] = {}
     if getattr(trainer, "fast_dev_run", False):
@@ -144,6 +162,7 @@ def run_fold(
         **({"alarm": alarm} if alarm else {}),
         "recording_events": learner.events,  # for combined
         **learner.facts,
+        **({} if tuned is None else {"tuning": tuned, "validation": tuned.pop("validation")}),
         "selected": [str(name) for name in detector.selected_names],
         "onnx": onnx,
         "timing_s": seconds,
@@ -168,6 +187,21 @@ def _save_statistics(
     materials = {str(recording): recording.material for recording in fold.having("train")}
     labels = {str(key): value for key, value in config.labels.items() if key != "_target_"}
     gathered_statistics(*learner.gathered, materials, labels, detector).save(path)
+
+
+def _origin(config: DictConfig, data: SlipDataModule) -> dict[str, Any]:
+    """What a detector says of where it comes from."""
+    source, trained = data.maker.source, data.split.having("train")
+    return {
+        "simulated": source.is_simulated,
+        **_units(source),
+        "experiment": config.name,
+        "seed": config.seed,
+        "split": data.split.name,
+        "features_dtype": config.features.dtype,
+        "train_materials": sorted({recording.material for recording in trained}),
+        "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
+    }
 
 
 def _units(source: RecordingSource) -> dict[str, str]:

@@ -55,7 +55,6 @@ class SlipLearner(L.LightningModule):
         recipe: how the machine is made.
         detector: a finished one, to be judged only.
         abstaining: how thresholds for unsure answers are set; by default none are.
-
         frame: features and ranges that were settled elsewhere; by default the recipe finds them.
 
     Attributes:

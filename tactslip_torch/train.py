@@ -79,8 +79,13 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     abstaining = Abstaining(config.coverage, config.coverage_by)
     alarming: Alarming | Debounced | None = instantiate(config.onset, _convert_="all") or None
     tuning: Tuning | None = instantiate(config.tuning, _convert_="all") or None
-    if tuning is not None and config.ckpt_path is not None:
-        raise ValueError("tuning starts from the first pass, which ckpt_path skips; leave it out")
+    if config.trainer.get("fast_dev_run"):
+        tuning = None  # a batch has no materials to hold out
+    if tuning is not None:
+        if config.ckpt_path is not None:
+            raise ValueError("tuning starts from the first pass, which ckpt_path skips; leave it")
+        for fold in folds:
+            tuning.check(recipe, pool, fold)
     if isinstance(alarming, Alarming) and len(folds) > 1:
         raise ValueError(
             f"onset=alarms sets the alarm of one detector, this split makes {len(folds)}; take "
@@ -98,10 +103,10 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             place = folder if len(folds) == 1 else folder / fold.name
             data = SlipDataModule(maker, fold, config.num_workers)
             learner = SlipLearner(pool, channel_filter, recipe, abstaining=abstaining)
-            found: dict[str, Any] = {}
+            found: dict[str, Any] | None = None
             if tuning is not None:
-                data, learner, found["tuning"] = tune_fold(config, place, data, learner, tuning)
-            fold_metrics[fold.name] = run_fold(config, place, data, learner, alarming) | found
+                data, learner, found = tune_fold(config, place, data, learner, tuning)
+            fold_metrics[fold.name] = run_fold(config, place, data, learner, alarming, found)
     metrics = common_facts(source, pool, config) | combined(fold_metrics, are_rivals(folds))
     metrics["timing_s"]["total"] = time.perf_counter() - started
     by_name = {str(name): name for name in pool.names}

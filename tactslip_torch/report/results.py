@@ -22,7 +22,7 @@ from tactslip_torch.report.tables import (
     splits_table,
     timing_table,
 )
-from tactslip_torch.report.tuning import tuning_figure, tuning_table
+from tactslip_torch.report.tuning import tuning_tables
 from tactslip_torch.report.validation import validation_figure, validation_table
 
 
@@ -58,8 +58,6 @@ def write_results(
             reliability_figure(
                 alarm["reliability"], folder / "reliability.png", simulated=simulated
             )
-    if metrics.get("tuning"):
-        tuning_figure(metrics["tuning"], folder / "tuning.png", simulated=simulated)
     if metrics.get("validation"):
         validation_figure(metrics["validation"], folder / "validation.png", simulated=simulated)
 
@@ -80,8 +78,7 @@ def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, st
         parts.append(selected_table(selected))
     if metrics.get("validation"):
         parts.append(validation_table(metrics["validation"], simulated=metrics["simulated"]))
-    if metrics.get("tuning"):
-        parts.append(tuning_table(metrics))
+    parts += tuning_tables(metrics)
     if metrics.get("solve"):
         parts.append(solve_line(metrics["solve"]))
     if metrics.get("timing_s"):

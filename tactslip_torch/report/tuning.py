@@ -14,7 +14,13 @@ from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-_WAYS = {
+HELD_NOTE = (
+    "held-out: mean log loss (nats) and balanced accuracy of each training group under C, c, "
+    "scales and filters that were chosen without it; ranking, ranges, K and, by way of the other "
+    "groups' descents, the number of steps met it. The detectors behind the other columns choose "
+    "by all groups, the first on more bins"
+)
+WAYS = {
     "recipe": "grid, by balanced accuracy",
     "grid": "grid, by loss",
     "tuned": "tuned by gradient",
@@ -26,26 +32,31 @@ def held_mean(found: Mapping[str, Any], way: str, name: str = "loss") -> float:
     return mean(float(group[way][name]) for group in found["held"])
 
 
-def tuning_table(metrics: Mapping[str, Any]) -> str:
-    """Loss and accuracy of groups that the choice never met, and accuracy of the detectors.
+def tuning_tables(metrics: Mapping[str, Any]) -> list[str]:
+    """A table for each fold that was tuned; none where nothing was.
 
     Args:
-        metrics: the content of ``metrics.json``, of a run with tuning.
+        metrics: the content of ``metrics.json``.
     """
-    found, splits = metrics["tuning"], metrics["splits"]
-    roles = [role for role in splits if splits[role]["balanced_accuracy"] is not None]
-    judged = {"recipe": found["splits"], "tuned": splits}
-    rows = []
-    for way, label in _WAYS.items():
-        row = [label, f"{held_mean(found, way):.4f}"]
-        row.append(f"{100 * held_mean(found, way, 'balanced_accuracy'):.2f}")
-        for role in roles:
-            scores = judged.get(way, {}).get(role)
-            row.append("" if scores is None else f"{100 * scores['balanced_accuracy']:.2f}")
-        rows.append(row)
-    header = ["settings", "held-out loss", "held-out %", *(f"{role} %" for role in roles)]
+    parts = {"": metrics, **metrics.get("folds", {})}
+    found = {name: part for name, part in parts.items() if part.get("tuning")}
+    texts = [_table(part["tuning"], part["splits"], name) for name, part in found.items()]
     head = [SIMULATED_LINE] if metrics["simulated"] else []
-    return "\n".join([*head, aligned(header, rows), *_notes(found)])
+    return ["\n".join([*head, text]) for text in texts]
+
+
+def _table(found: Mapping[str, Any], splits: Mapping[str, Any], fold: str) -> str:
+    """Loss and accuracy of groups that the choice never met, and accuracy of the detectors."""
+    roles = [role for role in splits if splits[role]["balanced_accuracy"] is not None]
+    judged = {**found["splits"], "tuned": splits}
+    rows = []
+    for way, label in WAYS.items():
+        accuracy = held_mean(found, way, "balanced_accuracy")
+        of_roles = [judged[way][role]["balanced_accuracy"] for role in roles]
+        row = [f"{100 * value:.2f}" for value in (accuracy, *of_roles)]
+        rows.append([label, f"{held_mean(found, way):.4f}", *row])
+    header = [f"tuning {fold}".strip(), "held-out loss", "held-out %", *(f"{r} %" for r in roles)]
+    return "\n".join([aligned(header, rows), *_notes(found)])
 
 
 def tuning_figure(found: Mapping[str, Any], path: str | Path, *, simulated: bool) -> None:
@@ -56,10 +67,12 @@ def tuning_figure(found: Mapping[str, Any], path: str | Path, *, simulated: bool
         path: the PNG to write, replaced as a whole if it exists.
         simulated: whether the data is.
     """
-    figure = Figure(figsize=(12.5, 4.2), layout="constrained")
-    losses, scales = figure.subplots(1, 2, width_ratios=(1.1, 1))
+    has_scales = "scales" in found["learned"]
+    figure = Figure(figsize=(12.5 if has_scales else 7.5, 4.2), layout="constrained")
+    losses, *scales = figure.subplots(1, 1 + has_scales, squeeze=False)[0]
     _descents(losses, found)
-    _scales(scales, found["scales"])
+    if scales:
+        _scales(scales[0], found["scales"])
     figure.suptitle("Tuning through the fit" + (" (simulated data)" if simulated else ""))
     with whole_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=160, facecolor="white")
@@ -68,8 +81,7 @@ def tuning_figure(found: Mapping[str, Any], path: str | Path, *, simulated: bool
 def _notes(found: Mapping[str, Any]) -> Sequence[str]:
     start = found["start"]
     return [
-        "held-out: mean log loss (nats) and balanced accuracy of each training group, by settings "
-        "chosen without it; ranking and scaling met it",
+        HELD_NOTE,
         f"{found['steps']} steps from C={start['penalty']:g}, c={start['offset']:g} to "
         f"C={found['penalty']:.3g}, c={found['offset']:.3g}; learned: "
         f"{', '.join(found['learned'])}; {found['bins']} bins; tuning took "

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from tactslip_torch.model.fit import TrainingBins
@@ -34,23 +34,26 @@ def grid_points(
     z: Tensor,
     is_slip: Tensor,
     groups: Tensor,
+    weights: Tensor,
     penalties: Sequence[float],
     offsets: Sequence[float],
 ) -> list[GridPoint]:
     """Every choice of C and c.
 
-    Shape:
-        - z: ``[N, K]``; is_slip, groups: ``[N]``
+    One whose held-out scores cannot be told, or tell slip backwards, has an infinite loss.
 
-    Raises:
-        ValueError: as ``HeldOut``, or if held-out scores tell slip backwards.
+    Shape:
+        - z: ``[N, K]``; is_slip, groups, weights: ``[N]``
     """
     points = []
     for offset in offsets:
-        machine = HeldOut(TrainingBins(z, is_slip), groups, Polynomial(2, offset))
+        machine = HeldOut(TrainingBins(z, is_slip, weights), groups, Polynomial(2, offset))
         for penalty in penalties:
-            with torch.no_grad():
+            try:
                 found = grouped_loss(machine.at(penalty).scores, is_slip, groups)
+            except ValueError:
+                points.append(GridPoint(penalty, offset, math.inf, 0.0))
+                continue
             points.append(GridPoint(penalty, offset, float(found.loss), found.balanced_accuracy))
     return points
 

@@ -58,14 +58,18 @@ class Descent(nn.Module):
         """How good settings are now: on their own groups left out in turn, and on the held one."""
         settings, bins = self.settings, self.bins
         z = settings.scaled(settings.features(bins))
-        scores = held_out_scores(z, bins.is_slip, bins.group, settings.penalty, settings.offset)
+        scores = held_out_scores(
+            z, bins.is_slip, bins.group, settings.penalty, settings.offset, bins.weights
+        )
         found = grouped_loss(scores, bins.is_slip, bins.group)
         if self.held is None:
             return found, None
         with torch.no_grad():
             kernel = Polynomial(2, float(settings.offset))
             machine = fit_machine(
-                TrainingBins(z.detach(), bins.is_slip), float(settings.penalty), kernel
+                TrainingBins(z.detach(), bins.is_slip, bins.weights),
+                float(settings.penalty),
+                kernel,
             )
             of_held: Tensor = machine(settings.scaled(settings.features(self.held)))
         held = grouped_loss(of_held, self.held.is_slip, self.held.group, found.calibration)

@@ -1,9 +1,10 @@
 """What tuning minimises: the log loss of held-out probabilities, every group and class alike.
 
 Scores are those of the machine that never met the bin's group, in closed form
-(``model.held_out_gradient``). They become probabilities by the logistic calibration of these very
-scores (``fit_platt``). Its slope and offset minimise the loss themselves (but for Platt's targets),
-so that they count as constants on the way back.
+(``model.held_out_gradient``). They become probabilities by one slope, ``llr = slope * score``: a
+detector decides at a score of 0, so a machine that leans to one side has to pay for it here. The
+slope is the one of least loss (but for Platt's targets), so that it counts as a constant on the way
+back.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def grouped_loss(
         scores: of bins.
         is_slip: their truth.
         groups: whole numbers.
-        calibration: by default the one fitted to these scores; of bins that were held out from
+        calibration: by default the slope fitted to these scores; of bins that were held out from
             tuning altogether, that of the others.
 
     Shape:
@@ -56,16 +57,25 @@ def grouped_loss(
         >>> grouped_loss(scores, is_slip, groups, Platt(1.0, 0.0)).balanced_accuracy
         0.75
     """
+    shares = _shares(is_slip, groups).to(scores)
     if calibration is None:
-        calibration = fit_platt(scores, is_slip)
+        calibration = _slope(scores.detach(), is_slip, shares)
     llr = calibration.llr(scores)
-    loss = softplus(torch.where(is_slip, -llr, llr))
+    losses = softplus(torch.where(is_slip, -llr, llr))
     is_right = (scores.detach() >= 0) == is_slip
-    losses, recalls = [], []
-    for group in groups.unique():
-        for kind in (False, True):
-            own = (groups == group) & (is_slip == kind)
-            if bool(own.any()):
-                losses.append(loss[own].mean())
-                recalls.append(float(is_right[own].double().mean()))
-    return GroupedLoss(torch.stack(losses).mean(), sum(recalls) / len(recalls), calibration)
+    return GroupedLoss((shares * losses).sum(), float(shares[is_right].sum()), calibration)
+
+
+def _shares(is_slip: Tensor, groups: Tensor) -> Tensor:
+    """The part of each bin in a mean over groups and classes, ``[N]``, float64."""
+    cell = 2 * torch.unique(groups, return_inverse=True)[1] + is_slip
+    _, place, counts = torch.unique(cell, return_inverse=True, return_counts=True)
+    shares: Tensor = 1 / (len(counts) * counts[place].double())
+    return shares
+
+
+def _slope(scores: Tensor, is_slip: Tensor, shares: Tensor) -> Platt:
+    """The slope alone: every bin beside its mirror image, so that there is nothing to offset."""
+    both = torch.cat([scores, -scores]), torch.cat([is_slip, ~is_slip])
+    found = fit_platt(*both, torch.cat([shares, shares]) * len(shares))
+    return Platt(found.slope, 0.0)

@@ -1,10 +1,13 @@
-"""A learner that fits what tuning found, and the maker of its features."""
+"""Learners that fit what is settled, and the maker of the features that was tuned."""
 
 from __future__ import annotations
+
+from typing import Any
 
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.learning import SlipLearner
+from tactslip_torch.recipe import Frame, Recipe
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.tuning.stage import Tuned
 
@@ -27,12 +30,19 @@ def tuned_maker(tuned: Tuned, maker: FeatureMaker) -> FeatureMaker:
     )
 
 
-def tuned_learner(tuned: Tuned, maker: FeatureMaker, first: SlipLearner) -> SlipLearner:
-    """A learner with nothing left to choose, of a maker's features."""
-    return SlipLearner(
-        maker.pool,
-        maker.channel_filter,
-        tuned.recipe(first.recipe),
-        abstaining=first.abstaining,
-        frame=tuned.frame,
-    )
+def settled_learner(
+    first: SlipLearner, maker: FeatureMaker, frame: Frame, penalty: float, offset: float
+) -> SlipLearner:
+    """A learner with nothing left to choose.
+
+    Args:
+        first: whose recipe it takes else.
+        maker: of its features.
+        frame: which, and how scaled.
+        penalty: C.
+        offset: the kernel's c.
+    """
+    changes: dict[str, Any] = {"num_features": len(frame.selected)}
+    recipe = Recipe(**first.recipe.facts() | changes | {"penalties": penalty, "offsets": offset})
+    parts = (maker.pool, maker.channel_filter, recipe)
+    return SlipLearner(*parts, abstaining=first.abstaining, frame=frame)
