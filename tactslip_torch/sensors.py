@@ -108,6 +108,11 @@ def sensors(config: DictConfig, folder: Path) -> dict[str, Any]:
     with whole_file(folder / "sensors.csv") as temporary:
         temporary.write_text(sensors_csv(content))
     sensors_figure(content, folder / "sensors.png")
+    if "tuned" in trained.detector.info:
+        print(
+            "\nthe detector was tuned: machines without sensors are fitted with its filters, but "
+            "with ranges and C of the recipe"
+        )
     print(f"\n{sensors_table(content)}\n\n{best_table(content)}\n\nresults in {folder}")
     return content
 
