@@ -69,7 +69,8 @@ def content_digest(*tensors: Tensor) -> str:
     for tensor in tensors:
         digest.update(f"{tensor.dtype}{tuple(tensor.shape)}".encode())
         if tensor.numel():  # an empty one may have strides that no view of bytes takes
-            content = tensor.detach().cpu().contiguous().view(-1).view(torch.uint8)
+            flat = tensor.detach().cpu().contiguous().as_strided((tensor.numel(),), (1,))
+            content = flat.view(torch.uint8)  # which strides of axes of length 1 would not allow
             digest.update(content.numpy().data)  # no copy, and NumPy need not know the dtype
     return digest.hexdigest()
 

@@ -137,6 +137,36 @@ def test_an_undone_step_leaves_no_trace(old, trained, new, tmp_path):
         undo(back)
 
 
+def test_undo_finds_what_was_there_before_a_recording_came_back_with_other_bins(old, tmp_path):
+    wood = recording("wood", 60)
+    quiet = replace(wood, z=wood.z[~wood.is_slip], is_slip=wood.is_slip[~wood.is_slip])
+    file, states = torch.arange(5, dtype=torch.uint8), [old]
+    for step in (
+        lambda at: add(at, solve(at), {"wood/0": wood}, 2.0, margin=1.0),
+        lambda at: forget(at, solve(at), {"wood/0": wood}),
+        lambda at: add(at, solve(at), {"wood/0": quiet}, 3.0, margin=1.0),
+    ):
+        states.append(taken(states[-1], step(states[-1]), {}, file, f"{len(states)}"))
+    contents = []
+    for number, state in enumerate(states):
+        state.save(tmp_path / f"{number}")
+        contents.append((tmp_path / f"{number}").read_bytes())
+    at = Statistics.load(tmp_path / "3")
+    for content in reversed(contents[:-1]):
+        at, _ = undo(at)
+        at.save(tmp_path / "back")
+        assert (tmp_path / "back").read_bytes() == content
+
+
+@pytest.mark.parametrize(("num_bins", "weight"), [(1, 2.0), (1, 5000.0), (3, 5000.0)])
+def test_a_lone_bin_and_a_heavy_one_come_in_and_go_out(old, num_bins, weight):
+    few = RecordingBins("few", recording("few", 61).z[:num_bins], torch.arange(num_bins) == 0)
+    there = old.reweighed({"few/0": weight}, {"few/0": few})
+    assert float(there.sums.weight.sum() - old.sums.weight.sum()) == num_bins * weight
+    back = there.reweighed({"few/0": 0.0})
+    assert torch.equal(back.sums.sums, old.sums.sums)
+
+
 def test_forgetting_is_never_having_met(old, trained):
     others = {name: own for name, own in trained.items() if own.material != "c"}
     mine = {name: own for name, own in trained.items() if own.material == "c"}

@@ -25,7 +25,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.sufficient import SufficientStats
 
 FILE = "statistics.pt"
-FORMAT = "tactslip_torch statistics 1"
+FORMAT = "tactslip_torch statistics 2"
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,7 @@ class Step:
         entry: of the journal, JSON-able.
         weights: of ``Statistics``, before it.
         changed: weight before it of each recording that it changed.
+        replaced: what it found under the names of recordings that came back with other bins.
         detector: digest of the detector before it.
         file: that detector's file, bytes.
     """
@@ -58,6 +59,7 @@ class Step:
     entry: Mapping[str, Any]
     weights: Mapping[str, float]
     changed: Mapping[str, float]
+    replaced: Mapping[str, RecordingBins]
     detector: str
     file: Tensor
 
@@ -101,7 +103,7 @@ class Statistics:
 
         Args:
             weights: by recording; 0 takes it out.
-            bins: of recordings that are not known yet.
+            bins: of recordings that are not known yet, or are out and come back with others.
 
         Raises:
             ValueError: if a recording that is taken out holds something else than was put in, or
@@ -116,7 +118,7 @@ class Statistics:
             for value, change in ((before, sums.remove), (weight, sums.update)):
                 for batch_id, part in _batches(name, len(own.z), value, sums.grid_bits):
                     z, is_slip = own.z[part], own.is_slip[part]
-                    change(batch_id, z, is_slip, torch.full_like(z[:, 0], value))
+                    change(batch_id, z, is_slip, z.new_full((len(z),), value))
         return replace(self, sums=sums, bins=known, weights={**self.weights, **weights})
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -132,18 +134,25 @@ class Statistics:
             "labels": dict(self.labels),
             "witnesses": self.witnesses.facts(),
             "detector": self.detector,
-            "bins": [[name, own.material, own.key] for name, own in self.bins.items()],
+            "bins": _bins_facts(self.bins),
             "weights": dict(self.weights),
             "steps": [
-                [step.entry, dict(step.weights), dict(step.changed), step.detector]
+                [
+                    step.entry,
+                    dict(step.weights),
+                    dict(step.changed),
+                    _bins_facts(step.replaced),
+                    step.detector,
+                ]
                 for step in self.steps
             ],
         }
         tensors = {"sums": self.sums.sums, "count": self.sums.count}
         tensors |= {f"witnesses.{name}": t for name, t in self.witnesses.tensors().items()}
-        for number, own in enumerate(self.bins.values()):
-            tensors |= {f"bins.{number}.z": own.z, f"bins.{number}.is_slip": own.is_slip}
-        tensors |= {f"steps.{number}": step.file for number, step in enumerate(self.steps)}
+        tensors |= _bins_tensors("bins", self.bins)
+        for number, step in enumerate(self.steps):
+            tensors |= {f"steps.{number}": step.file}
+            tensors |= _bins_tensors(f"steps.{number}.replaced", step.replaced)
         save_table(path, FORMAT, facts, tensors)
 
     @classmethod
@@ -165,18 +174,42 @@ class Statistics:
             facts["labels"],
             Witnesses.from_file(facts["witnesses"], of_witnesses),
             facts["detector"],
-            {
-                name: RecordingBins(
-                    material, tensors[f"bins.{number}.z"], tensors[f"bins.{number}.is_slip"], key
-                )
-                for number, (name, material, key) in enumerate(facts["bins"])
-            },
+            _bins_of_file(facts["bins"], tensors, "bins"),
             facts["weights"],
             tuple(
-                Step(entry, weights, changed, digest, tensors[f"steps.{number}"])
-                for number, (entry, weights, changed, digest) in enumerate(facts["steps"])
+                Step(
+                    entry,
+                    weights,
+                    changed,
+                    _bins_of_file(replaced, tensors, f"steps.{number}.replaced"),
+                    digest,
+                    tensors[f"steps.{number}"],
+                )
+                for number, (entry, weights, changed, replaced, digest) in enumerate(facts["steps"])
             ),
         )
+
+
+def _bins_facts(bins: Mapping[str, RecordingBins]) -> list[list[str]]:
+    return [[name, own.material, own.key] for name, own in bins.items()]
+
+
+def _bins_tensors(place: str, bins: Mapping[str, RecordingBins]) -> dict[str, Tensor]:
+    found = {}
+    for number, own in enumerate(bins.values()):
+        found |= {f"{place}.{number}.z": own.z, f"{place}.{number}.is_slip": own.is_slip}
+    return found
+
+
+def _bins_of_file(
+    facts: Sequence[Sequence[str]], tensors: Mapping[str, Tensor], place: str
+) -> dict[str, RecordingBins]:
+    return {
+        name: RecordingBins(
+            material, tensors[f"{place}.{number}.z"], tensors[f"{place}.{number}.is_slip"], key
+        )
+        for number, (name, material, key) in enumerate(facts)
+    }
 
 
 def _batches(

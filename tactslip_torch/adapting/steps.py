@@ -137,7 +137,8 @@ def undo(statistics: Statistics) -> tuple[Statistics, Tensor]:
     if not statistics.steps:
         raise ValueError("there is nothing to undo: this detector is as it was trained")
     *earlier, last = statistics.steps
-    back = statistics.reweighed(last.changed)
+    out = statistics.reweighed(dict.fromkeys(last.changed, 0.0))
+    back = out.reweighed(last.changed, last.replaced)
     known = {name: own for name, own in back.bins.items() if name in last.weights}
     return replace(
         back, bins=known, weights=last.weights, steps=tuple(earlier), detector=last.detector
@@ -159,7 +160,8 @@ def taken(
     after = change.statistics
     moved = {name: before.weight_of(name) for name in after.bins}
     moved = {name: value for name, value in moved.items() if value != after.weight_of(name)}
-    step = Step(entry, before.weights, moved, before.detector, file)
+    replaced = {name: own for name, own in before.bins.items() if own is not after.bins[name]}
+    step = Step(entry, before.weights, moved, replaced, before.detector, file)
     return replace(after, steps=(*before.steps, step), detector=digest)
 
 
