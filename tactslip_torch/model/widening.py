@@ -10,7 +10,11 @@ from torch import Tensor
 from tactslip_torch.model.calibration import Calibration
 
 MOST_OFF = 0.02
-"""By which a probability may be off that of the integral, at any mean and variance."""
+"""By which a probability may be off that of the integral, at any mean and variance.
+
+Of equal shares of slip and non-slip, as the classes were weighed for the variance; other shares
+come in afterwards by Bayes (``probability``), and no bound is stated for them.
+"""
 
 
 def widened_llr(calibration: Calibration, score: Tensor, variance: Tensor) -> Tensor:
