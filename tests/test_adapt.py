@@ -16,12 +16,15 @@ from tactslip_torch import SlipDetector
 from tactslip_torch import adapt as module
 from tactslip_torch.adapt import adapt
 from tactslip_torch.adapting.acceptance import Verdict
+from tactslip_torch.adapting.held_out import class_scales
 from tactslip_torch.adapting.statistics import Statistics, detector_digest
 from tactslip_torch.adapting.steps import add
 from tactslip_torch.config import conf_dir, one_line
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.model.conformal import answers
+from tactslip_torch.model.conformal import answers, thresholds
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.onset.sequential import KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.train import train
@@ -109,10 +112,50 @@ def test_a_material_comes_in_and_all_is_said(run, files, trained, capsys):
     assert entry["recordings"] == [f"C/{i}" for i in range(4)]
     alarm = AlarmSettings.of(new)
     assert (alarm.threshold, alarm.target_per_hour) == (SETTINGS.threshold, None)
-    assert "no rate is promised" in alarm.facts["adapted"]
+    assert "no rate is promised; the calibration is made anew" in alarm.facts["adapted"]
+    assert alarm.calibration.to_dict() == new.info["calibration"] != SETTINGS.calibration.to_dict()
     assert new.info["calibration"] != old.info["calibration"]
     assert new.info["abstain"]["adapted"]
     assert set(answers(torch.zeros(1), new.info["abstain"]["low"], 1.0).tolist()) <= {-1, 0, 1}
+
+
+def test_what_stands_in_for_a_sensor_is_of_old_and_new_bins(run, files, trained):
+    add_c(run, files, "weight=2")
+    old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
+    known = Statistics.load(run / "statistics.pt").known()
+    assert {2.0} < set(known.represents.tolist())  # a bin of C weighs as two
+    expected = torch.stack(
+        [
+            (known.z * w).sum(0) / w.sum()
+            for w in (known.represents[:, None] * (known.is_slip == c)[:, None] for c in (0, 1))
+        ]
+    )
+    torch.testing.assert_close(new.gaussians.mean, expected)
+    torch.testing.assert_close(new.typical, expected.mean(0))
+    assert not torch.allclose(old.gaussians.mean, expected)
+
+
+@pytest.mark.parametrize("left_out", ["recording", "material"])
+def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files, left_out):
+    detector = SlipDetector.load(run / "detector.pt")
+    detector.info["abstain"]["left_out"] = left_out
+    detector.save(run / "detector.pt")
+    add_c(run, files, "weight=2")
+    kept = SlipDetector.load(run / "detector.pt").info["abstain"]
+    statistics = Statistics.load(run / "statistics.pt")
+    known, machine = statistics.known(), statistics.machine
+    weights = class_scales(statistics.sums, machine)[known.is_slip.long()] * known.represents
+    scores = torch.empty_like(weights)
+    groups = known.recording if left_out == "recording" else known.material
+    for group in groups.unique():
+        rest = groups != group
+        bins = TrainingBins(known.z[rest], known.is_slip[rest], weights[rest])
+        fitted = fit_machine(bins, machine.penalty, Polynomial(2, machine.offset), route="dual")
+        scores[~rest] = fitted(known.z[~rest])
+    expected = thresholds(scores, known.is_slip, known.recording, 0.5)
+    assert (kept["low"], kept["high"]) == pytest.approx((expected.low, expected.high), rel=1e-6)
+    assert kept["left_out"] == left_out
+    assert f"never met its {left_out}" in kept["adapted"]
 
 
 def test_undo_restores_both_files_to_the_bit(run, files):

@@ -9,12 +9,14 @@ from typing import Any
 
 from torch import Tensor
 
+from tactslip_torch.adapting.bins import KnownBins
 from tactslip_torch.adapting.held_out import Solved, class_scales
-from tactslip_torch.adapting.statistics import Statistics
+from tactslip_torch.adapting.statistics import Machine, Statistics
 from tactslip_torch.fitting import solve_facts
 from tactslip_torch.model import abstention
 from tactslip_torch.model.abstention import abstention_of
 from tactslip_torch.model.calibration import fit_platt
+from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.conformal import fewest_recordings, thresholds
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins
@@ -33,9 +35,10 @@ def renewed(
 ) -> SlipDetector:
     """A detector with another machine; features, scaling and filter stay.
 
-    The calibration is made anew, of scores by machines that never met the bin's material, as in
-    training. An alarm keeps its threshold but promises no rate any more. Thresholds for unsure
-    answers are set anew on the recordings that are known, or go.
+    As training does it, but of the bins that are known: what stands in for a missing sensor; the
+    calibration, of scores by machines that never met the bin's material, an alarm's too; thresholds
+    for unsure answers, by machines that never met the recording or, as in training, the material.
+    The latter go where they cannot be told. An alarm keeps its threshold, but promises no rate.
 
     Args:
         detector: as it was; kept.
@@ -43,61 +46,96 @@ def renewed(
         solved: their machine.
         entry: of the journal.
     """
-    new = copy.deepcopy(detector)
+    new, known = copy.deepcopy(detector), solved.known
     new.head = solved.head
+    bins = _training_bins(statistics, known)
+    _renew_stand_ins(new, bins)
     info = new.info
     info["solve"] = solve_facts(solved.head)
     info["num_bins"] = int(statistics.sums.count.sum())
     info[JOURNAL] = [*info.get(JOURNAL, []), dict(entry)]
-    info["train_materials"] = [solved.known.materials[i] for i in solved.known.material.unique()]
+    info["train_materials"] = [known.materials[i] for i in known.material.unique()]
     keys = info.get("train_recordings", {}) | {n: b.key for n, b in statistics.bins.items()}
     entries = statistics.sums.ledger.entries
     out = {name for name in statistics.bins if name not in entries}
     info["train_recordings"] = {n: key for n, key in keys.items() if n not in out}
-    if info.get("calibration"):
-        info["calibration"] = _calibration(statistics, solved) or info["calibration"]
-    if ALARM in info:
-        facts = dict(info[ALARM].get("facts") or {}) | {"adapted": _SAID}
-        info[ALARM] = info[ALARM] | {"target_per_hour": None, "facts": facts}
+    if info.get("calibration") or ALARM in info:
+        found = _calibration(bins, known, statistics.machine)
+        if info.get("calibration"):
+            info["calibration"] = found or info["calibration"]
+        if ALARM in info:
+            info[ALARM] = _alarm(info[ALARM], found)
     if (answers := abstention_of(new)) is not None:
-        info[abstention.KEY] = _thresholds(solved, answers)
+        info[abstention.KEY] = _thresholds(bins, known, statistics.machine, answers)
     return new
 
 
-_SAID = (
-    "the machine changed after the threshold was set: no rate is promised; train with +exp=onset"
-)
+def _training_bins(statistics: Statistics, known: KnownBins) -> TrainingBins:
+    """Known bins, each weighing as much as all that it stands for, the classes balanced."""
+    scales = class_scales(statistics.sums, statistics.machine)
+    weights = scales[known.is_slip.long()] * known.represents
+    return TrainingBins(known.z, known.is_slip, weights)
 
 
-def _calibration(statistics: Statistics, solved: Solved) -> dict[str, Any] | None:
-    """From held-out scores, each material left out; ``None`` where there is but one, or none tells.
+def _renew_stand_ins(detector: SlipDetector, bins: TrainingBins) -> None:
+    """What is expected of a sensor that is missing."""
+    gaussians = ClassGaussians.fit(bins.features, bins.is_slip, bins.weights)
+    detector.typical.copy_(gaussians.mean.mean(0))  # both classes counting alike
+    if detector.gaussians is not None:
+        detector.gaussians = gaussians
 
-    As training does it, of a machine of the known bins, each weighing as much as all that it stands
-    for.
-    """
-    known, machine = solved.known, statistics.machine
-    scales = class_scales(statistics.sums, machine)
-    weights: Tensor = scales[known.is_slip.long()] * known.represents
-    bins = TrainingBins(known.z, known.is_slip, weights)
+
+def _scores_without(groups: Tensor, bins: TrainingBins, machine: Machine) -> Tensor:
+    """Of each known bin, by the machine of known bins that never met its group."""
+    return HeldOut(bins, groups, Polynomial(2, machine.offset)).at(machine.penalty).scores
+
+
+def _calibration(bins: TrainingBins, known: KnownBins, machine: Machine) -> dict[str, Any] | None:
+    """From held-out scores, each material left out; ``None`` where that cannot be told."""
     try:
-        left_out = HeldOut(bins, known.material, Polynomial(2, machine.offset))
-        scores = left_out.at(machine.penalty).scores
-        return fit_platt(scores, known.is_slip, weights).to_dict()
+        scores = _scores_without(known.material, bins, machine)
+        return fit_platt(scores, known.is_slip, bins.weights).to_dict()
     except ValueError as error:
         log.warning("the calibration stays as it was: %s", error)
         return None
 
 
-def _thresholds(solved: Solved, answers: abstention.Abstention) -> dict[str, Any] | None:
+def _alarm(plain: Mapping[str, Any], calibration: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Settings of an alarm that promise no rate, with the calibration if there is a new one."""
+    which = "that of the machine before" if calibration is None else "made anew"
+    said = (
+        "the machine changed after the threshold was set: no rate is promised; the calibration is "
+        f"{which}; train with +exp=onset"
+    )
+    return {
+        **plain,
+        "calibration": calibration or plain["calibration"],
+        "target_per_hour": None,
+        "facts": {**(plain.get("facts") or {}), "adapted": said},
+    }
+
+
+def _thresholds(
+    bins: TrainingBins, known: KnownBins, machine: Machine, answers: abstention.Abstention
+) -> dict[str, Any] | None:
     """Conformal thresholds for the same coverage on the recordings that are known."""
-    known, coverage = solved.known, answers.coverage
-    found = thresholds(solved.scores, known.is_slip, known.recording, coverage)
+    coverage = answers.coverage
+    left_out = "recording" if answers.facts.get("left_out") == "recording" else "material"
+    try:
+        groups = known.recording if left_out == "recording" else known.material
+        scores = _scores_without(groups, bins, machine)
+        found = thresholds(scores, known.is_slip, known.recording, coverage)
+    except ValueError as error:
+        log.warning("no answer is unsure any more: %s", error)
+        return None
     if fewest_recordings(coverage) > min(found.num_slip, found.num_non_slip):
         log.warning("no answer is unsure any more: too few recordings for coverage=%g", coverage)
         return None
     facts = dict(answers.facts) | {
+        "left_out": left_out,
         "num_recordings": {"slip": found.num_slip, "non_slip": found.num_non_slip},
-        "num_bins": len(solved.scores),
-        "adapted": "set anew on all recordings that are known, added ones among them",
+        "num_bins": len(scores),
+        "adapted": "set anew on all recordings that are known, added ones among them, each bin "
+        f"scored by a machine of the others that never met its {left_out}",
     }
     return abstention.Abstention(coverage, found.low, found.high, facts).to_dict()

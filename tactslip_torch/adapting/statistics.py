@@ -195,7 +195,7 @@ def _bins_facts(bins: Mapping[str, RecordingBins]) -> list[list[str]]:
 
 
 def _bins_tensors(place: str, bins: Mapping[str, RecordingBins]) -> dict[str, Tensor]:
-    found = {}
+    found: dict[str, Tensor] = {}
     for number, own in enumerate(bins.values()):
         found |= {f"{place}.{number}.z": own.z, f"{place}.{number}.is_slip": own.is_slip}
     return found
