@@ -92,7 +92,7 @@ def _stepped(
     else:
         change = forget(statistics, before, bins)
     # what is to be taken out goes, whatever that costs
-    problem = change.verdict.problem(margin) if config.action == "add" else None
+    problem = change.problem(margin) if config.action == "add" else None
     entry = _entry(config, bins, change) | {"forced": problem is not None and bool(config.force)}
     is_accepted = problem is None or bool(config.force)
     solved = time.perf_counter()
@@ -219,8 +219,10 @@ def _entry(config: DictConfig, bins: Mapping[str, RecordingBins], change: Change
         "num_bins": sum(len(own.z) for own in bins.values()),
         "slip_free": bool(config.slip_free),
         "weight": change.weight,
+        "factor": change.factor,
         "tried": [[factor, fall] for factor, fall in change.tried.items()],
         "old": change.verdict.to_dict(),
+        "since_training": change.drift.to_dict(),
         "new": dict(change.new),
     }
 

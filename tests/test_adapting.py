@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.adapting.acceptance import OF_ONE, Verdict, compared, mean_recall
+from tactslip_torch.adapting import steps
+from tactslip_torch.adapting.acceptance import OF_ONE, Verdict, accuracies, compared, mean_recall
 from tactslip_torch.adapting.bins import RecordingBins, Witnesses, known_bins
 from tactslip_torch.adapting.held_out import class_scales, solve
 from tactslip_torch.adapting.statistics import Machine, Statistics
@@ -186,8 +187,8 @@ def test_only_what_was_put_in_can_be_taken_out(old, trained):
 def test_auto_takes_the_largest_weight_that_old_materials_allow(old, new):
     before = solve(old)
     found = add(old, before, new, None, margin=0.1)
-    factors = list(found.tried)
-    chosen = max(f for f in factors if found.tried[f] == found.verdict.mean_fall)
+    chosen = found.factor
+    assert found.tried[chosen] == found.verdict.mean_fall
     assert found.verdict.problem(OF_MARGIN * 0.1) is None
     (next_larger,) = [f for f in FACTORS if f > chosen][:1]
     by_hand = add(old, before, new, found.weight * next_larger / chosen, margin=0.1)
@@ -197,8 +198,46 @@ def test_auto_takes_the_largest_weight_that_old_materials_allow(old, new):
 
 def test_where_nothing_is_allowed_auto_tries_the_smallest_weight(old, new):
     found = add(old, solve(old), new, None, margin=0.0)
-    assert min(found.tried) == FACTORS[0]
+    assert min(found.tried) == found.factor == FACTORS[0]
     assert found.weight * 3 * NUM_BINS == pytest.approx(FACTORS[0] * 4 * NUM_BINS)
+
+
+def test_auto_passes_by_weights_that_lead_to_no_machine(old, new, monkeypatch):
+    def solved(statistics):
+        if statistics.weight_of("new/0") > most:
+            raise ValueError("no machine")
+        return solve(statistics)
+
+    before, unit = solve(old), 4 * NUM_BINS / (3 * NUM_BINS)
+    monkeypatch.setattr(steps, "solve", solved)
+    for largest in (FACTORS[0], FACTORS[2]):
+        most = 1.01 * largest * unit
+        found = add(old, before, new, None, margin=0.9)
+        assert found.factor == max(found.tried) == largest
+    most = 0.0
+    with pytest.raises(ValueError, match="no machine"):
+        add(old, before, new, None, margin=0.9)
+
+
+def test_small_steps_together_keep_the_margin(old):
+    at, before, falls = old, solve(old), []
+    first = before
+    for number in range(6):
+        more = recordings(f"new{number}", 2, 200 + 10 * number, turn=1.0)
+        change = add(at, before, more, 1.0, margin=1.0)
+        assert change.drift.before == {
+            n: accuracies(first, first.known.recordings)[n] for n in "abc"
+        }
+        assert change.drift.after == {n: change.verdict.after[n] for n in "abc"}
+        falls.append((change.verdict.mean_fall, change.drift.mean_fall))
+        entry = {"old": change.verdict.to_dict()}
+        at = taken(at, change, entry, torch.zeros(1, dtype=torch.uint8), f"{number}")
+        before = change.solved
+    step, together = falls[-1]
+    assert together > 2 * step
+    margin = (step + together) / 2
+    assert change.verdict.problem(margin) is None
+    assert change.problem(margin).startswith("since before the first step, ")
 
 
 def test_a_new_material_is_learned_and_later_ones_share_its_weight(old, new):

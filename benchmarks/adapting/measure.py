@@ -26,7 +26,7 @@ from tactslip_torch.adapting.bins import RecordingBins
 from tactslip_torch.adapting.held_out import Solved, solve
 from tactslip_torch.adapting.renewal import renewed
 from tactslip_torch.adapting.statistics import Statistics, detector_digest
-from tactslip_torch.adapting.steps import FACTORS, Change, add, taken, undo
+from tactslip_torch.adapting.steps import FACTORS, add, taken, undo
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.fitting import TrainingPass
@@ -211,19 +211,14 @@ def _way(
             for name, own in chosen.items()
         }
     change = add(subject.statistics, before, chosen, None, sizes.margin)
-    is_accepted = change.verdict.problem(sizes.margin) is None
+    is_accepted = change.problem(sizes.margin) is None
     head = change.solved.head if is_accepted else before.head
     return {
         "new": _score(head, judged),
         "old": _old_score(head, old),
-        "factor": _factor(change),
+        "factor": change.factor,
         "accepted": is_accepted,
     }
-
-
-def _factor(change: Change) -> float:
-    """Of those tried, the one that the change has."""
-    return next(of for of, fall in change.tried.items() if fall == change.verdict.mean_fall)
 
 
 def ceiling(

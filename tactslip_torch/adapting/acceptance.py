@@ -75,6 +75,12 @@ def compared(before: Solved, after: Solved) -> Verdict:
     return Verdict(*({name: of[name] for name in sorted(materials)} for of in scores))
 
 
+def since(before: Mapping[str, float], verdict: Verdict) -> Verdict:
+    """From an earlier ``before`` to a verdict's ``after``, of the materials in both."""
+    both = sorted(before.keys() & verdict.after.keys())
+    return Verdict({n: before[n] for n in both}, {n: verdict.after[n] for n in both})
+
+
 def accuracies(solved: Solved, recordings: Collection[str]) -> dict[str, float]:
     """Balanced accuracy of every material in these recordings, held out in closed form."""
     known, says_slip = solved.known, solved.scores >= 0

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.adapting.acceptance import Verdict, accuracies, compared, mean_recall
+from tactslip_torch.adapting.acceptance import (
+    Verdict,
+    accuracies,
+    compared,
+    mean_recall,
+    since,
+)
 from tactslip_torch.adapting.bins import RecordingBins
 from tactslip_torch.adapting.held_out import Solved, solve
 from tactslip_torch.adapting.statistics import Statistics, Step
@@ -32,8 +39,10 @@ class Change:
         statistics: after it.
         solved: their machine.
         verdict: old materials, before and after.
+        drift: those of them that there were before the first step, as they were then, and after.
         weight: of a bin that was added; ``None`` where none was.
-        tried: weights in parts of an average old material, each with the mean fall it brought.
+        factor: the weight in parts of an average old material, where ``auto`` chose it.
+        tried: such parts, each with the mean fall it brought; those that led to a machine.
         new: balanced accuracy of the recordings that were added: ``before``, by the machine that
             never met them, and ``after``, each without its own recording; of a lone recording that
             is ``None``.
@@ -42,9 +51,23 @@ class Change:
     statistics: Statistics
     solved: Solved
     verdict: Verdict
+    drift: Verdict
     weight: float | None = None
+    factor: float | None = None
     tried: Mapping[float, float] = field(default_factory=dict)
     new: Mapping[str, float | None] = field(default_factory=dict)
+
+    def problem(self, margin: float, share: float = 1.0) -> str | None:
+        """Why the old materials do not allow it, in a line; ``None`` if they do.
+
+        Args:
+            margin: that their mean may fall by, by all steps together.
+            share: the part of it that this step may take.
+        """
+        if problem := self.verdict.problem(share * margin):
+            return problem
+        problem = self.drift.problem(margin)
+        return problem and f"since before the first step, {problem}"
 
 
 def add(
@@ -63,12 +86,13 @@ def add(
         before: their machine.
         bins: of the recordings, by name; of one material.
         weight: of a bin, where one of training has 1; ``None`` for ``auto``, the largest of
-            ``FACTORS`` by which old materials keep ``OF_MARGIN`` of the margin.
+            ``FACTORS`` by which old materials keep ``OF_MARGIN`` of the margin, in all steps the
+            margin; a weight that leads to no machine is too large.
         margin: that the old materials' mean may fall by.
 
     Raises:
         ValueError: if a recording is in already, there are several materials or no bins, the weight
-            is not positive, or as ``solve``.
+            is not positive, or as ``solve``; of ``auto``, at the smallest weight.
     """
     _check_new(statistics, bins)
     if weight is not None and not 0 < weight < MOST_WEIGHT:
@@ -86,7 +110,7 @@ def add(
     def change(value: float) -> Change:
         after = statistics.reweighed(dict.fromkeys(mine, value), bins)
         solved = solve(after)
-        return Change(after, solved, compared(before, solved), value)
+        return _change(statistics, before, after, solved, value)
 
     if weight is not None:
         chosen = change(weight)
@@ -95,11 +119,14 @@ def add(
         low, high = 0, len(FACTORS)  # the largest that is accepted is among low..high-1
         while high - low > 1:
             middle = (low + high) // 2
-            tried = changes[FACTORS[middle]] = change(FACTORS[middle] * unit)
-            is_fine = tried.verdict.problem(OF_MARGIN * margin) is None
+            factor = FACTORS[middle]
+            with suppress(ValueError):
+                changes[factor] = replace(change(factor * unit), factor=factor)
+            is_fine = factor in changes and changes[factor].problem(margin, OF_MARGIN) is None
             low, high = (middle, high) if is_fine else (low, middle)
-        chosen = changes.get(FACTORS[low]) or change(FACTORS[low] * unit)
-        changes[FACTORS[low]] = chosen
+        factor = FACTORS[low]
+        chosen = changes.get(factor) or replace(change(factor * unit), factor=factor)
+        changes[factor] = chosen
     tried_falls = {factor: of.verdict.mean_fall for factor, of in sorted(changes.items())}
     return replace(chosen, tried=tried_falls, new=_new_scores(before, chosen.solved, bins))
 
@@ -124,8 +151,19 @@ def forget(
             f"{absent[0]} is not in these statistics; action=list shows what was added"
         )
     after = statistics.reweighed(dict.fromkeys(bins, 0.0), bins)
-    solved = solve(after)
-    return Change(after, solved, compared(before, solved))
+    return _change(statistics, before, after, solve(after))
+
+
+def _change(
+    statistics: Statistics,
+    before: Solved,
+    after: Statistics,
+    solved: Solved,
+    weight: float | None = None,
+) -> Change:
+    verdict = compared(before, solved)
+    first = statistics.steps[0].entry.get("old", {}).get("before") if statistics.steps else None
+    return Change(after, solved, verdict, since(first or verdict.before, verdict), weight)
 
 
 def undo(statistics: Statistics) -> tuple[Statistics, Tensor]:
