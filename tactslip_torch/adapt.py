@@ -24,6 +24,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.adapting.bins import RecordingBins
 from tactslip_torch.adapting.held_out import solve
+from tactslip_torch.adapting.lock import locked
+from tactslip_torch.adapting.naming import check_once, known_names, materials_of
 from tactslip_torch.adapting.reading import recording_bins
 from tactslip_torch.adapting.renewal import renewed
 from tactslip_torch.adapting.statistics import (
@@ -32,12 +34,12 @@ from tactslip_torch.adapting.statistics import (
     detector_digest,
     statistics_of,
 )
-from tactslip_torch.adapting.steps import Change, add, forget, taken, undo
+from tactslip_torch.adapting.steps import Change, add, check_weight, forget, taken, undo
 from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.experiment import DTYPES, feature_cache, save_config, versions
-from tactslip_torch.export import export_detector
+from tactslip_torch.export import export_detector, stale_graphs
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.files import whole_file
 from tactslip_torch.model.detector import SlipDetector
@@ -67,15 +69,23 @@ def adapt(config: DictConfig, folder: Path) -> dict[str, Any]:
     if config.action not in actions:
         raise ValueError(f"action must be one of {', '.join(actions)}, got {config.action!r}")
     model = Path(config.model)
-    detector = SlipDetector.load(model)
-    if config.action == "undo":
-        return _undone(model, detector)
-    statistics = statistics_of(model, detector)
+    detector = SlipDetector.load(model)  # says what is amiss before anything is written
     if config.action == "list":
-        journal = [dict(step.entry) for step in statistics.steps]
+        journal = [dict(step.entry) for step in statistics_of(model, detector).steps]
         print(journal_table(journal))
         return {"steps": journal}
-    return _stepped(config, folder, detector, statistics)
+    with locked(model):
+        detector = SlipDetector.load(model)  # as nobody else changes it any more
+        if config.action == "undo":
+            found = _undone(model, detector)
+        else:
+            found = _stepped(config, folder, detector, statistics_of(model, detector))
+    if stale := stale_graphs(model):
+        print(
+            f"{', '.join(path.name for path in stale)} beside it: of another detector; "
+            f"python -m tactslip_torch.export model={model} writes anew"
+        )
+    return found
 
 
 def _stepped(
@@ -174,8 +184,10 @@ def _bins(
     config: DictConfig, detector: SlipDetector, statistics: Statistics
 ) -> dict[str, RecordingBins]:
     """Bins of the recordings that are given or, to forget, of those named."""
-    if config.action == "forget" and config.recordings is None:
-        return _remembered(config.material, statistics)
+    is_new, material = config.action == "add", config.material
+    material = None if material is None else str(material)  # 3 is a number to Hydra
+    if not is_new and config.recordings is None:
+        return _remembered(material, statistics)
     if OmegaConf.is_missing(config.data, "root") or config.data.root is None:
         raise ValueError(
             "no value for recordings; give recordings=FOLDER, a folder with a manifest"
@@ -188,9 +200,25 @@ def _bins(
     dtype = DTYPES[detector.info.get("features_dtype", "float64")]
     with feature_cache(config.cache) as cache:
         maker = FeatureMaker(source, detector.pool, detector.channel_filter, rule, cache, dtype)
-        return recording_bins(
-            detector, maker, bar, material=config.material, slip_free=bool(config.slip_free)
+        keys = detector.info.get("train_recordings", {})
+        names_in = known_names(statistics, keys, is_in=True)
+        names, taken_names = names_in, set()
+        if is_new:  # one that was forgotten gets its name again, others what they are to be called
+            ever = known_names(statistics, keys, is_in=False)
+            names = {key: name for key, name in ever.items() if name[1] == material}
+            taken_names = set(materials_of(statistics))
+        found = recording_bins(
+            detector,
+            maker,
+            bar,
+            material=material,
+            slip_free=bool(config.slip_free),
+            names=names,
+            taken=taken_names,
         )
+    if is_new:
+        check_once(found, names_in)
+    return found
 
 
 def _remembered(material: str | None, statistics: Statistics) -> dict[str, RecordingBins]:
@@ -203,8 +231,8 @@ def _remembered(material: str | None, statistics: Statistics) -> dict[str, Recor
     if not mine:
         known = sorted({b.material for n, b in statistics.bins.items() if statistics.weight_of(n)})
         raise ValueError(
-            f"forget takes material= one that was added ({', '.join(known) or 'there is none'}), "
-            f"got {material}; of what was trained on it needs recordings=FOLDER"
+            f"action=forget needs material= one that was added ({', '.join(known) or 'none was'}), "
+            f"or recordings=FOLDER, got {f'material={material}' if material else 'neither'}"
         )
     return mine
 
@@ -240,6 +268,7 @@ def _weight(value: Any) -> float | None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"weight must be auto or a positive number, got {value!r}")
+    check_weight(float(value))
     return float(value)
 
 

@@ -101,6 +101,20 @@ def sidecar_facts(path: Path) -> dict[str, Any]:
     return facts
 
 
+def stale_graphs(model: Path) -> tuple[Path, ...]:
+    """Graphs beside a detector's file that are of another one, or do not say of which."""
+    digest = hashlib.sha256(model.read_bytes()).hexdigest()
+    paths = [model.with_name(name) for name in FILES.values()]
+    return tuple(path for path in paths if path.is_file() and _detector_of(path) != digest)
+
+
+def _detector_of(path: Path) -> str | None:
+    try:
+        return str(sidecar_facts(path)["detector_sha256"])
+    except (OSError, ValueError, KeyError):
+        return None
+
+
 def worst_error(facts: dict[str, Any]) -> float:
     """The largest score error that a model's check measured, in standard deviations."""
     check = facts["check"]

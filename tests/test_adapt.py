@@ -1,5 +1,6 @@
 """``adapt`` as a command: what it leaves, takes back and refuses, on files of a tiny hand."""
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from tactslip_torch import adapt as module
 from tactslip_torch.adapt import adapt
 from tactslip_torch.adapting.acceptance import Verdict
 from tactslip_torch.adapting.held_out import class_scales
+from tactslip_torch.adapting.lock import locked
 from tactslip_torch.adapting.statistics import Statistics, detector_digest
 from tactslip_torch.adapting.steps import add
 from tactslip_torch.config import conf_dir, one_line
@@ -243,6 +245,79 @@ def test_a_step_cut_off_between_its_files_is_told_and_taken_back(run, files, tra
     assert content(run) == content(trained)
 
 
+def test_a_second_visit_is_numbered_on_and_known_recordings_are_found_again(run, files, tmp_path):
+    more = write_files(tmp_path / "more", ["C"], cycles=2, seed=1)
+    add_c(run, files, "weight=2", "material=3")
+    visit = f"recordings={more}", "material=3", "weight=2", "force=true"
+    assert adapt(settings(run, *visit), run / "results")["recordings"] == ["3/4", "3/5"]
+    first = f"recordings={files}", "data.materials=[C]"
+    found = adapt(settings(run, "action=forget", *first), run / "results")
+    assert (found["recordings"], found["materials"]) == ([f"3/{i}" for i in range(4)], ["3"])
+    found = add_c(run, files, "weight=2", "material=3", "force=true")
+    assert found["recordings"] == [f"3/{i}" for i in range(4)]
+
+
+def test_no_recording_comes_in_twice_by_another_name(run, files, tmp_path):
+    add_c(run, files, "weight=2", "material=wood")
+    state = content(run)
+    for again in ([], ["material=steel"], ["material=wood"]):
+        with pytest.raises(ValueError, match=r"is in already.*; action=forget takes it out first"):
+            add_c(run, files, "weight=2", *again)
+    twins = write_files(tmp_path / "twins", ["D"], cycles=2, seed=1)
+    one, other = sorted(twins.glob("D*.npz"))
+    other.write_bytes(one.read_bytes())
+    with pytest.raises(ValueError, match="D/1 is the same recording as D/0; give it once"):
+        adapt(settings(run, f"recordings={twins}", "weight=2"), run / "results")
+    assert content(run) == state
+
+
+def test_what_was_trained_on_does_not_come_in_again(run, files):
+    detector = SlipDetector.load(run / "detector.pt")
+    add_c(run, files, "weight=2", "material=wood")
+    key = SlipDetector.load(run / "detector.pt").info["train_recordings"]["wood/1"]
+    adapt(settings(run, "action=undo"), run / "results")
+    known = detector.info["train_recordings"]
+    trained_on = next(name for name in known if name.startswith("A"))
+    detector.info["train_recordings"] = known | {trained_on: key}
+    detector.save(run / "detector.pt")
+    with pytest.raises(ValueError, match=f"wood/1 is in already as {trained_on}"):
+        add_c(run, files, "weight=2", "material=wood")
+
+
+def test_two_programs_do_not_change_a_detector_at_once(run, files):
+    state = content(run)
+    with locked(run / "detector.pt"), pytest.raises(ValueError, match="another adapt is changing"):
+        add_c(run, files, "weight=2")
+    assert content(run) == state
+    add_c(run, files, "weight=2")
+    assert not list(run.glob(".*"))
+    (run / ".detector.pt.lock").touch()  # of a program that was killed
+    with pytest.raises(ValueError, match=r"if none runs any more, remove .*\.detector\.pt\.lock$"):
+        adapt(settings(run, "action=undo"), run / "results")
+    adapt(settings(run, "action=list"), run / "results")
+
+
+def test_graphs_of_the_detector_before_are_told(run, files, capsys):
+    def of(content):
+        (run / "model.onnx").touch()
+        facts = {"detector_sha256": hashlib.sha256(content).hexdigest()}
+        (run / "model.onnx.json").write_text(json.dumps(facts))
+
+    before = content(run)[0]
+    of(before)
+    add_c(run, files, "weight=2")
+    told = "model.onnx beside it: of another detector; python -m tactslip_torch.export model="
+    assert told in capsys.readouterr().out
+    adapt(settings(run, "action=undo"), run / "results")
+    assert told not in capsys.readouterr().out
+    (run / "model.onnx.json").unlink()
+    adapt(
+        settings(run, f"recordings={files}", "data.materials=[C]", "weight=2", "force=true"),
+        run / "results",
+    )
+    assert told in capsys.readouterr().out
+
+
 def test_graphs_are_written_anew_where_asked_for(run, files, monkeypatch):
     written = []
 
@@ -268,7 +343,11 @@ def test_graphs_are_written_anew_where_asked_for(run, files, monkeypatch):
         (["recordings=nowhere"], "no folder at nowhere"),
         (["weight=heavy"], "weight must be auto or a positive number, got 'heavy'"),
         (["margin=5"], "margin must lie in"),
-        (["action=forget", "material=D"], "forget takes material= one that was added"),
+        (["weight=nan"], "weight must be auto or a positive number below 8000, got nan"),
+        (["weight=-1"], "weight must be auto or a positive number below 8000, got -1"),
+        (["weight=0"], "weight must be auto or a positive number below 8000, got 0"),
+        (["action=forget", "material=D"], "action=forget needs material= one that was added"),
+        (["action=forget"], "action=forget needs material= one that was added (none was), or rec"),
         (["action=undo"], "nothing to undo"),
     ],
 )

@@ -639,12 +639,15 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "adapting.acceptance",
     ),
     "adapting.renewal": (
+        "adapting.bins",
         "adapting.statistics",
         "adapting.held_out",
         "model.*",
         "onset.settings",
         "fitting",
     ),
+    "adapting.naming": ("adapting.bins", "adapting.statistics"),
+    "adapting.lock": (),
     "adapting.reading": (
         "adapting.bins",
         "feature_maker",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +24,8 @@ def recording_bins(
     *,
     material: str | None = None,
     slip_free: bool = False,
+    names: Mapping[str, tuple[str, str]] | None = None,
+    taken: Collection[str] = (),
 ) -> dict[str, RecordingBins]:
     """The bins of every recording of a source, by name; those without a labelled bin are left out.
 
@@ -32,23 +35,31 @@ def recording_bins(
         progress: shows which recording is read.
         material: to call them, whatever they are called; they are numbered then in their order.
         slip_free: take the bins without slip alone.
+        names: what recordings are called and their materials, by key, whatever else holds.
+        taken: names that none is numbered to.
 
     Raises:
         ValueError: if a recording cannot be read.
     """
     ids = maker.source.ids
     everyone = Split("adapt", dict.fromkeys(ids, "train"))
-    found = {}
-    for number, recording in enumerate(progress(ids, "features, new recordings", "recording")):
-        name = _renamed(recording, material, number)
+    found, number = {}, itertools.count()
+    for recording in progress(ids, "features, new recordings", "recording"):
+        key = cache_key(maker.source.key(recording))
+        name, called = (names or {}).get(key) or _named(recording, material, number, taken)
         made = maker(recording, everyone)
         kept = ~made.is_slip if slip_free else made.is_slip | True
         z = detector.scaler(made.features[kept][:, list(detector.selected)].double())
-        key = cache_key(maker.source.key(recording))
         if len(z):
-            found[str(name)] = RecordingBins(name.material, z, made.is_slip[kept], key)
+            found[name] = RecordingBins(called, z, made.is_slip[kept], key)
     return found
 
 
-def _renamed(recording: RecordingId, material: str | None, number: int) -> RecordingId:
-    return recording if material is None else replace(recording, material=material, cycle=number)
+def _named(
+    recording: RecordingId, material: str | None, number: Iterator[int], taken: Collection[str]
+) -> tuple[str, str]:
+    """Name and material; of one that is renamed the next number that is free."""
+    if material is None:
+        return str(recording), recording.material
+    names = (str(replace(recording, material=material, cycle=cycle)) for cycle in number)
+    return next(name for name in names if name not in taken), material

@@ -95,10 +95,7 @@ def add(
             is not positive, or as ``solve``; of ``auto``, at the smallest weight.
     """
     _check_new(statistics, bins)
-    if weight is not None and not 0 < weight < MOST_WEIGHT:
-        raise ValueError(
-            f"weight must be auto or a positive number below {MOST_WEIGHT:g}, got {weight:g}"
-        )
+    check_weight(weight)
     material = next(iter(bins.values())).material
     mine = dict(bins) | {
         name: own
@@ -201,6 +198,18 @@ def taken(
     replaced = {name: own for name, own in before.bins.items() if own is not after.bins[name]}
     step = Step(entry, before.weights, moved, replaced, before.detector, file)
     return replace(after, steps=(*before.steps, step), detector=digest)
+
+
+def check_weight(weight: float | None) -> None:
+    """Refuse what is no weight of a bin; ``None`` stands for ``auto``.
+
+    Raises:
+        ValueError: if it is not positive, or too large.
+    """
+    if weight is not None and not 0 < weight < MOST_WEIGHT:
+        raise ValueError(
+            f"weight must be auto or a positive number below {MOST_WEIGHT:g}, got {weight:g}"
+        )
 
 
 def _check_new(statistics: Statistics, bins: Mapping[str, RecordingBins]) -> None:
