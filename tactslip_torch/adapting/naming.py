@@ -45,13 +45,11 @@ def check_once(bins: Mapping[str, RecordingBins], names_in: Mapping[str, tuple[s
     Raises:
         ValueError: if one is in already, or is there twice, by whatever name.
     """
-    names = {key: name for key, (name, _) in names_in.items()}
+    first: dict[str, str] = {}
     for name, own in bins.items():
-        if not own.key:
-            continue
-        if own.key in names and own.key in names_in:
-            called = "" if names[own.key] == name else f" as {names[own.key]}"
+        if own.key in names_in:
+            known, _ = names_in[own.key]
+            called = "" if known == name else f" as {known}"
             raise ValueError(f"{name} is in already{called}; action=forget takes it out first")
-        if own.key in names:
-            raise ValueError(f"{name} is the same recording as {names[own.key]}; give it once")
-        names[own.key] = name
+        if (other := first.setdefault(own.key, name)) != name:
+            raise ValueError(f"{name} is the same recording as {other}; give it once")
