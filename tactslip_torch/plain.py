@@ -13,6 +13,20 @@ def is_recorded() -> bool:
     return bool(is_traced or torch.compiler.is_compiling())
 
 
+def has_values(x: Tensor) -> bool:
+    """Whether a decision may be taken on the values, wherever they lie and whatever comes along.
+
+    Not so where a graph is recorded or ``x`` is transformed (vmap, func.grad, jvp).
+    """
+    if is_recorded():
+        return False
+    try:
+        x.detach().flatten()[:0].cpu().numpy()  # of what is transformed not even nothing
+    except RuntimeError:
+        return False
+    return True
+
+
 def is_plain(x: Tensor) -> bool:
     """Whether only values are asked for, and lie in memory that can be looked at.
 

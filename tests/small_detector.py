@@ -66,9 +66,9 @@ def small_detector(
     return SlipDetector(pool, channel_filter, selected, scaler, machine, facts, engine=engine)
 
 
-def alarming_detector() -> SlipDetector:
+def alarming_detector(seed: int = 0) -> SlipDetector:
     """The small detector, with settings by which the simulated slip raises alarms."""
-    made = small_detector(engine="eager")
+    made = small_detector(seed, engine="eager")
     scores = score_stream(made, simulated_stream(HAND, 2000.0, torch.float64), 20).score
     rise = 2.0 / float(scores.std())
     settings = AlarmSettings(

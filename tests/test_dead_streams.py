@@ -14,8 +14,8 @@ from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 
 
-def alarming_with_gaussians():
-    made = alarming_detector()
+def alarming_with_gaussians(seed=0):
+    made = alarming_detector(seed)
     z = made.scaler(made.pool(made.channel_filter.valid(raw_bins(200, 5)))[:, list(made.selected)])
     made.gaussians = ClassGaussians.fit(z, made.head(z) >= 0)
     return made
@@ -42,6 +42,18 @@ def test_a_dead_channel_of_a_stream_is_as_one_of_nan(detector, samples):
     for each, expected in zip(found, whole, strict=True):
         torch.testing.assert_close(each, expected, rtol=1e-9, atol=1e-9)
     assert not found.is_valid.any()
+
+
+def test_a_channel_that_no_feature_needs_may_die(samples):
+    """Once refused by torch, which lists no patterns of no bins."""
+    detector = alarming_with_gaussians(seed=4)
+    assert "SG1" not in {name.channel for name in detector.selected_names}
+    whole = StreamingDetector(detector, dtype=torch.float64).push(samples.T)
+    found = StreamingDetector(detector, dtype=torch.float64, dead=["SG1"]).push(samples.T)
+    assert torch.equal(found.score, whole.score)
+    assert torch.equal(found.llr, whole.llr)
+    assert torch.equal(found.is_valid, whole.is_valid)
+    assert whole.is_valid.any()
 
 
 def test_probability_and_statistic_are_of_the_widened_ratio(detector, samples):

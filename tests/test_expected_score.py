@@ -1,5 +1,8 @@
 """The expected score without some features, against quadrature and SciPy's Gaussians."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -73,6 +76,23 @@ def test_bins_that_miss_other_features_are_judged_each_by_their_own(rng):
         torch.testing.assert_close(found, torch.cat(each), rtol=1e-12, atol=1e-12)
 
 
+def test_each_bin_alone_where_patterns_cannot_be_looked_at(rng):
+    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    z = torch.from_numpy(rng.uniform(-1, 1, (30, NUM)))
+    is_missing = torch.from_numpy(rng.integers(0, 4, (30, 1)) == np.arange(NUM) % 4)
+    is_missing[0], is_missing[1] = False, True
+    for found, each in zip(
+        torch.vmap(expected)(z, is_missing), expected(z, is_missing), strict=True
+    ):
+        torch.testing.assert_close(found, each, rtol=1e-12, atol=1e-12)
+
+
+def test_no_bins_have_no_scores(rng):
+    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    mean, variance = expected(torch.zeros(0, NUM), torch.zeros(0, NUM).bool())
+    assert mean.shape == variance.shape == (0,)
+
+
 def test_nothing_missing_is_the_score_itself_and_certain(rng):
     head = head_of(rng)
     z = torch.from_numpy(rng.uniform(-1, 1, (4, NUM)))
@@ -113,6 +133,23 @@ def test_masks_are_made_once_and_the_oldest_forgotten(rng, monkeypatch):
     for feature in (0, 1, 0, 2, 0, 1):
         expected(z, torch.arange(NUM)[None] == feature)
     assert [int(mask.nonzero()) for mask in made] == [0, 1, 2, 1]
+
+
+def test_threads_may_share_what_is_kept(rng, monkeypatch):
+    """Once a KeyError, where one thread forgot what another had just found."""
+    monkeypatch.setattr(expected_score, "MOST_KEPT", 1)
+    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    masks = torch.eye(3, NUM, dtype=torch.bool)
+    z = torch.zeros(1, NUM, dtype=torch.float64)
+    alone = [float(expected(z, mask[None])[0]) for mask in masks]
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            found = pool.map(lambda i: float(expected(z, masks[i % 3][None])[0]), range(900))
+            assert list(found) == alone * 300
+    finally:
+        sys.setswitchinterval(before)
 
 
 def test_gaussians_of_many_bins_are_those_they_were_drawn_from(rng):

@@ -9,6 +9,7 @@ from test_detector import noise, random_detector
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.files import load_table, save_table
+from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.detector_file import FORMAT
 from tactslip_torch.model.scaling import FeatureScaler
@@ -17,9 +18,15 @@ from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 BAD = [float("nan"), float("inf"), -float("inf"), 1e308]
 
 
-@pytest.fixture(scope="module")
-def detector():
-    return random_detector()
+@pytest.fixture(scope="module", params=["typical", "gaussians"])
+def detector(request):
+    """With typical features alone, and with Gaussians of the features."""
+    made = random_detector()
+    if request.param == "gaussians":
+        bins = made.channel_filter.valid(noise(100, seed=5))
+        z = made.scaler(made.pool(bins)[:, list(made.selected)])
+        made.gaussians = ClassGaussians.fit(z, made.head(z) >= 0)
+    return made
 
 
 def used_channel(detector):
@@ -70,15 +77,21 @@ def test_a_missing_channel_gives_its_typical_features(bad, detector):
     assert detector(bins)[2].isnan() or bad == 1e308
 
 
-@pytest.mark.parametrize("bad", BAD)
-def test_a_channel_no_feature_needs_does_not_spoil_validity(bad, detector):
-    samples = noise(3)
+@pytest.mark.parametrize("num", [3, 30])
+@pytest.mark.parametrize("bad", [*BAD, "dead"])
+def test_a_channel_no_feature_needs_changes_nothing(bad, num, detector):
+    """Once an error of torch, of every detector with Gaussians: no bin to take the patterns of."""
+    samples, unused = noise(num), unused_channel(detector)
     expected = detector.judge_raw(samples)
-    samples[1, unused_channel(detector)] = bad
-    judged = detector.judge_raw(samples)
+    if bad == "dead":
+        judged = detector.judge_raw(samples, dead=[detector.pool.hand.names[unused]])
+    else:
+        samples[:, unused] = bad
+        judged = detector.judge_raw(samples)
     assert torch.equal(judged.score, expected.score)
+    assert torch.equal(judged.variance, torch.zeros_like(judged.score))
     assert judged.is_valid.all()
-    assert judged.is_missing[1].sum() == 1
+    assert judged.is_missing.sum(-1).tolist() == [1] * num
 
 
 @pytest.mark.parametrize("bad", BAD[:3])
@@ -118,9 +131,13 @@ def test_every_extreme_gives_a_finite_score_or_a_flag(kind, dtype, detector):
         assert judged.is_valid.float().mean() > 0.9
 
 
-def test_all_channels_missing_gives_the_typical_score(detector):
+def test_all_channels_missing_gives_the_score_of_what_is_known_beforehand(detector):
+    """That of typical features, or the mean over both classes, alike in number."""
     judged = detector.judge(torch.full((2, 24, 100), torch.nan))
     expected = detector.head(detector.typical)
+    if (known := detector.gaussians) is not None:
+        lift = (detector.head.quadratic * known.covariance).sum((-2, -1))
+        expected = (detector.head(known.mean) + lift).mean()
     torch.testing.assert_close(judged.score.double(), expected.expand(2), rtol=1e-6, atol=1e-7)
     assert not judged.is_valid.any()
 

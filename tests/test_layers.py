@@ -405,13 +405,14 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "files",
     ),
     "model.class_gaussians": (),
-    "model.expected_score": ("model.class_gaussians", "model.quadratic"),
+    "model.expected_score": ("model.class_gaussians", "model.quadratic", "plain"),
     "model.missing": (
         "features.pool",
         "model.class_gaussians",
         "model.detector_file",
         "model.expected_score",
         "model.quadratic",
+        "plain",
     ),
     "model.widening": ("model.calibration",),
     "model.agreement": (

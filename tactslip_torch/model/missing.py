@@ -12,6 +12,7 @@ from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector_file import Head
 from tactslip_torch.model.expected_score import ExpectedScore
 from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.plain import has_values
 
 Dead = Sequence[str] | Tensor
 """Channels that are not to be listened to: their names, or a mask ``[C]``, bool."""
@@ -88,7 +89,8 @@ class MissingScores:
         self._expected: ExpectedScore | None = None
         if gaussians is not None and isinstance(head, QuadraticForm):
             self._expected = ExpectedScore(head, gaussians)
-        self._of = _stamps(head, typical, channel_index, gaussians)
+        of = _tensors(head, typical, channel_index, gaussians)
+        self._stamps = [(each, _state(each)) for each in of]
 
     def is_of(
         self,
@@ -98,11 +100,8 @@ class MissingScores:
         gaussians: ClassGaussians | None,
     ) -> bool:
         """Whether it was made of these, none of them replaced or changed since."""
-        now = _stamps(head, typical, channel_index, gaussians)
-        return len(now) == len(self._of) and all(
-            new is old and version == before
-            for (new, version), (old, before) in zip(now, self._of, strict=True)
-        )
+        now = _tensors(head, typical, channel_index, gaussians)
+        return len(now) == len(self._stamps) and all(map(_is_as_stamped, now, self._stamps))
 
     def __call__(self, score: Tensor, scaled: Tensor, is_missing: Tensor) -> tuple[Tensor, Tensor]:
         """Scores and their variances; those of bins that miss no feature are as they came, and 0.
@@ -115,12 +114,18 @@ class MissingScores:
         """
         is_lost = is_missing.index_select(-1, self._channel_index)
         rows = is_lost.any(-1)
-        variance = torch.zeros_like(score)
+        if has_values(rows):
+            mean, spread = self._of(scaled[rows], is_lost[rows])
+            return _put(score, rows, mean), _put(torch.zeros_like(score), rows, spread)
+        mean, spread = (saturating(each, score.dtype) for each in self._of(scaled, is_lost))
+        return torch.where(rows, mean, score), torch.where(rows, spread, 0.0)
+
+    def _of(self, scaled: Tensor, is_lost: Tensor) -> tuple[Tensor, Tensor]:
+        """Of features ``[*, K]``, and which of them are missing."""
         if self._expected is None:
-            filled = torch.where(is_lost, self._typical, scaled)[rows]
-            return _put(score, rows, self._head(filled)), variance
-        mean, spread = self._expected(scaled[rows], is_lost[rows])
-        return _put(score, rows, mean), _put(variance, rows, spread)
+            score = self._head(torch.where(is_lost, self._typical, scaled))
+            return score, torch.zeros_like(score)
+        return self._expected(scaled, is_lost)
 
 
 def _put(values: Tensor, where: Tensor, others: Tensor) -> Tensor:
@@ -128,10 +133,20 @@ def _put(values: Tensor, where: Tensor, others: Tensor) -> Tensor:
     return values.masked_scatter(where, saturating(others, values.dtype))
 
 
-def _stamps(
+def _tensors(
     head: Head, typical: Tensor, channel_index: Tensor, gaussians: ClassGaussians | None
-) -> list[tuple[Tensor, int]]:
-    """Tensors, each with how often it was changed in place."""
+) -> list[Tensor]:
     of_features = [] if gaussians is None else gaussians.buffers()
-    tensors = [*head.buffers(), typical, channel_index, *of_features]
-    return [(each, each._version) for each in tensors]
+    return [*head.buffers(), typical, channel_index, *of_features]
+
+
+def _state(x: Tensor) -> int | Tensor:
+    """How often a tensor was changed in place; of inference tensors, which do not count, a copy."""
+    return x.clone() if x.is_inference() else x._version
+
+
+def _is_as_stamped(x: Tensor, stamp: tuple[Tensor, int | Tensor]) -> bool:
+    same, state = stamp
+    if x is not same:
+        return False
+    return torch.equal(x, state) if isinstance(state, Tensor) else x._version == state

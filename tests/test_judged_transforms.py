@@ -1,0 +1,137 @@
+"""Judgements under vmap, func.grad, jvp, a trace, torch.compile and inference mode."""
+
+import warnings
+
+import pytest
+import torch
+from small_detector import raw_bins, small_detector
+from test_missing import with_gaussians
+
+from tactslip_torch.model.detector import SlipDetector
+
+SEED = 4  # of a detector that needs no SG1
+
+
+@pytest.fixture(scope="module", params=["typical", "gaussians"])
+def detector(request):
+    return {"typical": small_detector, "gaussians": with_gaussians}[request.param](seed=SEED)
+
+
+def healthy_bins(detector):
+    return detector.channel_filter.valid(raw_bins(6))
+
+
+def broken_bins(detector):
+    """Bins that miss nothing, what no feature needs, a sensor, two (twice), and all."""
+    bins = healthy_bins(detector)
+    bins[1, 0, 50] = bins[2, 2, 50] = torch.nan
+    bins[3:5, 1:3, 50] = torch.inf
+    bins[5] = torch.nan
+    return bins
+
+
+BINS = pytest.mark.parametrize("bins_of", [healthy_bins, broken_bins])
+
+
+def assert_same(found, expected, most=1e-9):
+    for each, wanted in zip(found, expected, strict=True):
+        torch.testing.assert_close(each, wanted, rtol=most, atol=most)
+
+
+def gradient_of(detector, bins):
+    """Of the sum of the scores; the patterns are looked at here, and bins go by them."""
+    bins = bins.clone().requires_grad_()
+    detector.judge(bins).score.sum().backward()
+    return bins.grad
+
+
+@BINS
+def test_mapped_over_bins(bins_of, detector):
+    bins = bins_of(detector)
+    assert_same(torch.vmap(detector.judge)(bins), detector.judge(bins))
+    dead = ["SG2", "PVDF2"]
+    mapped = torch.vmap(lambda part: detector.judge(part, dead=dead))(bins)
+    assert_same(mapped, detector.judge(bins, dead=dead))
+
+
+@BINS
+def test_gradients_are_those_of_backward(bins_of, detector):
+    bins = bins_of(detector)
+    expected = gradient_of(detector, bins)
+    assert expected.isfinite().all()
+    assert expected[0].abs().max() > 0
+
+    def score(part):
+        return detector.judge(part).score.sum()
+
+    for take in (torch.func.grad(score), torch.vmap(torch.func.grad(score))):
+        torch.testing.assert_close(take(bins), expected, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script. is deprecated")  # torch's own, in jvp
+@BINS
+def test_tangents_are_those_of_backward(bins_of, detector):
+    bins = bins_of(detector)
+    direction = torch.randn(bins.shape, generator=torch.Generator().manual_seed(2)).double()
+    score, slope = torch.func.jvp(lambda x: detector.judge(x).score, (bins,), (direction,))
+    torch.testing.assert_close(score, detector.judge(bins).score, rtol=1e-9, atol=1e-9)
+    expected = (gradient_of(detector, bins) * direction).sum((-2, -1))
+    torch.testing.assert_close(slope, expected, rtol=1e-8, atol=1e-8)
+
+
+@BINS
+def test_a_trace_holds_for_other_bins(bins_of, detector):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # tracing is deprecated, and says so
+        given = healthy_bins(detector)
+        traced = torch.jit.trace(lambda x: tuple(detector.judge(x)), given, check_trace=False)
+        bins = bins_of(detector).flip(0)
+        # a trace keeps the table of entropies in float32
+        assert_same(traced(bins), detector.judge(bins), most=1e-4)
+
+
+def test_compiled_it_holds_for_other_bins(detector, monkeypatch):
+    """With samples for features, as capturing the descriptors takes half a minute."""
+
+    def samples(bins):
+        return bins.index_select(-2, detector.channel_index)[..., 7]
+
+    monkeypatch.setattr(detector, "_features", samples)
+    torch.compiler.reset()
+    compiled = torch.compile(detector.judge, backend="eager")  # capture alone, without a compiler
+    for bins in (healthy_bins(detector), broken_bins(detector)):
+        assert_same(compiled(bins), detector.judge(bins))
+
+
+# Inference mode ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["loaded", "moved"])
+def test_what_is_made_under_inference_mode_judges_what_is_missing(how, detector, tmp_path):
+    """Once refused by torch: tensors of that mode do not count how often they are changed."""
+    bins = broken_bins(detector)
+    detector.save(tmp_path / "detector.pt")
+    with torch.inference_mode():
+        made = SlipDetector.load(tmp_path / "detector.pt")
+        if how == "moved":
+            made = made.float().double()
+        inside = made.judge(bins)
+    for found in (inside, made.judge(bins)):
+        torch.testing.assert_close(found.score, detector.judge(bins).score, rtol=1e-5, atol=1e-5)
+
+
+def test_a_change_under_inference_mode_is_followed(tmp_path):
+    with_gaussians(seed=SEED).save(tmp_path / "detector.pt")
+    with torch.inference_mode():
+        made = SlipDetector.load(tmp_path / "detector.pt")
+        bins = broken_bins(made)
+        before = made.judge(bins).score
+        made.head.constant += 1.0
+        torch.testing.assert_close(made.judge(bins).score, before + 1, rtol=1e-9, atol=1e-9)
+
+
+def test_gradients_are_open_after_a_first_judgement_under_inference_mode():
+    detector = with_gaussians(seed=SEED)
+    with torch.inference_mode():
+        detector.judge(broken_bins(detector))
+    assert gradient_of(detector, broken_bins(detector)).isfinite().all()
