@@ -80,12 +80,14 @@ def bins_of(kind: str, num: int, hand: HandLayout, n: int, generator: torch.Gene
     return torch.where(is_odd, odd, noise).contiguous()
 
 
-def worst_errors(found: Tensor, reference: Tensor, names: Sequence[str]) -> dict[str, float]:
+def worst_errors(
+    found: Tensor, reference: Tensor, names: Sequence[str], large_cv: float = torch.inf
+) -> dict[str, float]:
     """Largest error of each descriptor, over max(magnitude of the reference, std of its column).
 
     Entropy is in bits, and mode is the share of values that are elsewhere than the reference's by
     1e-4 of that size. A cv beyond ``FLOOR_CV`` in the reference, where only the floor under the
-    mean is left, counts without its sign; one beyond ``LARGE_CV`` counts by as much less, its mean
+    mean is left, counts without its sign; one beyond ``large_cv`` counts by as much less, its mean
     being that much nearer to rounding. A spread below 1e-5 of what is usual is a root of
     rounding, and counts by its square.
     """
@@ -100,7 +102,7 @@ def worst_errors(found: Tensor, reference: Tensor, names: Sequence[str]) -> dict
     is_cv = torch.tensor([str(n)[-2:] == "cv" for n in names])
     has_no_sign = (reference.abs() > FLOOR_CV) & is_cv
     relative = torch.where(has_no_sign, (found.abs() - reference.abs()).abs() / size, relative)
-    relative = torch.where(is_cv, relative / (reference.abs() / LARGE_CV).clamp(min=1), relative)
+    relative = torch.where(is_cv, relative / (reference.abs() / large_cv).clamp(min=1), relative)
     squared = (found.square() - reference.square()).abs() / size.square()
     is_spread = torch.tensor([str(n).endswith("spread") for n in names])
     relative = torch.where(is_spread & (reference < 1e-5 * size), squared, relative)
@@ -123,7 +125,7 @@ def assert_equals_reference(
     """
     limits = {"entropy": 0.1, "mode": 1.0} if mixed else {"mode": 0.0}
     usual = 1e-4 if mixed else 1e-10
-    worst = worst_errors(found, reference, names)
+    worst = worst_errors(found, reference, names, LARGE_CV)
     beyond = {name: worst[name] for name in worst if worst[name] > limits.get(name, usual)}
     assert not beyond, f"errors beyond the rule ({'mixed' if mixed else 'float64'}): {beyond}"
 
