@@ -86,10 +86,11 @@ def tune_fold(
     start = facts["start"]
     parts = (data.maker, plan.frame, start["penalty"], start["offset"])
     by_loss = settled_learner(first, *parts)
-    make_trainer(config.trainer, folder / "start").fit(by_loss, datamodule=data)
+    other = make_trainer(config.trainer, folder / "start")
+    other.fit(by_loss, datamodule=data)
     facts["splits"] = {}
-    for name, way, learner in (("grid", "recipe", first), ("start", "grid", by_loss)):
-        judge = make_trainer(config.trainer, folder / name)
+    judged = (("grid", "recipe", trainer, first), ("start", "grid", other, by_loss))
+    for name, way, judge, learner in judged:
         judge.test(learner, datamodule=data, verbose=False)
         facts["splits"][way] = learner.metrics["splits"]
         if learner.detector is not None:
