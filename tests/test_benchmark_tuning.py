@@ -17,7 +17,7 @@ def test_quick_run_prints_and_keeps(tmp_path, capsys):
     assert report["simulated"] is True
     printed = capsys.readouterr().out
     for name, found in report["sections"].items():
-        assert f"{name}: tuned" in printed
+        assert f"{name} tuned" in printed
         assert f"{held_mean(found, 'tuned'):.4f}" in printed
         assert len(found["held"]) == 3
     everything = report["sections"][tuning.SECTIONS[-1]]
