@@ -100,6 +100,7 @@ def _through_detect(detector: SlipDetector, file: Path, config: DictConfig, fold
         "reading": OmegaConf.to_container(config.data.reading, resolve=True),
         "tare_s": list(config.data.tare_s) if config.data.tare_s else None,
         "threshold": None,
+        "dead": [],
         "engine": "auto",
         "figure": True,
         "view": None,
