@@ -19,7 +19,7 @@ from torch import Tensor
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.abstention import Abstention
-from tactslip_torch.model.conformal import check_coverage, fewest_recordings, thresholds
+from tactslip_torch.model.conformal import check_coverage, check_number, thresholds
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.held_out import HeldOut
 from tactslip_torch.planning import Plan
@@ -118,11 +118,7 @@ def abstention(
     sample = survey.sample.bins()
     scores = held_out_scores(plan, recipe, survey, groups_of(sample, left_out))
     found = thresholds(scores, sample.is_slip, sample.recording, coverage)
-    if (fewest := fewest_recordings(coverage)) > min(found.num_slip, found.num_non_slip):
-        raise ValueError(
-            f"coverage={coverage:g} takes {fewest} training recordings of either class, there are "
-            f"{found.num_slip} with slip and {found.num_non_slip} with non-slip; lower it"
-        )
+    check_number(found, coverage)
     facts: dict[str, Any] = {
         "unit": "recording",
         "left_out": "recording" if left_out == "recording" else recipe.group_by,

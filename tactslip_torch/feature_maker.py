@@ -163,7 +163,8 @@ class FeatureMaker:
     def raw_bins(self, recording: RecordingId, index: Tensor) -> Tensor:
         """Some bins of a recording before filtering, with the context that it takes.
 
-        At the ends of a recording the context is what ``extended`` makes of it.
+        At the ends of a recording the context is what ``extended`` makes of it. Samples are as they
+        are: a NaN or Inf stays.
 
         Args:
             recording: of the source.
@@ -173,13 +174,12 @@ class FeatureMaker:
             - output: ``[m, C, context_before + n + context_after]``, in the maker's dtype
 
         Raises:
-            ValueError: as ``__call__``.
+            ValueError: if a bin leaves the recording.
         """
         times = self.source.timeline(recording)
         bins = self.lay_bins(times)
         loaded = self._load(recording, times, bins)
-        filtered = self._filter(recording, loaded, bins)  # refuses what is not finite
-        whole = extended(loaded.samples.to(filtered), self.channel_filter)
+        whole = extended(loaded.samples.to(self.dtype), self.channel_filter)
         context = self.channel_filter.context_before + self.channel_filter.context_after
         return bins_at(whole, bins.starts[index], bins.bin_samples + context)
 

@@ -17,7 +17,7 @@ from tactslip_torch.model import abstention
 from tactslip_torch.model.abstention import abstention_of
 from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.class_gaussians import ClassGaussians
-from tactslip_torch.model.conformal import fewest_recordings, thresholds
+from tactslip_torch.model.conformal import check_number, thresholds
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.held_out import HeldOut
@@ -125,11 +125,9 @@ def _thresholds(
         groups = known.recording if left_out == "recording" else known.material
         scores = _scores_without(groups, bins, machine)
         found = thresholds(scores, known.is_slip, known.recording, coverage)
+        check_number(found, coverage)
     except ValueError as error:
         log.warning("no answer is unsure any more: %s", error)
-        return None
-    if fewest_recordings(coverage) > min(found.num_slip, found.num_non_slip):
-        log.warning("no answer is unsure any more: too few recordings for coverage=%g", coverage)
         return None
     facts = dict(answers.facts) | {
         "left_out": left_out,

@@ -9,12 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tactslip_torch.data.labels import needed_windows
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import bin_keys
-from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.finite import refuse_nonfinite
 
 MOST_RECORDINGS = 60
@@ -52,18 +50,18 @@ def draw_raw_bins(
     for recording in progress(recordings, "raw bins"):
         times = maker.source.timeline(recording)
         bins = maker.lay_bins(times)
-        windows = needed_windows(bins, before, times.duration_s, maker.source.sample_rate_hz)
-        samples = maker.source.load(recording, windows).samples
         first, last = bins.starts - before, bins.starts + bins.bin_samples + after
         may = fold.bin_roles(recording, len(first))["train"] & (first >= 0)
-        may &= last <= samples.shape[-1]
+        may &= last <= round(times.duration_s * maker.source.sample_rate_hz)
         keys = torch.where(may, bin_keys(str(recording), len(first)), torch.inf)
+        chosen = list[Tensor]()
         for value in (False, True):
             mine = torch.where(bins.is_slip == value, keys, torch.inf)
-            chosen = mine.argsort()[: min(each, int(mine.isfinite().sum()))]
-            parts.append(bins_at(samples, first[chosen], before + bins.bin_samples + after))
-            labels.append(bins.is_slip[chosen])
-            refuse_nonfinite(parts[-1], maker.source.hand.names, f"repair or leave out {recording}")
+            chosen.append(mine.argsort()[: min(each, int(mine.isfinite().sum()))])
+        index = torch.cat(chosen)
+        parts.append(maker.raw_bins(recording, index))
+        labels.append(bins.is_slip[index])
+        refuse_nonfinite(parts[-1], maker.source.hand.names, f"repair or leave out {recording}")
     is_slip = torch.cat(labels)
     for value, name in ((False, "non-slip"), (True, "slip")):
         if not bool((is_slip == value).any()):

@@ -105,6 +105,19 @@ def check_coverage(coverage: float) -> None:
         )
 
 
+def check_number(found: Thresholds, coverage: float) -> None:
+    """Refuse thresholds of so few recordings that no answer could be sure.
+
+    Raises:
+        ValueError: if either class has fewer than ``fewest_recordings``.
+    """
+    if (fewest := fewest_recordings(coverage)) > min(found.num_slip, found.num_non_slip):
+        raise ValueError(
+            f"coverage={coverage:g} takes {fewest} training recordings of either class, there are "
+            f"{found.num_slip} with slip and {found.num_non_slip} with non-slip; lower it"
+        )
+
+
 def fewest_recordings(coverage: float) -> int:
     """How many recordings any sure answer takes; with fewer, every bin is unsure.
 
