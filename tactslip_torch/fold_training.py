@@ -201,6 +201,7 @@ def _origin(config: DictConfig, data: SlipDataModule) -> dict[str, Any]:
         "split": data.split.name,
         "features_dtype": config.features.dtype,
         "train_materials": sorted({recording.material for recording in trained}),
+        "train_sessions": sorted({r.session or "1" for r in trained}),
         "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
     }
 

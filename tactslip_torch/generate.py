@@ -105,8 +105,9 @@ def written_table(written: Sequence[Written], seconds: float) -> str:
 
 
 def _shown(config: DictConfig, source: RecordingSource) -> dict[str, list[RecordingId]]:
-    """The recordings to draw, by scene."""
-    of_cycle = [recording for recording in source.ids if recording.cycle == config.cycle]
+    """The recordings to draw, by scene: of the first session."""
+    first = [recording for recording in source.ids if not recording.session]
+    of_cycle = [recording for recording in first if recording.cycle == config.cycle]
     if source.ids and not of_cycle:
         most = max(recording.cycle for recording in source.ids)
         raise ValueError(f"cycle must lie in 0..{most} to be drawn, got {config.cycle}")

@@ -127,6 +127,15 @@ def test_any_number_of_processes_writes_the_same_bytes(tmp_path):
     assert found[0] == found[1] == found[2]
 
 
+def test_sessions_have_files_of_their_own(tmp_path):
+    short = "+data.scene.strokes=[{speed_mm_s: 60.0, distance_mm: 60.0, pause_s: 0.5}]"
+    run(tmp_path, "scene=paper", "materials=[M1]", "cycles=1", "sessions=2", short)
+    found = contents(tmp_path)
+    assert set(found) == {"M1_paper_00.npz", "M1_paper_00_session2.npz"}
+    assert len(set(found.values())) == 2
+    assert [line["session"] for line in manifest(tmp_path)] == ["", "2"]
+
+
 def test_kinds_of_scenes_share_a_folder_and_have_rows_of_their_own(tmp_path, capsys):
     others = "+others.quiet={strokes: [{speed_mm_s: 60.0, distance_mm: 60.0}], cycles: 2}"
     short = "+data.scene.strokes=[{speed_mm_s: 60.0, distance_mm: 60.0, pause_s: 0.5}]"

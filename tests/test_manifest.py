@@ -101,7 +101,7 @@ def test_what_generate_writes_is_read(root):
         ((0.0, 1.0), (8.0, 9.0)),
         {"simulated": True, "fidelity": "kinematic", "seed": 0},
     )
-    line = manifest_line("a.csv", RecordingId("wood", 5, "taps"), content)
+    line = manifest_line("a.csv", RecordingId("wood", 5, "taps", "2"), content)
     with (root / "manifest.csv").open("w", newline="") as file:
         table = csv.DictWriter(file, list(line))
         table.writeheader()
@@ -109,7 +109,7 @@ def test_what_generate_writes_is_read(root):
     found = read_manifest(root / "manifest.csv", root)
     assert found.problems == found.warnings == ()
     (entry,) = found.entries
-    assert entry.recording == RecordingId("wood", 5, "taps")
+    assert entry.recording == RecordingId("wood", 5, "taps", "2")
     for name in ("onsets_s", "annotated_onsets_s", "sliding_s", "non_slip_s", "speeds_mm_s"):
         assert getattr(entry.truth, name) == getattr(content, name)
 
@@ -119,6 +119,21 @@ def test_trials_that_nobody_numbered_are_numbered_in_order(root):
         root, "file,material,trial\na.csv,wood,\nb.csv,wood,0\nc.csv,wood,\nday 2/d.csv,iron,\n"
     )
     assert [str(e.recording) for e in found.entries] == ["wood/1", "wood/0", "wood/2", "iron/0"]
+
+
+def test_each_session_counts_its_own_trials(root):
+    found = listed(
+        root,
+        "file,material,trial,session\na.csv,wood,,\nb.csv,wood,,monday\nc.csv,wood,0,tuesday\n",
+    )
+    assert found.problems == found.warnings == ()
+    assert [str(e.recording) for e in found.entries] == [
+        "wood/0",
+        "wood/0@monday",
+        "wood/0@tuesday",
+    ]
+    same = problems(root, "file,material,trial,session\na.csv,wood,3,two\nb.csv,wood,3,two\n")
+    assert "trial 3 of wood, scene paper, session two, was listed in" in same[0]
 
 
 def test_the_manifest_is_found_or_asked_for(root):

@@ -63,3 +63,8 @@ def test_ids_sort_by_material_then_cycle_and_read_well():
     ids = [RecordingId("wood", 0), RecordingId("M1", 10), RecordingId("M1", 2)]
     assert [str(i) for i in sorted(ids)] == ["M1/2", "M1/10", "wood/0"]
     assert len({RecordingId("M1", 2), RecordingId("M1", 2)}) == 1
+
+
+def test_a_session_is_said_where_there_are_several():
+    ids = [RecordingId("M1", 2, session="2"), RecordingId("M1", 2), RecordingId("M1", 2, "taps")]
+    assert [str(i) for i in sorted(ids)] == ["M1/2", "M1/2@2", "M1/2/taps"]

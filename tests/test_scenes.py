@@ -12,6 +12,7 @@ import pytest
 import torch
 from scene_files import NAMES, SCENE_FILES, insides, is_within, scene_of, whole_grid
 
+from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.simulation import (
     FIDELITIES,
     MATERIALS,
@@ -23,7 +24,9 @@ from tactslip_torch.simulation import (
     simulate,
     timeline,
 )
+from tactslip_torch.simulation.grasp import draw_grasp
 from tactslip_torch.simulation.ladder import scene_contact
+from tactslip_torch.simulation.sensors import draw_front
 from tactslip_torch.simulation.source import SimulatedRecordings
 
 EXPECTED = {"arm_motion", "taps", "grips", "pulled", "motor_off", "motor_only", "machine", "drift"}
@@ -242,6 +245,35 @@ def test_kinds_of_scenes_stand_beside_each_other_in_one_set():
     assert source.timeline(carried).non_slip_s[0][0] == 0.5
     assert len(source.timeline(paper).onsets_s) == 3
     assert source.load(carried).samples.isfinite().all()
+
+
+def test_sessions_are_other_mountings_and_the_first_is_that_of_a_set_with_one():
+    taps = {"taps": {"cycles": 1, "taps_per_s": 2.0}}
+    kinds = {"cycles": 2, "materials": ["M1", "M2"], "others": taps}
+    one, three = SimulatedRecordings(**kinds), SimulatedRecordings(sessions=3, **kinds)
+    assert three.ids[: len(one.ids)] == one.ids
+    assert [three.key(r) for r in one.ids] == [one.key(r) for r in one.ids]
+    assert {r.session for r in three.ids} == {"", "2", "3"}
+    assert len(three.ids) == len(set(map(str, three.ids))) == 3 * len(one.ids)
+    scenes = {r: Scene.from_dict(three.key(r)) for r in three.ids}
+    second = [scenes[RecordingId("M1", c, s, "2")] for c, s in ((0, "paper"), (0, "taps"))]
+    assert len({scene.session for scene in second}) == 1  # all kinds in one mounting
+    first = scenes[RecordingId("M1", 0)]
+    fronts = [draw_front(scene) for scene in (first, *second)]
+    noise = [front.white_v for front in fronts]
+    assert np.array_equal(noise[1], noise[2])
+    assert not np.isclose(noise[0], noise[1], rtol=1e-3).any()
+    with pytest.raises(ValueError, match=r"data\.sessions must be at least 1, got 0"):
+        SimulatedRecordings(sessions=0)
+
+
+def test_nothing_of_a_mounting_is_kept_in_another_session():
+    """Whatever is drawn for a session differs: levels of silence, pick-up, contact and skin."""
+    grasps = [draw_grasp(Scene("M1", session=session)) for session in ("M1", "M1/2")]
+    assert not np.isclose(grasps[0].resonance_hz, grasps[1].resonance_hz, rtol=1e-3).any()
+    surfaces = [grasp.surface for grasp in grasps]
+    for name in ("mu_s", "mu_ratio", "texture_mv", "wavelength_mm", "spectral_exponent"):
+        assert getattr(surfaces[0], name) != getattr(surfaces[1], name)
 
 
 # Refusals ------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """A machine, a bad mains, a warming hand: what each adds, when, and at which frequencies."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,9 +17,10 @@ from scene_files import (
     volts,
     whole_grid,
 )
+from scipy.stats import kstest
 
 from tactslip_torch.simulation import Scene, timeline
-from tactslip_torch.simulation.disturbances import mains_bursts
+from tactslip_torch.simulation.disturbances import mains_bursts, motor_level_mv
 from tactslip_torch.simulation.machine import machine_runs, machine_wave, rotation_hz
 
 TWO = ("M3", "M6")
@@ -198,3 +200,22 @@ def test_the_drift_scene_wanders_far_at_rest_and_the_paper_does_not():
     off = {"warming_mv": 0.0, "sg_drift_mv": 3.0, "arm_transient_mv": 0.0}
     assert wander(arm_transient_mv=0.0) > 0.2
     assert wander(**off) < 0.05
+
+
+# Motor ---------------------------------------------------------------------------------------
+
+
+def test_a_range_of_motor_vibration_is_drawn_per_recording_and_moves_nothing_else():
+    bounds = (1.0, 30.0)
+    first = scene_of("arm_motion", "M3", motor_vibration_mv=bounds)
+    scenes = [replace(first, cycle=cycle) for cycle in range(200)]
+    levels = np.array([motor_level_mv(scene) for scene in scenes])
+    place = np.log(levels / bounds[0]) / np.log(bounds[1] / bounds[0])
+    assert kstest(place, "uniform").pvalue > 0.01
+    again = scene_of("arm_motion", "M3", motor_vibration_mv=float(levels[0]))
+    assert np.array_equal(volts(scenes[0]), volts(again))
+
+
+def test_an_empty_range_of_motor_vibration_is_refused():
+    with pytest.raises(ValueError, match=r"motor_vibration_mv must be \(low, high\)"):
+        scene_of("arm_motion", "M3", motor_vibration_mv=(3.0, 1.0))

@@ -10,6 +10,7 @@ from tactslip_torch.data.splits import (
     confound,
     judged_once,
     leave_one_material_out,
+    leave_one_session_out,
     random_bins,
     seen6,
     unseen4,
@@ -398,3 +399,60 @@ def test_a_split_without_shares_ignores_the_seed():
     recording = RecordingId("M1", 0)
     masks = [Split("s", {recording: "train"}, seed=s).bin_roles(recording, 9) for s in (0, 1)]
     assert all(bool(mask["train"].all()) for mask in masks)
+
+
+# By session ----------------------------------------------------------------------------------
+
+
+def mounted(sessions=("", "2", "3"), cycles=10, materials=SEEN):
+    return [
+        RecordingId(r.material, r.cycle, session=s)
+        for s in sessions
+        for r in recordings(materials, cycles)
+    ]
+
+
+def test_cycles_of_a_session_are_drawn_on_their_own():
+    one = seen6(recordings(SEEN, 10), seen=SEEN)[0]
+    three = seen6(mounted(), seen=SEEN)[0]
+    assert {r: role for r, role in three.roles.items() if not r.session} == one.roles
+    tests = {
+        (m, s): frozenset(r.cycle for r in of_role(three, "test", m) if r.session == s)
+        for m in SEEN
+        for s in ("", "2", "3")
+    }
+    assert {len(cycles) for cycles in tests.values()} == {2}
+    assert len(set(tests.values())) > 3  # not the same cycles in every session
+    fewer = seen6(mounted(("2",)), seen=SEEN)[0]
+    assert fewer.roles == {r: role for r, role in three.roles.items() if r.session == "2"}
+
+
+def test_one_fold_for_every_session():
+    folds = leave_one_session_out(mounted(), seen=SEEN)
+    assert [fold.name for fold in folds] == [f"without_session_{n}" for n in (1, 2, 3)]
+    for fold, left_out in zip(folds, ("", "2", "3"), strict=True):
+        assert of_role(fold, "unseen") == {r for r in mounted() if r.session == left_out}
+        assert {r.session for r in fold.having("train", "test")} == {"", "2", "3"} - {left_out}
+        assert len(fold.having("train")) == 2 * len(SEEN) * 8
+    assert not are_rivals(folds)
+
+
+def test_the_first_session_can_be_trained_on_alone():
+    alone, *rest = leave_one_session_out(mounted(), seen=SEEN, first_alone=True)
+    assert alone.name == "session_1_alone"
+    assert {r.session for r in alone.having("train", "test")} == {""}
+    assert of_role(alone, "unseen") == {r for r in mounted() if r.session}
+    assert rest == leave_one_session_out(mounted(), seen=SEEN)
+    assert are_rivals([alone, *rest])  # what is unseen in both is not summed
+
+
+def test_a_material_of_the_left_out_session_alone_is_no_second_session():
+    extra = [*mounted(("", "2")), *mounted(("2",), materials=["wood"])]
+    without_1, without_2 = leave_one_session_out(extra, seen=[*SEEN, "wood"])
+    assert {r.material for r in of_role(without_2, "unseen")} == set(SEEN)
+    assert {r.material for r in of_role(without_1, "train")} == {*SEEN, "wood"}
+
+
+def test_one_session_cannot_be_left_out():
+    with pytest.raises(ValueError, match=r"needs at least two, got 1; .*data\.sessions=2"):
+        leave_one_session_out(recordings(SEEN), seen=SEEN)

@@ -160,8 +160,9 @@ class RecordingFolder:
 
     def path(self, recording: RecordingId) -> Path:
         """The recording's file."""
-        name = f"{recording.material}_{recording.scene}_{recording.cycle:02d}.{self.ending}"
-        return self.folder / name
+        session = f"_session{recording.session}" if recording.session else ""
+        name = f"{recording.material}_{recording.scene}_{recording.cycle:02d}{session}"
+        return self.folder / f"{name}.{self.ending}"
 
     def key(self, recording: RecordingId) -> dict[str, Any]:
         """What determines the recording's file, as JSON gives it back."""
@@ -220,6 +221,7 @@ def manifest_line(file: str, recording: RecordingId, content: Recording) -> dict
         "material": recording.material,
         "cycle": recording.cycle,
         "scene": recording.scene,
+        "session": recording.session,
         "onsets_s": json.dumps(content.onsets_s),
         "annotated_onsets_s": json.dumps(content.annotated_onsets_s),
         "sliding_s": json.dumps(content.sliding_s),

@@ -22,15 +22,23 @@ class RecordingId:
         material: what the hand slid on.
         cycle: number of the cycle on that material, from 0.
         scene: what was done with the hand; the paper's protocol unless said otherwise.
+        session: the mounting it was recorded in, where a material has several; ``""`` for its
+            first or only one. Each session counts its cycles from 0.
+
+    Example:
+        >>> str(RecordingId("M1", 3)), str(RecordingId("M1", 3, "taps", session="2"))
+        ('M1/3', 'M1/3/taps@2')
     """
 
     material: str
     cycle: int
     scene: str = "paper"
+    session: str = ""
 
     def __str__(self) -> str:
         scene = "" if self.scene == "paper" else f"/{self.scene}"
-        return f"{self.material}/{self.cycle}{scene}"
+        session = f"@{self.session}" if self.session else ""
+        return f"{self.material}/{self.cycle}{scene}{session}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,8 @@
 
 A split gives every bin of every recording a role. The default groups by cycle, stratified by
 material: neighbouring bins of one slide never stand on both sides. Of a set with several kinds of
-scenes, a cycle is on one side in all of them. The authors' split, random over bins, is here to show
+scenes, a cycle is on one side in all of them; cycles of different sessions have nothing to do with
+each other. The authors' split, random over bins, is here to show
 what that leaks.
 """
 
@@ -156,6 +157,50 @@ def leave_one_material_out(
     return folds
 
 
+def leave_one_session_out(
+    recordings: Sequence[RecordingId],
+    *,
+    seen: Sequence[str],
+    first_alone: bool = False,
+    train_share: float = 0.8,
+    seed: int = 0,
+) -> list[Split]:
+    """One fold per session: train on the others, judge the same materials in the one left out.
+
+    ``test`` are held-out cycles of the sessions trained on, ``unseen`` all cycles of the session
+    left out, of materials that the others have too.
+
+    Args:
+        recordings: of several sessions.
+        seen: materials to train on and to judge.
+        first_alone: put a fold before them that trains on the first session alone and judges the
+            same materials in all others: what a user gets who trains on one day's recordings.
+        train_share: of the cycles of each session trained on.
+        seed: of the draw.
+
+    Raises:
+        ValueError: if the set has one session, a material is not in it, or a role stays empty.
+    """
+    own = [r for material in seen for r in _cycles_of(recordings, material)]
+    sessions = sorted({recording.session for recording in own})
+    if len(sessions) < 2:
+        raise ValueError(
+            f"leaving one session out needs at least two, got {len(sessions)}; simulate more with "
+            "data.sessions=2, or name them in the manifest's column session"
+        )
+    folds = [(f"without_session_{session or 1}", {session}) for session in sessions]
+    if first_alone:
+        folds.insert(0, (f"session_{sessions[0] or 1}_alone", set(sessions[1:])))
+    splits = []
+    for name, left_out in folds:
+        trained = [recording for recording in own if recording.session not in left_out]
+        known = [material for material in seen if material in {r.material for r in trained}]
+        roles = _by_cycle(trained, known, train_share, seed)
+        away = [r for r in own if r.session in left_out and r.material in known]
+        splits.append(_checked(Split(name, roles | dict.fromkeys(away, "unseen")), ROLES))
+    return splits
+
+
 def confound(
     recordings: Sequence[RecordingId],
     *,
@@ -209,12 +254,13 @@ def confound(
 
 
 def are_rivals(folds: Sequence[Split]) -> bool:
-    """Whether any two folds hold out the same recordings.
+    """Whether any two folds hold out the same recordings, or leave one out that both call unseen.
 
     Each then judges a detector of its own on the same bins, and a sum over them is neither's score.
     """
     held_out = [tuple(fold.having("test", "unseen")) for fold in folds]
-    return len(set(held_out)) < len(held_out)
+    unseen = [recording for fold in folds for recording in fold.having("unseen")]
+    return len(set(held_out)) < len(held_out) or len(set(unseen)) < len(unseen)
 
 
 def judged_once(folds: Sequence[Split]) -> list[Split]:
@@ -238,23 +284,26 @@ def judged_once(folds: Sequence[Split]) -> list[Split]:
 def _by_cycle(
     recordings: Sequence[RecordingId], materials: Sequence[str], train_share: float, seed: int
 ) -> dict[RecordingId, str]:
-    """``train`` and ``test`` drawn within each material, at least one cycle each if there are two.
+    """``train`` and ``test`` drawn within each material and session, at least one cycle each.
 
-    The draw of a material depends on the seed and its place among its own cycles alone, so leaving
-    another material out does not change it. A cycle is on one side in all its scenes; cycles that
-    are there in different scenes are drawn apart, each kind as above, so that each scene has its
-    share.
+    The draw of a session depends on the seed and its place among its own cycles alone, so leaving
+    another session or material out does not change it. A cycle is on one side in all its scenes;
+    cycles that are there in different scenes are drawn apart, each kind as above, so that each
+    scene has its share. A session's only cycle falls by the share alone.
     """
     _check_share(train_share)
     roles: dict[RecordingId, str] = {}
+    mountings: dict[str, dict[int, list[RecordingId]]] = {}
     for material in materials:
-        cycles: dict[int, list[RecordingId]] = {}
         for recording in _cycles_of(recordings, material):
+            mounting = f"{material}@{recording.session}" if recording.session else material
+            cycles = mountings.setdefault(mounting, {})
             cycles.setdefault(recording.cycle, []).append(recording)
+    for mounting, cycles in mountings.items():
         alike: dict[tuple[str, ...], list[int]] = {}
         for cycle, members in cycles.items():
             alike.setdefault(tuple(member.scene for member in members), []).append(cycle)
-        generator = torch.Generator().manual_seed(seed * 1_000_003 + zlib.crc32(material.encode()))
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + zlib.crc32(mounting.encode()))
         for numbers in alike.values():
             num_train = round(train_share * len(numbers))
             if len(numbers) > 1:

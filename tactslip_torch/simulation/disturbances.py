@@ -53,7 +53,8 @@ class Common:
         couplings = lognormal(session, 0.4, num)
         self._mains_v = mains_v * couplings
         self._mains_burst_v = 1e-3 * knobs.mains_burst_mv * couplings
-        self._motor_v = 1e-3 * knobs.motor_vibration_mv * lognormal(session, 0.3, num)
+        motor_mv = motor_level_mv(scene)
+        self._motor_v = 1e-3 * motor_mv * lognormal(session, 0.3, num)
         signs = np.where(session.random((num, len(ARM_MODES_HZ))) < 0.5, -1.0, 1.0)
         self._arm_v = (
             1e-3
@@ -65,7 +66,7 @@ class Common:
         hums = knobs.mains_mv > 0 or self._mains_bursts
         self._mains = _mains(scene, grid) if hums else None
         self._mains_envelope = _burst_envelope(self._mains_bursts, grid)
-        self._motor = _motor(scene, motion) if plan and knobs.motor_vibration_mv > 0 else None
+        self._motor = _motor(scene, motion) if plan and motor_mv > 0 else None
         rings = plan and knobs.arm_transient_mv > 0
         self._arm = _arm_ringing(scene, plan, grid) if rings else None
         self._bursts = _draw_bursts(scene, duration_s)
@@ -135,6 +136,14 @@ def _burst_envelope(bursts: tuple[Stretch, ...], grid: Grid) -> Array:
         rise, fall = ((t - start_s) / _MAINS_RAMP_S, (end_s - t) / _MAINS_RAMP_S)
         envelope[rows] += smooth_step(rise) * smooth_step(fall)
     return envelope
+
+
+def motor_level_mv(scene: Scene) -> float:
+    """The recording's motor vibration: the knob, or a draw of its own from the knob's range."""
+    level = scene.disturbances.motor_vibration_mv
+    if isinstance(level, tuple):
+        return log_uniform(generator(*recording_key(scene, "motor level")), level)
+    return level
 
 
 def _motor(scene: Scene, motion: Motion) -> tuple[slice, Array]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.simulation.dynamics.stepper import integrator
 from tactslip_torch.simulation.materials import SEEN_MATERIALS, UNSEEN_MATERIALS
-from tactslip_torch.simulation.scene import PAPER, paper_scenes
+from tactslip_torch.simulation.scene import PAPER, Scene, paper_scenes
 from tactslip_torch.simulation.simulate import simulate
 from tactslip_torch.simulation.timeline import Timeline, timeline
 
@@ -19,16 +20,20 @@ class SimulatedRecordings:
 
     Args:
         seed: of the whole set.
-        cycles: recordings per material and kind of scene.
+        cycles: recordings per material, session and kind of scene.
         materials: ids in ``MATERIALS``.
         channels: rows for ``HandLayout.from_rows``; ``None`` for the paper's hand.
         fidelity: the rung to simulate on, one of ``FIDELITIES``.
         scene: overrides of any knob of the scenes; ``name`` is the kind they are.
         others: further kinds of scenes by name, with their overrides; ``cycles`` among them is
             the kind's own number. They start from the same knobs as ``scene``.
+        sessions: mountings of every material, each with all its cycles and kinds of scenes. The
+            first one's recordings are those of a set with one session; further ones are named
+            "2", "3" and so on, and draw everything that belongs to a mounting anew: noise floor,
+            mains, gains, offsets, load shares, couplings, skin, and the surface's own sample.
 
     Raises:
-        ValueError: as ``paper_scenes``.
+        ValueError: as ``paper_scenes``; or if there is no session.
 
     Example:
         >>> source = SimulatedRecordings(
@@ -50,17 +55,26 @@ class SimulatedRecordings:
         fidelity: str = "kinematic",
         scene: Mapping[str, Any] | None = None,
         others: Mapping[str, Mapping[str, Any]] | None = None,
+        sessions: int = 1,
     ) -> None:
+        if sessions < 1:
+            raise ValueError(f"data.sessions must be at least 1, got {sessions}")
         self.hand = HandLayout.paper24() if channels is None else HandLayout.from_rows(channels)
         base = {"fidelity": fidelity, "name": PAPER, **(scene or {})}
+        kinds = [{**base, "cycles": cycles}]
+        kinds += [{**kinds[0], **own, "name": name} for name, own in (others or {}).items()]
         materials = tuple(materials)
-        scenes = paper_scenes(seed=seed, cycles=cycles, materials=materials, hand=self.hand, **base)
-        for name, knobs in (others or {}).items():
-            own = {**base, "cycles": cycles, **knobs, "name": name}
-            scenes += paper_scenes(seed=seed, materials=materials, hand=self.hand, **own)
-        self._scenes = {RecordingId(s.material, s.cycle, s.name): s for s in scenes}
+        self._scenes: dict[RecordingId, Scene] = {}
+        for number in range(1, sessions + 1):
+            for own in kinds:
+                for scene_of in paper_scenes(seed=seed, materials=materials, hand=self.hand, **own):
+                    session = "" if number == 1 else str(number)
+                    mounted = _in_session(scene_of, session)
+                    name = RecordingId(mounted.material, mounted.cycle, mounted.name, session)
+                    self._scenes[name] = mounted
         self.ids = tuple(self._scenes)
-        self.sample_rate_hz = scenes[0].sample_rate_hz if scenes else 2000.0
+        first = next(iter(self._scenes.values()), None)
+        self.sample_rate_hz = 2000.0 if first is None else first.sample_rate_hz
 
     def timeline(self, recording: RecordingId) -> Timeline:
         """When things happen, without a sample being simulated."""
@@ -78,3 +92,8 @@ class SimulatedRecordings:
     ) -> Recording:
         """Simulate the recording, or the stretches of it that are asked for."""
         return simulate(self._scenes[recording], windows=windows)
+
+
+def _in_session(scene: Scene, session: str) -> Scene:
+    """The scene in a further session of its material, or as it is in the first."""
+    return replace(scene, session=f"{scene.session}/{session}") if session else scene

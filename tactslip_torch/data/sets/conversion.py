@@ -108,6 +108,7 @@ class Conversion:
             "material": recording.material,
             "trial": recording.cycle,
             "scene": recording.scene,
+            "session": recording.session,
             **{name: json.dumps(getattr(times, name)) for name in (*MOMENTS, *STRETCHES)},
             "sample_rate_hz": self.source.sample_rate_hz,
             "simulated": str(self.source.is_simulated).lower(),

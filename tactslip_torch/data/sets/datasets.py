@@ -225,7 +225,7 @@ class FileRecordings:
 def chosen(
     entries: Sequence[Entry], materials: Sequence[str] | None, cycles: int | None
 ) -> list[Entry]:
-    """The entries of some materials and, of each in each scene, the first so many trials.
+    """The entries of some materials and, of each in each scene and session, the first trials.
 
     Raises:
         ValueError: if a material is none of the set's, or the number is none.
@@ -238,13 +238,14 @@ def chosen(
         )
     if cycles is not None and not (isinstance(cycles, int) and cycles > 0):
         raise ValueError(f"data.cycles must be a number of trials or null, got {cycles!r}")
-    taken: dict[tuple[str, str], int] = {}
+    taken: dict[tuple[str, str, str], int] = {}
     kept = set()
     for entry in sorted(entries, key=lambda entry: entry.recording):
         name = entry.recording
-        number = taken.get((name.material, name.scene), 0)
+        place = name.material, name.scene, name.session
+        number = taken.get(place, 0)
         if (materials is None or name.material in materials) and number < (cycles or math.inf):
-            taken[name.material, name.scene] = number + 1
+            taken[place] = number + 1
             kept.add(entry.place)
     return [entry for entry in entries if entry.place in kept]
 

@@ -1,8 +1,8 @@
 """A manifest: which files are recordings, of what, and what is known of each.
 
 A table (CSV) or list (YAML) of ``file``, ``material`` (or ``object``), ``trial`` (or ``cycle``),
-``scene``, what ``truth.py`` reads, and ``sample_rate_hz`` of files that do not say it. What
-``generate`` writes is one.
+``scene``, ``session``, what ``truth.py`` reads, and ``sample_rate_hz`` of files that do not say
+it. What ``generate`` writes is one.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tactslip_torch.data.sets.truth import TRUTH_COLUMNS, Truth, truth_of
 
 NAMES = ("manifest.csv", "manifest.yaml", "manifest.yml")
 ALIASES = {"object": "material", "cycle": "trial"}
-COLUMNS = ("file", "material", "trial", "scene", *TRUTH_COLUMNS, "sample_rate_hz")
+COLUMNS = ("file", "material", "trial", "scene", "session", *TRUTH_COLUMNS, "sample_rate_hz")
 _IGNORED = ("simulated", "fidelity", "seed")
 """Further columns of what ``generate`` writes: files say this themselves."""
 
@@ -122,6 +122,7 @@ class _Draft(NamedTuple):
     material: str
     trial: int | None
     scene: str
+    session: str
     truth: Truth | None
     rate: float | None
 
@@ -131,7 +132,7 @@ def _draft(line: Line, root: Path) -> tuple[_Draft | None, list[str]]:
     cells = {ALIASES.get(column, column): cell for column, cell in line.cells.items()}
     problems = []
     words = {}
-    for column in ("file", "material", "trial", "scene", "sample_rate_hz"):
+    for column in ("file", "material", "trial", "scene", "session", "sample_rate_hz"):
         cell = cells.get(column, "")
         if not isinstance(cell, str):
             problems.append(f"{column} must be one value, got a list")
@@ -160,6 +161,7 @@ def _draft(line: Line, root: Path) -> tuple[_Draft | None, list[str]]:
         words["material"],
         int(trial) if trial else None,
         words["scene"] or RecordingId.scene,
+        words["session"],
         truth,
         float(rate) if rate else None,
     ), []
@@ -189,17 +191,17 @@ def file_problem(root: Path, file: str) -> str | None:
 
 
 def _numbered(drafts: list[_Draft]) -> Iterator[Entry]:
-    """Entries; an empty trial gets the next number that its material and scene do not have."""
-    used: dict[tuple[str, str], set[int]] = {}
+    """Entries; an empty trial gets the next number free for its material, scene and session."""
+    used: dict[tuple[str, str, str], set[int]] = {}
     for draft in drafts:
-        own = used.setdefault((draft.material, draft.scene), set())
+        own = used.setdefault((draft.material, draft.scene, draft.session), set())
         own |= {draft.trial} if draft.trial is not None else set()
-    for place, file, material, trial, scene, truth, rate in drafts:
+    for place, file, material, trial, scene, session, truth, rate in drafts:
         if trial is None:
-            own = used[material, scene]
+            own = used[material, scene, session]
             trial = next(number for number in range(len(own) + 1) if number not in own)
             own.add(trial)
-        yield Entry(place, file, RecordingId(material, trial, scene), truth, rate)
+        yield Entry(place, file, RecordingId(material, trial, scene, session), truth, rate)
 
 
 def _twice(entries: Iterable[Entry]) -> list[Problem]:
@@ -208,8 +210,9 @@ def _twice(entries: Iterable[Entry]) -> list[Problem]:
     first: dict[object, str] = {}
     for entry in entries:
         trial = entry.recording
+        session = f", session {trial.session}" if trial.session else ""
         for key, what in (
-            (trial, f"trial {trial.cycle} of {trial.material}, scene {trial.scene},"),
+            (trial, f"trial {trial.cycle} of {trial.material}, scene {trial.scene}{session},"),
             (entry.file, f"file {entry.file!r}"),
         ):
             if key in first:

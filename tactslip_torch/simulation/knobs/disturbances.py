@@ -20,6 +20,7 @@ class Disturbances:
         arm_transient_mv: ringing of the arm's modes at each start and stop, in every channel.
         motor_vibration_mv: rms of the vibration felt in every channel while the arm moves, at
             40 mm/s. In the paper's data slip *is* arm motion, so this one alone can tell slip.
+            A pair is a range, drawn per recording, log-uniform.
         mains_bursts_per_s: stretches of a tenth to a whole second in which the mains is stronger
             (a welder, a lift).
         mains_burst_mv: added amplitude of the fundamental in them, with its harmonics.
@@ -31,14 +32,14 @@ class Disturbances:
         label_jitter_ms: standard deviation of a person's onset marks, cut at three times that.
 
     Raises:
-        ValueError: if a knob is negative or not finite.
+        ValueError: if a knob is negative or not finite, or a range empty.
     """
 
     mains_mv: float = 3.0
     mains_session_spread: float = 0.7
     mains_hz: float = 50.0
     arm_transient_mv: float = 50.0
-    motor_vibration_mv: float = 1.0
+    motor_vibration_mv: float | tuple[float, float] = 1.0
     mains_bursts_per_s: float = 0.0
     mains_burst_mv: float = 50.0
     machine_mv: float = 0.0
