@@ -47,8 +47,8 @@ def unknown_choice(arguments: Sequence[str]) -> str | None:
     Example:
         >>> unknown_choice(["+exp=unseen4", "seed=3"]) is None
         True
-        >>> unknown_choice(["split=seen7"])
-        'unknown split seen7; known: confound, leave_one_material_out, random_bins, seen6, unseen4'
+        >>> unknown_choice(["labels=quarter_second"])
+        'unknown labels quarter_second; known: half_second, whole_slide'
     """
     folders = [conf_dir(), *_further_folders(arguments)]
     for argument in arguments:

@@ -7,6 +7,7 @@ from tactslip_torch.simulation.knobs import (
     Dynamics,
     Faults,
     Handling,
+    Imperfections,
     Sensors,
     Stroke,
 )
@@ -36,6 +37,7 @@ __all__ = [
     "Dynamics",
     "Faults",
     "Handling",
+    "Imperfections",
     "Material",
     "Scene",
     "Sensors",

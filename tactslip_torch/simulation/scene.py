@@ -14,6 +14,7 @@ from tactslip_torch.simulation.knobs import (
     Dynamics,
     Faults,
     Handling,
+    Imperfections,
     Sensors,
     Stroke,
 )
@@ -35,6 +36,7 @@ _GROUPS: dict[str, type[Any]] = {
     "handling": Handling,
     "faults": Faults,
     "dynamics": Dynamics,
+    "imperfections": Imperfections,
 }
 
 PAPER = "paper"
@@ -60,6 +62,7 @@ class Scene:
         handling: what loads the contact without sliding.
         faults: what is broken behind the sensors.
         dynamics: knobs of the dynamic rungs.
+        imperfections: what makes channels differ without slip; none by default.
         tail_s: rest behind the last stroke, or all there is.
         acceleration_m_s2: of the arm, at each start and stop.
         sample_rate_hz: samples per second and channel.
@@ -89,6 +92,7 @@ class Scene:
     handling: Handling = field(default_factory=Handling)
     faults: Faults = field(default_factory=Faults)
     dynamics: Dynamics = field(default_factory=Dynamics)
+    imperfections: Imperfections = field(default_factory=Imperfections)
     tail_s: float = 0.0
     acceleration_m_s2: float = 0.5
     sample_rate_hz: float = 2000.0
@@ -153,12 +157,17 @@ class Scene:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """The scene as plain JSON types, without loss: with its version, a cache key."""
+        """The scene as plain JSON types, without loss: with its version, a cache key.
+
+        Imperfections are left out where there are none, as before there were any.
+        """
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "hand"}
         plain["hand"] = self.hand.to_rows()
         plain["strokes"] = [asdict(stroke) for stroke in self.strokes]
         for name in _GROUPS:
             plain[name] = {k: _listed(v) for k, v in asdict(plain[name]).items()}
+        if self.imperfections == Imperfections():
+            del plain["imperfections"]
         plain["simulation_version"] = SIMULATION_VERSION
         return plain
 

@@ -1,7 +1,8 @@
 """A scene in, a recording out.
 
-Arm motion, contact on the scene's rung, handling, vibration, sensors, faults. Only the channels
-and the stretches of time that are asked for are computed; elements out of contact cost no friction.
+Arm motion, contact on the scene's rung, handling, vibration, imperfections, sensors, faults. Only
+the channels and the stretches of time that are asked for are computed; elements out of contact cost
+no friction.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from tactslip_torch.simulation.faults import held_samples, recorded_channels, st
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp
 from tactslip_torch.simulation.grid import Grid, block_samples_for
 from tactslip_torch.simulation.handling import Handled
+from tactslip_torch.simulation.imperfections import disturb, gain_factor, load_factor, pickup
 from tactslip_torch.simulation.ladder import scene_contact
 from tactslip_torch.simulation.motion import ArmStroke, Motion, arm_strokes, last_stop_s
 from tactslip_torch.simulation.randomness import Array
@@ -119,7 +121,12 @@ def _volts(
     for element in sorted(elements & set(grasp.touching.tolist())):
         contact = contact_of(element)
         vibration = element_vibration(scene, grasp, contact, field, element)
+        disturb(scene, grasp, contact, element, grid, vibration, duration_s)
         normal_n, shear_n, press_n = contact.normal_n, contact.friction_n, None
+        if (factor := load_factor(scene, element, grid.history[0])) is not None:
+            normal_n, shear_n = normal_n * factor, shear_n * factor
+            for band in (vibration.high, vibration.low):
+                band *= np.sqrt(factor[now])
         if not handled.is_idle:
             press_n = handled.press_n(element, normal_n, grid.history[0])
             normal_n = normal_n + press_n
@@ -132,7 +139,11 @@ def _volts(
                 felt = gauge_volts(scene, normal_n[now], shear_n[now], vibration)
             else:
                 felt = film_volts(scene, grid, shear_n, vibration, press_n)
-            volts[index] += front.gain[index] * felt
+            volts[index] += front.gain[index] * gain_factor(scene, index, grid) * felt
+    if (common_mode := pickup(scene, grid)) is not None:
+        wave, couplings = common_mode
+        for index in indices:
+            volts[index] += couplings[index] * wave
     return {
         index: front_end(scene, front, index, grid, volts[index], duration_s) for index in indices
     }

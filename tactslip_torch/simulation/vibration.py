@@ -184,6 +184,19 @@ def element_vibration(
     return vibration
 
 
+def shear_noise_v(scene: Scene, grasp: Grasp, element: int, speed_mm_s: float) -> float:
+    """Volts rms of an element that slides steadily, its texture's lines counted as noise."""
+    surface, contact, relative = grasp.surface, scene.contact, speed_mm_s / REFERENCE_MM_S
+    friction_mv = contact.friction_noise_mv * relative**contact.friction_noise_exponent
+    texture_mv = surface.texture_mv * relative**surface.texture_exponent
+    root_load = float(np.sqrt(grasp.load_n[element]))
+    return (
+        1e-3
+        * root_load
+        * float(np.hypot(surface.mu_ratio * surface.mu_s * friction_mv, texture_mv))
+    )
+
+
 def _powered(slide: Array, exponent: float) -> Array:
     """Level over that at the arm's speed; none where nothing slides, whatever the power."""
     return np.where(slide > 0, slide**exponent, 0.0)

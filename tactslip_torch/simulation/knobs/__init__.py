@@ -10,6 +10,7 @@ from tactslip_torch.simulation.knobs.disturbances import Disturbances
 from tactslip_torch.simulation.knobs.dynamics import Dynamics
 from tactslip_torch.simulation.knobs.faults import Faults
 from tactslip_torch.simulation.knobs.handling import Handling
+from tactslip_torch.simulation.knobs.imperfections import Imperfections
 from tactslip_torch.simulation.knobs.sensors import Sensors
 from tactslip_torch.simulation.knobs.strokes import Stroke
 
@@ -20,6 +21,7 @@ __all__ = [
     "Dynamics",
     "Faults",
     "Handling",
+    "Imperfections",
     "Sensors",
     "Stroke",
 ]
