@@ -50,7 +50,7 @@ def test_no_conf_is_an_error_that_says_where(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["+exp=nope"], "unknown exp nope; known: biotacsp_dos, confound, leave_one_mat"),
+        (["+exp=nope"], "unknown exp nope; known: biotacsp_dos, confound, deploy, hard, leav"),
         (["seed=3", "split=seen7"], "unknown split seen7; known: confound, leave_one_material_out"),
         (["labels=whole"], "unknown labels whole; known: half_second, whole_slide"),
         (["data=real"], "unknown data real; known: authors_raw, biotacsp_dos, files"),

@@ -98,6 +98,10 @@ def test_an_experiment_adds_no_key(name):
     known = set(keys_of(OmegaConf.to_container(composed(*groups))))
     if name in RECORDED:
         known |= {"features.frames.electrode"}  # kinds of channels are the data's
+    if weights := content.get("recipe", {}).get("scene_weights"):
+        assert set(weights) == set(composed(f"+exp={name}").others)  # kinds of scenes too
+        known |= {f"recipe.scene_weights.{scene}" for scene in weights}
+        known -= {"recipe.scene_weights"}
     assert set(keys_of(content)) <= known
     assert set(keys_of(OmegaConf.to_container(composed(f"+exp={name}")))) == known
 
@@ -182,6 +186,36 @@ def test_leave_one_material_out_leaves_each_out_once():
     _, folds = folds_of(composed("+exp=leave_one_material_out"))
     left_out = [{r.material for r in fold.having("unseen")} for fold in folds]
     assert left_out == [{material} for material in SEEN + UNSEEN]
+
+
+def test_sessions_trains_on_one_and_judges_the_same_materials_in_others():
+    source, (alone, *rest) = folds_of(composed("+exp=sessions"))
+    assert {r.session for r in alone.having("train")} == {""}
+    assert {r.session for r in alone.having("unseen")} == {"2", "3"}
+    for fold in (alone, *rest):
+        assert {r.material for r in fold.having(*ROLES)} == set(SEEN)
+        sessions = [{r.session for r in fold.having(role)} for role in ("train", "unseen")]
+        assert sessions[0].isdisjoint(sessions[1])
+    assert [len({r.session for r in fold.having("train")}) for fold in rest] == [2, 2, 2]
+    assert len(source.ids) < 280
+
+
+def test_deploy_trains_on_slips_and_motion_beside_an_arm_of_any_loudness():
+    config = composed("+exp=deploy")
+    _, (fold,) = folds_of(config)
+    trained = {r.scene for r in fold.having("train")}
+    assert trained == {"paper", *config.others}
+    for role in ("test", "unseen"):
+        assert {r.scene for r in fold.having(role)} >= {"paper", "arm_motion", "paper_loud"}
+    for name in ("arm_motion", "paper_loud"):
+        assert config.others[name].motor_vibration_mv == [1.0, 30.0]
+
+
+def test_hard_is_unseen4_on_another_hand():
+    hard, plain = (folds_of(composed(f"+exp={name}")) for name in ("hard", "unseen4"))
+    there = {(r.material, r.cycle): role for r, role in hard[1][0].roles.items()}
+    assert there == {(r.material, r.cycle): role for r, role in plain[1][0].roles.items()}
+    assert {r.scene for r in hard[0].ids} == {"hard"}
 
 
 def test_quick_is_small_and_has_every_role():

@@ -225,6 +225,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "data.sets.hand_file": ("data.*", "hand"),
     "data.labels": ("data.recording",),
     "data.splits": ("data.recording",),
+    "data.session_split": ("data.recording", "data.splits"),
     "simulation.*": ("hand", "engines", "data.recording", "simulation.*"),
     "signals.savgol": (),
     "signals.kernel_edges": ("signals.savgol",),

@@ -75,10 +75,10 @@ def unseen4(
     both = sorted(set(seen) & set(unseen))
     if both:
         raise ValueError(f"materials {', '.join(both)} are both seen and unseen; choose one side")
-    roles = _by_cycle(recordings, seen, train_share, seed)
+    roles = by_cycle(recordings, seen, train_share, seed)
     for material in unseen:
-        roles |= dict.fromkeys(_cycles_of(recordings, material), "unseen")
-    return [_checked(Split("unseen4", roles), ("train", "test", "unseen"))]
+        roles |= dict.fromkeys(cycles_of(recordings, material), "unseen")
+    return [checked(Split("unseen4", roles), ("train", "test", "unseen"))]
 
 
 def seen6(
@@ -93,8 +93,8 @@ def seen6(
     Raises:
         ValueError: if a material is not in the set or a role stays empty.
     """
-    roles = _by_cycle(recordings, seen, train_share, seed)
-    return [_checked(Split("seen6", roles), ("train", "test"))]
+    roles = by_cycle(recordings, seen, train_share, seed)
+    return [checked(Split("seen6", roles), ("train", "test"))]
 
 
 def random_bins(
@@ -114,9 +114,9 @@ def random_bins(
     """
     _check_share(train_share)
     roles = {
-        recording: "train" for material in seen for recording in _cycles_of(recordings, material)
+        recording: "train" for material in seen for recording in cycles_of(recordings, material)
     }
-    return [_checked(Split("random_bins", roles, 1 - train_share, seed), ("train",))]
+    return [checked(Split("random_bins", roles, 1 - train_share, seed), ("train",))]
 
 
 def leave_one_material_out(
@@ -148,57 +148,13 @@ def leave_one_material_out(
     for left_out in materials:
         others = [material for material in materials if material != left_out]
         if train_share == 1:
-            roles = {r: "train" for material in others for r in _cycles_of(recordings, material)}
-            roles |= dict.fromkeys(_cycles_of(recordings, left_out), "unseen")
+            roles = {r: "train" for material in others for r in cycles_of(recordings, material)}
+            roles |= dict.fromkeys(cycles_of(recordings, left_out), "unseen")
         else:
             sides = {"seen": others, "unseen": [left_out]}
             roles = dict(unseen4(recordings, **sides, train_share=train_share, seed=seed)[0].roles)
         folds.append(Split(f"without_{left_out}", roles))
     return folds
-
-
-def leave_one_session_out(
-    recordings: Sequence[RecordingId],
-    *,
-    seen: Sequence[str],
-    first_alone: bool = False,
-    train_share: float = 0.8,
-    seed: int = 0,
-) -> list[Split]:
-    """One fold per session: train on the others, judge the same materials in the one left out.
-
-    ``test`` are held-out cycles of the sessions trained on, ``unseen`` all cycles of the session
-    left out, of materials that the others have too.
-
-    Args:
-        recordings: of several sessions.
-        seen: materials to train on and to judge.
-        first_alone: put a fold before them that trains on the first session alone and judges the
-            same materials in all others: what a user gets who trains on one day's recordings.
-        train_share: of the cycles of each session trained on.
-        seed: of the draw.
-
-    Raises:
-        ValueError: if the set has one session, a material is not in it, or a role stays empty.
-    """
-    own = [r for material in seen for r in _cycles_of(recordings, material)]
-    sessions = sorted({recording.session for recording in own})
-    if len(sessions) < 2:
-        raise ValueError(
-            f"leaving one session out needs at least two, got {len(sessions)}; simulate more with "
-            "data.sessions=2, or name them in the manifest's column session"
-        )
-    folds = [(f"without_session_{session or 1}", {session}) for session in sessions]
-    if first_alone:
-        folds.insert(0, (f"session_{sessions[0] or 1}_alone", set(sessions[1:])))
-    splits = []
-    for name, left_out in folds:
-        trained = [recording for recording in own if recording.session not in left_out]
-        known = [material for material in seen if material in {r.material for r in trained}]
-        roles = _by_cycle(trained, known, train_share, seed)
-        away = [r for r in own if r.session in left_out and r.material in known]
-        splits.append(_checked(Split(name, roles | dict.fromkeys(away, "unseen")), ROLES))
-    return splits
 
 
 def confound(
@@ -249,7 +205,7 @@ def confound(
             for recording, role in grouped.roles.items()
             if role != "train" or recording.scene in scenes
         }
-        folds.append(_checked(Split(name, roles), ROLES))
+        folds.append(checked(Split(name, roles), ROLES))
     return folds
 
 
@@ -281,7 +237,7 @@ def judged_once(folds: Sequence[Split]) -> list[Split]:
     return kept
 
 
-def _by_cycle(
+def by_cycle(
     recordings: Sequence[RecordingId], materials: Sequence[str], train_share: float, seed: int
 ) -> dict[RecordingId, str]:
     """``train`` and ``test`` drawn within each material and session, at least one cycle each.
@@ -295,7 +251,7 @@ def _by_cycle(
     roles: dict[RecordingId, str] = {}
     mountings: dict[str, dict[int, list[RecordingId]]] = {}
     for material in materials:
-        for recording in _cycles_of(recordings, material):
+        for recording in cycles_of(recordings, material):
             mounting = f"{material}@{recording.session}" if recording.session else material
             cycles = mountings.setdefault(mounting, {})
             cycles.setdefault(recording.cycle, []).append(recording)
@@ -315,7 +271,8 @@ def _by_cycle(
     return roles
 
 
-def _cycles_of(recordings: Sequence[RecordingId], material: str) -> list[RecordingId]:
+def cycles_of(recordings: Sequence[RecordingId], material: str) -> list[RecordingId]:
+    """The recordings of a material, sorted; an error if there are none."""
     cycles = sorted(recording for recording in recordings if recording.material == material)
     if not cycles:
         known = ", ".join(sorted({recording.material for recording in recordings}))
@@ -328,7 +285,8 @@ def _check_share(train_share: float) -> None:
         raise ValueError(f"split.train_share must lie between 0 and 1, got {train_share}")
 
 
-def _checked(split: Split, needed: Sequence[str]) -> Split:
+def checked(split: Split, needed: Sequence[str]) -> Split:
+    """The split itself; an error if no recording has one of the roles."""
     for role in needed:
         if role not in split.roles.values():
             raise ValueError(
