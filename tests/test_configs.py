@@ -208,7 +208,7 @@ def test_deploy_trains_on_slips_and_motion_beside_an_arm_of_any_loudness():
     for role in ("test", "unseen"):
         assert {r.scene for r in fold.having(role)} >= {"paper", "arm_motion", "paper_loud"}
     for name in ("arm_motion", "paper_loud"):
-        assert config.others[name].motor_vibration_mv == [1.0, 30.0]
+        assert config.others[name].motor_vibration_mv == [1.0, 40.0]
 
 
 def test_hard_is_unseen4_on_another_hand():
