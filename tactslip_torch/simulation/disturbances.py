@@ -139,7 +139,7 @@ def _burst_envelope(bursts: tuple[Stretch, ...], grid: Grid) -> Array:
 
 
 def motor_level_mv(scene: Scene) -> float:
-    """The recording's motor vibration: the knob, or a draw of its own from the knob's range."""
+    """The recording's motor vibration: the scene's, or a draw of its own from the scene's range."""
     level = scene.disturbances.motor_vibration_mv
     if isinstance(level, tuple):
         return log_uniform(generator(*recording_key(scene, "motor level")), level)

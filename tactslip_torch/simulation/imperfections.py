@@ -1,4 +1,4 @@
-"""Noise, wander and partial slip of single elements; nothing where their knobs are zero.
+"""Noise, wander and partial slip of single elements; nothing where their parameters are zero.
 
 Everything is a function of absolute time and of keys of its own, so nothing else moves.
 """
@@ -78,7 +78,7 @@ def disturb(
     duration_s: float,
 ) -> None:
     """Change one touching element's vibration, in place: partial slip or sticking, local noise."""
-    knobs = scene.imperfections
+    parameters = scene.imperfections
     for start_s, end_s in partial_stretches(scene, _finger(scene, grasp, element), duration_s):
         rows = grid.overlapping(start_s, end_s)
         if rows.start == rows.stop:
@@ -93,9 +93,9 @@ def disturb(
         bands = _bands(scene, grasp, element, part, "partial slip")
         for band, noise in zip((vibration.high, vibration.low), bands, strict=True):
             band[rows] = sticks * band[rows] + own * noise
-    if knobs.local_noise_mv > 0:
+    if parameters.local_noise_mv > 0:
         rng = generator(*recording_key(scene, "local noise"), element)
-        size_v = 1e-3 * knobs.local_noise_mv * float(lognormal(rng, LEVEL_SPREAD))
+        size_v = 1e-3 * parameters.local_noise_mv * float(lognormal(rng, LEVEL_SPREAD))
         level = np.exp(LEVEL_SPREAD * wander(rng, grid)) * np.sqrt(grasp.load_n[element]) * size_v
         bands = _bands(scene, grasp, element, grid, "local noise")
         for band, noise in zip((vibration.high, vibration.low), bands, strict=True):

@@ -18,7 +18,7 @@ class Imperfections:
     Args:
         local_noise_mv: noise of every element that touches, sliding or not, independent between
             elements, rms at a PVDF film at 1 N. It stands for creep and settling of asperities
-            behind the skin's resonance, so it sounds like friction; its level wanders within the
+            behind the skin's resonance, so with the spectrum of friction noise; its level wanders within the
             recording and differs between elements (prior, ours: below the 1.5 to 4 mV rms that
             PHYSICS.md gives rest; independent, as a real fingertip's electrodes are in touch).
         share_wander: spread of the logarithm of each element's load while a grasp lasts, over
@@ -30,13 +30,13 @@ class Imperfections:
             wanders (a film is a source of high impedance, near motor drives and cables: MSI/TE
             Piezo Film Sensors Technical Manual asks for shielding; level prior, ours).
         partial_slips_per_s: how often a finger does what the hand does not. At rest it creeps over
-            a part of its presliding travel, and sounds so, while the others hold; in a slide it
+            a part of its presliding travel and vibrates, while the others hold; in a slide it
             sticks for as long. That is no slip of the hand, and not labelled (slip grows from the
             edge of a contact before all of it slides: Delhaye, Lefevre and Thonnard 2014, J. R.
             Soc. Interface, 10.1098/rsif.2014.0698; Andre et al. 2011, ibid.; rate prior, ours).
 
     Raises:
-        ValueError: if a knob is negative or not finite.
+        ValueError: if a parameter is negative or not finite.
     """
 
     local_noise_mv: float = 0.0
