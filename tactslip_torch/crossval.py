@@ -104,7 +104,8 @@ def judge(materials: Materials, recipe: Recipe, unseen: Sequence[str]) -> dict[s
     seen = sorted(set(materials.surveys) - set(unseen))
     survey = materials.survey_of(seen)
     allowed = recipe.allowed(materials.pool)
-    plan = plan_detector(recipe, survey, _quietly, allowed=allowed)
+    options: dict[str, Any] = {"allowed": allowed, "pool": materials.pool, "is_nested": False}
+    plan = plan_detector(recipe, survey, _quietly, **options)
     sample = survey.sample.bins()
     weights = stand_for(sample, recipe, survey.moments.count.tolist())
     training = TrainingBins(plan.frame(sample.features), sample.is_slip, weights)
@@ -126,7 +127,7 @@ def judge(materials: Materials, recipe: Recipe, unseen: Sequence[str]) -> dict[s
         "unseen": of_unseen,
         "test": score(seen, ("test",))[0],
         "per_material": by_material,
-        "num_features": len(plan.frame.selected),
+        "num_features": plan.frame.size,
         "penalty": plan.penalty,
     }
 

@@ -24,6 +24,7 @@ from tactslip_torch.features.cache import FeatureCache, default_cache_folder, so
 from tactslip_torch.features.extractor import EngineName, resolved
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pooling import statistics_of
 from tactslip_torch.files import whole_file
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.progress import RecordingProgressBar
@@ -48,6 +49,7 @@ def feature_parts(
     dtype: str,
     engine: EngineName,
     align: Align = "centred",
+    pooling: str | Sequence[str] | None = None,
 ) -> tuple[FeaturePool, ChannelFilter, torch.dtype, EngineName]:
     """Pool, filter, dtype and engine from the ``features`` section; no recording is read for it.
 
@@ -62,13 +64,16 @@ def feature_parts(
         dtype: in which features are computed.
         engine: what computes them.
         align: of the filter.
+        pooling: statistics over channels; the recipe takes them, here they are only checked.
 
     Raises:
-        ValueError: if a kind of channel has no frame, a bin allows no such level, or a value is
-            none that exists.
+        ValueError: if a kind of channel has no frame, a statistic is unknown, a bin
+            allows no such level, or a value is none that exists.
     """
     if dtype not in DTYPES:
         raise ValueError(f"features.dtype must be one of {', '.join(DTYPES)}, got {dtype!r}")
+    if pooling is not None:
+        statistics_of(pooling, len(source.hand))
     lengths = frame_lengths(source.hand, frames)
     bin_samples = round(bin_ms * source.sample_rate_hz / 1000)
     pool = FeaturePool(
@@ -182,16 +187,17 @@ def feature_rows(names: Sequence[FeatureName], hand: HandLayout) -> list[dict[st
     """Features as plain rows, with the kind and finger of their channel, for tables and figures."""
     rows = []
     for name in names:
-        channel = hand.channel(name.channel)
+        kind = name.channel if name.is_pooled else hand.channel(name.channel).kind
         rows.append(
             {
                 "name": str(name),
-                "channel": name.channel,
+                "channel": "all" if name.is_pooled else name.channel,
                 "component": name.component,
                 "domain": name.domain,
                 "descriptor": name.descriptor,
-                "kind": channel.kind,
-                "finger": channel.finger,
+                "statistic": name.statistic,
+                "kind": kind,
+                "finger": "all" if name.is_pooled else hand.channel(name.channel).finger,
             }
         )
     return rows

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.bin_sample import bin_keys
 from tactslip_torch.ledger import Ledger, content_digest
+from tactslip_torch.model.cholesky import from_above
 from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.kernel_elm import solve_normal_equations_
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.quadratic import QuadraticForm
@@ -20,11 +24,62 @@ from tactslip_torch.planning import Plan, Progress
 Head = QuadraticForm | KernelSum
 
 
+class LinearSums:
+    """Sums of fixed size that a machine of degree 1 is solved from, in either class.
+
+    Args:
+        num_features: K.
+    """
+
+    def __init__(self, num_features: int) -> None:
+        size = num_features + 1
+        self.products = torch.zeros(2, size, size, dtype=torch.float64)
+        self.count = torch.zeros(2, dtype=torch.float64)
+
+    def update(self, z: Tensor, is_slip: Tensor, weights: Tensor) -> None:
+        """Add bins.
+
+        Shape:
+            - z: ``[N, K]``; is_slip: ``[N]``, bool; weights: ``[N]``
+        """
+        x = torch.cat([z, torch.ones_like(z[:, :1])], 1)
+        for kind, mine in enumerate((~is_slip, is_slip)):
+            self.products[kind].addmm_((x[mine] * weights[mine, None]).mT, x[mine])
+            self.count[kind] += weights[mine].sum()
+
+    def merge(self, other: LinearSums) -> None:
+        """Add the bins of another."""
+        self.products += other.products
+        self.count += other.count
+
+    def solve(self, penalty: float, offset: float, balance: str) -> QuadraticForm:
+        """The machine.
+
+        Raises:
+            ValueError: if a class is absent or a number is not finite.
+        """
+        if not bool((self.count > 0).all()):
+            raise ValueError("training needs bins of both classes; add recordings with the other")
+        weight = torch.ones(2, dtype=torch.float64)
+        if balance == "weights":
+            weight = self.count.sum() / (2 * self.count)
+        unit = torch.ones(self.products.shape[1], dtype=torch.float64)
+        unit[-1] = math.sqrt(offset)  # of the constant
+        normal = (self.products * weight[:, None, None]).sum(0) * unit * unit[:, None]
+        sums = self.products[:, :, -1] * weight[:, None]
+        solved, report = solve_normal_equations_(
+            normal, (sums[1] - sums[0]) * unit, penalty, restore=from_above
+        )
+        head = QuadraticForm(solved.new_zeros(0, 0), solved[:-1], unit[-1] * solved[-1])
+        head.solved = report
+        return head
+
+
 class TrainingPass:
     """What a plan needs of the training bins, gathered recording by recording.
 
-    Sums of fixed size for the kernel of degree 2 and many bins; the bins themselves where they are
-    few or the kernel is another.
+    Sums of fixed size for polynomial kernels and many bins; the bins themselves where they are few
+    or the kernel is another.
 
     Args:
         plan: what was decided.
@@ -33,23 +88,31 @@ class TrainingPass:
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
         self.ledger = Ledger()
-        self.bins: dict[str, tuple[Tensor, Tensor]] = {}
-        self.stats: SufficientStats | None = None
-        if plan.adds_up:
-            self.stats = SufficientStats(len(plan.frame.selected))
+        self.bins: dict[str, tuple[Tensor, ...]] = {}
+        self.linear = LinearSums(plan.frame.size) if plan.is_linear else None
+        self.stats = SufficientStats(plan.frame.size) if plan.adds_up else None
 
-    def update(self, recording: str, features: Tensor, is_slip: Tensor) -> None:
+    def update(
+        self, recording: str, features: Tensor, is_slip: Tensor, scene: str = PAPER_SCENE
+    ) -> None:
         """Add the training bins of a recording, ``[N, F]`` and ``[N]``.
 
         Raises:
             ValueError: if the recording is there already.
         """
-        z, labels = training_part(self.plan, recording, features, is_slip)
+        plan = self.plan
+        z, labels = training_part(plan, recording, features, is_slip)
+        of_class = torch.tensor(plan.scene_weights.get(scene, (1.0, 1.0)), dtype=torch.float64)
+        each = plan.stands_for / (2.0 if plan.drop_channels > 0 else 1.0)  # two copies
+        weights = of_class[labels.long()] * each
         if self.stats is not None:
-            self.stats.update(recording, z, labels)
+            self.stats.update(recording, z, labels, weights)
             return
         self.ledger.add(recording, content_digest(z, labels))
-        self.bins[recording] = (z, labels)
+        if self.linear is None:
+            self.bins[recording] = (z, labels, weights)
+        else:
+            self.linear.update(z, labels, weights)
 
     def merge(self, other: TrainingPass) -> None:
         """Take over what another worker gathered.
@@ -62,6 +125,8 @@ class TrainingPass:
             return
         self.ledger.merge(other.ledger)
         self.bins |= other.bins
+        if self.linear is not None and other.linear is not None:
+            self.linear.merge(other.linear)
 
     def solve(self, progress: Progress | None = None) -> Head:
         """The machine.
@@ -73,22 +138,40 @@ class TrainingPass:
         plan = self.plan
         if self.stats is not None:
             return solve_sums(plan, self.stats)
+        is_balanced = plan.balance == "weights" and not plan.scene_weights  # which hold balance
+        if self.linear is not None:
+            assert isinstance(plan.kernel, Polynomial)  # is_linear
+            balance = "weights" if is_balanced else "none"
+            return self.linear.solve(plan.penalty, plan.kernel.offset, balance)
         parts = [self.bins[name] for name in sorted(self.bins)]
-        z = torch.cat([part[0] for part in parts])
-        is_slip = torch.cat([part[1] for part in parts])
-        weights = torch.full((len(z),), plan.stands_for, dtype=torch.float64)
-        if plan.balance == "weights":
+        z, is_slip, weights = (torch.cat(part) for part in zip(*parts, strict=True))
+        if is_balanced:
             counts = torch.bincount(is_slip.long(), minlength=2).clamp(min=1)
-            weights *= (len(z) / (2 * counts.double()))[is_slip.long()]
+            weights = weights * (len(z) / (2 * counts.double()))[is_slip.long()]
         return fit_machine(TrainingBins(z, is_slip, weights), plan.penalty, plan.kernel)
 
 
 def training_part(
     plan: Plan, recording: str, features: Tensor, is_slip: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Scaled selected features and labels of the bins of a recording that are trained on."""
+    """Scaled columns and labels of the bins of a recording that are trained on.
+
+    With ``plan.drop_channels`` they come twice, without some channels the second time, each copy
+    counting half.
+    """
     kept = _is_kept(recording, is_slip, plan.shares)
-    return plan.frame(features[kept]), is_slip[kept]
+    z = plan.frame(features[kept])
+    pooling = plan.frame.pooling
+    if plan.drop_channels == 0 or pooling is None:
+        return z, is_slip[kept]
+    num = len(pooling.hand)
+    keys = bin_keys(f"{recording}, channels", num + 1)
+    most = math.floor(plan.drop_channels * num)
+    left_out = keys[1:].argsort()[: math.floor(float(keys[0]) * (most + 1))]
+    is_missing = torch.zeros(num, dtype=torch.bool)
+    is_missing[left_out] = True
+    fewer = plan.frame(features[kept], is_missing.expand(len(z), num))
+    return torch.cat([z, fewer]), is_slip[kept].repeat(2)
 
 
 def solve_sums(plan: Plan, stats: SufficientStats) -> QuadraticForm:

@@ -22,6 +22,7 @@ from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.feature_maker import RecordingFeatures
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.fitting import TrainingPass, solve_facts
 from tactslip_torch.judging import (
@@ -121,10 +122,10 @@ class SlipLearner(L.LightningModule):
         mask = batch.roles["train"]
         features, is_slip = batch.features[mask], batch.is_slip[mask]
         if self._second is None:
-            group = self.recipe.group(batch.recording)
-            self._survey.update(str(batch.recording), group, features, is_slip)
+            stratum = self.recipe.stratum(batch.recording)
+            self._survey.update(str(batch.recording), stratum, features, is_slip)
         else:
-            self._second.update(str(batch.recording), features, is_slip)
+            self._second.update(str(batch.recording), features, is_slip, batch.recording.scene)
 
     def on_train_epoch_end(self) -> None:
         """Plan after the first epoch, solve after the second."""
@@ -154,6 +155,8 @@ class SlipLearner(L.LightningModule):
         checkpoint["plan"] = json.dumps(self._plan.facts())
         checkpoint["scaler"] = dict(self._plan.frame.scaler.state_dict())
         checkpoint["gaussians"] = self._plan.gaussians and self._plan.gaussians.tensors()
+        if (pooling := self._plan.frame.pooling) is not None:
+            checkpoint["pooling"] = (pooling.to_dict(), dict(pooling.state_dict()))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take up what ``on_save_checkpoint`` kept.
@@ -168,7 +171,10 @@ class SlipLearner(L.LightningModule):
             )
         scaler = FeatureScaler(**checkpoint["scaler"])
         gaussians = ClassGaussians.among(checkpoint.get("gaussians") or {})
-        self._plan = Plan.of(json.loads(checkpoint["plan"]), scaler, gaussians)
+        pooling = None
+        if kept := checkpoint.get("pooling"):
+            pooling = ChannelPooling.from_dict(self.pool.hand, *kept)
+        self._plan = Plan.of(json.loads(checkpoint["plan"]), scaler, gaussians, pooling)
 
     def on_test_start(self) -> None:
         """Forget what an earlier test judged.
@@ -190,7 +196,8 @@ class SlipLearner(L.LightningModule):
         device = next(self.detector.buffers()).device  # Lightning may have moved it
         score = self.detector.score_features(chosen.to(device)).cpu()
         says_slip = score >= 0
-        rival = self.threshold(chosen) if self.threshold else torch.zeros_like(says_slip)
+        columns = self.detector.columns(chosen.to(device)).cpu()
+        rival = self.threshold(columns) if self.threshold else torch.zeros_like(says_slip)
         abstention = abstention_of(self.detector)
         answer = abstention.answer(score) if abstention else None
         for role, part in judged_bins(batch, says_slip, rival, answer).items():
@@ -257,7 +264,7 @@ class SlipLearner(L.LightningModule):
 
     def _planned(self) -> Plan:
         parts = (self.recipe, self._survey, bar, self._frame, self._allowed)
-        plan = plan_detector(*parts, is_settled=self._frame is not None)
+        plan = plan_detector(*parts, pool=self.pool, is_settled=self._frame is not None)
         return self.abstaining.settle(plan, self.recipe, self._survey)
 
     def _sampled(self) -> TrainingPass:
@@ -278,6 +285,7 @@ class SlipLearner(L.LightningModule):
         self.facts = {"recipe": self.recipe.name} | {
             name: facts[name] for name in ("kernel", "penalty", "balance", "num_bins", "validation")
         }
+        self.facts |= {"nested_validation": plan.nested}
         of_head = {"head": head.cost._asdict(), "solve": solve_facts(head)}
         self.facts |= of_head | {"among": plan.among}
         self.seconds["solve"] = time.perf_counter() - started
@@ -292,6 +300,7 @@ class SlipLearner(L.LightningModule):
             | {KEY: plan.abstain},
             plan.typical,
             plan.gaussians,
+            plan.frame.pooling,
         )
 
     def rates(self) -> dict[str, str]:

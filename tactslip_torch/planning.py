@@ -13,6 +13,8 @@ from typing import Any, cast
 
 from torch import Tensor
 
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.fit import TrainingBins
@@ -20,11 +22,14 @@ from tactslip_torch.model.kernels import Kernel, Polynomial, kernel_from_dict
 from tactslip_torch.model.quadratic import num_quadratic_features
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import FeatureThreshold, best_threshold
+from tactslip_torch.model_selection import candidates, choose_model, fitted_frame
 from tactslip_torch.recipe import (
     Frame,
     Recipe,
     choose_frame,
     kept_shares,
+    sample_groups,
+    scene_weights,
     stand_for,
 )
 from tactslip_torch.validation import Progress as Progress
@@ -32,6 +37,9 @@ from tactslip_torch.validation import validate
 
 log = logging.getLogger(__name__)
 
+MOST_GAUSSIAN = 256
+"""So many features at most have the expected score where channels are missing: its matrices are of
+their number squared."""
 MOST_KEPT_BINS = 8192
 """So many bins at most for a kernel that does not fold: its machine is a matrix of bins by bins."""
 
@@ -56,7 +64,13 @@ class Plan:
         among: of a recipe that restricts the ranking: to what, how many features that leaves
             (``matching``), and the numbers chosen from after cutting them to it; else ``None``.
         abstain: thresholds for unsure answers, as ``Abstention.to_dict`` has them, if set.
-        gaussians: of the scaled features, for sensors that are missing; of a kernel that folds.
+        gaussians: of the scaled features, for sensors that are missing; of a kernel that folds and
+            at most ``MOST_GAUSSIAN`` features of channels.
+        nested: balanced accuracy of the whole choice on groups that it did not see, if it was
+            judged.
+        scene_weights: weight of a bin by scene, non-slip and slip, balance among it; empty if
+            scenes are not weighed.
+        drop_channels: the largest part of channels left out of second copies of recordings.
     """
 
     frame: Frame
@@ -72,19 +86,29 @@ class Plan:
     among: dict[str, Any] | None = None
     abstain: dict[str, Any] | None = None
     gaussians: ClassGaussians | None = None
+    nested: dict[str, Any] | None = None
+    scene_weights: dict[str, tuple[float, float]] = field(default_factory=dict)
+    drop_channels: float = 0.0
 
     @property
     def adds_up(self) -> bool:
         """Whether training bins become sums of fixed size; few bins, or other kernels, do not."""
-        fewer = self.num_bins <= num_quadratic_features(len(self.frame.selected))
+        fewer = self.num_bins <= num_quadratic_features(self.frame.size)
         return adds_up(self.kernel) and not fewer
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether a machine of degree 1 is solved from sums, as of more bins than columns."""
+        is_first = isinstance(self.kernel, Polynomial) and self.kernel.degree == 1
+        return is_first and self.num_bins > self.frame.size
 
     @property
     def calibration(self) -> dict[str, Any] | None:
         """By held-out scores of the choice that was taken; None if there was nothing to choose."""
-        chosen = (len(self.frame.selected), self.kernel.to_dict(), self.penalty)
+        chosen = (self.frame.size, self.kernel.to_dict(), self.penalty)
         for row in self.validation:
-            if (row["num_features"], row["kernel"], row["penalty"]) == chosen:
+            same = (row["num_features"], row["kernel"], row["penalty"]) == chosen
+            if row.get("chosen", same and "use" not in row):
                 return cast("dict[str, Any] | None", row.get("calibration"))
         return None
 
@@ -103,6 +127,9 @@ class Plan:
             "validation": self.validation,
             "among": self.among,
             "abstain": self.abstain,
+            "nested": self.nested,
+            "scene_weights": self.scene_weights,
+            "drop_channels": self.drop_channels,
         }
 
     def tensors(self) -> dict[str, Tensor]:
@@ -116,10 +143,11 @@ class Plan:
         facts: Mapping[str, Any],
         scaler: FeatureScaler,
         gaussians: ClassGaussians | None = None,
+        pooling: ChannelPooling | None = None,
     ) -> Plan:
         """The plan that ``facts`` described."""
         return cls(
-            frame=Frame(tuple(facts["selected"]), scaler),
+            frame=Frame(tuple(facts["selected"]), scaler, pooling),
             kernel=kernel_from_dict(facts["kernel"]),
             penalty=float(facts["penalty"]),
             balance=facts["balance"],
@@ -132,6 +160,9 @@ class Plan:
             among=facts.get("among"),  # older plans know no such restriction
             abstain=facts.get("abstain"),  # nor unsure answers
             gaussians=gaussians,
+            nested=facts.get("nested"),
+            scene_weights={k: (v[0], v[1]) for k, v in facts.get("scene_weights", {}).items()},
+            drop_channels=facts.get("drop_channels", 0.0),
         )
 
 
@@ -142,12 +173,17 @@ def plan_detector(
     frame: Frame | None = None,
     allowed: Tensor | None = None,
     *,
+    pool: FeaturePool | None = None,
     is_settled: bool = False,
+    is_nested: bool = True,
 ) -> Plan:
-    """Rank, scale, and choose K, c and C by closed-form validation on held-out groups.
+    """Choose the features and the machine by validation on held-out groups.
 
-    Features that were ranked and scaled elsewhere come as a ``frame``; which ones may be selected
-    here, for a recipe that restricts them, as ``allowed``, what ``recipe.allowed`` says.
+    A recipe with ``validation="nested"`` chooses by ``model_selection`` and needs the ``pool``;
+    ``is_nested=False`` leaves out the judgement of the choice. For other recipes: rank, scale, and
+    choose K, c and C by closed-form validation. Features that were ranked and scaled elsewhere come
+    as a ``frame``; which ones may be selected here, for a recipe that restricts them, as
+    ``allowed``, what ``recipe.allowed`` says.
 
     Of a recipe that leaves no choice nothing is validated, unless it ``is_settled``, by tuning:
     then held-out scores are wanted for what follows from them, such as a calibration.
@@ -159,6 +195,10 @@ def plan_detector(
     Raises:
         ValueError: if a class is absent or a solve fails.
     """
+    if recipe.validation == "nested" and frame is None:
+        if pool is None:
+            raise ValueError("recipe.validation=nested needs the pool; hand it over as pool=")
+        return _plan_nested(recipe, survey, progress, pool, allowed, is_nested=is_nested)
     frame = frame or choose_frame(recipe, survey, allowed)
     sizes = sorted({min(size, len(frame.selected)) for size in recipe.sizes})
     if sizes[-1] < recipe.sizes[-1]:
@@ -214,6 +254,57 @@ def plan_detector(
         validation=rows,
         among=None if allowed is None else _narrowed(recipe, allowed, sizes),
         gaussians=ClassGaussians.fit(z, sample.is_slip, weights) if kernel.collapses else None,
+    )
+
+
+def _plan_nested(
+    recipe: Recipe,
+    survey: Survey,
+    progress: Progress,
+    pool: FeaturePool,
+    allowed: Tensor | None,
+    *,
+    is_nested: bool,
+) -> Plan:
+    """``plan_detector`` by nested validation."""
+    sample = survey.sample.bins()
+    counts = survey.moments.count.tolist()
+    weights = stand_for(sample, recipe, counts)
+    shares = kept_shares(recipe, counts)
+    num_bins = round(sum(count * share for count, share in zip(counts, shares, strict=True)))
+    structures = candidates(recipe, num_bins)
+    rows: list[dict[str, Any]] = []
+    nested = None
+    structure = structures[0]
+    penalty = recipe.penalties_ascending[len(recipe.penalties_ascending) // 2]
+    if len(sample_groups(sample)[1]) > 1:
+        options: dict[str, Any] = {"num_bins": num_bins, "allowed": allowed, "is_nested": is_nested}
+        choice = choose_model(recipe, pool, sample, weights, progress, **options)
+        structure, penalty = choice.structure, choice.penalty
+        rows, nested = choice.rows, choice.nested
+        if choice.edge:
+            log.warning("%s", choice.edge)
+    else:
+        log.warning("%s, C=%g are taken unvalidated: one group", structure, penalty)
+    frame = fitted_frame(recipe, pool, sample, structure, allowed)
+    z = frame(sample.features)
+    has_gaussians = frame.pooling is None and frame.size <= MOST_GAUSSIAN
+    return Plan(
+        frame=frame,
+        kernel=structure.kernel,
+        penalty=penalty,
+        balance=recipe.balance,
+        shares=(shares[0], shares[1]),
+        stands_for=1.0,
+        num_bins=num_bins,
+        threshold=best_threshold(frame.columns(sample.features), sample.is_slip),
+        typical=_typical(z, sample.is_slip, weights),
+        validation=rows,
+        among=None if recipe.among is None or allowed is None else _narrowed(recipe, allowed, []),
+        gaussians=ClassGaussians.fit(z, sample.is_slip, weights) if has_gaussians else None,
+        nested=nested,
+        scene_weights=scene_weights(recipe, sample) if recipe.scene_weights else {},
+        drop_channels=recipe.drop_channels if frame.pooling is not None else 0.0,
     )
 
 

@@ -40,6 +40,7 @@ from tactslip_torch.experiment import (
     save_config,
 )
 from tactslip_torch.feature_maker import FeatureMaker
+from tactslip_torch.features.pooling import pooled_names
 from tactslip_torch.fold_training import check_statistics, run_fold, tune_fold
 from tactslip_torch.folds import combined
 from tactslip_torch.learning import SlipLearner
@@ -109,7 +110,10 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             fold_metrics[fold.name] = run_fold(config, place, data, learner, alarming, found)
     metrics = common_facts(source, pool, config) | combined(fold_metrics, are_rivals(folds))
     metrics["timing_s"]["total"] = time.perf_counter() - started
-    by_name = {str(name): name for name in pool.names}
+    names = list(pool.names)
+    if recipe.pooling is not None:
+        names += pooled_names(source.hand, pool.names, recipe.pooling)
+    by_name = {str(name): name for name in names}
     rows = feature_rows([by_name[name] for name in metrics["selected"]], source.hand)
     if is_first:
         write_results(folder, metrics, rows)

@@ -224,9 +224,9 @@ def test_parts_that_agree_make_the_same_detector(detector):
 
 
 def test_parts_that_disagree_are_refused(detector):
-    with pytest.raises(ValueError, match="11 selected features, a scaler of 12 and a head of 12"):
+    with pytest.raises(ValueError, match="11 columns, a scaler of 12 and a head of 12"):
         rebuilt(detector, selected=detector.selected[:-1])
-    with pytest.raises(ValueError, match="12 selected features, a scaler of 3 and a head of 12"):
+    with pytest.raises(ValueError, match="12 columns, a scaler of 3 and a head of 12"):
         rebuilt(detector, scaler=FeatureScaler(-torch.ones(3), torch.ones(3)))
     with pytest.raises(ValueError, match="a filter of 23 channels does not fit a hand of 24"):
         rebuilt(detector, channel_filter=ChannelFilter([11] * 23))

@@ -10,7 +10,7 @@ from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.plan import Plan, Wanted
 from tactslip_torch.graph.descriptors import DESCRIPTORS
 from tactslip_torch.graph.form import Form, Window
-from tactslip_torch.graph.head import lost_features, machine, scaled, with_typical
+from tactslip_torch.graph.head import lost_features, machine, pooled, scaled, with_typical
 from tactslip_torch.graph.missing import expected_scores, widened_llr_of
 from tactslip_torch.graph.rows import EXACT, Front
 from tactslip_torch.graph.sequence import llr_of, probability_of
@@ -73,9 +73,9 @@ def judge_bins(
         )
     front = Front(graph, detector, windows, form)
     features = selected_features(graph, detector, front, form)
-    z = scaled(graph, features, detector.scaler)
     is_dead = dead.take(front.window.channels, 0)
     is_missing = front.is_missing | is_dead
+    z = scaled(graph, pooled(graph, features, is_missing, detector), detector.scaler)
     is_lost = lost_features(is_missing, detector)
     head, gaussians, variance = detector.head, detector.gaussians, None
     score = machine(graph, with_typical(graph, z, is_lost, detector), head, form)

@@ -6,8 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.pooling import Ops, over_channels
 from tactslip_torch.graph.form import Form
-from tactslip_torch.graph.value import F32, F64, Nodes, Value
+from tactslip_torch.graph.order import ascending
+from tactslip_torch.graph.value import BOOL, F32, F64, I64, Nodes, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.detector_file import Head
@@ -16,6 +18,45 @@ from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 
 _LARGEST = float(np.finfo(np.float64).max)
+
+
+def pooled(graph: Graph, features: Value, is_missing: Value, detector: SlipDetector) -> Value:
+    """Columns for the scaler, ``[B, K]``, float64: ``ChannelPooling``; without one as they are.
+
+    Args:
+        graph: to which nodes are added.
+        features: of channels, ``[B, M]``, float64.
+        is_missing: ``[B, channels in use]``, bool.
+        detector: whose columns.
+    """
+    layer = detector.pooling
+    if layer is None:
+        return features
+    used = detector.extractor.plan.channels
+    parts, is_some = [], []
+    if layer.singles:
+        parts.append(features.take(layer.singles, 1))
+    for index, group in enumerate(layer.groups):
+        num = len(group.channels)
+        least = float(layer.least_range[index])
+        is_lost = is_missing.take([used.index(channel) for channel in group.channels], 1)
+        in_use = ~((features.take(group.ranges, 1) < least) | is_lost)
+        is_some.append(in_use.cast(I64).amax(1, True).cast(BOOL))
+        values = features.take(group.columns, 1).reshape(0, len(group.families), num)
+        knee = layer.knee[list(group.families), None]
+        size = (values.abs() * graph.constant(_of(1 / knee), F64) + 1.0).log()
+        bent = size * graph.op("Sign", values) * graph.constant(_of(knee), F64)
+        ops = Ops(
+            one=graph.constant(1.0, F64),
+            places=graph.constant(np.arange(num), F64),
+            where=graph.where,
+            ascending=lambda x, num=num: ascending(x, num),
+        )
+        parts += over_channels(bent, in_use.expand(1), group.statistics, num, ops)
+    columns = graph.concat(*parts, axis=1).take(layer.order, 1)
+    always = is_some[0] | ~is_some[0]
+    known = graph.concat(*is_some, always, axis=1).cast(F32).take(layer.kind_of, 1) > 0.0
+    return graph.where(known, columns, matrix(graph, layer.fill))
 
 
 def scaled(graph: Graph, features: Value, scaler: FeatureScaler) -> Value:
@@ -39,7 +80,10 @@ def scaled(graph: Graph, features: Value, scaler: FeatureScaler) -> Value:
 
 
 def lost_features(is_missing: Value, detector: SlipDetector) -> Value:
-    """Which features are of missing channels in use: ``[B, channels] -> [B, K]``, bool."""
+    """Which columns are of missing channels in use: ``[B, channels] -> [B, K]``, bool.
+
+    Those that are pooled are of no channel.
+    """
     used = detector.extractor.plan.channels
     of_channel = np.equal.outer(np.array(used), detector.channel_index.numpy())
     found: Value = (
@@ -68,7 +112,9 @@ def machine(graph: Graph, z: Value, head: Head, form: Form) -> Value:
         score = _kernel_sum(graph, z, head)
     else:
         z = z.cast(form.dtype)
-        pull = z @ _of(head.quadratic) + graph.constant(_of(head.linear), form.dtype)
+        pull = graph.constant(_of(head.linear), form.dtype)
+        if not head.is_linear:
+            pull = z @ _of(head.quadratic) + pull
         score = (pull * z).sum(1) + float(head.constant)
     largest = float(np.finfo(form.dtype).max)
     return score.clip(-largest, largest).cast(form.dtype)

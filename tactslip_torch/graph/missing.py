@@ -128,7 +128,7 @@ class _Bin:
         shapes = [(2, len(count), len(count)), (2,), ()]
         start = [matrix(graph, precision.matrix), matrix(graph, -precision.log_det)]
         (swept, log_det), _ = graph.scan(step, start, [places], shapes)
-        bend = matrix(graph, self._head.quadratic) * is_lost.expand(1) * is_lost
+        bend = matrix(graph, self._head.dense_quadratic) * is_lost.expand(1) * is_lost
         bent = bend @ swept
         spread = (bent * bent.transpose(0, 2, 1)).sum(2).sum(1) * 2.0
         return _Mask(is_lost, swept, log_det, -(bend * swept).sum(2).sum(1), spread)
@@ -138,7 +138,7 @@ class _Bin:
         graph, head = z.graph, self._head
         is_seen = 1.0 - mask.is_lost
         middle = matrix(graph, self._gaussians.mean)
-        quadratic, linear = matrix(graph, head.quadratic), matrix(graph, head.linear)
+        quadratic, linear = matrix(graph, head.dense_quadratic), matrix(graph, head.linear)
         away = (z - middle) * is_seen  # [2, K]
         turned = (mask.swept @ away.expand(2)).squeeze(2)
         filled = z * is_seen + (middle - turned) * mask.is_lost

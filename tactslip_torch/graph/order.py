@@ -43,7 +43,7 @@ def modes(graph: Graph, values: Value, scale: Value, num: int) -> Value:
     Neighbours within a tolerance of ``scale [B, R]`` are one value. Only where some row of the
     batch has such a pair are runs counted; elsewhere the smallest value is it.
     """
-    ordered = _sorted(values, num)
+    ordered = ascending(values, num)
     tolerance = scale * RUN_TOLERANCE[torch.float64]
     is_new = ordered.slice(1, num, 2) - ordered.slice(0, num - 1, 2) > tolerance.expand(2)
     has_runs = (~is_new).cast(I64).amax(2).amax(1).amax(0) > 0
@@ -96,8 +96,8 @@ def _largest(values: Value, count: int) -> Value:
     return values.graph.ops("TopK", values, count_of, dtypes=(None, I64), axis=2)[0]
 
 
-def _sorted(values: Value, num: int) -> Value:
-    """All values, rising."""
+def ascending(values: Value, num: int) -> Value:
+    """All values along the last of three axes, smallest first."""
     count_of = values.graph.axes(num)
     return values.graph.ops("TopK", values, count_of, dtypes=(None, I64), axis=2, largest=0)[0]
 

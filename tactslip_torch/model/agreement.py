@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector_file import Head
 from tactslip_torch.model.scaling import FeatureScaler
@@ -21,6 +22,7 @@ def check_parts(
     head: Head,
     typical: Tensor,
     gaussians: ClassGaussians | None,
+    pooling: ChannelPooling | None = None,
 ) -> None:
     """Refuse parts that disagree; what they are ``SlipDetector`` says.
 
@@ -29,9 +31,17 @@ def check_parts(
             are not scaled.
     """
     num = len(selected)
+    if pooling is not None:
+        given = tuple(pool.names[index] for index in selected if 0 <= index < len(pool.names))
+        if given != pooling.inputs or pooling.hand != pool.hand:
+            raise ValueError(
+                f"{num} selected features do not fit a pooling of {len(pooling.inputs)}: they must "
+                "be its inputs, in their order"
+            )
+        num = len(pooling.names)
     if not num == len(scaler.minimum) == head.num_features:
         raise ValueError(
-            f"{num} selected features, a scaler of {len(scaler.minimum)} and a head of "
+            f"{num} columns, a scaler of {len(scaler.minimum)} and a head of "
             f"{head.num_features}: the three must agree"
         )
     if len(channel_filter.window_lengths) != len(pool.hand):

@@ -16,6 +16,7 @@ from tactslip_torch.features.extractor import EngineName, FeatureExtractor, reso
 from tactslip_torch.features.guards import is_nowhere
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool, saturating
+from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.model.agreement import check_parts
 from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector_file import Head, damaged, read_detector, write_detector
@@ -36,19 +37,21 @@ class SlipDetector(nn.Module):
     Args:
         pool: what features there are, F of C channels.
         channel_filter: the Savitzky-Golay filter of each channel.
-        selected: pool indices of the K features in use, best first.
-        scaler: of the selected features.
+        selected: pool indices of the features that are read, best first: the K columns themselves
+            or, with ``pooling``, its inputs.
+        scaler: of the K columns.
         head: the machine on scaled features.
         info: JSON-able facts about the training, kept in the file.
         typical: scaled features that stand in for those of a missing channel; default 0.
         gaussians: of the scaled features; with them, what is missing leaves the expected score and
             its variance (``ExpectedScore``), instead of the score of ``typical`` features.
+        pooling: from the features that are read to the columns; ``None``: they are the columns.
         engine: what features are made by where no gradient is asked for (``FeatureExtractor``).
 
     Shape:
         - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
         - score: ``[*]``, dtype of ``bins``; at least 0 means slip
-        - inside: ``bins -> features [*, F] -> selected [*, K] -> scaled [*, K] -> score [*]``
+        - inside: ``bins -> features [*, M] -> columns [*, K] -> scaled [*, K] -> score [*]``
         - raw samples, for ``score_raw`` and ``judge_raw``: ``[*, C, before + n + after]``, with
           ``context_before`` and ``context_after`` samples around the bin
 
@@ -57,7 +60,7 @@ class SlipDetector(nn.Module):
     """
 
     typical: Tensor
-    channel_index: Tensor  # of each selected feature
+    channel_index: Tensor  # of each column; one past the last channel for a pooled one
     needed_index: Tensor  # of the channels in use
 
     def __init__(
@@ -70,29 +73,31 @@ class SlipDetector(nn.Module):
         info: Mapping[str, Any] | None = None,
         typical: Tensor | Sequence[float] | None = None,
         gaussians: ClassGaussians | None = None,
+        pooling: ChannelPooling | None = None,
         *,
         engine: EngineName = "auto",
     ) -> None:
         super().__init__()
-        typical = torch.as_tensor([0.0] * len(selected) if typical is None else typical)
-        check_parts(pool, channel_filter, selected, scaler, head, typical, gaussians)
+        typical = torch.as_tensor([0.0] * len(scaler.minimum) if typical is None else typical)
+        check_parts(pool, channel_filter, selected, scaler, head, typical, gaussians, pooling)
         self.pool, self.channel_filter = pool, channel_filter
         self.extractor = FeatureExtractor(pool, selected, engine)
         self.selected = self.extractor.selected
-        self.scaler, self.head, self.gaussians = scaler, head, gaussians
+        self.pooling, self.scaler, self.head, self.gaussians = pooling, scaler, head, gaussians
         self.info = dict(info or {})
         self._few: FewBins | None = None
         self._missing: MissingScores | None = None
         self.register_buffer("typical", typical.to(next(head.buffers()), copy=True))
-        channels = [pool.hand.names.index(name.channel) for name in self.selected_names]
-        indices = {"channel": channels, "needed": sorted(set(channels))}
+        place = {name: index for index, name in enumerate(pool.hand.names)}
+        channels = [place.get(name.channel, len(place)) for name in self.selected_names]
+        indices = {"channel": channels, "needed": self.extractor.plan.channels}
         for name, index in indices.items():
             self.register_buffer(f"{name}_index", torch.tensor(index), persistent=False)
 
     @property
     def selected_names(self) -> tuple[FeatureName, ...]:
-        """Names of the features in use, best first."""
-        return self.extractor.names
+        """Names of the columns, best first."""
+        return self.extractor.names if self.pooling is None else self.pooling.names
 
     @property
     def context_before(self) -> int:
@@ -197,14 +202,27 @@ class SlipDetector(nn.Module):
         return self._needed(self.pool.validity(bins))
 
     def score_features(self, features: Tensor) -> Tensor:
-        """Score selected, unscaled features.
+        """Score features that are neither pooled nor scaled.
 
         Shape:
-            - features: ``[*, K]`` in the order of ``selected``
+            - features: ``[*, M]`` in the order of ``selected``
             - output: ``[*]``, dtype of the detector
         """
         score: Tensor = self.head(self._scale(features))
         return score
+
+    def columns(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
+        """What the scaler takes: features, pooled over channels where the detector does that.
+
+        Shape:
+            - features: ``[*, M]`` in the order of ``selected``
+            - is_missing: ``[*, C]``, bool, channels to leave out of their pools
+            - output: ``[*, K]``
+        """
+        if self.pooling is None:
+            return features
+        columns: Tensor = self.pooling(features, is_missing)
+        return columns
 
     def _score(self, bins: Tensor, most: int = FEW_BINS) -> Tensor:
         if (few := self._few_bins(bins, most)) is not None:
@@ -228,7 +246,7 @@ class SlipDetector(nn.Module):
         is_whole = is_nowhere(is_missing)
         if not is_whole:
             bins = torch.where(is_missing[..., None], 0.0, bins)
-        scaled = self._scale(self._features(bins))
+        scaled = self._scale(self._features(bins), None if is_whole else is_missing)
         score = saturating(self.head(scaled), given)
         variance = torch.zeros_like(score)
         if not is_whole:
@@ -262,13 +280,14 @@ class SlipDetector(nn.Module):
     def _features(self, bins: Tensor) -> Tensor:
         return self.extractor(bins, self.scaler.minimum.dtype)
 
-    def _scale(self, features: Tensor) -> Tensor:
-        scaled: Tensor = self.scaler(saturating(features, self.scaler.minimum.dtype))
+    def _scale(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
+        columns = self.columns(saturating(features, self.scaler.minimum.dtype), is_missing)
+        scaled: Tensor = self.scaler(columns)
         return scaled.to(self.typical.dtype)
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SlipDetector:
         """``float()`` and ``to()``: what is known of features stays float64, as offsets cancel."""
-        modules = [self.scaler] if self.gaussians is None else [self.scaler, self.gaussians]
+        modules = [m for m in (self.scaler, self.gaussians, self.pooling) if m is not None]
         exact = [(each, *part) for each in modules for part in each.named_buffers()]
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]  # torch has no annotations
         for module, name, value in exact:
@@ -281,7 +300,7 @@ class SlipDetector(nn.Module):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the detector to one file, whole or not at all."""
-        parts = (self.pool, self.channel_filter, self.selected, self.head, self.info)
+        parts = (self.pool, self.channel_filter, self.selected, self.head, self.info, self.pooling)
         write_detector(path, *parts, self.state_dict())
 
     @classmethod

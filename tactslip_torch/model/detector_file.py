@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.files import load_table, save_table, table_form
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.class_gaussians import ClassGaussians
@@ -36,6 +37,7 @@ class DetectorParts(NamedTuple):
     info: Mapping[str, Any]
     typical: Tensor | None
     gaussians: ClassGaussians | None
+    pooling: ChannelPooling | None
 
 
 def write_detector(
@@ -45,6 +47,7 @@ def write_detector(
     selected: Sequence[int],
     head: Head,
     info: Mapping[str, Any],
+    pooling: ChannelPooling | None,
     state: Mapping[str, Tensor],
 ) -> None:
     """Write a detector with the tensors of its ``state_dict``, whole or not at all."""
@@ -53,6 +56,7 @@ def write_detector(
         "pool": pool.facts(),
         **channel_filter.facts(),
         "selected": list(selected),
+        "pooling": None if pooling is None else pooling.to_dict(),
         "kernel": head.kernel.to_dict() if isinstance(head, KernelSum) else None,
         "info": dict(info),
     }
@@ -101,8 +105,9 @@ def _parts(facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> DetectorPar
         head = QuadraticForm(**part("head."))
     else:
         head = KernelSum(**part("head."), kernel=kernel_from_dict(facts["kernel"]))
+    hand, pooling = HandLayout.from_rows(facts["channels"]), facts.get("pooling")
     return DetectorParts(
-        FeaturePool(HandLayout.from_rows(facts["channels"]), **facts["pool"]),
+        FeaturePool(hand, **facts["pool"]),
         ChannelFilter(
             facts["window_lengths"],
             facts["polyorder"],
@@ -115,4 +120,5 @@ def _parts(facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> DetectorPar
         facts["info"],
         state.get("typical"),
         ClassGaussians.among(state),
+        pooling and ChannelPooling.from_dict(hand, pooling, part("pooling.")),
     )

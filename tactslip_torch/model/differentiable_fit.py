@@ -172,7 +172,7 @@ def _scale(offset: Tensor, num_features: int) -> Tensor:
 
 def _slope(form: QuadraticForm, z: Tensor) -> Tensor:
     """Derivative of the score by z: ``[N, K]``."""
-    return 2 * z @ form.quadratic + form.linear
+    return 2 * z @ form.dense_quadratic + form.linear
 
 
 def _offset_slope(solved: Tensor, z: Tensor, shares: Tensor, offset: Tensor) -> Tensor:

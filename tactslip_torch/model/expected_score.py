@@ -72,7 +72,7 @@ class ExpectedScore:
 
     def __init__(self, head: QuadraticForm, gaussians: ClassGaussians) -> None:
         with torch.inference_mode(False):  # what is kept outlives the mode
-            parts = head.quadratic, head.linear, head.constant, gaussians.mean
+            parts = head.dense_quadratic, head.linear, head.constant, gaussians.mean
             self._quadratic, self._linear, self._constant, self._mean = (
                 part.detach().clone().double() for part in parts
             )

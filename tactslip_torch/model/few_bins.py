@@ -37,6 +37,9 @@ class Parts(Protocol):
     scaler: FeatureScaler
     head: Head
 
+    def columns(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
+        """What the scaler takes."""
+
     @property
     def needed_index(self) -> Tensor:
         """Channels in use, ascending."""
@@ -53,6 +56,7 @@ class FewBins:
         assert isinstance(parts.head, QuadraticForm)  # suits
         self._of = _held(parts)
         self._pool, self._scaler, head = parts.pool, parts.scaler, parts.head
+        self._columns = parts.columns
         # views: what is changed in place, as by load_state_dict, is seen here
         self._minimum, self._maximum = parts.scaler.minimum.numpy(), parts.scaler.maximum.numpy()
         self._knee = None if parts.scaler.knee is None else parts.scaler.knee.numpy()
@@ -79,7 +83,7 @@ class FewBins:
     def score(self, features: Tensor, dtype: torch.dtype) -> Tensor:
         """Scores ``[*]`` of selected features ``[*, K]``."""
         with np.errstate(all="ignore"):
-            return self._score(self._scaled(features), dtype)
+            return self._score(self._scaled(self._columns(features)), dtype)
 
     def judge(
         self,
@@ -97,11 +101,11 @@ class FewBins:
             is_whole = not is_missing.any()
             if not is_whole:
                 bins = bins.masked_fill(torch.from_numpy(is_missing)[..., None], 0.0)
-            scaled = self._scaled(features_of(bins))
+            lost = None if is_whole else torch.from_numpy(is_missing)
+            scaled = self._scaled(self._columns(features_of(bins), lost))
             score = self._score(scaled, given)
             variance = torch.zeros_like(score)
-            if not is_whole:
-                lost = torch.from_numpy(is_missing)
+            if lost is not None:
                 score, variance = without(score, torch.from_numpy(np.asarray(scaled)), lost)
             is_trusted = (is_alive & ~is_missing)[..., self._needed].all(-1)
             is_valid = np.asarray(is_trusted & np.isfinite(score.numpy()))
@@ -128,7 +132,9 @@ class FewBins:
 
     def _score(self, scaled: Array, dtype: torch.dtype) -> Tensor:
         """As ``QuadraticForm``, saturating at the largest number of a dtype."""
-        pull = scaled @ self._quadratic + self._linear
+        pull = self._linear
+        if self._quadratic.size:
+            pull = scaled @ self._quadratic + pull
         return saturating(
             torch.from_numpy(np.asarray((pull * scaled).sum(-1) + self._constant)), dtype
         )

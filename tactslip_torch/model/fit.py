@@ -187,8 +187,7 @@ def _solve_linear_primal(
         normal.addmm_(weighted.mT, x)
         moment.addmv_(weighted.mT, bins.targets[chunk])
     solved, report = solve_normal_equations_(normal, moment, penalty, restore=from_above)
-    flat = solved.new_zeros(num_features, num_features)
-    machine = QuadraticForm(flat, solved[:-1], math.sqrt(offset) * solved[-1])
+    machine = QuadraticForm(solved.new_zeros(0, 0), solved[:-1], math.sqrt(offset) * solved[-1])
     machine.solved = report
     return machine
 

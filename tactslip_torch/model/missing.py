@@ -74,7 +74,7 @@ class MissingScores:
     Args:
         head: the machine.
         typical: scaled features, ``[K]``.
-        channel_index: of each feature, ``[K]``.
+        channel_index: of each column, ``[K]``; one past the last channel for a pooled one.
         gaussians: of the features, if they are known.
     """
 
@@ -112,7 +112,8 @@ class MissingScores:
             - is_missing: ``[*, C]``, bool, of channels
             - output: ``[*]`` each
         """
-        is_lost = is_missing.index_select(-1, self._channel_index)
+        pooled = torch.zeros_like(is_missing[..., :1])  # never lost: it is of the other channels
+        is_lost = torch.cat([is_missing, pooled], -1).index_select(-1, self._channel_index)
         rows = is_lost.any(-1)
         if has_values(rows):
             mean, spread = self._of(scaled[rows], is_lost[rows])

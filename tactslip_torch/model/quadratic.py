@@ -2,7 +2,7 @@
 
 ``sum_i beta_i (z_i . z + c)^2 = z' Q z + l' z + a`` with ``Q = Z' diag(beta) Z``,
 ``l = 2 c Z' beta`` and ``a = c^2 sum(beta)``: exact, and of one size whatever the number of
-training bins. Degree 1 likewise, with ``Q = 0``, ``l = Z' beta`` and ``a = c sum(beta)``.
+training bins. Degree 1 likewise, with ``Q = 0`` (not stored), ``l = Z' beta``, ``a = c sum(beta)``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class QuadraticForm(nn.Module):
     """``z' Q z + l' z + a``.
 
     Args:
-        quadratic: ``[K, K]``, symmetric.
+        quadratic: ``[K, K]``, symmetric; of a linear machine empty, ``[0, 0]``.
         linear: ``[K]``.
         constant: a scalar tensor.
 
@@ -38,9 +38,10 @@ class QuadraticForm(nn.Module):
         super().__init__()
         self.solved: Solved | None = None
         num = linear.shape[-1]
-        if quadratic.shape != (num, num) or linear.shape != (num,) or constant.shape != ():
+        is_known = quadratic.shape in ((num, num), (0, 0))
+        if not is_known or linear.shape != (num,) or constant.shape != ():
             raise ValueError(
-                "expected quadratic [K, K], linear [K] and a scalar constant, got "
+                "expected quadratic [K, K] or [0, 0], linear [K] and a scalar constant, got "
                 f"{tuple(quadratic.shape)}, {tuple(linear.shape)} and {tuple(constant.shape)}"
             )
         self.register_buffer("quadratic", quadratic.clone())
@@ -53,9 +54,20 @@ class QuadraticForm(nn.Module):
         return self.linear.shape[-1]
 
     @property
+    def is_linear(self) -> bool:
+        """Whether there is no quadratic part, as of degree 1."""
+        return self.quadratic.numel() == 0
+
+    @property
+    def dense_quadratic(self) -> Tensor:
+        """``Q``, ``[K, K]``, of a linear machine too."""
+        num = self.num_features
+        return self.linear.new_zeros(num, num) if self.is_linear else self.quadratic
+
+    @property
     def cost(self) -> Cost:
         """Multiply-adds a bin and bytes, whatever the number of training bins."""
-        num_values = self.num_features * (self.num_features + 1)
+        num_values = self.num_features + self.quadratic.numel()
         return Cost(num_values, (num_values + 1) * self.linear.element_size())
 
     def forward(self, z: Tensor) -> Tensor:
@@ -65,6 +77,8 @@ class QuadraticForm(nn.Module):
             - z: ``[*, K]``
             - output: ``[*]``
         """
+        if self.is_linear:
+            return torch.linalg.vecdot(self.linear, z) + self.constant
         pull = nn.functional.linear(z, self.quadratic, self.linear)  # as few calls as can be
         score: Tensor = torch.linalg.vecdot(pull, z) + self.constant
         return score
@@ -96,8 +110,7 @@ def collapse(support: Tensor, beta: Tensor, kernel: Kernel = PAPER_KERNEL) -> Qu
     support, beta = support.double(), beta.double()
     pull, total = support.mT @ beta, beta.sum()
     if kernel.degree == 1:
-        flat = support.new_zeros(support.shape[1], support.shape[1])
-        return QuadraticForm(flat, pull, kernel.offset * total)
+        return QuadraticForm(support.new_zeros(0, 0), pull, kernel.offset * total)
     bend = support.mT @ (support * beta[:, None])
     return QuadraticForm(bend, 2 * kernel.offset * pull, kernel.offset**2 * total)
 

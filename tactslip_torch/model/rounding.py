@@ -66,7 +66,7 @@ def rounding_bound(head: QuadraticForm, dtype: torch.dtype = torch.float32) -> R
     num = head.num_features
     quadratic, linear, constant = (
         float(part.detach().double().abs().sum())
-        for part in (head.quadratic, head.linear, head.constant)
+        for part in (head.dense_quadratic, head.linear, head.constant)
     )
     if math.isnan(quadratic + linear + constant):
         raise ValueError("a coefficient of the head is NaN; fit it again")
@@ -134,7 +134,7 @@ def worst_error(
 
 
 def _stored(head: QuadraticForm, dtype: torch.dtype) -> QuadraticForm:
-    parts = (head.quadratic, head.linear, head.constant)
+    parts = (head.dense_quadratic, head.linear, head.constant)
     return QuadraticForm(*(part.detach().cpu().to(dtype) for part in parts))
 
 
@@ -150,11 +150,12 @@ def _starts(
     num = exact.num_features
     inside = 2 * torch.rand(num_points, num, generator=generator, dtype=torch.float64) - 1
     corners = _sign(torch.randn(num_points, num, generator=generator, dtype=torch.float64))
-    rows = _sign(exact.quadratic)
+    rows = _sign(exact.dense_quadratic)
     parts = [inside, corners, rows, -rows, _sign(exact.linear)[None], torch.ones(1, num)]
-    lost = rounded.quadratic.double() - exact.quadratic
-    if bool(lost.isfinite().all()) and bool(exact.quadratic.isfinite().all()):
-        vectors = torch.linalg.eigh(exact.quadratic + exact.quadratic.mT).eigenvectors.mT
+    lost = rounded.dense_quadratic.double() - exact.dense_quadratic
+    if bool(lost.isfinite().all()) and bool(exact.dense_quadratic.isfinite().all()):
+        bend = exact.dense_quadratic
+        vectors = torch.linalg.eigh(bend + bend.mT).eigenvectors.mT
         parts += [_sign(vectors), -_sign(vectors), vectors / vectors.abs().amax(1, keepdim=True)]
         uphill = corners
         for _ in range(8):  # each step adds up more of what storing the coefficients lost

@@ -11,36 +11,10 @@ import math
 import torch
 from torch import Tensor, nn
 
+from tactslip_torch.features.pooling import signed_log as signed_log
 from tactslip_torch.plain import is_plain
 
-
-def signed_log(features: Tensor, knee: Tensor) -> Tensor:
-    """``sign(f) * knee * log1p(|f| / knee)``: nearly ``f`` below the knee, logarithmic above.
-
-    Monotone, odd, with derivative ``knee / (knee + |f|)``, 1 at 0. Finite for every finite ``f``,
-    also where ``|f| / knee`` passes the largest float; NaN stays NaN.
-
-    Shape:
-        - features, output: ``[*, K]``
-        - knee: ``[K]``, positive
-    """
-    if is_plain(features) and is_plain(knee):
-        size = features.abs()
-        ratio = size / knee
-        if ratio.numel() and ratio.numpy().max() < math.inf:
-            bent = torch.where(ratio < torch.finfo(ratio.dtype).tiny, size, knee * ratio.log1p())
-            return bent.copysign_(features)  # the same bits as below in half as many calls
-    is_negative = features < 0
-    size = torch.where(is_negative, -features, features)  # abs() has derivative 0 at 0
-    ratio = size / knee
-    is_far = ratio.isinf()
-    near = ratio.log1p()
-    far = torch.where(is_far, size, 1.0).log() - knee.log()
-    far = far.clamp(min=math.log(torch.finfo(far.dtype).max))  # no step back where near ends
-    bent = knee * torch.where(is_far, far, near)
-    is_linear = ratio < torch.finfo(ratio.dtype).tiny  # a denormal ratio has lost its digits
-    bent = torch.where(is_linear, size, bent)
-    return torch.where(is_negative, -bent, bent)
+_COLUMNS = 128  # sorted at a time, which keeps memory small
 
 
 class FeatureScaler(nn.Module):
@@ -123,8 +97,8 @@ class FeatureScaler(nn.Module):
         if not compress and tail == 0:
             return cls(features.amin(0), features.amax(0))
         cls(features.amin(0), features.amax(0))  # refuses what is not finite, by feature
-        columns = [_range_of(column, compress, tail) for column in features.unbind(1)]
-        minimum, maximum, knee = (torch.stack(part) for part in zip(*columns, strict=True))
+        columns = [_ranges_of(part, compress, tail) for part in features.split(_COLUMNS, 1)]
+        minimum, maximum, knee = (torch.cat(part) for part in zip(*columns, strict=True))
         return cls(minimum, maximum, knee if compress else None)
 
     def forward(self, features: Tensor) -> Tensor:
@@ -144,23 +118,27 @@ class FeatureScaler(nn.Module):
         return torch.where(is_constant, 0 * relative.clamp(0, 0), scaled)
 
 
-def _range_of(column: Tensor, compress: bool, tail: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Minimum, maximum and knee of one feature; sorting one at a time keeps memory small."""
-    ordered = column.sort().values
-    knee = torch.ones_like(ordered[0])
+def _ranges_of(columns: Tensor, compress: bool, tail: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Minimum, maximum and knee of some features ``[N, k]``; ``[k]`` each."""
+    ordered = columns.mT.sort().values
+    knee = torch.ones_like(ordered[:, 0])
     if compress:
-        size = column.abs().sort().values
-        candidates = torch.stack([_quantile(size, 0.5), size[-1], knee])
-        knee = candidates[(candidates > 0).nonzero()[0, 0]]
-        ordered = signed_log(ordered, knee)
-    low, high = _quantile(ordered, tail), -_quantile(-ordered.flip(0), tail)
-    if bool(low < high):
-        return low, high, knee
-    return ordered[0], ordered[-1], knee
+        size = columns.mT.abs().sort().values
+        middle, largest = _quantile(size, 0.5), size[:, -1]
+        knee = torch.where(middle > 0, middle, torch.where(largest > 0, largest, knee))
+        ordered = signed_log(ordered, knee[:, None])
+    low, high = _quantile(ordered, tail), -_quantile(-ordered.flip(1), tail)
+    is_range = low < high
+    return (
+        torch.where(is_range, low, ordered[:, 0]),
+        torch.where(is_range, high, ordered[:, -1]),
+        knee,
+    )
 
 
 def _quantile(ordered: Tensor, share: float) -> Tensor:
-    """``numpy.quantile`` of ascending values, for a share below 1."""
-    position = share * (len(ordered) - 1)
+    """``numpy.quantile`` of ascending rows, for a share below 1."""
+    position = share * (ordered.shape[1] - 1)
     index = math.floor(position)
-    return torch.lerp(ordered[index], ordered[min(index + 1, len(ordered) - 1)], position - index)
+    above = ordered[:, min(index + 1, ordered.shape[1] - 1)]
+    return torch.lerp(ordered[:, index], above, position - index)

@@ -1,0 +1,453 @@
+"""Pooling over channels: statistics of each descriptor over all channels of a kind.
+
+Which finger touches what changes with every grasp, so a feature of one channel does not carry over
+to another material or mounting. Its mean and spread over the channels of a kind do. One layer over
+features that any engine has made, before scaling and head:
+
+    y_c = k sign(x_c) log(1 + |x_c| / k),    pooled = statistic of y_c over the channels c in use
+
+with ``k`` the training median of ``|x|`` of the descriptor. A channel that is missing or stuck is
+left out of its pools.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple, dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tactslip_torch.features.names import FeatureName
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.plain import is_plain
+
+STATISTICS = ("mean", "std", "min", "max", "median")
+SORTED = "sorted"
+"""In place of a list of statistics: the values in ascending order, ``rank1`` to ``rankN``."""
+STUCK_FRACTION = 0.1
+"""A channel that ranges less than this part of what channels of its kind range at their quietest
+in training is stuck. Ours: ten times below what was ever seen of a working channel."""
+QUIET_QUANTILE = 0.01
+CHUNK_BINS = 2048  # whose features are pooled at a time
+_RANGE_OF = {"slow": "raw", "fast": "A1"}  # the component whose range tells that a channel lives
+_RANK = re.compile(r"rank([1-9]\d*)")
+
+
+def signed_log(features: Tensor, knee: Tensor) -> Tensor:
+    """``sign(f) * knee * log1p(|f| / knee)``: nearly ``f`` below the knee, logarithmic above.
+
+    Monotone, odd, with derivative ``knee / (knee + |f|)``, 1 at 0. Finite for every finite ``f``,
+    also where ``|f| / knee`` passes the largest float; NaN stays NaN.
+
+    Shape:
+        - features, output: ``[*, K]``
+        - knee: broadcasts with ``features``, positive
+    """
+    if is_plain(features) and is_plain(knee):
+        size = features.abs()
+        ratio = size / knee
+        if ratio.numel() and ratio.numpy().max() < torch.inf:
+            bent = torch.where(ratio < torch.finfo(ratio.dtype).tiny, size, knee * ratio.log1p())
+            return bent.copysign_(features)  # the same bits as below in half as many calls
+    is_negative = features < 0
+    size = torch.where(is_negative, -features, features)  # abs() has derivative 0 at 0
+    ratio = size / knee
+    is_far = ratio.isinf()
+    near = ratio.log1p()
+    far = torch.where(is_far, size, 1.0).log() - knee.log()
+    largest = torch.tensor(torch.finfo(far.dtype).max, dtype=torch.float64).log().item()
+    far = far.clamp(min=largest)  # no step back where near ends
+    bent = knee * torch.where(is_far, far, near)
+    is_linear = ratio < torch.finfo(ratio.dtype).tiny  # a denormal ratio has lost its digits
+    bent = torch.where(is_linear, size, bent)
+    return torch.where(is_negative, -bent, bent)
+
+
+@dataclass(frozen=True)
+class Ops:
+    """What tensors and the values of an ONNX graph do not call alike.
+
+    Args:
+        one: the number 1, in the dtype of the values.
+        places: ``0 .. m-1``, ``[m]``, in that dtype.
+        where: chooses by a mask.
+        ascending: sorts along the last axis.
+    """
+
+    one: Any
+    places: Any
+    where: Callable[..., Any]
+    ascending: Callable[[Any], Any]
+
+
+def over_channels(
+    values: Any, in_use: Any, statistics: Sequence[str], num_channels: int, ops: Ops
+) -> list[Any]:
+    """Statistics over the last axis, of the entries in use; 0 where none is.
+
+    Written in operations that tensors and the values of an ONNX graph share.
+
+    Args:
+        values: of each row and channel; finite where in use.
+        in_use: which channels count, bool.
+        statistics: of ``STATISTICS``, or ranks, ``rank1`` being the smallest. With channels left
+            out, ranks are spread evenly over those that remain.
+        num_channels: length of the last axis.
+        ops: of the kind of value.
+
+    Shape:
+        - values: ``[*, R, m]``; in_use: ``[*, 1, m]``
+        - output: one ``[*, R]`` for each statistic
+    """
+    where, one = ops.where, ops.one
+    present = where(in_use, one, 0.0)
+    num = present.sum(-1, True)  # [*, 1, 1]
+    known = where(in_use, values, 0.0)
+    mean = known.sum(-1, True) / where(num > 0.0, num, one)
+    away = (known - mean) * present  # a channel that is not in use stands at the mean
+    ordered = None
+    found = []
+    for statistic in statistics:
+        if statistic == "mean":
+            found.append(mean.sum(-1))
+        elif statistic == "std":
+            variance = (away * away).sum(-1) / where(num > 1.5, num - one, one).sum(-1)
+            is_some = variance > 0.0  # at 0 the root has no derivative
+            found.append(where(is_some, where(is_some, variance, one).sqrt(), 0.0))
+        elif statistic == "min":
+            found.append(away.amin(-1) + mean.sum(-1))
+        elif statistic == "max":
+            found.append(away.amax(-1) + mean.sum(-1))
+        else:
+            if ordered is None:  # those not in use come last
+                ordered = ops.ascending(where(in_use, values, known.amax(-1, True)))
+            position = (num - one) * _fraction(statistic, num_channels)
+            weight = (one - (ops.places - position).abs()).clip(0.0, 1.0)  # linear interpolation
+            found.append((ordered * weight).sum(-1))
+    return found
+
+
+def _fraction(statistic: str, num_channels: int) -> float:
+    """Where an order statistic lies among ascending values, from 0 to 1."""
+    if statistic == "median":
+        return 0.5
+    rank = _RANK.fullmatch(statistic)
+    assert rank is not None  # checked when the layer was made
+    return (int(rank[1]) - 1) / max(num_channels - 1, 1)
+
+
+def statistics_of(setting: str | Sequence[str], num_channels: int) -> tuple[str, ...]:
+    """The statistics that ``features.pooling`` asks for, of a kind with so many channels.
+
+    One channel alone has only its value: the mean.
+
+    Raises:
+        ValueError: for an unknown statistic, or none.
+    """
+    if setting == SORTED:
+        return tuple(f"rank{number}" for number in range(1, num_channels + 1))
+    listed = [setting] if isinstance(setting, str) else list(setting)
+    unknown = [name for name in listed if name not in STATISTICS]
+    if unknown or not listed:
+        raise ValueError(
+            f"features.pooling must be {SORTED}, null or some of {', '.join(STATISTICS)}, got "
+            f"{setting!r}"
+        )
+    return tuple(dict.fromkeys(listed)) if num_channels > 1 else ("mean",)
+
+
+def pooled_names(
+    hand: HandLayout, names: Sequence[FeatureName], setting: str | Sequence[str]
+) -> tuple[FeatureName, ...]:
+    """What pooling makes of features: each descriptor of a kind, by statistic.
+
+    Raises:
+        ValueError: as ``statistics_of``.
+    """
+    found = []
+    for kind, channels in _channels_by_kind(hand).items():
+        of_first = [name for name in names if name.channel == hand.names[channels[0]]]
+        for statistic in statistics_of(setting, len(channels)):
+            found += [
+                FeatureName(kind, name.component, name.domain, name.descriptor, statistic)
+                for name in of_first
+            ]
+    return tuple(found)
+
+
+class ChannelPooling(nn.Module):
+    """Columns for scaling and head: pooled features, and features of channels as they are.
+
+    Args:
+        hand: the channels.
+        names: what comes out, K features, pooled or of channels.
+        knee: ``k`` of the compression, one for each of ``families``.
+        fill: what a pooled column is where no channel of its kind is in use; others are not read.
+        least_range: of the filtered bin of a channel of each of ``kinds``, below which it counts as
+            stuck; in the unit of the samples. 0: no channel ever does.
+
+    Attributes:
+        names: of the columns.
+        inputs: names of the M features of channels that go in.
+        kinds: of the channels that are pooled.
+        families: descriptors that are pooled, as names without statistic, kind by kind.
+
+    Shape:
+        - knee: ``[families]``; fill: ``[K]``; least_range: ``[kinds]``
+
+    Raises:
+        ValueError: if shapes disagree or a value is not finite, or a name is unknown.
+    """
+
+    knee: Tensor
+    fill: Tensor
+    least_range: Tensor
+
+    def __init__(
+        self,
+        hand: HandLayout,
+        names: Sequence[FeatureName],
+        knee: Tensor,
+        fill: Tensor,
+        least_range: Tensor,
+    ) -> None:
+        super().__init__()
+        self.hand, self.names = hand, tuple(names)
+        by_kind = _channels_by_kind(hand)
+        pooled = [name for name in self.names if name.is_pooled]
+        self.kinds = tuple(kind for kind in by_kind if any(n.channel == kind for n in pooled))
+        if strangers := {name.channel for name in pooled} - set(self.kinds):
+            raise ValueError(f"no channel of this hand is of kind {sorted(strangers)[0]!r}")
+        for name in pooled:
+            if not (name.statistic in STATISTICS or _RANK.fullmatch(name.statistic)):
+                raise ValueError(f"unknown statistic over channels in {str(name)!r}")
+        self.families = tuple(
+            dict.fromkeys(
+                FeatureName(n.channel, n.component, n.domain, n.descriptor)
+                for kind in self.kinds
+                for n in pooled
+                if n.channel == kind
+            )
+        )
+        shapes = [tuple(each.shape) for each in (knee, fill, least_range)]
+        wanted = [(len(self.families),), (len(self.names),), (len(self.kinds),)]
+        if shapes != wanted:
+            raise ValueError(f"expected knee, fill, least_range of shapes {wanted}, got {shapes}")
+        if not (bool((knee > 0).all()) and bool((least_range >= 0).all())) or not all(
+            bool(each.isfinite().all()) for each in (knee, fill, least_range)
+        ):
+            raise ValueError("pooling constants must be finite and knees positive; fit again")
+        for label, value in (("knee", knee), ("fill", fill), ("least_range", least_range)):
+            self.register_buffer(label, value.double().clone())
+        self._lay_out(by_kind)
+
+    def _lay_out(self, by_kind: Mapping[str, tuple[int, ...]]) -> None:
+        """Which inputs there are, and what is made of which."""
+        singles = [name for name in self.names if not name.is_pooled]
+        ranges = {kind: [_range_name(self.hand, c) for c in by_kind[kind]] for kind in self.kinds}
+        members = {
+            family: [replace(family, channel=self.hand.names[c]) for c in by_kind[family.channel]]
+            for family in self.families
+        }
+        taken = [*singles, *(n for own in (*ranges.values(), *members.values()) for n in own)]
+        self.inputs = tuple(dict.fromkeys(taken))
+        place = {name: index for index, name in enumerate(self.inputs)}
+        groups, made = [], list(singles)
+        for kind in self.kinds:
+            own = [i for i, family in enumerate(self.families) if family.channel == kind]
+            statistics = dict.fromkeys(
+                n.statistic for n in self.names if n.channel == kind and n.is_pooled
+            )
+            groups.append(
+                PooledKind(
+                    channels=by_kind[kind],
+                    families=tuple(own),
+                    columns=tuple(place[n] for i in own for n in members[self.families[i]]),
+                    ranges=tuple(place[name] for name in ranges[kind]),
+                    statistics=tuple(statistics),
+                )
+            )
+            made += [replace(self.families[i], statistic=s) for s in statistics for i in own]
+        self.groups = tuple(groups)
+        self.singles = tuple(place[name] for name in singles)
+        column = {name: index for index, name in enumerate(made)}
+        self.order = tuple(column[name] for name in self.names)
+        kind_of = [
+            self.kinds.index(name.channel) if name.is_pooled else len(self.kinds)
+            for name in self.names
+        ]
+        self.kind_of = tuple(kind_of)
+        index = {"singles": self.singles, "order": self.order, "kind_of": self.kind_of}
+        self._index = {name: torch.tensor(places).long() for name, places in index.items()}
+
+    @classmethod
+    def fit(
+        cls,
+        hand: HandLayout,
+        names: Sequence[FeatureName],
+        features: Tensor,
+        setting: str | Sequence[str],
+    ) -> ChannelPooling:
+        """Pool all features of training bins; the columns are the pooled features alone.
+
+        Args:
+            hand: the channels.
+            names: of the features, F; all channels of a kind have the same descriptors.
+            features: of training bins.
+            setting: ``"sorted"`` or statistics, as ``features.pooling`` has them.
+
+        Shape:
+            - features: ``[N, F]``, at least one bin, finite
+
+        Raises:
+            ValueError: as ``statistics_of``; or if features do not tell the range of each channel.
+        """
+        pooled = pooled_names(hand, names, setting)
+        place = {name: index for index, name in enumerate(names)}
+        least, in_use = [], {}
+        for kind, channels in _channels_by_kind(hand).items():
+            told_by = [_range_name(hand, channel) for channel in channels]
+            if untold := [name for name in told_by if name not in place]:
+                raise ValueError(f"pooling needs the feature {str(untold[0])!r}; leave it in")
+            ranges = features[:, [place[name] for name in told_by]].double()
+            quiet = ranges.sort(0).values[math.floor(QUIET_QUANTILE * (len(ranges) - 1))]
+            least.append(STUCK_FRACTION * float(quiet.median()))
+            in_use[kind] = ~(ranges < least[-1])
+        layer = cls(
+            hand,
+            pooled,
+            torch.ones(len(set(map(_family, pooled)))),
+            torch.zeros(len(pooled)),
+            torch.tensor(least, dtype=torch.float64),
+        )
+        inputs = torch.tensor([place[name] for name in layer.inputs])
+        for kind, group in zip(layer.kinds, layer.groups, strict=True):
+            values = features[:, inputs[group.index]].double().abs()
+            values = values.unflatten(1, (-1, len(group.channels)))
+            values = values.masked_fill(~in_use[kind][:, None, :], torch.nan).transpose(0, 1)
+            layer.knee[list(group.families)] = _knees(values.flatten(1))
+        columns = [layer(part[:, inputs].double()) for part in features.split(CHUNK_BINS)]
+        layer.fill.copy_(torch.cat(columns).median(0).values)
+        return layer
+
+    def forward(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
+        """Columns of bins.
+
+        Differentiable; a channel that is left out has no gradient.
+
+        Shape:
+            - features: ``[*, M]``, of ``inputs``, floating
+            - is_missing: ``[*, C]``, bool, channels that are left out beside those that are stuck
+            - output: ``[*, K]``; NaN where a feature of a channel in use is NaN
+        """
+        parts = [features.index_select(-1, self._index["singles"].to(features.device))]
+        is_some = []
+        for index, group in enumerate(self.groups):
+            ranges = features.index_select(-1, group.range_index.to(features.device))
+            in_use = ~(ranges < self.least_range[index].to(features))
+            if is_missing is not None:
+                in_use = in_use & ~is_missing[..., list(group.channels)]
+            is_some.append(in_use.any(-1))
+            num_channels = len(group.channels)
+            values = features.index_select(-1, group.index.to(features.device))
+            values = values.unflatten(-1, (-1, num_channels))
+            knee = self.knee[list(group.families), None].to(features)
+            ops = Ops(
+                one=features.new_ones(()),
+                places=torch.arange(num_channels).to(features),
+                where=torch.where,
+                ascending=lambda x: x.sort(-1).values,
+            )
+            in_rows = in_use[..., None, :]
+            values = signed_log(values, knee)
+            parts += over_channels(values, in_rows, group.statistics, num_channels, ops)
+        order, kind_of = (self._index[n].to(features.device) for n in ("order", "kind_of"))
+        columns = torch.cat(parts, dim=-1).index_select(-1, order)
+        known = torch.stack([*is_some, torch.ones_like(is_some[0])], -1).index_select(-1, kind_of)
+        return torch.where(known, columns, self.fill.to(features))
+
+    def select(self, index: Sequence[int]) -> ChannelPooling:
+        """The layer of some of its columns, in that order; it takes no more than they need."""
+        names = [self.names[i] for i in index]
+        return self._with(names, self.fill[list(index)])
+
+    def with_channels(self, names: Sequence[FeatureName]) -> ChannelPooling:
+        """The layer whose columns are these features of channels as they are, then its own."""
+        return self._with(
+            [*names, *self.names], torch.cat([self.fill.new_zeros(len(names)), self.fill])
+        )
+
+    def _with(self, names: Sequence[FeatureName], fill: Tensor) -> ChannelPooling:
+        pooled = {_family(name) for name in names if name.is_pooled}
+        families = [i for i, family in enumerate(self.families) if family in pooled]
+        kinds = [i for i, kind in enumerate(self.kinds) if any(f.channel == kind for f in pooled)]
+        return ChannelPooling(self.hand, names, self.knee[families], fill, self.least_range[kinds])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Names of the columns as JSON-able rows; ``from_dict`` takes them with the tensors."""
+        return {"names": [astuple(name) for name in self.names]}
+
+    @classmethod
+    def from_dict(
+        cls, hand: HandLayout, plain: Mapping[str, Any], tensors: Mapping[str, Tensor]
+    ) -> ChannelPooling:
+        """The layer that ``to_dict`` and ``state_dict`` described."""
+        return cls(hand, [FeatureName(*row) for row in plain["names"]], **tensors)
+
+
+@dataclass(frozen=True)
+class PooledKind:
+    """What is pooled over the channels of one kind.
+
+    Attributes:
+        channels: indices in the hand, m of them.
+        families: places of its descriptors in ``ChannelPooling.families``, R of them.
+        columns: of the inputs, ``R * m``: each descriptor of all channels, one after the other.
+        ranges: of the inputs, the range of each channel's bin.
+        statistics: over the channels.
+    """
+
+    channels: tuple[int, ...]
+    families: tuple[int, ...]
+    columns: tuple[int, ...]
+    ranges: tuple[int, ...]
+    statistics: tuple[str, ...]
+
+    @cached_property
+    def index(self) -> Tensor:
+        """``columns`` as a tensor."""
+        return torch.tensor(self.columns)
+
+    @cached_property
+    def range_index(self) -> Tensor:
+        """``ranges`` as a tensor."""
+        return torch.tensor(self.ranges)
+
+
+def _channels_by_kind(hand: HandLayout) -> dict[str, tuple[int, ...]]:
+    return {kind: hand.indices(kind) for kind in hand.kinds}
+
+
+def _family(name: FeatureName) -> FeatureName:
+    """A descriptor of a kind, whatever the statistic."""
+    return replace(name, statistic="")
+
+
+def _range_name(hand: HandLayout, channel: int) -> FeatureName:
+    """The feature that tells whether a channel moves at all."""
+    adapting = hand.channels[channel].adapting
+    assert adapting is not None  # of a made channel
+    return FeatureName(hand.names[channel], _RANGE_OF[adapting], "time", "range")
+
+
+def _knees(sizes: Tensor) -> Tensor:
+    """Median of each row without NaN; its largest where that is 0, and 1 where that is 0 too."""
+    middle = sizes.nanmedian(-1).values.nan_to_num(0.0)
+    largest = sizes.nan_to_num(0.0).amax(-1)
+    found = torch.where(middle > 0, middle, largest)
+    return torch.where(found > 0, found, 1.0)

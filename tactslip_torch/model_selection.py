@@ -1,0 +1,516 @@
+"""Nested leave-one-group-out choice of features, degree and penalty.
+
+A candidate is a set of features (of channels, pooled, or both; all or the best K), a degree and a
+penalty C. In each fold everything that is learned, compression constants, ranking and scaling
+among it, is learned without the group that is left out. Of the candidates within a tolerance of
+the best, the simplest machine with the strongest penalty is taken: penalties over several decades
+tie in validation and differ by far on a material that was not trained on.
+
+The choice itself is judged by leaving out two groups: for each group the same choice is made
+without it, and that machine is evaluated on it. This nested score may be reported.
+
+Reference:
+    Cawley and Talbot (2010), Journal of Machine Learning Research 11, 2079-2107.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pooling import ChannelPooling
+from tactslip_torch.model.calibration import fit_platt
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.model.threshold import best_threshold
+from tactslip_torch.recipe import Frame, Recipe, recalls_mean, sample_groups
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[Iterable[Any], str], Iterable[Any]]
+
+TRAINING_BINS = 100
+"""Bins of each stratum and class that a validation fold is fitted to; it is scored on all sampled
+ones."""
+MOST_DUAL_BINS = 2500
+"""Up to so many training bins a machine of degree 2 on all features is a candidate: it does not
+fold, so its cost grows with the bins."""
+MOST_EXTENSIONS = 3
+"""Decades by which a grid of penalties that ends at its edge is extended, at either end."""
+
+
+class Structure(NamedTuple):
+    """A candidate without its penalty.
+
+    Attributes:
+        use: ``"channel"``, ``"pooled"`` or ``"both"``.
+        num_features: the best so many of them; ``None``: all.
+        kernel: of degree 1 or 2.
+    """
+
+    use: str
+    num_features: int | None
+    kernel: Polynomial
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What validation found.
+
+    Args:
+        structure: that was chosen.
+        penalty: that was chosen.
+        rows: one for each candidate, JSON-able: ``use``, ``num_features``, ``kernel``, ``penalty``,
+            ``mean``, ``balanced_accuracy`` by group, and ``worst``: the group with the least
+            balanced accuracy, and what it would be at that group's best threshold.
+        nested: balanced accuracy of the whole procedure on each group that it did not see, and
+            their mean; ``None`` with fewer than three groups.
+        edge: what to say of a grid of penalties that ended at its edge; empty if it did not.
+    """
+
+    structure: Structure
+    penalty: float
+    rows: list[dict[str, Any]]
+    nested: dict[str, Any] | None
+    edge: str
+
+
+def choose_model(
+    recipe: Recipe,
+    pool: FeaturePool,
+    sample: SampledBins,
+    weights: Tensor,
+    progress: Progress,
+    *,
+    num_bins: int,
+    allowed: Tensor | None = None,
+    is_nested: bool = True,
+) -> Choice:
+    """Choose among the candidates of a recipe.
+
+    Args:
+        recipe: with ``validation="nested"``.
+        pool: the features of the sampled bins.
+        sample: of the training bins.
+        weights: for how many training bins each sampled one stands, classes balanced, ``[n]``.
+        progress: wraps the folds.
+        num_bins: that the machine will be trained on.
+        allowed: which features may be used, ``[F]``, bool.
+        is_nested: whether to judge the choice itself by leaving out two groups.
+
+    Raises:
+        ValueError: if no group has bins of both classes, or there is one group only.
+    """
+    groups, names = sample_groups(sample)
+    whole = [
+        index
+        for index in range(len(names))
+        if bool(sample.is_slip[groups == index].any())
+        and not bool(sample.is_slip[groups == index].all())
+    ]
+    if len(whole) < 2:
+        raise ValueError(
+            "validation leaves out groups and needs two with bins of both classes, got "
+            f"{len(whole)}; add recordings or take another recipe.group_by"
+        )
+    structures = candidates(recipe, num_bins)
+    folds = [frozenset([group]) for group in whole]
+    if is_nested and len(whole) > 2:
+        folds += [frozenset(pair) for pair in itertools.combinations(whole, 2)]
+    data = _Data(recipe, pool, sample, weights, groups, allowed)
+    penalties = list(recipe.penalties_ascending)
+    found = {}
+    for fold in progress(folds, "validation, groups left out"):
+        found[fold] = _Fold(data, fold, structures).at(penalties)
+    single = {group: found[frozenset([group])] for group in whole}
+    edge = _extended(data, found, penalties, structures, whole, recipe.tolerance)
+
+    def accuracy(fold: frozenset[int], group: int) -> Mapping[tuple[int, float], float]:
+        return found[fold].accuracy[group]
+
+    table = {group: accuracy(frozenset([group]), group) for group in whole}
+    chosen = _best(table, structures, recipe.tolerance)
+    rows = [
+        _row(structures[place], penalty, single, (place, penalty), data, names)
+        for place in range(len(structures))
+        for penalty in penalties
+    ]
+    chosen_row = rows[chosen[0] * len(penalties) + penalties.index(chosen[1])]
+    chosen_row |= {"chosen": True, "calibration": _calibration(single, chosen, data)}
+    nested = None
+    if is_nested and len(whole) > 2:
+        by_group = {}
+        for group in whole:
+            others = [other for other in whole if other != group]
+            inner = {other: accuracy(frozenset([group, other]), other) for other in others}
+            by_group[names[group]] = table[group][_best(inner, structures, recipe.tolerance)]
+        nested = {
+            "mean": sum(by_group.values()) / len(by_group),
+            "balanced_accuracy": by_group,
+        }
+    return Choice(structures[chosen[0]], chosen[1], rows, nested, edge)
+
+
+def candidates(recipe: Recipe, num_bins: int) -> list[Structure]:
+    """All structures of a recipe, the simplest first.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    sizes: list[int | None] = [*([None] if None in _several(recipe.num_features) else [])]
+    sizes += recipe.sizes
+    found = [
+        Structure(use, size, kernel)
+        for size in sizes
+        for kernel in recipe.kernels
+        if isinstance(kernel, Polynomial)
+        for use in _several(recipe.use)
+        if kernel.degree == 1 or size is not None or num_bins <= MOST_DUAL_BINS
+        if kernel.degree == 1 or not recipe.scene_weights or num_bins <= MOST_DUAL_BINS
+    ]
+    if not found:
+        raise ValueError(
+            "no candidate is left: degree 2 needs recipe.num_features and no scene_weights; add "
+            "degree 1"
+        )
+    return found
+
+
+def fitted_frame(
+    recipe: Recipe,
+    pool: FeaturePool,
+    sample: SampledBins,
+    structure: Structure,
+    allowed: Tensor | None = None,
+) -> Frame:
+    """Compression, ranking and scaling of a structure, learned from a sample of training bins."""
+    everything = torch.ones(len(sample.is_slip), dtype=torch.bool)
+    weights = sample.represents
+    groups, _ = sample_groups(sample)
+    data = _Data(recipe, pool, sample, weights, groups, allowed)
+    columns = _Columns(data, everything, everything, [structure.use])
+    places = columns.ranked(structure)
+    names = [columns.names(structure.use)[place] for place in places.tolist()]
+    scaler = columns.scaler(structure.use, places)
+    index = {name: place for place, name in enumerate(pool.names)}
+    if not any(name.is_pooled for name in names):
+        return Frame(tuple(index[name] for name in names), scaler)
+    assert columns.pooling is not None  # something is pooled
+    layer = columns.pooling
+    if structure.use == "both":
+        layer = layer.with_channels(data.names)
+    layer = layer.select([layer.names.index(name) for name in names])
+    return Frame(tuple(index[name] for name in layer.inputs), scaler, layer)
+
+
+def group_scores(columns: Tensor, is_slip: Tensor, groups: Tensor) -> Tensor:
+    """How well each feature separates the classes in every group, ``[F]``: larger is better.
+
+    ``|mean effect| / sqrt(within-class variance + variance of the effect + of the level)``, the
+    last two between groups: a feature whose threshold moves from material to material is worth
+    less, which a t-test does not know. 0 for a constant feature.
+
+    Shape:
+        - columns: ``[N, F]``; is_slip: ``[N]``, bool; groups: ``[N]``, whole numbers
+    """
+    effects, levels, spreads = [], [], []
+    for group in groups.unique().tolist():
+        mine = groups == group
+        quiet, slip = columns[mine & ~is_slip], columns[mine & is_slip]
+        if not len(quiet) or not len(slip):
+            continue
+        effects.append(slip.mean(0) - quiet.mean(0))
+        levels.append((slip.mean(0) + quiet.mean(0)) / 2)
+        spreads.append((slip.var(0, correction=0) + quiet.var(0, correction=0)) / 2)
+    effect, level = torch.stack(effects), torch.stack(levels)
+    square = torch.stack(spreads).mean(0)
+    if len(effects) > 1:
+        square = square + effect.var(0) + level.var(0)
+    found = effect.mean(0).abs() / square.sqrt()
+    return torch.where(square > 0, found, 0.0)
+
+
+class _Data:
+    """The sampled bins of the features that may be used."""
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        pool: FeaturePool,
+        sample: SampledBins,
+        weights: Tensor,
+        groups: Tensor,
+        allowed: Tensor | None,
+    ) -> None:
+        self.recipe, self.hand = recipe, pool.hand
+        self.is_slip, self.groups = sample.is_slip, groups
+        places = torch.arange(len(pool.names)) if allowed is None else allowed.nonzero().flatten()
+        self.names = [pool.names[place] for place in places.tolist()]
+        self.features = sample.features[:, places]
+        stratum = 2 * sample.group + sample.is_slip.long()
+        order = torch.zeros_like(stratum)  # of a bin within its stratum
+        self.weights = weights.clone()
+        for one in stratum.unique().tolist():
+            mine = (stratum == one).nonzero().flatten()
+            # bins are sorted by recording; spread those that are kept over all of them
+            kept = torch.linspace(0, len(mine) - 1, min(len(mine), TRAINING_BINS)).round().long()
+            order[mine] = 1
+            order[mine[kept]] = 0
+            self.weights[mine] *= len(mine) / len(kept)
+        self.is_kept = order == 0
+
+
+class _Columns:
+    """Columns of some sampled bins, with what the training bins among them taught."""
+
+    def __init__(self, data: _Data, rows: Tensor, train: Tensor, uses: Sequence[str]) -> None:
+        self._data, features = data, data.features[rows]
+        self.train = train[rows]
+        self.is_slip, self.groups = data.is_slip[rows], data.groups[rows]
+        self.pooling: ChannelPooling | None = None
+        parts = {"channel": features} if set(uses) != {"pooled"} else {}
+        if set(uses) != {"channel"}:
+            setting = data.recipe.pooling
+            assert setting is not None  # recipe
+            own = features[self.train]
+            self.pooling = layer = ChannelPooling.fit(data.hand, data.names, own, setting)
+            place = {name: index for index, name in enumerate(data.names)}
+            inputs = torch.tensor([place[name] for name in layer.inputs])
+            parts["pooled"] = layer(features.index_select(1, inputs).double())
+        compress, tail = data.recipe.compress, data.recipe.tail
+        self._fitted, self._scaled = {}, {}
+        for name, x in parts.items():
+            x = x.double()
+            scaler = FeatureScaler.fit(x[self.train], compress=compress, tail=tail)
+            self._fitted[name], self._scaled[name] = scaler, scaler(x)
+        self._ranks: dict[str, Tensor] = {}
+
+    def names(self, use: str) -> list[Any]:
+        """Of the columns of a use."""
+        pooled = [] if self.pooling is None else list(self.pooling.names)
+        return [
+            *(self._data.names if use != "pooled" else []),
+            *(pooled if use != "channel" else []),
+        ]
+
+    def scaled(self, use: str) -> Tensor:
+        """Scaled columns of all bins, ``[n, K]``."""
+        if use == "both":
+            return torch.cat([self._scaled["channel"], self._scaled["pooled"]], 1)
+        return self._scaled[use]
+
+    def scaler(self, use: str, places: Tensor) -> FeatureScaler:
+        """Of some columns."""
+        own = ["channel", "pooled"] if use == "both" else [use]
+        parts = [self._fitted[name] for name in own]
+        knees = [part.knee for part in parts if part.knee is not None]
+        return FeatureScaler(
+            torch.cat([part.minimum for part in parts])[places],
+            torch.cat([part.maximum for part in parts])[places],
+            torch.cat(knees)[places] if knees else None,
+        )
+
+    def ranked(self, structure: Structure) -> Tensor:
+        """Places of the columns of a structure, best first; all in their order."""
+        if structure.num_features is None:
+            return torch.arange(len(self.names(structure.use)))
+        own = ["channel", "pooled"] if structure.use == "both" else [structure.use]
+        for name in own:
+            if name not in self._ranks:
+                z = self._scaled[name][self.train]
+                is_slip, groups = self.is_slip[self.train], self.groups[self.train]
+                self._ranks[name] = group_scores(z, is_slip, groups)
+        scores = torch.cat([self._ranks[name] for name in own])
+        return scores.argsort(descending=True, stable=True)[: structure.num_features]
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """Scores of the left-out groups, and their balanced accuracies."""
+
+    scores: dict[int, dict[tuple[int, float], Tensor]]
+    accuracy: dict[int, dict[tuple[int, float], float]]
+
+
+class _Fold:
+    """Machines without some groups.
+
+    Columns are formed anew for other penalties rather than kept: they are large.
+    """
+
+    def __init__(self, data: _Data, left_out: frozenset[int], structures: list[Structure]) -> None:
+        self._data, self._left_out, self._structures = data, left_out, structures
+
+    def at(self, penalties: Sequence[float], places: Sequence[int] | None = None) -> _Scores:
+        """Balanced accuracies for some penalties; of some structures, by default of all."""
+        data = self._data
+        places = range(len(self._structures)) if places is None else places
+        is_out = torch.isin(data.groups, torch.tensor(sorted(self._left_out)))
+        train = data.is_kept & ~is_out
+        rows = train | is_out
+        columns = _Columns(data, rows, train, sorted({self._structures[p].use for p in places}))
+        targets = torch.where(data.is_slip, 1.0, -1.0).double()[train]
+        is_train, truths = columns.train, columns.is_slip[~columns.train]
+        of_group = {g: columns.groups[~is_train] == g for g in self._left_out}
+        found = _Scores({g: {} for g in self._left_out}, {g: {} for g in self._left_out})
+        for place in places:
+            structure = self._structures[place]
+            z = columns.scaled(structure.use)
+            if structure.num_features is not None:
+                z = z[:, columns.ranked(structure)]
+            solve = _Ridge(z[is_train], targets, data.weights[train], structure.kernel)
+            by_penalty = solve.at(penalties, z[~is_train])
+            for penalty, scores in zip(penalties, by_penalty, strict=True):
+                for group, mine in of_group.items():
+                    accuracy = recalls_mean(scores[mine] >= 0, truths[mine])
+                    assert accuracy is not None  # of groups with both classes
+                    found.accuracy[group][place, penalty] = accuracy
+                    found.scores[group][place, penalty] = scores[mine]
+        return found
+
+
+class _Ridge:
+    """Kernel ridge regression for several penalties, by the cheaper of primal and dual."""
+
+    def __init__(self, z: Tensor, targets: Tensor, weights: Tensor, kernel: Polynomial) -> None:
+        self._z, self._targets, self._weights, self._kernel = z, targets, weights, kernel
+        self._is_primal = kernel.degree == 1 and z.shape[1] < len(z)
+        if self._is_primal:
+            x = self._with_constant(z)
+            self._system = x.mT @ (x * weights[:, None])
+            self._right = x.mT @ (weights * targets)
+        else:
+            self._system, self._right = kernel(z, z), targets
+
+    def at(self, penalties: Sequence[float], others: Tensor) -> Tensor:
+        """Scores of other bins, ``[penalties, bins]``."""
+        found = []
+        for penalty in penalties:
+            system = self._system.clone()
+            ridge = 1 / penalty if self._is_primal else 1 / (penalty * self._weights)
+            system.diagonal().add_(ridge)
+            factor, info = torch.linalg.cholesky_ex(system)
+            right = self._right[:, None]
+            if int(info):  # a weak penalty on columns that repeat each other
+                found.append(torch.linalg.lstsq(system, right, driver="gelsd").solution)
+            else:
+                found.append(torch.cholesky_solve(right, factor))
+        solved = torch.cat(found, 1)
+        if self._is_primal:
+            return (self._with_constant(others) @ solved).mT
+        return (self._kernel(others, self._z) @ solved).mT
+
+    def _with_constant(self, z: Tensor) -> Tensor:
+        return torch.cat([z, torch.full_like(z[:, :1], math.sqrt(self._kernel.offset))], 1)
+
+
+Table = Mapping[int, Mapping[tuple[int, float], float]]
+"""Balanced accuracy by group and candidate, a place among the structures with a penalty."""
+
+
+def _means(table: Table) -> dict[tuple[int, float], float]:
+    first = next(iter(table.values()))
+    return {key: sum(of[key] for of in table.values()) / len(table) for key in first}
+
+
+def _best(table: Table, structures: Sequence[Structure], tolerance: float) -> tuple[int, float]:
+    """Of those within the tolerance: no selection, the lower degree, fewer features, least C."""
+    means = _means(table)
+    least = max(means.values()) - tolerance
+    uses = ("pooled", "channel", "both")  # by their number, of the paper's hand
+
+    def order(key: tuple[int, float]) -> tuple[bool, int, int, int, float]:
+        structure, penalty = structures[key[0]], key[1]
+        size = structure.num_features or 0
+        by_use = uses.index(structure.use)
+        return structure.num_features is not None, structure.kernel.degree, size, by_use, penalty
+
+    return min((key for key, mean in means.items() if mean >= least), key=order)
+
+
+def _extended(
+    data: _Data,
+    found: dict[frozenset[int], _Scores],
+    penalties: list[float],
+    structures: list[Structure],
+    whole: Sequence[int],
+    tolerance: float,
+) -> str:
+    """Extend a grid whose end was chosen, or is best; says what was done."""
+    said = []
+    for is_low in (True, False):
+        for _ in range(MOST_EXTENSIONS):
+            table = {group: found[frozenset([group])].accuracy[group] for group in whole}
+            means = _means(table)
+            chosen, best = _best(table, structures, tolerance), max(means, key=means.__getitem__)
+            end = penalties[0] if is_low else penalties[-1]
+            if (chosen if is_low else best)[1] != end or len(penalties) < 2:
+                break
+            beyond = end / 10 if is_low else end * 10
+            penalties.insert(0 if is_low else len(penalties), beyond)
+            for fold, scores in found.items():
+                more = _Fold(data, fold, structures).at([beyond])
+                for group in fold:
+                    scores.accuracy[group] |= more.accuracy[group]
+                    scores.scores[group] |= more.scores[group]
+            said.append(f"{beyond:g}")
+    if not said:
+        return ""
+    return f"recipe.penalties ended at its edge and was extended by {', '.join(said)}"
+
+
+def _row(
+    structure: Structure,
+    penalty: float,
+    single: Mapping[int, _Scores],
+    key: tuple[int, float],
+    data: _Data,
+    names: Sequence[str],
+) -> dict[str, Any]:
+    """What is told of a candidate."""
+    by_group = {group: of.accuracy[group][key] for group, of in single.items()}
+    worst = min(by_group, key=by_group.__getitem__)
+    scores, truth = single[worst].scores[worst][key], data.is_slip[data.groups == worst]
+    rule = best_threshold(scores[:, None], truth)
+    return {
+        "use": structure.use,
+        "num_features": structure.num_features,
+        "kernel": structure.kernel.to_dict(),
+        "penalty": penalty,
+        "mean": sum(by_group.values()) / len(by_group),
+        "balanced_accuracy": {names[group]: value for group, value in by_group.items()},
+        "worst": {
+            "group": names[worst],
+            "balanced_accuracy": by_group[worst],
+            "best_threshold": rule.threshold,
+            "at_best_threshold": recalls_mean(rule(scores[:, None]), truth),
+        },
+    }
+
+
+def _calibration(
+    single: Mapping[int, _Scores], key: tuple[int, float], data: _Data
+) -> dict[str, Any] | None:
+    """What left-out scores tell of slip, as plain values; None if they tell it backwards."""
+    mine = [data.groups == group for group in single]
+    scores = torch.cat([of.scores[group][key] for group, of in single.items()])
+    truth = torch.cat([data.is_slip[rows] for rows in mine])
+    weights = torch.cat([data.weights[rows] for rows in mine])
+    try:
+        return fit_platt(scores, truth, weights).to_dict()
+    except ValueError as error:
+        log.warning("scores are not calibrated: %s", error)
+        return None
+
+
+def _several(value: Any) -> tuple[Any, ...]:
+    return tuple(value) if isinstance(value, (tuple, list)) else (value,)
