@@ -18,9 +18,9 @@ class Imperfections:
     Args:
         local_noise_mv: noise of every element that touches, sliding or not, independent between
             elements, rms at a PVDF film at 1 N. It stands for creep and settling of asperities
-            behind the skin's resonance, so with the spectrum of friction noise; its level wanders within the
-            recording and differs between elements (prior, ours: below the 1.5 to 4 mV rms that
-            PHYSICS.md gives rest; independent, as a real fingertip's electrodes are in touch).
+            behind the skin's resonance, so it has the spectrum of friction noise; its level wanders
+            within the recording and differs between elements (prior, ours: below the 1.5 to 4 mV
+            rms that PHYSICS.md gives rest; independent, as a real fingertip's electrodes in touch).
         share_wander: spread of the logarithm of each element's load while a grasp lasts, over
             half a second to ten (prior: in the real set a channel's level wanders about the mean
             over channels by .2 to .3 within seconds).
