@@ -306,7 +306,8 @@ class _Columns:
         """Scaled columns of all bins, ``[n, K]``."""
         if use == "both":
             return torch.cat([self._scaled["channel"], self._scaled["pooled"]], 1)
-        return self._scaled[use]
+        scaled: Tensor = self._scaled[use]
+        return scaled
 
     def scaler(self, use: str, places: Tensor) -> FeatureScaler:
         """Of some columns."""

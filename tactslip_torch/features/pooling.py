@@ -117,8 +117,8 @@ def over_channels(
             found.append(mean.sum(-1))
         elif statistic == "std":
             variance = (away * away).sum(-1) / where(num > 1.5, num - one, one).sum(-1)
-            is_some = variance > 0.0  # at 0 the root has no derivative
-            found.append(where(is_some, where(is_some, variance, one).sqrt(), 0.0))
+            is_none = variance <= 0.0  # at 0 the root has no derivative
+            found.append(where(is_none, 0.0, where(is_none, one, variance).sqrt()))
         elif statistic == "min":
             found.append(away.amin(-1) + mean.sum(-1))
         elif statistic == "max":
@@ -226,14 +226,7 @@ class ChannelPooling(nn.Module):
         for name in pooled:
             if not (name.statistic in STATISTICS or _RANK.fullmatch(name.statistic)):
                 raise ValueError(f"unknown statistic over channels in {str(name)!r}")
-        self.families = tuple(
-            dict.fromkeys(
-                FeatureName(n.channel, n.component, n.domain, n.descriptor)
-                for kind in self.kinds
-                for n in pooled
-                if n.channel == kind
-            )
-        )
+        self.families = _families(self.kinds, pooled)
         shapes = [tuple(each.shape) for each in (knee, fill, least_range)]
         wanted = [(len(self.families),), (len(self.names),), (len(self.kinds),)]
         if shapes != wanted:
@@ -383,10 +376,11 @@ class ChannelPooling(nn.Module):
         )
 
     def _with(self, names: Sequence[FeatureName], fill: Tensor) -> ChannelPooling:
-        pooled = {_family(name) for name in names if name.is_pooled}
-        families = [i for i, family in enumerate(self.families) if family in pooled]
-        kinds = [i for i, kind in enumerate(self.kinds) if any(f.channel == kind for f in pooled)]
-        return ChannelPooling(self.hand, names, self.knee[families], fill, self.least_range[kinds])
+        pooled = [name for name in names if name.is_pooled]
+        kinds = [kind for kind in self.kinds if any(name.channel == kind for name in pooled)]
+        families = [self.families.index(family) for family in _families(kinds, pooled)]
+        places = [self.kinds.index(kind) for kind in kinds]
+        return ChannelPooling(self.hand, names, self.knee[families], fill, self.least_range[places])
 
     def to_dict(self) -> dict[str, Any]:
         """Names of the columns as JSON-able rows; ``from_dict`` takes them with the tensors."""
@@ -431,6 +425,12 @@ class PooledKind:
 
 def _channels_by_kind(hand: HandLayout) -> dict[str, tuple[int, ...]]:
     return {kind: hand.indices(kind) for kind in hand.kinds}
+
+
+def _families(kinds: Sequence[str], pooled: Sequence[FeatureName]) -> tuple[FeatureName, ...]:
+    """The descriptors that are pooled, kind by kind."""
+    own = (_family(name) for kind in kinds for name in pooled if name.channel == kind)
+    return tuple(dict.fromkeys(own))
 
 
 def _family(name: FeatureName) -> FeatureName:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -50,7 +52,7 @@ def pooled(graph: Graph, features: Value, is_missing: Value, detector: SlipDetec
             one=graph.constant(1.0, F64),
             places=graph.constant(np.arange(num), F64),
             where=graph.where,
-            ascending=lambda x, num=num: ascending(x, num),
+            ascending=partial(ascending, num=num),
         )
         parts += over_channels(bent, in_use.expand(1), group.statistics, num, ops)
     columns = graph.concat(*parts, axis=1).take(layer.order, 1)

@@ -78,7 +78,8 @@ class QuadraticForm(nn.Module):
             - output: ``[*]``
         """
         if self.is_linear:
-            return torch.linalg.vecdot(self.linear, z) + self.constant
+            linear: Tensor = torch.linalg.vecdot(self.linear, z) + self.constant
+            return linear
         pull = nn.functional.linear(z, self.quadratic, self.linear)  # as few calls as can be
         score: Tensor = torch.linalg.vecdot(pull, z) + self.constant
         return score

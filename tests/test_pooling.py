@@ -1,0 +1,178 @@
+"""Pooling over channels: the layer against plain NumPy, and what becomes of absent channels."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from oracles_pooling import pooled
+
+from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pooling import STATISTICS, ChannelPooling, pooled_names
+from tactslip_torch.hand import HandLayout
+
+HAND = HandLayout.from_rows(
+    {"name": f"{kind}{i}", "kind": kind, "finger": f"f{i}", "segment": "distal"}
+    for kind, num in (("SG", 3), ("PVDF", 4))
+    for i in range(1, num + 1)
+)
+POOL = FeaturePool(HAND, level=1)
+PLACE = {name: index for index, name in enumerate(POOL.names)}
+SETTINGS = (list(STATISTICS), "sorted")
+
+
+def features_of(rng, num=60):
+    bins = torch.from_numpy(
+        rng.standard_normal((num, 7, 100)) * 10 ** rng.uniform(-2, 1, (num, 7, 1))
+    )
+    return POOL(bins)
+
+
+def fitted(rng, setting=("mean", "std")):
+    features = features_of(rng)
+    return ChannelPooling.fit(HAND, POOL.names, features, setting), features
+
+
+def inputs_of(layer, features):
+    return features[:, [PLACE[name] for name in layer.inputs]]
+
+
+def expected(layer, features, is_missing=None):
+    out = np.empty((len(features), len(layer.names)))
+    knees = dict(zip(layer.families, layer.knee.tolist(), strict=True))
+    for column, name in enumerate(layer.names):
+        channels = [HAND.names[c] for c in HAND.indices(name.channel)]
+        family = replace(name, statistic="")
+        places = [PLACE[replace(family, channel=channel)] for channel in channels]
+        for row, values in enumerate(features[:, places].numpy()):
+            in_use = np.ones(len(channels), bool)
+            if is_missing is not None:
+                in_use = ~is_missing[row, list(HAND.indices(name.channel))].numpy()
+            out[row, column] = pooled(values, in_use, knees[family], name.statistic)
+    return torch.from_numpy(out)
+
+
+@pytest.mark.parametrize("setting", SETTINGS, ids=str)
+def test_equals_plain_numpy(rng, setting):
+    layer, features = fitted(rng, setting)
+    found = layer(inputs_of(layer, features))
+    torch.testing.assert_close(found, expected(layer, features), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("setting", SETTINGS, ids=str)
+def test_a_missing_channel_is_left_out(rng, setting):
+    layer, features = fitted(rng, setting)
+    is_missing = torch.zeros(len(features), 7, dtype=torch.bool)
+    is_missing[:, 1] = True
+    is_missing[::2, 4] = is_missing[::3, 5] = True
+    found = layer(inputs_of(layer, features), is_missing)
+    wanted = expected(layer, features, is_missing)
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-12)
+
+
+def test_a_stuck_channel_is_one_that_is_missing(rng):
+    layer, features = fitted(rng)
+    is_missing = torch.zeros(len(features), 7, dtype=torch.bool)
+    is_missing[:, [0, 3]] = True
+    bins = torch.from_numpy(rng.standard_normal((len(features), 7, 100)))
+    alive = POOL(bins)
+    bins[:, [0, 3]] = 0.3 + 1e-9 * torch.from_numpy(rng.standard_normal((len(features), 2, 100)))
+    stuck = layer(inputs_of(layer, POOL(bins)))
+    torch.testing.assert_close(stuck, layer(inputs_of(layer, alive), is_missing))
+
+
+def test_without_any_channel_of_a_kind_a_column_is_its_training_median(rng):
+    layer, features = fitted(rng)
+    is_missing = torch.zeros(len(features), 7, dtype=torch.bool)
+    is_missing[:, list(HAND.indices("PVDF"))] = True
+    given = inputs_of(layer, features)
+    found, whole = layer(given, is_missing), layer(given)
+    films = torch.tensor([name.channel == "PVDF" for name in layer.names])
+    middle = whole.median(0).values
+    torch.testing.assert_close(found[:, films], middle[films].expand(len(found), -1))
+    torch.testing.assert_close(found[:, ~films], whole[:, ~films])
+
+
+def test_a_channel_that_rests_in_training_is_never_stuck(rng):
+    bins = torch.from_numpy(rng.standard_normal((60, 7, 100)))
+    bins[::10] = 0.25  # one bin in ten is constant in every channel
+    layer = ChannelPooling.fit(HAND, POOL.names, POOL(bins), ["mean"])
+    assert layer.least_range.tolist() == [0.0, 0.0]
+
+
+def test_one_dead_channel_in_training_does_not_hide_the_others(rng):
+    bins = torch.from_numpy(rng.standard_normal((60, 7, 100)))
+    bins[:, 2] = 0.25
+    layer = ChannelPooling.fit(HAND, POOL.names, POOL(bins), ["mean", "std"])
+    assert (layer.least_range > 0).all()
+    mended = bins.clone()
+    mended[:, 2] = torch.from_numpy(rng.standard_normal((60, 100)))
+    is_missing = (torch.arange(7) == 2).expand(60, 7)
+    wanted = layer(inputs_of(layer, POOL(mended)), is_missing)
+    torch.testing.assert_close(layer(inputs_of(layer, POOL(bins))), wanted)
+
+
+def test_nan_is_never_left_out_in_silence(rng):
+    layer, features = fitted(rng)
+    given = inputs_of(layer, features)
+    given[3] = torch.nan
+    found = layer(given)
+    assert found[3].isnan().all()
+    assert found[[0, 1, 2, 4]].isfinite().all()
+
+
+def test_gradients_flow_and_are_finite_where_channels_agree(rng):
+    layer, features = fitted(rng, ["mean", "std", "min", "max", "median"])
+    layer = layer.select([3, 40, 77, 100, len(layer.names) - 1])
+    given = inputs_of(layer, features)[:3].clone()
+    assert torch.autograd.gradcheck(layer, given.requires_grad_())
+    same = torch.ones_like(given[:1]).requires_grad_()
+    layer(same).sum().backward()
+    assert same.grad is not None
+    assert same.grad.isfinite().all()
+
+
+def test_select_and_with_channels_take_no_more_than_they_need(rng):
+    layer, features = fitted(rng)
+    few = layer.select([5, 2])
+    assert [str(name) for name in few.names] == [str(layer.names[5]), str(layer.names[2])]
+    assert len(few.inputs) < len(layer.inputs)
+    torch.testing.assert_close(
+        few(inputs_of(few, features)), layer(inputs_of(layer, features))[:, [5, 2]]
+    )
+    own = FeatureName("PVDF2", "A1", "time", "mode")
+    both = few.with_channels([own])
+    found = both(inputs_of(both, features))
+    torch.testing.assert_close(found[:, 0], features[:, PLACE[own]])
+    torch.testing.assert_close(found[:, 1:], few(inputs_of(few, features)))
+
+
+def test_leading_axes_and_the_round_trip(rng):
+    layer, features = fitted(rng, "sorted")
+    given = inputs_of(layer, features)
+    wanted = layer(given)
+    torch.testing.assert_close(layer(given.unflatten(0, (3, 4, 5))).flatten(0, 2), wanted)
+    again = ChannelPooling.from_dict(HAND, layer.to_dict(), layer.state_dict())
+    assert again.names == layer.names
+    torch.testing.assert_close(again(given), wanted, rtol=0, atol=0)
+
+
+def test_a_single_channel_has_its_mean_alone():
+    hand = HandLayout.from_rows([{"name": "P", "kind": "PVDF", "finger": "f", "segment": "s"}])
+    pool = FeaturePool(hand, level=1)
+    names = pooled_names(hand, pool.names, ["mean", "std"])
+    assert {name.statistic for name in names} == {"mean"}
+    assert len(names) == len(pool.names)
+
+
+@pytest.mark.parametrize("setting", ["largest", [], ["mean", "mode"]])
+def test_unknown_statistics_are_refused(setting):
+    with pytest.raises(ValueError, match=r"features\.pooling must be sorted, null or some of mean"):
+        pooled_names(HAND, POOL.names, setting)
+
+
+def test_features_that_do_not_tell_the_range_are_refused(rng):
+    names = [name for name in POOL.names if name.descriptor != "range"]
+    with pytest.raises(ValueError, match="pooling needs the feature 'SG1 raw time range'"):
+        ChannelPooling.fit(HAND, names, torch.ones(2, len(names)), ["mean"])
