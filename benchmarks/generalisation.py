@@ -47,7 +47,7 @@ PAGE = ROOT / "docs" / "generalisation.md"
 SEEN = ("M1", "M2", "M3", "M4", "M5", "M6")
 LEVELS_MV = (1.0, 3.0, 10.0, 30.0)
 EXPERIMENTS = ("unseen4", "deploy")
-LIMITS = {
+LIMITS: dict[str, dict[str, tuple[float, float | None]]] = {
     "unseen4": {
         "test": (98.9, 98.6),
         "held-out materials": (98.5, 97.5),
@@ -211,8 +211,11 @@ def seed_run(seed: int, folder: Path, cache: Path, exps: Sequence[str], *, quick
         for name, own in parts.items():
             found[name][measure] = of(own)
 
+    def having(role: str, num: int) -> Callable[[RecordingSource], list[RecordingId]]:
+        return lambda source: first_of(source, role, seed, num)
+
     for role, label in (("test", "test"), ("unseen", "held out")):
-        keep = lambda source, role=role: first_of(source, role, seed, 99)  # noqa: E731
+        keep = having(role, 99)
         whole = on(f"{label}", [], keep)
         add("test" if role == "test" else "held-out materials", whole, balanced)
         add(f"calibration error, {label}", whole, calibration_error)
@@ -250,11 +253,11 @@ def seed_run(seed: int, folder: Path, cache: Path, exps: Sequence[str], *, quick
     by_side(pulled, "pulled object found", truth=True)
     for level in LEVELS_MV:
         over = [f"+scene.motor_vibration_mv={level}"]
-        keep = lambda source: [  # noqa: E731
-            *first_of(source, "test", seed, 2),
-            *first_of(source, "unseen", seed, 3),
-        ]
-        slips = on(f"slips, {level:g} mV", over, keep)
+
+        def some(source: RecordingSource) -> list[RecordingId]:
+            return [*having("test", 2)(source), *having("unseen", 3)(source)]
+
+        slips = on(f"slips, {level:g} mV", over, some)
         by_side(slips, f"slips at {level:g} mV found", truth=True)
         over = ["scene=arm_motion", "data.cycles=8", f"scene.motor_vibration_mv={level}"]
         arm = on(f"moving arm, {level:g} mV", [over[0], over[1], f"+{over[2]}"], later(6))
