@@ -77,7 +77,8 @@ def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, st
     if selected:
         parts.append(selected_table(selected))
     if metrics.get("validation"):
-        parts.append(validation_table(metrics["validation"], simulated=metrics["simulated"]))
+        simulated, nested = metrics["simulated"], metrics.get("nested_validation")
+        parts.append(validation_table(metrics["validation"], simulated=simulated, nested=nested))
     parts += tuning_tables(metrics)
     if metrics.get("solve"):
         parts.append(solve_line(metrics["solve"]))

@@ -43,7 +43,8 @@ def selected_features_figure(
 
     Args:
         selected: one mapping per feature with ``channel``, ``component``, ``domain``,
-            ``descriptor``, ``kind`` and ``finger``.
+            ``descriptor``, ``kind`` and ``finger``; of a pooled one ``statistic``, which then
+            stands in place of the finger.
         path: the PNG to write, replaced as a whole if it exists.
         simulated: whether the bins they were ranked on are.
 
@@ -77,9 +78,10 @@ def selected_features_figure(
         words = f"paper: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
         component.set_xlabel(words, fontsize=_SMALL, color=_GREY)
 
-    pairs = [(feature["kind"], feature["finger"]) for feature in selected]
+    is_pooled = any(feature.get("statistic") for feature in selected)
+    pairs = [(f["kind"], f.get("statistic") or f["finger"]) for f in selected]
     _stacked_bars(finger, pairs, list(by_finger.get("SG", ())), colours, by_finger)
-    _tidy(finger, "y", "(c) finger")
+    _tidy(finger, "y", "(c) statistic over channels" if is_pooled else "(c) finger")
     _descriptor_bars(figure.add_subplot(grid[:, 1]), selected, colours, is_papers)
     with whole_file(path) as unfinished:
         figure.savefig(unfinished, format="png", dpi=180, facecolor="white")
