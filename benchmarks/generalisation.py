@@ -28,7 +28,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from torch import Tensor
 
-from benchmarks.outcome import RESULTS, ROOT
+from benchmarks.outcome import RESULTS, ROOT, between_markers
 from benchmarks.reproduction.runs import code_digest, run
 from tactslip_torch.config import conf_dir
 from tactslip_torch.data.recording import RecordingId, RecordingSource
@@ -41,6 +41,7 @@ from tactslip_torch.files import whole_file
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import calibration_of
 from tactslip_torch.progress import bar
+from tactslip_torch.report.tables import splits_table
 
 COMMAND = "python -m benchmarks.generalisation"
 PAGE = ROOT / "docs" / "generalisation.md"
@@ -360,6 +361,32 @@ def _baselines(report: Mapping[str, Any], name: str) -> list[str]:
     return lines
 
 
+def first_result(report: Mapping[str, Any], metrics: Mapping[str, Any]) -> str:
+    """README's first result: what the main job prints with its default seed, and all seeds."""
+    rows = {row["measure"]: row for row in summary(report, "unseen4")}
+    told = []
+    for measure in ("test", "held-out materials", "another session"):
+        row = rows[measure]
+        seeds = ", ".join(f"{value:.2f}" for value in row["by_seed"])
+        told.append(f"| {measure} | {row['mean']:.2f} ± {row['spread']:.2f} | {seeds} |")
+    return "\n".join(
+        [
+            f"It prints among others (seed 0, `{COMMAND}`, code {report['code']}):",
+            "",
+            "```",
+            splits_table(metrics),
+            "```",
+            "",
+            f"Balanced accuracy, %, with {len(report['seeds'])} seeds, **simulated**; *unseen* are the",
+            "held-out materials, *another session* is another mounting of the six seen materials:",
+            "",
+            "| | mean ± sd | by seed |",
+            "|---|---|---|",
+            *told,
+        ]
+    )
+
+
 def figure(report: Mapping[str, Any], path: Path) -> None:
     """Vibration: slips found and false slips, by level, and accuracies by seed."""
     axes: Any
@@ -436,6 +463,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     PAGE.parent.mkdir(exist_ok=True)
     with whole_file(PAGE) as temporary:
         temporary.write_text(text)
+    if "0" in report["seeds"] and "unseen4" in report["experiments"]:
+        metrics = json.loads((options.runs / "unseen4-0" / "metrics.json").read_text())
+        readme = ROOT / "README.md"
+        block = first_result(report, metrics)
+        whole = between_markers(readme.read_text(encoding="utf-8"), "first result", block)
+        with whole_file(readme) as temporary:
+            temporary.write_text(whole, encoding="utf-8")
 
 
 if __name__ == "__main__":
