@@ -377,7 +377,7 @@ def first_result(report: Mapping[str, Any], metrics: Mapping[str, Any]) -> str:
             splits_table(metrics),
             "```",
             "",
-            f"Balanced accuracy, %, with {len(report['seeds'])} seeds, **simulated**; *unseen* are the",
+            f"Balanced accuracy, %, {len(report['seeds'])} seeds, **simulated**; *unseen* are the",
             "held-out materials, *another session* is another mounting of the six seen materials:",
             "",
             "| | mean ± sd | by seed |",

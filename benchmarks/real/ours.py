@@ -54,7 +54,8 @@ def detector_of(windows: Windows, recipe: Recipe, training: Training) -> SlipDet
     for place, features, is_slip in parts:
         recording = windows.recordings[place]
         survey.update(str(recording), recipe.group(recording), features, is_slip)
-    plan = plan_detector(recipe, survey, _quietly, allowed=allowed)
+    options: dict[str, Any] = {"allowed": allowed, "pool": pool, "is_nested": False}
+    plan = plan_detector(recipe, survey, _quietly, **options)
     gathered = TrainingPass(plan)
     for place, features, is_slip in parts:
         gathered.update(str(windows.recordings[place]), features, is_slip)
@@ -65,9 +66,10 @@ def detector_of(windows: Windows, recipe: Recipe, training: Training) -> SlipDet
         plan.frame.selected,
         plan.frame.scaler,
         head,
-        {"penalty": plan.penalty, "calibration": plan.calibration},
+        {"penalty": plan.penalty, "calibration": plan.calibration, "kernel": plan.kernel.to_dict()},
         plan.typical,
         plan.gaussians,
+        plan.frame.pooling,
     )
 
 
@@ -83,7 +85,13 @@ def _fit(windows: Windows, recipe: Recipe, training: Training) -> Fitted:
         with torch.no_grad():
             return detector.judge(torch.from_numpy(samples)).score.numpy()
 
-    chosen = {"features": len(selected), "C": detector.info["penalty"]}
+    names = detector.selected_names
+    chosen = {
+        "features": len(names),
+        "pooled": sum(name.is_pooled for name in names),
+        "degree": detector.info["kernel"].get("degree"),
+        "C": detector.info["penalty"],
+    }
     return Fitted(decide, judge, chosen)
 
 

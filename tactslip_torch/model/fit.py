@@ -36,6 +36,7 @@ Progress = Callable[[Iterable[int], str], Iterable[int]]
 """Wraps a range so that its progress shows; gets the range and what is being done."""
 
 CHUNK_BINS = 2048
+MOST_QUADRATIC = 1000
 _MOST_DUAL = 16_384  # bins whose Gram matrix (2 GiB) is worth keeping the light ones
 
 
@@ -124,13 +125,27 @@ def fit_machine(
         bins.weights,
         restore=lambda spoilt: lower_gram(kernel, bins.features, spoilt),
     )
-    if kernel.collapses:
-        machine: QuadraticForm | KernelSum = collapse(bins.features, beta, kernel)
-    else:
-        machine = KernelSum(bins.features, beta, kernel)
+    machine = machine_of(bins.features, beta, kernel)
+    if isinstance(machine, KernelSum):
         log.info(machine.cost_note)
     machine.solved = report
     return machine
+
+
+def machine_of(support: Tensor, beta: Tensor, kernel: Kernel) -> QuadraticForm | KernelSum:
+    """A kernel sum, folded where its kernel folds and that makes it smaller.
+
+    A quadratic form has a number for each pair of features: of more than ``MOST_QUADRATIC``
+    features and fewer bins than that, the sum over bins is the smaller one.
+
+    Shape:
+        - support: ``[N, K]``; beta: ``[N]``
+    """
+    is_wide = support.shape[1] > max(MOST_QUADRATIC, len(support))
+    is_quadratic = isinstance(kernel, Polynomial) and kernel.degree == 2
+    if kernel.collapses and not (is_wide and is_quadratic):
+        return collapse(support, beta, kernel)
+    return KernelSum(support, beta, kernel)
 
 
 def takes_dual(kernel: Kernel, num_bins: int, num_features: int) -> bool:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from tactslip_torch.model.cholesky import forward_solve
 from tactslip_torch.model.downdate import Monomials, residuals_by_block, residuals_by_iteration
-from tactslip_torch.model.fit import Route, TrainingBins, takes_dual
+from tactslip_torch.model.fit import Route, TrainingBins, machine_of, takes_dual
 from tactslip_torch.model.kernel_elm import solve_normal_equations_
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, lower_gram
@@ -34,7 +34,7 @@ from tactslip_torch.model.left_out import (
     order_groups,
     products_within,
 )
-from tactslip_torch.model.quadratic import QuadraticForm, collapse
+from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.threads import for_each
 
 _ITERATIONS = 60  # that conjugate gradients usually take
@@ -117,8 +117,7 @@ class HeldOut:
         left_out = leave_out_(
             self._system.clone(), self._targets, penalty, self._weights, self._groups
         )
-        fold = collapse if self._kernel.collapses else KernelSum
-        head = fold(self._z, left_out.beta, self._kernel)
+        head = machine_of(self._z, left_out.beta, self._kernel)
         head.solved = left_out.report
         return head, left_out.residuals
 
