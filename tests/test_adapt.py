@@ -31,7 +31,7 @@ from tactslip_torch.onset.sequential import KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.train import train
 
-TRAINING = (*TINY, "data.seed=0", "statistics=true", "coverage=0.5", "cache=off")
+TRAINING = (*TINY, "recipe=robust", "data.seed=0", "statistics=true", "coverage=0.5", "cache=off")
 SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0)
 
 

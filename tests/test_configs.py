@@ -170,7 +170,7 @@ def test_unseen4_is_the_papers_split():
     expected = {(m, "train"): 22 for m in SEEN} | {(m, "test"): 6 for m in SEEN}
     assert counts == expected | {(m, "unseen"): 28 for m in UNSEEN}
     assert config.labels.layout == "whole_slide"
-    assert config.recipe.name == "robust"
+    assert config.recipe.name == "general"
     assert composed("+exp=unseen4", "recipe=paper").recipe.num_features == 120
 
 
@@ -246,7 +246,8 @@ def test_every_option_composes(group, option):
 def test_recipe_and_rule_defaults_are_those_of_their_files():
     """The file states what an experiment may change; the signature says the same."""
     config = composed("recipe=paper")
-    assert instantiate(config.recipe, _convert_="all") == Recipe()
+    pooling = tuple(config.features.pooling)  # of the file of features
+    assert instantiate(config.recipe, _convert_="all") == Recipe(pooling=pooling)
     assert instantiate(config.labels) == LabelRule()
     half = instantiate(composed("labels=half_second").labels)
     assert half == LabelRule(layout="half_second")

@@ -84,6 +84,7 @@ def test_recipes_are_told_apart_by_their_keys(tmp_path):
     assert {name: len(splits) for name, splits in found["splits"].items()} == {
         "paper": 4,
         "robust": 4,
+        "general": 4,
         "welch": 4,
     }
     assert {split["num_features"] for split in found["splits"]["welch"]} == {4}

@@ -52,7 +52,7 @@ def bytes_of(path):
 
 def test_shards_give_the_detector_of_one_process(made, tmp_path):
     folder, cache, *_ = made
-    run_train(tmp_path, *TINY, *MANY, cache)
+    run_train(tmp_path, *TINY, "recipe=robust", *MANY, cache)
     own, theirs = tensors(tmp_path), tensors(folder)
     assert own.keys() == theirs.keys()
     for name, value in own.items():
@@ -188,7 +188,7 @@ def test_a_kernel_that_does_not_add_up_is_refused_at_once(tmp_path):
 def test_few_bins_agree_with_train_to_rounding(made, tmp_path):
     _, cache, *_ = made
     few = ("recipe.num_features=40", cache)  # 861 monomials
-    run_train(tmp_path, *TINY, *MANY, *few)
+    run_train(tmp_path, *TINY, "recipe=robust", *MANY, *few)
     act("collect", tmp_path / "survey.stats", *few)
     act("plan", tmp_path / "plan.stats", f"inputs={tmp_path / 'survey.stats'}")
     plan = f"plan={tmp_path / 'plan.stats'}"
