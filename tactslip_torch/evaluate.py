@@ -36,6 +36,7 @@ from tactslip_torch.experiment import (
 )
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
+from tactslip_torch.folds import merged_baselines
 from tactslip_torch.judging import event_numbers, together
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
@@ -67,6 +68,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     if is_first:
         save_config(config, folder)
     parts: dict[str, dict[str, Any]] = {}
+    baselines: dict[str, dict[str, Any]] = {}
     events: list[dict[str, Any]] = []
     answers: dict[str, dict[str, Any]] = {}
     overlaps = {fold.name: overlap(detector, source, fold) for fold in folds}
@@ -84,6 +86,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             data = SlipDataModule(maker, fold, config.num_workers)
             trainer.test(learner, datamodule=data, verbose=False)
             parts[fold.name] = learner.metrics["splits"]
+            baselines[fold.name] = learner.metrics["baselines"]
             events.append(learner.events)
             for role, of_role in learner.metrics.get("answers", {}).items():
                 answers.setdefault(role, {})[fold.name] = of_role
@@ -93,7 +96,9 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             role: merged_metrics([splits[role] for splits in parts.values() if role in splits])
             for role in roles
         },
-        "baselines": learner.metrics["baselines"] if len(folds) == 1 else {},
+        "baselines": learner.metrics["baselines"]
+        if len(once) == 1
+        else merged_baselines(baselines),
         "events": event_numbers(together(events)),
         "answers": {role: merged_answers(of_role) for role, of_role in answers.items()},
         "selected": [str(name) for name in detector.selected_names],

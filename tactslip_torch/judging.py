@@ -46,18 +46,19 @@ class JudgedBins(NamedTuple):
     """Decisions on bins of one recording that have one role.
 
     Attributes:
+        baselines: decisions of baselines by name (``tactslip_torch.baselines``).
         is_whole: whether these are all bins of the recording.
         answer: slip, non-slip or unsure (``model.conformal``); None of a detector that is never
             unsure.
 
     Shape:
-        - truth, says_slip, rival_says_slip, speed_mm_s, position, stroke, ends_s, answer: ``[N]``
+        - truth, says_slip, speed_mm_s, position, stroke, ends_s, answer, each of baselines: ``[N]``
     """
 
     recording: RecordingId
     truth: Tensor
     says_slip: Tensor
-    rival_says_slip: Tensor
+    baselines: Mapping[str, Tensor]
     speed_mm_s: Tensor
     position: Tensor
     stroke: Tensor
@@ -71,7 +72,7 @@ class JudgedBins(NamedTuple):
 def judged_bins(
     batch: RecordingFeatures,
     says_slip: Tensor,
-    rival_says_slip: Tensor,
+    baselines: Mapping[str, Tensor],
     answer: Tensor | None = None,
 ) -> dict[str, JudgedBins]:
     """Decisions ``[N]`` on the bins of a recording, for each role that some of them have."""
@@ -80,7 +81,7 @@ def judged_bins(
             batch.recording,
             batch.is_slip[mask],
             says_slip[mask],
-            rival_says_slip[mask],
+            {name: decisions[mask] for name, decisions in baselines.items()},
             batch.speed_mm_s[mask],
             batch.position[mask],
             batch.stroke[mask],
@@ -95,8 +96,8 @@ def judged_bins(
     }
 
 
-def bin_scores(parts: Sequence[JudgedBins]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """``bin_metrics`` of the detector and ``split_metrics`` of its rival on all bins."""
+def bin_scores(parts: Sequence[JudgedBins]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """``bin_metrics`` of the detector, and ``split_metrics`` of each baseline, on all bins."""
     truth = torch.cat([part.truth for part in parts])
     places = torch.cat([part.position for part in parts]).tolist()
     scores = bin_metrics(
@@ -107,8 +108,12 @@ def bin_scores(parts: Sequence[JudgedBins]) -> tuple[dict[str, Any], dict[str, A
         [part.recording.scene for part in parts for _ in part.truth],
         [None if place == NO_POSITION else place for place in places],
     )
-    rival = torch.cat([part.rival_says_slip for part in parts])
-    return scores, split_metrics(confusion_matrix(truth, rival))
+    return scores, {
+        name: split_metrics(
+            confusion_matrix(truth, torch.cat([part.baselines[name] for part in parts]))
+        )
+        for name in parts[0].baselines
+    }
 
 
 def answer_scores(parts: Sequence[JudgedBins], coverage: float) -> dict[str, Any]:

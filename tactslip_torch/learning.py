@@ -17,6 +17,8 @@ import torch
 from torch import nn
 
 from tactslip_torch.abstaining import Abstaining
+from tactslip_torch.baselines import KEY as BASELINES
+from tactslip_torch.baselines import Baselines
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.feature_maker import RecordingFeatures
@@ -37,7 +39,6 @@ from tactslip_torch.model.abstention import KEY, abstention_of
 from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.model.threshold import FeatureThreshold
 from tactslip_torch.onset.events import LatencyParts, RecordingEvents
 from tactslip_torch.pace import Pace
 from tactslip_torch.planning import Plan, plan_detector
@@ -57,6 +58,7 @@ class SlipLearner(L.LightningModule):
         detector: a finished one, to be judged only.
         abstaining: how thresholds for unsure answers are set; by default none are.
         frame: features and ranges that were settled elsewhere; by default the recipe finds them.
+        with_baselines: fit baselines on the sample of training bins, to be evaluated beside.
 
     Attributes:
         detector: the result, after the second epoch.
@@ -75,6 +77,8 @@ class SlipLearner(L.LightningModule):
         detector: SlipDetector | None = None,
         abstaining: Abstaining | None = None,
         frame: Frame | None = None,
+        *,
+        with_baselines: bool = True,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -85,9 +89,10 @@ class SlipLearner(L.LightningModule):
         self._allowed = self.recipe.allowed(pool)
         self._frame = frame
         self.detector = detector
-        self.threshold: FeatureThreshold | None = None
-        if detector and "rival" in detector.info:
-            self.threshold = FeatureThreshold(**detector.info["rival"])
+        self.with_baselines = with_baselines
+        self.baselines: Baselines | None = None
+        if detector and BASELINES in detector.info:
+            self.baselines = Baselines.from_dict(detector.pool, detector.info[BASELINES])
         self.facts: dict[str, Any] = {}
         self.metrics: dict[str, Any] = {}
         self.events: dict[str, dict[str, list[RecordingEvents]]] = {}
@@ -98,6 +103,7 @@ class SlipLearner(L.LightningModule):
         self._survey = Survey(len(pool.names), self.recipe.sample_bins)
         self._plan: Plan | None = None
         self._second: TrainingPass | None = None
+        self._is_resumed = False
         self._judged: dict[str, list[JudgedBins]] = {}
         # nothing is trained by it: torch's DistributedDataParallel refuses a module without one
         self._anchor = nn.Parameter(torch.zeros(()))
@@ -121,10 +127,10 @@ class SlipLearner(L.LightningModule):
         self._pace.add(batch)
         mask = batch.roles["train"]
         features, is_slip = batch.features[mask], batch.is_slip[mask]
-        if self._second is None:
+        if self._second is None or self._is_resumed:
             stratum = self.recipe.stratum(batch.recording)
             self._survey.update(str(batch.recording), stratum, features, is_slip)
-        else:
+        if self._second is not None:
             self._second.update(str(batch.recording), features, is_slip, batch.recording.scene)
 
     def on_train_epoch_end(self) -> None:
@@ -133,14 +139,15 @@ class SlipLearner(L.LightningModule):
         passed = time.perf_counter()
         name = "survey_pass" if self._second is None else "training_pass"
         self.seconds[name] = passed - self._pass_started
+        if self._second is None or self._is_resumed:
+            parts = of_all_ranks(self._survey)
+            self._survey = parts[0]
+            for part in parts[1:]:
+                self._survey.merge(part)
         if self._second is not None:
             sum_over_ranks(self._second)
             self._solve(self._second)
             return
-        parts = of_all_ranks(self._survey)
-        self._survey = parts[0]
-        for part in parts[1:]:
-            self._survey.merge(part)
         self._plan = from_first_rank(self._planned)
         self.seconds["validation"] = time.perf_counter() - passed
         if self._is_single_pass:
@@ -175,6 +182,7 @@ class SlipLearner(L.LightningModule):
         if kept := checkpoint.get("pooling"):
             pooling = ChannelPooling.from_dict(self.pool.hand, *kept)
         self._plan = Plan.of(json.loads(checkpoint["plan"]), scaler, gaussians, pooling)
+        self._is_resumed = True  # baselines need the first pass's sample: drawn in the second
 
     def on_test_start(self) -> None:
         """Forget what an earlier test judged.
@@ -194,22 +202,24 @@ class SlipLearner(L.LightningModule):
         self._pace.add(batch)
         chosen = batch.features[:, list(self.detector.selected)].double()
         device = next(self.detector.buffers()).device  # Lightning may have moved it
-        score = self.detector.score_features(chosen.to(device)).cpu()
+        scaled = self.detector.scaled(chosen.to(device))
+        score = self.detector.head(scaled).cpu()
         says_slip = score >= 0
-        columns = self.detector.columns(chosen.to(device)).cpu()
-        rival = self.threshold(columns) if self.threshold else torch.zeros_like(says_slip)
+        baselines = self.baselines(batch.features, scaled.cpu()) if self.baselines else {}
         abstention = abstention_of(self.detector)
         answer = abstention.answer(score) if abstention else None
-        for role, part in judged_bins(batch, says_slip, rival, answer).items():
+        for role, part in judged_bins(batch, says_slip, baselines, answer).items():
             self._judged[role].append(part)
 
     def on_test_epoch_end(self) -> None:
         """Turn decisions into metrics."""
         assert self.detector is not None  # on_test_start
         torch.set_num_threads(self._num_threads)
-        self.metrics = {"splits": {}, "baselines": {}}
+        self.metrics = {"splits": {}}
         self.events = {}
-        rivals: dict[str, Any] = {}
+        baselines = self.baselines.metadata() if self.baselines else {}
+        for about in baselines.values():
+            about["splits"] = {}
         rate_hz = self.detector.pool.sample_rate_hz
         latency = LatencyParts(
             self.detector.look_ahead / rate_hz, self.detector.pool.bin_samples / rate_hz
@@ -220,7 +230,9 @@ class SlipLearner(L.LightningModule):
             parts.sort(key=lambda part: part.recording)
             if not parts:
                 continue
-            scores, rivals[role] = bin_scores(parts)
+            scores, of_baselines = bin_scores(parts)
+            for name, found in of_baselines.items():
+                baselines[name]["splits"][role] = found
             self.metrics["splits"][role] = scores
             self.events[role] = events_by_rule(parts, latency)
             if abstention := abstention_of(self.detector):
@@ -230,11 +242,7 @@ class SlipLearner(L.LightningModule):
                 if scores[name] is not None:
                     self.log(f"{role}/{name}", scores[name], batch_size=1)
         self.metrics["events"] = event_numbers(self.events)
-        if self.threshold:
-            feature = str(self.detector.selected_names[self.threshold.index])
-            self.metrics["baselines"] = {
-                "best_single_feature": {"feature": feature, "splits": rivals}
-            }
+        self.metrics["baselines"] = baselines
 
     @property
     def worker_seconds(self) -> dict[str, float]:
@@ -280,7 +288,6 @@ class SlipLearner(L.LightningModule):
         plan = gathered.plan
         head = from_first_rank(lambda: gathered.solve(bar))
         self.log("penalty", plan.penalty, batch_size=1)
-        self.threshold = plan.threshold
         facts = plan.facts()
         self.facts = {"recipe": self.recipe.name} | {
             name: facts[name] for name in ("kernel", "penalty", "balance", "num_bins", "validation")
@@ -288,7 +295,14 @@ class SlipLearner(L.LightningModule):
         self.facts |= {"nested_validation": plan.nested}
         of_head = {"head": head.cost._asdict(), "solve": solve_facts(head)}
         self.facts |= of_head | {"among": plan.among}
-        self.seconds["solve"] = time.perf_counter() - started
+        solved = time.perf_counter()
+        self.seconds["solve"] = solved - started
+        if self.with_baselines:
+            sample = self._survey.sample.bins()
+            self.baselines = from_first_rank(
+                lambda: Baselines.fit(self.pool, plan.frame(sample.features), sample)
+            )
+            self.seconds["baselines"] = time.perf_counter() - solved
         self.detector = SlipDetector(
             self.pool,
             self.channel_filter,
@@ -296,8 +310,8 @@ class SlipLearner(L.LightningModule):
             plan.frame.scaler,
             head,
             self.facts
-            | {"rival": plan.threshold.to_dict(), "calibration": plan.calibration}
-            | {KEY: plan.abstain},
+            | {"calibration": plan.calibration, KEY: plan.abstain}
+            | ({BASELINES: self.baselines.to_dict()} if self.baselines else {}),
             plan.typical,
             plan.gaussians,
             plan.frame.pooling,

@@ -21,7 +21,6 @@ from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.kernels import Kernel, Polynomial, kernel_from_dict
 from tactslip_torch.model.quadratic import num_quadratic_features
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.model.threshold import FeatureThreshold, best_threshold
 from tactslip_torch.model_selection import candidates, choose_model, fitted_frame
 from tactslip_torch.recipe import (
     Frame,
@@ -56,7 +55,6 @@ class Plan:
         shares: of non-slip and slip bins that are trained on.
         stands_for: how many bins each of those stands for, as in validation.
         num_bins: how many bins are trained on; about, where shares are below 1.
-        threshold: the best single selected feature, a rival to be reported beside.
         typical: mean of the scaled features, both classes counting alike; it stands in where a
             sensor is missing.
         validation: one row per choice: what was chosen from, the balanced accuracy of each
@@ -80,7 +78,6 @@ class Plan:
     shares: tuple[float, float]
     stands_for: float
     num_bins: int
-    threshold: FeatureThreshold
     typical: tuple[float, ...]
     validation: list[dict[str, Any]] = field(default_factory=list)
     among: dict[str, Any] | None = None
@@ -122,7 +119,6 @@ class Plan:
             "shares": list(self.shares),
             "stands_for": self.stands_for,
             "num_bins": self.num_bins,
-            "rival": self.threshold.to_dict(),
             "typical": list(self.typical),
             "validation": self.validation,
             "among": self.among,
@@ -154,7 +150,6 @@ class Plan:
             shares=(facts["shares"][0], facts["shares"][1]),
             stands_for=facts["stands_for"],
             num_bins=facts["num_bins"],
-            threshold=FeatureThreshold(**facts["rival"]),
             typical=tuple(facts["typical"]),
             validation=list(facts["validation"]),
             among=facts.get("among"),  # older plans know no such restriction
@@ -200,7 +195,7 @@ def plan_detector(
             raise ValueError("recipe.validation=nested needs the pool; hand it over as pool=")
         return _plan_nested(recipe, survey, progress, pool, allowed, is_nested=is_nested)
     frame = frame or choose_frame(recipe, survey, allowed)
-    sizes = sorted({min(size, len(frame.selected)) for size in recipe.sizes})
+    sizes = sorted({min(size, frame.size) for size in recipe.sizes})
     if sizes[-1] < recipe.sizes[-1]:
         log.warning(
             "recipe.num_features=%d is cut to %d: no more match", recipe.sizes[-1], sizes[-1]
@@ -241,6 +236,7 @@ def plan_detector(
         num_bins = MOST_KEPT_BINS
     frame = frame.first(size)
     z = frame(sample.features)
+    has_gaussians = kernel.collapses and frame.pooling is None
     return Plan(
         frame=frame,
         kernel=kernel,
@@ -249,11 +245,11 @@ def plan_detector(
         shares=(shares[0], shares[1]),
         stands_for=stands_for,
         num_bins=round(num_bins),
-        threshold=best_threshold(sample.features[:, list(frame.selected)].double(), sample.is_slip),
         typical=_typical(z, sample.is_slip, weights),
         validation=rows,
         among=None if allowed is None else _narrowed(recipe, allowed, sizes),
-        gaussians=ClassGaussians.fit(z, sample.is_slip, weights) if kernel.collapses else None,
+        gaussians=ClassGaussians.fit(z, sample.is_slip, weights) if has_gaussians else None,
+        drop_channels=0.0 if frame.pooling is None else recipe.drop_channels,
     )
 
 
@@ -297,7 +293,6 @@ def _plan_nested(
         shares=(shares[0], shares[1]),
         stands_for=1.0,
         num_bins=num_bins,
-        threshold=best_threshold(frame.columns(sample.features), sample.is_slip),
         typical=_typical(z, sample.is_slip, weights),
         validation=rows,
         among=None if recipe.among is None or allowed is None else _narrowed(recipe, allowed, []),

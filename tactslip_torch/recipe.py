@@ -56,7 +56,7 @@ class Recipe:
         group_by: what a validation fold leaves out: a ``"material"`` or a fifth of the
             ``"cycle"`` numbers (ours; the authors' search is not described).
         sample_bins: bins of each group and class that the first pass keeps for quantiles,
-            correlations, the single-feature rival and validation. Exact ranges and the t-test take
+            correlations, baselines and validation. Exact ranges and the t-test take
             every bin.
         among: ranks only features that match (ours), such as ``{"kind": "SG", "descriptor":
             "mean"}``: of each attribute a value, or one of several. ``num_features`` is cut to
@@ -298,12 +298,15 @@ class Frame:
         return scaled
 
     def first(self, num: int) -> Frame:
-        """The frame of the best ``num`` features."""
+        """The frame of the best ``num`` columns."""
         scaler = self.scaler
         knee = None if scaler.knee is None else scaler.knee[:num]
-        return Frame(
-            self.selected[:num], FeatureScaler(scaler.minimum[:num], scaler.maximum[:num], knee)
-        )
+        scaler = FeatureScaler(scaler.minimum[:num], scaler.maximum[:num], knee)
+        if self.pooling is None:
+            return Frame(self.selected[:num], scaler)
+        place = dict(zip(self.pooling.inputs, self.selected, strict=True))
+        layer = self.pooling.select(range(min(num, self.size)))
+        return Frame(tuple(place[name] for name in layer.inputs), scaler, layer)
 
 
 def choose_frame(recipe: Recipe, survey: Survey, allowed: Tensor | None = None) -> Frame:

@@ -103,7 +103,13 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         for fold in folds:
             place = folder if len(folds) == 1 else folder / fold.name
             data = SlipDataModule(maker, fold, config.num_workers)
-            learner = SlipLearner(pool, channel_filter, recipe, abstaining=abstaining)
+            learner = SlipLearner(
+                pool,
+                channel_filter,
+                recipe,
+                abstaining=abstaining,
+                with_baselines=config.baselines,
+            )
             found: dict[str, Any] | None = None
             if tuning is not None:
                 data, learner, found = tune_fold(config, place, data, learner, tuning)

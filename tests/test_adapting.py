@@ -19,7 +19,6 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.sufficient import SufficientStats
-from tactslip_torch.model.threshold import FeatureThreshold
 from tactslip_torch.planning import Plan
 from tactslip_torch.recipe import Frame
 
@@ -318,7 +317,7 @@ def test_witnesses_are_bins_that_were_trained_on_under_undersampling(rng):
     frame = Frame((0, 2), FeatureScaler(torch.zeros(2).double(), torch.ones(2).double()))
     plan = Plan(
         frame, Polynomial(2, 0.5), 1.0, "undersample", (1.0, 0.4), 1.0, 60,
-        FeatureThreshold(0, 1, 0.0), (0.0, 0.0),
+        (0.0, 0.0),
     )  # fmt: skip
     sample, kept = BinSample(30), {}
     for name in ("m/0", "m/1"):

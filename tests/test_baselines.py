@@ -1,297 +1,207 @@
-"""The rivals' scores by NumPy's spectrum and PyWavelets' branches, and the rule of transitions."""
+"""Baselines: simple statistics out of pool features, what each learns, and what is kept of them."""
 
-import pickle
+import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from oracles import assert_manners, plausible_bins, wavelet_branches
-from small_detector import HAND, raw_bins, small_detector
+from small_detector import HAND
+from small_set import SmallSet, small_maker
+from test_learning import learn, unseen_c
 
+from tactslip_torch.baselines import KEY, Baselines, PooledNumber
+from tactslip_torch.datamodule import SlipDataModule
+from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.simple import SimpleStatistics
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.onset.baselines import (
-    FLOOR_V,
-    VIBRATION_HZ,
-    BaselineDetector,
-    film_band_power,
-    first_transition,
-    largest_detail,
+from tactslip_torch.model.classifiers import LogisticRegression, RandomForest
+from tactslip_torch.model.detector import SlipDetector
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*isinstance.treespec, LeafSpec.*",
+    "ignore:The '.*_dataloader' does not have many workers",
+    "ignore:.*does not have many workers",
 )
-from tactslip_torch.onset.latch import latch, latch_start
-from tactslip_torch.onset.scoring import score_stream
-from tactslip_torch.signals.filtering import ChannelFilter
-
-FILMS = HandLayout.paper24().indices("PVDF")
-SCORES = {"film_band_power": film_band_power, "largest_detail": largest_detail}
-
-
-def band_rms(x, rate=2000.0, band=VIBRATION_HZ):
-    """Root mean square of what is left of a bin if all lines outside the band are taken out."""
-    lines, hz = np.fft.rfft(x), np.fft.rfftfreq(len(x), 1 / rate)
-    lines[(hz < band[0]) | (hz > band[1]) | (hz == 0)] = 0
-    return np.sqrt(np.mean(np.fft.irfft(lines, len(x)) ** 2))
+NAMES = [
+    "best_pooled_number",
+    "logistic_regression",
+    "logistic_regression_simple",
+    "random_forest_simple",
+]
 
 
-def detail(x, levels=(1, 2, 3, 4)):
-    branches = wavelet_branches(x)
-    return max(np.abs(branches[2 * m - 1]).max() for m in levels)
+def bins_of(num, seed=0):
+    """Noise on an offset, ``[N, 4, 100]``, of which slip is twice as loud; every level occurs."""
+    rng = np.random.default_rng(seed)
+    is_slip = np.arange(num) % 2 == 0
+    level = np.where(is_slip, 2.0, 1.0) * rng.uniform(0.9, 1.1, num)
+    bins = level[:, None, None] * rng.standard_normal((num, 4, 100))
+    bins[:, :2] += 3.0
+    return torch.from_numpy(bins), torch.from_numpy(is_slip)
 
 
-# ------------------------------------------------------------------------------------ the values
-def test_band_power_is_numpys_on_bins_of_a_hand(rng):
-    bins = plausible_bins(rng, 6)
-    expected = [np.log(max(band_rms(x) for x in bin_[14:])) for bin_ in bins]
-    actual = film_band_power(torch.from_numpy(bins), FILMS)
-    np.testing.assert_allclose(actual, expected, atol=1e-10)
+def sampled(num=160, groups=("a", "b"), seed=0, most=400):
+    pool = FeaturePool(HAND)
+    sample = BinSample(most)
+    for number, group in enumerate(groups):
+        bins, is_slip = bins_of(num, seed + number)
+        sample.update(f"{group}/0", group, pool(bins).float(), is_slip)
+    return pool, sample.bins()
 
 
-@pytest.mark.parametrize("num", [50, 99, 100, 128])
-@pytest.mark.parametrize("band", [(5.0, 400.0), (40.0, 200.0), (0.0, 1000.0)])
-def test_band_power_is_numpys_for_bins_of_any_length(num, band, rng):
-    """Up to half the rate too, where an even bin has a line that is no pair."""
-    bins = 0.2 + rng.standard_normal((3, 2, num))
-    expected = [np.log(max(band_rms(x, 2000.0, band) for x in bin_)) for bin_ in bins]
-    actual = film_band_power(torch.from_numpy(bins), [0, 1], 2000.0, band)
-    np.testing.assert_allclose(actual, expected, atol=1e-10)
+@pytest.fixture(scope="module")
+def fitted():
+    pool, sample = sampled()
+    scaled = sample.features[:, :40].double()
+    return pool, Baselines.fit(pool, scaled, sample)
 
 
-def test_a_tone_counts_in_its_band_and_only_there():
-    t = torch.arange(100, dtype=torch.float64) / 2000
-    tone = 0.3 * torch.sin(2 * torch.pi * 60 * t) + 2.0
-    bins = tone.expand(1, 1, 100)
-    rms = 0.3 / 2**0.5
-    assert film_band_power(bins, [0]).exp().item() == pytest.approx(rms, rel=1e-9)
-    assert film_band_power(bins, [0], band_hz=(60, 60)).exp().item() == pytest.approx(rms, rel=1e-9)
-    assert film_band_power(bins, [0], band_hz=(80, 400)).item() == pytest.approx(np.log(FLOOR_V))
-    # at another rate the same samples are another tone
-    assert film_band_power(bins, [0], 1000.0, (30, 30)).exp().item() == pytest.approx(rms, rel=1e-9)
+# ------------------------------------------------------------------------------- simple statistics
+@pytest.mark.parametrize(("wavelet", "num"), [("rbio2.2", 100), ("db4", 128), ("haar", 64)])
+def test_simple_statistics_are_those_of_the_bin(wavelet, num, rng):
+    """Of all sizes, on offsets, and of constant bins, slow and fast channels in any order."""
+    rows = HAND.to_rows()
+    hand = HandLayout.from_rows([rows[2], rows[0], rows[3], rows[1]])
+    size = 10 ** rng.uniform(-4, 2, (12, 4, 1))
+    bins = size * (rng.standard_normal((12, 4, num)) + rng.uniform(-2, 2, (12, 4, 1)))
+    bins[3], bins[4], bins[5, 2] = 0.0, 0.25, -3.0
+    pool = FeaturePool(hand, bin_samples=num, wavelet=wavelet)
+    found = SimpleStatistics(pool)(pool(torch.from_numpy(bins)))
+    x = bins[:, [*hand.slow, *hand.fast]]
+    wanted = [x.mean(-1), x.std(-1, ddof=1), np.sqrt((x**2).mean(-1))]
+    largest = np.abs(x).max(-1)
+    for part, expected in zip(found.split(4, 1), wanted, strict=True):
+        error = np.abs(part.numpy() - expected)
+        assert (error <= 1e-6 * np.abs(expected) + 1e-12 * largest).all()
 
 
-@pytest.mark.parametrize("levels", [None, (1,), (3, 4)])
-def test_the_largest_detail_is_pywavelets(levels, rng):
-    bins = plausible_bins(rng, 6)
-    of = (1, 2, 3, 4) if levels is None else levels
-    expected = [np.log(max(detail(x, of) for x in bin_[14:])) for bin_ in bins]
-    actual = largest_detail(torch.from_numpy(bins), FILMS, levels=levels)
-    np.testing.assert_allclose(actual, expected, atol=1e-10)
+# -------------------------------------------------------------------------------- what is learned
+def test_each_learns_what_is_separable(fitted):
+    pool, baselines = fitted
+    bins, is_slip = bins_of(300, seed=9)
+    features = pool(bins).float()
+    found = baselines(features, features[:, :40].double())
+    assert list(found) == NAMES == list(baselines.metadata())
+    for name, says_slip in found.items():
+        assert says_slip.dtype == torch.bool
+        assert (says_slip == is_slip).double().mean() > 0.95, name
 
 
-@pytest.mark.parametrize("name", SCORES)
-def test_only_films_count_and_the_largest_does(name, rng):
-    score = SCORES[name]
-    bins = torch.from_numpy(plausible_bins(rng, 3))
-    whole = score(bins, FILMS)
-    other = bins.clone()
-    other[:, :14] = torch.randn(3, 14, 100, dtype=torch.float64)
-    assert torch.equal(score(other, FILMS), whole)
-    each = torch.stack([score(bins, [film]) for film in FILMS], dim=-1)
-    torch.testing.assert_close(each.amax(-1), whole, rtol=1e-12, atol=1e-12)
-    is_film = torch.arange(24) >= 14
-    assert torch.equal(score(bins, is_film), whole)
-    apart = [FILMS[0], FILMS[7], FILMS[3]]
-    torch.testing.assert_close(each[:, [0, 7, 3]].amax(-1), score(bins, apart))
+def test_the_pooled_number_is_the_best_of_all_means_and_deviations(fitted):
+    pool, baselines = fitted
+    number = baselines.pooled
+    assert number.name.is_pooled
+    assert number.name.statistic in ("mean", "std")
+    assert len(number.inputs) <= 4  # two channels and their ranges, no more of the pool
+    rng = np.random.default_rng(0)
+    pool, sample = sampled()
+    features = torch.from_numpy(rng.standard_normal(sample.features.shape)).float().abs()
+    place = {str(name): index for index, name in enumerate(pool.names)}
+    for channel in ("PVDF1", "PVDF2"):
+        features[:, place[f"{channel} A3 time iqr"]] += 5.0 * ~sample.is_slip
+    found = PooledNumber.fit(pool, replace(sample, features=features))
+    assert str(found.name) == "PVDF A3 time iqr [mean]"
+    assert found.rule.sign == -1
+    assert torch.equal(found(features), sample.is_slip)
 
 
-# ----------------------------------------------------------------------------------- the manners
-@pytest.mark.parametrize("name", SCORES)
-def test_scores_take_any_axes_dtypes_and_strides(name, rng):
-    bins = torch.from_numpy(rng.standard_normal((4, 3, 100)))
-    assert_manners(lambda x: SCORES[name](x, [1, 2]), bins, num_axes=2, rtol=1e-11)
+def test_the_simple_ones_see_nothing_of_the_detector(fitted):
+    pool, baselines = fitted
+    features = pool(bins_of(50, seed=3)[0]).float()
+    one, other = (baselines(features, torch.full((50, 40), value).double()) for value in (-9, 9))
+    assert torch.equal(one["random_forest_simple"], other["random_forest_simple"])
+    assert torch.equal(one["logistic_regression_simple"], other["logistic_regression_simple"])
+    assert len(one["logistic_regression"].unique()) == 1  # that one sees nothing else
 
 
-@pytest.mark.parametrize("name", SCORES)
-def test_many_bins_are_each_their_own(name, rng):
-    """More than are taken at once."""
-    bins = torch.from_numpy(rng.standard_normal((600, 2, 100)))
-    picked = [0, 255, 256, 511, 512, 599]
-    torch.testing.assert_close(
-        SCORES[name](bins, [0, 1])[picked], SCORES[name](bins[picked], [0, 1])
-    )
+def test_logistic_regression_is_scikit_learns():
+    linear = pytest.importorskip("sklearn.linear_model")
+    scaling = pytest.importorskip("sklearn.preprocessing")
+    _, sample = sampled(60)
+    rng = np.random.default_rng(4)
+    columns = 3.0 + rng.standard_normal((len(sample.is_slip), 5)) * [1, 1e-3, 1e3, 1, 0]
+    columns[:, 0] += sample.is_slip.numpy()
+    found = LogisticRegression.fit(torch.from_numpy(columns), sample)
+    scaler = scaling.StandardScaler().fit(columns)
+    made = linear.LogisticRegression(C=found.penalty, class_weight="balanced", tol=1e-10)
+    made.fit(scaler.transform(columns), sample.is_slip, sample.represents)
+    wanted = made.decision_function(scaler.transform(columns))
+    score = torch.from_numpy(columns) @ found.weights + found.constant
+    np.testing.assert_allclose(score, wanted, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", SCORES)
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e200])
-def test_gradients_flow(name, scale, rng):
-    """Of the score; its amplitude is in proportion to the bin, so this one's scale with it."""
-    bins = torch.from_numpy(rng.standard_normal((2, 2, 50))).requires_grad_()
-
-    def score(x):
-        return SCORES[name](scale * x, [0, 1], **({"level": 3} if name == "largest_detail" else {}))
-
-    assert torch.autograd.gradcheck(score, (bins,), eps=1e-6, atol=1e-6)
-
-
-def test_constants_made_without_gradients_serve_with_them():
-    """What is kept from a call in inference mode must do in training."""
-    bins = torch.randn(1, 1, 92, dtype=torch.float64)
-    for score in SCORES.values():
-        with torch.inference_mode():
-            score(bins, [0])
-        x = bins.clone().requires_grad_()
-        score(x, [0]).sum().backward()
-        assert x.grad.abs().sum() > 0
+def test_the_forest_votes_as_scikit_learns_does():
+    ensemble = pytest.importorskip("sklearn.ensemble")
+    _, sample = sampled(60)
+    rng = np.random.default_rng(4)
+    columns = torch.from_numpy(rng.standard_normal((len(sample.is_slip), 6)))
+    made = ensemble.RandomForestClassifier(200, class_weight="balanced", random_state=0)
+    made.fit(columns.numpy(), sample.is_slip, sample_weight=sample.represents)
+    others = torch.from_numpy(rng.standard_normal((400, 6)))
+    found = RandomForest(columns, sample)(others)
+    right = found.numpy() == made.predict(others.numpy())
+    assert right.mean() > 0.995  # equal votes are decided by rounding
 
 
-# ---------------------------------------------------------------------------------- the extremes
-@pytest.mark.parametrize("name", SCORES)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_what_is_scaled_moves_by_the_log_of_the_scale(name, dtype, rng):
-    bins = torch.from_numpy(rng.standard_normal((5, 2, 100))).to(dtype)
-    here = SCORES[name](bins, [0, 1])
-    for scale in (1e-4, 1e4, 1e25, 1e36) + ((1e300,) if dtype == torch.float64 else ()):
-        moved = SCORES[name](bins * scale, [0, 1])
-        torch.testing.assert_close(moved, here + np.log(scale), rtol=1e-5, atol=1e-5)
+def test_bins_stand_for_those_they_were_drawn_from():
+    """A group with ten times the bins weighs ten times as much, though as many were kept."""
+    rng = np.random.default_rng(1)
+    sample = BinSample(100)
+    for group, num, sign in (("few", 200, -1.0), ("many", 2000, 1.0)):
+        is_slip = torch.arange(num) % 2 == 0
+        x = torch.where(is_slip, 1.0, -1.0) * sign + 0.1 * torch.from_numpy(rng.normal(size=num))
+        sample.update(group, group, x[:, None].float(), is_slip)
+    bins = sample.bins()
+    assert len(bins.is_slip) == 400
+    found = LogisticRegression.fit(bins.features, bins)
+    assert found.weights[0] > 0
 
 
-@pytest.mark.parametrize("name", SCORES)
-@pytest.mark.parametrize("value", [0.0, 5.0, -1e30, 1e-40])
-def test_a_dead_hand_has_the_lowest_score(name, value):
-    dead = torch.full((2, 3, 100), value, dtype=torch.float64).requires_grad_()
-    score = SCORES[name](dead, [0, 1, 2])
-    if abs(value) < 1e6:  # beyond, rounding is more than a microvolt
-        assert (score == torch.tensor(FLOOR_V, dtype=torch.float64).log()).all()
-    assert score.isfinite().all()
-    score.sum().backward()
-    assert dead.grad.isfinite().all()
+def test_one_class_is_refused():
+    pool, sample = sampled(40)
+    only = replace(sample, is_slip=torch.ones_like(sample.is_slip))
+    with pytest.raises(ValueError, match="both classes; got only one"):
+        Baselines.fit(pool, sample.features[:, :5], only)
 
 
-@pytest.mark.parametrize("name", SCORES)
-def test_a_small_vibration_on_a_large_offset_survives_float32(name, rng):
-    small = 1e-3 * np.round(rng.standard_normal((3, 1, 100)), 2)  # whole parts of 2^-17 of 4
-    small = np.round(small * 2**17) / 2**17
-    bins = torch.from_numpy(small)
-    expected = SCORES[name](bins, [0])
-    on_top = SCORES[name]((bins + 4.0).float(), [0])
-    torch.testing.assert_close(on_top.double(), expected, rtol=0, atol=1e-5)
+# --------------------------------------------------------------------------------- what is kept
+def test_the_pooled_number_survives_json(fitted):
+    pool, baselines = fitted
+    kept = json.loads(json.dumps(baselines.to_dict()))
+    again = Baselines.from_dict(pool, kept)
+    features = pool(bins_of(50, seed=3)[0]).float()
+    scaled = features[:, :40].double()
+    assert list(again(features, scaled)) == NAMES[:1]
+    assert torch.equal(again(features, scaled)[NAMES[0]], baselines(features, scaled)[NAMES[0]])
+    assert again.to_dict() == baselines.to_dict()
 
 
-@pytest.mark.parametrize("name", SCORES)
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-@pytest.mark.parametrize("place", [0, 7, 50])
-def test_a_bare_score_of_what_is_not_finite_is_nan(name, value, place):
-    bins = torch.randn(4, 3, 100)
-    bins[1, 2, place] = value
-    bins[2, 0, place] = value  # no film
-    assert SCORES[name](bins, [1, 2]).isnan().tolist() == [False, True, False, False]
-    one_line = film_band_power(bins, [1, 2], band_hz=(60, 60))  # of which no weight is 0
-    assert one_line.isnan().tolist() == [False, True, False, False]
+def test_a_learner_evaluates_them_and_a_saved_detector_those_it_keeps(tmp_path):
+    from lightning import Trainer
 
+    from tactslip_torch.learning import SlipLearner
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda x: film_band_power(x, []), "needs a film"),
-        (lambda x: largest_detail(x, torch.zeros(3, dtype=torch.bool)), "needs a film"),
-        (lambda x: film_band_power(x, [0], 2000.0, (1.0, 9.0)), "no line of 100 samples"),
-        (lambda x: film_band_power(x, [0], 2000.0, (0.0, 0.0)), "no line of 100 samples"),
-        (lambda x: largest_detail(x, [0], levels=(5,)), "levels must lie in 1..4"),
-        (lambda x: largest_detail(x, [0], levels=()), "levels must lie in 1..4"),
-        (lambda x: largest_detail(x[..., :20], [0]), "level must lie in"),
-        (lambda x: largest_detail(x, [0], wavelet="none"), "unknown wavelet"),
-    ],
-)
-def test_what_is_no_baseline_is_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call(torch.randn(2, 3, 100))
-
-
-# ------------------------------------------------------------------------------ first transition
-def transitions(is_slip):
-    """The rule, read aloud: slip now and none before."""
-    return [now and not before for before, now in zip([False, *is_slip], is_slip, strict=False)]
-
-
-@given(st.lists(st.booleans(), max_size=30))
-def test_an_alarm_is_each_change_to_slip(is_slip):
-    stream = torch.tensor(is_slip, dtype=torch.bool)
-    assert first_transition(stream).tolist() == transitions(is_slip)
-
-
-def test_transitions_take_any_axes_and_are_causal(rng):
-    is_slip = torch.from_numpy(rng.uniform(size=(3, 2, 40)) < 0.4)
-    found = first_transition(is_slip)
-    for place in np.ndindex(3, 2):
-        assert found[place].tolist() == transitions(is_slip[place].tolist())
-    later = is_slip.clone()
-    later[..., 25:] = ~later[..., 25:]
-    assert torch.equal(first_transition(later)[..., :25], found[..., :25])
-
-
-def test_it_is_the_latch_without_debounce_and_pause(rng):
-    llr = torch.from_numpy(rng.standard_normal((4, 100)))
-    start = latch_start(llr[:, 0])
-    is_alarm, is_on, _ = latch(llr, 0.0, margin=0.0, rearm=1, refractory=0, state=start)
-    assert torch.equal(first_transition(llr >= 0), is_alarm)
-    assert torch.equal(llr >= 0, is_on)
-
-
-# --------------------------------------------------------------------------------- in the harness
-def rival(name, **change):
-    detector = small_detector()
-    parts = {"pool": detector.pool, "channel_filter": detector.channel_filter} | change
-    return BaselineDetector(name, parts["pool"], parts["channel_filter"])
-
-
-@pytest.mark.parametrize("name", SCORES)
-def test_a_rival_judges_filtered_bins(name, rng):
-    detector = rival(name)
-    films = list(HAND.indices("PVDF"))
-    assert detector.needed_index.tolist() == films
-    assert detector.look_ahead == 5  # half the films' frame, not the gauges' 25
-    bins = ChannelFilter([51, 51, 11, 11]).valid(raw_bins(20))
-    score, is_valid, is_missing, _ = detector.judge(bins)
-    assert torch.equal(score, SCORES[name](bins, films))
-    assert is_valid.all()
-    assert not is_missing.any()
-    in_32 = detector.judge(bins, given=torch.float32)
-    assert in_32.score.dtype == torch.float32
-    torch.testing.assert_close(in_32.score.double(), score, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("name", SCORES)
-def test_a_missing_film_is_flagged_and_counts_as_silent(name):
-    detector = rival(name)
-    bins = ChannelFilter([51, 51, 11, 11]).valid(raw_bins(5))
-    whole = detector.judge(bins)
-    bins[1, 2, 30] = torch.nan  # a film
-    bins[2, 0, 30] = torch.inf  # a gauge, which no score depends on
-    bins[3, 3] = 0.1  # a dead film
-    bins[4] = torch.nan
-    found = detector.judge(bins)
-    assert found.score.isfinite().all()
-    assert found.is_valid.tolist() == [True, False, True, False, False]
-    assert found.is_missing.sum(-1).tolist() == [0, 1, 1, 0, 4]
-    other = SCORES[name](bins[1:2], [3])
-    torch.testing.assert_close(found.score[1:2], other)
-    torch.testing.assert_close(found.score[[0, 2]], whole.score[[0, 2]])
-
-
-@pytest.mark.parametrize("name", SCORES)
-def test_a_rival_runs_where_a_detector_does(name, rng):
-    """Each score of a stream is that of its bin, filtered whole."""
-    detector = rival(name)
-    samples = torch.from_numpy(rng.standard_normal((4, 700)))
-    samples[2, 400:410] = torch.nan
-    found = score_stream(detector, samples, 20)
-    filtered = ChannelFilter([51, 51, 11, 11])(samples)
-    starts = range(0, 700 - 100 + 1, 20)
-    assert len(found.score) == len(starts)
-    bins = torch.stack([filtered[:, s : s + 100] for s in starts])
-    torch.testing.assert_close(found.score, detector.judge(bins).score, rtol=1e-12, atol=1e-12)
-    reached = [s < 415 and s + 100 > 395 for s in starts]
-    assert (~found.is_valid).tolist() == reached
-    again = pickle.loads(pickle.dumps(detector))
-    assert torch.equal(score_stream(again, samples, 20).score, found.score)
-
-
-def test_a_rival_that_does_not_exist_or_feels_nothing_is_refused():
-    with pytest.raises(ValueError, match="no baseline 'loudest'; take one of film_band_power"):
-        rival("loudest")
-    gauges = HandLayout(tuple(c for c in HAND.channels if c.kind == "SG"))
-    with pytest.raises(ValueError, match="needs a film"):
-        rival("largest_detail", pool=FeaturePool(gauges), channel_filter=ChannelFilter([51, 51]))
-    with pytest.raises(ValueError, match="expected bins"):
-        rival("largest_detail").judge(torch.randn(2, 3, 100))
+    source = SmallSet()
+    learner = learn(source, unseen_c(source))
+    metrics = learner.metrics
+    assert list(metrics["baselines"]) == NAMES
+    for found in metrics["baselines"].values():
+        assert list(found["splits"]) == list(metrics["splits"])
+        for role, scores in found["splits"].items():
+            assert scores["num_bins"] == metrics["splits"][role]["num_bins"]
+        assert found["splits"]["train"]["balanced_accuracy"] > 0.75
+    json.dumps(metrics["baselines"])
+    learner.detector.save(tmp_path / "detector.pt")
+    detector = SlipDetector.load(tmp_path / "detector.pt")
+    assert list(detector.info[KEY]) == NAMES[:1]
+    maker = small_maker(source)
+    judge = SlipLearner(maker.pool, maker.channel_filter, detector=detector)
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+    trainer = Trainer(accelerator="cpu", enable_checkpointing=False, **quiet)
+    data = SlipDataModule(maker, unseen_c(source), num_workers=0)
+    trainer.test(judge, datamodule=data, verbose=False)
+    (name,) = judge.metrics["baselines"]
+    splits = metrics["baselines"][name]["splits"]
+    assert judge.metrics["baselines"][name]["splits"] == splits

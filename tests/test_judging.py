@@ -47,7 +47,7 @@ def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), recording=None, r
 
 
 def events_of(batch, says_slip, latency=LATENCY, role="test"):
-    part = judged_bins(batch, says_slip, says_slip)[role]
+    part = judged_bins(batch, says_slip, {})[role]
     return {name: own[0] for name, own in events_by_rule([part], latency).items()}
 
 
@@ -201,7 +201,7 @@ def test_a_split_by_bin_has_no_events_and_says_why():
     num = len(whole.is_slip)
     some = torch.arange(num) % 5 > 0
     apart = batch_of(roles={"train": some, "test": ~some, "unseen": torch.zeros_like(some)})
-    parts = judged_bins(apart, apart.is_slip, apart.is_slip)
+    parts = judged_bins(apart, apart.is_slip, {})
     assert list(parts) == ["train", "test"]
     assert [part.is_whole for part in parts.values()] == [False, False]
     assert sum(len(part.truth) for part in parts.values()) == num
@@ -211,7 +211,7 @@ def test_a_split_by_bin_has_no_events_and_says_why():
         for numbers in by_rule.values():
             assert numbers["reason"] == BINS_APART
             assert numbers["found"] is numbers["false_alarms_per_minute"] is None
-    of_whole = judged_bins(whole, whole.is_slip, whole.is_slip)["test"]
+    of_whole = judged_bins(whole, whole.is_slip, {})["test"]
     assert events_by_rule([of_whole, parts["test"]], LATENCY) == {name: [] for name in RULES}
     numbers = event_numbers({"test": events_by_rule([of_whole], LATENCY)})
     assert "reason" not in numbers["test"]["first_transition"]
@@ -223,7 +223,7 @@ def test_recordings_of_different_length_do_not_mix():
     parts = []
     for batch, wrong in ((short, [(0, -12)]), (long, [(1, -4), (1, 3)])):
         decisions = says(batch, wrong=wrong)
-        parts.append(judged_bins(batch, decisions, decisions)["test"])
+        parts.append(judged_bins(batch, decisions, {})["test"])
     alone = [events_by_rule([part], LATENCY) for part in parts]
     for name, own in events_by_rule(parts, LATENCY).items():
         assert own == [one[name][0] for one in alone]
@@ -234,7 +234,7 @@ def test_tests_of_several_folds_are_pooled_by_role_and_rule():
     def fold(cycle, wrong):
         batch = batch_of(recording=RecordingId("M1", cycle))
         decisions = says(batch, wrong=wrong)
-        part = judged_bins(batch, decisions, decisions)["test"]
+        part = judged_bins(batch, decisions, {})["test"]
         return {"test": events_by_rule([part], LATENCY)}
 
     folds = [fold(0, [(0, -10)]), fold(1, []), {"unseen": fold(2, [])["test"]}]
@@ -253,11 +253,13 @@ def test_scores_are_of_all_bins_of_a_role():
     first, second = batch_of(), batch_of(onsets=(), ends=(), stretches=((1.0, 2.0),))
     never = [torch.zeros_like(batch.is_slip) for batch in (first, second)]
     parts = [
-        judged_bins(batch, batch.is_slip, none)["test"]
+        judged_bins(batch, batch.is_slip, {"never": none, "right": batch.is_slip})["test"]
         for batch, none in zip((first, second), never, strict=True)
     ]
-    scores, rival = bin_scores(parts)
+    scores, baselines = bin_scores(parts)
     assert scores["accuracy"] == 1.0
-    assert scores["num_bins"] == rival["num_bins"] == len(first.is_slip) + 20
-    assert (rival["slip_recall"], rival["non_slip_recall"]) == (0.0, 1.0)
+    assert baselines["right"]["accuracy"] == 1.0
+    found = baselines["never"]
+    assert scores["num_bins"] == found["num_bins"] == len(first.is_slip) + 20
+    assert (found["slip_recall"], found["non_slip_recall"]) == (0.0, 1.0)
     assert sum(of["num_bins"] for of in scores["per_position"].values()) == len(first.is_slip)

@@ -208,7 +208,7 @@ class SlipDetector(nn.Module):
             - features: ``[*, M]`` in the order of ``selected``
             - output: ``[*]``, dtype of the detector
         """
-        score: Tensor = self.head(self._scale(features))
+        score: Tensor = self.head(self.scaled(features))
         return score
 
     def columns(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
@@ -223,6 +223,12 @@ class SlipDetector(nn.Module):
             return features
         columns: Tensor = self.pooling(features, is_missing)
         return columns
+
+    def scaled(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
+        """Scaled columns, which the head takes; shapes as ``columns`` has them."""
+        columns = self.columns(saturating(features, self.scaler.minimum.dtype), is_missing)
+        scaled: Tensor = self.scaler(columns)
+        return scaled.to(self.typical.dtype)
 
     def _score(self, bins: Tensor, most: int = FEW_BINS) -> Tensor:
         if (few := self._few_bins(bins, most)) is not None:
@@ -246,7 +252,7 @@ class SlipDetector(nn.Module):
         is_whole = is_nowhere(is_missing)
         if not is_whole:
             bins = torch.where(is_missing[..., None], 0.0, bins)
-        scaled = self._scale(self._features(bins), None if is_whole else is_missing)
+        scaled = self.scaled(self._features(bins), None if is_whole else is_missing)
         score = saturating(self.head(scaled), given)
         variance = torch.zeros_like(score)
         if not is_whole:
@@ -279,11 +285,6 @@ class SlipDetector(nn.Module):
 
     def _features(self, bins: Tensor) -> Tensor:
         return self.extractor(bins, self.scaler.minimum.dtype)
-
-    def _scale(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
-        columns = self.columns(saturating(features, self.scaler.minimum.dtype), is_missing)
-        scaled: Tensor = self.scaler(columns)
-        return scaled.to(self.typical.dtype)
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SlipDetector:
         """``float()`` and ``to()``: what is known of features stays float64, as offsets cancel."""

@@ -1,4 +1,4 @@
-"""The simplest rival: one feature and one threshold."""
+"""The simplest detector: one feature and one threshold."""
 
 from __future__ import annotations
 
@@ -32,19 +32,23 @@ class FeatureThreshold:
         return decision
 
 
-def best_threshold(features: Tensor, is_slip: Tensor) -> FeatureThreshold:
+def best_threshold(
+    features: Tensor, is_slip: Tensor, weights: Tensor | None = None
+) -> FeatureThreshold:
     """The single feature and threshold of the best balanced accuracy on training bins.
 
     Shape:
         - features: ``[N, K]``, finite; is_slip: ``[N]``, bool
+        - weights: ``[N]``, of each bin; 1 by default
 
     Raises:
         ValueError: if a class is absent.
     """
     if bool(is_slip.all()) or not bool(is_slip.any()):
         raise ValueError("a threshold needs bins of both classes")
-    slip = is_slip.double()
-    step = slip / slip.sum() - (1 - slip) / (1 - slip).sum()
+    weights = torch.ones(len(is_slip), dtype=torch.float64) if weights is None else weights
+    slip, quiet = weights * is_slip, weights * ~is_slip
+    step = slip / slip.sum() - quiet / quiet.sum()
     values, order = features.sort(dim=0)
     below = step[order].cumsum(0)[:-1]  # slip recall minus non-slip recall if cut above this value
     below = torch.where(values[1:] > values[:-1], below, 0.0)  # no cut between equal values

@@ -16,6 +16,14 @@ SIMULATED_LINE = "SIMULATED data: numbers of a simulated hand, not of the paper'
 PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
 PAPER_SCENE_LINE = "of several scenes: materials and speeds are of the paper's scene alone"
 
+BASELINES = {
+    "best_pooled_number": "best pooled number",
+    "logistic_regression": "logistic regression, same features",
+    "logistic_regression_simple": "logistic regression on mean, std, rms",
+    "random_forest_simple": "random forest on mean, std, rms",
+}
+"""What baselines (``tactslip_torch.baselines``) are called in tables."""
+
 _SCORES = {
     "accuracy": "accuracy %",
     "balanced_accuracy": "balanced %",
@@ -25,7 +33,7 @@ _SCORES = {
 
 
 def splits_table(metrics: Mapping[str, Any]) -> str:
-    """Accuracy, balanced accuracy, both recalls and bins of each split, the paper's row below.
+    """Accuracy, balanced accuracy, both recalls and bins of each split; baselines and paper below.
 
     The paper's row is left out where hand or scenes are not its own. The first line says SIMULATED
     where the data is.
@@ -34,11 +42,13 @@ def splits_table(metrics: Mapping[str, Any]) -> str:
         metrics: the content of ``metrics.json``.
     """
     rows = []
-    rival = metrics.get("baselines", {}).get("best_single_feature")
+    baselines = metrics.get("baselines", {})
     for name, scores in metrics["splits"].items():
         rows.append([name, *_score_cells(scores), str(scores["num_bins"])])
-        if rival and name in rival["splits"]:
-            rows.append(["  one feature", *_score_cells(rival["splits"][name]), "-"])
+        for baseline, found in baselines.items():
+            if name in found["splits"]:
+                label = f"  {BASELINES.get(baseline, baseline)}"
+                rows.append([label, *_score_cells(found["splits"][name]), "-"])
         if paper := published.beside(metrics, name):
             rows.append(["  paper", *_score_cells(vars(paper)), "-"])
     source = [PAPER_LINE] if metrics.get("is_papers_hand", True) else []

@@ -45,4 +45,5 @@ def settled_learner(
     changes: dict[str, Any] = {"num_features": len(frame.selected)}
     recipe = Recipe(**first.recipe.facts() | changes | {"penalties": penalty, "offsets": offset})
     parts = (maker.pool, maker.channel_filter, recipe)
-    return SlipLearner(*parts, abstaining=first.abstaining, frame=frame)
+    options: dict[str, Any] = {"frame": frame, "with_baselines": first.with_baselines}
+    return SlipLearner(*parts, abstaining=first.abstaining, **options)
