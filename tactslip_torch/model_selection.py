@@ -18,6 +18,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -33,6 +34,7 @@ from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import best_threshold
 from tactslip_torch.recipe import Frame, Recipe, recalls_mean, sample_groups
+from tactslip_torch.threads import for_each
 
 log = logging.getLogger(__name__)
 
@@ -128,9 +130,16 @@ def choose_model(
         folds += [frozenset(pair) for pair in itertools.combinations(whole, 2)]
     data = _Data(recipe, pool, sample, weights, groups, allowed)
     penalties = list(recipe.penalties_ascending)
-    found = {}
-    for fold in progress(folds, "validation, groups left out"):
+    found: dict[frozenset[int], _Scores] = {}
+    steps, lock = iter(progress(folds, "validation, groups left out")), threading.Lock()
+
+    def leave_out(fold: frozenset[int]) -> None:
         found[fold] = _Fold(data, fold, structures).at(penalties)
+        with lock:
+            next(steps, None)
+
+    next(steps, None)  # shows the bar
+    for_each(leave_out, folds)
     single = {group: found[frozenset([group])] for group in whole}
     edge = _extended(data, found, penalties, structures, whole, recipe.tolerance)
 
