@@ -165,6 +165,11 @@ def run_fold(
         **learner.facts,
         **({} if tuned is None else {"tuning": tuned, "validation": tuned.pop("validation")}),
         "selected": [str(name) for name in detector.selected_names],
+        "trained_on": {
+            "materials": detector.info["train_materials"],
+            "sessions": detector.info["train_sessions"],
+            "scenes": sorted({recording.scene for recording in data.split.having("train")}),
+        },
         "onnx": onnx,
         "timing_s": seconds,
         "worker_s": learner.worker_seconds,

@@ -41,8 +41,10 @@ log = logging.getLogger(__name__)
 Progress = Callable[[Iterable[Any], str], Iterable[Any]]
 
 TRAINING_BINS = 100
-"""Bins of each stratum and class that a validation fold is fitted to; it is scored on all sampled
-ones."""
+"""Bins of each stratum and class that a validation fold is fitted to, at most; it is scored on all
+sampled ones."""
+MOST_TRAINING_BINS = 2000
+"""Of all strata together: many kinds of scenes have fewer bins each."""
 MOST_DUAL_BINS = 2500
 """Up to so many training bins a machine of degree 2 on all features is a candidate: it does not
 fold, so its cost grows with the bins."""
@@ -268,10 +270,12 @@ class _Data:
         stratum = 2 * sample.group + sample.is_slip.long()
         order = torch.zeros_like(stratum)  # of a bin within its stratum
         self.weights = weights.clone()
-        for one in stratum.unique().tolist():
+        strata = stratum.unique().tolist()
+        most = min(TRAINING_BINS, max(MOST_TRAINING_BINS // len(strata), 10))
+        for one in strata:
             mine = (stratum == one).nonzero().flatten()
             # bins are sorted by recording; spread those that are kept over all of them
-            kept = torch.linspace(0, len(mine) - 1, min(len(mine), TRAINING_BINS)).round().long()
+            kept = torch.linspace(0, len(mine) - 1, min(len(mine), most)).round().long()
             order[mine] = 1
             order[mine[kept]] = 0
             self.weights[mine] *= len(mine) / len(kept)

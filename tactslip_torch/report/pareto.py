@@ -1,4 +1,4 @@
-"""What ``pareto`` found: the front of latency, compute and accuracy, and the detector chosen."""
+"""Table and figure of ``pareto``: the front of latency, compute and accuracy, and who is chosen."""
 
 from __future__ import annotations
 
@@ -16,6 +16,12 @@ from tactslip_torch.report.tables import SIMULATED_LINE, aligned
 _ALIGN_COLOURS = {"centred": "#0072B2", "causal": "#D55E00", "trailing": "#009E73"}
 _CHOSEN = "#009E73"
 _BUSY = 0.05  # share of interrupted calls from which it is said
+_NAMED = {
+    "most_accurate": ("A", "most accurate"),
+    "cheap": ("B", "at most 1 point worse, at most 1/3 of its compute"),
+    "few": ("C", "at most 20 numbers"),
+}
+"""The detectors that are named: a letter for the figure, and what they are."""
 
 
 def pareto_table(found: Mapping[str, Any]) -> str:
@@ -36,12 +42,31 @@ def pareto_table(found: Mapping[str, Any]) -> str:
     interrupted = max(row["interrupted"] for row in found["front"])
     head.append(f"{_busy(interrupted)} (the most of any detector on the front)")
     header = ["latency ms", "look-ahead", "bin", "hop", "compute us", "p50 us"]
-    header += ["valid. %", "K", "deg.", "numbers", "filter", "channels", "components", "ranking"]
+    header += ["valid. %", "K", "deg.", "numbers", "filter", "channels", "components"]
+    header += ["columns", "ranking"]
     rows = [
         _cells(row) for row in sorted(found["front"], key=lambda row: row["latency"]["worst_ms"])
     ]
     table = aligned(header, rows, num_left=0)
-    return "\n".join([*head, "", table, "", *_verdict(found)])
+    return "\n".join([*head, "", table, "", *_named(found), "", *_verdict(found)])
+
+
+def _named(found: Mapping[str, Any]) -> list[str]:
+    """A line on each detector that is named; compute is the median, steady on a busy machine."""
+    lines = []
+    most = found["named"]["most_accurate"]["p50_us"]
+    for name, (letter, what) in _NAMED.items():
+        row = found["named"][name]
+        if row is None:
+            lines.append(f"{letter} {what}: none of those timed")
+            continue
+        lines.append(
+            f"{letter} {what}: {_percent(row['validation'])} %, {row['p50_us']:.0f} us p50 "
+            f"({row['p50_us'] / most:.2f} of A), {row['num_features']} numbers ({row['columns']}, "
+            f"{row['components']}, {row['channels']}) of {row['features_read']} features, degree "
+            f"{row['degree']}, {row['align']}, {row['arithmetic']}"
+        )
+    return lines
 
 
 def none_meets(found: Mapping[str, Any]) -> str:
@@ -96,16 +121,16 @@ def pareto_figure(found: Mapping[str, Any], path: str | Path) -> None:
     _panel(left, found, lambda row: row["latency"]["worst_ms"], 0)
     left.axvline(limits["deadline_ms"], color="black", linestyle=":", linewidth=1)
     left.set_xlabel("worst-case latency, onset to decision, ms")
-    left.set_ylabel(
-        "balanced accuracy, %, a material left out\nof the machine, not of ranking and scaling"
-    )
+    left.set_ylabel("balanced accuracy, %, a material left out")
     title = "front: shortest hop; chosen: longest that keeps the deadline (dotted)"
     left.set_title(title, fontsize=10)
     _panel(right, found, lambda row: row["p99_us"], 1)
+    right.plot([], [], "s", color="white", markeredgecolor="black", label="pooled over channels")
+    letters = [f"{letter}: {what}" for letter, what in _NAMED.values()]
     right.axvline(limits["compute_us"], color="black", linestyle=":", linewidth=1)
     right.set_xscale("log")
     _plain_ticks(right)
-    right.set_xlabel("compute, raw samples to decision, p99, us")
+    right.set_xlabel("compute, raw samples to decision, p99, us\n" + "; ".join(letters))
     right.set_title("one bin, one thread; dotted: the limit", fontsize=10)
     handles, labels = right.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
@@ -135,9 +160,12 @@ def _panel(axes: Axes, found: Mapping[str, Any], x: Callable[[Any], float], plac
     )
     for align, colour in _ALIGN_COLOURS.items():
         rows = [row for row in found["front"] if row["align"] == align]
-        if rows:
-            ys = [100 * row["validation"] for row in rows]
-            axes.plot([x(row) for row in rows], ys, "o", color=colour, label=f"front, {align}")
+        label = f"front, {align}"
+        for marker, is_pooled in (("o", False), ("s", True)):
+            own = [row for row in rows if (row["columns"] != "channel") == is_pooled]
+            ys = [100 * row["validation"] for row in own]
+            axes.plot([x(row) for row in own], ys, marker, color=colour, label=label if own else "")
+            label = "" if own else label
     best = -1.0
     steps: list[tuple[float, float]] = []
     for row in sorted(found["front"], key=lambda row: (x(row), -row["validation"])):
@@ -145,6 +173,10 @@ def _panel(axes: Axes, found: Mapping[str, Any], x: Callable[[Any], float], plac
             best = row["validation"]
             steps.append((x(row), 100 * best))
     axes.step(*zip(*steps, strict=True), where="post", color="#555555", linewidth=1)
+    for name, (letter, _) in _NAMED.items():
+        if row := found["named"][name]:
+            at = x(row), 100 * row["validation"]
+            axes.annotate(letter, at, (4, 5), textcoords="offset points", weight="bold")
     chosen = found["chosen"]
     if chosen:
         axes.plot(
@@ -171,13 +203,14 @@ def _verdict(found: Mapping[str, Any]) -> list[str]:
         f"{chosen['engine']}; p50 {chosen['p50_us']:.0f} us, p99 of all calls "
         f"{chosen['p99_all_us']:.0f} us, {100 * latency['load']:.1f} % of a core, "
         f"{found['limits']['compute_us'] / latency['compute_us']:.2f} times faster than asked)",
-        f"  {chosen['num_features']} features of {len(chosen['channels_read'])} channels, degree "
+        f"  {chosen['num_features']} numbers ({chosen['columns']}) of "
+        f"{chosen['features_read']} features of {len(chosen['channels_read'])} channels, degree "
         f"{chosen['degree']}, {chosen['align']}, {chosen['arithmetic']}; fitted to "
         f"{chosen['fitted_to']}",
         f"  of those that met both when timed {found['tried']} tried there, {found['not_tried']} "
         "not tried; " + _busy(chosen["interrupted"]),
-        f"  balanced accuracy {_percent(chosen['validation'])} % in validation, which chose it and "
-        "whose ranking and scaling saw the material left out: a little too good; "
+        f"  balanced accuracy {_percent(chosen['validation'])} % in validation, which chose it: a "
+        "little too good; "
         f"{_percent(chosen['test']['balanced_accuracy'])} % on "
         f"{chosen['test']['num_bins']} bins of the test cycles of seen materials",
     ]
@@ -189,7 +222,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
     cells += [f"{latency[part]:g}" for part in ("look_ahead_ms", "bin_ms", "hop_ms")]
     cells += [f"{row['p99_us']:.0f}", f"{row['p50_us']:.0f}", _percent(row["validation"])]
     cells += [str(row["num_features"]), str(row["degree"])]
-    names = ("arithmetic", "align", "channels", "components", "ranking")
+    names = ("arithmetic", "align", "channels", "components", "columns", "ranking")
     return cells + [str(row[name]) for name in names]
 
 

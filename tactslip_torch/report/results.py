@@ -21,6 +21,7 @@ from tactslip_torch.report.tables import (
     solve_line,
     splits_table,
     timing_table,
+    trained_on_lines,
 )
 from tactslip_torch.report.tuning import tuning_tables
 from tactslip_torch.report.validation import validation_figure, validation_table
@@ -64,7 +65,7 @@ def write_results(
 
 def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
-    parts = [splits_table(metrics), materials_table(metrics)]
+    parts = [splits_table(metrics), *trained_on_lines(metrics), materials_table(metrics)]
     if metrics.get("events"):
         parts.append(events_table(metrics))
     if metrics.get("answers"):

@@ -80,6 +80,17 @@ def materials_table(metrics: Mapping[str, Any]) -> str:
     return _titled(metrics, "\n".join([*head, aligned(header, rows, num_left=2)]))
 
 
+def trained_on_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Which materials, sessions and scenes were trained on, a line each fold that says so."""
+    folds = metrics.get("folds") or {"": metrics}
+    lines = []
+    for name, fold in folds.items():
+        if known := fold.get("trained_on"):
+            listed = "; ".join(f"{what} {', '.join(of)}" for what, of in known.items())
+            lines.append(f"{name + ' ' if name else ''}trained on {listed}")
+    return ["\n".join(lines)] if lines else []
+
+
 def timing_table(timing_s: Mapping[str, float]) -> str:
     """Seconds of each stage and its share of the whole.
 
