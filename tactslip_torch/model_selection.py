@@ -122,9 +122,15 @@ def choose_model(
         and not bool(sample.is_slip[groups == index].all())
     ]
     if len(whole) < 2:
+        lacking = [
+            f"{name} has no {'non-slip' if bool(sample.is_slip[groups == index].all()) else 'slip'}"
+            for index, name in enumerate(names)
+            if index not in whole
+        ]
         raise ValueError(
             "validation leaves out groups and needs two with bins of both classes, got "
-            f"{len(whole)}; add recordings or take another recipe.group_by"
+            f"{len(whole)} ({', '.join(lacking) or 'there is one group'}); add recordings or take "
+            "another recipe.group_by"
         )
     structures = candidates(recipe, num_bins)
     folds = [frozenset([group]) for group in whole]
@@ -150,12 +156,8 @@ def choose_model(
 
     table = {group: accuracy(frozenset([group]), group) for group in whole}
     chosen = _best(table, structures, recipe.tolerance)
-    rows = [
-        _row(structures[place], penalty, single, (place, penalty), data, names)
-        for place in range(len(structures))
-        for penalty in penalties
-    ]
-    chosen_row = rows[chosen[0] * len(penalties) + penalties.index(chosen[1])]
+    by_key = {key: _row(structures, key, single, data, names) for key in sorted(_means(table))}
+    rows, chosen_row = list(by_key.values()), by_key[chosen]
     chosen_row |= {"chosen": True, "calibration": _calibration(single, chosen, data)}
     nested = None
     if is_nested and len(whole) > 2:
@@ -300,12 +302,14 @@ class _Columns:
             inputs = torch.tensor([place[name] for name in layer.inputs])
             parts["pooled"] = layer(features.index_select(1, inputs).double())
         compress, tail = data.recipe.compress, data.recipe.tail
-        self._fitted, self._scaled = {}, {}
+        self._fitted: dict[str, FeatureScaler] = {}
+        self._scaled: dict[str, Tensor] = {}
         for name, x in parts.items():
             x = x.double()
             scaler = FeatureScaler.fit(x[self.train], compress=compress, tail=tail)
             self._fitted[name], self._scaled[name] = scaler, scaler(x)
         self._ranks: dict[str, Tensor] = {}
+        self._products: dict[str, Tensor] = {}
 
     def names(self, use: str) -> list[Any]:
         """Of the columns of a use."""
@@ -319,13 +323,35 @@ class _Columns:
         """Scaled columns of all bins, ``[n, K]``."""
         if use == "both":
             return torch.cat([self._scaled["channel"], self._scaled["pooled"]], 1)
-        scaled: Tensor = self._scaled[use]
-        return scaled
+        return self._scaled[use]
+
+    def num_columns(self, structure: Structure) -> int:
+        """K of a structure."""
+        num = sum(self._scaled[name].shape[1] for name in _parts(structure.use))
+        return min(num, structure.num_features or num)
+
+    def of(self, structure: Structure) -> Tensor:
+        """Scaled columns of a structure, best first, ``[n, K]``."""
+        z = self.scaled(structure.use)
+        return z if structure.num_features is None else z[:, self.ranked(structure)]
+
+    def products(self, structure: Structure) -> Tensor:
+        """Inner products of all bins with the training bins, ``[n, train]``."""
+        if structure.num_features is not None:
+            z = self.of(structure)
+            return z @ z[self.train].mT
+        total: Tensor | None = None
+        for name in _parts(structure.use):
+            if name not in self._products:
+                z = self._scaled[name]
+                self._products[name] = z @ z[self.train].mT
+            total = self._products[name] if total is None else total + self._products[name]
+        assert total is not None  # of at least one part
+        return total
 
     def scaler(self, use: str, places: Tensor) -> FeatureScaler:
         """Of some columns."""
-        own = ["channel", "pooled"] if use == "both" else [use]
-        parts = [self._fitted[name] for name in own]
+        parts = [self._fitted[name] for name in _parts(use)]
         knees = [part.knee for part in parts if part.knee is not None]
         return FeatureScaler(
             torch.cat([part.minimum for part in parts])[places],
@@ -337,7 +363,7 @@ class _Columns:
         """Places of the columns of a structure, best first; all in their order."""
         if structure.num_features is None:
             return torch.arange(len(self.names(structure.use)))
-        own = ["channel", "pooled"] if structure.use == "both" else [structure.use]
+        own = _parts(structure.use)
         for name in own:
             if name not in self._ranks:
                 z = self._scaled[name][self.train]
@@ -345,6 +371,10 @@ class _Columns:
                 self._ranks[name] = group_scores(z, is_slip, groups)
         scores = torch.cat([self._ranks[name] for name in own])
         return scores.argsort(descending=True, stable=True)[: structure.num_features]
+
+
+def _parts(use: str) -> tuple[str, ...]:
+    return ("channel", "pooled") if use == "both" else (use,)
 
 
 @dataclass(frozen=True)
@@ -378,11 +408,7 @@ class _Fold:
         found = _Scores({g: {} for g in self._left_out}, {g: {} for g in self._left_out})
         for place in places:
             structure = self._structures[place]
-            z = columns.scaled(structure.use)
-            if structure.num_features is not None:
-                z = z[:, columns.ranked(structure)]
-            solve = _Ridge(z[is_train], targets, data.weights[train], structure.kernel)
-            by_penalty = solve.at(penalties, z[~is_train])
+            by_penalty = _ridge_scores(columns, structure, targets, data.weights[train], penalties)
             for penalty, scores in zip(penalties, by_penalty, strict=True):
                 for group, mine in of_group.items():
                     accuracy = recalls_mean(scores[mine] >= 0, truths[mine])
@@ -392,39 +418,38 @@ class _Fold:
         return found
 
 
-class _Ridge:
-    """Kernel ridge regression for several penalties, by the cheaper of primal and dual."""
+def _ridge_scores(
+    columns: _Columns,
+    structure: Structure,
+    targets: Tensor,
+    weights: Tensor,
+    penalties: Sequence[float],
+) -> Tensor:
+    """Scores of the left-out bins by kernel ridge regression, ``[penalties, bins]``.
 
-    def __init__(self, z: Tensor, targets: Tensor, weights: Tensor, kernel: Polynomial) -> None:
-        self._z, self._targets, self._weights, self._kernel = z, targets, weights, kernel
-        self._is_primal = kernel.degree == 1 and z.shape[1] < len(z)
-        if self._is_primal:
-            x = self._with_constant(z)
-            self._system = x.mT @ (x * weights[:, None])
-            self._right = x.mT @ (weights * targets)
+    Through the primal or the dual, whichever has fewer unknowns.
+    """
+    kernel, is_train = structure.kernel, columns.train
+    num = columns.num_columns(structure)
+    if kernel.degree == 1 and num < len(targets):
+        z = columns.of(structure)
+        x = torch.cat([z, torch.full_like(z[:, :1], math.sqrt(kernel.offset))], 1)
+        system = x[is_train].mT @ (x[is_train] * weights[:, None])
+        right, others, each = x[is_train].mT @ (weights * targets), x[~is_train], torch.ones(())
+    else:
+        gram = (columns.products(structure) + kernel.offset) ** kernel.degree
+        system, right, others, each = gram[is_train], targets, gram[~is_train], 1 / weights
+    solved = []
+    for penalty in penalties:
+        ridged = system.clone()
+        ridged.diagonal().add_(each / penalty)
+        factor, info = torch.linalg.cholesky_ex(ridged)
+        if int(info):  # a weak penalty on columns that repeat each other
+            found = torch.linalg.lstsq(ridged, right[:, None], driver="gelsd").solution
         else:
-            self._system, self._right = kernel(z, z), targets
-
-    def at(self, penalties: Sequence[float], others: Tensor) -> Tensor:
-        """Scores of other bins, ``[penalties, bins]``."""
-        found = []
-        for penalty in penalties:
-            system = self._system.clone()
-            ridge = 1 / penalty if self._is_primal else 1 / (penalty * self._weights)
-            system.diagonal().add_(ridge)
-            factor, info = torch.linalg.cholesky_ex(system)
-            right = self._right[:, None]
-            if int(info):  # a weak penalty on columns that repeat each other
-                found.append(torch.linalg.lstsq(system, right, driver="gelsd").solution)
-            else:
-                found.append(torch.cholesky_solve(right, factor))
-        solved = torch.cat(found, 1)
-        if self._is_primal:
-            return (self._with_constant(others) @ solved).mT
-        return (self._kernel(others, self._z) @ solved).mT
-
-    def _with_constant(self, z: Tensor) -> Tensor:
-        return torch.cat([z, torch.full_like(z[:, :1], math.sqrt(self._kernel.offset))], 1)
+            found = torch.cholesky_solve(right[:, None], factor)
+        solved.append(found)
+    return (others @ torch.cat(solved, 1)).mT
 
 
 Table = Mapping[int, Mapping[tuple[int, float], float]]
@@ -466,16 +491,19 @@ def _extended(
             table = {group: found[frozenset([group])].accuracy[group] for group in whole}
             means = _means(table)
             chosen, best = _best(table, structures, tolerance), max(means, key=means.__getitem__)
-            end = penalties[0] if is_low else penalties[-1]
-            if (chosen if is_low else best)[1] != end or len(penalties) < 2:
+            place, penalty = chosen if is_low else best
+            own = [key[1] for key in means if key[0] == place]
+            if penalty != (min(own) if is_low else max(own)) or len(penalties) < 2:
                 break
-            beyond = end / 10 if is_low else end * 10
-            penalties.insert(0 if is_low else len(penalties), beyond)
-            for fold, scores in found.items():
-                more = _Fold(data, fold, structures).at([beyond])
+            beyond = penalty / 10 if is_low else penalty * 10
+
+            def extend(fold: frozenset[int], place: int = place, beyond: float = beyond) -> None:
+                more = _Fold(data, fold, structures).at([beyond], [place])
                 for group in fold:
-                    scores.accuracy[group] |= more.accuracy[group]
-                    scores.scores[group] |= more.scores[group]
+                    found[fold].accuracy[group].update(more.accuracy[group])
+                    found[fold].scores[group].update(more.scores[group])
+
+            for_each(extend, list(found))
             said.append(f"{beyond:g}")
     if not said:
         return ""
@@ -483,14 +511,14 @@ def _extended(
 
 
 def _row(
-    structure: Structure,
-    penalty: float,
-    single: Mapping[int, _Scores],
+    structures: Sequence[Structure],
     key: tuple[int, float],
+    single: Mapping[int, _Scores],
     data: _Data,
     names: Sequence[str],
 ) -> dict[str, Any]:
     """What is told of a candidate."""
+    structure, penalty = structures[key[0]], key[1]
     by_group = {group: of.accuracy[group][key] for group, of in single.items()}
     worst = min(by_group, key=by_group.__getitem__)
     scores, truth = single[worst].scores[worst][key], data.is_slip[data.groups == worst]
