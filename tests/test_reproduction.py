@@ -26,15 +26,21 @@ def counts(quiet=0.9, slip=0.8, num=(1000, 3000), **groups):
     return {"confusion": confusion, **groups}
 
 
-def run_of(seed=0, roles=("train", "test", "unseen"), rival=0.7, selected=(), **scores):
+def run_of(seed=0, roles=("train", "test", "unseen"), pooled=0.7, selected=(), **scores):
     return {
         "simulated": True,
         "seed": seed,
         "seconds": 60.0,
         "splits": {role: counts(**scores) for role in roles},
-        "best_single_feature": {
-            "feature": "SG1 raw time mean",
-            "splits": {role: counts(rival, rival) for role in roles},
+        "baselines": {
+            "best_pooled_number": {
+                "feature": "PVDF D2 time mean [std]",
+                "splits": {role: counts(pooled, pooled) for role in roles},
+            },
+            "random_forest_simple": {
+                "feature": None,
+                "splits": {role: counts(0.85, 0.85) for role in roles},
+            },
         },
         "selected": list(selected),
         "validation": None,
@@ -212,10 +218,23 @@ def test_an_ablation_of_fewer_seeds_is_held_against_everything_on_those_seeds():
     assert cells_of(table, "everything")[at] == "-"
 
 
-def test_an_ablation_that_was_not_run_is_left_out_and_the_rival_is_the_threshold():
+def test_baselines_stand_beside_the_detector_where_results_have_them():
+    report = report_of(unseen4=[run_of(0, pooled=0.7), run_of(1, pooled=0.8)])
+    table = beyond.baselines_table(report)
+    assert table.rows[0][0] == "unseen4, train"
+    by_name = dict(zip(table.header, table.rows[-1], strict=True))
+    assert by_name["best pooled number"] == "75.00 ± 7.07"
+    assert by_name["random forest on mean, std, rms"] == "85.00 ± 0.00"
+    assert by_name["logistic regression, same features"] == "-"
+    for run in report["runs"]["unseen4"]:
+        del run["baselines"]
+    assert beyond.baselines_table(report) is None
+
+
+def test_an_ablation_that_was_not_run_is_left_out_and_the_baseline_is_the_threshold():
     report = report_of(
         **{
-            "unseen4": [run_of(rival=0.75, selected=["a"] * 120)],
+            "unseen4": [run_of(pooled=0.75, selected=["a"] * 120)],
             "SG means only": [run_of(quiet=0.5, slip=0.5, selected=["a"] * 14)],
         }
     )
@@ -223,10 +242,10 @@ def test_an_ablation_that_was_not_run_is_left_out_and_the_rival_is_the_threshold
     assert set(rows) == {
         "everything",
         "means of the SGs only",
-        "the best single selected feature with a threshold",
+        "the best single pooled number with a threshold",
     }
     assert rows["means of the SGs only"][-1] == "14"
-    assert rows["the best single selected feature with a threshold"][1] == "75.00"
+    assert rows["the best single pooled number with a threshold"][1] == "75.00"
     assert rows["everything"][1] == "85.00"
 
 
@@ -597,20 +616,20 @@ def test_scores_are_those_of_the_metrics(tmp_path):
     scores = split_metrics([[90, 10], [5, 45]])
     places = {"-1": {"recall": 0.5, "num_right": 3, "num_bins": 6}}
     groups = {"per_speed": {"20": split_metrics([[1, 1], [2, 2]])}, "per_position": places}
-    rival = {"feature": "f", "splits": {"test": split_metrics([[1, 3], [0, 4]])}}
+    pooled = {"feature": "f", "splits": {"test": split_metrics([[1, 3], [0, 4]])}}
     metrics = {
         "simulated": True,
         "seed": 4,
         "timing_s": {"total": 2.0},
         "splits": {"test": scores | groups},
-        "baselines": {"best_single_feature": rival},
+        "baselines": {"best_pooled_number": pooled},
         "penalty": 0.1,
         "selected": ["a"],
     }
     report = report_of(unseen4=[json.loads(json.dumps(runs.kept(metrics, tmp_path)))])
     for score in results.SCORES:
         assert results.percent(report, "unseen4", "test", score) == [100 * scores[score]]
-    assert results.rival_percent(report, "unseen4", "test", "non_slip_recall") == [25.0]
+    assert results.baseline_percent(report, "unseen4", "test", "non_slip_recall") == [25.0]
     assert results.percent(report, "unseen4", "test", "accuracy", ("per_speed", ["20"])) == [50.0]
     assert results.recall_beside_onset(report, "unseen4", "test", ["-1", "-2"]) == [50.0]
 

@@ -17,6 +17,7 @@ _RIVALS = (
     THIRD,
     "#cc79a7",
     "#56b4e9",
+    "#e69f00",
 )  # Okabe and Ito, as the others; the second MiniRocket lighter
 _CORNER = 0.3
 

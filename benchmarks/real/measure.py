@@ -18,15 +18,13 @@ from benchmarks.clocks import on_threads, paired_ratio, shuffled_rounds
 from benchmarks.real import rivals
 from benchmarks.real.method import Fitted, Method, Training
 from benchmarks.real.ours import ours, pool_rows
-from benchmarks.real.rocket import BY_OBJECTS, BY_WINDOWS, rocket
+from benchmarks.real.rocket import WAYS, rocket
 from benchmarks.real.scores import balanced
 from benchmarks.real.sizes import Sizes
 from benchmarks.real.windows import Array, Windows
 from tactslip_torch.data.splits import Split
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
-
-_ROCKETS = (BY_WINDOWS, BY_OBJECTS)
 
 
 @dataclass(eq=False)
@@ -62,7 +60,7 @@ def methods_of(
     pool = pool_rows(windows)
     return [
         *(ours(windows, recipe, *pool) for recipe in recipes),
-        *(rocket(windows, *of, sizes) for of in product(_ROCKETS, sizes.rocket_seeds)),
+        *(rocket(windows, *of, sizes) for of in product(WAYS, sizes.rocket_seeds)),
         rivals.forest(windows, sizes, folder / "tsfel"),
         rivals.svc(windows, sizes, *pool),
         rivals.regression(windows, sizes),
@@ -100,18 +98,17 @@ def on_folds(
     return found
 
 
-def middle_rockets(found: Mapping[str, Found], is_slip: Array) -> tuple[str, str]:
-    """By windows and by objects, the MiniRocket whose balanced accuracy is the middle one.
+def middle_rockets(found: Mapping[str, Found], is_slip: Array) -> tuple[str, ...]:
+    """Of each way of ``rocket.WAYS``, the seed whose balanced accuracy is the middle one.
 
     Of an even number of seeds it is the upper.
     """
     middle = []
-    for way in _ROCKETS:
+    for way in WAYS:
         names = [name for name in found if name.startswith(way)]
         names.sort(key=lambda name: balanced(found[name].scores, is_slip))
         middle.append(names[len(names) // 2])
-    by_windows, by_objects = middle
-    return by_windows, by_objects
+    return tuple(middle)
 
 
 def clocked(

@@ -155,6 +155,10 @@ def _protocol(report: Report) -> str:
         "balanced accuracy, all but MiniRocket's features refitted, as the other rivals choose. "
         f"It draws at random, so {len(settings['rocket_seeds'])} seeds are shown, and in each way "
         "the one in the middle by balanced accuracy is what ours stands beside.",
+        f"MultiRocketHydra (aeon, {settings['multi_rocket_kernels']:,} kernels of MultiRocket and "
+        f"{settings['hydra_groups']} groups of Hydra's, each part with the scaler that aeon gives "
+        "it) and ridge, whose penalty is chosen by objects, with the same seeds. Its features and "
+        "scalers are fitted once in a fold, without labels.",
         f"TSFEL, all features, and a random forest of {settings['trees']} trees "
         f"({settings['inner_trees']} while choosing). RBF SVC: features by the t-test on our pool, "
         "compressed and scaled as `robust` does. Logistic regression: mean, standard deviation, "

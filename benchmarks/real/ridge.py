@@ -28,11 +28,16 @@ def ridge_scores(rows: Array, is_slip: Array, others: Array, alphas: Array) -> A
     scaler = StandardScaler().fit(rows)
     rows, others = scaler.transform(rows), scaler.transform(others)
     target, number = np.where(is_slip, 1.0, -1.0), len(is_slip)
-    weight = np.where(is_slip, number / is_slip.sum(), number / (~is_slip).sum()) / 2
-    weight = weight.astype(rows.dtype)
+    weight = balanced_weights(is_slip).astype(rows.dtype)
     middle, root = weight @ rows / number, np.sqrt(weight)
     rows = (rows - middle) * root[:, None]
     values, vectors = eigh((rows @ rows.T).astype(np.float64), driver="evd")
     wanted = vectors.T @ (root * target)  # balanced: the weighted mean of targets is 0
     known = (others - middle) @ rows.T @ vectors
     return np.stack([known @ (wanted / (values.clip(0) + alpha)) for alpha in alphas])
+
+
+def balanced_weights(is_slip: Array) -> Array:
+    """Weights ``[n]`` with which both classes count alike, their mean 1."""
+    number = len(is_slip)
+    return np.where(is_slip, number / is_slip.sum(), number / (~is_slip).sum()) / 2

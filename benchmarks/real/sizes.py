@@ -13,8 +13,10 @@ class Sizes:
         objects: how many at most; ``None`` for all.
         each: recordings of each object and scene at most; ``None`` for all.
         inner: groups that the training objects of a fold make to choose from, at most.
-        rocket_seeds: seeds of MiniRocket's kernels.
+        rocket_seeds: seeds of the kernels of MiniRocket and MultiRocketHydra.
         rocket_kernels: of MiniRocket.
+        multi_rocket_kernels: of MultiRocket; it makes eight features of each.
+        hydra_groups: of Hydra's kernels, eight each, for every dilation.
         trees: of a forest.
         inner_trees: of one while choosing.
         leaves: windows in a leaf of a tree at least, to choose from.
@@ -34,6 +36,8 @@ class Sizes:
     inner: int = 5
     rocket_seeds: tuple[int, ...] = (0, 1, 2)
     rocket_kernels: int = 10_000
+    multi_rocket_kernels: int = 6_250
+    hydra_groups: int = 64
     trees: int = 200
     inner_trees: int = 20
     leaves: tuple[int, ...] = (1, 4)
@@ -54,6 +58,8 @@ QUICK = Sizes(
     inner=2,
     rocket_seeds=(0, 1),
     rocket_kernels=168,
+    multi_rocket_kernels=84,
+    hydra_groups=4,
     trees=5,
     inner_trees=3,
     leaves=(1,),

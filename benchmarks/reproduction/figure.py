@@ -12,9 +12,9 @@ from benchmarks.reproduction.confound import FOLDS, ROLES, SCENES, recalls, scen
 from benchmarks.reproduction.results import (
     MeanSd,
     Report,
+    baseline_percent,
     percent,
     recall_beside_onset,
-    rival_percent,
     roles_of,
 )
 from tactslip_torch.report import published
@@ -37,15 +37,15 @@ def seeds_figure(report: Report, path: Path) -> None:
     axes = drawing.subplots()
     for place, (name, role) in enumerate(names):
         values = percent(report, name, role, "balanced_accuracy")
-        rivals = rival_percent(report, name, role, "balanced_accuracy")
-        axes.plot(rivals, [place] * len(rivals), "|", color=PEER, ms=8)
+        pooled = baseline_percent(report, name, role, "balanced_accuracy")
+        axes.plot(pooled, [place] * len(pooled), "|", color=PEER, ms=8)
         axes.plot(values, [place] * len(values), "o", color=OURS, alpha=0.7, ms=5)
         paper = published.SPLITS[BESIDE[name, role]] if (name, role) in BESIDE else None
         if paper and paper.balanced_accuracy:
             x = 100 * paper.balanced_accuracy
             axes.plot([x, x], [place - 0.4, place + 0.4], color="black", lw=2)
     axes.plot([], [], "o", color=OURS, alpha=0.7, ms=5, label="ours, a dot a seed")
-    axes.plot([], [], "|", color=PEER, ms=8, label="best single selected feature")
+    axes.plot([], [], "|", color=PEER, ms=8, label="best pooled number")
     axes.plot([], [], color="black", lw=2, label="paper, real hand")
     axes.set_yticks(range(len(names)), [f"{name}, {role}" for name, role in names], fontsize=8)
     axes.set_ylim(len(names) - 0.4, -0.6)

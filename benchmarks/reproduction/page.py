@@ -17,6 +17,7 @@ from benchmarks.reproduction.beside import (
 )
 from benchmarks.reproduction.beyond import (
     ablations_table,
+    baselines_table,
     leak_table,
     places_table,
     strokes_table,
@@ -27,8 +28,8 @@ from benchmarks.reproduction.experiments import EXPERIMENTS, SEEDS
 from benchmarks.reproduction.reasons import reasons
 from benchmarks.reproduction.results import (
     Report,
+    baseline_percent,
     percent,
-    rival_percent,
     runs_of,
     seeds_text,
     text,
@@ -130,6 +131,7 @@ def _first(report: Report) -> list[str]:
 def _second(report: Report, images: str) -> list[str]:
     if not runs_of(report, "unseen4"):
         return []
+    baselines = baselines_table(report)
     return [
         "## 2. What the paper's data could not show",
         "### Beside the onset",
@@ -139,6 +141,7 @@ def _second(report: Report, images: str) -> list[str]:
         shown(strokes_table(report)),
         "### With less",
         shown(ablations_table(report)),
+        *([] if baselines is None else ["### Baselines", shown(baselines)]),
         "### Recipes",
         shown(validation_table(report)),
         "### Leakage",
@@ -228,15 +231,15 @@ def short_table(report: Report) -> str:
     for name, roles in SHORT.items():
         for role in roles:
             cells = [text(percent(report, name, role, score)) for score in _COLUMNS]
-            rival = text(rival_percent(report, name, role, "balanced_accuracy"))
+            pooled = text(baseline_percent(report, name, role, "balanced_accuracy"))
             if runs_of(report, name):
                 num = seeds_text(len(runs_of(report, name)))
-                rows.append([f"`{name}` {role}, simulated, {num}", *cells, rival])
+                rows.append([f"`{name}` {role}, simulated, {num}", *cells, pooled])
                 if (name, role) in BELOW:
                     paper = published.SPLITS[BELOW[name, role]]
                     values = [getattr(paper, score) for score in _COLUMNS]
                     of_paper = ["" if value is None else f"{100 * value:.2f}" for value in values]
                     rows.append([f"paper, real hand, {BELOW[name, role]}", *of_paper, ""])
-    header = ["experiment", *_COLUMNS.values(), "best single selected feature, balanced %"]
+    header = ["experiment", *_COLUMNS.values(), "best pooled number, balanced %"]
     table = shown(Table(header, rows))
     return f"{QUICK_LINE}\n\n{table}" if report["quick"] else table

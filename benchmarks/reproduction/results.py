@@ -96,15 +96,22 @@ def by_seed(
     return {seed: 100 * value for seed, value in scores.items() if value is not None}
 
 
-def rival_percent(report: Report, experiment: str, role: str, score: str) -> list[float]:
-    """As ``percent``, of the best single selected feature with a threshold."""
-    return list(rival_by_seed(report, experiment, role, score).values())
+POOLED_NUMBER = "best_pooled_number"
 
 
-def rival_by_seed(report: Report, experiment: str, role: str, score: str) -> dict[int, float]:
-    """As ``rival_percent``, with the seed of each number."""
+def baseline_percent(
+    report: Report, experiment: str, role: str, score: str, baseline: str = POOLED_NUMBER
+) -> list[float]:
+    """As ``percent``, of a baseline (``tactslip_torch.baselines``)."""
+    return list(baseline_by_seed(report, experiment, role, score, baseline).values())
+
+
+def baseline_by_seed(
+    report: Report, experiment: str, role: str, score: str, baseline: str = POOLED_NUMBER
+) -> dict[int, float]:
+    """As ``baseline_percent``, with the seed of each number."""
     scores = {
-        run["seed"]: _score(run["best_single_feature"]["splits"].get(role), score, None)
+        run["seed"]: _score(_baseline(run, baseline).get(role), score, None)
         for run in runs_of(report, experiment)
     }
     return {seed: 100 * value for seed, value in scores.items() if value is not None}
@@ -156,6 +163,12 @@ def score_of(confusions: Sequence[Sequence[Sequence[int]]], score: str) -> float
         return None
     value: float | None = summed_metrics([{"confusion": of} for of in confusions])[score]
     return value
+
+
+def _baseline(run: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Splits of a baseline; none in results of earlier code."""
+    splits: Mapping[str, Any] = run.get("baselines", {}).get(name, {}).get("splits", {})
+    return splits
 
 
 def _score(

@@ -75,12 +75,14 @@ def kept(metrics: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _of_fold(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    rival = metrics["baselines"]["best_single_feature"]
     return {
         "splits": {role: _counts(scores) for role, scores in metrics["splits"].items()},
-        "best_single_feature": {
-            "feature": rival["feature"],
-            "splits": {role: _counts(scores) for role, scores in rival["splits"].items()},
+        "baselines": {
+            name: {
+                "feature": found.get("feature"),
+                "splits": {role: _counts(scores) for role, scores in found["splits"].items()},
+            }
+            for name, found in metrics["baselines"].items()
         },
         "penalty": metrics["penalty"],
         "validation": max((row["mean"] for row in metrics.get("validation", [])), default=None),
