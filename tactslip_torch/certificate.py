@@ -194,7 +194,7 @@ def certify(
     worst = float(base.error.max())
     margin = (head["bound"] or 0.0) + FACTOR * worst
     kinds_of = {channel.name: channel.kind for channel in detector.pool.hand.channels}
-    known = KnownInputs(base.covers, kinds_of, {n.channel for n in detector.selected_names})
+    known = KnownInputs(base.covers, kinds_of, {n.channel for n in detector.extractor.names})
     double = copy.deepcopy(detector).double()
     thinned = calibration[:: -(-len(calibration) // _GRADIENT_BINS)].double()
     content: dict[str, Any] = {

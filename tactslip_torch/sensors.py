@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,7 @@ from tactslip_torch.importance.refit import HELD_OUT, Refit
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.progress import bar
-from tactslip_torch.recipe import Recipe, fit_frame, stand_for
+from tactslip_torch.recipe import Recipe, fit_frame, sample_groups, stand_for
 from tactslip_torch.report.hand_figure import sensors_figure
 from tactslip_torch.report.sensors import best_table, sensors_csv, sensors_table
 
@@ -89,6 +89,11 @@ def sensors(config: DictConfig, folder: Path) -> dict[str, Any]:
         raise ValueError(f"anew must be ranked or shared, got {config.anew!r}")
     with feature_cache(config.cache) as cache:
         trained = _trained(Path(config.model), cache)
+        if trained.detector.pooling is not None and (few is not None or config.anew != "ranked"):
+            raise ValueError(
+                "this detector pools all features over channels, none are selected anew among "
+                "channels; leave out num_features and anew, or train with recipe=robust"
+            )
         save_config(config, folder)
         refit, ranking = _read(config, trained)
         gradient = _gradients(config, trained)
@@ -161,29 +166,42 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
     for batch in bar(data.loader(ROLES), "features", "recording"):
         name, recording = str(batch.recording), batch.recording
         if bool((mask := batch.roles["train"]).any()):
-            group = recipe.group(recording)
-            survey.update(name, group, batch.features[mask], batch.is_slip[mask])
+            stratum = recipe.stratum(recording)
+            survey.update(name, stratum, batch.features[mask], batch.is_slip[mask])
         for role, other in others.items():
             mask = batch.roles[role]
             other.update(name, recording.material, batch.features[mask], batch.is_slip[mask])
     torch.set_num_threads(num_threads)
-    sample = survey.sample.bins()
-    counts = survey.moments.count.tolist()
+    sample, detector = survey.sample.bins(), trained.detector
+    weights = stand_for(sample, recipe, survey.moments.count.tolist())
+    group, group_names = sample_groups(sample)
+    sample = replace(sample, group=group, group_names=group_names)
+    selected, is_pooled = list(detector.selected), detector.pooling is not None
+    allowed = recipe.allowed(pool)
+    if is_pooled:  # which takes all features of a channel, or none
+        allowed = torch.zeros(len(pool.names), dtype=torch.bool)
+        allowed[selected] = True
     refit = Refit(
         train=sample,
-        weights=stand_for(sample, recipe, counts),
+        weights=weights,
         judged={role: of.bins() for role, of in others.items() if of.num_seen},
-        scaler=fit_frame(recipe, survey, range(len(pool.names))).scaler,
-        kernel=kernel_from_dict(trained.detector.info["kernel"]),
-        penalties=recipe.penalties_ascending,
+        scaler=(
+            detector.scaler
+            if is_pooled
+            else fit_frame(recipe, survey, range(len(pool.names))).scaler
+        ),
+        kernel=kernel_from_dict(detector.info["kernel"]),
+        penalties=sorted({*recipe.penalties_ascending, float(detector.info["penalty"])}),
+        pooling=detector.pooling,
+        inputs=selected,
     )
     ranking = Ranking(
         scores=t_scores(survey.moments, recipe.score_variance),
         channels=[name.channel for name in pool.names],
-        allowed=recipe.allowed(pool),
+        allowed=allowed,
         sample=sample,
-        num_features=config.num_features or len(trained.detector.selected),
-        most_correlation=recipe.most_correlation,
+        num_features=config.num_features or len(selected),
+        most_correlation=1.0 if is_pooled else recipe.most_correlation,
         is_shared=config.anew == "shared",
     )
     return refit, ranking

@@ -74,6 +74,11 @@ def stats(config: DictConfig) -> str:
 def _collect(config: DictConfig) -> str:
     """Survey a shard of the training recordings or, with a plan, add up what that needs."""
     recipe: Recipe = instantiate(config.recipe, _convert_="all")
+    if recipe.validation == "nested":
+        raise ValueError(
+            "sums need a machine of degree 2 on features of channels, which "
+            f"recipe={recipe.name} does not always make; take recipe=robust or recipe=paper"
+        )
     if not all(adds_up(kernel) for kernel in recipe.kernels):
         raise ValueError(
             "sums need recipe.kernel=polynomial recipe.degree=2; train fits other kernels"

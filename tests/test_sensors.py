@@ -34,7 +34,7 @@ def composed(*overrides):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    train(composed_train(*TINY, "cache=off"), folder)
+    train(composed_train(*TINY, "recipe=robust", "cache=off"), folder)
     return folder
 
 

@@ -21,8 +21,13 @@ def check_recipe(recipe: Recipe) -> None:
     """That a detector made this way can be solved again from sums.
 
     Raises:
-        ValueError: if its kernel does not add up, or a penalty is not finite.
+        ValueError: if its kernel does not add up, a penalty is not finite, or it is chosen nested.
     """
+    if recipe.validation == "nested":
+        raise ValueError(
+            "statistics=true needs a machine of degree 2 on features of channels, which "
+            f"recipe={recipe.name} does not always make; take recipe=robust or recipe=paper"
+        )
     if not all(adds_up(kernel) for kernel in recipe.kernels):
         raise ValueError(
             "statistics=true needs recipe.kernel=polynomial recipe.degree=2, whose bins add up; "

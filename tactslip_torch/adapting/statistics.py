@@ -247,7 +247,8 @@ def statistics_of(model: str | os.PathLike[str], detector: SlipDetector) -> Stat
     path = Path(model).with_name(FILE)
     if not path.is_file():
         raise FileNotFoundError(
-            f"no {FILE} beside {model}; train with statistics=true, which leaves it there"
+            f"no {FILE} beside {model}; train with recipe=robust statistics=true, which leaves it "
+            "there"
         )
     found = Statistics.load(path)
     if found.detector != (digest := detector_digest(detector)):

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.importance.accuracy import Tally, balanced_accuracy, tally
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.held_out import HeldOut
@@ -57,9 +58,12 @@ class Refit:
         train: sampled training bins with the whole pool.
         weights: ``[n]`` of those, positive.
         judged: bins of other roles; they choose nothing.
-        scaler: of the whole pool.
+        scaler: of the whole pool or, with ``pooling``, of its columns.
         kernel: of the machines.
         penalties: values of C to choose from.
+        pooling: of a detector that pools over channels: machines are of its columns, made of the
+            channels whose features they are given.
+        inputs: pool indices of what it takes.
     """
 
     train: SampledBins
@@ -68,6 +72,8 @@ class Refit:
     scaler: FeatureScaler
     kernel: Kernel
     penalties: Sequence[float]
+    pooling: ChannelPooling | None = None
+    inputs: Sequence[int] = ()
     _known: dict[Any, tuple[Verdict, Any]] = field(default_factory=dict, repr=False, compare=False)
 
     def __call__(self, features: Sequence[int]) -> Verdict:
@@ -117,11 +123,23 @@ class Refit:
         return max(found, key=lambda pair: pair[0].merit)  # of equal ones the smallest C
 
     def _scaled(self, bins: SampledBins, features: Sequence[int]) -> Tensor:
+        if self.pooling is not None:
+            return self._pooled(self.pooling, bins, set(features))
         index, knee = list(features), self.scaler.knee
         ranges = self.scaler.minimum[index], self.scaler.maximum[index]
         scaler = FeatureScaler(*ranges, None if knee is None else knee[index])
         scaled: Tensor = scaler(bins.features[:, index].double())
         return scaled
+
+    def _pooled(self, layer: ChannelPooling, bins: SampledBins, features: set[int]) -> Tensor:
+        """Columns of the channels of these features; of other channels, the middle of the range."""
+        pairs = list(zip(layer.inputs, self.inputs, strict=True))
+        heard = {name.channel for name, index in pairs if index in features}
+        is_missing = torch.tensor([name not in heard for name in layer.hand.names])
+        values = bins.features[:, list(self.inputs)].double()
+        scaled: Tensor = self.scaler(layer(values, is_missing.expand(len(values), -1)))
+        single = [not name.is_pooled and name.channel not in heard for name in layer.names]
+        return scaled.masked_fill(torch.tensor(single), 0.0)
 
     def _held_out(self, scores: Tensor, num_features: int, penalty: float) -> Verdict:
         residuals = torch.where(self.train.is_slip, 1.0, -1.0) - scores

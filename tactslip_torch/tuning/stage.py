@@ -98,9 +98,14 @@ class Tuning:
         """Refuse before any work what could not be tuned behind it.
 
         Raises:
-            ValueError: if the kernel is not of degree 2, there are fewer than three groups to hold
-                some out, or something to be learned has no place to start from.
+            ValueError: if the recipe is nested or not of degree 2, there are fewer than three
+                groups to hold some out, or something to be learned has no place to start from.
         """
+        if recipe.validation == "nested":
+            raise ValueError(
+                "tuning needs a machine of degree 2 on features of channels, which "
+                f"recipe={recipe.name} does not always make; take recipe=robust or recipe=paper"
+            )
         for kernel in recipe.kernels:
             if not isinstance(kernel, Polynomial) or kernel.degree != 2:
                 raise ValueError(f"tuning needs a polynomial kernel of degree 2, got {kernel}")
