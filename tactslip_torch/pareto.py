@@ -1,12 +1,13 @@
 """Deadline in, model out: ``python -m tactslip_torch.pareto deadline_ms=80 compute_us=500``.
 
-Measures what groups of features cost on this machine; searches features, channels, components,
-filter, head, precision and hop for the front of worst-case latency and compute against accuracy;
-times those on the front and close to the limits. Those that meet both limits by that timing are
-timed again in a fresh process, in order of accuracy, the last try kept for the one with most
-head-room; the first that meets both there is written. Leaves ``pareto.json``, ``pareto.png``, the
-resolved configuration and, last of all, ``detector.pt``. Exit status 1 if no detector meets the
-limits; all but the detector is written then.
+Measures what groups of features and pooling cost on this machine; searches features, of channels
+and pooled over them, channels, components, filter, head, precision and hop for the front of
+worst-case latency and compute against accuracy; times those on the front and close to the limits,
+and names three: the most accurate, a cheap one that is hardly worse, and one of few numbers. Those
+that meet both limits by that timing are timed again in a fresh process, in order of accuracy, the
+last try kept for the one with most head-room; the first that meets both there is written. Leaves
+``pareto.json``, ``pareto.png``, the resolved configuration and, last of all, ``detector.pt``. Exit
+status 1 if no detector meets the limits; all but the detector is written then.
 
 Only training recordings are searched on. The test cycles of the seen materials judge the detector
 once it is chosen; of unseen materials nothing is read.
@@ -33,7 +34,14 @@ from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
 from tactslip_torch.deadline.cost import CostModel
-from tactslip_torch.deadline.front import Candidate, distinct, nondominated, worth_timing
+from tactslip_torch.deadline.front import (
+    Candidate,
+    distinct,
+    landmarks,
+    nondominated,
+    worth_naming,
+    worth_timing,
+)
 from tactslip_torch.deadline.latency import (
     DEFINITION,
     Latency,
@@ -58,8 +66,9 @@ from tactslip_torch.signals.filtering import Align
 EXIT_NONE_MEETS = 1
 EXIT_INTERRUPTED = 130
 VALIDATION = (
-    "a material left out at a time, training recordings only; ranking and scaling saw the material "
-    "left out, the machine alone is refitted; it chose"
+    "a material left out at a time, training recordings only; of pooled columns, compression, "
+    "ranking and scaling are learned without it; of channel features, ranking and scaling saw the "
+    "material left out, the machine alone is refitted; it chose"
 )
 
 
@@ -89,10 +98,12 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
         candidates = searcher.candidates(bar)
         if shop.search.drop_fingers:
             keeping = [each for each in candidates if not limits.misses(each.latency)]
-            best = max(keeping or candidates, key=lambda each: each.balanced_accuracy)
+            of_channels = [each for each in keeping or candidates if each.columns == "channel"]
+            best = max(of_channels or candidates, key=lambda each: each.balanced_accuracy)
             candidates += searcher.without_fingers(best, bar)
         candidates = distinct(candidates)
-        timed = shop.timed(worth_timing(candidates, shop.search.most_timed, limits))
+        worth = worth_timing(candidates, shop.search.most_timed, limits)
+        timed = shop.timed(distinct([*worth, *worth_naming(candidates)]))
         trial = folder / "trial.pt"
         try:
             found = _chosen(config, limits, shop, timed, trial)
@@ -120,6 +131,12 @@ def _facts(
 ) -> dict[str, Any]:
     """What was searched and timed, JSON-able."""
     front = [timed[place] for place in nondominated([each.point for each in timed])]
+    named = landmarks(
+        sorted(timed, key=_preferred),
+        lambda each: each.candidate.balanced_accuracy,
+        lambda each: each.timing.p50_us,
+        lambda each: each.candidate.frame.size,
+    )
     scale = median(each.timing.p99_us / each.candidate.latency.compute_us for each in timed)
     source = next(iter(shop.makers.values())).source
     return common_facts(source, shop.pool, config) | {
@@ -129,6 +146,10 @@ def _facts(
         "validation": VALIDATION,
         "engine": next(iter(shop.makers.values())).extractor.engine,
         "front": [row_of(shop, each, limits, each.latency, each.timing) for each in front],
+        "named": {
+            name: each and row_of(shop, each, limits, each.latency, each.timing)
+            for name, each in named.items()
+        },
         "timed": len(timed),
         "searched": len(candidates),
         "measured_over_modelled": scale,
@@ -238,15 +259,15 @@ def row_of(
 ) -> dict[str, Any]:
     """A detector as JSON-able facts."""
     candidate, names = timed.candidate, shop.pool.names
-    selected = [names[index] for index in candidate.selected]
+    read, layer = [names[index] for index in candidate.selected], candidate.frame.pooling
     return {
-        "num_features": len(selected),
+        "num_features": candidate.frame.size,
+        "features_read": len(read),
         "align": candidate.align,
         "channels": candidate.channels,
-        "channels_read": sorted(
-            {name.channel for name in selected}, key=shop.pool.hand.names.index
-        ),
+        "channels_read": sorted({name.channel for name in read}, key=shop.pool.hand.names.index),
         "components": candidate.components,
+        "columns": candidate.columns,
         "ranking": candidate.ranking,
         "degree": candidate.degree,
         "penalty": candidate.penalty,
@@ -260,7 +281,7 @@ def row_of(
         "modelled_us": candidate.latency.compute_us,
         "validation": candidate.balanced_accuracy,
         "validation_by_group": dict(candidate.by_group),
-        "selected": [str(name) for name in selected],
+        "selected": [str(name) for name in (read if layer is None else layer.names)],
     }
 
 

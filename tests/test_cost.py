@@ -89,6 +89,14 @@ def test_compute_is_of_the_whole_call_at_its_tail():
     assert found == pytest.approx(2.0 * (model().features_us(needed) + 100.5))
 
 
+def test_pooling_has_a_price_and_one_for_each_feature_it_reads():
+    (needed,) = parts("SG1 raw time mean")
+    price = model(pooling_us=40.0, pooling_of_one_us=0.25)
+    assert price.compute_us(needed, 3) == pytest.approx(model().compute_us(needed, 3))
+    more = 2.0 * (40.0 + 0.25 * 28)
+    assert price.compute_us(needed, 3, 28) == pytest.approx(model().compute_us(needed, 3) + more)
+
+
 def test_the_bill_for_a_ranking_adds_up_and_no_column_is_free():
     names = ["SG1 raw time mean", "PVDF1 A2 time median", "PVDF1 A2 time std"]
     needed = parts(*names)
@@ -149,10 +157,13 @@ def test_a_bad_timing_does_not_move_the_line():
 
 
 def test_measured_prices_are_of_this_machine():
-    costs = measure_costs(POOL, ChannelFilter([51, 51, 11, 11]), [4, 8], "eager", calls=5)
+    costs = measure_costs(
+        POOL, ChannelFilter([51, 51, 11, 11]), [4, 8], "eager", ["mean", "std"], calls=5
+    )
     assert costs.facts()["groups"].keys() == GROUPS.keys()
     assert costs.rest_us >= 0
     assert costs.rest_of_one_us >= 0
+    assert costs.pooling_us + costs.pooling_of_one_us > 0
     few, many = (set().union(*parts(*names)) for names in (POOL.names[:1], POOL.names))
     assert 0 < costs.features_us(few) <= costs.features_us(many)
     assert costs.tail >= 1

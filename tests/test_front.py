@@ -10,18 +10,26 @@ from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
 from tactslip_torch.data.splits import seen6
 from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.deadline.cost import GROUPS, CostModel
-from tactslip_torch.deadline.front import Candidate, nondominated, worth_timing
+from tactslip_torch.deadline.front import (
+    Candidate,
+    landmarks,
+    nondominated,
+    worth_naming,
+    worth_timing,
+)
 from tactslip_torch.deadline.latency import Latency, Limits
 from tactslip_torch.deadline.search import Search, Searcher
 from tactslip_torch.features.groups import allowed, of_fingers
 from tactslip_torch.features.names import FeatureName, pool_names
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.selection import rank_features, t_scores
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.recipe import fit_frame, recalls_mean, stand_for
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.recipe import Frame, fit_frame, recalls_mean, stand_for
 from tactslip_torch.signals.filtering import ChannelFilter
 
 SMALL = {
@@ -37,12 +45,20 @@ SMALL = {
     "penalties": [0.1, 1.0],
     "bins": 40,
 }
+POOLED = {"statistics": [["mean"]], "pooled_sizes": [None, 4], "pooled_components": ["moments"]}
 RECIPE = small_recipe(balance="weights", compress=True, tail=0.01)
 HAND = HandLayout.paper24()
 
 
 def quietly(items, what):
     return items
+
+
+def described(candidates):
+    """What can be compared of candidates."""
+    return [
+        (c._replace(frame=None), c.detector, c.frame.scaler.minimum.tolist()) for c in candidates
+    ]
 
 
 def searcher(source=None, recipe=RECIPE, **changes):
@@ -62,7 +78,7 @@ def searcher(source=None, recipe=RECIPE, **changes):
 
 @pytest.fixture(scope="module")
 def searched():
-    made = searcher()
+    made = searcher(**POOLED)
     return made, made.candidates(quietly)
 
 
@@ -83,6 +99,14 @@ def test_groups_hold_what_their_names_say():
     costly = {"median", "mode", "iqr", "entropy"}
     assert names_of("all", "unsorted") == {n for n in everything if n.descriptor not in costly}
     assert {name.domain for name in names_of("all", "time")} == {"time"}
+    jumping = {"mode", "cv", "entropy"}
+    steady = {n for n in everything if n.descriptor not in jumping}
+    assert names_of("all", "steady") == steady
+    moments = {n for n in steady if n.descriptor not in costly}
+    assert names_of("all", "moments") == moments
+    assert names_of("all", "time_moments") == {n for n in moments if n.domain == "time"}
+    assert {n.descriptor for n in names_of("all", "spreads")} == {"std", "range"}
+    assert {n.domain for n in names_of("all", "spreads")} == {"time"}
     left = everything - names_of("all", "deep_spectra")
     assert {name.component for name in left} == {"A1", "D1", "A2", "D2"}
     assert {name.domain for name in left} == {"freq"}
@@ -128,6 +152,13 @@ def test_fingers_are_those_of_the_channels():
         ({"alpha": 1.5}, r"search.alpha must be at most 1, got 1.5"),
         ({"drop_fingers": None}, r"search.drop_fingers must be true or false, got None"),
         ({"degrees": [3]}, r"search.degrees must be of 1 and 2, got \[3\]"),
+        ({"statistics": "mean"}, r"search.statistics must be a list in brackets, got 'mean'"),
+        ({"statistics": ["mean"]}, r"search.statistics must be lists of some of mean, std"),
+        ({"statistics": [["mean", "mode"]]}, r"search.statistics must be lists of some of mean"),
+        ({"statistics": [[]]}, r"search.statistics must be lists of some of mean, std"),
+        ({"pooled_sizes": [0]}, r"search.pooled_sizes must be a positive whole number, got 0"),
+        ({"pooled_sizes": []}, r"search.pooled_sizes is empty"),
+        ({"pooled_components": ["cheap"]}, r"search.pooled_components: unknown 'cheap'"),
     ],
 )
 def test_what_cannot_be_searched_is_refused(changes, message):
@@ -148,11 +179,13 @@ def test_every_group_ranking_head_and_size_is_there_once(searched):
     _, candidates = searched
     groups = {("all", "all"), ("all", "time"), ("films", "all"), ("films", "time")}
     groups.add(("gauges", "all"))  # a gauge has no spectra: gauges in time are the same again
+    candidates = [c for c in candidates if c.columns == "channel"]
     met = [(c.channels, c.components, c.ranking, c.degree, len(c.selected)) for c in candidates]
     expected = itertools.product(groups, SMALL["rankings"], (1, 2), (3, 6))
     assert sorted(met) == sorted((*group, *rest) for group, *rest in expected)
     names = FeaturePool(SMALL_HAND).names
     for each in candidates:
+        assert each.frame.pooling is None
         chosen = [names[index] for index in each.selected]
         if each.channels == "films":
             assert {name.channel for name in chosen} == {"PVDF1"}
@@ -203,7 +236,7 @@ def test_the_number_of_threads_changes_nothing(searched):
     made, candidates = searched
     torch.set_num_threads(2)
     try:
-        assert made.candidates(quietly) == candidates
+        assert described(made.candidates(quietly)) == described(candidates)
     finally:
         torch.set_num_threads(1)
 
@@ -212,10 +245,73 @@ def test_test_cycles_teach_nothing():
     fold = seen6(SmallSet().ids, seen=["a", "b", "c"])[0]
     loud = SmallSet(gains=dict.fromkeys(fold.having("test"), 9.0))
     few = {"rankings": ["t"], "channels": ["all"], "components": ["all"], "degrees": [2]}
-    quiet = searcher(**few).candidates(quietly)
-    assert searcher(loud, **few).candidates(quietly) == quiet
+    quiet = described(searcher(**few).candidates(quietly))
+    assert described(searcher(loud, **few).candidates(quietly)) == quiet
     loud = SmallSet(gains=dict.fromkeys(fold.having("train")[:3], 9.0))
-    assert searcher(loud, **few).candidates(quietly) != quiet
+    assert described(searcher(loud, **few).candidates(quietly)) != quiet
+
+
+def test_pooled_candidates_of_every_group_size_and_degree(searched):
+    _, candidates = searched
+    pooled = [c for c in candidates if c.columns != "channel"]
+    met = [(c.channels, c.ranking, c.degree) for c in pooled]
+    sized = [("none", 1), ("none", 2), ("gd", 1), ("gd", 2)]
+    expected = [(channels, *of) for channels in ("all", "films", "gauges") for of in sized]
+    assert sorted(met) == sorted(expected)
+    for each in pooled:
+        assert (each.columns, each.components) == ("pooled mean", "moments")
+        names = each.frame.pooling.names
+        assert len(names) == each.frame.size == each.frame.pooling.knee.numel()
+        kinds = {name.channel for name in names}
+        assert kinds <= {"all": {"SG", "PVDF"}, "films": {"PVDF"}, "gauges": {"SG"}}[each.channels]
+        assert not {name.descriptor for name in names} & {"mode", "cv", "entropy", "median", "iqr"}
+        assert each.frame.size == 4 or each.ranking == "none"
+
+
+def test_a_pooled_score_is_that_of_everything_learned_without_the_material(searched):
+    made, candidates = searched
+    (found,) = [
+        c
+        for c in candidates
+        if (c.channels, c.ranking, c.degree) == ("films", "none", 1) and c.columns != "channel"
+    ]
+    sample = made.surveys["centred"].sample.bins()
+    weights = stand_for(sample, RECIPE, made.surveys["centred"].moments.count.tolist())
+    place = {name: index for index, name in enumerate(made.pool.names)}
+    names = [
+        name
+        for name, inside in zip(
+            made.pool.names, allowed(SMALL_HAND, made.pool.names, "films", "moments"), strict=True
+        )
+        if inside
+    ]
+    features = sample.features[:, [place[name] for name in names]].double()
+    expected = []
+    for index in range(len(sample.group_names)):
+        out = sample.group == index
+        layer = ChannelPooling.fit(SMALL_HAND, names, features[~out], ["mean"])
+        columns = layer(features[:, [names.index(name) for name in layer.inputs]])
+        scaler = FeatureScaler.fit(columns[~out], compress=True, tail=0.01)
+        z = scaler(columns)
+        training = TrainingBins(z[~out], sample.is_slip[~out], weights[~out])
+        head = fit_machine(training, found.penalty, Polynomial(1, 0.5))
+        expected.append(recalls_mean(head(z[out]) >= 0, sample.is_slip[out]))
+    assert list(found.by_group.values()) == pytest.approx(expected)
+    assert found.balanced_accuracy == pytest.approx(sum(expected) / 3)
+
+
+def test_pooled_compute_is_of_all_channels_and_of_pooling():
+    made = searcher(**POOLED, rankings=["t"], components=["all"], channels=["films"])
+    flat = made.candidates(quietly)
+    made.costs = replace(made.costs, pooling_us=100.0, pooling_of_one_us=1.0)
+    for before, after in zip(flat, made.candidates(quietly), strict=True):
+        num_pooled = len(after.selected) if after.columns != "channel" else 0
+        more = 2.0 * (100 + num_pooled) if num_pooled else 0.0  # p99 is twice the median here
+        assert after.latency.compute_us - before.latency.compute_us == pytest.approx(more)
+        if num_pooled:
+            assert set(after.selected) == {
+                made.pool.names.index(name) for name in after.frame.pooling.inputs
+            }
 
 
 def test_fingers_are_dropped_from_the_best_on():
@@ -224,13 +320,13 @@ def test_fingers_are_dropped_from_the_best_on():
     made.pool = FeaturePool(HandLayout((gauge, replace(film, finger="thumb"))))
     candidates = made.candidates(quietly)
     best = next(c for c in candidates if c.channels == "all" and c.degree == 2)
-    best = best._replace(selected=(0, 100))
+    best = best._replace(frame=frame_of((0, 100)))
     found = made.without_fingers(best, quietly)
     assert {c.channels for c in found} == {"all without index", "all without thumb"}
     of_film = next(c for c in candidates if c.channels == "films" and len(c.selected) == 6)
     without = [c for c in found if c.channels == "all without index" and len(c.selected) == 6]
     assert without[0].selected == of_film.selected
-    alone = best._replace(selected=(0,))
+    alone = best._replace(frame=frame_of((0,)))
     assert made.without_fingers(alone, quietly) == []
 
 
@@ -251,7 +347,7 @@ def test_each_finger_goes_that_is_missed_least(monkeypatch):
 
     monkeypatch.setattr(made, "_scored", played)
     one_of_each = [made._channel_of.index(channel) for channel in (0, 3, 6, 9, 12)]
-    best = candidate(60.0, 100.0, 0.9)._replace(selected=tuple(one_of_each))
+    best = candidate(60.0, 100.0, 0.9)._replace(frame=frame_of(one_of_each))
     found = made.without_fingers(best, quietly)
     assert len(found) == 5 + 4 + 3 + 2
     kept = [max(c.balanced_accuracy for c in part) for part in (found[:5], found[5:9], found[9:12])]
@@ -277,13 +373,44 @@ def test_the_front_is_what_nothing_beats(rng):
     assert nondominated([]) == []
 
 
-def candidate(worst_ms, compute_us, accuracy):
+def frame_of(selected):
+    ends = torch.ones(len(selected))
+    return Frame(tuple(selected), FeatureScaler(-ends, ends))
+
+
+def candidate(worst_ms, compute_us, accuracy, size=50):
     latency = Latency(worst_ms - 55 - compute_us / 1000, 50.0, 5.0, compute_us)
-    return Candidate("centred", "all", "all", "t", 2, 0.1, (1,), accuracy, {}, latency)
+    frame = frame_of(range(size))
+    about = "centred", "all", "all", "channel", "t", 2, 0.1
+    return Candidate(*about, frame, accuracy, {}, latency)
 
 
 WIDE = Limits(1000.0, 1e6, [5.0])
 NONE = Limits(1.0, 1.0, [5.0])
+
+
+def test_landmarks_are_the_best_the_cheap_and_the_small():
+    def found(*rows, less=1 / 3):
+        get = [lambda row, i=i: row[i] for i in range(3)]
+        return list(landmarks(rows, *get, less).values())
+
+    best, third, poor = (0.99, 300.0, 100), (0.981, 100.0, 60), (0.979, 10.0, 30)
+    few, fewer = (0.95, 200.0, 20), (0.94, 90.0, 8)
+    assert found(poor, few, third, best, fewer) == [best, third, few]
+    assert found(poor, few, best) == [best, None, few]
+    assert found(best, third, poor) == [best, third, None]
+    quick = (0.99, 200.0, 100)  # of the same accuracy: the quickest
+    assert found(best, quick, third) == [quick, None, None]
+    assert found(best, quick, third, less=0.5) == [quick, third, None]
+
+
+def test_landmarks_are_found_by_the_model_that_errs():
+    line = [candidate(60.0 + i, 100.0 * (i + 1), 0.5 + 0.04 * i) for i in range(10)]
+    few = candidate(90.0, 5000.0, 0.3, size=20)
+    cheap = candidate(91.0, 300.0, 0.8501)  # of 1000 us; with a model that errs: none
+    named = worth_naming([*line, few, cheap])
+    assert [each for each in named if each is not cheap] == [line[9], few] * 3
+    assert cheap in named
 
 
 def test_worth_timing_goes_by_layers():

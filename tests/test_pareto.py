@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,9 +21,13 @@ from tactslip_torch.deadline.search import Search
 from tactslip_torch.deadline.timing import Timing
 from tactslip_torch.deadline.workshop import Timed, Workshop
 from tactslip_torch.feature_maker import FeatureMaker
+from tactslip_torch.features.groups import allowed
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.model_selection import Structure, fitted_frame
+from tactslip_torch.recipe import Frame, fit_frame
 from tactslip_torch.report.pareto import _plain_ticks, none_meets, pareto_table
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -66,6 +71,7 @@ def test_the_files_and_the_parts_of_the_promise(written):
     names = {"pareto.json", "pareto.png", "detector.pt", "config.yaml"}
     assert found["validation"] in pareto_table(found)
     assert "ranking and scaling saw the material left out" in found["validation"]
+    assert {row["columns"] for row in found["front"]} <= {"channel", "pooled mean, std"}
     assert {path.name for path in folder.iterdir()} == names
     assert (folder / "pareto.png").read_bytes().startswith(b"\x89PNG")
     assert found["simulated"] is False
@@ -125,6 +131,12 @@ def test_the_table_says_what_the_files_do(written, capsys):
         cells = f"{row['latency']['worst_ms']:.2f}"
         assert any(cells in line for line in rows)
     assert "SIMULATED" not in table
+    best = found["named"]["most_accurate"]
+    assert best["validation"] == max(row["validation"] for row in found["front"])
+    assert f"A most accurate: {100 * best['validation']:.2f} %" in table
+    assert found["named"]["few"]["num_features"] <= 20
+    without = pareto_table(found | {"named": found["named"] | {"cheap": None}})
+    assert "B at most 1 point worse, at most 1/3 of its compute: none of those timed" in without
     assert found["definition"] in table
     assert "look-ahead" in table
     assert f"{100 * found['chosen']['test']['balanced_accuracy']:.2f} %" in table
@@ -382,6 +394,7 @@ def candidate(**changes):
         "align": "causal",
         "channels": "all",
         "components": "all",
+        "columns": "channel",
         "ranking": "t",
         "degree": 1,
         "penalty": 0.01,
@@ -390,7 +403,10 @@ def candidate(**changes):
         "by_group": {},
         "latency": Latency(0.0, 50.0, 5.0, 100.0),
     }
-    return Candidate(**(parts | changes))
+    parts |= changes
+    selected = parts.pop("selected")
+    ends = torch.ones(len(selected), dtype=torch.float64)
+    return Candidate(**({"frame": Frame(selected, FeatureScaler(-ends, ends))} | parts))
 
 
 def test_a_detector_found_twice_is_one_candidate():
@@ -406,9 +422,35 @@ def test_a_detector_found_twice_is_one_candidate():
     assert distinct(found) == [found[0], *found[3:]]
 
 
+def scaled(shop, found):
+    """The candidate with its features scaled as the search does."""
+    return found._replace(frame=fit_frame(shop.recipe, shop.surveys[found.align], found.selected))
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_pooled_detector_is_made_timed_and_judged(shop, degree):
+    survey = shop.surveys["causal"]
+    recipe = replace(shop.recipe, pooling=["mean", "std"], use="pooled")
+    everything = Structure("pooled", 10**6, Polynomial(1))
+    mask = allowed(shop.pool.hand, shop.pool.names, "all", "time_moments")
+    frame = fitted_frame(recipe, shop.pool, survey.sample.bins(), everything, mask).first(18)
+    chosen = candidate(frame=frame, columns="pooled mean, std", degree=degree)
+    detector = shop.make(chosen, "double", from_all=True)
+    assert detector.info["fitted_to"] == "all training bins"
+    assert detector.pooling.names == frame.pooling.names
+    assert len(detector.selected_names) == 18
+    assert detector.gaussians is None
+    assert set(detector.selected) == {shop.pool.names.index(n) for n in frame.pooling.inputs}
+    assert shop.judged(detector)["balanced_accuracy"] > 0.5
+    (timed,) = shop.timed([chosen])
+    row = command.row_of(shop, timed, Limits(80.0, 500.0, [5.0]), timed.latency, timed.timing)
+    assert (row["num_features"], row["features_read"]) == (18, len(detector.selected))
+    assert row["selected"] == [str(name) for name in frame.pooling.names]
+
+
 @pytest.mark.parametrize("degree", [1, 2])
 def test_a_machine_of_all_bins_is_that_of_all_bins(shop, degree):
-    chosen = candidate(degree=degree)
+    chosen = scaled(shop, candidate(degree=degree))
     detector = shop.make(chosen, "double", from_all=True)
     assert detector.info["fitted_to"] == "all training bins"
     maker = shop.makers["causal"]

@@ -3,8 +3,9 @@
 A feature needs parts: a film that is read, a branch that is formed, its spectrum, a sort, a
 column. What a selection costs is the sum over the parts it needs, each counted once, and over the
 groups of parts it needs at all: a group has a price of its own, for calls that happen once however
-many rows there are. Prices are fitted to timings of ``FeatureExtractor`` with one bin and one
-thread. The model prunes a search; what is promised is timed as a whole (``timing``).
+many rows there are. Pooling over channels has a price, and one more for each feature it reads.
+Prices are fitted to timings of ``FeatureExtractor`` with one bin and one thread. The model prunes a
+search; what is promised is timed as a whole (``timing``).
 """
 
 from __future__ import annotations
@@ -18,10 +19,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tactslip_torch.deadline.timing import one_thread, single_bins, time_calls, time_detector
+from tactslip_torch.deadline.timing import (
+    Timing,
+    one_thread,
+    single_bins,
+    time_calls,
+    time_detector,
+)
 from tactslip_torch.features.extractor import EngineName, FeatureExtractor
 from tactslip_torch.features.plan import ORDERED, Plan, make_plan
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pooling import ChannelPooling, pooled_names
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
@@ -62,9 +70,11 @@ class CostModel:
         group_us: by group, once if any of its parts is needed.
         part_us: by group, of each of its parts.
         rest_us: what filter, scaling, head and checks add.
-        rest_of_one_us: and more for each feature.
+        rest_of_one_us: and more for each number that the machine takes.
         tail: p99 over p50, usually.
         error: median relative error on the timings it was fitted to.
+        pooling_us: what pooling over channels adds.
+        pooling_of_one_us: and more for each feature that is pooled.
     """
 
     base_us: float
@@ -74,14 +84,24 @@ class CostModel:
     rest_of_one_us: float
     tail: float
     error: float
+    pooling_us: float = 0.0
+    pooling_of_one_us: float = 0.0
 
     def features_us(self, parts: set[Part]) -> float:
         """Median time of the features that need these parts."""
         return self.base_us + sum(self._price(part) for part in parts)
 
-    def compute_us(self, parts: set[Part], num_features: int) -> float:
-        """p99 of a whole call, from raw samples to the decision."""
-        rest_us = self.rest_us + num_features * self.rest_of_one_us
+    def compute_us(self, parts: set[Part], num_columns: int, num_pooled: int = 0) -> float:
+        """p99 of a whole call, from raw samples to the decision.
+
+        Args:
+            parts: that the features need.
+            num_columns: numbers that the machine takes.
+            num_pooled: features that they are pooled of; 0 if they are features themselves.
+        """
+        rest_us = self.rest_us + num_columns * self.rest_of_one_us
+        if num_pooled:
+            rest_us += self.pooling_us + num_pooled * self.pooling_of_one_us
         return self.tail * (self.features_us(parts) + rest_us)
 
     def bill(self, needed: Sequence[set[Part]]) -> tuple[Tensor, Tensor]:
@@ -114,6 +134,8 @@ class CostModel:
             },
             "rest_us": self.rest_us,
             "rest_of_one_us": self.rest_of_one_us,
+            "pooling_us": self.pooling_us,
+            "pooling_of_one_us": self.pooling_of_one_us,
             "p99_over_p50": self.tail,
             "median_relative_error": self.error,
         }
@@ -143,6 +165,7 @@ def measure_costs(
     channel_filter: ChannelFilter,
     sizes: Sequence[int],
     engine: EngineName = "auto",
+    statistics: Sequence[str] = (),
     *,
     calls: int = 100,
     watch: Callable[[Sequence[Any], str], Any] = lambda items, what: items,
@@ -154,26 +177,38 @@ def measure_costs(
         channel_filter: of the hand.
         sizes: numbers of features for which the rest is timed.
         engine: what computes features.
+        statistics: over channels, whose pooling is timed; none: it is not.
         calls: of each selection, in each of three runs.
         watch: shows progress.
     """
     needed = parts_of(make_plan(pool.hand, pool.level, pool.names))
     bins = single_bins(pool, pool.bin_samples)
     timings, sizes = [], sorted(set(sizes))
+    layers = list(_layers(pool, statistics)) if statistics else []
     designs = list(_designs(needed, sizes))
     with one_thread():
         for selected in watch(designs, "cost of feature groups"):
             extractor = FeatureExtractor(pool, selected, engine)
             timings.append(time_calls(extractor, bins, calls))
-        rest, tails = [], []
+
+        def whole(selected: Sequence[int], layer: ChannelPooling | None = None) -> Timing:
+            return time_detector(stand_in(pool, channel_filter, selected, engine, layer), calls)
+
+        rest, tails, pooling = [], [], []
         for size in sizes:
             some = _spread(range(len(pool.names)), size)
             of_features = time_calls(FeatureExtractor(pool, some, engine), bins, calls)
-            detector = stand_in(pool, channel_filter, some, engine)
-            whole = time_detector(detector, calls)
-            tails.append(whole.p99_us / whole.p50_us)
-            rest.append(whole.p50_us - of_features.p50_us)
-    rest_us, rest_of_one_us = _line(sizes, rest)
+            of_all = whole(some)
+            tails.append(of_all.p99_us / of_all.p50_us)
+            rest.append(of_all.p50_us - of_features.p50_us)
+        rest_us, rest_of_one_us = _line(sizes, rest)
+        for layer in layers:
+            some = [pool.names.index(name) for name in layer.inputs]
+            of_features = time_calls(FeatureExtractor(pool, some, engine), bins, calls)
+            of_head_us = rest_us + len(layer.names) * rest_of_one_us
+            pooling.append(whole(some, layer).p50_us - of_features.p50_us - of_head_us)
+    lengths = [len(layer.inputs) for layer in layers]
+    pooling_us, pooling_of_one_us = _line(lengths, pooling) if layers else (0.0, 0.0)
     taken = torch.tensor([timing.p50_us for timing in timings], dtype=torch.float64)
     counts = torch.stack([_counted(set().union(*(needed[i] for i in s))) for s in designs])
     prices = _nonnegative(counts / taken[:, None])
@@ -186,6 +221,8 @@ def measure_costs(
         rest_of_one_us=rest_of_one_us,
         tail=median(tails),
         error=float(((counts @ prices) / taken - 1).abs().median()),
+        pooling_us=pooling_us,
+        pooling_of_one_us=pooling_of_one_us,
     )
 
 
@@ -194,15 +231,28 @@ def stand_in(
     channel_filter: ChannelFilter,
     selected: Sequence[int],
     engine: EngineName = "auto",
+    layer: ChannelPooling | None = None,
 ) -> SlipDetector:
     """A detector that nobody trained, which takes as long as one that somebody did."""
-    num = len(selected)
+    num = len(selected) if layer is None else len(layer.names)
     generator = torch.Generator().manual_seed(num)
     bend = torch.randn(num, num, generator=generator, dtype=torch.float64)
     ends = torch.ones(num, dtype=torch.float64)
     head = QuadraticForm(bend + bend.T, bend[0].clone(), torch.tensor(0.5, dtype=torch.float64))
     scaler = FeatureScaler(-ends, ends, ends)
-    return SlipDetector(pool, channel_filter, selected, scaler, head, engine=engine)
+    return SlipDetector(pool, channel_filter, selected, scaler, head, pooling=layer, engine=engine)
+
+
+def _layers(pool: FeaturePool, statistics: Sequence[str]) -> Iterator[ChannelPooling]:
+    """Layers that nobody fitted, of few to many columns."""
+    names = pooled_names(pool.hand, pool.names, statistics)
+    kinds = len(pool.hand.kinds)
+    for number in (8, 60, 240):
+        some = [names[index] for index in _spread(range(len(names)), max(number, kinds))]
+        families = {(n.channel, n.component, n.domain, n.descriptor) for n in some}
+        used = {name.channel for name in some}
+        zeros = torch.zeros(len(some)), torch.zeros(len(used))
+        yield ChannelPooling(pool.hand, some, torch.ones(len(families)), *zeros)
 
 
 def _designs(needed: Sequence[set[Part]], sizes: Sequence[int]) -> Iterator[list[int]]:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple, TypeVar
 
 from tactslip_torch.deadline.latency import Latency, Limits
+from tactslip_torch.features.names import FeatureName
+from tactslip_torch.recipe import Frame
 from tactslip_torch.signals.filtering import Align
 
 _MODEL_ERRS = (1.5, 1.0, 1 / 1.5)  # modelled compute over what will be measured
+FEW_NUMBERS = 20
+LESS_ACCURATE = 0.01
+LESS_COMPUTE = 1 / 3
+
+_T = TypeVar("_T")
 
 
 class Candidate(NamedTuple):
@@ -17,13 +24,16 @@ class Candidate(NamedTuple):
     Attributes:
         align: of the filter.
         channels: which channels features may be of, in words.
-        components: which components.
-        ranking: how features were ranked.
+        components: which components and descriptors.
+        columns: what the machine takes: ``"channel"`` features, or statistics over channels, such
+            as ``"pooled mean, std"``.
+        ranking: how they were ranked; ``"none"`` if all are taken.
         degree: of the head.
         penalty: its C, the best of those tried.
-        selected: pool indices of its features, best first.
-        balanced_accuracy: on held-out groups, mean over them. A little too good: it chose, and
-            ranking and scaling saw the held-out group too; only the machine is refitted.
+        frame: which features are read, and how its numbers are made of them, best first.
+        balanced_accuracy: on held-out groups, mean over them. A little too good: it chose. Of
+            pooled columns everything is learned without the held-out group; ranking and scaling of
+            channel features saw it too, and only the machine is refitted.
         by_group: of each held-out group.
         latency: worst case with the shortest hop, compute modelled until timed.
     """
@@ -31,10 +41,11 @@ class Candidate(NamedTuple):
     align: Align
     channels: str
     components: str
+    columns: str
     ranking: str
     degree: int
     penalty: float
-    selected: tuple[int, ...]
+    frame: Frame
     balanced_accuracy: float
     by_group: Mapping[str, float | None]
     latency: Latency
@@ -45,9 +56,16 @@ class Candidate(NamedTuple):
         return self.latency.worst_ms, self.latency.compute_us, -self.balanced_accuracy
 
     @property
-    def detector(self) -> tuple[Align, int, float, frozenset[int]]:
+    def selected(self) -> tuple[int, ...]:
+        """Pool indices of the features that are read."""
+        return self.frame.selected
+
+    @property
+    def detector(self) -> tuple[Align, int, float, frozenset[int | FeatureName]]:
         """What its detector is made of, however its features were found."""
-        return self.align, self.degree, self.penalty, frozenset(self.selected)
+        layer = self.frame.pooling
+        columns = self.selected if layer is None else layer.names
+        return self.align, self.degree, self.penalty, frozenset(columns)
 
 
 def distinct(candidates: Iterable[Candidate]) -> list[Candidate]:
@@ -72,6 +90,54 @@ def nondominated(points: Sequence[Sequence[float]]) -> list[int]:
         if not any(all(a <= b for a, b in zip(points[k], own, strict=True)) for k in kept):
             kept.append(index)
     return sorted(kept)
+
+
+def landmarks(
+    detectors: Sequence[_T],
+    accuracy: Callable[[_T], float],
+    compute: Callable[[_T], float],
+    size: Callable[[_T], int],
+    less_compute: float = LESS_COMPUTE,
+) -> dict[str, _T | None]:
+    """The detectors that a user asks for first, of several equally accurate ones the quickest.
+
+    Args:
+        detectors: at least one.
+        accuracy: of a detector.
+        compute: of a detector.
+        size: how many numbers its machine takes.
+        less_compute: part of the compute of the most accurate one that ``"cheap"`` may take.
+
+    Returns:
+        ``"most_accurate"``; ``"cheap"``, at most 1 point worse, with at most a third of its
+        compute; ``"few"``, of at most 20 numbers. ``None`` where there is no such detector.
+    """
+
+    def best(some: Sequence[_T]) -> _T | None:
+        return min(some, key=lambda each: (-accuracy(each), compute(each)), default=None)
+
+    top = best(detectors)
+    assert top is not None
+    most, least = less_compute * compute(top), accuracy(top) - LESS_ACCURATE
+    cheap = [each for each in detectors if compute(each) <= most and accuracy(each) >= least]
+    few = [each for each in detectors if size(each) <= FEW_NUMBERS]
+    return {"most_accurate": top, "cheap": best(cheap), "few": best(few)}
+
+
+def worth_naming(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """The ``landmarks`` as modelled, also if the model errs."""
+    return [
+        each
+        for factor in _MODEL_ERRS
+        for each in landmarks(
+            candidates,
+            lambda each: each.balanced_accuracy,
+            lambda each: each.latency.compute_us,
+            lambda each: each.frame.size,
+            factor * LESS_COMPUTE,
+        ).values()
+        if each is not None
+    ]
 
 
 def worth_timing(candidates: Sequence[Candidate], most: int, limits: Limits) -> list[Candidate]:

@@ -25,7 +25,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.planning import adds_up, plan_detector
 from tactslip_torch.progress import bar
-from tactslip_torch.recipe import Recipe, fit_frame, recalls_mean, stand_for
+from tactslip_torch.recipe import Recipe, recalls_mean, stand_for
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import Align
 
@@ -117,6 +117,7 @@ class Workshop:
             maker.channel_filter,
             sizes,
             maker.extractor.engine,
+            max(self.search.statistics, key=len, default=()),
             calls=calls,
             watch=bar,
         )
@@ -140,16 +141,14 @@ class Workshop:
         survey, data = self.surveys[candidate.align], self._data[candidate.align]
         recipe = replace(
             self.recipe,
-            num_features=len(candidate.selected),
+            num_features=candidate.frame.size,
             kernel="polynomial",
             degree=candidate.degree,
             offsets=offset_of(self.recipe),
             penalties=candidate.penalty,
         )
-        plan = plan_detector(
-            recipe, survey, _quietly, fit_frame(recipe, survey, candidate.selected)
-        )
-        is_bounded = adds_up(plan.kernel) and len(candidate.selected) > self.most_summed
+        plan = plan_detector(recipe, survey, _quietly, candidate.frame)
+        is_bounded = adds_up(plan.kernel) and plan.frame.size > self.most_summed
         if from_all and not is_bounded:
             gathered = TrainingPass(plan)
             with one_thread():
@@ -164,7 +163,7 @@ class Workshop:
             head = fit_machine(training, plan.penalty, plan.kernel)
             bins = f"{self.search.bins} training bins of each material and class"
         facts = plan.facts()
-        info = {name: facts[name] for name in ("kernel", "penalty", "balance", "num_bins", "rival")}
+        info = {name: facts[name] for name in ("kernel", "penalty", "balance", "num_bins")}
         trained, source = self.fold.having("train"), data.maker.source
         info |= {
             "recipe": recipe.name,
@@ -186,6 +185,7 @@ class Workshop:
             info,
             plan.typical,
             plan.gaussians,
+            plan.frame.pooling,
             engine=data.maker.extractor.engine,
         )
 

@@ -12,8 +12,12 @@ from tactslip_torch.features.names import FeatureName
 from tactslip_torch.hand import HandLayout
 
 Channels = Literal["all", "films", "gauges"]
-Components = Literal["all", "unsorted", "deep_spectra", "time"]
+Components = Literal[
+    "all", "unsorted", "deep_spectra", "time", "steady", "moments", "time_moments", "spreads"
+]
 _SORTED_OR_COUNTED = frozenset({"median", "mode", "iqr", "entropy"})
+_JUMPING = frozenset({"mode", "cv", "entropy"})  # by several deviations at 1 nV of noise
+_SPREADS = frozenset({"std", "range"})
 ATTRIBUTES = ("kind", "finger", "channel", "component", "domain", "descriptor")
 _DEEP = 3  # from this level on a branch has a rank below a fifth of the bin
 
@@ -111,4 +115,11 @@ def _is_of(name: FeatureName, components: str) -> bool:
         return name.descriptor not in _SORTED_OR_COUNTED
     if components == "deep_spectra":
         return name.domain == "time" or int(name.component[1:]) >= _DEEP
+    if components in ("steady", "moments", "time_moments"):
+        is_left_out = name.descriptor in _JUMPING
+        if components != "steady":
+            is_left_out |= name.descriptor in _SORTED_OR_COUNTED
+        return not is_left_out and (components != "time_moments" or name.domain == "time")
+    if components == "spreads":
+        return name.domain == "time" and name.descriptor in _SPREADS
     return components == "all" or name.domain == "time"

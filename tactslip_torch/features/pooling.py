@@ -303,7 +303,10 @@ class ChannelPooling(nn.Module):
         pooled = pooled_names(hand, names, setting)
         place = {name: index for index, name in enumerate(names)}
         least, in_use = [], {}
+        kinds = {name.channel for name in pooled}
         for kind, channels in _channels_by_kind(hand).items():
+            if kind not in kinds:
+                continue
             told_by = [_range_name(hand, channel) for channel in channels]
             if untold := [name for name in told_by if name not in place]:
                 raise ValueError(f"pooling needs the feature {str(untold[0])!r}; leave it in")
