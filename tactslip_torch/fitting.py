@@ -22,10 +22,14 @@ from tactslip_torch.model.sufficient import SufficientStats
 from tactslip_torch.planning import Plan, Progress
 
 Head = QuadraticForm | KernelSum
+GRID_BITS = 38  # of sums that hold 2^25 bins
 
 
 class LinearSums:
     """Sums of fixed size that a machine of degree 1 is solved from, in either class.
+
+    Whole multiples of ``2 ** -GRID_BITS``, rounded once for each batch of bins: the same bits in
+    any order and on any number of workers.
 
     Args:
         num_features: K.
@@ -33,24 +37,32 @@ class LinearSums:
 
     def __init__(self, num_features: int) -> None:
         size = num_features + 1
-        self.products = torch.zeros(2, size, size, dtype=torch.float64)
-        self.count = torch.zeros(2, dtype=torch.float64)
+        self.sums = torch.zeros(2, size, size, dtype=torch.int64)
 
     def update(self, z: Tensor, is_slip: Tensor, weights: Tensor) -> None:
         """Add bins.
 
         Shape:
-            - z: ``[N, K]``; is_slip: ``[N]``, bool; weights: ``[N]``
+            - z: ``[N, K]``, in ``[-1, 1]``; is_slip: ``[N]``, bool; weights: ``[N]``
+
+        Raises:
+            ValueError: if a number is not finite, or the grid has no room.
         """
         x = torch.cat([z, torch.ones_like(z[:, :1])], 1)
         for kind, mine in enumerate((~is_slip, is_slip)):
-            self.products[kind].addmm_((x[mine] * weights[mine, None]).mT, x[mine])
-            self.count[kind] += weights[mine].sum()
+            products = (x[mine] * weights[mine, None]).mT @ x[mine]
+            if not bool((products.abs() + self.count[kind] < 2.0 ** (62 - GRID_BITS)).all()):
+                raise ValueError("sums of degree 1 take finite features of 16 million bins at most")
+            self.sums[kind] += (products * 2.0**GRID_BITS).round().long()
+
+    @property
+    def count(self) -> Tensor:
+        """Weight of the bins of non-slip and of slip, ``[2]``."""
+        return self.sums[:, -1, -1].double() / 2.0**GRID_BITS
 
     def merge(self, other: LinearSums) -> None:
         """Add the bins of another."""
-        self.products += other.products
-        self.count += other.count
+        self.sums += other.sums
 
     def solve(self, penalty: float, offset: float, balance: str) -> QuadraticForm:
         """The machine.
@@ -58,15 +70,17 @@ class LinearSums:
         Raises:
             ValueError: if a class is absent or a number is not finite.
         """
-        if not bool((self.count > 0).all()):
+        all_products = self.sums.double() / 2.0**GRID_BITS
+        count = self.count
+        if not bool((count > 0).all()):
             raise ValueError("training needs bins of both classes; add recordings with the other")
         weight = torch.ones(2, dtype=torch.float64)
         if balance == "weights":
-            weight = self.count.sum() / (2 * self.count)
-        unit = torch.ones(self.products.shape[1], dtype=torch.float64)
+            weight = count.sum() / (2 * count)
+        unit = torch.ones(all_products.shape[1], dtype=torch.float64)
         unit[-1] = math.sqrt(offset)  # of the constant
-        normal = (self.products * weight[:, None, None]).sum(0) * unit * unit[:, None]
-        sums = self.products[:, :, -1] * weight[:, None]
+        normal = (all_products * weight[:, None, None]).sum(0) * unit * unit[:, None]
+        sums = all_products[:, :, -1] * weight[:, None]
         solved, report = solve_normal_equations_(
             normal, (sums[1] - sums[0]) * unit, penalty, restore=from_above
         )

@@ -18,6 +18,7 @@ from torch import Tensor
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
 from tactslip_torch.features.groups import checked_attributes, matching
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
@@ -220,7 +221,7 @@ class Recipe:
         """
         is_firm = ~is_rounding(pool)
         if self.descriptors is not None:
-            known = {name.descriptor for name in pool.names}
+            known = {*TIME_DESCRIPTORS, *SPECTRUM_DESCRIPTORS, "band_energy_ratio"}
             if unknown := [name for name in self.descriptors if name not in known]:
                 raise ValueError(
                     f"recipe.descriptors: unknown {unknown[0]!r}, expected some of "

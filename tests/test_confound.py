@@ -98,7 +98,9 @@ def ran(tmp_path_factory):
     folder = tmp_path_factory.mktemp("confound")
     recipe = ("recipe.num_features=10", "recipe.penalties=[0.1,1.0]", "recipe.sample_bins=100")
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        returned = train(composed("+exp=confound", *recipe, "export=false"), folder)
+        returned = train(
+            composed("+exp=confound", "recipe=robust", *recipe, "export=false"), folder
+        )
     return folder, printed.getvalue(), returned
 
 

@@ -22,6 +22,7 @@ from tactslip_torch.graph.trials import (
     degenerate_bins,
     noise_bins,
     simulated_bins,
+    unit_of,
 )
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
@@ -87,9 +88,12 @@ def check_bins(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
     judged = Judged(run, detector, form)
     hand, rate = detector.pool.hand, detector.pool.sample_rate_hz
     length, dtype = judged.window.length, judged.dtype
-    simulated = simulated_bins(hand, rate, _SIMULATED, length, dtype)
+    unit = unit_of(detector)
+    simulated = unit * simulated_bins(hand, rate, _SIMULATED, length, dtype)
     slip = judged.compare([simulated], "simulated bins")
-    drawn = [noise_bins(hand, batch, length, seed, dtype) for seed, batch in enumerate(BATCHES)]
+    drawn = [
+        unit * noise_bins(hand, batch, length, seed, dtype) for seed, batch in enumerate(BATCHES)
+    ]
     noise = judged.compare(drawn, "noise")
     # the latter of a detector for which nothing happens in a simulation
     sd = float(slip.exact.std()) or float(noise.exact.std()) or 1.0

@@ -17,7 +17,7 @@ from tactslip_torch.graph.bin_check import WORST_DEGENERATE_SD, WORST_PROBABILIT
 from tactslip_torch.graph.form import Form
 from tactslip_torch.graph.runs import Run
 from tactslip_torch.graph.stream import Timing
-from tactslip_torch.graph.trials import dead_masks, simulated_stream
+from tactslip_torch.graph.trials import dead_masks, simulated_stream, unit_of
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing import Dead
@@ -56,7 +56,7 @@ def check_stream(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]
     timing = Timing.of(detector, settings)
     hand, rate = detector.pool.hand, detector.pool.sample_rate_hz
     slip = simulated_stream(hand, rate, dtype, _FEWEST_BINS * max(timing.first, timing.frame)).T
-    whole = slowed(slip, timing)
+    whole = slowed(unit_of(detector) * slip, timing)
     expected = _columns(double, settings, whole)
     sd = float(expected["score"].std()) or 1.0
     worst = WORST_SD[form.precision]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from itertools import cycle
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.simulation.extremes import EXTREMES, RAIL_V, extreme_bins
 from tactslip_torch.simulation.scene import Scene
 from tactslip_torch.simulation.simulate import simulate
@@ -19,6 +21,7 @@ KINDS: tuple[str, ...] = (*EXTREMES, *BROKEN)
 
 _BEFORE_S, _AFTER_S = 1.0, 0.5  # of the simulated onset
 _SPARE = 10  # samples that the simulator may leave out at the ends
+_QUIET_V = 2e-3  # twice the least range of a channel of a detector of simulated recordings
 _FEWEST_BINS = 4  # that a simulated slip lasts at least, whatever the rate
 
 
@@ -84,6 +87,18 @@ def simulated_bins(
     samples = simulated_stream(hand, sample_rate_hz, dtype, _FEWEST_BINS * length)
     starts = torch.linspace(0, samples.shape[-1] - length, num).long()
     return samples.unfold(-1, length, 1)[:, starts].movedim(1, 0).contiguous()
+
+
+def unit_of(detector: SlipDetector) -> float:
+    """What a volt is to a detector, a power of 2 from 1 on.
+
+    One that leaves out channels which hardly move, by what it was trained on in another unit, must
+    hear of something in what it is tried on.
+    """
+    if detector.pooling is None or not len(detector.pooling.least_range):
+        return 1.0
+    quietest = float(detector.pooling.least_range.max()) / _QUIET_V
+    return 2.0 ** max(math.ceil(math.log2(quietest)), 0) if quietest > 0 else 1.0
 
 
 @lru_cache(maxsize=1)
