@@ -96,10 +96,10 @@ def composed(*overrides, name="train"):
 def ran(tmp_path_factory):
     """``+exp=confound`` on the small scenes: the folder, what it printed, what it returned."""
     folder = tmp_path_factory.mktemp("confound")
-    recipe = ("recipe.num_features=10", "recipe.penalties=[0.1,1.0]", "recipe.sample_bins=100")
+    recipe = ("recipe=robust", "recipe.num_features=10", "recipe.penalties=[0.1,1.0]")
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         returned = train(
-            composed("+exp=confound", "recipe=robust", *recipe, "export=false"), folder
+            composed("+exp=confound", *recipe, "recipe.sample_bins=100", "export=false"), folder
         )
     return folder, printed.getvalue(), returned
 

@@ -1,0 +1,338 @@
+"""A detector that pools over channels, as the default recipe makes it, in every use of a detector.
+
+Trained by ``train`` on a few simulated recordings; what is tested are recordings it never met.
+"""
+
+import copy
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from hydra.utils import instantiate
+from test_commands import TINY, composed, run_train
+
+from tactslip_torch import SlipDetector
+from tactslip_torch.certificate import certify
+from tactslip_torch.export import export_detector
+from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.graph.trials import simulated_bins
+from tactslip_torch.importance.choosing import without
+from tactslip_torch.importance.refit import Refit
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.sensors import sensors
+from tactslip_torch.stats import stats
+from tactslip_torch.train import train
+
+POOLED = ("recipe.use=pooled", "recipe.num_features=null", "recipe.degree=1")
+HOP = 50
+STUCK_AT = 9_000  # sample
+MOST_MOVED = 1e-4  # of the scores' standard deviation
+DEAD = ("SG2", "SG9", "PVDF1", "PVDF7")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pooled")
+    cache = tmp_path_factory.mktemp("cache")
+    run_train(
+        folder, "+exp=quick", *POOLED, "onset=debounced", "num_workers=0", f"cache={cache}",
+        "export=false", "baselines=false",
+    )  # fmt: skip
+    return folder
+
+
+@pytest.fixture(scope="module")
+def detector(run):
+    return SlipDetector.load(run / "detector.pt")
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """A test recording in float64, with digits that float32 does not hold."""
+    source = instantiate(composed("+exp=quick").data, _convert_="all")
+    samples = source.load(source.ids[1]).samples.double()
+    generator = torch.Generator().manual_seed(0)
+    digits = torch.rand(samples.shape, generator=generator, dtype=torch.float64) - 0.5
+    return samples + digits * torch.finfo(torch.float32).eps * samples.abs()
+
+
+@pytest.fixture(scope="module")
+def whole(detector, recording):
+    return score_stream(detector, recording, HOP)
+
+
+def noise_like(samples, size=1e-9, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    return size * torch.randn(samples.shape, generator=generator, dtype=torch.float64)
+
+
+# What it is --------------------------------------------------------------------------------------
+
+
+def test_it_pools_both_kinds_and_leaves_out_what_jumps(detector):
+    assert detector.pooling is not None
+    assert detector.pooling.kinds == ("SG", "PVDF")
+    assert all(name.is_pooled for name in detector.selected_names)
+    jumping = {"mode", "cv", "entropy", "median", "iqr"}
+    assert not jumping & {name.descriptor for name in detector.extractor.names}
+    assert detector.head.is_linear
+    assert detector.gaussians is None
+
+
+def test_its_file_holds_all_of_it(detector, recording, whole, tmp_path):
+    detector.save(tmp_path / "again.pt")
+    again = SlipDetector.load(tmp_path / "again.pt")
+    assert torch.equal(score_stream(again, recording, HOP).score, whole.score)
+    assert again.selected_names == detector.selected_names
+    assert torch.equal(again.pooling.least_range, detector.pooling.least_range)
+    assert torch.equal(score_stream(copy.deepcopy(detector), recording, HOP).score, whole.score)
+
+
+def test_a_damaged_pooling_is_refused(detector, tmp_path):
+    broken = copy.deepcopy(detector)
+    broken.pooling.knee[0] = -1.0
+    broken.save(tmp_path / "broken.pt")
+    with pytest.raises(ValueError, match=r"broken\.pt") as caught:
+        SlipDetector.load(tmp_path / "broken.pt")
+    assert "\n" not in str(caught.value)
+
+
+# Must hold: last digits, and channels that get stuck ---------------------------------------------
+
+
+def test_a_nanovolt_of_noise_moves_no_score(detector, recording, whole):
+    found = score_stream(detector, recording + noise_like(recording), HOP)
+    sd = float(whole.score.std())
+    assert float((found.score - whole.score).abs().max()) < MOST_MOVED * sd
+    assert torch.equal(found.score >= 0, whole.score >= 0)
+
+
+def test_float32_in_place_of_float64_moves_no_score(detector, recording, whole):
+    assert not torch.equal(recording.float().double(), recording)
+    found = score_stream(detector, recording.float(), HOP)
+    sd = float(whole.score.std())
+    assert float((found.score.double() - whole.score).abs().max()) < MOST_MOVED * sd
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-9], ids=["constant", "1 nV"])
+@pytest.mark.parametrize("channel", DEAD)
+def test_a_stuck_channel_is_left_out_within_a_second(channel, noise, detector, recording, whole):
+    place = detector.pool.hand.names.index(channel)
+    stuck, dead = recording.clone(), recording.clone()
+    stuck[place, STUCK_AT:] = recording[place, STUCK_AT] + noise_like(
+        recording[place, STUCK_AT:], noise
+    )
+    dead[place] = torch.nan
+    found, wanted = (score_stream(detector, x, HOP) for x in (stuck, dead))
+    starts = HOP * torch.arange(len(found.score))
+    later = starts + detector.pool.bin_samples > STUCK_AT + 2000  # bins that end a second later
+    assert int(later.sum()) > 100
+    assert torch.equal(found.score[later], wanted.score[later])
+    before = starts + detector.pool.bin_samples + detector.look_ahead < STUCK_AT
+    assert torch.equal(found.score[before], whole.score[before])
+    assert not torch.equal(found.score[later], whole.score[later])  # it was in use
+
+
+def test_decisions_of_a_stream_with_a_stuck_channel_are_those_without_it(detector, recording):
+    place = detector.pool.hand.names.index("PVDF7")
+    stuck = recording.clone()
+    stuck[place, STUCK_AT:] = 0.2
+    streams = [
+        StreamingDetector(detector, dtype=torch.float64),
+        StreamingDetector(detector, dtype=torch.float64, dead=["PVDF7"]),
+    ]
+    found, wanted = (
+        stream.push(samples.T) for stream, samples in zip(streams, (stuck, recording), strict=True)
+    )
+    later = found.available_s > (STUCK_AT + 2000) / 2000.0 + 1.0  # the rule remembers 3 decisions
+    assert int(later.sum()) > 20
+    for name in ("score", "llr", "probability", "statistic"):
+        one, other = (getattr(each, name)[later] for each in (found, wanted))
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+    assert not found.is_valid[later].any()
+
+
+# Dead channels -----------------------------------------------------------------------------------
+
+
+def test_dead_channels_are_left_out_of_their_pools(detector, recording):
+    bins = recording.unfold(-1, 400, 400).transpose(0, 1)[:, :, : detector.pool.bin_samples]
+    judged = detector.judge(bins, dead=list(DEAD))
+    mask = torch.tensor([name in DEAD for name in detector.pool.hand.names])
+    features = detector.extractor(bins.masked_fill(mask[:, None], 0.0), torch.float64)
+    columns = detector.columns(features, mask.expand(len(bins), -1))
+    wanted = detector.head(detector.scaler(columns))
+    torch.testing.assert_close(judged.score, wanted, rtol=1e-10, atol=1e-12)
+    assert (judged.variance == 0).all()
+    assert not judged.is_valid.any()
+    holed = bins.clone()
+    holed[:, mask, 7] = torch.nan
+    torch.testing.assert_close(detector.judge(holed).score, judged.score, rtol=1e-10, atol=1e-12)
+
+
+def test_few_bins_are_judged_as_many(detector, recording):
+    bins = recording.unfold(-1, 400, 400).transpose(0, 1)[:40, :, : detector.pool.bin_samples]
+    for dead in ((), DEAD):
+        many = detector.judge(bins, dead=list(dead))
+        few = [detector.judge(part, dead=list(dead)) for part in bins.split(2)]
+        score = torch.cat([each.score for each in few])
+        torch.testing.assert_close(score, many.score, rtol=1e-9, atol=1e-12)
+
+
+def test_without_any_channel_a_score_is_finite_and_not_valid(detector, recording):
+    judged = detector.judge(
+        recording[None, :, : detector.pool.bin_samples], dead=list(detector.pool.hand.names)
+    )
+    assert judged.score.isfinite().all()
+    assert not judged.is_valid.any()
+
+
+# Streams and graphs ------------------------------------------------------------------------------
+
+
+def test_a_stream_is_the_recording(detector, recording):
+    stream = StreamingDetector(detector, dtype=torch.float64)
+    pieces = [stream.push(part.T) for part in recording.split(333, dim=-1)]
+    pieces.append(stream.flush())
+    score = torch.cat([piece.score for piece in pieces])
+    hop = stream.settings.hop_samples
+    wanted = score_stream(detector, recording, hop)
+    torch.testing.assert_close(score, wanted.score[: len(score)], rtol=1e-9, atol=1e-12)
+    assert 0 <= len(wanted.score) - len(score) <= 1
+
+
+@pytest.fixture(scope="module")
+def graphs(detector, tmp_path_factory):
+    """Both graphs, which held themselves against torch before they were left."""
+    folder = tmp_path_factory.mktemp("graphs")
+    paths = export_detector(detector, folder, ["bin", "stream"], precision="float64")
+    return [onnxruntime.InferenceSession(str(path)) for path in paths if path.suffix == ".onnx"]
+
+
+@pytest.mark.onnx
+@pytest.mark.parametrize("broken", [None, "dead", "nan", "stuck"])
+def test_the_graph_of_a_bin_is_torch(graphs, broken, detector):
+    hand, length = detector.pool.hand, graphs[0].get_inputs()[0].shape[-1]
+    bins = simulated_bins(hand, 2000.0, 40, length, torch.float64)
+    dead = np.array([broken == "dead" and name in DEAD for name in hand.names])
+    if broken == "nan":
+        bins[::2, 3, 50] = bins[1::2, 17, 60] = torch.nan
+    if broken == "stuck":
+        bins[:, [3, 17]] = 0.4 + noise_like(bins[:, [3, 17]])
+    score, valid = graphs[0].run(["score", "valid"], {"samples": bins.numpy(), "dead": dead})
+    judged = detector.judge_raw(bins, dead=torch.from_numpy(dead))
+    atol = 1e-9 * float(judged.score.std())
+    np.testing.assert_allclose(score, judged.score.numpy(), rtol=0, atol=atol)
+    assert valid.tolist() == judged.is_valid.tolist()
+
+
+@pytest.mark.onnx
+def test_an_order_statistic_and_both_kinds_of_column_are_exported(detector, run, tmp_path):
+    folder = tmp_path / "both"
+    cache = run.parent / "cache"
+    run_train(
+        folder, *TINY[:-1], "recipe.use=both", "recipe.num_features=25", "recipe.degree=2",
+        "features.pooling=[mean,std,min,max,median]", "data.cycles=8", f"cache={cache}",
+    )  # fmt: skip
+    made = SlipDetector.load(folder / "detector.pt")
+    assert (folder / "model.onnx").exists()
+    assert {name.is_pooled for name in made.selected_names} == {True, False}
+
+
+# Commands ----------------------------------------------------------------------------------------
+
+
+def test_certify_measures_it(detector, recording):
+    length = detector.context_before + detector.pool.bin_samples + detector.context_after
+    bins = recording.unfold(-1, length, 300).transpose(0, 1).contiguous()
+    found = certify(detector, bins[::2], {"test": bins[1::2]}, simulated=True, extremes=4).facts()
+    assert [facts["outside_range"] for facts in found["sets"].values()][0] == 0
+    flips = [facts["flips"]["outside_margin"] for facts in found["sets"].values()]
+    assert flips == [0, 0]
+    assert found["sets"]["test"]["error"]["worst_sd"] < 1e-4
+
+
+@pytest.fixture(scope="module")
+def pooled_run(tmp_path_factory):
+    """On four channels; its columns are of those of films and gauges, in pairs."""
+    folder = tmp_path_factory.mktemp("tiny")
+    run_train(folder, *TINY, "recipe.use=pooled", "recipe.num_features=null", "cache=off")
+    return folder
+
+
+def sensors_of(run, folder, *overrides):
+    small = ("bins=20", "judged_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
+    given = (*small, f"model={run / 'detector.pt'}", "cache=off", *overrides)
+    return sensors(composed(*given, name="sensors"), folder)
+
+
+def test_sensors_are_left_out_of_the_pools(pooled_run, tmp_path):
+    found = sensors_of(pooled_run, tmp_path)
+    detector = SlipDetector.load(pooled_run / "detector.pt")
+    own = dict.fromkeys(detector.pool.hand.names, 0)
+    for name in detector.extractor.names:
+        own[name.channel] += 1
+    rows = {row["name"]: row for row in found["units"] if row["unit"] == "channel"}
+    assert {name: row["features_in_use"] for name, row in rows.items()} == own
+    whole = found["with_all"]
+    assert whole["as_selected"] == whole["selected_anew"]
+    assert whole["as_selected"]["balanced_accuracy"]["test"] > 0.9
+    assert all(row["lost"] == row["lost_anew"] for row in rows.values())
+    assert found["best"]["channel"][-1]["num_features"] == len(detector.selected)
+    assert found["best"]["channel"][-1]["lost"]["test"]["mean"] == 0.0
+    assert rows["PVDF1"]["gradient"]["slip"] > 0
+
+
+def test_refitted_columns_are_those_of_a_hand_without_the_channel(detector, recording):
+    bins = recording.unfold(-1, 400, 400).transpose(0, 1)[:, :, : detector.pool.bin_samples]
+    features = detector.pool(bins)
+    num = len(features)
+    sample = SampledBins(
+        features.float(), torch.arange(num) % 2 == 0, torch.zeros(num).long(), ("M",),
+        torch.zeros(num).long(), ("M/0",), torch.arange(num), torch.ones(num).double(),
+    )  # fmt: skip
+    refit = Refit(
+        sample, torch.ones(num).double(), {}, detector.scaler, Polynomial(1, 0.5), (0.1,),
+        detector.pooling, detector.selected,
+    )  # fmt: skip
+    names = [name.channel for name in detector.pool.names]
+    found = refit._scaled(sample, without(detector.selected, DEAD, names))
+    is_missing = torch.tensor([name in DEAD for name in detector.pool.hand.names])
+    given = features[:, list(detector.selected)].float().double()
+    torch.testing.assert_close(found, detector.scaled(given, is_missing.expand(num, -1)))
+
+
+@pytest.mark.parametrize("override", ["num_features=3", "anew=shared"])
+def test_sensors_select_nothing_anew_where_all_is_pooled(override, pooled_run, tmp_path):
+    with pytest.raises(
+        ValueError, match="leave out num_features and anew, or train with"
+    ) as caught:
+        sensors_of(pooled_run, tmp_path, override)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("what", "line"),
+    [
+        (("statistics=true",), "statistics=true needs a machine of degree 2"),
+        (("tuning=gradient",), "tuning needs a machine of degree 2"),
+    ],
+)
+def test_what_needs_channel_features_says_so(what, line, tmp_path):
+    with pytest.raises(ValueError, match="take recipe=robust or recipe=paper") as caught:
+        train(composed(*TINY, "cache=off", *what), tmp_path)
+    assert str(caught.value).startswith(line)
+    assert "\n" not in str(caught.value)
+
+
+def test_shards_need_channel_features_and_say_so(tmp_path):
+    overrides = [o for o in TINY if not o.startswith("export")]
+    config = composed(
+        *overrides, "recipe=general", "action=collect", f"out={tmp_path / 'a'}", name="stats"
+    )
+    with pytest.raises(ValueError, match=r"sums need a machine of degree 2 .* take recipe=robust"):
+        stats(config)
+    assert not (tmp_path / "a").exists()
