@@ -390,9 +390,9 @@ NONE = Limits(1.0, 1.0, [5.0])
 
 
 def test_landmarks_are_the_best_the_cheap_and_the_small():
-    def found(*rows, less=1 / 3):
+    def found(*rows):
         get = [lambda row, i=i: row[i] for i in range(3)]
-        return list(landmarks(rows, *get, less).values())
+        return list(landmarks(rows, *get).values())
 
     best, third, poor = (0.99, 300.0, 100), (0.981, 100.0, 60), (0.979, 10.0, 30)
     few, fewer = (0.95, 200.0, 20), (0.94, 90.0, 8)
@@ -401,16 +401,14 @@ def test_landmarks_are_the_best_the_cheap_and_the_small():
     assert found(best, third, poor) == [best, third, None]
     quick = (0.99, 200.0, 100)  # of the same accuracy: the quickest
     assert found(best, quick, third) == [quick, None, None]
-    assert found(best, quick, third, less=0.5) == [quick, third, None]
 
 
-def test_landmarks_are_found_by_the_model_that_errs():
-    line = [candidate(60.0 + i, 100.0 * (i + 1), 0.5 + 0.04 * i) for i in range(10)]
-    few = candidate(90.0, 5000.0, 0.3, size=20)
-    cheap = candidate(91.0, 300.0, 0.8501)  # of 1000 us; with a model that errs: none
-    named = worth_naming([*line, few, cheap])
-    assert [each for each in named if each is not cheap] == [line[9], few] * 3
-    assert cheap in named
+def test_the_best_of_each_group_and_of_few_numbers_may_be_named():
+    made = [candidate(60.0, 100.0, accuracy) for accuracy in (0.8, 0.9, 0.7)]
+    pooled = [each._replace(columns="pooled mean") for each in made]
+    time = [each._replace(components="time") for each in pooled[:1]]
+    few = [candidate(60.0, 100.0, accuracy, size=20) for accuracy in (0.4, 0.5)]
+    assert worth_naming([*made, *pooled, *time, *few]) == [made[1], pooled[1], time[0], few[1]]
 
 
 def test_worth_timing_goes_by_layers():

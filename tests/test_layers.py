@@ -620,6 +620,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "recipe",
         "planning",
         "fitting",
+        "graph.*",
         "progress",
     ),
     "pareto": ("*",),

@@ -97,7 +97,6 @@ def landmarks(
     accuracy: Callable[[_T], float],
     compute: Callable[[_T], float],
     size: Callable[[_T], int],
-    less_compute: float = LESS_COMPUTE,
 ) -> dict[str, _T | None]:
     """The detectors that a user asks for first, of several equally accurate ones the quickest.
 
@@ -106,7 +105,6 @@ def landmarks(
         accuracy: of a detector.
         compute: of a detector.
         size: how many numbers its machine takes.
-        less_compute: part of the compute of the most accurate one that ``"cheap"`` may take.
 
     Returns:
         ``"most_accurate"``; ``"cheap"``, at most 1 point worse, with at most a third of its
@@ -118,26 +116,27 @@ def landmarks(
 
     top = best(detectors)
     assert top is not None
-    most, least = less_compute * compute(top), accuracy(top) - LESS_ACCURATE
+    most, least = LESS_COMPUTE * compute(top), accuracy(top) - LESS_ACCURATE
     cheap = [each for each in detectors if compute(each) <= most and accuracy(each) >= least]
     few = [each for each in detectors if size(each) <= FEW_NUMBERS]
     return {"most_accurate": top, "cheap": best(cheap), "few": best(few)}
 
 
 def worth_naming(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """The ``landmarks`` as modelled, also if the model errs."""
-    return [
-        each
-        for factor in _MODEL_ERRS
-        for each in landmarks(
-            candidates,
-            lambda each: each.balanced_accuracy,
-            lambda each: each.latency.compute_us,
-            lambda each: each.frame.size,
-            factor * LESS_COMPUTE,
-        ).values()
-        if each is not None
-    ]
+    """Candidates that may be ``landmarks``: the best of few numbers, and of each group.
+
+    What compute a graph takes is not modelled; it depends on the descriptors first.
+    """
+    best: dict[object, Candidate] = {}
+    for each in candidates:
+        groups: list[object] = [(each.columns == "channel", each.components)]
+        if each.frame.size <= FEW_NUMBERS:
+            groups.append(FEW_NUMBERS)
+        for group in groups:
+            other = best.setdefault(group, each)
+            if each.balanced_accuracy > other.balanced_accuracy:
+                best[group] = each
+    return list(best.values())
 
 
 def worth_timing(candidates: Sequence[Candidate], most: int, limits: Limits) -> list[Candidate]:

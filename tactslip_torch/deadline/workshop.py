@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from tactslip_torch.data.labels import needed_windows
 from tactslip_torch.data.splits import Split
@@ -15,12 +16,21 @@ from tactslip_torch.deadline.cost import CostModel, measure_costs
 from tactslip_torch.deadline.front import Candidate
 from tactslip_torch.deadline.latency import Latency, shortest_hop
 from tactslip_torch.deadline.search import Search, offset_of
-from tactslip_torch.deadline.timing import Timing, one_thread, time_detector
+from tactslip_torch.deadline.timing import (
+    Timing,
+    one_thread,
+    single_bins,
+    time_calls,
+    time_detector,
+)
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pool import Arithmetic, FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.fitting import TrainingPass, solve_facts
+from tactslip_torch.graph.bins import bin_graph
+from tactslip_torch.graph.form import Form
+from tactslip_torch.graph.runs import session_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.planning import adds_up, plan_detector
@@ -39,12 +49,15 @@ class Timed:
         arithmetic: of its pool.
         timing: of ``judge_raw``.
         latency: with the shortest hop that compute at p99 fits into.
+        graph_us: median of its ONNX graph in onnxruntime, of samples in float32; of the pool in
+            float64.
     """
 
     candidate: Candidate
     arithmetic: Arithmetic
     timing: Timing
     latency: Latency
+    graph_us: float
 
     @property
     def point(self) -> tuple[float, float, float]:
@@ -126,12 +139,13 @@ class Workshop:
         """Detectors of the candidates, fitted to the sample, in every arithmetic, by the clock."""
         found = []
         for candidate in bar(candidates, "timing the front", "detector"):
+            graph_us = time_graph(self.make(candidate, "double"), self.search.calls).p50_us
             for arithmetic in self.search.arithmetics:
                 with one_thread():
                     timing = time_detector(self.make(candidate, arithmetic), self.search.calls)
                 latency = replace(candidate.latency, compute_us=timing.p99_us)
                 latency = shortest_hop(latency, self.search.hops_ms)
-                found.append(Timed(candidate, arithmetic, timing, latency))
+                found.append(Timed(candidate, arithmetic, timing, latency, graph_us))
         return found
 
     def make(
@@ -212,6 +226,18 @@ class Workshop:
             "balanced_accuracy": recalls_mean(torch.cat(says), is_slip),
             "num_bins": len(is_slip),
         }
+
+
+def time_graph(detector: SlipDetector, calls: int) -> Timing:
+    """Time the ONNX graph of a detector in onnxruntime, one ordinary bin and one thread."""
+    session = session_of(bin_graph(detector, Form()).model({}))
+    samples = next(each for each in session.get_inputs() if each.name == "samples")
+    bins = single_bins(detector.pool, samples.shape[-1])
+
+    def call(given: Tensor) -> object:
+        return session.run(None, {"samples": given.numpy()})
+
+    return time_calls(call, bins, calls)
 
 
 def _quietly(items: Iterable[Any], what: str) -> Iterable[Any]:
