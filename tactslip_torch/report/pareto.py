@@ -135,7 +135,7 @@ def pareto_figure(found: Mapping[str, Any], path: str | Path) -> None:
     right.set_xlabel("compute, raw samples to decision, p99, us")
     right.set_title("one bin, one thread; dotted: the limit", fontsize=10)
     handles, labels = right.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=9, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=150)
 
