@@ -88,7 +88,8 @@ def check_bins(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
     judged = Judged(run, detector, form)
     hand, rate = detector.pool.hand, detector.pool.sample_rate_hz
     length, dtype = judged.window.length, judged.dtype
-    unit = unit_of(detector)
+    pooling = detector.pooling
+    unit = unit_of(None if pooling is None else pooling.least_range)
     simulated = unit * simulated_bins(hand, rate, _SIMULATED, length, dtype)
     slip = judged.compare([simulated], "simulated bins")
     drawn = [

@@ -56,7 +56,9 @@ def check_stream(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]
     timing = Timing.of(detector, settings)
     hand, rate = detector.pool.hand, detector.pool.sample_rate_hz
     slip = simulated_stream(hand, rate, dtype, _FEWEST_BINS * max(timing.first, timing.frame)).T
-    whole = slowed(unit_of(detector) * slip, timing)
+    pooling = detector.pooling
+    unit = unit_of(None if pooling is None else pooling.least_range)
+    whole = slowed(unit * slip, timing)
     expected = _columns(double, settings, whole)
     sd = float(expected["score"].std()) or 1.0
     worst = WORST_SD[form.precision]

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.simulation.extremes import EXTREMES, RAIL_V, extreme_bins
 from tactslip_torch.simulation.scene import Scene
 from tactslip_torch.simulation.simulate import simulate
@@ -89,15 +88,18 @@ def simulated_bins(
     return samples.unfold(-1, length, 1)[:, starts].movedim(1, 0).contiguous()
 
 
-def unit_of(detector: SlipDetector) -> float:
+def unit_of(least_range: Tensor | None) -> float:
     """What a volt is to a detector, a power of 2 from 1 on.
 
     One that leaves out channels which hardly move, by what it was trained on in another unit, must
     hear of something in what it is tried on.
+
+    Args:
+        least_range: of a channel that is not stuck, by kind (``ChannelPooling``).
     """
-    if detector.pooling is None or not len(detector.pooling.least_range):
+    if least_range is None or not len(least_range):
         return 1.0
-    quietest = float(detector.pooling.least_range.max()) / _QUIET_V
+    quietest = float(least_range.max()) / _QUIET_V
     return 2.0 ** max(math.ceil(math.log2(quietest)), 0) if quietest > 0 else 1.0
 
 
