@@ -48,7 +48,8 @@ def measure(model: Path | None, overrides: Sequence[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         if model is None:
             run = Path(folder) / "run"
-            _run("tactslip_torch.train", "+exp=unseen4", "export=false", f"hydra.run.dir={run}")
+            given = ["+exp=unseen4", "recipe=robust", "export=false"]  # selects among channels
+            _run("tactslip_torch.train", *given, f"hydra.run.dir={run}")
             model = run / "detector.pt"
         for name in SECTIONS:
             out = Path(folder) / name

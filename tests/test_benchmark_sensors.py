@@ -21,7 +21,7 @@ def here(module, *arguments):
     folder = Path(next(a for a in arguments if a not in rest).partition("=")[2])
     if module == "tactslip_torch.train":
         folder.mkdir()
-        train(composed_train(*TINY, "cache=off"), folder)
+        train(composed_train(*TINY, "recipe=robust", "cache=off"), folder)
     else:
         sensors(composed(*rest, "cache=off"), folder)
 
