@@ -10,8 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from fractions import Fraction
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -46,7 +44,7 @@ def resample(samples: Tensor, from_hz: float, to_hz: float) -> Tensor:
 
     Raises:
         ValueError: if samples are none, a rate is not positive, their ratio is none of two whole
-            numbers up to ``MOST``, or SciPy is not installed.
+            numbers up to ``MOST``.
 
     Example:
         >>> resample(torch.ones(1, 5), 100.0, 50.0)
@@ -70,7 +68,9 @@ def resample(samples: Tensor, from_hz: float, to_hz: float) -> Tensor:
     blocks = -(-_HALF * max(up, down) // (up * down))  # of ``down`` samples, which become ``up``
     margin = ((0, 0), (blocks * down, blocks * down))
     padded = np.pad(np.where(is_good, x - offset, 0.0), margin, mode="edge")
-    found = _scipy_signal().resample_poly(padded, up, down, axis=-1)
+    from scipy.signal import resample_poly  # takes half a second to import
+
+    found = resample_poly(padded, up, down, axis=-1)
     found = found[:, blocks * up : blocks * up + num] + offset  # which would ripple a little
     for row in np.flatnonzero(~is_good.all(-1)):
         found[row, _is_reached(~is_good[row], num, up, down)] = np.nan
@@ -148,11 +148,3 @@ def _is_reached(is_bad: NDArray[Any], num: int, up: int, down: int) -> NDArray[n
     first = np.clip(-((reach - places) // up), 0, len(is_bad))
     last = np.clip((places + reach) // up + 1, 0, len(is_bad))
     return np.asarray(before[last] > before[first])
-
-
-def _scipy_signal() -> Any:
-    if find_spec("scipy") is None:
-        raise ValueError(
-            'resampling needs scipy, which is not installed; pip install "tactslip_torch[formats]"'
-        )
-    return import_module("scipy.signal")
