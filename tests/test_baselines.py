@@ -10,13 +10,18 @@ from small_detector import HAND
 from small_set import SmallSet, small_maker
 from test_learning import learn, unseen_c
 
-from tactslip_torch.baselines import KEY, Baselines, PooledNumber
+from tactslip_torch.baselines import (
+    KEY,
+    Baselines,
+    LogisticRegression,
+    PooledNumber,
+    RandomForest,
+    SimpleStatistics,
+)
 from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.simple import SimpleStatistics
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.classifiers import LogisticRegression, RandomForest
 from tactslip_torch.model.detector import SlipDetector
 
 pytestmark = pytest.mark.filterwarnings(

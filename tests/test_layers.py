@@ -512,7 +512,9 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "features.*",
         "signals.*",
     ),
+    "baselines": ("recipe", "model.*", "features.*"),
     "learning": (
+        "baselines",
         "pace",
         "datamodule",
         "feature_maker",

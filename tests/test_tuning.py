@@ -261,7 +261,7 @@ def test_second_fit_is_of_what_was_learned(small, tuned):
     assert made.channel_filter.kernels == {k: tuple(v) for k, v in tuned.kernels.items()}
 
     class First:
-        recipe, abstaining = RECIPE, None
+        recipe, abstaining, with_baselines = RECIPE, None, False
 
     learner = settled_learner(First(), made, tuned.frame, tuned.penalty, tuned.offset)
     assert learner.recipe.penalties_ascending == (tuned.penalty,)
