@@ -41,8 +41,9 @@ log = logging.getLogger(__name__)
 Progress = Callable[[Iterable[Any], str], Iterable[Any]]
 
 TRAINING_BINS = 100
-"""Bins of each stratum and class that a validation fold is fitted to, at most; it is scored on all
-sampled ones."""
+"""Bins of each stratum and class that a validation fold is fitted to, at most, so that machines
+with more columns than bins can be solved; it is scored on all sampled ones. Where every candidate
+is of pooled features at degree 1, all sampled bins are taken."""
 MOST_TRAINING_BINS = 2000
 """Of all strata together: many kinds of scenes have fewer bins each."""
 MOST_DUAL_BINS = 2500
@@ -137,6 +138,8 @@ def choose_model(
     if is_nested and len(whole) > 2:
         folds += [frozenset(pair) for pair in itertools.combinations(whole, 2)]
     data = _Data(recipe, pool, sample, weights, groups, allowed)
+    if not all(each.use == "pooled" and each.kernel.degree == 1 for each in structures):
+        data.thin_out()
     penalties = list(recipe.penalties_ascending)
     found: dict[frozenset[int], _Scores] = {}
     steps, lock = iter(progress(folds, "validation, groups left out")), threading.Lock()
@@ -269,19 +272,21 @@ class _Data:
         places = torch.arange(len(pool.names)) if allowed is None else allowed.nonzero().flatten()
         self.names = [pool.names[place] for place in places.tolist()]
         self.features = sample.features[:, places]
-        stratum = 2 * sample.group + sample.is_slip.long()
-        order = torch.zeros_like(stratum)  # of a bin within its stratum
         self.weights = weights.clone()
-        strata = stratum.unique().tolist()
+        self.is_kept = torch.ones_like(sample.is_slip)
+        self._stratum = 2 * sample.group + sample.is_slip.long()
+
+    def thin_out(self) -> None:
+        """Fit to fewer bins of each stratum; those that stay weigh more."""
+        strata = self._stratum.unique().tolist()
         most = min(TRAINING_BINS, max(MOST_TRAINING_BINS // len(strata), 10))
         for one in strata:
-            mine = (stratum == one).nonzero().flatten()
+            mine = (self._stratum == one).nonzero().flatten()
             # bins are sorted by recording; spread those that are kept over all of them
             kept = torch.linspace(0, len(mine) - 1, min(len(mine), most)).round().long()
-            order[mine] = 1
-            order[mine[kept]] = 0
+            self.is_kept[mine] = False
+            self.is_kept[mine[kept]] = True
             self.weights[mine] *= len(mine) / len(kept)
-        self.is_kept = order == 0
 
 
 class _Columns:
