@@ -362,7 +362,7 @@ def first_result(report: Mapping[str, Any], metrics: Mapping[str, Any]) -> str:
             "```",
             "",
             f"Balanced accuracy, %, {len(rows['test']['by_seed'])} seeds, **simulated**. *Unseen*",
-            "are the held-out materials, *another session* is another mounting of the six seen ones:",
+            "are the held-out materials, *another session* another mounting of the six seen ones:",
             "",
             "| | mean ± sd | by seed |",
             "|---|---|---|",
@@ -414,7 +414,7 @@ def figure(report: Mapping[str, Any], path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2, 3, 4])
     text = "seeds with which +exp=deploy is trained as well; it takes three times as long"
     parser.add_argument("--deploy", type=int, nargs="*", default=[0, 1, 2, 3, 4], help=text)
     parser.add_argument("--runs", type=Path, default=ROOT / "outputs" / "generalisation")
