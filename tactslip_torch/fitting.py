@@ -22,7 +22,7 @@ from tactslip_torch.model.sufficient import SufficientStats
 from tactslip_torch.planning import Plan, Progress
 
 Head = QuadraticForm | KernelSum
-GRID_BITS = 38  # of sums that hold 2^25 bins
+GRID_BITS = 38  # of sums that hold 2^24 bins
 
 
 class LinearSums:
