@@ -320,7 +320,7 @@ def page(report: Mapping[str, Any]) -> str:
         )
         lines += [
             "",
-            f"Nested validation is {below:.2f} points below held-out materials (wanted: -0.5 to 2).",
+            f"Nested validation is {below:.2f} points below held-out ones (wanted: -0.5 to 2).",
             f"Slips found on held-out materials beside motor vibration: {loud}.",
             "",
             *_by_seed(own),
