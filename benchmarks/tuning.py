@@ -28,7 +28,7 @@ LEARNED = {
     "C, c, scales and filters": "[penalty,offset,scales,smoothing,wavelet]",
 }
 _QUICK = ["+exp=quick", "tuning=gradient", "tuning.bins=6", "tuning.steps=2"]
-_QUICK += ["recipe.num_features=8"]
+_QUICK += ["recipe=robust", "recipe.num_features=8"]
 SECTIONS = tuple(LEARNED)
 
 

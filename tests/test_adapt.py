@@ -367,7 +367,7 @@ def test_a_detector_without_its_statistics_says_how_to_get_them(run, trained):
     with pytest.raises(ValueError, match="belongs to another detector"):
         adapt(settings(run, "action=list"), run / "results")
     (run / "statistics.pt").unlink()
-    with pytest.raises(FileNotFoundError, match="train with statistics=true"):
+    with pytest.raises(FileNotFoundError, match="train with recipe=robust statistics=true"):
         adapt(settings(run, "action=list"), run / "results")
 
 

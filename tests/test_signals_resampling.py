@@ -1,7 +1,6 @@
 """Samples at another rate against closed forms, and channels of several rates brought together."""
 
 import math
-import sys
 
 import numpy as np
 import pytest
@@ -140,12 +139,6 @@ def test_what_cannot_be_resampled_is_refused_in_one_line(samples, from_hz, to_hz
     with pytest.raises(ValueError, match=message) as refused:
         resample(samples, from_hz, to_hz)
     assert "\n" not in str(refused.value)
-
-
-def test_without_scipy_it_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "scipy", None)
-    with pytest.raises(ValueError, match=r'pip install "tactslip_torch\[formats\]"'):
-        resample(torch.ones(1, 5), 1.0, 2.0)
 
 
 # Several rates -------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ class Sizes:
         seed: of the simulated set and of draws.
     """
 
-    training: tuple[str, ...] = ("+exp=unseen4",)
+    training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
     counts: tuple[int, ...] = (1, 2, 5, 10)
     slip_free_counts: tuple[int, ...] = (2, 5, 10)
     draws: int = 3
@@ -36,6 +36,7 @@ class Sizes:
 QUICK = Sizes(
     training=(
         "+exp=quick",
+        "recipe=robust",
         "data.cycles=4",
         "recipe.num_features=10",
         "recipe.penalties=[0.0003]",

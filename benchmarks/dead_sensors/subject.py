@@ -61,7 +61,7 @@ def fitted_subject(sizes: Sizes) -> Subject:
         ValueError: if its scores cannot be calibrated.
     """
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = compose("train", ["+exp=unseen4", *sizes.overrides])
+        config = compose("train", ["+exp=unseen4", "recipe=robust", *sizes.overrides])
     source, rule = instantiate(config.data, _convert_="all"), instantiate(config.labels)
     recipe = instantiate(config.recipe, _convert_="all")
     fold = instantiate(config.split, _convert_="all")(source.ids)[0]

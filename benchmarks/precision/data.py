@@ -141,4 +141,4 @@ def _joined(parts: Sequence[Part]) -> Part:
 
 def _config(sizes: Sizes) -> DictConfig:
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("train", ["+exp=unseen4", *sizes.overrides])
+        return compose("train", ["+exp=unseen4", "recipe=robust", *sizes.overrides])
