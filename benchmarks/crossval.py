@@ -1,4 +1,4 @@
-"""Both recipes on every choice of four unseen materials: ``python -m benchmarks.crossval``.
+"""Recipes on every choice of four held-out materials: ``python -m benchmarks.crossval``.
 
 Runs ``python -m tactslip_torch.crossval`` unless this code has, keeps its numbers and its figure in
 ``benchmarks/results``, and puts the tables between the markers in README.md.
@@ -31,6 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
     parser.add_argument("--run", type=Path, default=ROOT / "outputs" / "crossval" / "0")
+    text = "of the markers in README.md and of the files in benchmarks/results"
+    parser.add_argument("--name", default="crossval", help=text)
     parser.add_argument("overrides", nargs="*", help="passed on, such as num_unseen=1")
     options = parser.parse_args(arguments)
     made_by = options.run / "code.txt"
@@ -42,18 +44,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise SystemExit(done.returncode)
         made_by.write_text(code)
     found = json.loads((options.run / "crossval.json").read_text())
-    with whole_file(RESULTS / "crossval.json") as temporary:
+    with whole_file(RESULTS / f"{options.name}.json") as temporary:
         temporary.write_text(json.dumps(found) + "\n")
-    crossval_figure(found, RESULTS / "crossval.png")
+    crossval_figure(found, RESULTS / f"{options.name}.png")
+    named = [] if options.name == "crossval" else [f"--name {options.name}"]
+    command = " ".join([COMMAND, *named, *(f"'{each}'" for each in options.overrides)])
     kind = "simulated" if found["simulated"] else "recorded"
     note = (
         f"Balanced accuracy, %, {kind}, seed {found['seed']}; machines fitted on "
-        f"{found['train_bins']} bins of each material and class (`{COMMAND}`):"
+        f"{found['train_bins']} bins of each material and class (`{command}`, code "
+        f"{code.split()[0]}):"
     )
     text = "\n\n".join([note, markdown(split_rows(found)), markdown(material_rows(found))])
     readme = ROOT / "README.md"
     with whole_file(readme) as temporary:
-        temporary.write_text(between_markers(readme.read_text(), "crossval", text))
+        temporary.write_text(between_markers(readme.read_text(), options.name, text))
 
 
 if __name__ == "__main__":
