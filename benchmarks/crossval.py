@@ -48,11 +48,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         temporary.write_text(json.dumps(found) + "\n")
     crossval_figure(found, RESULTS / f"{options.name}.png")
     named = [] if options.name == "crossval" else [f"--name {options.name}"]
-    command = " ".join([COMMAND, *named, *(f"'{each}'" for each in options.overrides)])
+    shown = " ".join([COMMAND, *named, *(f"'{each}'" for each in options.overrides)])
     kind = "simulated" if found["simulated"] else "recorded"
     note = (
         f"Balanced accuracy, %, {kind}, seed {found['seed']}; machines fitted on "
-        f"{found['train_bins']} bins of each material and class (`{command}`, code "
+        f"{found['train_bins']} bins of each material and class (`{shown}`, code "
         f"{code.split()[0]}):"
     )
     text = "\n\n".join([note, markdown(split_rows(found)), markdown(material_rows(found))])
