@@ -6,7 +6,7 @@ among it, is learned without the group that is left out. Of the candidates withi
 the best, the simplest machine with the strongest penalty is taken: penalties over several decades
 tie in validation and differ by far on a material that was not trained on.
 
-The choice itself is judged by leaving out two groups: for each group the same choice is made
+The choice itself is evaluated by leaving out two groups: for each group the same choice is made
 without it, and that machine is evaluated on it. This nested score may be reported.
 
 Reference:
@@ -110,7 +110,7 @@ def choose_model(
         progress: wraps the folds.
         num_bins: that the machine will be trained on.
         allowed: which features may be used, ``[F]``, bool.
-        is_nested: whether to judge the choice itself by leaving out two groups.
+        is_nested: whether to evaluate the choice itself by leaving out two groups.
 
     Raises:
         ValueError: if no group has bins of both classes, or there is one group only.
@@ -182,14 +182,14 @@ def candidates(recipe: Recipe, num_bins: int) -> list[Structure]:
     Raises:
         ValueError: if there is none.
     """
-    sizes: list[int | None] = [*([None] if None in _several(recipe.num_features) else [])]
+    sizes: list[int | None] = [None] if recipe.takes_all else []
     sizes += recipe.sizes
     found = [
         Structure(use, size, kernel)
         for size in sizes
         for kernel in recipe.kernels
         if isinstance(kernel, Polynomial)
-        for use in _several(recipe.use)
+        for use in recipe.uses
         if kernel.degree == 1 or size is not None or num_bins <= MOST_DUAL_BINS
         if kernel.degree == 1 or not recipe.scene_weights or num_bins <= MOST_DUAL_BINS
     ]
@@ -557,7 +557,3 @@ def _calibration(
     except ValueError as error:
         log.warning("scores are not calibrated: %s", error)
         return None
-
-
-def _several(value: Any) -> tuple[Any, ...]:
-    return tuple(value) if isinstance(value, (tuple, list)) else (value,)

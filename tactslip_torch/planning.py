@@ -175,7 +175,7 @@ def plan_detector(
     """Choose the features and the machine by validation on held-out groups.
 
     A recipe with ``validation="nested"`` chooses by ``model_selection`` and needs the ``pool``;
-    ``is_nested=False`` leaves out the judgement of the choice. For other recipes: rank, scale, and
+    ``is_nested=False`` does not evaluate the choice itself. For other recipes: rank, scale, and
     choose K, c and C by closed-form validation. Features that were ranked and scaled elsewhere come
     as a ``frame``; which ones may be selected here, for a recipe that restricts them, as
     ``allowed``, what ``recipe.allowed`` says.

@@ -69,7 +69,7 @@ class Recipe:
         ranking: ``"t"``, the paper's t-test, or ``"gd"``, which knows of groups (ours:
             ``group_scores``).
         validation: ``"held"``: features are ranked and scaled once for all validation folds;
-            ``"nested"``: anew in each fold, and the choice is judged by leaving out two groups
+            ``"nested"``: anew in each fold, and the choice is evaluated by leaving out two groups
             (``model_selection``).
         tolerance: choices within so much of the best balanced accuracy are as good: of them, the
             simplest machine with the strongest penalty is taken. For ``"nested"``.
@@ -159,7 +159,7 @@ class Recipe:
     def _check_nested(self) -> None:
         """Refuse what only a nested validation can do, without one."""
         known = ("channel", "pooled", "both")
-        if unknown := [name for name in _several(self.use) if name not in known]:
+        if unknown := [name for name in self.uses if name not in known]:
             raise ValueError(f"recipe.use must be some of {', '.join(known)}, got {unknown[0]!r}")
         if not 0 <= self.tolerance < 1:
             raise ValueError(f"recipe.tolerance must lie in [0, 1), got {self.tolerance}")
@@ -168,7 +168,7 @@ class Recipe:
         for scene, weight in self.scene_weights.items():
             if not 0 < weight < math.inf:
                 raise ValueError(f"recipe.scene_weights.{scene} must be positive, got {weight}")
-        if set(_several(self.use)) != {"channel"} and self.pooling is None:
+        if set(self.uses) != {"channel"} and self.pooling is None:
             raise ValueError(
                 "recipe.use=pooled needs statistics over channels; set features.pooling=[mean, std]"
             )
@@ -180,14 +180,24 @@ class Recipe:
                 )
             return
         wants = {
-            "use": set(_several(self.use)) != {"channel"},
-            "num_features=null": None in _several(self.num_features),
+            "use": set(self.uses) != {"channel"},
+            "num_features=null": self.takes_all,
             "several degrees": len(_several(self.degree)) > 1,
             "ranking=gd": self.ranking == "gd",
             "scene_weights": bool(self.scene_weights),
         }
         if wanted := [name for name, is_wanted in wants.items() if is_wanted]:
             raise ValueError(f"recipe: {wanted[0]} needs recipe.validation=nested, as general has")
+
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """Kinds of features to choose from."""
+        return _several(self.use)
+
+    @property
+    def takes_all(self) -> bool:
+        """Whether all features, without selection, are among what is chosen from."""
+        return None in _several(self.num_features)
 
     @property
     def sizes(self) -> tuple[int, ...]:
