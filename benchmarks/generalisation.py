@@ -87,10 +87,10 @@ def is_at_most(measure: str) -> bool:
     return "called slip" in measure or "error" in measure
 
 
-def config_of(seed: int, overrides: Sequence[str]) -> Any:
+def config_of(overrides: Sequence[str]) -> Any:
     """The configuration of a set of recordings."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("train", ["+exp=unseen4", f"seed={seed}", *overrides])
+        return compose("train", list(overrides))
 
 
 def recordings(
@@ -197,7 +197,7 @@ def seed_run(seed: int, folder: Path, cache: Path, name: str, *, quick: bool) ->
     }
 
     def on(what: str, over: Sequence[str], keep: Any, *, half: bool = False) -> list[Scored]:
-        config = config_of(seed, [*small, *over])
+        config = config_of(["+exp=unseen4", f"seed={seed}", *small, *over])
         made = recordings(config, cache, keep, f"seed {seed}, {what}")
         return [scored(detector, each, half=half) for each in made]
 

@@ -31,6 +31,9 @@ from tactslip_torch.model.scaling import FeatureScaler
 Balance = Literal["undersample", "weights"]
 GroupBy = Literal["material", "cycle"]
 CYCLE_GROUPS = 5
+FREE_CONSTANT = 1.0e6
+"""``c`` of degree 1, where it weighs the constant alone: so large, the penalty does not reach it.
+A penalised constant moves the threshold of a machine with few bins or a strong penalty."""
 _SCENE = "|"  # between group and scene in the name of a stratum
 
 
@@ -254,7 +257,7 @@ class Recipe:
         if self.kernel == "rbf":
             return (RadialBasis(float(self.gamma or 0.0)),)
         return tuple(
-            Polynomial(degree, float(c))
+            Polynomial(degree, FREE_CONSTANT if degree == 1 else float(c))
             for degree in sorted(_several(self.degree))
             for c in _several(self.offsets)
         )

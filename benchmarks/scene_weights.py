@@ -1,0 +1,141 @@
+"""Weights of scenes of ``+exp=deploy``, by validation: ``python -m benchmarks.scene_weights``.
+
+For each set of weights, and for each training material: a machine is fitted to training bins of the
+other training materials, and evaluated on those of this one. No test cycle and no held-out material
+is read. The weights with the least mean error are taken; the error is the mean of three: protocol
+bins decided wrongly (mean of both classes), bins of a moving arm without slip called slip, and
+slips beside a loud arm that are missed. All data are simulated.
+
+Writes ``benchmarks/results/scene_weights.json``; ``benchmarks.generalisation`` shows it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from hydra.utils import instantiate
+from torch import Tensor
+
+from benchmarks.generalisation import config_of, recordings
+from benchmarks.outcome import RESULTS
+from benchmarks.reproduction.runs import code_digest
+from tactslip_torch.data.recording import RecordingId, RecordingSource
+from tactslip_torch.data.splits import PAPER_SCENE, Split
+from tactslip_torch.experiment import feature_parts
+from tactslip_torch.features.bin_sample import BinSample, SampledBins
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.files import whole_file
+from tactslip_torch.fitting import LinearSums
+from tactslip_torch.model_selection import candidates, fitted_frame
+from tactslip_torch.recipe import Recipe, sample_groups, stand_for
+
+WEIGHTS = {"arm_motion": (0.3, 1.0, 3.0), "paper_loud": (0.3, 1.0), "others": (0.1, 0.3, 1.0)}
+PENALTY = 1e-3  # what validation takes for every seed of +exp=unseen4
+FILE = RESULTS / "scene_weights.json"
+
+
+def training_bins(
+    seed: int, cache: Path, small: Sequence[str]
+) -> tuple[Recipe, FeaturePool, SampledBins]:
+    """The recipe of ``+exp=deploy``, its pool, and a sample of its training bins."""
+    config = config_of(["+exp=deploy", f"seed={seed}", *small])
+    recipe: Recipe = instantiate(config.recipe, _convert_="all")
+    pool = feature_parts(
+        instantiate(config.data, _convert_="all"), config.labels.bin_ms, **config.features
+    )[0]
+    sample = BinSample(recipe.sample_bins)
+
+    def keep(source: RecordingSource) -> list[RecordingId]:
+        fold: Split = instantiate(config.split, _convert_="all")(source.ids)[0]
+        return fold.having("train")
+
+    for made in recordings(config, cache, keep, f"seed {seed}, training"):
+        stratum = recipe.stratum(made.recording)
+        sample.update(str(made.recording), stratum, made.features, made.is_slip)
+    return recipe, pool, sample.bins()
+
+
+def without(sample: SampledBins, is_out: Tensor) -> SampledBins:
+    """The other bins of a sample."""
+    own = ("features", "is_slip", "group", "recording", "bin_index", "represents")
+    return replace(sample, **{name: getattr(sample, name)[~is_out] for name in own})
+
+
+def error_rows(
+    recipe: Recipe, pool: FeaturePool, sample: SampledBins
+) -> Iterator[tuple[tuple[float, ...], dict[str, float]]]:
+    """Errors in % on each left-out material, for each set of weights."""
+    structure = candidates(recipe, len(sample.is_slip))[0]
+    groups, names = sample_groups(sample)
+    scene = [name.split("|")[-1] for name in sample.group_names]
+    is_of = {one: torch.tensor([s == one for s in scene])[sample.group] for one in set(scene)}
+    slip = sample.is_slip
+    counts = [float(sample.represents[slip == kind].sum()) for kind in (False, True)]
+    for place in range(len(names)):
+        is_out = groups == place
+        training = without(sample, is_out)
+        frame = fitted_frame(recipe, pool, training, structure, recipe.allowed(pool))
+        z, others = frame(training.features), frame(sample.features[is_out])
+        for weights in itertools.product(*WEIGHTS.values()):
+            by_scene = dict.fromkeys(recipe.scene_weights, weights[-1])
+            by_scene |= dict(zip(WEIGHTS, weights[:-1], strict=False))
+            each = stand_for(training, replace(recipe, scene_weights=by_scene), counts)
+            sums = LinearSums(frame.size)
+            sums.update(z, training.is_slip, each)
+            says = torch.zeros_like(slip)
+            says[is_out] = sums.solve(PENALTY, 1.0, "none")(others) >= 0
+
+            def share(one: str, truth: bool, says: Tensor = says, is_out: Tensor = is_out) -> float:
+                mine = is_out & is_of[one] & (slip == truth)
+                return 100 * float((says[mine] != truth).double().mean())
+
+            protocol = (share(PAPER_SCENE, False) + share(PAPER_SCENE, True)) / 2
+            yield (
+                weights,
+                {
+                    "protocol": protocol,
+                    "moving arm called slip": share("arm_motion", False),
+                    "slips beside a loud arm missed": share("paper_loud", True),
+                },
+            )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--cache", type=Path, default=Path("outputs/generalisation/cache"))
+    parser.add_argument("--quick", action="store_true", help="few recordings; writes nothing")
+    options = parser.parse_args(arguments)
+    small = ["data.cycles=5"] if options.quick else []
+    found: dict[tuple[float, ...], list[dict[str, float]]] = {}
+    for seed in options.seeds:
+        for weights, errors in error_rows(*training_bins(seed, options.cache, small)):
+            found.setdefault(weights, []).append(errors)
+    rows = []
+    for weights, of in found.items():
+        errors = {name: statistics.fmean(one[name] for one in of) for name in of[0]}
+        rows.append(
+            dict(zip(WEIGHTS, weights, strict=True))
+            | errors
+            | {"mean error": statistics.fmean(errors.values())}
+        )
+    rows.sort(key=lambda row: row["mean error"])
+    for row in rows:
+        print("  ".join(f"{name} {value:.3g}" for name, value in row.items()))
+    if options.quick:
+        return
+    report = {"simulated": True, "code": code_digest(), "seeds": options.seeds, "rows": rows}
+    with whole_file(FILE) as temporary:
+        temporary.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
