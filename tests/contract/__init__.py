@@ -1,0 +1,1 @@
+"""What must stay true while everything behind the public names and commands is rearranged."""

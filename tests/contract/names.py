@@ -1,0 +1,215 @@
+"""Every name, command, configuration key and file that the contract tests reach.
+
+A renaming edits this file alone; its diff since 0.1.0 is the migration table of the changelog.
+Left: the word the tests use. Right: what it is called now.
+"""
+
+# ruff: noqa: F401  (the imports are the table)
+# Names in Python -------------------------------------------------------------------------------
+
+from collections.abc import Sequence
+
+from tactslip_torch import (
+    AlarmSettings,
+    FeatureExtractor,
+    FeaturePool,
+    HandLayout,
+    Scene,
+    SlipDetector,
+    StreamingDetector,
+    SufficientStats,
+    simulate,
+)
+from tactslip_torch.model.differentiable_fit import fit_quadratic
+from tactslip_torch.model.held_out_gradient import held_out_scores
+
+PACKAGE = "tactslip_torch"
+ENGINES = ("eager", "compiled")
+"""Of ``FeatureExtractor``, beside the reference, which is the pool itself."""
+
+
+def predict_raw(detector, samples, **options):
+    """Scores and validity of raw bins that come with their context."""
+    return detector.judge_raw(samples, **options)
+
+
+def score_raw(detector, samples):
+    return detector.score_raw(samples)
+
+
+def stream_with_masked_channels(detector, channels, **options):
+    return StreamingDetector(detector, dead=channels, **options)
+
+
+def solve_moments(stats, penalty):
+    return stats.solve(penalty=penalty)
+
+
+# Commands: the arguments of ``python`` -----------------------------------------------------------
+
+COMMANDS = {
+    "train": f"-m {PACKAGE}.train",
+    "evaluate": f"-m {PACKAGE}.evaluate",
+    "detect": f"-m {PACKAGE}.detect",
+    "generate": f"-m {PACKAGE}.generate",
+    "data": f"-m {PACKAGE}.data_tool",
+    "export": f"-m {PACKAGE}.export",
+    "adapt": f"-m {PACKAGE}.adapt",
+    "importance": f"-m {PACKAGE}.sensors",
+    "crossval": f"-m {PACKAGE}.crossval",
+    "pareto": f"-m {PACKAGE}.pareto",
+    "certify": f"-m {PACKAGE}.certify",
+    "calibrate": f"-m {PACKAGE}.calibrate",
+    "stats": f"-m {PACKAGE}.stats",  # may leave: DESIGN.md
+}
+BAD_INPUT_STATUS = 2
+TRACEBACK_VARIABLE = "TACTSLIP_TRACEBACK"
+
+# Configuration ---------------------------------------------------------------------------------
+
+KEYS = {
+    "action": "action",
+    "baselines": "baselines",
+    "bin_ms": "labels.bin_ms",
+    "bins": "bins",
+    "bins_of_fit": "train_bins",
+    "bins_to_explain": "gradient_bins",
+    "bins_to_score": "judged_bins",
+    "cache": "cache",
+    "calibration_points": "most_points",
+    "calibration_seeds": "seeds",
+    "channels": "data.channels",
+    "coverage": "coverage",
+    "cycles": "data.cycles",
+    "data": "data",
+    "deadline_ms": "deadline_ms",
+    "draws": "draws",
+    "dtype": "features.dtype",
+    "engine": "features.engine",
+    "every_decision": "decisions",
+    "experiment": "+exp",
+    "export": "export",
+    "extremes": "extremes",
+    "fact_cycles": "fact_cycles",
+    "figure": "figure",
+    "folder": "hydra.run.dir",
+    "format": "to",
+    "frames": "features.frames",
+    "generated_cycles": "cycles",
+    "graph": "graph",
+    "held_out": "split.unseen",
+    "input": "input",
+    "inputs": "inputs",
+    "label": "labels",
+    "layout": "labels.layout",
+    "masked_channels": "dead",
+    "materials": "data.materials",
+    "materials_of_crossval": "materials",
+    "model": "model",
+    "most_correlation": "recipe.most_correlation",
+    "most_channels": "most_channels",
+    "most_compute_us": "compute_us",
+    "num_features": "recipe.num_features",
+    "num_held_out": "num_unseen",
+    "onset": "onset",
+    "out": "out",
+    "output": "output",
+    "pattern": "pattern",
+    "penalties": "recipe.penalties",
+    "plan": "plan",
+    "precision": "precision",
+    "recipe": "recipe",
+    "recordings": "recordings",
+    "resume": "ckpt_path",
+    "retime_calls": "retime_calls",
+    "root": "data.root",
+    "root_of_data": "root",
+    "scene_setting": "+scene",
+    "search": "search",
+    "seed": "seed",
+    "seen": "split.seen",
+    "shard": "shard",
+    "slip_free": "slip_free",
+    "split": "split",
+    "statistics": "statistics",
+    "tolerance": "tolerance",
+    "train_share": "split.train_share",
+    "train_share_of_crossval": "train_share",
+    "workers": "num_workers",
+}
+"""By the tests' word the key on the command line."""
+MISSPELT_KEY = "recipe.num_featurs"
+
+
+def settings(**given: object) -> list[str]:
+    """Overrides for a command line; keys as in ``KEYS``."""
+    return [f"{KEYS[word]}={_written(value)}" for word, value in given.items()]
+
+
+def _written(value: object) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k}: {_written(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return "[" + ", ".join(map(_written, value)) + "]"
+    return str(value)
+
+
+# Words in files --------------------------------------------------------------------------------
+
+DETECTOR = "detector.pt"
+METRICS = "metrics.json"
+CHECKPOINT = "last.ckpt"
+STATISTICS = "statistics.pt"
+BIN_GRAPH = "model.onnx"
+STREAM_GRAPH = "stream.onnx"
+SIDECAR = "{}.json"
+ONSETS = ("onsets.json", "onsets.csv")
+CERTIFICATE = "certificate.json"
+MANIFEST = "manifest.csv"
+
+# metrics.json: the splits' names, and what the fit alone decides
+TRAIN, TEST, HELD_OUT = "train", "test", "unseen"
+SPLITS = "splits"
+CONFUSION = "confusion"
+FIT_FACTS = ("selected", "penalty", "kernel", "solve", "validation", "num_bins")
+TRAINING_RECORDINGS = "train_recordings"  # in the detector's info
+
+# Graphs: inputs and outputs
+BIN_INPUT, BIN_OUTPUTS = "samples", ("score", "probability", "valid")
+MASK_INPUT = "dead"
+STREAM_INPUTS = ("samples", "tail", "state", "threshold")
+STREAM_HANDED_ON = {"tail": "next_tail", "state": "next_state"}
+STREAM_OUTPUTS = {
+    "score": "score",
+    "probability": "probability",
+    "statistic": "statistic",
+    "valid": "is_valid",
+    "alarm": "is_alarm",
+    "on": "is_on",
+    "time_s": "available_s",
+    "onset_s": "onset_s",
+}
+"""Of the stream's graph and of the hosts, beside the fields of what ``push`` returns."""
+
+# Recordings in files ---------------------------------------------------------------------------
+
+from tactslip_torch.data.clock import even_clock  # noqa: E402
+from tactslip_torch.data.formats.reading import Reading, pieces  # noqa: E402
+from tactslip_torch.data.formats.registry import (  # noqa: E402
+    FORMATS,
+    endings,
+    find_format,
+    format_of,
+    named_format,
+    open_file,
+)
+
+EXTRA_OF_FORMATS = {
+    "h5py": "formats",
+    "mcap": "formats",
+    "rosbags": "formats",
+    "pyarrow": "parquet",
+}
+"""By the library that reads or writes a format the extra that brings it."""

@@ -1,0 +1,896 @@
+"""Files: ours there and back, other people's as they meant them, by stretches; or one line."""
+
+import importlib.util
+import json
+import pickle
+import shutil
+import zipfile
+from itertools import pairwise
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import scipy.io
+import torch
+from mcap.reader import make_reader
+from message_bags import (
+    START_NS,
+    STEP_NS,
+    WRENCH,
+    How,
+    Sent,
+    array,
+    json_message,
+    noise,
+    times,
+    wrench,
+    wrenches,
+    write_bag,
+    write_mcap,
+)
+from rosbags.highlevel import AnyReader
+
+from tactslip_torch import HandLayout, Recording
+
+from .names import (
+    EXTRA_OF_FORMATS,
+    FORMATS,
+    Reading,
+    endings,
+    even_clock,
+    find_format,
+    format_of,
+    named_format,
+    open_file,
+    pieces,
+)
+
+ENDINGS = ("npz", "csv", "tsv", "txt", "dat", "h5", "hdf5", "he5", "mat", "mcap", "parquet", "bag2")
+KEY = {"scene": {"seed": 3}, "list": [1, None]}
+TRUTH = (
+    "sample_rate_hz",
+    "material",
+    "speeds_mm_s",
+    "onsets_s",
+    "annotated_onsets_s",
+    "sliding_s",
+    "non_slip_s",
+    "slip_s",
+    "units",
+    "provenance",
+)
+FLOATS = "std_msgs/msg/Float64MultiArray"
+
+
+def hand_of(names):
+    return HandLayout.from_rows(
+        {"name": name, "kind": "SG", "finger": f"f{i}", "segment": "tip", "adapting": "slow"}
+        for i, name in enumerate(names)
+    )
+
+
+def recording(samples=None, **changes):
+    values = {
+        "samples": torch.from_numpy(noise(2, 1234, seed=3)) if samples is None else samples,
+        "sample_rate_hz": 2000.0,
+        "material": "Stahl ü 'x: y' #",
+        "speeds_mm_s": (20.0, 40.0),
+        "onsets_s": (1 / 3, 0.1 + 1e-9),
+        "sliding_s": ((0.1, 0.2), (0.3, 0.4)),
+        "annotated_onsets_s": (0.06, 1 / 3),
+        "non_slip_s": ((0.01, 0.02),),
+        "slip_s": ((0.25, 0.3),),
+        "provenance": {"simulated": True, "note": 'a\nb: [c, {d}] & *e \\ "f" \''},
+        "units": "mV",
+    }
+    return Recording(**(values | changes))
+
+
+def bits(samples):
+    """Bytes in which one NaN is as good as another: text keeps only that it is one."""
+    values = samples.numpy().copy()
+    values[np.isnan(values)] = np.nan
+    return values.tobytes()
+
+
+def odd_numbers(dtype):
+    """Every pattern of bits that is easily lost: NaN, infinity, -0.0, the least number."""
+    whole, real = (np.uint32, np.float32) if dtype == torch.float32 else (np.uint64, np.float64)
+    top = np.finfo(real).bits - 1
+    patterns = [0, 1 << top, 1, (1 << top) - 1, (1 << top) - 2, 3 << (top - 1)]
+    return torch.from_numpy(np.array(patterns, whole).view(real)).reshape(2, 3)
+
+
+def assert_truth(found, wanted, hand):
+    for name in TRUTH:
+        assert getattr(found.recording, name) == getattr(wanted, name), name
+    assert (found.hand, found.key) == (hand, KEY)
+
+
+def read(path, how=None):
+    """All that a file of somebody gives: samples, names, times, rate; by stretches as whole."""
+    with open_file(path, how or Reading()) as opened:
+        assert opened.archived is None
+        samples = opened.samples
+        size = samples.num_samples
+        whole = samples.read(0, size)
+        assert whole.dtype == samples.dtype
+        assert whole.shape == (samples.num_channels, size)
+        assert bits(torch.cat(list(pieces(samples, 7)), 1)) == bits(whole)
+        assert bits(samples.read(size // 3, size // 2)) == bits(whole[:, size // 3 : size // 2])
+        assert samples.read(size, size + 5).shape == (samples.num_channels, 0)
+        since = opened.times and opened.times.read(0, size)
+        if opened.times:
+            part = opened.times.read(size // 3, size // 2)
+            assert torch.equal(part, since[size // 3 : size // 2])
+        return whole, opened.names, since, opened.sample_rate_hz
+
+
+def refused(path, how=None, error=ValueError):
+    """The one line that a file gets; it names the file."""
+    with pytest.raises(error) as caught:
+        read(path, how)
+    said = str(caught.value)
+    assert "\n" not in said
+    assert str(path) in said
+    assert len(said) < 1000 + len(str(path))
+    return said
+
+
+# Ours ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_what_goes_in_comes_out(tmp_path, ending, dtype):
+    form, path = named_format(ending), tmp_path / f"a.{ending}"
+    for samples in (
+        torch.from_numpy(noise(3, 2001)).to(dtype),
+        torch.from_numpy(noise(1, 1)).to(dtype),
+        torch.arange(24.0).reshape(12, 2).to(dtype).T,  # not contiguous
+        odd_numbers(dtype),
+        torch.empty(2, 0, dtype=dtype),
+    ):
+        wanted = recording(samples, sample_rate_hz=1e6 / 3)
+        hand = hand_of(["SG1", "Kraft ü", 'a "b", c'][: len(samples)])
+        form.save(path, wanted, hand, KEY)
+        found = form.load(path)
+        assert found.recording.samples.dtype == dtype
+        assert found.recording.samples.shape == samples.shape
+        assert bits(found.recording.samples) == bits(samples.contiguous())
+        assert_truth(found, wanted, hand)
+        assert form.key(path) == KEY
+        with open_file(path) as opened:
+            assert_truth(opened.archived, wanted, hand)
+            assert opened.archived.recording.samples.shape == (len(hand), 0)
+            assert (opened.names, opened.sample_rate_hz) == (hand.names, 1e6 / 3)
+            parts = [samples[:, :0], *pieces(opened.samples, 333)]
+            assert bits(torch.cat(parts, 1)) == bits(samples.contiguous())
+            part = opened.samples.read(1500, 1600)
+            assert bits(part) == bits(samples[:, 1500:1600].contiguous())
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_equal_recordings_are_equal_bytes_whenever_written(tmp_path, ending, monkeypatch):
+    form = named_format(ending)
+    for folder in ("a", "b"):
+        form.save(tmp_path / folder / f"x.{ending}", recording(), hand_of("ab"), KEY)
+        monkeypatch.setattr("time.time", lambda: 2e9)
+        monkeypatch.setattr("time.asctime", lambda *_: "another day")
+    files = [sorted(p for p in (tmp_path / f).rglob("*") if p.is_file()) for f in ("a", "b")]
+    assert [p.read_bytes() for p in files[0]] == [p.read_bytes() for p in files[1]]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_what_cannot_be_kept_is_refused_and_nothing_is_lost(tmp_path, ending):
+    form, path = named_format(ending), tmp_path / f"a.{ending}"
+    form.save(path, recording(), hand_of("ab"), KEY)
+    for names, changes, key, said in (
+        ("abc", {}, {}, "the hand has 3 channels, the recording 2"),
+        ("ab", {"provenance": {"by": object()}}, {}, "provenance must be plain JSON"),
+        ("ab", {}, {"rate": float("nan")}, "key must be plain JSON"),
+        ("ab", {"samples": torch.zeros(2, 9, dtype=torch.int32)}, {}, "float32 or float64"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            form.save(path, recording(**changes), hand_of(names), key)
+    assert_truth(form.load(path), recording(), hand_of("ab"))
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_is_replaced_only_if_it_is_a_bag(tmp_path):
+    form, bag = named_format("bag2"), tmp_path / "bag #1?%41 ü.bag2"
+    form.save(bag, recording(), hand_of("ab"), {"n": 1})
+    form.save(bag, recording(), hand_of("ab"), {"n": 2})
+    assert form.key(bag) == {"n": 2}
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.tex").write_text("years of work")
+    (tmp_path / "file").write_text("a file")
+    (tmp_path / "link").symlink_to(bag)
+    for name in ("home", "file", "link"):
+        with pytest.raises(ValueError, match="give another name"):
+            form.save(tmp_path / name, recording(), hand_of("ab"), {})
+    assert (tmp_path / "home" / "thesis.tex").read_text() == "years of work"
+
+
+def test_libraries_alone_read_ours(tmp_path):
+    wanted, hand = recording(), hand_of(["a", "Fö"])
+    samples = wanted.samples.numpy()
+    for form in FORMATS.values():
+        form.save(tmp_path / f"a.{form.endings[0]}", wanted, hand, KEY)
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as content:
+        np.testing.assert_array_equal(content["samples"], samples)
+        assert (content["sample_rate_hz"], content["units"]) == (2000.0, "mV")
+        assert content["channel_name"].tolist() == ["a", "Fö"]
+        assert json.loads(str(content["key"])) == KEY
+    numbers = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=2)
+    np.testing.assert_array_equal(numbers[:, 1:].T, samples)
+    np.testing.assert_allclose(numbers[:, 0], np.arange(1234) / 2000)
+    with h5py.File(tmp_path / "a.h5") as file:
+        np.testing.assert_array_equal(file["samples"][()], samples)
+        assert file["samples"].attrs["sample_rate_hz"] == 2000.0
+        assert [name.decode() for name in file["samples"].attrs["channel_name"]] == ["a", "Fö"]
+    found = scipy.io.loadmat(tmp_path / "a.mat")
+    np.testing.assert_array_equal(found["samples"], samples)
+    assert [name.item() for name in found["channel_name"].flat] == ["a", "Fö"]
+    table = pq.read_table(tmp_path / "a.parquet")
+    assert table.schema.names == ["time_s", "a", "Fö"]
+    np.testing.assert_array_equal([table.column(n).to_numpy() for n in ("a", "Fö")], samples)
+    with (tmp_path / "a.mcap").open("rb") as file:
+        kinds = {(s.name, c.topic) for s, c, _ in make_reader(file, True).iter_messages()}
+    assert kinds == {(FLOATS, "/tactile")}
+    for name in ("a.mcap", "a.bag2"):
+        with AnyReader([tmp_path / name]) as reader:
+            sent = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()]
+        assert [axis.label for axis in sent[0].layout.dim] == ["samples", "channels"]
+        joined = np.concatenate([message.data.reshape(-1, 2) for message in sent])
+        np.testing.assert_array_equal(joined.T, samples)
+
+
+def test_ours_saved_again_by_others_are_ours(tmp_path):
+    wanted, hand = recording(), hand_of("ab")
+    named_format("npz").save(tmp_path / "a.npz", wanted, hand, KEY)
+    with np.load(tmp_path / "a.npz") as content:
+        np.savez_compressed(tmp_path / "b.npz", **content)
+    named_format("mat").save(tmp_path / "a.mat", wanted, hand, KEY)
+    found = {n: v for n, v in scipy.io.loadmat(tmp_path / "a.mat").items() if n[0] != "_"}
+    scipy.io.savemat(tmp_path / "b.mat", found, do_compression=True)
+    made_73(tmp_path / "c.mat", header=found["header"].item(), samples=found["samples"])
+    for name in ("b.npz", "b.mat", "c.mat"):
+        archived = format_of(tmp_path / name).load(tmp_path / name)
+        assert torch.equal(archived.recording.samples, wanted.samples)
+        assert_truth(archived, wanted, hand)
+
+
+@pytest.mark.parametrize("ending", ["npz", "csv", "h5", "mcap", "parquet", "bag2"])
+def test_a_damaged_sample_of_ours_is_noticed(tmp_path, ending):
+    """MAT files of version 5 keep no check sums; all others must notice, or text be no number."""
+    form, path = named_format(ending), tmp_path / f"a.{ending}"
+    form.save(path, recording(), hand_of("ab"), KEY)
+    inner = path / "recording.db3" if path.is_dir() else path
+    content = bytearray(inner.read_bytes())
+    values = recording().samples.numpy()
+    plain = {
+        "csv": repr(float(values[0, 700])).encode(),
+        "mcap": values[:, 700].tobytes(),
+        "bag2": values[:, 700].tobytes(),
+    }.get(ending, values[0, 700:703].tobytes())
+    content[content.index(plain) + 2] ^= 0x40
+    inner.write_bytes(content)
+    with pytest.raises(ValueError, match=f"a.{ending}"):
+        form.load(path)
+    with pytest.raises(ValueError, match=f"a.{ending}"), open_file(path) as opened:
+        opened.samples.read(0, 1234)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_cut_file_of_ours_gives_all_or_nothing(tmp_path, ending):
+    form, path = named_format(ending), tmp_path / f"a.{ending}"
+    form.save(path, recording(), hand_of("ab"), KEY)
+    inner = path / "recording.db3" if path.is_dir() else path
+    whole, all_of_it = inner.read_bytes(), bits(recording().samples)
+    for share in range(0, 100, 9):
+        inner.write_bytes(whole[: len(whole) * share // 100])
+        said, found = "", all_of_it
+        try:
+            found = bits(form.load(path).recording.samples)
+        except ValueError as error:
+            said = str(error)
+        assert found == all_of_it
+        assert not said or (str(path) in said and "\n" not in said)
+
+
+# Which files there are -------------------------------------------------------------------------
+
+
+def test_formats_are_known_by_their_ending(tmp_path):
+    wanted = {*ENDINGS, "npy", "lvm"} - {"bag2"}
+    assert wanted <= set(endings())
+    for ending in wanted:
+        assert find_format(tmp_path / f"A.{ending.upper()}") is named_format(ending)
+    assert find_format(tmp_path / "a.png") is find_format(tmp_path / ".csv") is None
+    assert refused(tmp_path / "a.csv", error=FileNotFoundError).startswith("no file")
+    (tmp_path / "a.png").touch()
+    assert "must end in .npz or " in refused(tmp_path / "a.png")
+    with pytest.raises(ValueError, match=r"format must be one of .*, got 'png'"):
+        named_format("png")
+
+
+@pytest.mark.parametrize("ending", [*(e for e in ENDINGS if e != "bag2"), "npy", "lvm"])
+def test_what_is_no_such_file_is_one_line(tmp_path, ending):
+    path = tmp_path / f"a.{ending}"
+    junk = [b"", bytes(5000), b"to be or not to be\n" * 50, b"\x89PNG\r\n\x1a\n" + bytes(99)]
+    for content in (*junk, b"PK\x05\x06" + bytes(18), bytes(range(256)) * 40, pickle.dumps([1])):
+        path.write_bytes(content)
+        refused(path)
+        for way in (named_format(ending).load, named_format(ending).key):
+            with pytest.raises(ValueError, match=f"a.{ending}") as caught:
+                way(path)
+            assert "\n" not in str(caught.value)
+    (tmp_path / f"folder.{ending}").mkdir()
+    refused(tmp_path / f"folder.{ending}")
+
+
+def test_theirs_is_not_loaded_as_ours(tmp_path):
+    np.savez(tmp_path / "a.npz", samples=np.zeros((2, 9)))
+    (tmp_path / "a.csv").write_text("t,a\n0,1\n")
+    made_hdf5(tmp_path / "a.h5", samples=np.zeros((2, 9)))
+    scipy.io.savemat(tmp_path / "a.mat", {"samples": np.zeros((2, 9))})
+    pq.write_table(pa.table({"a": [1.0, 2.0]}), tmp_path / "a.parquet")
+    write_mcap(tmp_path / "a.mcap", [wrenches(10)[0]])
+    write_bag(tmp_path / "bag", [wrenches(10)[0]])
+    for path in sorted(tmp_path.iterdir()):
+        for way in (format_of(path).load, format_of(path).key):
+            with pytest.raises(ValueError, match="no recording of ours") as caught:
+                way(path)
+            assert str(path) in str(caught.value)
+    later = {"format": np.array("tactslip_torch recording 2"), "samples": np.zeros((2, 9))}
+    np.savez(tmp_path / "later.npz", **later)
+    with pytest.raises(ValueError, match="must be of format 'tactslip_torch recording 1', got"):
+        format_of(tmp_path / "later.npz").load(tmp_path / "later.npz")
+
+
+class Runs:
+    """What leaves a file behind if it is ever unpickled."""
+
+    def __init__(self, canary):
+        self.canary = canary
+
+    def __reduce__(self):
+        return (open, (str(self.canary), "w"))
+
+
+def test_nothing_in_a_file_is_executed(tmp_path):
+    canary = tmp_path / "canary"
+    held = np.array([[Runs(canary)]], dtype=object)
+    np.save(tmp_path / "a.npy", held, allow_pickle=True)
+    np.savez(tmp_path / "a.npz", samples=held)
+    np.savez(tmp_path / "b.npz", samples=np.zeros((9, 2)), time=np.array([Runs(canary)] * 9))
+    for ending in ENDINGS:
+        if ending != "bag2":
+            (tmp_path / f"p.{ending}").write_bytes(pickle.dumps(Runs(canary)))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["samples"] = np.void(pickle.dumps(Runs(canary)))
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text(f"!!python/object/apply:os.mkdir [{canary}]\n")
+    for path in sorted(tmp_path.iterdir()):
+        refused(path)
+    assert not canary.exists()
+
+
+# Text ------------------------------------------------------------------------------------------
+
+ROWS = np.array([[0.0, 1.5, -2.0], [0.5, 2.5, 4e-3], [1.0, np.nan, 5.0]])
+TABLES = {
+    "t,a,b\n0,1.5,-2\n0.5,2.5,4e-3\n1,nan,5\n": True,
+    "t,a,b\r\n0,1.5,-2\r\n0.5,2.5,4e-3\r\n1,NaN,5": True,
+    "Time (s), a , b\n0, 1.5, -2\n0.5, 2.5, 4E-3\n1, , +5.\n": True,
+    "t\ta\tb\n0\t1.5\t-2\n.5\t2.5\t.004\n1\t\t5\n": True,
+    "0\t1.5\t-2\n0.5\t2.5\t4e-3\n1\tnan\t5\n": False,
+    "0.0\t1.5\t-2\t\n0.5\t2.5\t4e-3\t\n1\tnan\t5\t\n": False,
+    "t;a;b;\n0;1.5;-2;\n0.5;2.5;4e-3;\n1;;5;\n": True,
+    "t;a;b\n0;1,5;-2\n0,5;2,5;4e-3\n1;;5\n": True,
+    "0\t1,5\t-2\t\n0,5\t2,5\t,004\t\n1\tnan\t5\t\n": False,
+    "  0   1.5  -2\n  0.5 2.5  4e-3\n  1 nan 5\n": False,
+    ' t "a" b\n 0 1.5 -2\n\n0.5 2.5 4e-3\n   \n1 nan 5\n': True,
+    '"t","a","b"\n"0","1.5","-2"\n"0.5","2.5","4e-3"\n"1","","5"\n': True,
+    "# t a b\n0 1.5 -2\n0.5 2.5 4e-3 # here\n# and\n1 nan 5\n": True,
+    "# 3 rows\n0 1.5 -2\n0.5 2.5 4e-3\n1 nan 5\n": False,
+    "A title\n\nt,a,b\ns,V,(V)\n0,1.5,-2\n0.5,2.5,4e-3\n1,nan,5\n": True,
+    "rate,2000,Hz\nt,a,b\n0,1.5,-2\n0.5,2.5,4e-3\n1,nan,5\n": True,
+    "t_ms,a,b\n0,1.5,-2\n500,2.5,4e-3\n1000,nan,5\n": True,
+    "t,a,b\n7,1.5,-2\n7.5,2.5,4e-3\n8,nan,5\n": True,
+}
+
+
+def assert_rows(found, names):
+    samples, columns, since, rate = found
+    np.testing.assert_array_equal(samples, ROWS[:, 1:].T)
+    assert (columns, rate) == (names, None)
+    assert since.tolist() == [0.0, 0.5, 1.0]
+
+
+@pytest.mark.parametrize("content", TABLES)
+def test_a_text_table_is_found_out(tmp_path, content):
+    (tmp_path / "a.txt").write_bytes(content.encode())
+    assert_rows(read(tmp_path / "a.txt"), ("a", "b") if TABLES[content] else None)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+def test_encodings(tmp_path, encoding):
+    content = "t;Kraft °;b\n0;1,5;-2\n0,5;2,5;4e-3\n1;;5\n"
+    (tmp_path / "a.txt").write_bytes(content.encode(encoding))
+    assert_rows(read(tmp_path / "a.txt"), ("Kraft °", "b"))
+
+
+LVM = (
+    "LabVIEW Measurement\t\nSeparator\tTab\nDecimal_Separator\t{point}\nX_Columns\t{x}\n"
+    "***End_of_Header***\t\n\t\nChannels\t2\t\nSamples\t3\t3\t\nDate\t2012/06/01\t2012/06/01\t\n"
+    "X_Dimension\tTime\tTime\t\nDelta_X\t0{point}500000\t0{point}500000\t\n"
+    "***End_of_Header***\t\t\t\nX_Value\tUntitled\tUntitled 1\tComment\n"
+)
+
+
+@pytest.mark.parametrize("point", [".", ","])
+@pytest.mark.parametrize("x", ["One", "No"])
+def test_labview_measurements(tmp_path, x, point):
+    rows = ["0.0\t1.5\t-2.0", "0.5\t2.5\t4E-3", "1.0\tNaN\t5.0"]
+    rows = [row if x == "One" else row[row.index("\t") :] for row in rows]
+    content = LVM.format(x=x, point=point) + "\n".join(rows).replace(".", point) + "\n"
+    (tmp_path / "a.lvm").write_text(content)
+    samples, names, since, rate = read(tmp_path / "a.lvm")
+    np.testing.assert_array_equal(samples, ROWS[:, 1:].T)
+    assert (names, rate) == (("Untitled", "Untitled 1"), 2.0)
+    assert since is None if x == "No" else since.tolist() == [0.0, 0.5, 1.0]
+
+
+def test_columns_of_text_are_chosen(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("n,u,v,w\n5,1,2,3\n6,4,5,6\n")
+    assert read(path)[1:3] == (("n", "u", "v", "w"), None)
+    samples, names, since, _ = read(path, Reading(time="n", channels=("w", 1)))
+    assert (samples.tolist(), names) == ([[3.0, 6.0], [1.0, 4.0]], ("w", "u"))
+    assert since.tolist() == [0.0, 1.0]
+    assert read(path, Reading(time=0, time_unit="ms"))[2].tolist() == [0.0, 1e-3]
+    assert "'x'" in refused(path, Reading(time="x"))
+    assert "4" in refused(path, Reading(channels=(4,)))
+    path.write_text("1 2\n3 4\n")  # no names: times come first, unless the rate is said
+    assert read(path)[0].tolist() == [[2.0, 4.0]]
+    assert read(path, Reading(sample_rate_hz=9.0))[0].tolist() == [[1.0, 3.0], [2.0, 4.0]]
+    assert read(path, Reading(time=None))[0].shape == (2, 2)
+    path.write_text("1|2\n3|4\n")
+    assert read(path, Reading(delimiter="|"))[0].tolist() == [[2.0, 4.0]]
+    rows = [f"{i},{i / 100},{i * 10**7},{i % 3},{i}" for i in range(50)]
+    path.write_text("\n".join([",time,timestamp_ns,g1,g2", *rows]) + "\n")
+    assert read(path)[1] == ("g1", "g2")  # neither the number of the row nor other times
+
+
+def test_a_large_table_is_read_by_stretches(tmp_path):
+    values = noise(60_000, 3)
+    rows = [f"{a!r},{b!r},{c!r}" for a, b, c in values.tolist()]
+    (tmp_path / "a.csv").write_text("a,b,c\n" + "\n".join(rows) + "\n")
+    with open_file(tmp_path / "a.csv", Reading(sample_rate_hz=2000.0)) as opened:
+        assert opened.samples.num_samples == 60_000
+        np.testing.assert_array_equal(opened.samples.read(33_000, 33_100), values[33_000:33_100].T)
+        found = torch.cat(list(pieces(opened.samples, 7777)), 1)
+    np.testing.assert_array_equal(found, values.T)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("t,a\n0,1\n1,2,3\n2,3\n", "line 3"),
+        ("t,a\n0,1\n1\n", "line 3"),
+        ("t,a\n0,1\n\n# b\n1,two\n", "line 5: 'two' is no number"),
+        ("t,a\n0,x\n1,2\n", "line 2: 'x' is no number"),
+        ("t,a\n0,1\n1,0x10\n", "line 3: '0x10' is no number"),
+        ("t,a\n0,1\n1,1_0\n", "line 3: '1_0' is no number"),
+        ("t,a,b\n0,1\n1,2\n", "3 columns are named"),
+        ("t,a,a\n0,1,2\n", "two columns are called 'a'"),
+        ("0;1,234\n1;5,678\n", "decimals or thousands"),
+        ("t,a,b\n", "no row of numbers"),
+        ("t,a\n0,1\n1\0,2\n", "NUL"),
+        ("0,1\n" + "9" * 2_100_000, "line 2"),
+        (("0," + "0" * 40 + "\n") * 30_000 + "0,1,2", "line 30001"),
+        (LVM.format(x="Multi", point=".") + "0.0\t1.5\t-2.0\n", "line 4: times for each column"),
+    ],
+)
+def test_what_is_wrong_in_text_has_its_line(tmp_path, content, said):
+    (tmp_path / "a.csv").write_text(content)
+    assert said in refused(tmp_path / "a.csv")
+
+
+# Arrays: NumPy, HDF5, MAT, Parquet -------------------------------------------------------------
+
+
+def made_hdf5(path, **datasets):
+    with h5py.File(path, "w") as file:
+        for name, values in datasets.items():
+            file[name] = values
+    return path
+
+
+def made_73(path, **variables):
+    """As MATLAB writes it: rows and columns turned, classes marked, characters as numbers."""
+    kinds = {"f8": "double", "f4": "single", "i2": "int16", "b1": "logical"}
+    with h5py.File(path, "w", userblock_size=512) as file:
+
+        def put(name, values):
+            if isinstance(values, list):
+                references = [put(f"#refs#/{name}{i}", one).ref for i, one in enumerate(values)]
+                kept = file.create_dataset(name, data=[references], dtype=h5py.ref_dtype)
+                kind = "cell"
+            elif isinstance(values, str):
+                codes = np.frombuffer(values.encode("utf-16-le"), "<u2")
+                kept, kind = file.create_dataset(name, data=codes[:, None]), "char"
+            else:
+                kept = file.create_dataset(name, data=np.atleast_2d(values).T)
+                kind = kinds[np.atleast_2d(values).dtype.str[1:]]
+            kept.attrs["MATLAB_class"] = np.bytes_(kind)
+            return kept
+
+        for name, values in variables.items():
+            put(name, values)
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+    return path
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8", ">f4", ">f8", "i1", "u2", "i4", "i8"])
+def test_numpy_arrays(tmp_path, dtype):
+    volts = np.random.default_rng(0).integers(0, 99, (60, 3)).astype(dtype)
+    np.save(tmp_path / "a.npy", volts)
+    np.save(tmp_path / "b.npy", np.asfortranarray(volts))
+    np.savez(tmp_path / "a.npz", samples=volts.T)
+    np.savez_compressed(tmp_path / "b.npz", samples=np.asfortranarray(volts.T))
+    is_small = np.dtype(dtype).itemsize <= (4 if np.dtype(dtype).kind == "f" else 2)
+    for path in sorted(tmp_path.iterdir()):
+        samples, names, since, rate = read(path)
+        np.testing.assert_array_equal(samples, volts.T)
+        assert samples.dtype == (torch.float32 if is_small else torch.float64)
+        assert (names, since, rate) == (None, None, None)
+
+
+def test_archives_with_names_times_and_rates(tmp_path):
+    volts = np.arange(18, dtype=np.int16).reshape(9, 2)
+    np.savez(tmp_path / "a.npz", volts=volts, stamp=np.arange(9) * 500_000 + 10**18, fs=2000.0)
+    assert "volts" in refused(tmp_path / "a.npz")
+    samples, _, since, rate = read(tmp_path / "a.npz", Reading(samples="volts", time_unit="ns"))
+    assert samples.tolist() == volts.T.tolist()
+    assert since.tolist() == pytest.approx(np.arange(9) * 0.0005, abs=1e-15)
+    assert rate == 2000.0
+    assert "'clock'" in refused(tmp_path / "a.npz", Reading(samples="volts", time="clock"))
+    np.savez(tmp_path / "square.npz", volts=np.zeros((3, 3)))
+    assert "reading.time_first" in refused(tmp_path / "square.npz", Reading(samples="volts"))
+    np.save(tmp_path / "b.npy", volts.T)
+    assert read(tmp_path / "b.npy", Reading(time_first=False))[0].tolist() == volts.T.tolist()
+
+
+def test_hdf5_matrices_and_columns(tmp_path):
+    volts, path = noise(60, 3).astype(np.float32), tmp_path / "a.h5"
+    for values in (volts, volts.T):
+        made_hdf5(path, **{"trial/volts": values, "fs": 250, "note": "hello"})
+        samples, names, since, rate = read(path)
+        np.testing.assert_array_equal(samples, volts.T)
+        assert (names, since, rate) == (None, None, 250.0)
+    made_hdf5(path, **{"imu/x": np.arange(9.0), "imu/y": np.arange(9, dtype="i2")})
+    with h5py.File(path, "a") as file:  # nanoseconds since 1970: no float64 holds them
+        file["imu/Timestamp"] = 10**18 + 2_000_000 * np.arange(9)
+        file["imu"].attrs["Rate"] = 500.0
+        file.attrs["rate"] = 1.0
+    samples, names, since, rate = read(path, Reading(time_unit="ns"))
+    assert (names, rate) == (("x", "y"), 500.0)  # what is said nearest
+    assert since.tolist() == [2_000_000 * i * 1e-9 for i in range(9)]
+    assert read(path, Reading(channels=("y",), time=None))[0].dtype == torch.float32
+    made_hdf5(path, volts=np.zeros((60, 3)), labels=["a", "b", "time_ms"])
+    assert read(path)[1] == ("a", "b")  # the third column is times by its name
+    with h5py.File(path, "a") as file:
+        file["volts"].attrs["channel_name"] = ["q", "r", "s"]
+    assert read(path, Reading(channels=("s", 0)))[1] == ("s", "q")
+
+
+def test_compressed_hdf5_is_read_by_stretches(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("x", data=noise(9000, 3), chunks=(500, 3), compression="gzip")
+    np.testing.assert_array_equal(read(tmp_path / "a.h5")[0], noise(9000, 3).T)
+
+
+def test_several_arrays_are_named_and_one_is_chosen(tmp_path):
+    arrays = {"a/volts": np.zeros((60, 3)), "b/volts": np.ones((50, 2)), "square": np.zeros((4, 4))}
+    made_hdf5(tmp_path / "a.h5", **arrays, t=np.zeros(7))
+    plain = {name.replace("/", "_"): values for name, values in arrays.items()}
+    scipy.io.savemat(tmp_path / "a.mat", plain | {"t": np.zeros(7)})
+    for path, separator in ((tmp_path / "a.h5", "/"), (tmp_path / "a.mat", "_")):
+        said = refused(path)
+        assert f"a{separator}volts" in said
+        assert "say reading.samples" in said
+        assert read(path, Reading(samples=f"b{separator}volts"))[0].shape == (2, 50)
+        assert "reading.time_first" in refused(path, Reading(samples="square"))
+        assert "'c'" in refused(path, Reading(samples="c"))
+        assert "7" in refused(path, Reading(samples=f"a{separator}volts", time="t"))
+        assert "3" in refused(path, Reading(samples=f"a{separator}volts", channels=(0, 3)))
+    assert read(tmp_path / "a.h5", Reading(samples="b"))[0].shape == (2, 50)  # a group
+    made_hdf5(tmp_path / "b.h5", x=np.zeros(9), y=np.zeros(8))
+    assert "say reading.channels" in refused(tmp_path / "b.h5")
+    assert read(tmp_path / "b.h5", Reading(channels=("y",)))[0].shape == (1, 8)
+
+
+def test_hdf5_never_leaves_its_file(tmp_path):
+    other = made_hdf5(tmp_path / "other.h5", samples=np.zeros((90, 2)))
+    (tmp_path / "other.raw").write_bytes(np.ones((90, 2)).tobytes())
+    layout = h5py.VirtualLayout((90, 2), "f8")
+    layout[:] = h5py.VirtualSource(str(other), "samples", (90, 2))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["link"] = h5py.ExternalLink(str(other), "/samples")
+        file["soft"] = h5py.SoftLink("/link")
+        file.create_virtual_dataset("virtual", layout)
+        raw = [(str(tmp_path / "other.raw"), 0, 1440)]
+        file.create_dataset("raw", (90, 2), "f8", external=raw)
+        file["circle/a"] = file["/"]
+    assert "no samples" in refused(tmp_path / "a.h5")
+    assert "file" in refused(tmp_path / "a.h5", Reading(samples="virtual"))
+
+
+@pytest.mark.parametrize("is_compressed", [False, True])
+def test_mat_files_of_version_5(tmp_path, is_compressed):
+    path, volts = tmp_path / "a.mat", noise(60, 3).astype(np.float32)
+    for values in (volts, volts.T):
+        content = {"volts": values, "Fs": 250.0, "note": "hello"}
+        scipy.io.savemat(path, content, do_compression=is_compressed)
+        samples, names, since, rate = read(path)
+        np.testing.assert_array_equal(samples, volts.T)
+        assert (names, since, rate, samples.dtype) == (None, None, 250.0, torch.float32)
+    trial = {"x": np.arange(50.0), "y": np.arange(50, dtype="i2")[:, None]}
+    trial |= {"time_ms": np.arange(50.0) * 2, "sampling_rate": 500.0, "deep": {"z": np.ones(50)}}
+    other = {"when": "today", "parts": np.array([1, "a"], dtype=object)}
+    scipy.io.savemat(path, {"trial": trial, "other": other}, do_compression=is_compressed)
+    samples, names, since, rate = read(path)
+    assert (names, rate) == (("x", "y", "z"), 500.0)
+    assert since.tolist() == [2 * i * 1e-3 for i in range(50)]
+    assert read(path, Reading(samples="trial.deep.z"))[1] == ("z",)
+    assert read(path, Reading(channels=("trial.y",)))[0].dtype == torch.float32
+    assert "cell" in refused(path, Reading(samples="other.parts"))
+    for words in (np.array(["left", "right", "Mitte"]), np.array(["left", "right", "Mitte"], "O")):
+        scipy.io.savemat(path, {"volts": np.zeros((60, 3)), "channels": words})
+        assert read(path)[1] == ("left", "right", "Mitte")
+
+
+def test_mat_files_of_version_73(tmp_path):
+    volts = noise(60, 3).astype("f4")
+    variables = {"data/volts": volts, "data/t": np.arange(60.0)[:, None], "data/fs": np.float64(9)}
+    path = made_73(tmp_path / "a.mat", labels=["a", "bc", "d"], is_on=np.ones(3, "?"), **variables)
+    samples, names, since, rate = read(path)
+    np.testing.assert_array_equal(samples, volts.T)
+    assert (names, since.tolist(), rate) == (("a", "bc", "d"), list(range(60)), 9.0)
+    named = Reading(samples="data.volts", channels=("d", 0))
+    np.testing.assert_array_equal(read(path, named)[0], volts.T[[2, 0]])
+    path = made_73(tmp_path / "b.mat", x=np.arange(9.0), y=np.arange(9, dtype="i2"), word="hello")
+    assert read(path)[1] == ("x", "y")
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (np.zeros((9, 2), dtype=complex), "complex"),
+        (np.zeros((9, 2), dtype=bool), "true or false"),
+        (np.zeros((2, 3, 4)), "3 dimensions"),
+        (3.0, "no samples"),
+    ],
+)
+def test_what_is_no_samples_is_named(tmp_path, values, said):
+    assert said in refused(made_hdf5(tmp_path / "a.h5", it=values))
+    scipy.io.savemat(tmp_path / "a.mat", {"it": values})
+    assert said in refused(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize("rows", [4, 1000])
+def test_parquet_tables(tmp_path, rows):
+    path = tmp_path / "a.parquet"
+    stamps = np.datetime64("2026-01-02T03:04:05", "us") + np.arange(9) * 500
+    columns = {"note": ["a"] * 9, "when": stamps, "x": np.arange(9.0), "y": np.ones(9, "i2")}
+    pq.write_table(pa.table(columns), path, row_group_size=rows)
+    samples, names, since, _ = read(path)
+    assert (names, samples.tolist()) == (("x", "y"), [list(range(9)), [1.0] * 9])
+    assert since.tolist() == [500 * i * 1e-6 for i in range(9)]
+    assert read(path, Reading(channels=("y", 2)))[1] == ("y", "x")  # numbers count every column
+    assert "'note'" in refused(path, Reading(channels=("note",)))
+    assert "'q'" in refused(path, Reading(channels=("q",)))
+    assert "9" in refused(path, Reading(time=9))
+    table = pa.table({"x": pa.array([1, None, 3], pa.int16()), "time_ms": [0.0, 5.0, 10.0]})
+    pq.write_table(table.replace_schema_metadata({"Fs": "250", "by": "me"}), path)
+    samples, names, since, rate = read(path)
+    np.testing.assert_array_equal(samples, [[1, np.nan, 3]])
+    assert (names, since.tolist(), rate) == (("x",), [0.0, 0.005, 0.01], 250.0)
+
+
+# Messages: MCAP and rosbag2 --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("packing", ["none", "lz4", "zstd"])
+@pytest.mark.parametrize("is_chunked", [True, False])
+@pytest.mark.parametrize("is_indexed", [True, False])
+def test_stamped_messages_in_mcap(tmp_path, packing, is_chunked, is_indexed):
+    sent, values = wrenches(500)
+    path = write_mcap(tmp_path / "a.mcap", [sent], How(packing, is_chunked, is_indexed))
+    samples, names, since, _ = read(path)
+    np.testing.assert_array_equal(samples, values)
+    assert names[:2] == ("wrench.force.x", "wrench.force.y")
+    np.testing.assert_array_equal(
+        since, np.arange(500) * STEP_NS / 1e9
+    )  # though stamps are of 2023
+    chosen = Reading(channels=("wrench.torque.z", 0))
+    np.testing.assert_array_equal(read(path, chosen)[0], values[[5, 0]])
+    assert "'nope'" in refused(path, Reading(channels=("nope",)))
+
+
+@pytest.mark.parametrize(
+    ("storage", "mode"),
+    [("sqlite3", "none"), ("sqlite3", "message"), ("mcap", "none"), ("mcap", "storage")],
+)
+def test_stamped_messages_in_rosbag2(tmp_path, storage, mode):
+    sent, values = wrenches(500)
+    other = Sent("/rosout", WRENCH, sent.messages[:3])
+    samples, names, since, _ = read(write_bag(tmp_path / "bag", [other, sent], storage, mode))
+    np.testing.assert_array_equal(samples, values)
+    assert names[0] == "wrench.force.x"
+    np.testing.assert_array_equal(since, np.arange(500) * STEP_NS / 1e9)
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_a_bag_in_several_files_is_one_recording(tmp_path, storage):
+    sent, values = wrenches(300)
+    ending = {"sqlite3": "db3", "mcap": "mcap"}[storage]
+    for number in (0, 1):
+        part = Sent(sent.topic, sent.kind, sent.messages[150 * number : 150 * number + 150])
+        write_bag(tmp_path / f"part{number}", [part], storage)
+    bag = tmp_path / "part0"
+    shutil.copy(tmp_path / "part1" / f"part1.{ending}", bag)
+    text = (bag / "metadata.yaml").read_text()
+    line = next(line for line in text.splitlines() if f"- part0.{ending}" in line)
+    second = line.replace("part0", "part1")
+    (bag / "metadata.yaml").write_text(text.replace(line, f"{line}\n{second}", 1))
+    np.testing.assert_array_equal(read(bag)[0], values)
+
+
+@pytest.mark.parametrize("field", ["timestamp", "header", "t", "time_us", "clock"])
+def test_json_messages_and_their_times(tmp_path, field):
+    values, messages = noise(50, 3), []
+    for row, time in zip(values, times(50), strict=True):
+        stamp = dict(zip(("sec", "nsec"), divmod(time, 10**9), strict=True))
+        since = time - START_NS
+        own = {
+            "timestamp": {"timestamp": stamp},
+            "header": {"header": {"stamp": stamp, "frame_id": "hand"}},
+            "t": {"t": since * 1e-9},
+            "time_us": {"time_us": since * 1e-3},
+            "clock": {"clock": since},
+        }[field]
+        content = own | {"v": list(row[:2]), "deep": {"x": row[2], "text": "1.5"}}
+        messages.append((7, json_message(content)))
+    sent = Sent("/t", "thing", messages, "json", "jsonschema", "{}")
+    how = Reading(time="clock", time_unit="ns") if field == "clock" else None
+    samples, names, since, _ = read(write_mcap(tmp_path / "a.mcap", [sent]), how)
+    assert names == ("v[0]", "v[1]", "deep.x")
+    np.testing.assert_array_equal(samples, values.T)
+    np.testing.assert_allclose(since, np.arange(50) * STEP_NS / 1e9, rtol=0, atol=1e-12)
+
+
+def test_log_times_and_stamps_of_zero(tmp_path):
+    values = noise(20, 6)
+    messages = [(time, wrench(row, 0)) for time, row in zip(times(20), values, strict=True)]
+    path = write_mcap(tmp_path / "a.mcap", [Sent("/ft", WRENCH, messages)])
+    assert read(path)[2].tolist() == [n * STEP_NS / 1e9 for n in range(20)]
+    messages = [(5 * t, wrench(row, t)) for t, row in zip(times(20), values, strict=True)]
+    path = write_mcap(tmp_path / "b.mcap", [Sent("/ft", WRENCH, messages)])
+    since = read(path, Reading(time="log_time"))[2]
+    assert since.tolist() == [n * 5 * STEP_NS / 1e9 for n in range(20)]
+    assert read(path, Reading(time=None))[2] is None
+
+
+def blocks_of(values, lengths):
+    """Blocks of samples ``[n, C]`` of these lengths, each logged at its first sample."""
+    edges = np.cumsum([0, *lengths])
+    return [
+        (
+            START_NS + int(first) * STEP_NS,
+            array(values[first:stop].reshape(-1), ("samples", "ch"), (stop - first, 3)),
+        )
+        for first, stop in pairwise(edges)
+    ]
+
+
+def test_blocks_of_samples(tmp_path):
+    lengths = np.random.default_rng(2).permutation(np.arange(1, 61))
+    values = noise(int(lengths.sum()), 3)
+    path = write_mcap(tmp_path / "a.mcap", [Sent("/b", FLOATS, blocks_of(values, lengths))])
+    samples, names, since, _ = read(path)
+    assert names is None
+    np.testing.assert_array_equal(samples, values.T)
+    np.testing.assert_allclose(since, np.arange(len(values)) * STEP_NS / 1e9, rtol=0, atol=1e-12)
+    messages = blocks_of(values, [20] * 50)
+    del messages[17]
+    with open_file(write_mcap(path, [Sent("/b", FLOATS, messages)])) as opened:
+        clock = even_clock(opened.times, opened.samples.num_samples)
+    assert [(gap.start, gap.missing) for gap in clock.gaps] == [(340, 20)]
+    single = write_mcap(path, [Sent("/b", FLOATS, blocks_of(values, [9]))])
+    assert read(single)[2] is None
+    since = read(single, Reading(sample_rate_hz=100.0))[2]
+    np.testing.assert_allclose(since, np.arange(9) / 100)
+
+
+def test_messages_go_by_their_times(tmp_path):
+    sent, values = wrenches(400)
+    sent.messages = [sent.messages[n] for n in np.random.default_rng(0).permutation(400)]
+    for path in (write_mcap(tmp_path / "a.mcap", [sent]), write_bag(tmp_path / "bag", [sent])):
+        samples, _, since, _ = read(path)
+        np.testing.assert_array_equal(samples, values)
+        assert (since.diff() > 0).all()
+
+
+def test_the_topic_is_the_one_named_or_the_only_one(tmp_path):
+    (left, values), (right, others) = wrenches(30, "/left"), wrenches(30, "/right", seed=1)
+    log = Sent("/rosout", WRENCH, left.messages)
+    text = Sent("/text", "std_msgs/msg/String", [(1, b"\0\1\0\0\2\0\0\0a\0")])
+    unread = Sent("/proto", "x.Y", [(1, b"abc")], "protobuf", "protobuf", "")
+    two = (
+        write_mcap(tmp_path / "a.mcap", [log, text, unread, left, right]),
+        write_bag(tmp_path / "bag", [log, text, left, right]),
+    )
+    for path in two:
+        said = refused(path)
+        assert "/left, /right" in said
+        assert "reading.samples" in said
+        for topic, wanted in (("/left", values), ("/right", others)):
+            np.testing.assert_array_equal(read(path, Reading(samples=topic))[0], wanted)
+        assert "/left" in refused(path, Reading(samples="/no"))
+    assert "protobuf" in refused(two[0], Reading(samples="/proto"))
+    alone = write_mcap(tmp_path / "b.mcap", [log, text, left])
+    np.testing.assert_array_equal(read(alone)[0], values)
+    assert "no topic with samples" in refused(write_mcap(tmp_path / "c.mcap", [text]))
+
+
+def test_a_cut_mcap_file_is_refused_with_its_remedy(tmp_path):
+    path = write_mcap(tmp_path / "a.mcap", [wrenches(120)[0]])
+    content = path.read_bytes()
+    for size in [*range(8, 200, 7), *range(200, len(content), 531), len(content) - 1]:
+        path.write_bytes(content[:size])
+        said = refused(path)
+    assert "mcap recover" in said
+
+
+# Claims that are not believed ------------------------------------------------------------------
+
+
+def test_small_files_that_claim_much_are_refused(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", samples=np.zeros((2, 2**23)))
+    with zipfile.ZipFile(tmp_path / "b.npz", "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("samples.npy", b"x")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("samples", (24, 2**40), "f8", chunks=(24, 2**10))
+    scipy.io.savemat(tmp_path / "a.mat", {"x": np.zeros((2, 2**23))}, do_compression=True)
+    zeros = np.zeros(2**23)
+    pq.write_table(pa.table({"x": zeros, "y": zeros}), tmp_path / "a.parquet")
+    for path in sorted(tmp_path.iterdir()):
+        assert path.stat().st_size < 2**20
+        refused(path)
+
+
+# Libraries that are not there ------------------------------------------------------------------
+
+NEEDED = {"a.h5": "h5py", "a.mcap": "mcap", "a.bag2": "rosbags", "a.parquet": "pyarrow"}
+
+
+@pytest.mark.parametrize("name", NEEDED)
+def test_an_absent_library_is_one_line_with_its_remedy(tmp_path, monkeypatch, name):
+    find_spec, library = importlib.util.find_spec, NEEDED[name]
+
+    def hidden(module, *rest):
+        return None if module.partition(".")[0] == library else find_spec(module, *rest)
+
+    for module in ("tactslip_torch.data.formats.reading", "importlib.util"):
+        monkeypatch.setattr(f"{module}.find_spec", hidden, raising=False)
+    with pytest.raises(ValueError, match=f"needs {library}, which is not installed") as caught:
+        named_format(name[2:]).save(tmp_path / name, recording(), hand_of("ab"), KEY)
+    assert f'pip install "tactslip_torch[{EXTRA_OF_FORMATS[library]}]"' in str(caught.value)
+    assert "\n" not in str(caught.value)
