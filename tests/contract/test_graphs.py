@@ -1,0 +1,158 @@
+"""The exported graphs, run by onnxruntime alone, against the detector in torch."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+import torch
+
+from .conftest import RECIPES
+from .names import (
+    BIN_GRAPH,
+    BIN_INPUT,
+    BIN_OUTPUTS,
+    MASK_INPUT,
+    SIDECAR,
+    STREAM_GRAPH,
+    STREAM_HANDED_ON,
+    STREAM_INPUTS,
+    STREAM_OUTPUTS,
+    StreamingDetector,
+    predict_raw,
+)
+from .recordings import NAMES, samples_of
+
+pytestmark = pytest.mark.onnx
+
+CASES = [
+    ("general", "float32"),
+    ("selected", "float32"),
+    pytest.param(("general", "float64"), marks=pytest.mark.slow),
+    pytest.param(("selected", "float64"), marks=pytest.mark.slow),
+]
+CLOSE = {"float32": 1e-4, "float64": 1e-9}
+"""Of scores in standard deviations of ordinary scores, and of probabilities."""
+
+
+@pytest.fixture(scope="module", params=CASES, ids="-".join)
+def exported(request, graphs_of, trained_by):
+    """Folder of graphs, detector and precision."""
+    recipe, precision = request.param
+    assert recipe in RECIPES
+    return graphs_of(recipe, precision), trained_by(recipe).detector, precision
+
+
+def session_of(path):
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.log_severity_level = 3
+    return ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+
+def kinds_of_bin(detector):
+    """Raw bins by kind, float32 ``[N, C, n]``, so that both sides read the same numbers."""
+    length = detector.context_before + detector.pool.bin_samples + detector.context_after
+    samples = samples_of("D", 2).T
+    plain = np.lib.stride_tricks.sliding_window_view(samples, length, 1).swapaxes(0, 1)[::211]
+    time = np.arange(length)
+    broken = plain.copy()
+    broken[::2, 1, 60] = np.nan
+    broken[1::2, 2, 70] = np.inf
+    shapes = [np.where(time < 75, 0.0, 5.0), np.where(time % 2 == 0, -5.0, 5.0), time / 100.0]
+    shapes += [np.eye(length)[75], np.zeros(length), np.full(length, 0.1), 1e-30 * np.sin(time)]
+    return {
+        "ordinary": plain,
+        "broken": broken,
+        "shapes": np.stack([np.stack([row] * 4) for row in shapes]).astype(np.float32),
+        "one": plain[:1],
+        "none": plain[:0],
+    }
+
+
+@pytest.mark.parametrize("kind", ["ordinary", "broken", "shapes", "one", "none"])
+def test_the_bin_graph_scores_as_the_detector(exported, kind):
+    folder, detector, precision = exported
+    kinds = kinds_of_bin(detector)
+    session, bins = session_of(folder / BIN_GRAPH), kinds[kind].astype(precision)
+    found = dict(zip(BIN_OUTPUTS, session.run(BIN_OUTPUTS, {BIN_INPUT: bins}), strict=True))
+    expected = predict_raw(detector, torch.from_numpy(bins).double())
+    ordinary = predict_raw(detector, torch.from_numpy(kinds["ordinary"].copy()).double()).score
+    scores = expected.score.numpy()
+    bound = CLOSE[precision] * (float(ordinary.std()) + np.abs(scores))
+    assert (np.abs(found["score"] - scores) <= bound).all()
+    assert found["score"].dtype == precision
+    assert np.array_equal(found["valid"], expected.is_valid.numpy())
+    assert (found["probability"] >= 0).all()
+    assert (found["probability"] <= 1).all()
+    if kind == "broken":
+        assert not found["valid"].all()
+
+
+def test_the_bin_graph_takes_a_mask_of_channels(exported):
+    folder, detector, precision = exported
+    bins = kinds_of_bin(detector)["ordinary"].astype(precision)
+    name = detector.pool.hand.names[detector.needed_index[0]]
+    feeds = {BIN_INPUT: bins, MASK_INPUT: np.array([n == name for n in NAMES])}
+    score, valid = session_of(folder / BIN_GRAPH).run(["score", "valid"], feeds)
+    missing = torch.from_numpy(bins.copy()).double()
+    missing[:, NAMES.index(name)] = torch.nan
+    expected = predict_raw(detector, missing).score.numpy()
+    close = CLOSE[precision] * (np.abs(expected) + expected.std())
+    assert (np.abs(score - expected) <= close).all()
+    assert not valid.any()
+
+
+class Fed:
+    """The stream graph, and what it handed on."""
+
+    def __init__(self, path, precision):
+        self.session, self.precision = session_of(path), precision
+        self.memory = {
+            "tail": np.empty((0, len(NAMES)), precision),
+            "state": np.empty(0),
+            "threshold": np.empty(0),
+        }
+
+    def push(self, samples):
+        feeds = {"samples": np.ascontiguousarray(samples, self.precision), **self.memory}
+        assert set(feeds) == set(STREAM_INPUTS)
+        names = [*STREAM_OUTPUTS, *STREAM_HANDED_ON.values()]
+        found = dict(zip(names, self.session.run(names, feeds), strict=True))
+        self.memory |= {name: found.pop(handed) for name, handed in STREAM_HANDED_ON.items()}
+        return found
+
+
+@pytest.mark.parametrize("cuts", [(), (1, 2, 3, 150, 151, 1000), range(37, 4000, 37)], ids=len)
+@pytest.mark.parametrize("is_broken", [False, True], ids=["whole", "broken"])
+def test_the_stream_graph_decides_as_the_stream(exported, cuts, is_broken):
+    folder, detector, precision = exported
+    samples = samples_of("D", 1)[1000:5000].copy()
+    if is_broken:
+        samples[2000:2010, 1:3] = np.nan
+    graph = Fed(folder / STREAM_GRAPH, precision)
+    parts = [graph.push(samples[a:b]) for a, b in pairwise([0, *cuts, len(samples)])]
+    stream = StreamingDetector(detector, dtype=torch.float64)
+    expected = stream.push(samples)
+    assert expected.is_alarm.any()
+    assert expected.is_valid.all() != is_broken
+    spread = {"score": float(expected.score.std()), "statistic": float(expected.statistic.std())}
+    for name, field in STREAM_OUTPUTS.items():
+        values = np.concatenate([part[name] for part in parts])
+        truth = getattr(expected, field).numpy()
+        if truth.dtype == bool:
+            assert np.array_equal(values, truth), name
+        else:
+            close = 1e-9 if name.endswith("_s") else CLOSE[precision] * spread.get(name, 1.0)
+            np.testing.assert_allclose(values, truth, rtol=0, atol=close, err_msg=name)
+
+
+@pytest.mark.parametrize("name", [BIN_GRAPH, STREAM_GRAPH])
+def test_a_graph_says_what_it_takes(exported, name):
+    folder, detector, precision = exported
+    told = json.loads((folder / SIDECAR.format(name)).read_text())
+    assert told["channels"] == NAMES
+    assert told["sample_rate_hz"] == detector.pool.sample_rate_hz
+    assert told["precision"] == precision
+    assert told["simulated"] is False
