@@ -138,19 +138,10 @@ def _multi_rocket_hydra(windows: Array, seed: int, num_kernels: int, num_groups:
     return transform
 
 
-def ridge_by_windows(rows: Array, is_slip: Array, is_scaled: bool = False) -> tuple[Any, float]:
-    """Ridge on rows ``[n, F]``, its penalty by leaving single windows out, and that penalty."""
-    from sklearn.linear_model import RidgeClassifierCV
-
-    made = scaled(RidgeClassifierCV(ALPHAS, class_weight="balanced"), is_scaled)
-    made.fit(rows, is_slip)
-    return made, float(made[-1].alpha_)
-
-
 def ridge_by_groups(
     rows: Array, is_slip: Array, groups: Array, is_scaled: bool = False
 ) -> tuple[Any, float]:
-    """Likewise, by leaving each group out."""
+    """Ridge on rows ``[n, F]``, its penalty by leaving each group out, and that penalty."""
     from sklearn.linear_model import RidgeClassifier
 
     products = (rows @ rows.T).astype(np.float64) if is_scaled else None

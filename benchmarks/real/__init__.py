@@ -1,1 +1,1 @@
-"""The benchmark on real recordings: ours and rivals, each object left out in turn."""
+"""The benchmark on real recordings: ours and baselines, each object left out in turn."""

@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import product
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -15,14 +13,15 @@ import numpy as np
 
 from benchmarks.clocks import Way as Timed
 from benchmarks.clocks import on_threads, paired_ratio, shuffled_rounds
-from benchmarks.real import rivals
+from benchmarks.peers.rockets import MINI_ROCKET, MULTI_ROCKET_HYDRA
+from benchmarks.real.baselines import same_features, simple_baselines
 from benchmarks.real.method import Fitted, Method, Training
 from benchmarks.real.ours import ours, pool_rows
-from benchmarks.real.rocket import WAYS, rocket
-from benchmarks.real.scores import balanced
+from benchmarks.real.rocket import rocket
 from benchmarks.real.sizes import Sizes
 from benchmarks.real.windows import Array, Windows
 from tactslip_torch.data.splits import Split
+from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
 
@@ -46,24 +45,18 @@ class Found:
     last: Fitted | None = None
 
 
-def methods_of(
-    windows: Windows, recipes: Sequence[Recipe], sizes: Sizes, folder: Path
-) -> list[Method]:
-    """All methods, ours first, with their rows.
-
-    Args:
-        windows: all.
-        recipes: of ours.
-        sizes: how much.
-        folder: of rows that are kept.
-    """
+def methods_of(windows: Windows, recipes: Sequence[Recipe], sizes: Sizes) -> list[Method]:
+    """All methods, ours first, with their rows."""
     pool = pool_rows(windows)
+    detectors: dict[tuple[str, ...], SlipDetector] = {}
+    first, *others = recipes
     return [
-        *(ours(windows, recipe, *pool) for recipe in recipes),
-        *(rocket(windows, *of, sizes) for of in product(WAYS, sizes.rocket_seeds)),
-        rivals.forest(windows, sizes, folder / "tsfel"),
-        rivals.svc(windows, sizes, *pool),
-        rivals.regression(windows, sizes),
+        ours(windows, first, *pool, detectors),
+        *(ours(windows, recipe, *pool) for recipe in others),
+        same_features(*pool, detectors, sizes),
+        *simple_baselines(windows.samples, sizes),
+        *(rocket(windows, MINI_ROCKET, seed, sizes) for seed in sizes.rocket_seeds),
+        rocket(windows, MULTI_ROCKET_HYDRA, sizes.rocket_seeds[0], sizes),
     ]
 
 
@@ -98,19 +91,6 @@ def on_folds(
     return found
 
 
-def middle_rockets(found: Mapping[str, Found], is_slip: Array) -> tuple[str, ...]:
-    """Of each way of ``rocket.WAYS``, the seed whose balanced accuracy is the middle one.
-
-    Of an even number of seeds it is the upper.
-    """
-    middle = []
-    for way in WAYS:
-        names = [name for name in found if name.startswith(way)]
-        names.sort(key=lambda name: balanced(found[name].scores, is_slip))
-        middle.append(names[len(names) // 2])
-    return tuple(middle)
-
-
 def clocked(
     windows: Windows, found: Mapping[str, Found], names: Sequence[str], beside: str, sizes: Sizes
 ) -> dict[str, Any]:
@@ -133,7 +113,7 @@ def clocked(
     for name in names:
         of = found[name]
         assert of.last is not None  # on_folds
-        counts[name] = min(sizes.slow_batch if of.method.is_slow else sizes.batch, len(of.scores))
+        counts[name] = min(sizes.batch, len(of.scores))
         batch = windows.samples[-counts[name] :].copy()
         wanted = of.last.decide(of.method.rows[-counts[name] :])
         differs[name] = float(np.abs(of.last.judge(batch) - wanted).max())

@@ -26,6 +26,11 @@ class Training(NamedTuple):
     objects: Array
     recording: Array
 
+    @property
+    def fold(self) -> tuple[str, ...]:
+        """The training objects, ascending."""
+        return tuple(sorted(set(self.objects.tolist())))
+
 
 class Fitted(NamedTuple):
     """What a fit made.
@@ -49,11 +54,9 @@ class Method(NamedTuple):
         rows: of every window ``[N, *]``, for which no label was looked at.
         rows_s: seconds that describing a window took; 0 where ``fit`` does it.
         fit: to a fold.
-        is_slow: windows are described one after another.
     """
 
     name: str
     rows: Array
     rows_s: float
     fit: Callable[[Training], Fitted]
-    is_slow: bool = False

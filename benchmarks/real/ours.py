@@ -32,7 +32,13 @@ def pool_rows(windows: Windows) -> tuple[Array, float]:
     return rows.numpy(), (time.perf_counter() - started) / len(samples)
 
 
-def ours(windows: Windows, recipe: Recipe, rows: Array, rows_s: float) -> Method:
+def ours(
+    windows: Windows,
+    recipe: Recipe,
+    rows: Array,
+    rows_s: float,
+    detectors: dict[tuple[str, ...], SlipDetector] | None = None,
+) -> Method:
     """The machine of a recipe.
 
     Args:
@@ -40,8 +46,9 @@ def ours(windows: Windows, recipe: Recipe, rows: Array, rows_s: float) -> Method
         recipe: how it is made.
         rows: of ``pool_rows``.
         rows_s: likewise.
+        detectors: keeps that of each fold, by training objects.
     """
-    fit = partial(_fit, windows, recipe)
+    fit = partial(_fit, windows, recipe, detectors)
     return Method(f"ours, recipe={recipe.name}", rows, rows_s, fit)
 
 
@@ -73,8 +80,15 @@ def detector_of(windows: Windows, recipe: Recipe, training: Training) -> SlipDet
     )
 
 
-def _fit(windows: Windows, recipe: Recipe, training: Training) -> Fitted:
+def _fit(
+    windows: Windows,
+    recipe: Recipe,
+    detectors: dict[tuple[str, ...], SlipDetector] | None,
+    training: Training,
+) -> Fitted:
     detector = detector_of(windows, recipe, training)
+    if detectors is not None:
+        detectors[training.fold] = detector
     selected = list(detector.selected)
 
     def decide(rows: Array) -> Array:

@@ -1,4 +1,4 @@
-"""How much is done, and what rivals choose from inside a fold."""
+"""How much is done, and what baselines choose from inside a fold."""
 
 from __future__ import annotations
 
@@ -13,22 +13,16 @@ class Sizes:
         objects: how many at most; ``None`` for all.
         each: recordings of each object and scene at most; ``None`` for all.
         inner: groups that the training objects of a fold make to choose from, at most.
-        rocket_seeds: seeds of the kernels of MiniRocket and MultiRocketHydra.
+        rocket_seeds: of the kernels of MiniRocket; MultiRocketHydra, which is slow, has the first.
         rocket_kernels: of MiniRocket.
         multi_rocket_kernels: of MultiRocket; it makes eight features of each.
         hydra_groups: of Hydra's kernels, eight each, for every dilation.
         trees: of a forest.
-        inner_trees: of one while choosing.
         leaves: windows in a leaf of a tree at least, to choose from.
-        tree_features: share of features that a split looks at, or ``"sqrt"``, to choose from.
-        svc_features: how many features of the pool, to choose from.
-        svc_penalties: C, to choose from.
-        svc_widths: gamma times the number of features, to choose from.
         regression_penalties: C of logistic regression, to choose from.
         draws: of the bootstrap.
         rounds: of the clock.
         batch: windows that are scored at once.
-        slow_batch: the same, of what makes features one window after another.
     """
 
     objects: int | None = None
@@ -38,18 +32,12 @@ class Sizes:
     rocket_kernels: int = 10_000
     multi_rocket_kernels: int = 6_250
     hydra_groups: int = 64
-    trees: int = 200
-    inner_trees: int = 20
+    trees: int = 100
     leaves: tuple[int, ...] = (1, 4)
-    tree_features: tuple[float | str, ...] = ("sqrt",)
-    svc_features: tuple[int, ...] = (60, 120, 240)
-    svc_penalties: tuple[float, ...] = (0.3, 1.0, 3.0, 10.0)
-    svc_widths: tuple[float, ...] = (0.3, 1.0, 3.0)
     regression_penalties: tuple[float, ...] = (0.001, 0.01, 0.1, 1.0, 10.0)
     draws: int = 2000
     rounds: int = 11
     batch: int = 128
-    slow_batch: int = 2
 
 
 QUICK = Sizes(
@@ -61,14 +49,9 @@ QUICK = Sizes(
     multi_rocket_kernels=84,
     hydra_groups=4,
     trees=5,
-    inner_trees=3,
     leaves=(1,),
-    svc_features=(60,),
-    svc_penalties=(1.0, 10.0),
-    svc_widths=(1.0,),
     regression_penalties=(0.1, 1.0),
     draws=50,
     rounds=2,
     batch=8,
-    slow_batch=1,
 )
