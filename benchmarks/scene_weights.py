@@ -2,10 +2,10 @@
 
 For each set of weights, and for each training material: a machine is fitted to training bins of the
 other training materials, and evaluated on those of this one. No test cycle and no held-out material
-is read. The weights with the least mean error are taken, of equals those with the least error on the
-protocol; the error is the mean of three: protocol bins decided wrongly (mean of both classes), bins
-of a moving arm without slip called slip, and slips beside a loud arm that are missed. All data are
-simulated.
+is read. The weights with the least mean error are taken, of equals those with the least error on
+the protocol; the error is the mean of three: protocol bins decided wrongly (mean of both classes),
+bins of a moving arm without slip called slip, and slips beside a loud arm that are missed. All data
+are simulated.
 
 Writes ``benchmarks/results/scene_weights.json``; ``benchmarks.generalisation`` shows it.
 """

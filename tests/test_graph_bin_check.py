@@ -187,11 +187,11 @@ def test_where_engines_disagree_rounding_decides(precision):
     name = "float32" if precision == torch.float32 else "float64"
     judged = Judged(None, detector_of("PVDF1 D3 time cv"), Form(name))
     bins = degenerate_bins(HAND, "step", 200, judged.window.length, precision)
-    exact = judged.score(bins).numpy()
-    others = [judged.score(bins, engine).numpy() for engine in ("reference", "eager")]
+    exact = judged.exact(bins).score.numpy()
+    others = [judged.exact(bins, other).score.numpy() for other in judged.others]
     disagree = (np.abs(np.stack(others) - exact) > 1e-2).any(0)
     assert disagree.any()
     is_rounding = judged.is_rounding(bins, exact, 1e-2)
     assert is_rounding[disagree].all()
     noise = noise_bins(HAND, 50, judged.window.length, 0, precision)
-    assert not judged.is_rounding(noise, judged.score(noise).numpy(), 1e-6).any()
+    assert not judged.is_rounding(noise, judged.exact(noise).score.numpy(), 1e-6).any()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
-from tactslip_torch.features.extractor import EngineName, FeatureExtractor
+from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.runs import Run
 from tactslip_torch.graph.trials import (
@@ -141,23 +141,22 @@ class Judged:
         self.calibrated = calibration_of(detector)
         self.unstated = WORST_PROBABILITY[form.precision]
         self.dead: Tensor | None = None
+        self.others: list[SlipDetector] = []
+        for engine in ("reference", "eager"):
+            other = copy.copy(self.detector)
+            other.extractor = FeatureExtractor(other.pool, other.selected, engine)
+            self.others.append(other)
 
     def judge(self, samples: Tensor) -> Judgement:
         """By torch, scores in float64."""
         with torch.no_grad():
             # a sensor is trusted by what its samples resolve in the precision they come in
             trusted = self.detector.judge_raw(self._padded(samples), dead=self.dead)
-        return self._exact(samples)._replace(is_valid=trusted.is_valid)
+        return self.exact(samples)._replace(is_valid=trusted.is_valid)
 
-    def score(self, samples: Tensor, engine: EngineName | None = None) -> Tensor:
-        """Scores ``[N]`` in float64, by another engine if one is named."""
-        return self._exact(samples, engine).score
-
-    def _exact(self, samples: Tensor, engine: EngineName | None = None) -> Judgement:
-        detector = self.detector
-        if engine is not None:
-            detector = copy.copy(detector)
-            detector.extractor = FeatureExtractor(detector.pool, detector.selected, engine)
+    def exact(self, samples: Tensor, detector: SlipDetector | None = None) -> Judgement:
+        """In float64, by the detector or one of ``others``, whose features other engines make."""
+        detector = detector or self.detector
         with torch.no_grad():
             return detector.judge_raw(self._padded(samples.double()), dead=self.dead)
 
@@ -184,8 +183,9 @@ class Judged:
         generator = torch.Generator().manual_seed(0)
         drawn = 2 * torch.rand((_DRAWS, *x.shape), generator=generator, dtype=x.dtype) - 1
         moves = [size, -size, *(size * drawn), *(-size * drawn)]
-        others = [self.score(x, engine) for engine in ("reference", "eager")]
-        moved = self.score(torch.cat([x + move for move in moves])).unflatten(0, (-1, len(x)))
+        others = [self.exact(x, other).score for other in self.others]
+        moved = self.exact(torch.cat([x + move for move in moves])).score
+        moved = moved.unflatten(0, (-1, len(x)))
         scores = torch.cat([torch.stack(others), moved]).numpy()
         return np.asarray((np.abs(scores - exact) > most).any(0))
 
