@@ -1,0 +1,65 @@
+"""Which part of the package imports which (DESIGN.md's arrows), held against the sources."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1] / "tactslip_torch"
+ARROWS = {
+    "runtime": (),
+    "hand": (),
+    "native": (),
+    "signals": ("hand",),
+    "data": ("hand",),
+    "simulation": ("hand", "data", "native"),
+    "features": ("hand", "signals", "native"),
+    "model": ("features", "signals", "native", "hand"),
+    "onset": ("model", "features", "signals", "native", "hand"),
+    "deploy": ("features", "model", "onset", "signals", "hand"),
+    "training": ("hand", "signals", "data", "features", "model", "onset", "deploy", "report"),
+    "analysis": ("hand", "signals", "data", "features", "model", "onset", "deploy", "training"),
+    "report": (),
+}
+"""Importer: what it may import beside itself and ``runtime``; what is not named may import all."""
+PART = {
+    "runtime": ("config", "files", "ledger", "plain", "progress", "threads", "workers"),
+    "features": ("engines",),
+    "deploy": ("graph", "export"),
+    "training": ("abstaining", "adapting", "alarming", "baselines", "datamodule", "experiment",
+                 "feature_maker", "fitting", "fold_training", "folds", "judging", "learning", "model_selection",
+                 "pace", "planning", "ranks", "recipe", "tuning", "validation", "facts"),
+    "analysis": ("bracket", "certificate", "deadline", "importance"),
+}  # fmt: skip
+"""Modules and folders that stand for a part until they are in its folder."""
+KNOWN = (
+    ("alarming.", "report."),
+    ("certificate", "simulation."),
+    ("data.sets.", "signals.resampling"),
+    ("export", "certify"),
+    ("graph.trials", "simulation."),
+    ("simulation.", "engines"),
+)
+"""Importer and imported, by how they begin: arrows that are still to be turned."""
+
+
+def part_of(module: str) -> str:
+    name = module.split(".")[0]
+    return next((part for part, own in PART.items() if name in own), name)
+
+
+def test_parts_import_along_the_arrows() -> None:
+    wrong = set()
+    for path in ROOT.rglob("*.py"):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        part = part_of(module)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ImportFrom) or not node.module:
+                continue
+            if not node.module.startswith("tactslip_torch."):
+                continue
+            name = node.module.removeprefix("tactslip_torch.")
+            other = part_of(name)
+            if any(module.startswith(a) and name.startswith(b) for a, b in KNOWN):
+                continue
+            if part in ARROWS and other not in (part, "runtime", *ARROWS[part]):
+                wrong.add(f"{module} -> {node.module}")
+    assert not wrong, "\n".join(sorted(wrong))
