@@ -25,8 +25,9 @@ PART = {
     "features": ("engines",),
     "deploy": ("graph", "export"),
     "training": ("abstaining", "adapting", "alarming", "baselines", "datamodule", "experiment",
-                 "feature_maker", "fitting", "fold_training", "folds", "judging", "learning",
-                 "model_selection", "pace", "planning", "ranks", "recipe", "tuning", "validation", "facts"),
+                 "facts", "feature_maker", "fitting", "fold_training", "folds", "judging",
+                 "learning", "model_selection", "pace", "planning", "ranks", "recipe", "tuning",
+                 "validation"),
     "analysis": ("bracket", "certificate", "deadline", "importance"),
 }  # fmt: skip
 """Modules and folders that stand for a part until they are in its folder."""
