@@ -24,6 +24,8 @@ from tactslip_torch.model.differentiable_fit import fit_quadratic
 from tactslip_torch.model.held_out_gradient import held_out_scores
 
 PACKAGE = "tactslip_torch"
+REPLACED_NEXT = ("features/", "graph/", "model/few_bins")
+"""Of the package, what the issue behind this one replaces; not counted in ``modules.py``."""
 ENGINES = ("eager", "compiled")
 """Of ``FeatureExtractor``, beside the reference, which is the pool itself."""
 
@@ -93,6 +95,7 @@ KEYS = {
     "fact_cycles": "fact_cycles",
     "figure": "figure",
     "folder": "hydra.run.dir",
+    "force": "force",
     "format": "to",
     "frames": "features.frames",
     "generated_cycles": "cycles",
@@ -103,7 +106,9 @@ KEYS = {
     "label": "labels",
     "layout": "labels.layout",
     "masked_channels": "dead",
+    "material": "material",
     "materials": "data.materials",
+    "generated_materials": "materials",
     "materials_of_crossval": "materials",
     "model": "model",
     "most_correlation": "recipe.most_correlation",
@@ -126,6 +131,10 @@ KEYS = {
     "root_of_data": "root",
     "scene_setting": "+scene",
     "search": "search",
+    "search_calls": "search.calls",
+    "search_precisions": "search.arithmetics",
+    "search_sizes": "search.sizes",
+    "search_timed": "search.most_timed",
     "seed": "seed",
     "seen": "split.seen",
     "shard": "shard",
@@ -168,12 +177,21 @@ SIDECAR = "{}.json"
 ONSETS = ("onsets.json", "onsets.csv")
 CERTIFICATE = "certificate.json"
 MANIFEST = "manifest.csv"
+IMPORTANCE = "sensors.json"
+CROSSVAL = "crossval.json"
+PARETO = "pareto.json"
+DECISIONS = "{}_decisions.csv"
+RUN_FILES = (DETECTOR, METRICS, CHECKPOINT, "config.yaml", "confusion.png", "selected_features.png")
+CHECK, SUMMARY, CONVERT, TEMPLATE = "check", "summary", "convert", "label_template"
+UNSEEN_EXPERIMENT, REAL_EXPERIMENT = "unseen4", "biotacsp_dos"
+ADD, UNDO, LIST, FORGET = "add", "undo", "list", "forget"
 
 # metrics.json: the splits' names, and what the fit alone decides
 TRAIN, TEST, HELD_OUT = "train", "test", "unseen"
 SPLITS = "splits"
 CONFUSION = "confusion"
 FIT_FACTS = ("selected", "penalty", "kernel", "solve", "validation", "num_bins")
+ALARM_INFO = "alarm"  # in the detector's info
 TRAINING_RECORDINGS = "train_recordings"  # in the detector's info
 
 # Graphs: inputs and outputs
@@ -192,6 +210,19 @@ STREAM_OUTPUTS = {
     "onset_s": "onset_s",
 }
 """Of the stream's graph and of the hosts, beside the fields of what ``push`` returns."""
+
+HOSTS = {
+    "python": "{python} {export}/python/detect.py",
+    "c": "{build}/detect",
+    "node": "node {export}/node/detect.mjs",
+    "web": "node {export}/web/shot.mjs",
+}
+BUILD_C_HOST = "make -C {export}/c CC=gcc PYTHON={python} BUILD={build}"
+INSTALL_HOST = "npm ci"  # in the folder of the host, of node and web
+HOST_OPTIONS = {"every": "--decisions", "chunk": "--chunk", "threshold": "--threshold"}
+HOST_OPTIONS |= {"rate": "--rate"}
+"""Beside model and recording, which the web host takes as options of these names."""
+WEB_OPTIONS = ("--model", "--recording", "--output")
 
 # Recordings in files ---------------------------------------------------------------------------
 

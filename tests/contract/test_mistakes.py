@@ -1,0 +1,182 @@
+"""The commonest mistakes at every command: one line that says what came and what is wanted."""
+
+import subprocess
+import sys
+
+import pytest
+
+from .names import (
+    ALARM_INFO,
+    BAD_INPUT_STATUS,
+    COMMANDS,
+    DETECTOR,
+    MISSPELT_KEY,
+    TRACEBACK_VARIABLE,
+    SlipDetector,
+    settings,
+)
+from .recordings import CHANNELS, of_set, split_of_set
+from .running import arguments_of, environment
+
+
+def files(**words):
+    """Overrides for the shared set, its split, and more."""
+    return [*of_set("{root}"), *split_of_set(), *settings(workers=0, **words)]
+
+
+MISTAKES = {
+    # command, overrides, words of the line
+    "no experiment": ("train", settings(experiment="nope"), "nope unseen4"),
+    "no recipe": ("train", files(recipe="best"), "best general paper robust"),
+    "no data": ("train", settings(data="webcam"), "webcam simulated files"),
+    "no folder": ("train", settings(data="files", root="nowhere"), "nowhere"),
+    "no root": ("train", settings(data="files"), "data.root ..."),
+    "unknown material": (
+        "train",
+        settings(materials=["M1", "Foo"], seen=["M1"], held_out=["Foo"]),
+        "'Foo' M1 iron",
+    ),
+    "material of no recording": ("train", files(seen=["A", "Z"]), "'Z' A, B, C, D"),
+    "seen and held out": ("train", files(held_out=["A"]), "A seen unseen"),
+    "layout": ("train", settings(layout="nope"), "labels.layout 'nope' whole_slide half_second"),
+    "bin of half samples": ("train", settings(bin_ms=50.1), "labels.bin_ms=50.1 100.2 2000"),
+    "no recordings left": ("train", settings(cycles=0), "cycles 1 0"),
+    "share": ("train", files(train_share=1.5), "split.train_share 0 1 1.5"),
+    "even frame": ("train", files(frames={"SG": 50, "PVDF": 11}), "features.frames.SG odd 50"),
+    "dtype": ("train", files(dtype="float16"), "features.dtype float64 float32 'float16'"),
+    "engine": ("train", files(engine="cuda"), "engine 'cuda' compiled eager"),
+    "too many features": (
+        "train",
+        files(recipe="paper", num_features=9999),
+        "recipe.num_features=9999 506",
+    ),
+    "no penalty": ("train", files(recipe="paper", penalties=[]), "recipe.penalties []"),
+    "coverage": ("train", files(coverage=95), "coverage 0 1 95"),
+    "seed": ("train", files(seed="first"), "seed 'first' whole"),
+    "resume from nothing": ("train", files(resume="nowhere"), "nowhere"),
+    "statistics of the wrong recipe": (
+        "train",
+        files(recipe="general", statistics=True),
+        "statistics recipe",
+    ),
+    "channel of no column": (
+        "train",
+        files(channels=[CHANNELS[0] | {"name": "Z1"}, *CHANNELS[1:]]),
+        "Z1 SG1 csv",
+    ),
+    "evaluate without a model": ("evaluate", [], "model ..."),
+    "evaluate nothing": ("evaluate", settings(model="missing.pt"), "no detector missing.pt"),
+    "evaluate another hand": ("evaluate", settings(model="{model}", cycles=2), "4 24 SG1"),
+    "detect nothing": ("detect", settings(model="missing.pt", input="{root}"), "missing.pt"),
+    "detect in nothing": ("detect", settings(model="{model}", input="nowhere"), "nowhere"),
+    "detect without an alarm": (
+        "detect",
+        settings(model="{bare}", input="{root}"),
+        "alarm onset",
+    ),
+    "mask of no channel": (
+        "detect",
+        settings(model="{model}", input="{root}", masked_channels=["SG9"]),
+        "'SG9' SG1",
+    ),
+    "export nothing": ("export", settings(model="missing.pt"), "no detector missing.pt"),
+    "export in a precision": (
+        "export",
+        settings(model="{model}", precision="int8"),
+        "precision float32 float64 'int8'",
+    ),
+    "export of no graph": ("export", settings(model="{model}", graph="cnn"), "bin stream 'cnn'"),
+    "export of no alarm": ("export", settings(model="{bare}", graph="stream"), "alarm onset"),
+    "certify nothing": ("certify", settings(model="missing.pt"), "no detector missing.pt"),
+    "adapt without statistics": (
+        "adapt",
+        settings(model="{bare}", recordings="{root}", channels=CHANNELS),
+        "statistics.pt statistics=true",
+    ),
+    "adapt by nothing": ("adapt", settings(model="{model}"), "recordings"),
+    "adapt in another way": ("adapt", settings(model="{model}", action="learn"), "add 'learn'"),
+    "undo nothing": ("adapt", settings(model="{model}", action="undo"), "undo"),
+    "importance of nothing": ("importance", settings(model="missing.pt"), "missing.pt"),
+    "crossval of too many": (
+        "crossval",
+        [*of_set("{root}"), *settings(num_held_out=4, workers=0)],
+        "num_unseen 4",
+    ),
+    "pareto without time": ("pareto", files(deadline_ms=-1), "deadline_ms -1"),
+    "calibrate on reported seeds": (
+        "calibrate",
+        settings(calibration_seeds=[3]),
+        "seeds 1000 [3]",
+    ),
+    "generate an unknown material": (
+        "generate",
+        settings(generated_materials=["gold"], workers=0),
+        "'gold' M1",
+    ),
+    "data action": ("data", settings(action="mend", root_of_data="{root}"), "'mend' check"),
+    "data of nothing": ("data", settings(action="check", root_of_data="nowhere"), "nowhere"),
+    "convert to nothing": (
+        "data",
+        settings(action="convert", root_of_data="{root}", format="docx", output="to"),
+        "'docx' npz text",
+    ),
+    "shard beyond": ("stats", settings(action="collect", out="x", shard="3/2"), "shard 3/2"),
+}
+
+
+BEHIND_A_BAR = {"bin of half samples"}
+"""Seen only when the first pass has begun, and so behind its progress bar."""
+
+
+@pytest.fixture(scope="module")
+def places(trained_by, recordings, tmp_path_factory):
+    """What stands for the words in braces: a detector with an alarm, one without, recordings."""
+    folder = tmp_path_factory.mktemp("bare")
+    bare = SlipDetector.load(trained_by("general").file)
+    del bare.info[ALARM_INFO]
+    bare.save(folder / DETECTOR)
+    model = trained_by("selected").file
+    return {"{model}": model, "{root}": recordings, "{bare}": folder / DETECTOR}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_one_line_and_a_failing_exit(command, places, name, tmp_path):
+    which, overrides, words = MISTAKES[name]
+    for word, place in places.items():
+        overrides = [override.replace(word, str(place)) for override in overrides]
+    ran = command(tmp_path, which, *overrides)
+    assert ran.status == BAD_INPUT_STATUS, ran
+    line = ran.err.replace("\r", "\n").splitlines()[-1]
+    if name in BEHIND_A_BAR:
+        line = line[line.index("error: ") :]
+    else:
+        assert ran.err == f"{line}\n"
+    assert line.startswith("error: ")
+    missing = [word for word in words.split() if word not in line]
+    assert not missing, ran.err
+
+
+@pytest.mark.parametrize("which", COMMANDS)
+def test_a_misspelt_key_is_refused_by_every_command(command, which, tmp_path):
+    """By Hydra's own message, in several lines, with the key in it."""
+    key = MISSPELT_KEY if which == "train" else "misspelt_key"
+    ran = command(tmp_path, which, f"{key}=1")
+    assert ran.status != 0
+    assert key.split(".")[-1] in ran.err
+    assert "Traceback" not in ran.err
+
+
+def test_a_traceback_is_there_for_whoever_asks(tmp_path):
+    """In a process of its own, as a user starts it; a broken recording is named too."""
+    told = settings(model="missing.pt")
+    done = subprocess.run(
+        [sys.executable, *arguments_of("evaluate", *told)],
+        cwd=tmp_path,
+        env=environment(**{TRACEBACK_VARIABLE: "1"}),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode != 0
+    assert "Traceback" in done.stderr
+    assert "missing.pt" in done.stderr
