@@ -22,19 +22,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from tactslip_torch.adapting.bins import RecordingBins
-from tactslip_torch.adapting.held_out import solve
-from tactslip_torch.adapting.lock import locked
-from tactslip_torch.adapting.naming import check_once, known_names, materials_of
-from tactslip_torch.adapting.reading import recording_bins
-from tactslip_torch.adapting.renewal import renewed
-from tactslip_torch.adapting.statistics import (
-    FILE,
-    Statistics,
-    detector_digest,
-    statistics_of,
-)
-from tactslip_torch.adapting.steps import Change, add, check_weight, forget, taken, undo
 from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
@@ -46,6 +33,28 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import KEY as ALARM
 from tactslip_torch.progress import bar
 from tactslip_torch.report.adaptation import adaptation_figure, adaptation_table, journal_table
+from tactslip_torch.training.adaptation import (
+    Change,
+    add,
+    check_once,
+    check_weight,
+    forget,
+    known_names,
+    materials_of,
+    recording_bins,
+    renewed,
+    solve,
+    taken,
+    undo,
+)
+from tactslip_torch.training.statistics import (
+    FILE,
+    RecordingBins,
+    Statistics,
+    detector_digest,
+    locked,
+    statistics_of,
+)
 
 FORMAT = "tactslip_torch adaptation 1"
 

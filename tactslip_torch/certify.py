@@ -3,7 +3,7 @@
 Writes ``certificate.json`` and ``certificate.html`` beside the detector: float32 against float64 on
 training bins, on held-out bins and on generated extremes, with the margin within which a decision
 may turn. Exit status 0 if the certificate holds, 1 if it does not; the files are written all the
-same. In a program, ``tactslip_torch.certificate.certify`` needs no configuration.
+same. In a program, ``tactslip_torch.analysis.certificate.certify`` needs no configuration.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 import tactslip_torch
-from tactslip_torch.certificate import certify as measure
+from tactslip_torch.analysis.certificate import certify as measure
 from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.data.labels import LabelRule, needed_windows
 from tactslip_torch.data.recording import RecordingId, RecordingSource
@@ -35,8 +35,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.progress import bar
 from tactslip_torch.report.certificate import verdict
 from tactslip_torch.report.certificate_page import MARK, certificate_page
-from tactslip_torch.signals.binning import bins_at
-from tactslip_torch.signals.finite import refuse_nonfinite
+from tactslip_torch.signals.binning import bins_at, refuse_nonfinite
 
 FORMAT = "tactslip_torch certificate 1"
 EXIT_DOES_NOT_HOLD = 1

@@ -31,8 +31,7 @@ from tactslip_torch.config import (
     run_entry_point,
 )
 from tactslip_torch.data.folder import file_facts, has_truth, recording_files
-from tactslip_torch.data.formats.reading import Reading, pieces
-from tactslip_torch.data.formats.registry import open_file
+from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.data.sets.hand_file import HandFile, hand_file
 from tactslip_torch.data.sets.stream import stream_of
@@ -40,8 +39,7 @@ from tactslip_torch.experiment import save_config, versions
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing import dead_names
-from tactslip_torch.onset.answering import answer_of
-from tactslip_torch.onset.decider import Decisions
+from tactslip_torch.onset.decisions import Decisions, answer_of
 from tactslip_torch.onset.events import (
     EventRules,
     LatencyParts,

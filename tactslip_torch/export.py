@@ -36,7 +36,7 @@ from tactslip_torch.graph.facts import (
     sidecar_path,
     sidecar_text,
 )
-from tactslip_torch.graph.form import Form, Layout, Precision
+from tactslip_torch.graph.form import Form, Precision
 from tactslip_torch.graph.stream import stream_graph
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
@@ -51,7 +51,6 @@ def export_detector(
     folder: str | os.PathLike[str],
     graphs: Sequence[GraphKind] = ("bin", "stream"),
     precision: Precision = "float32",
-    layout: Layout = "latency",
     *,
     source: str | os.PathLike[str] | None = None,
     alone: bool = True,
@@ -63,7 +62,6 @@ def export_detector(
         folder: for ``model.onnx`` and ``stream.onnx``.
         graphs: ``"bin"``, ``"stream"`` or both.
         precision: of samples and scores, ``"float32"`` or ``"float64"``.
-        layout: ``"latency"`` for one bin at a time, ``"bulk"`` for many.
         source: file that the detector is kept in; by it a host knows which it has, and a
             ``certificate.json`` beside it is handed on if it is this detector's.
         alone: whether the check runs each file in a process of its own, which takes a second.
@@ -75,7 +73,7 @@ def export_detector(
         ValueError: if there is no such graph, form or setting, or a model fails its check; what
             was in the folder is kept then.
     """
-    form = Form(precision, layout)
+    form = Form(precision)
     if not graphs or not set(graphs) <= set(get_args(GraphKind)):
         wanted = " or ".join(get_args(GraphKind))
         raise ValueError(f"graphs must be {wanted}, or both, got {', '.join(graphs) or 'none'}")
@@ -207,9 +205,7 @@ def main(config: DictConfig) -> None:
         if folder.suffix == ".onnx" or folder.is_file():
             raise ValueError(f"output must be a folder, got {folder}; the files have their names")
         graphs = _wanted(config.graph, detector)
-        paths = export_detector(
-            detector, folder, graphs, config.precision, config.layout, source=source
-        )
+        paths = export_detector(detector, folder, graphs, config.precision, source=source)
         for path in paths:
             print(summary(path))
 

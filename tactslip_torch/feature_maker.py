@@ -24,8 +24,7 @@ from tactslip_torch.features.cache import FeatureCache, cache_key, source_digest
 from tactslip_torch.features.extractor import EngineName, FeatureExtractor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.signals.binning import bins_at
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.signals.learnable import extended
+from tactslip_torch.signals.filtering import ChannelFilter, extended
 
 
 class Stroke(NamedTuple):

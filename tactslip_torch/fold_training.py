@@ -11,10 +11,6 @@ import lightning as L
 from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig
 
-from tactslip_torch.adapting.gathering import check_recipe, gathered_statistics
-from tactslip_torch.adapting.statistics import FILE as STATISTICS
-from tactslip_torch.alarming.debounced import Debounced
-from tactslip_torch.alarming.stage import Alarming
 from tactslip_torch.config import (
     one_line,
 )
@@ -31,12 +27,14 @@ from tactslip_torch.graph.facts import GraphKind
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
-from tactslip_torch.onset.scoring import Scorer
+from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.settings import KEY
 from tactslip_torch.recipe import Recipe, stand_for
 from tactslip_torch.report.tuning import tuning_figure
-from tactslip_torch.tuning.second_fit import settled_learner, tuned_maker
-from tactslip_torch.tuning.stage import Tuning
+from tactslip_torch.training.adaptation import check_recipe, gathered_statistics
+from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
+from tactslip_torch.training.statistics import FILE as STATISTICS
+from tactslip_torch.training.tuning import Tuning, settled_learner
 
 log = logging.getLogger(__name__)
 
@@ -63,8 +61,8 @@ class SaveAfterFirstPass(Checkpoint):
 
 def tune_fold(
     config: DictConfig, folder: Path, data: SlipDataModule, first: SlipLearner, tuning: Tuning
-) -> tuple[SlipDataModule, SlipLearner, dict[str, Any]]:
-    """Fit as the recipe says, and learn from there; what the second fit takes, and what was found.
+) -> tuple[SlipLearner, dict[str, Any]]:
+    """Fit as the recipe says, and learn from there: the second fit's learner, and what was found.
 
     Detectors of the recipe's choice and of the grid's least loss are judged as the tuned one will
     be, and kept as ``grid.pt`` and ``start.pt``: what is beyond the latter is due to the gradient.
@@ -81,11 +79,11 @@ def tune_fold(
     plan, (_, sample) = first.plan, first.gathered
     counts = [float(sample.represents[sample.is_slip == kind].sum()) for kind in (False, True)]
     weights = stand_for(sample, first.recipe, counts)
-    tuned = tuning(plan, first.recipe, sample, weights, data.maker, data.split)
+    names = [str(name) for name in data.maker.pool.names]
+    tuned = tuning(plan, first.recipe, sample, weights, names)
     facts |= tuned.facts
     start = facts["start"]
-    parts = (data.maker, plan.frame, start["penalty"], start["offset"])
-    by_loss = settled_learner(first, *parts)
+    by_loss = settled_learner(first, data.maker, plan.frame, start["penalty"], start["offset"])
     other = make_trainer(config.trainer, folder / "start")
     other.fit(by_loss, datamodule=data)
     facts["splits"] = {}
@@ -98,10 +96,9 @@ def tune_fold(
             learner.detector.save(folder / f"{name}.pt")
     simulated = data.maker.source.is_simulated
     tuning_figure(facts, folder / "tuning.png", simulated=simulated)
-    maker = tuned_maker(tuned, data.maker)
-    learner = settled_learner(first, maker, tuned.frame, tuned.penalty, tuned.offset)
+    learner = settled_learner(first, data.maker, tuned.frame, tuned.penalty, tuned.offset)
     facts["validation"] = first.facts["validation"]
-    return SlipDataModule(maker, data.split, config.num_workers), learner, facts
+    return learner, facts
 
 
 def run_fold(
@@ -109,7 +106,7 @@ def run_fold(
     folder: Path,
     data: SlipDataModule,
     learner: SlipLearner,
-    alarming: Alarming | Debounced | None,
+    alarming: CalibratedAlarm | DebouncedAlarm | None,
     tuned: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Fit, test, set the alarm of, save and export one fold; what it found.

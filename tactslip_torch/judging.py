@@ -27,8 +27,8 @@ from tactslip_torch.onset.events import (
     pooled_metrics,
     recording_events,
 )
-from tactslip_torch.onset.latch import latch, latch_start
-from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.onset.rules import latch, latch_start
+from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.report.answers import answer_counts, answer_metrics
 from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
 
@@ -144,7 +144,7 @@ def events_by_rule(
         statistic, _ = rule.scan(llr, rule.start(llr[:, 0]))
         start = latch_start(llr[:, 0])
         is_alarm, is_on, _ = latch(
-            statistic, 0.0, margin=rule.margin, rearm=1, refractory=0, state=start
+            statistic, 0.0, rearm=1, refractory=0, state=start
         )
         heard: dict[RecordingId, list[_Stream]] = {}
         for (part, rows), alarms, status in zip(streams, is_alarm, is_on, strict=True):

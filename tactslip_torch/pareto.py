@@ -29,31 +29,34 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
-from tactslip_torch.data.labels import LabelRule
-from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.data.splits import Split
-from tactslip_torch.deadline.cost import CostModel
-from tactslip_torch.deadline.front import (
+from tactslip_torch.analysis.latency import (
+    DEFINITION,
+    CostModel,
+    Latency,
+    Limits,
+    Timing,
+    check_hops,
+    check_number,
+    least_latency_ms,
+    shortest_hop,
+    time_in_fresh_process,
+)
+from tactslip_torch.analysis.pareto import (
     Candidate,
+    Search,
+    Searcher,
+    Timed,
+    Workshop,
     distinct,
     landmarks,
     nondominated,
     worth_naming,
     worth_timing,
 )
-from tactslip_torch.deadline.latency import (
-    DEFINITION,
-    Latency,
-    Limits,
-    check_hops,
-    check_number,
-    least_latency_ms,
-    shortest_hop,
-)
-from tactslip_torch.deadline.search import Search, Searcher
-from tactslip_torch.deadline.timing import Timing, time_in_fresh_process
-from tactslip_torch.deadline.workshop import Timed, Workshop
+from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.recording import RecordingSource
+from tactslip_torch.data.splits import Split
 from tactslip_torch.experiment import common_facts, feature_cache, feature_parts, save_config
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache

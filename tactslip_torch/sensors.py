@@ -22,6 +22,16 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from tactslip_torch.analysis.importance import (
+    HELD_OUT,
+    Draws,
+    Ranking,
+    Refit,
+    draw_raw_bins,
+    first_order,
+    measure,
+    score_gradients,
+)
 from tactslip_torch.config import conf_dir, errors_in_one_line, run_entry_point
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import ROLES, Split
@@ -33,11 +43,6 @@ from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.selection import t_scores
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.files import whole_file
-from tactslip_torch.importance.choosing import Ranking
-from tactslip_torch.importance.gradient import first_order, score_gradients
-from tactslip_torch.importance.measuring import Draws, measure
-from tactslip_torch.importance.raw_bins import draw_raw_bins
-from tactslip_torch.importance.refit import HELD_OUT, Refit
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.progress import bar

@@ -20,8 +20,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from tactslip_torch.abstaining import Abstaining
-from tactslip_torch.alarming.debounced import Debounced
-from tactslip_torch.alarming.stage import Alarming
 from tactslip_torch.config import (
     conf_dir,
     errors_in_one_line,
@@ -46,7 +44,8 @@ from tactslip_torch.folds import combined
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.report.results import print_results, write_results
-from tactslip_torch.tuning.stage import Tuning
+from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
+from tactslip_torch.training.tuning import Tuning
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +77,8 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     if config.statistics:
         check_statistics(config, recipe)
     abstaining = Abstaining(config.coverage, config.coverage_by)
-    alarming: Alarming | Debounced | None = instantiate(config.onset, _convert_="all") or None
+    alarming: CalibratedAlarm | DebouncedAlarm | None
+    alarming = instantiate(config.onset, _convert_="all") or None
     tuning: Tuning | None = instantiate(config.tuning, _convert_="all") or None
     if config.trainer.get("fast_dev_run"):
         tuning = None  # a batch has no materials to hold out
@@ -86,13 +86,13 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         if config.ckpt_path is not None:
             raise ValueError("tuning starts from the first pass, which ckpt_path skips; leave it")
         for fold in folds:
-            tuning.check(recipe, pool, fold)
-    if isinstance(alarming, Alarming) and len(folds) > 1:
+            tuning.check(recipe, fold)
+    if isinstance(alarming, CalibratedAlarm) and len(folds) > 1:
         raise ValueError(
             f"onset=alarms sets the alarm of one detector, this split makes {len(folds)}; take "
             "split=unseen4 or split=seen6, or onset=debounced"
         )
-    if isinstance(alarming, Debounced):
+    if isinstance(alarming, DebouncedAlarm):
         alarming.hop_samples(pool.sample_rate_hz, pool.bin_samples)  # refused before the fit
     is_first = is_first_process()
     if is_first:
@@ -112,7 +112,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             )
             found: dict[str, Any] | None = None
             if tuning is not None:
-                data, learner, found = tune_fold(config, place, data, learner, tuning)
+                learner, found = tune_fold(config, place, data, learner, tuning)
             fold_metrics[fold.name] = run_fold(config, place, data, learner, alarming, found)
     metrics = common_facts(source, pool, config) | combined(fold_metrics, are_rivals(folds))
     metrics["timing_s"]["total"] = time.perf_counter() - started

@@ -18,8 +18,8 @@ from test_detector import random_detector
 
 from tactslip_torch import Scene, SlipDetector, simulate
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.onset.scoring import score_stream
-from tactslip_torch.onset.sequential import Cusum
+from tactslip_torch.onset.decisions import score_stream
+from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 

@@ -19,9 +19,8 @@ from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.conformal import thresholds
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.onset.answering import answer_of
-from tactslip_torch.onset.decider import Decider, Decisions
-from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.onset.decisions import Decider, Decisions, answer_of
+from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.planning import Plan, plan_detector
 from tactslip_torch.recipe import Recipe, stand_for

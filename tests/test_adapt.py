@@ -16,20 +16,17 @@ from test_commands import TINY, TinyRecordings, composed
 from tactslip_torch import SlipDetector
 from tactslip_torch import adapt as module
 from tactslip_torch.adapt import adapt
-from tactslip_torch.adapting.acceptance import Verdict
-from tactslip_torch.adapting.held_out import class_scales
-from tactslip_torch.adapting.lock import locked
-from tactslip_torch.adapting.statistics import Statistics, detector_digest
-from tactslip_torch.adapting.steps import add
 from tactslip_torch.config import conf_dir, one_line
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.conformal import answers, thresholds
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.train import train
+from tactslip_torch.training.adaptation import Verdict, add, class_scales
+from tactslip_torch.training.statistics import Statistics, detector_digest, locked
 
 TRAINING = (*TINY, "recipe=robust", "data.seed=0", "statistics=true", "coverage=0.5", "cache=off")
 SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0)
@@ -88,9 +85,9 @@ def test_training_leaves_statistics_that_make_its_detector(trained):
     assert found.detector == detector_digest(detector)
     machine = found.machine
     head = found.sums.solve(machine.penalty, machine.offset, balance=machine.balance)
-    z = found.witnesses.z
+    z = found.rehearsal.z
     torch.testing.assert_close(head(z), detector.head(z), rtol=1e-9, atol=1e-12)
-    assert sorted(set(found.witnesses.materials)) == ["A", "B"]
+    assert sorted(set(found.rehearsal.materials)) == ["A", "B"]
 
 
 def test_a_material_comes_in_and_all_is_said(run, files, trained, capsys):
@@ -178,7 +175,7 @@ def test_what_is_forgotten_leaves_the_machine_it_came_to(run, files, trained):
     add_c(run, files, "weight=3")
     adapt(settings(run, "action=forget", "material=C"), run / "results")
     old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
-    z = Statistics.load(run / "statistics.pt").witnesses.z
+    z = Statistics.load(run / "statistics.pt").rehearsal.z
     torch.testing.assert_close(new.head(z), old.head(z), rtol=1e-9, atol=1e-12)
     assert new.info["train_materials"] == ["A", "B"]
 

@@ -7,12 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.adapting import steps
-from tactslip_torch.adapting.acceptance import OF_ONE, Verdict, accuracies, compared, mean_recall
-from tactslip_torch.adapting.bins import RecordingBins, Witnesses, known_bins
-from tactslip_torch.adapting.held_out import class_scales, solve
-from tactslip_torch.adapting.statistics import Machine, Statistics
-from tactslip_torch.adapting.steps import FACTORS, OF_MARGIN, add, forget, taken, undo
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.fitting import training_part
 from tactslip_torch.model.fit import TrainingBins, fit_machine
@@ -21,6 +15,29 @@ from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.sufficient import SufficientStats
 from tactslip_torch.planning import Plan
 from tactslip_torch.recipe import Frame
+from tactslip_torch.training import adaptation as steps
+from tactslip_torch.training.adaptation import (
+    FACTORS,
+    OF_MARGIN,
+    OF_ONE,
+    Verdict,
+    accuracies,
+    add,
+    class_scales,
+    compared,
+    forget,
+    mean_recall,
+    solve,
+    taken,
+    undo,
+)
+from tactslip_torch.training.statistics import (
+    Machine,
+    RecordingBins,
+    Rehearsal,
+    Statistics,
+    known_bins,
+)
 
 K, NUM_BINS = 3, 24
 MACHINE = Machine(0.05, 0.5, "weights")
@@ -42,12 +59,12 @@ def recordings(material, number, first_seed, turn=0.0):
 
 
 def statistics(trained):
-    """Of recordings whose bins are all witnesses."""
+    """Of recordings whose bins are all rehearsal."""
     sums = SufficientStats(K)
     for name, own in trained.items():
         sums.update(name, own.z, own.is_slip)
     sizes = torch.tensor([len(own.z) for own in trained.values()])
-    witnesses = Witnesses(
+    rehearsal = Rehearsal(
         torch.cat([own.z for own in trained.values()]),
         torch.cat([own.is_slip for own in trained.values()]),
         torch.ones(int(sizes.sum()), dtype=torch.float64),
@@ -55,7 +72,7 @@ def statistics(trained):
         tuple(trained),
         tuple(own.material for own in trained.values()),
     )
-    return Statistics(sums, MACHINE, {"bin_ms": 50.0}, witnesses, "digest", {}, {})
+    return Statistics(sums, MACHINE, {"bin_ms": 50.0}, rehearsal, "digest", {}, {})
 
 
 @pytest.fixture(scope="module")
@@ -302,7 +319,7 @@ def test_mean_recall_is_balanced_accuracy_or_that_of_the_one_class():
 
 def test_witnesses_give_way_to_all_bins_of_a_recording_that_is_taken_out(old, trained, new):
     known = known_bins(
-        old.witnesses, {"a/0": trained["a/0"]} | new, {"a/0": 0.0} | dict.fromkeys(new, 3.0)
+        old.rehearsal, {"a/0": trained["a/0"]} | new, {"a/0": 0.0} | dict.fromkeys(new, 3.0)
     )
     assert not bool(known.of(["a/0"]).any())
     assert set(known.weight[known.of(new)].tolist()) == {3.0}
@@ -325,7 +342,7 @@ def test_witnesses_are_bins_that_were_trained_on_under_undersampling(rng):
         is_slip = torch.arange(40) % 2 == 0
         sample.update(name, "m", features, is_slip)
         kept[name] = training_part(plan, name, features, is_slip)[0]
-    found = Witnesses.of(plan, sample.bins(), {"m/0": "m", "m/1": "m"})
+    found = Rehearsal.of(plan, sample.bins(), {"m/0": "m", "m/1": "m"})
     for number, name in enumerate(found.recordings):
         rows = found.z[found.recording == number]
         in_training = (rows[:, None] == kept[name]).all(-1).any(-1)

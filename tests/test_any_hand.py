@@ -20,7 +20,7 @@ from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.rounding import is_rounding
 from tactslip_torch.graph.form import Window
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.recipe import Recipe

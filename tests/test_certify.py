@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from small_detector import raw_bins, small_detector
 from test_commands import TinyRecordings
 
-from tactslip_torch.certificate import certify as measure
+from tactslip_torch.analysis.certificate import certify as measure
 from tactslip_torch.certify import _plain, certify, main
 from tactslip_torch.config import conf_dir
 from tactslip_torch.features.cache import cache_key

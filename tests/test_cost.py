@@ -10,21 +10,19 @@ import torch
 from scipy.optimize import nnls
 from small_detector import HAND, small_detector
 
-from tactslip_torch.deadline.cost import (
+from tactslip_torch.analysis.latency import (
     GROUPS,
     CostModel,
+    Timing,
     _counted,
     _designs,
     _line,
     _nonnegative,
+    main,
     measure_costs,
+    one_thread,
     parts_of,
     stand_in,
-)
-from tactslip_torch.deadline.timing import (
-    Timing,
-    main,
-    one_thread,
     time_calls,
     time_in_fresh_process,
 )
@@ -185,8 +183,10 @@ class Played:
     def __init__(self, monkeypatch, *runs):
         self.now, self.switches = 0, 0
         self.left = iter([1, *(us for run in runs for us in run)])  # the first is not timed
-        monkeypatch.setattr("tactslip_torch.deadline.timing.time.perf_counter_ns", lambda: self.now)
-        monkeypatch.setattr("tactslip_torch.deadline.timing._interruptions", lambda: self.switches)
+        monkeypatch.setattr(
+            "tactslip_torch.analysis.latency.time.perf_counter_ns", lambda: self.now
+        )
+        monkeypatch.setattr("tactslip_torch.analysis.latency._interruptions", lambda: self.switches)
 
     def __call__(self, given):
         us = next(self.left)
@@ -223,7 +223,7 @@ def test_a_saved_detector_is_timed_in_a_process_of_its_own(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"timing .*gone.pt in a fresh process failed: .*gone.pt"):
         time_in_fresh_process(tmp_path / "gone.pt", 20)
     with pytest.raises(
-        SystemExit, match=r"usage: python -m tactslip_torch.deadline.timing detector.pt"
+        SystemExit, match=r"usage: python -m tactslip_torch.analysis.latency detector.pt"
     ):
         main([])
 
@@ -244,7 +244,7 @@ def test_threads_are_given_back():
 
 
 def test_the_module_runs_as_a_command():
-    command = [sys.executable, "-m", "tactslip_torch.deadline.timing"]
+    command = [sys.executable, "-m", "tactslip_torch.analysis.latency"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert "usage: python -m tactslip_torch.deadline.timing detector.pt" in done.stderr
+    assert "usage: python -m tactslip_torch.analysis.latency detector.pt" in done.stderr

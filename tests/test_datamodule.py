@@ -10,8 +10,7 @@ from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.signals.savgol import savgol_filter
+from tactslip_torch.signals.filtering import ChannelFilter, savgol_filter
 
 
 def split_of(source, **options):

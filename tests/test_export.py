@@ -155,11 +155,3 @@ def test_every_head_and_scaler_comes_through(variant, precision, tmp_path):
     spread = float(detector.score_raw(noise(64)).std())
     np.testing.assert_allclose(got["score"], expected, rtol=0, atol=worst * spread)
     assert got["score"].dtype == precision
-
-
-def test_the_bulk_layout_gives_the_same(detector, exported, tmp_path):
-    paths = export_detector(detector, tmp_path, layout="bulk", alone=False)
-    samples = cropped(detector, raw_bins(64).float())
-    in_bulk, one = (run(path, samples=samples)["score"] for path in (paths[0], exported[0]))
-    assert sidecar_facts(paths[0])["layout"] == sidecar_facts(paths[1])["layout"] == "bulk"
-    np.testing.assert_allclose(in_bulk, one, rtol=0, atol=1e-4 * float(one.std()))

@@ -116,15 +116,15 @@ def test_the_command_leaves_what_the_detector_can_give(monkeypatch, capsys, tmp_
     detector.save(tmp_path / "detector.pt")
     made = []
 
-    def instead(of, folder, graphs, precision, layout, *, source):
-        made.append((str(folder), graphs, precision, layout, str(source)))
+    def instead(of, folder, graphs, precision, *, source):
+        made.append((str(folder), graphs, precision, str(source)))
         return ()
 
     monkeypatch.setattr(export, "export_detector", instead)
     model = f"model={tmp_path / 'detector.pt'}"
     assert command(monkeypatch, capsys, model) == (0, "", "")
     out = tmp_path / "out"
-    options = ("graph=stream", "precision=float64", "layout=bulk", f"output={out}")
+    options = ("graph=stream", "precision=float64", f"output={out}")
     assert command(monkeypatch, capsys, model, *options)[0] == 0
     command(monkeypatch, capsys, model, "graph=both")
     detector = small_detector()
@@ -132,10 +132,10 @@ def test_the_command_leaves_what_the_detector_can_give(monkeypatch, capsys, tmp_
     command(monkeypatch, capsys, model)
     source, here = str(tmp_path / "detector.pt"), str(tmp_path)
     assert made == [
-        (here, ("bin", "stream"), "float32", "latency", source),
-        (str(out), ("stream",), "float64", "bulk", source),
-        (here, ("bin", "stream"), "float32", "latency", source),
-        (here, ("bin",), "float32", "latency", source),
+        (here, ("bin", "stream"), "float32", source),
+        (str(out), ("stream",), "float64", source),
+        (here, ("bin", "stream"), "float32", source),
+        (here, ("bin",), "float32", source),
     ]
 
 

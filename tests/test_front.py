@@ -7,18 +7,18 @@ import pytest
 import torch
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
 
-from tactslip_torch.data.splits import seen6
-from tactslip_torch.datamodule import SlipDataModule
-from tactslip_torch.deadline.cost import GROUPS, CostModel
-from tactslip_torch.deadline.front import (
+from tactslip_torch.analysis.latency import GROUPS, CostModel, Latency, Limits
+from tactslip_torch.analysis.pareto import (
     Candidate,
+    Search,
+    Searcher,
     landmarks,
     nondominated,
     worth_naming,
     worth_timing,
 )
-from tactslip_torch.deadline.latency import Latency, Limits
-from tactslip_torch.deadline.search import Search, Searcher
+from tactslip_torch.data.splits import seen6
+from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.features.groups import allowed, of_fingers
 from tactslip_torch.features.names import FeatureName, pool_names
 from tactslip_torch.features.pool import FeaturePool

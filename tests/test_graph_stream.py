@@ -17,8 +17,8 @@ from tactslip_torch.graph.stream import Timing, stream_graph
 from tactslip_torch.graph.value import F64
 from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.judgement import Judgement
-from tactslip_torch.onset.scoring import score_stream
-from tactslip_torch.onset.sequential import BayesFilter, Cusum, Hysteresis, KOfN
+from tactslip_torch.onset.decisions import score_stream
+from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -26,10 +26,7 @@ from tactslip_torch.signals.filtering import ChannelFilter
 RATE = 2000.0
 KINDS = ("all", "PVDF", "long")  # long: a frame that a causal bin does not hold
 ALIGNMENTS = ("centred", "causal", "trailing")
-RULES = {
-    rule.name: rule
-    for rule in (KOfN(2, 3), Hysteresis(0.5), BayesFilter(1.0, 0.3, 0.01, 0.2), Cusum(0.5, 0.5, 2))
-}
+RULES = {rule.name: rule for rule in (KOfN(2, 3), Cusum(0.5, 0.5, 2))}
 # Scores of the stand-in lie about 0, so that half of them speak for slip.
 CALIBRATIONS = {
     "platt": Platt(1.0, 0.0),

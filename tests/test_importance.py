@@ -7,24 +7,24 @@ import pytest
 import torch
 from small_detector import HAND, raw_bins, small_detector
 
-from tactslip_torch.features.bin_sample import BinSample
-from tactslip_torch.features.selection import ClassMoments, t_scores
-from tactslip_torch.hand import HandLayout
-from tactslip_torch.importance.accuracy import (
+from tactslip_torch.analysis.importance import (
+    HELD_OUT,
+    Ranking,
+    Refit,
     balanced_accuracy,
+    best_first,
     difference,
     draw_recordings,
-    tally,
-)
-from tactslip_torch.importance.choosing import (
-    Ranking,
-    best_first,
+    first_order,
+    score_gradients,
     side_by_side,
+    tally,
     units_of,
     without,
 )
-from tactslip_torch.importance.gradient import first_order, score_gradients
-from tactslip_torch.importance.refit import HELD_OUT, Refit
+from tactslip_torch.features.bin_sample import BinSample
+from tactslip_torch.features.selection import ClassMoments, t_scores
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import PAPER_KERNEL
 from tactslip_torch.model.scaling import FeatureScaler

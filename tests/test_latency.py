@@ -2,7 +2,7 @@
 
 import pytest
 
-from tactslip_torch.deadline.latency import (
+from tactslip_torch.analysis.latency import (
     Latency,
     Limits,
     check_hops,

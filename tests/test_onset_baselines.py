@@ -20,8 +20,8 @@ from tactslip_torch.onset.baselines import (
     first_transition,
     largest_detail,
 )
-from tactslip_torch.onset.latch import latch, latch_start
-from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.decisions import score_stream
+from tactslip_torch.onset.rules import latch, latch_start
 from tactslip_torch.signals.filtering import ChannelFilter
 
 FILMS = HandLayout.paper24().indices("PVDF")
@@ -223,7 +223,7 @@ def test_transitions_take_any_axes_and_are_causal(rng):
 def test_it_is_the_latch_without_debounce_and_pause(rng):
     llr = torch.from_numpy(rng.standard_normal((4, 100)))
     start = latch_start(llr[:, 0])
-    is_alarm, is_on, _ = latch(llr, 0.0, margin=0.0, rearm=1, refractory=0, state=start)
+    is_alarm, is_on, _ = latch(llr, 0.0, rearm=1, refractory=0, state=start)
     assert torch.equal(first_transition(llr >= 0), is_alarm)
     assert torch.equal(llr >= 0, is_on)
 

@@ -13,13 +13,10 @@ from test_commands import TinyRecordings, composed
 
 import tactslip_torch.pareto as command
 from tactslip_torch import SlipDetector
+from tactslip_torch.analysis.latency import Latency, Limits, Timing
+from tactslip_torch.analysis.pareto import Candidate, Search, Timed, Workshop, distinct
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import seen6, unseen4
-from tactslip_torch.deadline.front import Candidate, distinct
-from tactslip_torch.deadline.latency import Latency, Limits
-from tactslip_torch.deadline.search import Search
-from tactslip_torch.deadline.timing import Timing
-from tactslip_torch.deadline.workshop import Timed, Workshop
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.groups import allowed
 from tactslip_torch.features.pool import FeaturePool
@@ -263,7 +260,7 @@ def test_those_that_meet_the_limits_go_by_accuracy(monkeypatch, tmp_path):
         us = 100.0 * (len(met) + 2)
         return Timing(100.0, us, us, calls)
 
-    monkeypatch.setattr("tactslip_torch.deadline.workshop.time_detector", played)
+    monkeypatch.setattr("tactslip_torch.analysis.pareto.time_detector", played)
     slow = Timing(50.0, 900_000.0, 900_000.0, 20)
     monkeypatch.setattr(command, "time_in_fresh_process", lambda *a: slow)
     found = run(tmp_path, "deadline_ms=500", "compute_us=400", "tries=9")

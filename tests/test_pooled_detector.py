@@ -13,14 +13,13 @@ from hydra.utils import instantiate
 from test_commands import TINY, composed, run_train
 
 from tactslip_torch import SlipDetector
-from tactslip_torch.certificate import certify
+from tactslip_torch.analysis.certificate import certify
+from tactslip_torch.analysis.importance import Refit, without
 from tactslip_torch.export import export_detector
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.graph.trials import simulated_bins
-from tactslip_torch.importance.choosing import without
-from tactslip_torch.importance.refit import Refit
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.sensors import sensors
 from tactslip_torch.stats import stats

@@ -8,8 +8,8 @@ import torch
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
 from test_learning import learn, unseen_c
 
+from tactslip_torch.analysis.pareto import Workshop
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.deadline.workshop import Workshop
 from tactslip_torch.features.groups import matching
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey

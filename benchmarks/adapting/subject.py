@@ -16,9 +16,6 @@ from torch import Tensor
 
 from benchmarks.adapting.sizes import Sizes
 from benchmarks.reproduction.runs import run
-from tactslip_torch.adapting.bins import RecordingBins
-from tactslip_torch.adapting.reading import recording_bins
-from tactslip_torch.adapting.statistics import Statistics, statistics_of
 from tactslip_torch.config import conf_dir
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
@@ -28,6 +25,8 @@ from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
+from tactslip_torch.training.adaptation import recording_bins
+from tactslip_torch.training.statistics import RecordingBins, Statistics, statistics_of
 
 
 @dataclass(frozen=True, eq=False)

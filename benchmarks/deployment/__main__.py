@@ -84,7 +84,7 @@ def start_rows(files: Files, sizes: Sizes, folder: Path) -> list[dict[str, Any]]
     whole = folder / "bin.npy"
     np.save(whole, raw.numpy())
     jobs = {}
-    for way in (DEPLOYED, exported("float64", "latency")):
+    for way in (DEPLOYED, exported("float64")):
         model = files.paths[of_way(way, BIN)]
         cut = folder / f"{way.replace(', ', '-')}.npy"
         np.save(cut, judge_of(model, 1, ChannelFilter(WINDOW_LENGTHS).context).cut(raw))

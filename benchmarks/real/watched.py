@@ -16,7 +16,6 @@ from omegaconf import DictConfig, OmegaConf
 from benchmarks.real.method import Training
 from benchmarks.real.ours import detector_of
 from benchmarks.real.windows import Array, Windows
-from tactslip_torch.alarming.debounced import Debounced
 from tactslip_torch.data.sets.datasets import FileRecordings
 from tactslip_torch.data.splits import Split
 from tactslip_torch.detect import detect
@@ -24,6 +23,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
+from tactslip_torch.training.alarm import DebouncedAlarm
 
 HOP_MS = 40.0
 
@@ -52,7 +52,7 @@ def watched(
     """
     source = windows.maker.source
     assert isinstance(source, FileRecordings)
-    alarm = Debounced(HOP_MS)
+    alarm = DebouncedAlarm(HOP_MS)
     slips = dict(zip(windows.recording.tolist(), windows.is_slip.tolist(), strict=True))
     counts: dict[str, dict[str, int]] = {}
     shown = ""

@@ -73,7 +73,7 @@ class FeatureExtractor:
         pool: what features there are.
         selected: pool indices of the features wanted, in the order of the output; default: all.
         engine: ``"auto"`` takes the compiled one where numba is installed, else the eager one. Its
-            first use on a machine takes some 20 s (``warm_up``). A smooth pool has the reference.
+            first use on a machine takes some 20 s (``warm_up``).
 
     Attributes:
         plan: the least work for these features.
@@ -105,8 +105,7 @@ class FeatureExtractor:
             )
         self.pool = pool
         self.selected = tuple(chosen)
-        usable = resolved(engine)
-        self.engine: EngineName = usable if pool.smooth is None else "reference"
+        self.engine: EngineName = resolved(engine)
         self.plan = make_plan(pool.hand, pool.level, self.names)
         self._index = None if selected is None else torch.tensor(self.selected)
         self._start()

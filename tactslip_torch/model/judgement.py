@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.plain import is_plain
-from tactslip_torch.signals.finite import refuse_nonfinite
+from tactslip_torch.signals.binning import refuse_nonfinite
 from tactslip_torch.threads import in_parts
 
 Nonfinite = Literal["mask", "raise"]

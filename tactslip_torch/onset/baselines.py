@@ -20,10 +20,9 @@ from torch import Tensor
 from tactslip_torch.features.guards import are_ordinary, is_nowhere, stretch
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.judgement import Judgement
-from tactslip_torch.signals.filter_bank import Wavelet
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
-from tactslip_torch.signals.wavelet import branch_matrix, branch_names
+from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names
 
 BaselineName = Literal["film_band_power", "largest_detail"]
 VIBRATION_HZ = (5.0, 400.0)
