@@ -1,9 +1,9 @@
 """What float32 does to a detector: ``python -m tactslip_torch.certify model=detector.pt``.
 
-Writes ``certificate.json`` and ``certificate.html`` beside the detector: float32 against float64 on
-training bins, on held-out bins and on generated extremes, with the margin within which a decision
-may turn. Exit status 0 if the certificate holds, 1 if it does not; the files are written all the
-same. In a program, ``tactslip_torch.analysis.certificate.certify`` needs no configuration.
+Writes ``certificate.json`` and its figure ``certificate.png`` beside the detector: float32 against
+float64 on training bins, on held-out bins and on generated extremes, with the margin within which a
+decision may turn. Exit status 0 if the certificate holds, 1 if it does not; the files are written
+all the same. In a program, ``tactslip_torch.analysis.certificate.certify`` needs no configuration.
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ from tactslip_torch.features.cache import cache_key, source_digest
 from tactslip_torch.files import whole_file
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.progress import bar
-from tactslip_torch.report.certificate import verdict
-from tactslip_torch.report.certificate_page import MARK, certificate_page
+from tactslip_torch.report.certificate import certificate_figure, verdict
 from tactslip_torch.signals.binning import bins_at, refuse_nonfinite
 
 FORMAT = "tactslip_torch certificate 1"
@@ -93,8 +92,8 @@ def certify(config: DictConfig) -> tuple[dict[str, Any], Path]:
     }
     with whole_file(folder / "certificate.json") as temporary:
         temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    with whole_file(folder / "certificate.html") as temporary:
-        temporary.write_text(certificate_page(content, points), encoding="utf-8")
+    with whole_file(folder / "certificate.png") as temporary:
+        certificate_figure(content, points).savefig(temporary, format="png", dpi=170)
     return content, folder
 
 
@@ -216,10 +215,9 @@ def _refuse_unwritable(folder: Path) -> None:
 
 def _refuse_foreign(folder: Path) -> None:
     """Raise if a file that this would replace is none of ours."""
-    for name, mark in (("certificate.json", FORMAT), ("certificate.html", MARK)):
-        path = folder / name
-        if path.exists() and mark not in path.read_text(encoding="utf-8", errors="replace"):
-            raise ValueError(f"{path} is no certificate of ours; move it, or give another out=")
+    path = folder / "certificate.json"
+    if path.exists() and FORMAT not in path.read_text(encoding="utf-8", errors="replace"):
+        raise ValueError(f"{path} is no certificate of ours; move it, or give another out=")
 
 
 def _plain(value: Any) -> Any:
@@ -236,7 +234,7 @@ def main(config: DictConfig) -> None:
     """Entry point."""
     with errors_in_one_line():
         content, folder = certify(config)
-        line = f"{verdict(content)}; see {folder / 'certificate.html'}"
+        line = f"{verdict(content)}; see {folder / 'certificate.json'}"
         if not content["holds"]:
             print(line, file=sys.stderr)
             raise SystemExit(EXIT_DOES_NOT_HOLD)
