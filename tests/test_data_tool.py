@@ -16,7 +16,7 @@ from test_datasets import HAND, RATE_HZ, broken, manifest, ours, samples, table
 
 from tactslip_torch import data_tool
 from tactslip_torch.config import one_line
-from tactslip_torch.data.formats.registry import FORMATS, format_of
+from tactslip_torch.data.formats import FORMATS, format_of
 from tactslip_torch.data.sets.datasets import FileRecordings
 from tactslip_torch.data.sets.inspection import inspected, oddities
 from tactslip_torch.data.sets.template import guessed, guesser, write_template

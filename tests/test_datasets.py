@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.data.formats.registry import named_format
+from tactslip_torch.data.formats import named_format
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.data.sets import digest, look_memory, survey

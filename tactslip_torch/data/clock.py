@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tactslip_torch.data.clock_step import step_of
 from tactslip_torch.data.clock_ticks import BLOCK, MAKES_UP, Ticks, settled
-from tactslip_torch.data.formats.reading import Samples, Times
+from tactslip_torch.data.formats import Samples, Times
 
 GapRule = Literal["refuse", "missing", "bridge"]
 GAP_RULES: tuple[str, ...] = get_args(GapRule)

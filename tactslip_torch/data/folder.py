@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tactslip_torch.data.formats.header import Archived
-from tactslip_torch.data.formats.reading import Opened
-from tactslip_torch.data.formats.registry import (
+from tactslip_torch.data.formats import (
+    Archived,
     Format,
+    Opened,
     endings,
     find_format,
     format_of,

@@ -227,20 +227,19 @@ WEB_OPTIONS = ("--model", "--recording", "--output")
 # Recordings in files ---------------------------------------------------------------------------
 
 from tactslip_torch.data.clock import even_clock  # noqa: E402
-from tactslip_torch.data.formats.reading import Reading, pieces  # noqa: E402
-from tactslip_torch.data.formats.registry import (  # noqa: E402
+from tactslip_torch.data.formats import (  # noqa: E402
     FORMATS,
+    Reading,
     endings,
     find_format,
     format_of,
     named_format,
     open_file,
+    pieces,
 )
 
-EXTRA_OF_FORMATS = {
-    "h5py": "formats",
-    "mcap": "formats",
-    "rosbags": "formats",
-    "pyarrow": "parquet",
-}
-"""By the library that reads or writes a format the extra that brings it."""
+INSTALL_FORMATS = 'pip install "tactslip-torch[formats]"'
+"""What brings the library of a format that is not installed."""
+ISOLATED = {"isolate": True}
+MOST_MEMORY, MOST_TIME = "isolate_gib", "isolate_s"
+"""Of ``Reading``: in a process of its own, with so much memory and time."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tactslip_torch.data.folder import Written, as_kept, refuse_to_replace
-from tactslip_torch.data.formats.registry import Format, named_format
+from tactslip_torch.data.formats import Format, named_format
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.sets.datasets import FileRecordings
 from tactslip_torch.data.sets.truth import MOMENTS, STRETCHES

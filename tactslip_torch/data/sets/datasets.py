@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from tactslip_torch.data.clock import GapRule
-from tactslip_torch.data.formats.reading import is_number
+from tactslip_torch.data.formats import is_number
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.data.sets.agreement import Part
 from tactslip_torch.data.sets.digest import file_digest
@@ -169,7 +169,7 @@ class FileRecordings:
             "channels": self.hand.to_rows(),
             "treatment": asdict(self._plan.treatment),
             "streams": [
-                {"reading": asdict(stream.reading), "rows": part.rows, "rate_hz": part.rate_hz}
+                {"reading": stream.reading.key(), "rows": part.rows, "rate_hz": part.rate_hz}
                 for stream, part in zip(self._plan.streams, one.parts, strict=True)
             ],
         }

@@ -11,9 +11,7 @@ from torch import Tensor
 
 from tactslip_torch.data.clock import EvenSamples
 from tactslip_torch.data.folder import refuse_other_channels
-from tactslip_torch.data.formats.header import Archived
-from tactslip_torch.data.formats.reading import Reading, Samples
-from tactslip_torch.data.formats.registry import open_file
+from tactslip_torch.data.formats import Archived, Reading, Samples, open_file
 from tactslip_torch.data.sets.sampling import tare_level, tare_of
 from tactslip_torch.data.sets.stream import Found, Stream, hand_of, look_at
 from tactslip_torch.hand import HandLayout

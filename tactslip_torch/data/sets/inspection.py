@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tactslip_torch.data.formats.reading import pieces
+from tactslip_torch.data.formats import pieces
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.sets.agreement import Part
 from tactslip_torch.data.sets.datasets import FileRecordings

@@ -15,8 +15,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from tactslip_torch.data.clock import Clock, Gap
-from tactslip_torch.data.formats.header import DTYPES
 from tactslip_torch.data.sets.stream import Found, Stream
 from tactslip_torch.data.sets.truth import STRETCHES, Truth
 from tactslip_torch.files import whole_file
@@ -28,7 +29,7 @@ Looks = dict[str, tuple[Found, ...]]
 
 def memory_of(root: Path, streams: Iterable[Stream]) -> Path:
     """Where looks at a set are kept, for one way of reading it."""
-    readings = [asdict(stream.reading) for stream in streams]
+    readings = [stream.reading.key() for stream in streams]
     code = hashlib.sha256()
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         code.update(path.read_bytes())
@@ -94,7 +95,7 @@ def _found(plain: dict[str, Any]) -> Found:
         **plain
         | {
             "clock": Clock(rate_hz, num_samples, tuple(Gap(*gap) for gap in gaps), jitter_s),
-            "dtype": DTYPES[plain["dtype"]],
+            "dtype": torch.float32 if plain["dtype"] == "float32" else torch.float64,
             "names": _tuple(plain["names"]),
             "hand": plain["hand"] and HandLayout.from_rows(plain["hand"]),
             "truth": truth and Truth(**truth),

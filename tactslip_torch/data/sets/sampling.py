@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.data.clock import GAP_RULES, EvenSamples, GapRule
-from tactslip_torch.data.formats.reading import Samples, is_number
-from tactslip_torch.data.formats.registry import open_file
+from tactslip_torch.data.formats import Samples, is_number, open_file
 from tactslip_torch.data.sets.stream import Found, Stream
 from tactslip_torch.data.sets.truth import Stretch
 from tactslip_torch.signals.resampling import resample

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import torch
 
 from tactslip_torch.data.clock import Clock, even_clock
-from tactslip_torch.data.formats.reading import AS_IT_SAYS, Opened, Reading
-from tactslip_torch.data.formats.registry import open_file
+from tactslip_torch.data.formats import AS_IT_SAYS, Opened, Reading, open_file
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.data.sets.truth import Truth
 from tactslip_torch.hand import KNOWN_KINDS, Adapting, Channel, HandLayout

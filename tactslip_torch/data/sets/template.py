@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from tactslip_torch.data.formats.registry import endings, find_format
+from tactslip_torch.data.formats import endings, find_format
 from tactslip_torch.data.sets.manifest import NAMES
 from tactslip_torch.files import whole_file
 
