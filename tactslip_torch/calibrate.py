@@ -1,6 +1,6 @@
 """The free knobs of the simulated hand, set once: ``python -m tactslip_torch.calibrate``.
 
-The three knobs move along one line of difficulty (``simulation/knobs/calibrated.py``). Calibration
+The three knobs move along one line of difficulty (``simulation/parameters.py``). Calibration
 finds the place on it where the paper's own protocol, on seen materials, scores what the paper
 published for them, as a mean over seeds that no reported result uses. The qualitative facts
 (``facts.py``) must hold there; else it stays at the closest point tried where they do, and says
@@ -42,8 +42,12 @@ from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.report import published
 from tactslip_torch.report.calibration import calibration_figure, calibration_table, point_line
-from tactslip_torch.simulation.knobs.calibrated import CALIBRATED_PATH, PRIORS, knobs_at
-from tactslip_torch.simulation.materials import SEEN_MATERIALS
+from tactslip_torch.simulation.parameters import (
+    CALIBRATED_PATH,
+    PRIORS,
+    SEEN_MATERIALS,
+    parameters_at,
+)
 from tactslip_torch.simulation.scene import SIMULATION_VERSION
 
 FIRST_SEED = 1000
@@ -83,7 +87,7 @@ def seen_accuracy(maker: FeatureMaker, data: SlipDataModule, recipe: Recipe, wha
 
 def evaluate_point(config: DictConfig, difficulty: float) -> dict[str, Any]:
     """Accuracy and facts at a place on the line of difficulty, JSON-able."""
-    knobs = knobs_at(difficulty)
+    knobs = parameters_at(difficulty)
     accuracies = []
     recordings: dict[str, list[Signals]] = {}
     for seed in config.seeds:

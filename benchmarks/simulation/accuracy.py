@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from benchmarks.clocks import say
-from benchmarks.simulation.sizes import Sizes
+from benchmarks.simulation.sizes import Sizes, parameters_of
 from tactslip_torch.config import conf_dir
 from tactslip_torch.crossval import Materials
 from tactslip_torch.data.splits import seen6
@@ -76,13 +76,12 @@ def accuracies(sizes: Sizes) -> list[dict[str, Any]]:
 def _materials(config: Any, variant: Variant, sizes: Sizes) -> Materials:
     rung, step_us = variant
     say(f"features of {len(SEEN_MATERIALS) * sizes.cycles} recordings: {rung}, {step_us}")
-    knobs = {} if step_us is None else {"step_us": step_us}
+    step = {} if step_us is None else {"step_us": step_us}
     source = SimulatedRecordings(
         seed=sizes.seed,
         cycles=sizes.cycles,
         materials=SEEN_MATERIALS,
-        fidelity=rung,
-        scene=knobs,
+        scene=parameters_of(rung) | step,
     )
     rule = instantiate(config.labels)
     split = seen6(source.ids, seen=SEEN_MATERIALS, train_share=sizes.train_share, seed=sizes.seed)[

@@ -1,4 +1,4 @@
-"""The scheme of ``stage`` and ``eager`` as a kernel that numba compiles: float64, on the CPU.
+"""The scheme of ``bristles`` as a kernel that numba compiles: float64, on the CPU.
 
 Lanes are carried in blocks of 16, each with the steps of Newton that the eager engine takes; those
 that are done wait for the slowest. What belongs to a block lies in one array, 16 numbers for each
@@ -69,7 +69,7 @@ def _friction(at: Array) -> None:
 
 @_inner
 def _pull(at: Array, bent: Array, weight: float, i: int, a: float) -> None:
-    """Add a bristle's force and slope: ``bristles.pull``."""
+    """Add a bristle's force and slope: ``bristles._Stage.pull``."""
     for b in range(_SIDE):
         x, s, d0, load = at[_X + b], at[_S + b], at[_D0 + b], at[_LOAD + b] * weight
         base, lag = bent[i, b], a * s
@@ -92,7 +92,7 @@ def _pull(at: Array, bent: Array, weight: float, i: int, a: float) -> None:
 
 @_inner
 def _newton(at: Array, a: float, halve: bool, may_try: bool) -> float:
-    """One step for each speed, as in ``stage._root``; how many lanes are not done."""
+    """One step for each speed, as in ``bristles._Stage.root``; how many lanes are not done."""
     still = 0.0
     for b in range(_SIDE):
         x, low, high, done = at[_X + b], at[_LOW + b], at[_HIGH + b], at[_DONE + b]
@@ -192,22 +192,20 @@ def carry_blocks(
     patience: int,
     gross: float,
     every: int,
-    ago: int,
     out: Array,
     incipient: Array,
 ) -> None:
     """Carry lanes through some steps; ``states [3, L]`` and ``bristles [L, n]`` in place.
 
     ``table [12, L]`` holds mass, k, k1, tau, c, mu_s, mu_k, vs, s and d0 of a bristle,
-    ``1 / (1 + a / tau)`` and ``A``; ``patience`` and ``gross`` are ``stage``'s and ``lanes``';
-    ``arm`` and ``normal [2 K, 1 or L]`` two rows a step;
+    ``1 / (1 + a / tau)`` and ``A``; ``patience`` and ``gross`` are ``bristles``';
+    ``arm`` and ``normal [2 K, L]`` have two rows a step;
     ``out [4, t, L]`` takes friction, inertia, speed and slip, ``incipient [t, L]`` the rest.
     """
     num_lanes, n = bristles.shape
     at, z = np.zeros(_END), np.empty((n, _SIDE))
     bent, rates = np.empty((n, _SIDE)), np.empty((n, _SIDE))
     a = gamma * step_s
-    arm_by, normal_by = int(arm.shape[1] > 1), int(normal.shape[1] > 1)
     for first in range(0, num_lanes, _SIDE):
         num = min(_SIDE, num_lanes - first)
         for b in range(_SIDE):  # the last lane fills up the last block
@@ -224,13 +222,13 @@ def carry_blocks(
             for which in range(2):
                 for b in range(_SIDE):
                     lane = min(first + b, num_lanes - 1)
-                    at[_ARM + b] = arm[2 * step + which, arm_by * lane]
-                    at[_LOAD + b] = normal[2 * step + which, normal_by * lane]
+                    at[_ARM + b] = arm[2 * step + which, lane]
+                    at[_LOAD + b] = normal[2 * step + which, lane]
                 for b in range(3 * _SIDE):
                     at[_U0 + b] = at[_U + b]
                 _begin(at, z, bent, pressure, a)
                 number, still = 0, 1.0
-                while still > 0.0:  # it ends: see stage.PATIENCE
+                while still > 0.0:  # it ends: see bristles.PATIENCE
                     _friction(at)
                     for i in range(n):
                         _pull(at, bent, pressure[i], i, a)
@@ -241,7 +239,7 @@ def carry_blocks(
                 for b in range(_SIDE):
                     v = at[_TURN + b] * at[_X + b]
                     at[_X + b] = at[_START + b] + (v - at[_START + b]) / gamma
-            number = ago + step + 1
+            number = step + 1
             if number % every == 0:
                 for b in range(num):
                     row, lane = number // every - 1, first + b

@@ -1,4 +1,8 @@
-"""Blocks of time: the unit in which samples are computed and noise is keyed.
+"""Blocks of time and the random numbers in them: what makes any stretch computable alone.
+
+Every draw comes from a Philox counter generator whose key is a hash of its purpose (seed, session,
+material, cycle, name) and whose counter is the block of time it belongs to. So the same scene
+gives the same bytes whatever the worker, the order, or the stretch of time asked for.
 
 A block has a fixed place on the recording's time axis, and everything in it is computed whole,
 from itself and the block before it. So a stretch of time needs the blocks that cover it and one
@@ -8,15 +12,69 @@ block of history, and its samples equal those of the whole recording. Filters ar
 
 from __future__ import annotations
 
+import hashlib
+import json
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.simulation.randomness import Array, Key, normal_blocks
+Array = NDArray[np.float64]
+"""Float64 NumPy array."""
 
-Blocks = NDArray[np.int64]
+Key = tuple[str | int, ...]
+"""What a draw is for, most general part first."""
+
+Interval = tuple[float, float]
+"""Start and end in seconds."""
+
+
+def generator(*key: str | int) -> np.random.Generator:
+    """The generator that belongs to ``key``, always at its beginning."""
+    return np.random.Generator(np.random.Philox(key=_philox_key(key)))
+
+
+def _philox_key(key: Key) -> NDArray[np.uint64]:
+    """128 bits of the SHA-256 of the key's JSON text (typed: 1 and "1" differ)."""
+    digest = hashlib.sha256(json.dumps(key).encode()).digest()
+    return np.frombuffer(digest[:16], dtype="<u8").astype(np.uint64)
+
+
+def normal_blocks(key: Key, blocks: NDArray[np.int64], block_samples: int) -> Array:
+    """Standard normal noise in blocks of absolute index; block -1 and later exist.
+
+    Shape:
+        - blocks: ``[K]``
+        - output: ``[K, block_samples]``, row k a function of the key and of ``blocks[k]`` alone
+    """
+    bits = np.random.Philox(key=_philox_key(key))
+    normal, state = np.random.Generator(bits), bits.state
+    noise = np.empty((len(blocks), block_samples))
+    for row, block in zip(noise, blocks.tolist(), strict=True):
+        state["state"]["counter"][2] = block + 1  # the counter's lower words run within the block
+        bits.state = state
+        normal.standard_normal(out=row)
+    return noise
+
+
+def lognormal(
+    rng: np.random.Generator, spread: float, size: int | tuple[int, ...] | None = None
+) -> Array:
+    """Factors of median 1 whose logarithm has standard deviation ``spread``."""
+    return np.exp(spread * rng.standard_normal(size))
+
+
+def log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    """One value whose logarithm is uniform between those of the bounds, both positive."""
+    low, high = bounds
+    return low * math.exp(math.log(high / low) * rng.random())
+
+
+def smooth_step(phase: Array) -> Array:
+    """Half a raised cosine: 0 up to phase 0, 1 from phase 1."""
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.clip(phase, 0.0, 1.0)))
 
 
 def block_samples_for(sample_rate_hz: float) -> int:
@@ -34,7 +92,7 @@ class Grid:
         sample_rate_hz: samples per second.
     """
 
-    blocks: Blocks
+    blocks: NDArray[np.int64]
     block_samples: int
     sample_rate_hz: float
 
@@ -44,6 +102,10 @@ class Grid:
         index = self.blocks[:, None] * self.block_samples + np.arange(self.block_samples)
         return np.asarray(index / self.sample_rate_hz, dtype=np.float64)
 
+    def zeros(self) -> Array:
+        """A signal of zeros, ``[K, B]``."""
+        return np.zeros((len(self.blocks), self.block_samples))
+
     def overlapping(self, start_s: float, end_s: float) -> slice:
         """The rows whose blocks touch ``[start_s, end_s]``."""
         first = np.floor(start_s * self.sample_rate_hz / self.block_samples)
@@ -51,8 +113,12 @@ class Grid:
         low, high = np.searchsorted(self.blocks, [first, last + 1])
         return slice(int(low), int(high))
 
+    def only(self, rows: slice) -> Grid:
+        """A grid of some of the rows."""
+        return Grid(self.blocks[rows], self.block_samples, self.sample_rate_hz)
+
     @cached_property
-    def history(self) -> tuple[Grid, Blocks, Blocks]:
+    def history(self) -> tuple[Grid, NDArray[np.int64], NDArray[np.int64]]:
         """A grid that also has every block's predecessor, and the rows of both in it.
 
         The larger grid, the rows ``[K]`` of the predecessors, the rows ``[K]`` of the blocks.
@@ -84,6 +150,25 @@ class Grid:
         """The ``B + 1`` frequencies of a filter's response."""
         step_hz = 0.5 * self.sample_rate_hz / self.block_samples
         return np.arange(self.block_samples + 1, dtype=np.float64) * step_hz
+
+    def node_times_s(self, num: int) -> Array:
+        """Times of ``num`` nodes a block and the one behind it, ``[K, num + 1]``."""
+        nodes = np.arange(num + 1) / num
+        return np.asarray(
+            (self.blocks[:, None] + nodes) * (self.block_samples / self.sample_rate_hz)
+        )
+
+    def joined(self, values: Array) -> Array:
+        """Values at the nodes joined by straight lines.
+
+        Shape:
+            - values: ``[K, num + 1]``
+            - output: ``[K, B]``
+        """
+        step = self.block_samples // (values.shape[1] - 1)
+        ramp = np.arange(step) / step
+        lines: Array = values[:, :-1, None] + np.diff(values)[:, :, None] * ramp
+        return np.asarray(lines.reshape(len(self.blocks), self.block_samples), dtype=np.float64)
 
 
 def causal_response(magnitude: Array, *, unit_power: bool = False) -> NDArray[np.complex128]:
