@@ -62,8 +62,9 @@ COMMANDS = {
     "pareto": f"-m {PACKAGE}.pareto",
     "certify": f"-m {PACKAGE}.certify",
     "calibrate": f"-m {PACKAGE}.calibrate",
-    "stats": f"-m {PACKAGE}.stats",  # may leave: DESIGN.md
 }
+BATCH_FIT = "examples/batch_fit.py"
+"""In the place of the command ``stats`` of 0.1.0."""
 BAD_INPUT_STATUS = 2
 TRACEBACK_VARIABLE = "TACTSLIP_TRACEBACK"
 
@@ -243,3 +244,10 @@ INSTALL_FORMATS = 'pip install "tactslip-torch[formats]"'
 ISOLATED = {"isolate": True}
 MOST_MEMORY, MOST_TIME = "isolate_gib", "isolate_s"
 """Of ``Reading``: in a process of its own, with so much memory and time."""
+
+
+def rate_in_set(path):
+    """The rate at which a set of files takes a recording."""
+    from tactslip_torch.data.sets.stream import Stream, look
+
+    return look(path, Stream()).clock.sample_rate_hz

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import runpy
 import shutil
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 
 from .names import (
     ADD,
+    BATCH_FIT,
     CERTIFICATE,
     CHECK,
     CONFUSION,
@@ -42,7 +44,6 @@ from .names import (
 from .recordings import (
     CHANNELS,
     NAMES,
-    RATE_HZ,
     SEEN,
     SLIDE_S,
     TRIALS,
@@ -51,6 +52,7 @@ from .recordings import (
     split_of_set,
     write_set,
 )
+from .running import ROOT
 
 NUM_RECORDINGS = 4 * len(TRIALS)
 BINS = np.array([20, 28])
@@ -352,26 +354,13 @@ def test_workers_and_a_warm_cache_change_nothing(command, quick, tmp_path):
 
 
 @pytest.mark.slow
-def test_statistics_in_shards_give_the_detector_of_one_process(
-    command, selected, recordings, cache, tmp_path
-):
-    """May leave, with its reason (DESIGN.md): an example script takes the place of the command."""
-    data = [*of_set(recordings), *split_of_set(), *settings(workers=0, cache=cache)]
-    recipe = settings(recipe="robust", num_features=12, penalties=[0.001, 0.1])
-
-    def act(action, out, **words):
-        given = settings(action=action, out=out, **words)
-        command.well(tmp_path, "stats", *data, *recipe, *given)
-
-    for shard in (1, 2):
-        act("collect", f"survey-{shard}.stats", shard=f"{shard}/2")
-    act("merge", "survey.stats", inputs=["survey-2.stats", "survey-1.stats"])
-    act("plan", "plan.stats", inputs=["survey.stats"])
-    for shard in (1, 2):
-        act("collect", f"sums-{shard}.stats", shard=f"{shard}/2", plan="plan.stats")
-    act("merge", "sums.stats", inputs=["sums-1.stats", "sums-2.stats"])
-    act("solve", "detector.pt", plan="plan.stats", inputs=["sums.stats"])
+def test_sums_in_shards_give_the_detector_of_one_process(selected, tmp_path):
+    """By the example script, which took the place of 0.1.0's command."""
+    example, run = runpy.run_path(str(ROOT / BATCH_FIT)), selected.file.parent
+    for shard in ("1/2", "2/2"):
+        example["collect"](run, shard, tmp_path / f"sums-{shard[0]}.stats", [])
+    shards = sorted(tmp_path.glob("sums-*.stats"), reverse=True)
+    example["solve"](run, tmp_path / "detector.pt", shards)
     found = SlipDetector.load(tmp_path / "detector.pt")
     assert found.selected_names == selected.detector.selected_names
     torch.testing.assert_close(probe(found), probe(selected.detector), rtol=1e-9, atol=1e-9)
-    assert found.pool.sample_rate_hz == RATE_HZ

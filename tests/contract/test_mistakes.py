@@ -120,7 +120,6 @@ MISTAKES = {
         settings(action="convert", root_of_data="{root}", format="docx", output="to"),
         "'docx' npz text",
     ),
-    "shard beyond": ("stats", settings(action="collect", out="x", shard="3/2"), "shard 3/2"),
 }
 
 
