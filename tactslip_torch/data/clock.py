@@ -26,6 +26,7 @@ _RATE_ERR = 0.01
 _FEW_GAPS = 1e-3
 _OSCILLATOR_ERR = 1e-4  # of three digits at most are what people mean
 _FIT_ERR = 2e-6
+_SAID_ERR = 1e-5
 _PIECE = 1 << 18
 
 
@@ -149,6 +150,17 @@ def nominal_rate(measured_hz: float, spread: float = 0.0) -> float:
         if abs(rounded / measured_hz - 1) <= err:
             return rounded
     return measured_hz
+
+
+def snapped_rate(rate_hz: float) -> float:
+    """A rate that is said, without an error of less than 1e-5 that some program left in it.
+
+    Example:
+        >>> snapped_rate(24.00000322), snapped_rate(92.31), snapped_rate(1e6 / 3)
+        (24.0, 92.31, 333333.3333333333)
+    """
+    plain = float(f"{rate_hz:.4g}")
+    return plain if abs(plain / rate_hz - 1) < _SAID_ERR else rate_hz
 
 
 class EvenSamples:

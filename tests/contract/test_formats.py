@@ -48,6 +48,7 @@ from .names import (
     named_format,
     open_file,
     pieces,
+    rate_in_set,
 )
 
 ENDINGS = ("npz", "csv", "tsv", "txt", "dat", "h5", "hdf5", "he5", "mat", "mcap", "parquet", "bag2")
@@ -923,3 +924,10 @@ def test_isolated_reading_has_limits(tmp_path):
     scipy.io.savemat(path, {"x": np.random.default_rng(0).random((2, 2**22))})
     assert "memory" in refused(path, Reading(**ISOLATED | {MOST_MEMORY: 0.01}))
     assert "0.01 s" in refused(path, Reading(**ISOLATED | {MOST_TIME: 0.01}))
+
+
+def test_a_rate_with_a_small_error_is_the_round_one(tmp_path):
+    """What a set sees of a file: 24.00000322 Hz stopped everything where others say 24."""
+    path = tmp_path / "a.npz"
+    named_format("npz").save(path, recording(sample_rate_hz=24.00000322), hand_of("ab"), KEY)
+    assert rate_in_set(path) == 24.0

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from tactslip_torch.data.clock import Clock, even_clock
+from tactslip_torch.data.clock import Clock, even_clock, snapped_rate
 from tactslip_torch.data.formats import AS_IT_SAYS, Opened, Reading, open_file
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.data.sets.truth import Truth
@@ -137,7 +137,7 @@ def look_at(opened: Opened, path: Path, stream: Stream, stated_hz: float | None 
     if archived:
         recording = archived.recording
         return Found(
-            Clock(recording.sample_rate_hz, num),
+            Clock(snapped_rate(recording.sample_rate_hz), num),
             False,
             samples.num_channels,
             samples.dtype,
@@ -149,6 +149,7 @@ def look_at(opened: Opened, path: Path, stream: Stream, stated_hz: float | None 
             recording.provenance,
         )
     stated = stated_hz or opened.sample_rate_hz or stream.reading.sample_rate_hz
+    stated = stated and snapped_rate(stated)
     if opened.times is not None:
         clock = even_clock(opened.times, num, stated, str(path))
     elif stated is not None:
