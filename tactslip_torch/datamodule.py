@@ -44,17 +44,6 @@ class SlipDataModule(L.LightningDataModule):
         self.num_workers = min(processors, 8) if num_workers is None else num_workers
         self._shares_processors = num_workers is None
 
-    def about(self) -> dict[str, Any]:
-        """What bins and features are, as JSON-able facts: statistics of others do not mix."""
-        pool = self.maker.pool
-        return {
-            "channels": pool.hand.to_rows(),
-            "pool": pool.facts(),
-            **self.maker.channel_filter.facts(),
-            "features_dtype": str(self.maker.dtype).removeprefix("torch."),
-            "training_bins": self.fingerprint(),
-        }
-
     def train_dataloader(self) -> DataLoader[RecordingFeatures]:
         """This process's share of the recordings with training bins.
 

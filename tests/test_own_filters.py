@@ -1,7 +1,5 @@
 """Filters of one's own, given as numbers: features, cache, statistics and files."""
 
-import json
-
 import pytest
 import torch
 from any_hands import own_kernels, own_wavelet
@@ -11,7 +9,6 @@ from small_set import SMALL_HAND, SmallSet
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import unseen4
-from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
@@ -58,22 +55,6 @@ def test_other_filters_are_another_entry_of_the_cache(tmp_path):
         for choice in choices:
             maker_of(source, cache=cache, **choice)(RECORDING, split_of(source))
     assert source.loads == len(choices)
-
-
-def test_statistics_say_which_filters_they_are_of():
-    source = SmallSet()
-    about = [
-        SlipDataModule(maker, split_of(source), num_workers=0).about()
-        for maker in (
-            maker_of(source),
-            maker_of(source, WAVELET),
-            maker_of(source, kernels=KERNELS),
-        )
-    ]
-    assert len({json.dumps(facts, sort_keys=True) for facts in about}) == 3
-    assert "kernels" not in about[0]
-    assert FeaturePool(SMALL_HAND, **about[1]["pool"]).wavelet == WAVELET
-    assert about[2]["kernels"]["11"] == list(KERNELS[11])
 
 
 @pytest.fixture
