@@ -31,7 +31,6 @@ from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.files import whole_file
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import KEY as ALARM
-from tactslip_torch.progress import bar
 from tactslip_torch.report.adaptation import adaptation_figure, adaptation_table, journal_table
 from tactslip_torch.training.adaptation import (
     Change,
@@ -219,7 +218,6 @@ def _bins(
         found = recording_bins(
             detector,
             maker,
-            bar,
             material=material,
             slip_free=bool(config.slip_free),
             names=names,

@@ -98,12 +98,12 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
         costs = shop.costs()
         recipe, filters = shop.recipe, {a: m.channel_filter for a, m in shop.makers.items()}
         searcher = Searcher(shop.search, recipe, shop.pool, costs, shop.surveys, filters)
-        candidates = searcher.candidates(bar)
+        candidates = searcher.candidates()
         if shop.search.drop_fingers:
             keeping = [each for each in candidates if not limits.misses(each.latency)]
             of_channels = [each for each in keeping or candidates if each.columns == "channel"]
             best = max(of_channels or candidates, key=lambda each: each.balanced_accuracy)
-            candidates += searcher.without_fingers(best, bar)
+            candidates += searcher.without_fingers(best)
         candidates = distinct(candidates)
         worth = worth_timing(candidates, shop.search.most_timed, limits)
         timed = shop.timed(distinct([*worth, *worth_naming(candidates)]))

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Sized
 from typing import Any
 
-from lightning.pytorch.callbacks import Callback, LambdaCallback, TQDMProgressBar
+from lightning.pytorch.callbacks import TQDMProgressBar
 from tqdm.auto import tqdm
 
 LEAD = 31
@@ -25,7 +25,7 @@ def bar(
 
 
 class Ticker:
-    """A bar that several trainers share, a step an epoch.
+    """A bar that is moved by hand, as of work on several threads.
 
     Args:
         what: is done.
@@ -44,9 +44,9 @@ class Ticker:
     def __exit__(self, *error: object) -> None:
         self._bar.close()
 
-    def callback(self) -> Callback:
-        """For one of the trainers."""
-        return LambdaCallback(on_train_epoch_end=lambda *_: self._bar.update())
+    def tick(self) -> None:
+        """A step is done."""
+        self._bar.update()
 
 
 class RecordingProgressBar(TQDMProgressBar):

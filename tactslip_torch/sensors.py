@@ -110,7 +110,6 @@ def sensors(config: DictConfig, folder: Path) -> dict[str, Any]:
         gradient,
         most=config.most_channels,
         draws=Draws(config.draws, config.seed),
-        progress=bar,
     )
     content["timing_s"] = {"total": time.perf_counter() - started}
     with whole_file(folder / "sensors.json") as temporary:
@@ -214,8 +213,8 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
 
 def _gradients(config: DictConfig, trained: Trained) -> dict[str, dict[str, float]]:
     """By channel: how far it moves the score, at bins of either class."""
-    raw, is_slip = draw_raw_bins(trained.maker, trained.fold, config.gradient_bins, bar)
-    scores, gradients = score_gradients(trained.detector, raw, bar)
+    raw, is_slip = draw_raw_bins(trained.maker, trained.fold, config.gradient_bins)
+    scores, gradients = score_gradients(trained.detector, raw)
     moved = first_order(scores, gradients, raw, is_slip)
     by_class = zip(moved.non_slip.tolist(), moved.slip.tolist(), strict=True)
     return {

@@ -34,10 +34,6 @@ UNITS = {name: frozenset(name) for name in "abc"}
 PENALTIES = (0.01, 0.1, 1.0)
 
 
-def quietly(items, what):
-    return items
-
-
 def sampled(seed, tells, groups="MNO", recordings=4, bins=12):
     """Bins whose features ``tells`` follow the class, by how much; the others are noise."""
     rng = np.random.default_rng(seed)
@@ -231,19 +227,19 @@ def test_a_shared_ranking_takes_as_many_of_each_channel():
 def test_the_best_few_begin_with_what_tells_most_and_end_with_all():
     refit = refit_of({2: 1.5, 4: 0.9})
     ranking = ranking_of(refit)
-    steps = best_first(refit, ranking, UNITS, 9, quietly, "")
+    steps = best_first(refit, ranking, UNITS, 9, "")
     assert [name for name, _ in steps] == ["b", "c", "a"]
     assert [verdict.num_features for _, verdict in steps] == [2, 4, 6]
     alone = {name: refit(ranking(channels)).merit for name, channels in UNITS.items()}
     assert steps[0][1].merit == max(alone.values())
     assert steps[-1][1].tallies["test"].right.equal(refit(ranking("abc")).tallies["test"].right)
-    assert len(best_first(refit, ranking, UNITS, 2, quietly, "")) == 2
+    assert len(best_first(refit, ranking, UNITS, 2, "")) == 2
 
 
 def test_a_unit_without_a_feature_never_joins():
     refit = refit_of({2: 1.5})
     allowed = torch.tensor([False] * 2 + [True] * 4)
-    steps = best_first(refit, ranking_of(refit, 6, allowed), UNITS, 9, quietly, "")
+    steps = best_first(refit, ranking_of(refit, 6, allowed), UNITS, 9, "")
     assert sorted(name for name, _ in steps) == ["b", "c"]
 
 
@@ -264,7 +260,7 @@ def test_verdicts_come_in_order_and_alike_on_any_number_of_threads():
 
 def test_gradients_are_those_of_finite_differences():
     detector, samples = small_detector(2), raw_bins(3)
-    scores, gradients = score_gradients(detector, samples, quietly)
+    scores, gradients = score_gradients(detector, samples)
     torch.testing.assert_close(scores, detector.score_raw(samples))
     generator = torch.Generator().manual_seed(0)
     way = torch.randn(samples.shape, generator=generator, dtype=torch.float64)
@@ -277,7 +273,7 @@ def test_gradients_are_those_of_finite_differences():
 def test_a_channel_that_is_not_in_use_moves_nothing():
     detector = small_detector()
     samples = raw_bins(4)
-    _, gradients = score_gradients(detector, samples, quietly)
+    _, gradients = score_gradients(detector, samples)
     used = {name.channel for name in detector.selected_names}
     for index, name in enumerate(HAND.names):
         assert bool(gradients[:, index].any()) is (name in used)

@@ -134,7 +134,7 @@ def test_tables_name_every_unit_and_number_of_sensors(found):
 
 def test_raw_bins_are_training_bins_of_both_classes_with_their_context(run):
     trained = _trained(run / "detector.pt", None)
-    raw, is_slip = draw_raw_bins(trained.maker, trained.fold, 24, lambda items, what: items)
+    raw, is_slip = draw_raw_bins(trained.maker, trained.fold, 24)
     assert raw.shape == (len(is_slip), 4, trained.detector.context_before + 125)
     assert int(is_slip.sum()) == len(is_slip) // 2 >= 12
     of_train = torch.cat(
@@ -142,7 +142,7 @@ def test_raw_bins_are_training_bins_of_both_classes_with_their_context(run):
     )
     starts = set(of_train[0].tolist())
     assert all(float(bin_[0, 0]) in starts for bin_ in raw)
-    again, _ = draw_raw_bins(trained.maker, trained.fold, 24, lambda items, what: items)
+    again, _ = draw_raw_bins(trained.maker, trained.fold, 24)
     assert torch.equal(raw, again)
     filtered = trained.detector.channel_filter.valid(raw.double())
     score = trained.detector(filtered)

@@ -23,7 +23,6 @@ from tactslip_torch.experiment import feature_parts
 from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.training.adaptation import recording_bins
 from tactslip_torch.training.statistics import RecordingBins, Statistics, statistics_of
@@ -94,7 +93,7 @@ def subject_of(sizes: Sizes, folder: Path, cache: Path) -> Subject:
         instantiate(config.recipe, _convert_="all"),
         split,
         maker,
-        recording_bins(detector, maker, bar),
+        recording_bins(detector, maker),
     )
 
 

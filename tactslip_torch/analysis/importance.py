@@ -30,6 +30,7 @@ from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.held_out import HeldOut
 from tactslip_torch.model.kernels import Kernel
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.progress import bar
 from tactslip_torch.signals.binning import refuse_nonfinite
 from tactslip_torch.threads import for_each
 
@@ -269,7 +270,6 @@ class Refit:
 Item = TypeVar("Item")
 Units = Mapping[str, frozenset[str]]
 """What is taken or left out together, by name: the channels of each."""
-Progress = Callable[[Iterable[Any], str], Iterable[Any]]
 
 
 def units_of(hand: HandLayout) -> dict[str, dict[str, frozenset[str]]]:
@@ -363,7 +363,6 @@ def best_first(
     select: Callable[[Collection[str]], Sequence[int]],
     units: Units,
     most: int,
-    progress: Progress,
     what: str,
 ) -> list[tuple[str, Verdict]]:
     """Greedy forward selection: at each step the unit that serves held-out groups best joins.
@@ -378,8 +377,7 @@ def best_first(
         select: features of channels, such as a ``Ranking``.
         units: to choose from; those none of whose features may be selected never join.
         most: steps at most.
-        progress: wraps the steps.
-        what: is done, for it.
+        what: is done, for the progress bar.
 
     Returns:
         For each step the name of the unit that joined, and the verdict with it.
@@ -387,7 +385,7 @@ def best_first(
     left = [name for name, channels in units.items() if len(select(channels))]
     taken: frozenset[str] = frozenset()
     steps: list[tuple[str, Verdict]] = []
-    for number in progress(range(min(most, len(left))), what):
+    for number in bar(range(min(most, len(left))), what):
         sets = [taken | units[name] for name in left]
         near = [steps[-1][1].penalty] if number else refit.penalties
         selections = [select(channels) for channels in sets]
@@ -411,7 +409,6 @@ class FirstOrder(NamedTuple):
 def score_gradients(
     detector: SlipDetector,
     samples: Tensor,
-    progress: Callable[[Iterable[Any], str], Iterable[Any]],
 ) -> tuple[Tensor, Tensor]:
     """Scores of raw bins and their derivatives with respect to every volt, in float64.
 
@@ -421,14 +418,13 @@ def score_gradients(
     Args:
         detector: as loaded.
         samples: in volts, with the context that ``score_raw`` needs.
-        progress: wraps the chunks.
 
     Shape:
         - samples: ``[N, C, T]``
         - output: ``[N]`` and ``[N, C, T]``, float64
     """
     scores, gradients = [], []
-    for part in progress(samples.double().split(_CHUNK), "gradients"):
+    for part in bar(samples.double().split(_CHUNK), "gradients"):
         volts = part.clone().requires_grad_()
         score = detector.score_raw(volts)
         (gradient,) = torch.autograd.grad(score.sum(), volts)
@@ -485,7 +481,6 @@ def draw_raw_bins(
     maker: FeatureMaker,
     fold: Split,
     number: int,
-    progress: Callable[[Iterable[Any], str], Iterable[Any]],
 ) -> tuple[Tensor, Tensor]:
     """Training bins in volts, half of each class, drawn by ``bin_keys``: the same every time.
 
@@ -495,7 +490,6 @@ def draw_raw_bins(
         maker: of the recordings.
         fold: says who is trained on.
         number: of bins, about.
-        progress: wraps the recordings.
 
     Shape:
         - first output: ``[N, C, before + n + after]``, as ``score_raw`` takes them
@@ -509,7 +503,7 @@ def draw_raw_bins(
     before, after = maker.channel_filter.context_before, maker.channel_filter.context_after
     parts: list[Tensor] = []
     labels: list[Tensor] = []
-    for recording in progress(recordings, "raw bins"):
+    for recording in bar(recordings, "raw bins"):
         times = maker.source.timeline(recording)
         bins = maker.lay_bins(times)
         first, last = bins.starts - before, bins.starts + bins.bin_samples + after
@@ -559,7 +553,6 @@ def measure(
     *,
     most: int,
     draws: Draws,
-    progress: Progress,
 ) -> dict[str, Any]:
     """What absence costs, what each tells alone, and the best few.
 
@@ -571,7 +564,6 @@ def measure(
         gradient: by channel, to be put into its row.
         most: of the best few, at most.
         draws: for intervals.
-        progress: wraps what is gone through.
 
     Returns:
         ``with_all``: machines with every sensor. ``units``: a row for every channel, finger and
@@ -583,7 +575,7 @@ def measure(
     rows: list[dict[str, Any]] = []
     best: dict[str, list[dict[str, Any]]] = {}
     for what, units in units_of(hand).items():
-        for name in progress(list(units), f"without each {what}"):
+        for name in bar(list(units), f"without each {what}"):
             channels = units[name]
             choices = [
                 without(selected, channels, ranking.channels),
@@ -603,7 +595,7 @@ def measure(
                     "alone": _accuracies(alone),
                 }
             )
-        steps = best_first(refit, ranking, units, most, progress, f"best {what}s")
+        steps = best_first(refit, ranking, units, most, f"best {what}s")
         best[what] = [
             {"joins": name, "lost": _lost(whole["selected_anew"], verdict, draws)} | _facts(verdict)
             for name, verdict in steps

@@ -38,7 +38,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
 from tactslip_torch.features.extractor import EngineName, FeatureExtractor
@@ -48,6 +50,7 @@ from tactslip_torch.features.pooling import ChannelPooling, pooled_names
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.progress import bar
 from tactslip_torch.signals.filtering import ChannelFilter
 
 DEFINITION = (
@@ -393,7 +396,6 @@ _OF_DESCRIPTOR = dict.fromkeys(ORDERED, "sorts") | {
     "spectral_centroid": "lines",
     "spectral_spread": "lines",
 }
-_SWEEPS = 3000
 
 Part = tuple[str, tuple[object, ...]]  # a group, and which of it; none of it: the group as such
 
@@ -505,7 +507,6 @@ def measure_costs(
     statistics: Sequence[str] = (),
     *,
     calls: int = 100,
-    watch: Callable[[Sequence[Any], str], Any] = lambda items, what: items,
 ) -> CostModel:
     """Fit the model to timings on this machine.
 
@@ -516,7 +517,6 @@ def measure_costs(
         engine: what computes features.
         statistics: over channels, whose pooling is timed; none: it is not.
         calls: of each selection, in each of three runs.
-        watch: shows progress.
     """
     needed = parts_of(make_plan(pool.hand, pool.level, pool.names))
     bins = single_bins(pool, pool.bin_samples)
@@ -524,7 +524,7 @@ def measure_costs(
     layers = list(_layers(pool, statistics)) if statistics else []
     designs = list(_designs(needed, sizes))
     with one_thread():
-        for selected in watch(designs, "cost of feature groups"):
+        for selected in bar(designs, "cost of feature groups"):
             extractor = FeatureExtractor(pool, selected, engine)
             timings.append(time_calls(extractor, bins, calls))
 
@@ -548,7 +548,10 @@ def measure_costs(
     pooling_us, pooling_of_one_us = _line(lengths, pooling) if layers else (0.0, 0.0)
     taken = torch.tensor([timing.p50_us for timing in timings], dtype=torch.float64)
     counts = torch.stack([_counted(set().union(*(needed[i] for i in s))) for s in designs])
-    prices = _nonnegative(counts / taken[:, None])
+    rows = (counts / taken[:, None]).numpy()
+    prices = torch.from_numpy(
+        nnls(rows, np.ones(len(rows)), maxiter=10_000)[0]
+    )  # relative errors count
     names = list(GROUPS)
     return CostModel(
         base_us=float(prices[0]),
@@ -635,17 +638,6 @@ def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
     slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.combinations(points, 2)]
     slope = max(median(slopes), 0.0) if slopes else 0.0
     return max(median(height - slope * place for place, height in points), 0.0), slope
-
-
-def _nonnegative(rows: Tensor) -> Tensor:
-    """The x, none negative, with ``rows @ x`` closest to 1: least squares by coordinates."""
-    gram, pull = rows.T @ rows, rows.sum(0)
-    x = torch.zeros_like(pull)
-    for _ in range(_SWEEPS):
-        for i in range(len(x)):
-            if gram[i, i] > 0:
-                x[i] = (x[i] + (pull[i] - gram[i] @ x) / gram[i, i]).clamp(min=0)
-    return x
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -12,9 +12,7 @@ that are left are timed, fitted and evaluated.
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeVar, get_args
@@ -60,7 +58,7 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model_selection import Structure, choose_model, fitted_frame
 from tactslip_torch.planning import adds_up, plan_detector
-from tactslip_torch.progress import bar
+from tactslip_torch.progress import Ticker, bar
 from tactslip_torch.recipe import Frame, Recipe, fit_frame, recalls_mean, stand_for
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import Align, ChannelFilter
@@ -237,7 +235,6 @@ def _keeps(candidate: Candidate, limits: Limits, factor: float) -> bool:
 
 
 Ranking = Literal["t", "ccweighting", "per_cost"]
-Watch = Callable[[Iterable[Any], str], Iterable[Any]]
 _NAMES = {
     "channels": Channels,
     "components": Components,
@@ -401,7 +398,7 @@ class Searcher:
         self._needs, self._prices = costs.bill(self._needed)
         self._channel_of = [pool.hand.names.index(name.channel) for name in pool.names]
 
-    def candidates(self, watch: Watch) -> list[Candidate]:
+    def candidates(self) -> list[Candidate]:
         """All candidates, in an order that does not depend on the number of threads.
 
         Raises:
@@ -419,9 +416,9 @@ class Searcher:
                 for group in search.pooled_groups(self.pool)
                 for statistics in search.statistics
             ]
-        return [each for scored in self._all(jobs, watch) for each in scored]
+        return [each for scored in self._all(jobs) for each in scored]
 
-    def without_fingers(self, best: Candidate, watch: Watch) -> list[Candidate]:
+    def without_fingers(self, best: Candidate) -> list[Candidate]:
         """Candidates like the best with one finger after the other left out, greedily."""
         hand = self.pool.hand
         found: list[Candidate] = []
@@ -437,7 +434,7 @@ class Searcher:
                 label = f"{best.channels} without {' and '.join([*dropped, finger])}"
                 as_best = (best.components, mask, best.ranking, [best.degree])
                 jobs.append(partial(self._scored, best.align, label, *as_best))
-            trials = self._all(jobs, watch)
+            trials = self._all(jobs)
             tops = [max((each.balanced_accuracy for each in own), default=-1.0) for own in trials]
             if max(tops) < 0:  # too few features are left for any size
                 break
@@ -445,22 +442,16 @@ class Searcher:
             found += [each for own in trials for each in own]
         return found
 
-    def _all(
-        self, jobs: Sequence[Callable[[], list[Candidate]]], watch: Watch
-    ) -> list[list[Candidate]]:
+    def _all(self, jobs: Sequence[Callable[[], list[Candidate]]]) -> list[list[Candidate]]:
         """What each job finds, in their order; every job is done by one thread."""
         found: list[list[Candidate]] = [[] for _ in jobs]
-        ticking = threading.Lock()
+        with Ticker("search, groups", "step", len(jobs)) as ticker:
 
-        def work(number: int) -> None:
-            found[number] = jobs[number]()
-            with ticking:
-                next(ticks)
+            def work(number: int) -> None:
+                found[number] = jobs[number]()
+                ticker.tick()
 
-        with closing(tick for tick in watch(range(len(jobs)), "search, groups")) as ticks:
             for_each(work, range(len(jobs)))
-            for _ in ticks:  # shows that all is done
-                pass
         return found
 
     def _scored(
@@ -700,7 +691,6 @@ class Workshop:
             maker.extractor.engine,
             max(self.search.statistics, key=len, default=()),
             calls=calls,
-            watch=bar,
         )
 
     def timed(self, candidates: Sequence[Candidate]) -> list[Timed]:

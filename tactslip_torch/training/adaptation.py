@@ -15,7 +15,7 @@ import copy
 import itertools
 import logging
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -46,6 +46,7 @@ from tactslip_torch.model.sufficient import SufficientStats
 from tactslip_torch.model.symmetric_solve import solve_symmetric_
 from tactslip_torch.onset.settings import KEY as ALARM
 from tactslip_torch.planning import adds_up
+from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.training.statistics import (
     KnownBins,
@@ -630,13 +631,9 @@ def check_once(bins: Mapping[str, RecordingBins], names_in: Mapping[str, tuple[s
             raise ValueError(f"{name} is the same recording as {other}; give it once")
 
 
-Progress = Callable[[Iterable[Any], str, str], Iterable[Any]]
-
-
 def recording_bins(
     detector: SlipDetector,
     maker: FeatureMaker,
-    progress: Progress,
     *,
     material: str | None = None,
     slip_free: bool = False,
@@ -648,7 +645,6 @@ def recording_bins(
     Args:
         detector: whose features are made.
         maker: of the recordings, with the detector's pool and filter.
-        progress: shows which recording is read.
         material: to call them, whatever they are called; they are numbered then in their order.
         slip_free: take the bins without slip alone.
         names: what recordings are called and their materials, by key, whatever else holds.
@@ -660,7 +656,7 @@ def recording_bins(
     ids = maker.source.ids
     everyone = Split("adapt", dict.fromkeys(ids, "train"))
     found, number = {}, itertools.count()
-    for recording in progress(ids, "features, new recordings", "recording"):
+    for recording in bar(ids, "features, new recordings", "recording"):
         key = cache_key(maker.source.key(recording))
         name, called = (names or {}).get(key) or _named(recording, material, number, taken)
         made = maker(recording, everyone)
