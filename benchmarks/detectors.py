@@ -21,9 +21,7 @@ from benchmarks.selection import kept_selection, selection_of
 from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.kernels import Polynomial, kernel_from_dict
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 

@@ -38,7 +38,7 @@ from tactslip_torch.data.sets.stream import stream_of
 from tactslip_torch.experiment import save_config, versions
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing import dead_names
+from tactslip_torch.model.missing_channels import dead_names
 from tactslip_torch.onset.decisions import Decisions, answer_of
 from tactslip_torch.onset.events import (
     EventRules,

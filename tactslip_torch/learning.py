@@ -36,8 +36,8 @@ from tactslip_torch.judging import (
     judged_bins,
 )
 from tactslip_torch.model.abstention import KEY, abstention_of
-from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.events import LatencyParts, RecordingEvents
 from tactslip_torch.pace import Pace

@@ -55,12 +55,9 @@ def sum_over_ranks(gathered: TrainingPass) -> None:
                 gathered.merge(part)
         return
     stats = gathered.stats
-    shares = of_all_ranks((stats.ledger, stats.count, stats.sums[:, 0].tolist()))
+    parts = of_all_ranks((stats.ledger, stats.count))
     stats.ledger = Ledger()
-    for ledger, _, _ in shares:
+    for ledger, _ in parts:
         stats.ledger.merge(ledger)  # refuses a recording that two of them saw
-    own = torch.distributed.get_rank()
-    others = [brought for rank, (_, _, brought) in enumerate(shares) if rank != own]
-    stats.check_capacity([sum(of_class) for of_class in zip(*others, strict=True)])
-    stats.count = torch.stack([count for _, count, _ in shares]).sum(0)
+    stats.count = torch.stack([count for _, count in parts]).sum(0)
     torch.distributed.all_reduce(stats.sums)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.fit import TrainingBins
-from tactslip_torch.model.held_out import HeldOut
 from tactslip_torch.model.kernels import Kernel
+from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.recipe import recalls_mean
 
 log = logging.getLogger(__name__)

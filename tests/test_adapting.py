@@ -11,8 +11,8 @@ from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.fitting import training_part
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.model.sufficient import SufficientStats
 from tactslip_torch.planning import Plan
 from tactslip_torch.recipe import Frame
 from tactslip_torch.training import adaptation as steps

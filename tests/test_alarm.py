@@ -20,7 +20,7 @@ from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.baselines import first_transition
 from tactslip_torch.onset.decisions import Decider

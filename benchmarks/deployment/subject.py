@@ -17,8 +17,7 @@ from benchmarks.detectors import Timed, timed_detector
 from benchmarks.streaming.ways import settings_of
 from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.quadratic import collapse
+from tactslip_torch.model.kernels import KernelSum, collapse
 from tactslip_torch.onset.settings import KEY
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation import UNSEEN_MATERIALS

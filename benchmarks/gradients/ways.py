@@ -11,11 +11,9 @@ from torch.nn.functional import softplus
 
 from benchmarks.gradients.sizes import Kind
 from benchmarks.model.synthetic import SyntheticBins
-from tactslip_torch.model.differentiable_fit import fit_quadratic
-from tactslip_torch.model.fit import Route, TrainingBins, fit_machine
-from tactslip_torch.model.held_out import HeldOut
-from tactslip_torch.model.held_out_gradient import held_out_scores
+from tactslip_torch.model.fit import Route, TrainingBins, fit_machine, fit_quadratic
 from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.leave_one_group_out import HeldOut, held_out_scores
 
 BASE, OURS, PEER = "forward alone", "differentiable", "autograd"
 

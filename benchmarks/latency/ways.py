@@ -16,7 +16,7 @@ from benchmarks.exported import ORT, session
 from benchmarks.latency.sizes import Sizes
 from benchmarks.peers import heads, loop, others
 from tactslip_torch.features.extractor import EngineName
-from tactslip_torch.model.kernel_sum import KernelSum
+from tactslip_torch.model.kernels import KernelSum
 from tactslip_torch.signals.filtering import ChannelFilter
 
 LOOP = "SciPy + PyWavelets loop, kernel sum"

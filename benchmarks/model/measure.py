@@ -27,10 +27,9 @@ from benchmarks.model.sizes import Sizes
 from benchmarks.model.worker import Worker
 from tactslip_torch.ledger import content_digest
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.held_out import HeldOut
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.quadratic import QuadraticForm, quadratic_features
-from tactslip_torch.model.sufficient import SufficientStats
+from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm
+from tactslip_torch.model.leave_one_group_out import HeldOut
+from tactslip_torch.model.moments import SufficientStats
 
 
 def size(sizes: Sizes) -> dict[str, Any]:
@@ -80,7 +79,7 @@ def accumulation(sizes: Sizes) -> dict[str, Any]:
     for num_bins in sizes.update_bins:
         z, is_slip = sizes.source.training(num_bins)
         stats = SufficientStats(sizes.num_features)
-        monomials = quadratic_features(z, sizes.offset)
+        monomials = Polynomial(2, sizes.offset).monomials(z)
         square = torch.zeros(monomials.shape[1], monomials.shape[1], dtype=torch.float64)
         calls: dict[str, Callable[[], Any]] = {
             "update": partial(_update, stats, z, is_slip),

@@ -19,7 +19,7 @@ from typing import IO, Any, cast
 import torch
 
 from benchmarks.model.synthetic import SyntheticBins, num_batches
-from tactslip_torch.model.sufficient import SufficientStats
+from tactslip_torch.model.moments import SufficientStats
 
 _REPORTS = 20  # progress lines of a job that takes long
 _LONG_S = 30.0

@@ -20,9 +20,8 @@ from benchmarks.clocks import Way, in_turns, say, shuffled_rounds
 from benchmarks.precision.data import ROLES, Experiment, described, pool_in
 from benchmarks.precision.sizes import Sizes
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernel_elm import solve_kernel_elm_
-from tactslip_torch.model.kernels import lower_gram
-from tactslip_torch.model.quadratic import QuadraticForm, collapse
+from tactslip_torch.model.kernels import QuadraticForm, collapse, gram_matrix
+from tactslip_torch.model.solve import solve_symmetric
 from tactslip_torch.recipe import recalls_mean
 
 OF_FLOAT32, IN_FLOAT32 = "float64, of float32 features", "float32 matrix"  # solves
@@ -70,9 +69,9 @@ def _by_the_rule(experiment: Experiment, arithmetic: str, gram_dtype: torch.dtyp
     targets = torch.where(experiment.train.is_slip, 1.0, -1.0).to(gram_dtype)
     weights = experiment.weights.to(gram_dtype)
     plan = experiment.plan
-    gram = lower_gram(plan.kernel, z)
+    gram = gram_matrix(plan.kernel, z)
     try:
-        beta, report = solve_kernel_elm_(gram, targets, plan.penalty, weights)
+        beta, report, _ = solve_symmetric(gram, targets, plan.penalty, weights, name="gram")
     except ValueError as error:
         return Fitted(None, None, str(error))
     return Fitted(collapse(z, beta, plan.kernel), report.condition, None)

@@ -19,7 +19,7 @@ from benchmarks.engines import FLOAT64, pool_of
 from benchmarks.model.worker import WorkerFailedError
 from benchmarks.streaming.ways import RATE_HZ, Endless, ours, stream_samples
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 

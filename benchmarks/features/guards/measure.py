@@ -23,12 +23,10 @@ from benchmarks.model.synthetic import SyntheticBins
 from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.cholesky import cholesky_, cholesky_solve
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernel_elm import solve_kernel_elm_
-from tactslip_torch.model.kernels import PAPER_KERNEL, lower_gram
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import PAPER_KERNEL, QuadraticForm, gram_matrix
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.model.solve import solve_symmetric
 from tactslip_torch.signals.filtering import ChannelFilter
 
 NUM_FEATURES, PENALTY = 120, 0.1  # of the machine that is timed
@@ -90,7 +88,7 @@ def solve(sizes: Sizes) -> dict[str, Any]:
         for num_bins in sizes.solved:
             say(f"solve of {num_bins} bins on {threads_text(threads)}")
             z, is_slip = SyntheticBins(NUM_FEATURES).training(num_bins)
-            gram, targets = lower_gram(PAPER_KERNEL, z), torch.where(is_slip, 1.0, -1.0).double()
+            gram, targets = gram_matrix(PAPER_KERNEL, z), torch.where(is_slip, 1.0, -1.0).double()
             ways = {
                 "guards": Way(partial(_reported, gram, targets)),
                 "off": Way(partial(_bare, gram, targets)),
@@ -129,11 +127,10 @@ def untrained_detector() -> SlipDetector:
 
 
 def _reported(gram: Tensor, targets: Tensor) -> Tensor:
-    return solve_kernel_elm_(gram.clone(), targets, PENALTY).x
+    return solve_symmetric(gram, targets, PENALTY).x
 
 
 def _bare(gram: Tensor, targets: Tensor) -> Tensor:
     system = gram.clone()
     system.diagonal().add_(1 / PENALTY)
-    cholesky_(system)
-    return cholesky_solve(system, targets)
+    return torch.cholesky_solve(targets[:, None], torch.linalg.cholesky(system))[:, 0]
