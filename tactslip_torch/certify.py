@@ -37,8 +37,8 @@ from tactslip_torch.report.certificate import certificate_figure, verdict
 from tactslip_torch.signals.binning import bins_at, refuse_nonfinite
 
 FORMAT = "tactslip_torch certificate 1"
-EXIT_DOES_NOT_HOLD = 1
-PER_RECORDING = 40
+_EXIT_DOES_NOT_HOLD = 1
+_PER_RECORDING = 40
 """Bins drawn from a recording, more where there are too few recordings."""
 _PAST_LARGEST = 2**63
 
@@ -118,7 +118,7 @@ def draw_bins(
     recordings = _in_turn(fold.having(role), generator)
     if not recordings:
         raise ValueError(f"no recording has the role {role!r} in {fold.name}; choose another split")
-    each = max(PER_RECORDING, math.ceil(number / len(recordings)))
+    each = max(_PER_RECORDING, math.ceil(number / len(recordings)))
     recordings = recordings[: math.ceil(number / each)]
     source = maker.source
     before, after = maker.channel_filter.context_before, maker.channel_filter.context_after
@@ -237,7 +237,7 @@ def main(config: DictConfig) -> None:
         line = f"{verdict(content)}; see {folder / 'certificate.json'}"
         if not content["holds"]:
             print(line, file=sys.stderr)
-            raise SystemExit(EXIT_DOES_NOT_HOLD)
+            raise SystemExit(_EXIT_DOES_NOT_HOLD)
         print(line)
 
 

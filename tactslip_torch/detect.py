@@ -64,7 +64,7 @@ from tactslip_torch.report.onset_tally import Tally
 from tactslip_torch.report.onset_traces import Traces, view_of
 
 FORMAT = "tactslip_torch onsets 1"
-PIECE_S = 1.0
+_PIECE_S = 1.0
 _RULES = EventRules()
 
 
@@ -243,7 +243,7 @@ def _drawn(hand: HandLayout) -> dict[str, int]:
 
 
 def _piece_samples(detector: SlipDetector) -> int:
-    return round(PIECE_S * detector.pool.sample_rate_hz)
+    return round(_PIECE_S * detector.pool.sample_rate_hz)
 
 
 def _num_pieces(path: Path, listener: Listener) -> int:

@@ -27,8 +27,7 @@ from tactslip_torch.onset.events import (
     pooled_metrics,
     recording_events,
 )
-from tactslip_torch.onset.rules import latch, latch_start
-from tactslip_torch.onset.rules import KOfN
+from tactslip_torch.onset.rules import KOfN, latch, latch_start
 from tactslip_torch.report.answers import answer_counts, answer_metrics
 from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
 

@@ -66,9 +66,9 @@ from tactslip_torch.recipe import Recipe
 from tactslip_torch.report.pareto import none_meets, pareto_figure, pareto_table
 from tactslip_torch.signals.filtering import Align
 
-EXIT_NONE_MEETS = 1
-EXIT_INTERRUPTED = 130
-VALIDATION = (
+_EXIT_NONE_MEETS = 1
+_EXIT_INTERRUPTED = 130
+_VALIDATION = (
     "a material left out at a time, training recordings only; of pooled columns, compression, "
     "ranking and scaling are learned without it; of channel features, ranking and scaling saw the "
     "material left out, the machine alone is refitted; it chose"
@@ -146,7 +146,7 @@ def _facts(
         "definition": DEFINITION,
         "limits": {"deadline_ms": limits.deadline_ms, "compute_us": limits.compute_us},
         "headroom": config.headroom,
-        "validation": VALIDATION,
+        "validation": _VALIDATION,
         "engine": next(iter(shop.makers.values())).extractor.engine,
         "front": [row_of(shop, each, limits, each.latency, each.timing) for each in front],
         "named": {
@@ -297,10 +297,10 @@ def main(config: DictConfig) -> None:
             found = pareto(config, Path(HydraConfig.get().runtime.output_dir))
         except KeyboardInterrupt:
             print("interrupted: no detector is written", file=sys.stderr)
-            raise SystemExit(EXIT_INTERRUPTED) from None
+            raise SystemExit(_EXIT_INTERRUPTED) from None
         if found["chosen"] is None:
             print(none_meets(found), file=sys.stderr)
-            raise SystemExit(EXIT_NONE_MEETS)
+            raise SystemExit(_EXIT_NONE_MEETS)
 
 
 if __name__ == "__main__":

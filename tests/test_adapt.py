@@ -25,7 +25,7 @@ from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.train import train
-from tactslip_torch.training.adaptation import Verdict, add, class_scales
+from tactslip_torch.training.adaptation import Verdict, _class_scales, add
 from tactslip_torch.training.statistics import Statistics, detector_digest, locked
 
 TRAINING = (*TINY, "recipe=robust", "data.seed=0", "statistics=true", "coverage=0.5", "cache=off")
@@ -143,7 +143,7 @@ def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files,
     kept = SlipDetector.load(run / "detector.pt").info["abstain"]
     statistics = Statistics.load(run / "statistics.pt")
     known, machine = statistics.known(), statistics.machine
-    weights = class_scales(statistics.sums, machine)[known.is_slip.long()] * known.represents
+    weights = _class_scales(statistics.sums, machine)[known.is_slip.long()] * known.represents
     scores = torch.empty_like(weights)
     groups = known.recording if left_out == "recording" else known.material
     for group in groups.unique():

@@ -17,13 +17,13 @@ from tactslip_torch.planning import Plan
 from tactslip_torch.recipe import Frame
 from tactslip_torch.training import adaptation as steps
 from tactslip_torch.training.adaptation import (
+    _OF_MARGIN,
+    _OF_ONE,
     FACTORS,
-    OF_MARGIN,
-    OF_ONE,
     Verdict,
+    _class_scales,
     accuracies,
     add,
-    class_scales,
     compared,
     forget,
     mean_recall,
@@ -36,7 +36,7 @@ from tactslip_torch.training.statistics import (
     RecordingBins,
     Rehearsal,
     Statistics,
-    known_bins,
+    _known_bins,
 )
 
 K, NUM_BINS = 3, 24
@@ -102,7 +102,7 @@ def fitted(bins, weights, scales):
 
 def test_a_known_bin_scores_as_by_the_machine_refitted_without_its_recording(old, trained, new):
     after = old.reweighed(dict.fromkeys(new, 2.5), new)
-    solved, scales = solve(after), class_scales(after.sums, MACHINE)
+    solved, scales = solve(after), _class_scales(after.sums, MACHINE)
     everyone = trained | new
     for name in ("b/2", "new/1"):
         others = [own for other, own in everyone.items() if other != name]
@@ -114,7 +114,7 @@ def test_a_known_bin_scores_as_by_the_machine_refitted_without_its_recording(old
 
 def test_added_recordings_are_in_the_machine_with_their_weight(old, trained, new):
     after = old.reweighed(dict.fromkeys(new, 7.0), new)
-    scales = class_scales(after.sums, MACHINE)
+    scales = _class_scales(after.sums, MACHINE)
     bins, weights = [*trained.values(), *new.values()], [1.0] * len(trained) + [7.0] * len(new)
     z = recording("any", 5).z
     expected = fitted(bins, weights, scales)(z)
@@ -205,10 +205,10 @@ def test_auto_takes_the_largest_weight_that_old_materials_allow(old, new):
     found = add(old, before, new, None, margin=0.1)
     chosen = found.factor
     assert found.tried[chosen] == found.verdict.mean_fall
-    assert found.verdict.problem(OF_MARGIN * 0.1) is None
+    assert found.verdict.problem(_OF_MARGIN * 0.1) is None
     (next_larger,) = [f for f in FACTORS if f > chosen][:1]
     by_hand = add(old, before, new, found.weight * next_larger / chosen, margin=0.1)
-    assert by_hand.verdict.problem(OF_MARGIN * 0.1) is not None
+    assert by_hand.verdict.problem(_OF_MARGIN * 0.1) is not None
     assert found.weight * 3 * NUM_BINS == pytest.approx(chosen * 4 * NUM_BINS)
 
 
@@ -296,7 +296,7 @@ def test_a_verdict_names_what_falls():
     assert Verdict(same, same).problem(0.0) is None
     mean = Verdict(same, {"a": 0.88, "b": 0.8}).problem(0.005)
     assert mean.startswith("old materials fall from 85.00 to 84.00 %")
-    one = Verdict(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7}).problem(0.04 / OF_ONE)
+    one = Verdict(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7}).problem(0.04 / _OF_ONE)
     assert one.startswith("b falls from 80.00 to 75.00 %")
     assert Verdict(same, {"a": 0.88, "b": 0.8}).problem(0.0101) is None
     assert Verdict({}, {}).problem(0.0) is None
@@ -318,7 +318,7 @@ def test_mean_recall_is_balanced_accuracy_or_that_of_the_one_class():
 
 
 def test_witnesses_give_way_to_all_bins_of_a_recording_that_is_taken_out(old, trained, new):
-    known = known_bins(
+    known = _known_bins(
         old.rehearsal, {"a/0": trained["a/0"]} | new, {"a/0": 0.0} | dict.fromkeys(new, 3.0)
     )
     assert not bool(known.of(["a/0"]).any())

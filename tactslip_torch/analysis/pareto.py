@@ -66,9 +66,9 @@ from tactslip_torch.threads import for_each
 from tactslip_torch.validation import validate
 
 _MODEL_ERRS = (1.5, 1.0, 1 / 1.5)  # modelled compute over what will be measured
-FEW_NUMBERS = 20
-LESS_ACCURATE = 0.01
-LESS_COMPUTE = 1 / 3
+_FEW_NUMBERS = 20
+_LESS_ACCURATE = 0.01
+_LESS_COMPUTE = 1 / 3
 
 _T = TypeVar("_T")
 
@@ -171,9 +171,9 @@ def landmarks(
 
     top = best(detectors)
     assert top is not None
-    most, least = LESS_COMPUTE * compute(top), accuracy(top) - LESS_ACCURATE
+    most, least = _LESS_COMPUTE * compute(top), accuracy(top) - _LESS_ACCURATE
     cheap = [each for each in detectors if compute(each) <= most and accuracy(each) >= least]
-    few = [each for each in detectors if size(each) <= FEW_NUMBERS]
+    few = [each for each in detectors if size(each) <= _FEW_NUMBERS]
     return {"most_accurate": top, "cheap": best(cheap), "few": best(few)}
 
 
@@ -185,8 +185,8 @@ def worth_naming(candidates: Sequence[Candidate]) -> list[Candidate]:
     best: dict[object, Candidate] = {}
     for each in candidates:
         groups: list[object] = [(each.columns == "channel", each.components)]
-        if each.frame.size <= FEW_NUMBERS:
-            groups.append(FEW_NUMBERS)
+        if each.frame.size <= _FEW_NUMBERS:
+            groups.append(_FEW_NUMBERS)
         for group in groups:
             other = best.setdefault(group, each)
             if each.balanced_accuracy > other.balanced_accuracy:
@@ -475,7 +475,7 @@ class Searcher:
         bins = TrainingBins(frame(sample.features), sample.is_slip, weights)
         found = []
         for degree, size in itertools.product(degrees, sizes):
-            kernel = Polynomial(degree, offset_of(self.recipe))
+            kernel = Polynomial(degree, _offset_of(self.recipe))
             choices = [(size, kernel, penalty) for penalty in self.search.penalties]
             rows = validate(bins, sample.group, sample.group_names, choices, _quietly)
             best = max(rows, key=lambda row: float(row["mean"]))
@@ -516,7 +516,7 @@ class Searcher:
             kernel="polynomial",
             num_features=tuple(self.search.pooled_sizes),
             degree=tuple(self.search.degrees),
-            offsets=offset_of(self.recipe),
+            offsets=_offset_of(self.recipe),
             penalties=tuple(self.search.penalties),
         )
         sample, counts = self._samples[align], self.surveys[align].moments.count.tolist()
@@ -589,7 +589,7 @@ class Searcher:
         return shortest_hop(parts_ms, hops)
 
 
-def offset_of(recipe: Recipe) -> float:
+def _offset_of(recipe: Recipe) -> float:
     """The polynomial's c: the first of the recipe's."""
     offsets = recipe.offsets
     return float(offsets[0] if isinstance(offsets, Sequence) else offsets)
@@ -697,7 +697,7 @@ class Workshop:
         """Detectors of the candidates, fitted to the sample, in every arithmetic, by the clock."""
         found = []
         for candidate in bar(candidates, "timing the front", "detector"):
-            graph_us = time_graph(self.make(candidate, "double"), self.search.calls).p50_us
+            graph_us = _time_graph(self.make(candidate, "double"), self.search.calls).p50_us
             for arithmetic in self.search.arithmetics:
                 with one_thread():
                     timing = time_detector(self.make(candidate, arithmetic), self.search.calls)
@@ -716,7 +716,7 @@ class Workshop:
             num_features=candidate.frame.size,
             kernel="polynomial",
             degree=candidate.degree,
-            offsets=offset_of(self.recipe),
+            offsets=_offset_of(self.recipe),
             penalties=candidate.penalty,
         )
         plan = plan_detector(recipe, survey, _quietly, candidate.frame)
@@ -786,7 +786,7 @@ class Workshop:
         }
 
 
-def time_graph(detector: SlipDetector, calls: int) -> Timing:
+def _time_graph(detector: SlipDetector, calls: int) -> Timing:
     """Time the ONNX graph of a detector in onnxruntime, one ordinary bin and one thread."""
     session = session_of(bin_graph(detector, Form()).model({}))
     samples = next(each for each in session.get_inputs() if each.name == "samples")

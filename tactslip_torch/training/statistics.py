@@ -148,7 +148,7 @@ class KnownBins(NamedTuple):
         return torch.tensor([name in recordings for name in self.recordings])[self.recording]
 
 
-def known_bins(
+def _known_bins(
     rehearsal: Rehearsal, bins: Mapping[str, RecordingBins], weights: Mapping[str, float]
 ) -> KnownBins:
     """Rehearsal, and all bins of recordings that came later and are in.
@@ -250,7 +250,7 @@ class Statistics:
 
     def known(self) -> KnownBins:
         """Bins that are in the sums and known one by one."""
-        return known_bins(self.rehearsal, self.bins, self.weights)
+        return _known_bins(self.rehearsal, self.bins, self.weights)
 
     def reweighed(
         self, weights: Mapping[str, float], bins: Mapping[str, RecordingBins] | None = None

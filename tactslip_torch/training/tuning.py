@@ -36,8 +36,8 @@ from tactslip_torch.planning import Plan
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Frame, Recipe
 
-Setting = Literal["penalty", "offset", "scales"]
-SETTINGS: tuple[Setting, ...] = get_args(Setting)
+_Setting = Literal["penalty", "offset", "scales"]
+SETTINGS: tuple[_Setting, ...] = get_args(_Setting)
 
 
 class Tuned(NamedTuple):
