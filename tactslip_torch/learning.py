@@ -16,7 +16,6 @@ import lightning as L
 import torch
 from torch import nn
 
-from tactslip_torch.abstaining import Abstaining
 from tactslip_torch.baselines import KEY as BASELINES
 from tactslip_torch.baselines import Baselines
 from tactslip_torch.data.splits import ROLES
@@ -46,6 +45,7 @@ from tactslip_torch.progress import bar
 from tactslip_torch.ranks import from_first_rank, of_all_ranks, sum_over_ranks
 from tactslip_torch.recipe import Frame, Recipe
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.abstention import Abstaining
 
 
 class SlipLearner(L.LightningModule):

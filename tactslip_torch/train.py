@@ -19,7 +19,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from tactslip_torch.abstaining import Abstaining
 from tactslip_torch.config import (
     conf_dir,
     errors_in_one_line,
@@ -44,6 +43,7 @@ from tactslip_torch.folds import combined
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.recipe import Recipe
 from tactslip_torch.report.results import print_results, write_results
+from tactslip_torch.training.abstention import Abstaining
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.tuning import Tuning
 

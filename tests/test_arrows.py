@@ -24,16 +24,15 @@ PART = {
     "runtime": ("config", "files", "ledger", "plain", "progress", "threads", "workers"),
     "features": ("engines",),
     "deploy": ("graph", "export"),
-    "training": ("abstaining", "adapting", "alarming", "baselines", "datamodule", "experiment",
+    "training": ("baselines", "datamodule", "experiment",
                  "facts", "feature_maker", "fitting", "fold_training", "folds", "judging",
-                 "learning", "model_selection", "pace", "planning", "ranks", "recipe", "tuning",
+                 "learning", "model_selection", "pace", "planning", "ranks", "recipe",
                  "validation"),
-    "analysis": ("bracket", "certificate", "deadline", "importance"),
+    "analysis": ("bracket",),
 }  # fmt: skip
 """Modules and folders that stand for a part until they are in its folder."""
 KNOWN = (
-    ("alarming.", "report."),
-    ("certificate", "simulation."),
+    ("analysis.certificate", "simulation."),
     ("data.sets.", "signals.resampling"),
     ("export", "certify"),
     ("graph.trials", "simulation."),

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from benchmarks.abstaining.sizes import Sizes
 from benchmarks.clocks import say
-from tactslip_torch.abstaining import held_out_scores
 from tactslip_torch.config import conf_dir
 from tactslip_torch.crossval import Materials
 from tactslip_torch.data.splits import seen6
@@ -27,6 +26,7 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.planning import plan_detector
 from tactslip_torch.recipe import Recipe, stand_for
 from tactslip_torch.simulation import SEEN_MATERIALS
+from tactslip_torch.training.abstention import held_out_scores
 
 ROLES = {"test": "held-out cycles of seen materials", "unseen": "materials never met"}
 
