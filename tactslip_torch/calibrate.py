@@ -1,12 +1,12 @@
-"""The free knobs of the simulated hand, set once: ``python -m tactslip_torch.calibrate``.
+"""The free parameters of the simulated hand, set once: ``python -m tactslip_torch.calibrate``.
 
-The three knobs move along one line of difficulty (``simulation/parameters.py``). Calibration
+The three parameters move along one line of difficulty (``simulation/parameters.py``). Calibration
 finds the place on it where the paper's own protocol, on seen materials, scores what the paper
 published for them, as a mean over seeds that no reported result uses. The qualitative facts
 (``facts.py``) must hold there; else it stays at the closest point tried where they do, and says
 how much is missing. Nothing else of the paper's results is read, and no unseen material is ever
 simulated. Leaves ``calibration.json``, ``calibration.png`` and the resolved configuration;
-``write=true`` also freezes the values as the defaults of the knobs, and only of this protocol.
+``write=true`` also freezes the values as the defaults of the scenes, and only of this protocol.
 """
 
 from __future__ import annotations

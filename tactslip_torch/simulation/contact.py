@@ -39,7 +39,7 @@ from tactslip_torch.simulation.bristles import (
     stage_times_s,
 )
 from tactslip_torch.simulation.grasp import Grasp, Surface, draw_grasp, quasi_static_slips
-from tactslip_torch.simulation.scene import ArmStroke, Motion, Scene
+from tactslip_torch.simulation.scene import ArmStroke, Motion, Scene, next_starts_s
 
 SLIDE_RISE_S = 0.004
 """Time constant with which an element that let go reaches the arm's speed (ours)."""
@@ -128,8 +128,8 @@ class KinematicContact:
         grasp, recoil_s = self._grasp, self._scene.contact.recoil_s
         share, after = motion.grid.zeros(), self._grasp.shear_after
         presliding_mm, ratio = grasp.presliding_mm[element], grasp.surface.mu_ratio
-        next_starts_s = [*(stroke.start_s for stroke in motion.plan), np.inf][1:]
-        for number, (stroke, next_s) in enumerate(zip(motion.plan, next_starts_s, strict=True)):
+        nexts_s = next_starts_s(motion.plan)
+        for number, (stroke, next_s) in enumerate(zip(motion.plan, nexts_s, strict=True)):
             rows = motion.grid.overlapping(stroke.start_s, next_s)
             if rows.start == rows.stop:
                 continue
@@ -243,8 +243,7 @@ class BristleContact:
         normal_n = grasp.normal_n(element, motion.position_mm, motion.grid.time_s)
         static_n = grasp.surface.mu_s * normal_n
         friction_n, slide, inertia_n = motion.grid.zeros(), grid.zeros(), grid.zeros()
-        next_starts_s = [*(stroke.start_s for stroke in plan[1:]), np.inf]
-        for trace, stroke, next_s in zip(self._traces, plan, next_starts_s, strict=True):
+        for trace, stroke, next_s in zip(self._traces, plan, next_starts_s(plan), strict=True):
             stop_s = stroke.stop_s
             rows = motion.grid.overlapping(stop_s, next_s)
             t = motion.grid.time_s[rows]
@@ -390,9 +389,8 @@ def slides_of(scene: Scene, grasp: Grasp) -> list[Slide]:
     """The strokes of a scene that slide, ready to be integrated."""
     plan, rate_hz, down = scene.slides, scene.sample_rate_hz, grasp.touching
     lanes, rest = lanes_of(scene, grasp), quasi_static_slips(grasp, plan)
-    next_starts_s = [*(stroke.start_s for stroke in plan[1:]), np.inf]
     slides = []
-    for number, (stroke, next_s) in enumerate(zip(plan, next_starts_s, strict=True)):
+    for number, (stroke, next_s) in enumerate(zip(plan, next_starts_s(plan), strict=True)):
         settling_s = min(SETTLING_S, next_s - stroke.stop_s)
         first = int(np.floor(stroke.start_s * rate_hz))
         last = int(np.ceil((stroke.stop_s + settling_s) * rate_hz))

@@ -377,10 +377,10 @@ class Event:
         return self.start_s, self.end_s + SETTLE_S
 
 
-def _merged(stretches: list[Interval]) -> tuple[Interval, ...]:
-    """The union of stretches, ascending and apart; empty ones are left out."""
+def _merged(intervals: list[Interval]) -> tuple[Interval, ...]:
+    """The union of intervals, ascending and apart; empty ones are left out."""
     union: list[list[float]] = []
-    for start_s, end_s in sorted(stretches):
+    for start_s, end_s in sorted(intervals):
         if end_s <= start_s:
             continue
         if union and start_s <= union[-1][1]:
@@ -429,7 +429,7 @@ def _draw_events(
 
 
 def _place(rooms: list[Interval], share: float) -> float:
-    """The time at a share of the stretches' total length."""
+    """The time at a share of the intervals' total length."""
     lengths = np.array([end_s - start_s for start_s, end_s in rooms])
     reached = np.cumsum(lengths)
     room = min(int(np.searchsorted(reached, share * reached[-1], side="right")), len(rooms) - 1)
@@ -484,13 +484,13 @@ class Handled:
         """
         if not self._plan:
             return ((0.0, duration_s),)
-        stretches = [event.interval_s for event in (*self.taps, *self.grips)]
+        intervals = [event.interval_s for event in (*self.taps, *self.grips)]
         for number, stroke in enumerate(self._plan):
             later = [s.start_s for s in self._plan[number + 1 :] if s.slides]
             if not stroke.slides:
                 stop_s = min([stroke.stop_s + RINGING_S, *later])
-                stretches.append((stroke.start_s, stop_s))
-        return _merged([(start_s, min(end_s, duration_s)) for start_s, end_s in stretches])
+                intervals.append((stroke.start_s, stop_s))
+        return _merged([(start_s, min(end_s, duration_s)) for start_s, end_s in intervals])
 
     def shear_n(self, element: int, time_s: Array) -> Array:
         """Newtons of the carried object's inertia on an element; signed like a slide's friction."""
@@ -640,7 +640,7 @@ def disturb(
 ) -> None:
     """Change one touching element's vibration, in place: partial slip or sticking, local noise."""
     parameters = scene.imperfections
-    for start_s, end_s in partial_stretches(scene, _finger(scene, grasp, element)):
+    for start_s, end_s in partial_intervals(scene, _finger(scene, grasp, element)):
         rows = grid.overlapping(start_s, end_s)
         if rows.start == rows.stop:
             continue
@@ -680,8 +680,8 @@ def pickup(scene: Scene, grid: Grid) -> tuple[Array, Array] | None:
     return 1e-3 * size_mv * level * noise, couplings
 
 
-def partial_stretches(scene: Scene, finger: str) -> tuple[Interval, ...]:
-    """When a finger slips or sticks on its own; stretches may overlap."""
+def partial_intervals(scene: Scene, finger: str) -> tuple[Interval, ...]:
+    """When a finger slips or sticks on its own; intervals may overlap."""
     rate_hz = scene.imperfections.partial_slips_per_s
     if rate_hz == 0:
         return ()

@@ -264,14 +264,15 @@ class Contact(_Parameters):
         self._require("relaxation", self.relaxation[1] <= 1, "at most 1")
         loads = all(0 <= load < math.inf for _, load in self.finger_loads)
         self._require("finger_loads", loads, "finite and not negative")
-        touches = "no element in contact: Contact.{} must be {}, got {!r}"
         for name, holds, wanted in (
             ("lifted_fraction", self.lifted_fraction < 1, "below 1"),
-            ("touching", self.touching is None or bool(self.touching), "null or name a channel"),
+            ("touching", self.touching is None or bool(self.touching), "null or some channels"),
             ("load_n", self.load_n > 0, "positive"),
         ):
             if not holds:
-                raise ValueError(touches.format(name, wanted, getattr(self, name)))
+                raise ValueError(
+                    f"no element in contact: {name} must be {wanted}, got {getattr(self, name)!r}"
+                )
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,21 @@
-"""The dynamic rungs look as the paper describes too: ``facts`` on few recordings of each."""
+"""Bristles look as the paper describes too: ``facts`` on few recordings of one and of many."""
 
 from dataclasses import replace
 
 import pytest
+from scene_files import BRISTLES, CONTACTS
 from test_facts import BY_NAME, HAND, changed, shuffled
 
 from tactslip_torch.facts import filtered
-from tactslip_torch.simulation import SEEN_MATERIALS, paper_scenes
-from tactslip_torch.simulation.batch import simulate_many
+from tactslip_torch.simulation import SEEN_MATERIALS, paper_scenes, simulate_many
 
-GENTLE = {"patch": {"pvdf_abrupt": 1.25}}
+GENTLE = {"many": {"pvdf_abrupt": 1.25}}
 """A patch lets go bristle by bristle, so its bursts are weaker; shuffled ones are 1."""
 
 
-@pytest.fixture(scope="module", params=["lugre", "patch"])
-def rung(request):
-    scenes = paper_scenes(cycles=3, materials=SEEN_MATERIALS, fidelity=request.param)
+@pytest.fixture(scope="module", params=BRISTLES)
+def bristles(request):
+    scenes = paper_scenes(cycles=3, materials=SEEN_MATERIALS, **CONTACTS[request.param])
     recordings = {material: [] for material in SEEN_MATERIALS}
     for recording in simulate_many(scenes):
         recordings[recording.material].append(filtered(recording, HAND))
@@ -23,10 +23,10 @@ def rung(request):
 
 
 @pytest.mark.parametrize("name", BY_NAME)
-def test_a_fact_holds_on_a_dynamic_rung_and_fails_on_shuffled_signals(rung, name):
-    fidelity, recordings = rung
+def test_a_fact_holds_with_bristles_and_fails_on_shuffled_signals(bristles, name):
+    model, recordings = bristles
     fact = BY_NAME[name]
-    fact = replace(fact, low=GENTLE.get(fidelity, {}).get(name, fact.low))
+    fact = replace(fact, low=GENTLE.get(model, {}).get(name, fact.low))
     values = fact.values(recordings)
     assert values
     assert all(map(fact.allows, values.values())), values
