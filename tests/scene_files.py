@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import yaml
 
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.simulation import Scene, paper_scenes, simulate, timeline
 from tactslip_torch.simulation.blocks import Grid, block_samples_for
 from tactslip_torch.simulation.contact import ElementContact, scene_contact

@@ -14,9 +14,10 @@ from PIL import Image
 from test_commands import TINY, TinyRecordings, composed
 
 from tactslip_torch import SlipDetector
-from tactslip_torch import adapt as module
-from tactslip_torch.adapt import adapt
-from tactslip_torch.config import conf_dir, one_line
+from tactslip_torch.commands import adapt as module
+from tactslip_torch.commands.adapt import adapt
+from tactslip_torch.commands.entry import conf_dir, one_line
+from tactslip_torch.commands.train import train
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.conformal import answers, thresholds
@@ -24,7 +25,6 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
-from tactslip_torch.train import train
 from tactslip_torch.training.adaptation import Verdict, _class_scales, add
 from tactslip_torch.training.statistics import Statistics, detector_digest, locked
 
@@ -303,7 +303,7 @@ def test_graphs_of_the_detector_before_are_told(run, files, capsys):
     before = content(run)[0]
     of(before)
     add_c(run, files, "weight=2")
-    told = "model.onnx beside it: of another detector; python -m tactslip_torch.export model="
+    told = "model.onnx beside it: of another detector; python -m tactslip_torch export model="
     assert told in capsys.readouterr().out
     adapt(settings(run, "action=undo"), run / "results")
     assert told not in capsys.readouterr().out
@@ -382,7 +382,7 @@ def test_training_refuses_statistics_that_it_cannot_leave(tmp_path, overrides, m
 
 
 def test_the_command_ends_with_status_2_and_one_line(run):
-    command = [sys.executable, "-m", "tactslip_torch.adapt", f"model={run / 'nothing.pt'}"]
+    command = [sys.executable, "-m", "tactslip_torch", "adapt", f"model={run / 'nothing.pt'}"]
     ended = subprocess.run(
         [*command, f"hydra.run.dir={run / 'results'}"], capture_output=True, text=True, check=False
     )

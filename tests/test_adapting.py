@@ -8,13 +8,10 @@ import pytest
 import torch
 
 from tactslip_torch.features.bin_sample import BinSample
-from tactslip_torch.fitting import training_part
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.sufficient import SufficientStats
-from tactslip_torch.planning import Plan
-from tactslip_torch.recipe import Frame
 from tactslip_torch.training import adaptation as steps
 from tactslip_torch.training.adaptation import (
     _OF_MARGIN,
@@ -31,6 +28,9 @@ from tactslip_torch.training.adaptation import (
     taken,
     undo,
 )
+from tactslip_torch.training.fitting import training_part
+from tactslip_torch.training.recipe import Frame
+from tactslip_torch.training.selection import Plan
 from tactslip_torch.training.statistics import (
     Machine,
     RecordingBins,

@@ -6,7 +6,7 @@ import pytest
 from scene_files import BRISTLES, CONTACTS
 from test_facts import BY_NAME, HAND, changed, shuffled
 
-from tactslip_torch.facts import filtered
+from tactslip_torch.analysis.signal_checks import filtered
 from tactslip_torch.simulation import SEEN_MATERIALS, paper_scenes, simulate_many
 
 GENTLE = {"many": {"pvdf_abrupt": 1.25}}

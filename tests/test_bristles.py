@@ -12,7 +12,7 @@ import pytest
 import torch
 from dynamics_oracle import SMOOTH, TACKY, Drive, Element, carry, driven, ramped
 
-from tactslip_torch import engines
+from tactslip_torch import runtime as engines
 from tactslip_torch.simulation import bristles
 from tactslip_torch.simulation.bristles import (
     EngineName,

@@ -8,9 +8,15 @@ from types import MappingProxyType
 import pytest
 from test_commands import composed
 
-from tactslip_torch import calibrate as command
-from tactslip_torch.bracket import Point, chosen_point, next_difficulty
-from tactslip_torch.calibrate import calibrate, evaluate_point
+from tactslip_torch.commands import calibrate as command
+from tactslip_torch.commands.calibrate import (
+    Point,
+    calibrate,
+    chosen_point,
+    evaluate_point,
+    next_difficulty,
+)
+from tactslip_torch.commands.train import train
 from tactslip_torch.report import published
 from tactslip_torch.report.calibration import calibration_table
 from tactslip_torch.simulation import Contact, Disturbances, paper_scenes, parameters
@@ -21,7 +27,6 @@ from tactslip_torch.simulation.parameters import (
     parameters_at,
     read_calibrated,
 )
-from tactslip_torch.train import train
 
 SMALL = (
     "data.cycles=1",
@@ -356,7 +361,7 @@ def test_what_is_no_calibration_is_refused(tmp_path, override, message):
 
 
 def test_bad_input_is_one_line_and_exit_status_2(tmp_path):
-    arguments = [sys.executable, "-m", "tactslip_torch.calibrate", "seeds=[3]"]
+    arguments = [sys.executable, "-m", "tactslip_torch", "calibrate", "seeds=[3]"]
     done = subprocess.run(arguments, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith("error: seeds must differ and be 1000 or more")

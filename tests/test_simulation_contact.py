@@ -10,7 +10,7 @@ import pytest
 import torch
 from scene_files import BRISTLES, CONTACTS, RATE_HZ, contacts, scene_on, whole_grid
 
-from tactslip_torch import engines
+from tactslip_torch import runtime as engines
 from tactslip_torch.simulation import (
     MATERIALS,
     SEEN_MATERIALS,

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.selection import rank_distinct, rank_features
@@ -30,9 +29,9 @@ from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.held_out import HeldOut
 from tactslip_torch.model.kernels import Kernel
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.progress import bar
+from tactslip_torch.runtime import bar, for_each
 from tactslip_torch.signals.binning import refuse_nonfinite
-from tactslip_torch.threads import for_each
+from tactslip_torch.training.datamodule import FeatureMaker
 
 _COVERAGE = 0.95
 

@@ -50,7 +50,7 @@ from tactslip_torch.features.pooling import ChannelPooling, pooled_names
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.progress import bar
+from tactslip_torch.runtime import bar
 from tactslip_torch.signals.filtering import ChannelFilter
 
 DEFINITION = (

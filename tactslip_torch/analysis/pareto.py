@@ -37,8 +37,6 @@ from tactslip_torch.analysis.latency import (
 )
 from tactslip_torch.data.labels import needed_windows
 from tactslip_torch.data.splits import Split
-from tactslip_torch.datamodule import SlipDataModule
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.groups import Channels, Components, allowed, of_fingers
@@ -49,21 +47,26 @@ from tactslip_torch.features.pooling import STATISTICS
 from tactslip_torch.features.ranking import rank_per_cost, rank_weighted
 from tactslip_torch.features.selection import rank_distinct, rank_features, t_scores
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.fitting import TrainingPass, solve_facts
 from tactslip_torch.graph.bins import bin_graph
 from tactslip_torch.graph.form import Form
 from tactslip_torch.graph.runs import session_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.model_selection import Structure, choose_model, fitted_frame
-from tactslip_torch.planning import adds_up, plan_detector
-from tactslip_torch.progress import Ticker, bar
-from tactslip_torch.recipe import Frame, Recipe, fit_frame, recalls_mean, stand_for
+from tactslip_torch.runtime import Ticker, bar, for_each
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import Align, ChannelFilter
-from tactslip_torch.threads import for_each
-from tactslip_torch.validation import validate
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.training.fitting import TrainingPass, solve_facts
+from tactslip_torch.training.recipe import Frame, Recipe, fit_frame, recalls_mean, stand_for
+from tactslip_torch.training.selection import (
+    Structure,
+    adds_up,
+    choose_model,
+    fitted_frame,
+    plan_detector,
+    validate,
+)
 
 _MODEL_ERRS = (1.5, 1.0, 1 / 1.5)  # modelled compute over what will be measured
 _FEW_NUMBERS = 20

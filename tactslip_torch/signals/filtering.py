@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.plain import is_plain
+from tactslip_torch.runtime import is_plain
 
 Align = Literal["centred", "causal", "trailing"]
 """Which part of its frame's polynomial a sample takes, and where the frame lies.

@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.engines import usable_engine
+from tactslip_torch.runtime import usable_engine
 
 EngineName = Literal["auto", "compiled", "eager"]
 

@@ -2,7 +2,7 @@
 
 Defaults are the starting values of PHYSICS.md unless marked. Every ``*_spread`` is the standard
 deviation of the logarithm of a factor of median 1. Three parameters are *calibrated*: set once, by
-``python -m tactslip_torch.calibrate``, on seen-material test accuracy and the qualitative facts
+``python -m tactslip_torch calibrate``, on seen-material test accuracy and the qualitative facts
 alone, and frozen with where they come from in ``calibrated.json``. They move together along one
 line of difficulty: ``d`` prior standard deviations harder means less friction noise, longer
 presliding and more bursts, each by its own spread to the power ``d``.

@@ -22,8 +22,8 @@ from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.conformal import check_coverage, check_number, thresholds
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.held_out import HeldOut
-from tactslip_torch.planning import Plan
-from tactslip_torch.recipe import Recipe, stand_for
+from tactslip_torch.training.recipe import Recipe, stand_for
+from tactslip_torch.training.selection import Plan
 
 log = logging.getLogger(__name__)
 

@@ -25,10 +25,8 @@ from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.cache import cache_key
-from tactslip_torch.fitting import TrainingPass, solve_facts
 from tactslip_torch.model import abstention
 from tactslip_torch.model.abstention import abstention_of
 from tactslip_torch.model.calibration import fit_platt
@@ -45,9 +43,11 @@ from tactslip_torch.model.quadratic import QuadraticForm, from_primal, quadratic
 from tactslip_torch.model.sufficient import SufficientStats
 from tactslip_torch.model.symmetric_solve import solve_symmetric_
 from tactslip_torch.onset.settings import KEY as ALARM
-from tactslip_torch.planning import adds_up
-from tactslip_torch.progress import bar
-from tactslip_torch.recipe import Recipe
+from tactslip_torch.runtime import bar
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.fitting import TrainingPass, solve_facts
+from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.selection import adds_up
 from tactslip_torch.training.statistics import (
     KnownBins,
     Machine,

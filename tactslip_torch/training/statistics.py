@@ -20,11 +20,11 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
-from tactslip_torch.files import load_table, save_table
 from tactslip_torch.ledger import Ledger, content_digest
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.sufficient import SufficientStats
-from tactslip_torch.planning import Plan
+from tactslip_torch.runtime import load_table, save_table
+from tactslip_torch.training.selection import Plan
 
 
 @dataclass(frozen=True, eq=False)
