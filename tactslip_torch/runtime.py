@@ -407,3 +407,16 @@ def _start(function: Callable[[Any], Any]) -> None:
 def _call(item: Any) -> Any:
     assert _function is not None  # _start
     return _function(item)
+
+
+def is_first_process() -> bool:
+    """Whether this is the only process of a run, or the one that writes and speaks for all."""
+    return process_number() == 0
+
+
+def process_number() -> int:
+    """The rank of this process in its run, by what torchrun, Lightning or SLURM has set."""
+    for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK"):
+        if name in os.environ:
+            return int(os.environ[name])
+    return 0

@@ -16,6 +16,7 @@ from hydra.errors import InstantiationException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import tactslip_torch
+from tactslip_torch.runtime import is_first_process, process_number
 
 CONF_HINT = "train.yaml"
 EXIT_BAD_INPUT = 2
@@ -103,19 +104,6 @@ def run_entry_point(main: Callable[[], Any]) -> None:
     if "TORCHELASTIC_RUN_ID" in os.environ and not is_first_process():
         sys.argv += ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
     main()
-
-
-def is_first_process() -> bool:
-    """Whether this is the only process of a run, or the one that writes and speaks for all."""
-    return process_number() == 0
-
-
-def process_number() -> int:
-    """The rank of this process in its run, by what torchrun, Lightning or SLURM has set."""
-    for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK"):
-        if name in os.environ:
-            return int(os.environ[name])
-    return 0
 
 
 @contextmanager

@@ -19,7 +19,6 @@ from omegaconf import DictConfig
 from tactslip_torch.commands.entry import (
     conf_dir,
     errors_in_one_line,
-    is_first_process,
     run_entry_point,
 )
 from tactslip_torch.data.labels import LabelRule
@@ -30,6 +29,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report.answers import merged_answers
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.report.scores import merged_metrics
+from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import (
     DTYPES,

@@ -22,7 +22,6 @@ from omegaconf import DictConfig
 from tactslip_torch.commands.entry import (
     conf_dir,
     errors_in_one_line,
-    is_first_process,
     run_entry_point,
 )
 from tactslip_torch.data.labels import LabelRule
@@ -30,6 +29,7 @@ from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, are_rivals
 from tactslip_torch.features.pooling import pooled_names
 from tactslip_torch.report.results import print_results, write_results
+from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.abstention import Abstaining
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule

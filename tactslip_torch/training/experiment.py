@@ -22,9 +22,6 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm.auto import tqdm
 
 import tactslip_torch
-from tactslip_torch.commands.entry import (
-    one_line,
-)
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.cache import (
@@ -567,7 +564,7 @@ def export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, flo
             found[kind] = {"error": worst_error(facts), "bytes": facts["onnx_bytes"]}
         except Exception as error:  # of onnxruntime they have no base in common
             log.exception("the %s graph was not written", kind)
-            found[kind] = one_line(error).splitlines()[0]
+            found[kind] = " ".join(str(error).split()).splitlines()[0]
     return found
 
 
