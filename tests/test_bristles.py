@@ -189,17 +189,6 @@ def test_slope_of_the_force_is_its_derivative(rng: np.random.Generator) -> None:
     assert ((slope - at.slope).abs() <= 1e-9 * scale.detach()).all()
 
 
-def test_bristles_alike_are_one() -> None:
-    alone, n = TACKY.lanes(m=[5e-3]), 7
-    many = TACKY.lanes(m=[5e-3], pressure=[1 / n] * n)
-    drive = driven(ramped(0.04), one)
-    first, end = carry(alone, LaneState.sticking(alone), drive, 600, 250e-6)
-    second, last = carry(many, LaneState.sticking(many), drive, 600, 250e-6)
-    assert_same(first, second, 1e-9)
-    torch.testing.assert_close(last.bristle_m, end.bristle_m.expand(1, n))
-    assert torch.equal(hertz_pressure(1), torch.ones(1, dtype=torch.float64))
-
-
 @pytest.mark.parametrize("arm_m_s", [0.02, 0.06])
 def test_the_edge_lets_go_before_the_whole(arm_m_s: float) -> None:
     lanes = replace(SMOOTH, sigma=3e3, d0=1.0).lanes(m=[5e-3], pressure=hertz_pressure(32))
@@ -534,65 +523,6 @@ def test_a_search_ends_though_nothing_can_be_found(engine: EngineName, wrong: fl
     drive = driven(lambda t: wrong, lambda t: 1.0)
     trace, _ = carry(lanes, start, drive, 3, 250e-6, engine=needing(engine))
     assert not trace.friction_n.isfinite().any()
-
-
-def test_stiff_skin_is_coulombs_slider() -> None:
-    """Skin and bristles far stiffer than any: steady friction is ``mu(v) N`` at once."""
-    lanes = SMOOTH.lanes(k=[1e6, 1e7], sigma=[1e8, 1e9], k1=0.0, pressure=hertz_pressure(8))
-    drive = driven(lambda t: 0.04, lambda t: 2.0 + math.sin(20.0 * t))
-    trace, _ = carry(lanes, LaneState.sticking(lanes), drive, 800, 250e-6)
-    times = np.arange(101, 801) * 250e-6
-    wanted = torch.tensor(0.7 * (2.0 + np.sin(20.0 * times)))[:, None].expand(-1, 2)
-    carried = trace.friction_n[100:] - trace.inertia_n[100:]
-    torch.testing.assert_close(carried, wanted, rtol=1e-3, atol=0)
-
-
-@pytest.mark.parametrize(
-    ("n", "step_s", "engine"),
-    [
-        *product((1, 8), (1.0 / 32000, 1.0 / 4000, 1.0 / 400), ("compiled",)),
-        (2, 1.0 / 4000, "eager"),
-        (2, 1.0 / 400, "eager"),
-    ],
-)
-def test_friction_gives_nothing_over_a_cycle(n: int, step_s: float, engine: EngineName) -> None:
-    """Work of friction less what bristles store, by the right ends of the steps, over a cycle.
-
-    Sticking bristles are springs: their gross work is large and comes back. What is left is not
-    negative to 2e-5 of the gross work, and to 2e-3 at steps of a 40th of a cycle. The first cycle
-    begins without a force and does not end so, which right ends do not count: half a step's power.
-    """
-    period, engine = 0.1, needing(engine)
-    num_cycles = 4 if engine == "compiled" else 2
-    speeds = (1e-6, 1e-4, 3e-3, 0.05, 0.5)
-    grid = np.array(list(product(speeds, (0.0, 5e-3), (3e3, 1e5), (0.0, 0.9), (0.0, 1.0))))
-    speed, m, sigma, tremor, damped = torch.tensor(grid).T
-    d0 = damped * (5e-3 * sigma).sqrt()
-    lanes = TACKY.lanes(m=m, sigma=sigma, d0=d0, pressure=hertz_pressure(n))
-
-    def drive(times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        phase = (2.0 * math.pi / period * times)[:, None]
-        return speed * torch.cos(phase), 1.0 + tremor * torch.sin(3.0 * phase)
-
-    num, state = round(period / step_s), LaneState.sticking(lanes)
-    each = lanes.bristle_stiffness_n_m / n
-    for cycle in range(num_cycles):
-        before = 0.5 * each * state.bristle_m.square().sum(-1)
-        trace, state = carry(
-            lanes, state, drive, num, step_s, first_step=cycle * num, engine=engine
-        )
-        ends = cycle * period + step_s * torch.arange(1, num + 1, dtype=torch.float64)
-        stretching = drive(ends)[0] - trace.speed_m_s
-        pull = trace.friction_n + lanes.damping_n_s_m * stretching - trace.inertia_n
-        power = step_s * pull * trace.speed_m_s
-        after = 0.5 * each * state.bristle_m.square().sum(-1)
-        gross = power.abs().sum(0) + before + after
-        lost = power.sum(0) - (after - before)
-        tolerance = 2e-5 if step_s < 1e-3 else 2e-3
-        if cycle:
-            assert (lost >= -tolerance * gross).all()
-    slides = speed == 0.5
-    assert (lost[slides] > 0.5 * gross[slides]).all()
 
 
 @pytest.mark.parametrize("trembling", ["pull", "pull and load"])

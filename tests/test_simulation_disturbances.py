@@ -1,7 +1,6 @@
 """What disturbs, handles and breaks: what each adds to the channels, when, and where it stops."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -96,30 +95,6 @@ def test_a_machine_shakes_with_the_square_of_its_speed_and_turns_without_a_break
     whole_run = part(wave, start_s + 0.31, stop_s - 0.31)
     assert np.abs(np.diff(wave)).max() < 1.01 * np.abs(np.diff(whole_run)).max()  # no seam
     assert rms(whole_run) == pytest.approx(1.0, rel=0.02)
-
-
-def test_a_machine_is_the_sessions_and_its_runs_are_the_recordings():
-    def level(cycle: int, **changes: str) -> np.ndarray:
-        scene = scene_of("machine", "M3", cycle, **changes)
-        return rms(
-            part(difference("machine", "M3", "machine_mv", cycle, **changes), *full_speed(scene))
-        )
-
-    first, second, other = level(0), level(1), level(0, session="another")
-    np.testing.assert_allclose(first, second, rtol=0.05)
-    assert np.abs(np.log(first / other)).max() > 0.3
-    speeds = {rotation_hz(scene_of("machine", "M3", cycle)) for cycle in range(3)}
-    assert len(speeds) == 1
-    assert rotation_hz(scene_of("machine", "M3", session="another")) not in speeds
-    runs = [machine_runs(scene_of("machine", "M3", cycle)) for cycle in (0, 1)]
-    assert runs[0] != runs[1]
-    long = machine_runs(scene_of("machine", "M3", tail_s=100.0))
-    assert long[: len(runs[0])] == runs[0]
-    lengths = np.array([b - a for a, b in long])
-    gaps = np.array([b[0] - a[1] for a, b in pairwise(long)])
-    assert len(long) > 10
-    assert 1.0 <= lengths.min() < lengths.max() <= 4.0
-    assert 0.5 <= gaps.min() < gaps.max() <= 2.0
 
 
 @pytest.mark.parametrize("material", TWO)
@@ -247,19 +222,6 @@ def test_lost_samples_repeat_the_last_one_in_all_channels(material, drops):
     assert is_lost.any()
     assert np.all(np.diff(broken)[:, is_lost[1:]] == 0)
     assert np.mean(np.any(np.diff(broken)[:, ~is_lost[1:]] != 0, axis=0)) > 0.99
-
-
-@pytest.mark.parametrize("drops", [{}, {"drops_per_s": 20.0, "drop_ms": [100.0, 200.0]}])
-def test_a_window_in_a_loss_knows_the_sample_before_it(drops):
-    """Losses that overlap hold one sample for longer than a block of 256 ms."""
-    scene = scene_of("dropped_samples", "M4", **drops)
-    truth, whole = timeline(scene), samples(scene)
-    for first, end in losses(scene, truth.num_samples)[:40]:
-        window = ((end - 1) / RATE_HZ, end / RATE_HZ)
-        part = samples(scene, windows=[window], channels=["SG2", "PVDF7"])
-        index = round(window[0] * RATE_HZ)
-        assert torch.equal(part[rows(scene, "SG2", "PVDF7"), index], whole[[1, 20], index])
-        assert first <= index
 
 
 def test_losses_come_at_their_rate_and_length():
@@ -405,20 +367,6 @@ def test_a_pulled_object_slips_and_no_arm_is_felt(material):
     assert slip_vibration(scene_of("pulled", material, **SURE, **silent)) < 1.1
     calm = {**silent, "pvdf_shear_v_per_n": 0.0}
     assert onset_bursts(scene_of("pulled", material, **some, **calm)) < 1.5
-
-
-@pytest.mark.parametrize("material", TWO)
-def test_an_arm_that_is_off_and_an_arm_alone(material):
-    some = {"touching": ("SG10", "SG11", "SG12", "SG7", "SG8"), **SURE}
-    off, alone = (scene_of(name, material, **some) for name in ("motor_off", "motor_only"))
-    assert jolt_without_touch(off) < 1.5
-    assert jolt_without_touch(alone) > 5.0
-    off, alone = (scene_of(name, material, **SURE) for name in ("motor_off", "motor_only"))
-    assert slip_vibration(off) > 1.4
-    assert slip_vibration(alone) > 1.5
-    assert slip_vibration(replace(alone, disturbances=off.disturbances)) < 1.1
-    assert onset_bursts(off) > 5.0
-    assert onset_bursts(replace(alone, disturbances=off.disturbances)) < 0.1 * onset_bursts(off)
 
 
 @pytest.mark.parametrize("material", TWO)

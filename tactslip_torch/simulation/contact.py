@@ -154,16 +154,14 @@ class KinematicContact:
         omega = 2 * np.pi * grasp.resonance_hz[element]
         decay = grasp.damping[element] * omega
         times_s = [time_s for slip in self.slips_of(element) for time_s in slip]
-        places = [grid.overlapping(t, t + 12.0 / decay) for t in times_s]
-        if all(rows.start == rows.stop for rows in places):
-            return volts
-        rng = generator(*scene.key("onset pulse"), element)
-        strengths = lognormal(rng, 0.3, (len(self.slips.start_s), 2))
+        strengths = lognormal(
+            generator(*scene.key("onset pulse"), element), 0.3, (len(self.slips.start_s), 2)
+        )
         full_v = scene.contact.onset_pulse_v * grasp.friction_n[element]
         sizes = (np.array(BURST_SHARES) * full_v * strengths).ravel()
-        for rows, start_s, size in zip(places, times_s, sizes, strict=True):
-            since = np.maximum(grid.time_s[rows] - start_s, 0.0)
-            volts[rows] += size * (np.exp(-decay * since) * np.sin(omega * since))
+        for start_s, size in zip(times_s, sizes, strict=True):
+            rows, wave = grid.ringing(start_s, 12.0 / decay, omega, decay)
+            volts[rows] += size * wave
         return volts
 
 
