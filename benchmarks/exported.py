@@ -17,7 +17,7 @@ from torch import Tensor
 from benchmarks.clocks import say
 from benchmarks.detectors import Timed
 from benchmarks.engines import FLOAT32, FLOAT64
-from tactslip_torch.export import export_detector
+from tactslip_torch.graph.export import export_detector
 from tactslip_torch.graph.form import Precision
 
 ORT = "onnxruntime, float32, with validity"

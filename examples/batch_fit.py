@@ -18,7 +18,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from tactslip_torch import SlipDetector, SufficientStats
-from tactslip_torch.feature_maker import FeatureMaker
+from tactslip_torch.training.datamodule import FeatureMaker
 
 
 def collect(run: Path, shard: str, out: Path, overrides: list[str]) -> None:

@@ -50,7 +50,7 @@ def main(path: str = "learned_filter.pt", steps: int = 25) -> list[float]:
         scaler = FeatureScaler.fit(features.detach(), compress=True)
         scores = held_out_scores(scaler(features), is_slip, groups, PENALTY)
         loss = softplus(torch.where(is_slip, -4.0, 4.0) * scores).mean()
-        losses.append(float(loss))
+        losses.append(float(loss.detach()))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -9,7 +9,6 @@ import pywt
 import torch
 
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.experiment import frame_lengths
 from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
@@ -20,9 +19,10 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY, AlarmSettings
-from tactslip_torch.recipe import Recipe
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.wavelet import WaveletFilters, highest_level
+from tactslip_torch.training.experiment import frame_lengths
+from tactslip_torch.training.recipe import Recipe
 
 
 def own_wavelet() -> WaveletFilters:

@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from tactslip_torch.data.formats import FORMATS, pieces
-from tactslip_torch.data.sets.manifest import read_manifest
+from tactslip_torch.data.manifest import read_manifest
 
 MOST_PIECES = 40
 

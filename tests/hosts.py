@@ -87,7 +87,7 @@ def exported(folder_factory: Any, precision: str = "float32") -> Path:
         folder_factory: pytest's ``tmp_path_factory``.
         precision: of the graphs.
     """
-    from tactslip_torch.export import export_detector
+    from tactslip_torch.graph.export import export_detector
 
     if precision not in _EXPORTED:
         folder: Path = folder_factory.mktemp(f"exported_{precision}")

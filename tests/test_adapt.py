@@ -14,9 +14,10 @@ from PIL import Image
 from test_commands import TINY, TinyRecordings, composed
 
 from tactslip_torch import SlipDetector
-from tactslip_torch import adapt as module
-from tactslip_torch.adapt import adapt
-from tactslip_torch.config import conf_dir, one_line
+from tactslip_torch.commands import adapt as module
+from tactslip_torch.commands.adapt import adapt
+from tactslip_torch.commands.entry import conf_dir, one_line
+from tactslip_torch.commands.train import train
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.conformal import answers, thresholds
@@ -24,8 +25,7 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
-from tactslip_torch.train import train
-from tactslip_torch.training.adaptation import Verdict, add, class_scales
+from tactslip_torch.training.adaptation import Verdict, _class_scales, add
 from tactslip_torch.training.statistics import Statistics, detector_digest, locked
 
 TRAINING = (*TINY, "recipe=robust", "data.seed=0", "statistics=true", "coverage=0.5", "cache=off")
@@ -143,7 +143,7 @@ def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files,
     kept = SlipDetector.load(run / "detector.pt").info["abstain"]
     statistics = Statistics.load(run / "statistics.pt")
     known, machine = statistics.known(), statistics.machine
-    weights = class_scales(statistics.sums, machine)[known.is_slip.long()] * known.represents
+    weights = _class_scales(statistics.sums, machine)[known.is_slip.long()] * known.represents
     scores = torch.empty_like(weights)
     groups = known.recording if left_out == "recording" else known.material
     for group in groups.unique():
@@ -157,16 +157,20 @@ def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files,
     assert f"never met its {left_out}" in kept["adapted"]
 
 
-def test_undo_restores_both_files_to_the_bit(run, files):
-    states = [content(run)]
+def test_undo_restores_the_detector_to_the_bit_and_its_sums(run, files):
+    def state():
+        return (run / "detector.pt").read_bytes(), Statistics.load(run / "statistics.pt").sums
+
+    states = [state()]
     add_c(run, files, "weight=2")
-    states.append(content(run))
+    states.append(state())
     adapt(settings(run, "action=forget", "material=C"), run / "results")
-    states.append(content(run))
-    assert states[0] != states[1] != states[2]
-    for state in (states[1], states[0]):
+    assert states[0][0] != states[1][0] != (run / "detector.pt").read_bytes()
+    for detector, sums in (states[1], states[0]):
         adapt(settings(run, "action=undo"), run / "results")
-        assert content(run) == state
+        assert state()[0] == detector
+        torch.testing.assert_close(state()[1].sums, sums.sums, rtol=0, atol=1e-11)
+        assert state()[1].ledger.entries == sums.ledger.entries
     with pytest.raises(ValueError, match="nothing to undo"):
         adapt(settings(run, "action=undo"), run / "results")
 
@@ -239,7 +243,9 @@ def test_a_step_cut_off_between_its_files_is_told_and_taken_back(run, files, tra
     with pytest.raises(ValueError, match=r"one step ahead of .* action=undo"):
         adapt(settings(run, "action=list"), run / "results")
     adapt(settings(run, "action=undo"), run / "results")
-    assert content(run) == content(trained)
+    assert content(run)[0] == content(trained)[0]
+    sums, before = (Statistics.load(each / "statistics.pt").sums.sums for each in (run, trained))
+    torch.testing.assert_close(sums, before, rtol=0, atol=1e-11)
 
 
 def test_a_second_visit_is_numbered_on_and_known_recordings_are_found_again(run, files, tmp_path):
@@ -303,7 +309,7 @@ def test_graphs_of_the_detector_before_are_told(run, files, capsys):
     before = content(run)[0]
     of(before)
     add_c(run, files, "weight=2")
-    told = "model.onnx beside it: of another detector; python -m tactslip_torch.export model="
+    told = "model.onnx beside it: of another detector; python -m tactslip_torch export model="
     assert told in capsys.readouterr().out
     adapt(settings(run, "action=undo"), run / "results")
     assert told not in capsys.readouterr().out
@@ -382,7 +388,7 @@ def test_training_refuses_statistics_that_it_cannot_leave(tmp_path, overrides, m
 
 
 def test_the_command_ends_with_status_2_and_one_line(run):
-    command = [sys.executable, "-m", "tactslip_torch.adapt", f"model={run / 'nothing.pt'}"]
+    command = [sys.executable, "-m", "tactslip_torch", "adapt", f"model={run / 'nothing.pt'}"]
     ended = subprocess.run(
         [*command, f"hydra.run.dir={run / 'results'}"], capture_output=True, text=True, check=False
     )

@@ -14,7 +14,8 @@ from small_set import RATE_HZ, SMALL_HAND
 
 from benchmarks.alarms import text_of
 from benchmarks.outcome import RESULTS, ROOT, between_markers
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pool import FeaturePool
@@ -29,7 +30,6 @@ from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.report.alarm import alarm_figure, alarm_table, scenes_table
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.train import train
 from tactslip_torch.training.alarm import (
     FIRST_TRANSITION,
     FITS,

@@ -10,8 +10,8 @@ from small_detector import raw_bins, small_detector
 from test_commands import TinyRecordings
 
 from tactslip_torch.analysis.certificate import certify as measure
-from tactslip_torch.certify import _plain, certify, main
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.certify import _plain, certify, main
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.report.certificate import certificate_figure, number, verdict
 from tactslip_torch.simulation.extremes import EXTREMES

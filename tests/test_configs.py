@@ -8,13 +8,13 @@ from hydra.errors import InstantiationException
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import ROLES, Split
-from tactslip_torch.experiment import feature_parts
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.recipe import Recipe
 from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.recipe import Recipe
 
 RECORDED = {"biotacsp_dos"}
 """Experiments on real recordings, which are not here: a folder of their layout stands in."""

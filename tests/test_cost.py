@@ -17,11 +17,11 @@ from tactslip_torch.analysis.latency import (
     _counted,
     _designs,
     _line,
+    _stand_in,
     main,
     measure_costs,
     one_thread,
     parts_of,
-    stand_in,
     time_calls,
     time_in_fresh_process,
 )
@@ -155,7 +155,7 @@ def test_measured_prices_are_of_this_machine():
 
 
 def test_a_stand_in_gives_finite_scores():
-    detector = stand_in(POOL, ChannelFilter([51, 51, 11, 11]), [0, 30, 100], "eager")
+    detector = _stand_in(POOL, ChannelFilter([51, 51, 11, 11]), [0, 30, 100], "eager")
     score = detector.judge_raw(torch.randn(7, 4, 150)).score
     assert score.isfinite().all()
 

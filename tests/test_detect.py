@@ -13,11 +13,11 @@ from PIL import Image
 from small_detector import HAND, small_detector
 
 from tactslip_torch import HandLayout, Recording
-from tactslip_torch import detect as module
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands import detect as module
+from tactslip_torch.commands.detect import detect, main
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.formats import FORMATS, Format
 from tactslip_torch.data.formats._arrays import ArraySamples
-from tactslip_torch.detect import detect, main
 from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import Decider, score_stream

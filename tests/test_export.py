@@ -11,7 +11,7 @@ import torch
 from small_detector import HAND, alarming_detector, raw_bins
 from test_detector import VARIANTS, noise, random_detector
 
-from tactslip_torch.export import export_detector, sidecar_facts, summary, worst_error
+from tactslip_torch.graph.export import export_detector, sidecar_facts, summary, worst_error
 from tactslip_torch.graph.form import Window
 from tactslip_torch.graph.trials import simulated_stream
 from tactslip_torch.model.calibration import probability

@@ -8,10 +8,11 @@ import sys
 import pytest
 from small_detector import alarming_detector, certified, small_detector
 
-from tactslip_torch import export, fold_training
-from tactslip_torch.certify import FORMAT as CERTIFICATE_FORMAT
-from tactslip_torch.export import export_detector, sidecar_facts, summary, worst_error
+from tactslip_torch.commands.certify import FORMAT as CERTIFICATE_FORMAT
+from tactslip_torch.graph import export
+from tactslip_torch.graph.export import export_detector, sidecar_facts, summary, worst_error
 from tactslip_torch.graph.facts import sidecar_path
+from tactslip_torch.training import experiment as fold_training
 
 pytestmark = pytest.mark.onnx
 
@@ -164,7 +165,7 @@ def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, name):
 def test_it_works_as_a_command(detector, tmp_path):
     detector.save(tmp_path / "detector.pt")
     done = subprocess.run(
-        [sys.executable, "-m", "tactslip_torch.export", "model=detector.pt", "output=out"],
+        [sys.executable, "-m", "tactslip_torch", "export", "model=detector.pt", "output=out"],
         cwd=tmp_path,
         capture_output=True,
         text=True,

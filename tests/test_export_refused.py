@@ -8,8 +8,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from small_detector import alarming_detector, small_detector
 
-from tactslip_torch import export
-from tactslip_torch.export import export_detector
+from tactslip_torch.graph import export
+from tactslip_torch.graph.export import export_detector
 
 pytestmark = pytest.mark.onnx
 

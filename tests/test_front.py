@@ -18,7 +18,6 @@ from tactslip_torch.analysis.pareto import (
     worth_timing,
 )
 from tactslip_torch.data.splits import seen6
-from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.features.groups import allowed, of_fingers
 from tactslip_torch.features.names import FeatureName, pool_names
 from tactslip_torch.features.pool import FeaturePool
@@ -29,8 +28,9 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.recipe import Frame, fit_frame, recalls_mean, stand_for
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.recipe import Frame, fit_frame, recalls_mean, stand_for
 
 SMALL = {
     "sizes": [3, 6],

@@ -15,12 +15,12 @@ from oracles import savgol
 from test_commands import BAD_INPUT, TinyRecordings, composed
 
 from tactslip_torch import HandLayout, simulate
-from tactslip_torch import generate as module
-from tactslip_torch.config import folder_problem, one_line
+from tactslip_torch.commands import generate as module
+from tactslip_torch.commands.entry import folder_problem, one_line
+from tactslip_torch.commands.generate import generate, written_table
 from tactslip_torch.data.folder import RecordingFolder, Written, manifest_line
 from tactslip_torch.data.formats import FORMATS, Format
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.generate import generate, written_table
 from tactslip_torch.simulation.scene import Scene
 from tactslip_torch.simulation.source import SimulatedRecordings
 
@@ -318,7 +318,7 @@ def test_a_folder_that_cannot_be_made_is_said_in_one_line(tmp_path):
 def test_the_command_ends_with_one_line_and_status_2(tmp_path, argument, said):
     (tmp_path / "file").write_text("mine")
     done = subprocess.run(
-        [sys.executable, "-m", "tactslip_torch.generate", argument],
+        [sys.executable, "-m", "tactslip_torch", "generate", argument],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -229,18 +229,16 @@ def test_a_decision_that_nothing_reaches_says_nothing(rule):
 
 
 def test_a_threshold_that_is_given_counts_for_that_push():
-    host, own = pair_of(rule="hysteresis")[0], pair_of(rule="hysteresis")[0]
+    host, own = pair_of(rule="k_of_n")[0], pair_of(rule="k_of_n")[0]
     samples = signal(1200, 8).T.numpy()
     for threshold in (0.3, 2.0, -np.inf, np.inf):
-        at_it, _ = pair_of(rule="hysteresis")
-        at_it.session = session_of(
-            "all", "centred", "hysteresis", "platt", 20, "float64", threshold
-        )
+        at_it, _ = pair_of(rule="k_of_n")
+        at_it.session = session_of("all", "centred", "k_of_n", "platt", 20, "float64", threshold)
         at_it.tail, at_it.state = host.tail, host.state
         expected, found = at_it.push(samples), host.push(samples, threshold)
         for name, value in expected.items():
             np.testing.assert_array_equal(found[name], value, err_msg=name)
-    usual, found = own.push(samples), pair_of(rule="hysteresis")[0].push(samples, 1.0)
+    usual, found = own.push(samples), pair_of(rule="k_of_n")[0].push(samples, 1.0)
     np.testing.assert_array_equal(found["alarm"], usual["alarm"])
 
 

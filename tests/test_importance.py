@@ -11,13 +11,13 @@ from tactslip_torch.analysis.importance import (
     HELD_OUT,
     Ranking,
     Refit,
+    _draw_recordings,
+    _side_by_side,
     balanced_accuracy,
     best_first,
     difference,
-    draw_recordings,
     first_order,
     score_gradients,
-    side_by_side,
     tally,
     units_of,
     without,
@@ -98,7 +98,7 @@ def test_a_draw_counts_a_recording_as_often_as_it_was_drawn():
     bins = sampled(4, {})
     is_right = torch.rand(len(bins.is_slip), generator=torch.Generator().manual_seed(1)) < 0.7
     found = tally(is_right, bins)
-    times = draw_recordings(found.group, 5, seed=2)
+    times = _draw_recordings(found.group, 5, seed=2)
     for draw, accuracy in zip(times, balanced_accuracy(found, times), strict=True):
         drawn = [r for r, count in enumerate(draw.tolist()) for _ in range(int(count))]
         assert float(accuracy) == pytest.approx(by_hand(is_right, bins, drawn))
@@ -249,7 +249,7 @@ def test_verdicts_come_in_order_and_alike_on_any_number_of_threads():
     found = []
     for threads in (1, 3):
         torch.set_num_threads(threads)
-        found.append(side_by_side(refit_of({2: 1.0}), selections))
+        found.append(_side_by_side(refit_of({2: 1.0}), selections))
     torch.set_num_threads(before)
     assert [verdict.num_features for verdict in found[0]] == [1, 2, 3, 1]
     assert [v.merit for v in found[0]] == [v.merit for v in found[1]]

@@ -13,8 +13,8 @@ from small_detector import HAND, raw_bins, small_detector
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.baselines import (
+    _VIBRATION_HZ,
     FLOOR_V,
-    VIBRATION_HZ,
     BaselineDetector,
     film_band_power,
     first_transition,
@@ -28,7 +28,7 @@ FILMS = HandLayout.paper24().indices("PVDF")
 SCORES = {"film_band_power": film_band_power, "largest_detail": largest_detail}
 
 
-def band_rms(x, rate=2000.0, band=VIBRATION_HZ):
+def band_rms(x, rate=2000.0, band=_VIBRATION_HZ):
     """Root mean square of what is left of a bin if all lines outside the band are taken out."""
     lines, hz = np.fft.rfft(x), np.fft.rfftfreq(len(x), 1 / rate)
     lines[(hz < band[0]) | (hz > band[1]) | (hz == 0)] = 0

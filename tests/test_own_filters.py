@@ -9,13 +9,13 @@ from small_set import SMALL_HAND, SmallSet
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import unseen4
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.files import load_table, save_table
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.detector_file import FORMAT
+from tactslip_torch.runtime import load_table, save_table
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.datamodule import FeatureMaker
 
 RECORDING = RecordingId("a", 0)
 

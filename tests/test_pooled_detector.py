@@ -15,14 +15,14 @@ from test_commands import TINY, composed, run_train
 from tactslip_torch import SlipDetector
 from tactslip_torch.analysis.certificate import certify
 from tactslip_torch.analysis.importance import Refit, without
-from tactslip_torch.export import export_detector
+from tactslip_torch.commands.importance import sensors
+from tactslip_torch.commands.train import train
 from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.graph.export import export_detector
 from tactslip_torch.graph.trials import simulated_bins
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.sensors import sensors
-from tactslip_torch.train import train
 
 POOLED = ("recipe.use=pooled", "recipe.num_features=null", "recipe.degree=1")
 HOP = 50

@@ -14,9 +14,8 @@ from tactslip_torch.features.groups import matching
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.learning import SlipLearner
-from tactslip_torch.planning import Plan, plan_detector
-from tactslip_torch.recipe import (
+from tactslip_torch.training.learner import SlipLearner
+from tactslip_torch.training.recipe import (
     Recipe,
     bin_weights,
     choose_frame,
@@ -24,6 +23,7 @@ from tactslip_torch.recipe import (
     recalls_mean,
     stand_for,
 )
+from tactslip_torch.training.selection import Plan, plan_detector
 
 NUM = 30
 

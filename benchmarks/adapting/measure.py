@@ -23,10 +23,8 @@ from benchmarks.adapting.sizes import Sizes
 from benchmarks.adapting.subject import Subject, divided, drawn, joined
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.fitting import TrainingPass
 from tactslip_torch.model.detector_file import Head
-from tactslip_torch.planning import plan_detector
-from tactslip_torch.progress import bar
+from tactslip_torch.runtime import bar
 from tactslip_torch.training.adaptation import (
     FACTORS,
     Solved,
@@ -37,6 +35,8 @@ from tactslip_torch.training.adaptation import (
     taken,
     undo,
 )
+from tactslip_torch.training.fitting import TrainingPass
+from tactslip_torch.training.selection import plan_detector
 from tactslip_torch.training.statistics import RecordingBins, Statistics, detector_digest
 
 AUTO, SLIP_FREE, ONE, SHIFT, CEILING = "auto", "slip-free", "weight 1", "threshold", "ceiling"

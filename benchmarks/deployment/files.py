@@ -12,7 +12,7 @@ from benchmarks.deployment.naive import NaivePipeline, export_naive
 from benchmarks.deployment.sizes import Sizes
 from benchmarks.deployment.subject import Subject
 from benchmarks.engines import FLOAT64, pool_of
-from tactslip_torch.export import export_detector
+from tactslip_torch.graph.export import export_detector
 from tactslip_torch.graph.facts import GraphKind
 from tactslip_torch.graph.form import Precision
 from tactslip_torch.signals.filtering import ChannelFilter

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from benchmarks.onset.sizes import Sizes
 from benchmarks.reproduction.runs import run
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.training.alarm import CalibratedAlarm
 
 

@@ -22,7 +22,7 @@ from benchmarks.precision.sizes import Sizes
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm, collapse, gram_matrix
 from tactslip_torch.model.solve import solve_symmetric
-from tactslip_torch.recipe import recalls_mean
+from tactslip_torch.training.recipe import recalls_mean
 
 OF_FLOAT32, IN_FLOAT32 = "float64, of float32 features", "float32 matrix"  # solves
 HALVES = {"bfloat16": torch.bfloat16, "float16": torch.float16}

@@ -16,16 +16,16 @@ from hydra.utils import instantiate
 
 from benchmarks.clocks import say
 from benchmarks.simulation.sizes import Sizes, parameters_of
-from tactslip_torch.config import conf_dir
-from tactslip_torch.crossval import Materials
+from tactslip_torch.commands.crossval import Materials
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.splits import seen6
-from tactslip_torch.experiment import feature_parts
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.planning import plan_detector
-from tactslip_torch.recipe import recalls_mean, stand_for
 from tactslip_torch.simulation import SEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.recipe import recalls_mean, stand_for
+from tactslip_torch.training.selection import plan_detector
 
 Variant = tuple[str, float | None]
 """Rung and step."""

@@ -118,10 +118,10 @@ FACTOR = 4
 WORST_SD = 1e-3  # largest score error allowed on recordings, in standard deviations of the score
 INSIDE_SHARE = 0.01  # fewer of the held-out bins may lie inside the margin
 LARGEST_RATIO = 1e4  # a bound further above the worst error seen says too little
-RULE = f"{FACTOR} x the worst error on calibration bins, plus the bound of the head if it has one"
+_RULE = f"{FACTOR} x the worst error on calibration bins, plus the bound of the head if it has one"
 _CHUNK_BINS, _GRADIENT_BINS = 16, 128
 
-Watch = Callable[[Iterable[Any], str, str], Iterable[Any]]
+_Watch = Callable[[Iterable[Any], str, str], Iterable[Any]]
 """Shows how far a loop is: takes its items, what it does, and what an item is."""
 
 
@@ -164,7 +164,7 @@ def _quietly(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
 
 
 def compare(
-    detector: SlipDetector, samples: Tensor, what: str = "bins", watch: Watch = _quietly
+    detector: SlipDetector, samples: Tensor, what: str = "bins", watch: _Watch = _quietly
 ) -> Comparison:
     """Score bins in float32 and in float64, stage by stage.
 
@@ -249,7 +249,7 @@ def certify(
     simulated: bool,
     extremes: int = 100,
     seed: int = 0,
-    watch: Watch = _quietly,
+    watch: _Watch = _quietly,
 ) -> Certificate:
     """Measure what float32 does to a detector, and within which margin its decisions stand.
 
@@ -297,7 +297,7 @@ def certify(
         "margin": {
             "score": margin,
             "sd": margin / sd,
-            "rule": RULE,
+            "rule": _RULE,
             "worst_calibration_error": worst,
         },
         "head": head,

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.selection import rank_distinct, rank_features
@@ -30,11 +29,11 @@ from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.kernels import Kernel
 from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.progress import bar
+from tactslip_torch.runtime import bar, for_each
 from tactslip_torch.signals.binning import refuse_nonfinite
-from tactslip_torch.threads import for_each
+from tactslip_torch.training.datamodule import FeatureMaker
 
-COVERAGE = 0.95
+_COVERAGE = 0.95
 
 
 class Tally(NamedTuple):
@@ -96,7 +95,7 @@ def balanced_accuracy(found: Tally, times: Tensor | None = None) -> Tensor:
     return torch.stack(by_group).nanmean(0)
 
 
-def draw_recordings(group: Tensor, num_draws: int, seed: int) -> Tensor:
+def _draw_recordings(group: Tensor, num_draws: int, seed: int) -> Tensor:
     """How often each recording is in each draw: as many as there are of its group, replaced.
 
     Shape:
@@ -132,9 +131,9 @@ def difference(before: Tally, after: Tally, num_draws: int, seed: int) -> Differ
     """
     if num_draws < 1:
         raise ValueError(f"an interval needs at least one draw, got {num_draws}; give draws=1000")
-    times = draw_recordings(before.group, num_draws, seed)
+    times = _draw_recordings(before.group, num_draws, seed)
     gaps = balanced_accuracy(before, times) - balanced_accuracy(after, times)
-    tail = (1 - COVERAGE) / 2
+    tail = (1 - _COVERAGE) / 2
     ends = torch.tensor([tail, 1 - tail], dtype=torch.float64)
     low, high = gaps.nanquantile(ends).tolist()
     return Difference(float(balanced_accuracy(before) - balanced_accuracy(after)), low, high)
@@ -267,8 +266,8 @@ class Refit:
         return Verdict(num_features, penalty, {HELD_OUT: tally(is_right, self.train)}, error)
 
 
-Item = TypeVar("Item")
-Units = Mapping[str, frozenset[str]]
+_Item = TypeVar("_Item")
+_Units = Mapping[str, frozenset[str]]
 """What is taken or left out together, by name: the channels of each."""
 
 
@@ -347,7 +346,7 @@ def without(features: Iterable[int], channels: Collection[str], names: Sequence[
     return [index for index in features if names[index] not in channels]
 
 
-def side_by_side(function: Callable[[Item], Verdict], items: Sequence[Item]) -> list[Verdict]:
+def _side_by_side(function: Callable[[_Item], Verdict], items: Sequence[_Item]) -> list[Verdict]:
     """``function`` of every item, on as many threads as torch has; the same bits on any number."""
     found: dict[int, Verdict] = {}
 
@@ -361,14 +360,14 @@ def side_by_side(function: Callable[[Item], Verdict], items: Sequence[Item]) -> 
 def best_first(
     refit: Refit,
     select: Callable[[Collection[str]], Sequence[int]],
-    units: Units,
+    units: _Units,
     most: int,
     what: str,
 ) -> list[tuple[str, Verdict]]:
     """Greedy forward selection: at each step the unit that serves held-out groups best joins.
 
     Features are selected anew among the channels taken. Candidates are compared at the C of the
-    step before (the first at every C), and C is chosen anew for the one that joins. Units that
+    step before (the first at every C), and C is chosen anew for the one that joins. _Units that
     tie go by the smaller held-out error, then in order. That a set was chosen by its held-out
     accuracy makes this one optimistic; judged roles choose nothing.
 
@@ -389,7 +388,7 @@ def best_first(
         sets = [taken | units[name] for name in left]
         near = [steps[-1][1].penalty] if number else refit.penalties
         selections = [select(channels) for channels in sets]
-        verdicts = side_by_side(partial(refit.held_out, penalties=near), selections)
+        verdicts = _side_by_side(partial(refit.held_out, penalties=near), selections)
         best = max(range(len(left)), key=lambda i: (*verdicts[i].merit, -i))
         steps.append((left.pop(best), refit(selections[best])))
         taken = sets[best]
@@ -473,7 +472,7 @@ def first_order(scores: Tensor, gradients: Tensor, samples: Tensor, is_slip: Ten
     return FirstOrder(non_slip, slip)
 
 
-MOST_RECORDINGS = 60
+_MOST_RECORDINGS = 60
 """So many at most are read or simulated; of more, materials in turn."""
 
 
@@ -498,7 +497,7 @@ def draw_raw_bins(
     Raises:
         ValueError: if a class has no such bin, or a sample is not finite.
     """
-    recordings = _in_turn(fold.having("train"))[:MOST_RECORDINGS]
+    recordings = _in_turn(fold.having("train"))[:_MOST_RECORDINGS]
     each = max(1, math.ceil(number / 2 / len(recordings)))
     before, after = maker.channel_filter.context_before, maker.channel_filter.context_after
     parts: list[Tensor] = []
@@ -582,7 +581,7 @@ def measure(
                 ranking(everything - channels),
                 ranking(channels),
             ]
-            fewer, anew, alone = side_by_side(refit, choices)
+            fewer, anew, alone = _side_by_side(refit, choices)
             rows.append(
                 {
                     "unit": what,

@@ -50,7 +50,7 @@ from tactslip_torch.features.pooling import ChannelPooling, pooled_names
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.progress import bar
+from tactslip_torch.runtime import bar
 from tactslip_torch.signals.filtering import ChannelFilter
 
 DEFINITION = (
@@ -162,7 +162,7 @@ class Limits:
         """
         for factor in (headroom, 1.0):
             given = replace(parts, compute_us=factor * compute_us)
-            found = longest_hop(given, self.hops_ms, self.deadline_ms, self.compute_us)
+            found = _longest_hop(given, self.hops_ms, self.deadline_ms, self.compute_us)
             if not self.misses(found):
                 break
         return replace(found, compute_us=compute_us)
@@ -240,7 +240,7 @@ def least_latency_ms(bin_ms: float, hops_ms: Sequence[float], look_ahead_ms: flo
     return Latency(look_ahead_ms, bin_ms, min(hops_ms), 0.0).worst_ms
 
 
-def longest_hop(
+def _longest_hop(
     parts: Latency, hops_ms: Sequence[float], deadline_ms: float, compute_us: float
 ) -> Latency:
     """The same with the longest hop that meets the limits, which spares the processor most.
@@ -249,7 +249,7 @@ def longest_hop(
     than compute.
 
     Example:
-        >>> longest_hop(Latency(12.5, 50.0, 5.0, 300.0), [5.0, 10.0, 25.0], 80.0, 500.0).hop_ms
+        >>> _longest_hop(Latency(12.5, 50.0, 5.0, 300.0), [5.0, 10.0, 25.0], 80.0, 500.0).hop_ms
         10.0
     """
     all_of_them = [
@@ -397,7 +397,7 @@ _OF_DESCRIPTOR = dict.fromkeys(ORDERED, "sorts") | {
     "spectral_spread": "lines",
 }
 
-Part = tuple[str, tuple[object, ...]]  # a group, and which of it; none of it: the group as such
+_Part = tuple[str, tuple[object, ...]]  # a group, and which of it; none of it: the group as such
 
 
 @dataclass(frozen=True)
@@ -426,11 +426,11 @@ class CostModel:
     pooling_us: float = 0.0
     pooling_of_one_us: float = 0.0
 
-    def features_us(self, parts: set[Part]) -> float:
+    def features_us(self, parts: set[_Part]) -> float:
         """Median time of the features that need these parts."""
         return self.base_us + sum(self._price(part) for part in parts)
 
-    def compute_us(self, parts: set[Part], num_columns: int, num_pooled: int = 0) -> float:
+    def compute_us(self, parts: set[_Part], num_columns: int, num_pooled: int = 0) -> float:
         """p99 of a whole call, from raw samples to the decision.
 
         Args:
@@ -443,7 +443,7 @@ class CostModel:
             rest_us += self.pooling_us + num_pooled * self.pooling_of_one_us
         return self.tail * (self.features_us(parts) + rest_us)
 
-    def bill(self, needed: Sequence[set[Part]]) -> tuple[Tensor, Tensor]:
+    def bill(self, needed: Sequence[set[_Part]]) -> tuple[Tensor, Tensor]:
         """What ``rank_per_cost`` takes: which parts each feature needs, and their prices.
 
         A column's price holds its share of the rest, and is never nothing.
@@ -479,14 +479,14 @@ class CostModel:
             "median_relative_error": self.error,
         }
 
-    def _price(self, part: Part) -> float:
+    def _price(self, part: _Part) -> float:
         group, which = part
         return self.part_us[group] if which else self.group_us[group]
 
 
-def parts_of(plan: Plan) -> list[set[Part]]:
+def parts_of(plan: Plan) -> list[set[_Part]]:
     """The parts that each column of a plan needs; those of several features are the union."""
-    needed: list[set[Part]] = [{("columns", (place,))} for place in range(plan.num_features)]
+    needed: list[set[_Part]] = [{("columns", (place,))} for place in range(plan.num_features)]
     for wanted in plan.wanted:
         row = plan.rows[wanted.row]
         own = needed[wanted.place]
@@ -529,7 +529,7 @@ def measure_costs(
             timings.append(time_calls(extractor, bins, calls))
 
         def whole(selected: Sequence[int], layer: ChannelPooling | None = None) -> Timing:
-            return time_detector(stand_in(pool, channel_filter, selected, engine, layer), calls)
+            return time_detector(_stand_in(pool, channel_filter, selected, engine, layer), calls)
 
         rest, tails, pooling = [], [], []
         for size in sizes:
@@ -566,7 +566,7 @@ def measure_costs(
     )
 
 
-def stand_in(
+def _stand_in(
     pool: FeaturePool,
     channel_filter: ChannelFilter,
     selected: Sequence[int],
@@ -595,10 +595,10 @@ def _layers(pool: FeaturePool, statistics: Sequence[str]) -> Iterator[ChannelPoo
         yield ChannelPooling(pool.hand, some, torch.ones(len(families)), *zeros)
 
 
-def _designs(needed: Sequence[set[Part]], sizes: Sequence[int]) -> Iterator[list[int]]:
+def _designs(needed: Sequence[set[_Part]], sizes: Sequence[int]) -> Iterator[list[int]]:
     """Selections that tell the groups apart: each group with one, some and all of its parts."""
     for group in GROUPS:
-        first: dict[Part, int] = {}  # of each part of the group, the feature that needs fewest
+        first: dict[_Part, int] = {}  # of each part of the group, the feature that needs fewest
         for index, own in enumerate(needed):
             for part in own:
                 if part[0] == group and part[1]:
@@ -620,7 +620,7 @@ def _spread(places: Sequence[int], number: int) -> list[int]:
     return [places[index * len(places) // number] for index in range(min(number, len(places)))]
 
 
-def _counted(parts: set[Part]) -> Tensor:
+def _counted(parts: set[_Part]) -> Tensor:
     """How many of each group there are, behind a 1 for the call and 0 or 1 for each group."""
     counts = [1.0]
     counts += [float((group, ()) in parts) for group in GROUPS]

@@ -37,8 +37,6 @@ from tactslip_torch.analysis.latency import (
 )
 from tactslip_torch.data.labels import needed_windows
 from tactslip_torch.data.splits import Split
-from tactslip_torch.datamodule import SlipDataModule
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.groups import Channels, Components, allowed, of_fingers
@@ -49,26 +47,31 @@ from tactslip_torch.features.pooling import STATISTICS
 from tactslip_torch.features.ranking import rank_per_cost, rank_weighted
 from tactslip_torch.features.selection import rank_distinct, rank_features, t_scores
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.fitting import TrainingPass, solve_facts
 from tactslip_torch.graph.bins import bin_graph
 from tactslip_torch.graph.form import Form
 from tactslip_torch.graph.runs import session_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.model_selection import Structure, choose_model, fitted_frame
-from tactslip_torch.planning import adds_up, plan_detector
-from tactslip_torch.progress import Ticker, bar
-from tactslip_torch.recipe import Frame, Recipe, fit_frame, recalls_mean, stand_for
+from tactslip_torch.runtime import Ticker, bar, for_each
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import Align, ChannelFilter
-from tactslip_torch.threads import for_each
-from tactslip_torch.validation import validate
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.training.fitting import TrainingPass, solve_facts
+from tactslip_torch.training.recipe import Frame, Recipe, fit_frame, recalls_mean, stand_for
+from tactslip_torch.training.selection import (
+    Structure,
+    adds_up,
+    choose_model,
+    fitted_frame,
+    plan_detector,
+    validate,
+)
 
 _MODEL_ERRS = (1.5, 1.0, 1 / 1.5)  # modelled compute over what will be measured
-FEW_NUMBERS = 20
-LESS_ACCURATE = 0.01
-LESS_COMPUTE = 1 / 3
+_FEW_NUMBERS = 20
+_LESS_ACCURATE = 0.01
+_LESS_COMPUTE = 1 / 3
 
 _T = TypeVar("_T")
 
@@ -171,9 +174,9 @@ def landmarks(
 
     top = best(detectors)
     assert top is not None
-    most, least = LESS_COMPUTE * compute(top), accuracy(top) - LESS_ACCURATE
+    most, least = _LESS_COMPUTE * compute(top), accuracy(top) - _LESS_ACCURATE
     cheap = [each for each in detectors if compute(each) <= most and accuracy(each) >= least]
-    few = [each for each in detectors if size(each) <= FEW_NUMBERS]
+    few = [each for each in detectors if size(each) <= _FEW_NUMBERS]
     return {"most_accurate": top, "cheap": best(cheap), "few": best(few)}
 
 
@@ -185,8 +188,8 @@ def worth_naming(candidates: Sequence[Candidate]) -> list[Candidate]:
     best: dict[object, Candidate] = {}
     for each in candidates:
         groups: list[object] = [(each.columns == "channel", each.components)]
-        if each.frame.size <= FEW_NUMBERS:
-            groups.append(FEW_NUMBERS)
+        if each.frame.size <= _FEW_NUMBERS:
+            groups.append(_FEW_NUMBERS)
         for group in groups:
             other = best.setdefault(group, each)
             if each.balanced_accuracy > other.balanced_accuracy:
@@ -475,7 +478,7 @@ class Searcher:
         bins = TrainingBins(frame(sample.features), sample.is_slip, weights)
         found = []
         for degree, size in itertools.product(degrees, sizes):
-            kernel = Polynomial(degree, offset_of(self.recipe))
+            kernel = Polynomial(degree, _offset_of(self.recipe))
             choices = [(size, kernel, penalty) for penalty in self.search.penalties]
             rows = validate(bins, sample.group, sample.group_names, choices, _quietly)
             best = max(rows, key=lambda row: float(row["mean"]))
@@ -516,7 +519,7 @@ class Searcher:
             kernel="polynomial",
             num_features=tuple(self.search.pooled_sizes),
             degree=tuple(self.search.degrees),
-            offsets=offset_of(self.recipe),
+            offsets=_offset_of(self.recipe),
             penalties=tuple(self.search.penalties),
         )
         sample, counts = self._samples[align], self.surveys[align].moments.count.tolist()
@@ -589,7 +592,7 @@ class Searcher:
         return shortest_hop(parts_ms, hops)
 
 
-def offset_of(recipe: Recipe) -> float:
+def _offset_of(recipe: Recipe) -> float:
     """The polynomial's c: the first of the recipe's."""
     offsets = recipe.offsets
     return float(offsets[0] if isinstance(offsets, Sequence) else offsets)
@@ -697,7 +700,7 @@ class Workshop:
         """Detectors of the candidates, fitted to the sample, in every arithmetic, by the clock."""
         found = []
         for candidate in bar(candidates, "timing the front", "detector"):
-            graph_us = time_graph(self.make(candidate, "double"), self.search.calls).p50_us
+            graph_us = _time_graph(self.make(candidate, "double"), self.search.calls).p50_us
             for arithmetic in self.search.arithmetics:
                 with one_thread():
                     timing = time_detector(self.make(candidate, arithmetic), self.search.calls)
@@ -716,7 +719,7 @@ class Workshop:
             num_features=candidate.frame.size,
             kernel="polynomial",
             degree=candidate.degree,
-            offsets=offset_of(self.recipe),
+            offsets=_offset_of(self.recipe),
             penalties=candidate.penalty,
         )
         plan = plan_detector(recipe, survey, _quietly, candidate.frame)
@@ -786,7 +789,7 @@ class Workshop:
         }
 
 
-def time_graph(detector: SlipDetector, calls: int) -> Timing:
+def _time_graph(detector: SlipDetector, calls: int) -> Timing:
     """Time the ONNX graph of a detector in onnxruntime, one ordinary bin and one thread."""
     session = session_of(bin_graph(detector, Form()).model({}))
     samples = next(each for each in session.get_inputs() if each.name == "samples")

@@ -20,7 +20,7 @@ from tactslip_torch.data.formats import (
     named_format,
 )
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 MANIFEST = "manifest.csv"
 

@@ -19,14 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.engines import usable_engine
 from tactslip_torch.features.eager.engine import EagerEngine
 from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool, saturating
-from tactslip_torch.plain import is_plain
-from tactslip_torch.threads import for_each
+from tactslip_torch.runtime import for_each, is_plain, usable_engine
 
 EngineName = Literal["auto", "compiled", "eager", "reference"]
 _LOG = logging.getLogger(__name__)

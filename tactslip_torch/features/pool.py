@@ -25,7 +25,7 @@ from tactslip_torch.features.guards import saturating as saturating
 from tactslip_torch.features.names import pool_names
 from tactslip_torch.features.transforms import amplitudes_by, branches_by
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.plain import is_recorded
+from tactslip_torch.runtime import is_recorded
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import (
     WaveletFilters,

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.files import load_table, save_table, table_form
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.kernels import KernelSum, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.runtime import load_table, save_table, table_form
 from tactslip_torch.signals.filtering import ChannelFilter
 
 FORMAT = "tactslip_torch detector 3"

@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from tactslip_torch.features.pool import saturating
 from tactslip_torch.model.calibration import Calibration
 from tactslip_torch.model.kernels import Head, QuadraticForm
-from tactslip_torch.plain import has_values
+from tactslip_torch.runtime import has_values
 
 Dead = Sequence[str] | Tensor
 """Channels that are not to be listened to: their names, or a mask ``[C]``, bool."""

@@ -19,10 +19,10 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from tactslip_torch.files import load_table, save_table
 from tactslip_torch.ledger import Ledger, content_digest, first_difference
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.solve import solve_symmetric
+from tactslip_torch.runtime import load_table, save_table
 
 FORMAT = "tactslip_torch sums 2"
 _CLASSES = ("non-slip", "slip")

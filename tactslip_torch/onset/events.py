@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypedDict
 import torch
 from torch import Tensor
 
-OUTCOMES = ("found", "early", "missed")
+_OUTCOMES = ("found", "early", "missed")
 """What becomes of an onset: exactly one of these."""
 
 _FOREVER_S = 1e9
@@ -523,7 +523,7 @@ def _summary(events: Sequence[RecordingEvents], draws: Draws) -> dict[str, Any]:
     def of(outcome: str) -> list[float]:
         return total(lambda one: sum(onset.outcome == outcome for onset in one.onsets))
 
-    outcomes = {outcome: of(outcome) for outcome in OUTCOMES}
+    outcomes = {outcome: of(outcome) for outcome in _OUTCOMES}
     onsets = total(lambda one: len(one.onsets))
     alarms = total(lambda one: sum(onset.num_alarms for onset in one.onsets))
     false = total(lambda one: len(one.false_alarms_s))

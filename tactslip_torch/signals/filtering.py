@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.plain import is_plain
+from tactslip_torch.runtime import is_plain
 
 Align = Literal["centred", "causal", "trailing"]
 """Which part of its frame's polynomial a sample takes, and where the frame lies.
@@ -33,7 +33,7 @@ Edges = tuple[Tensor, Tensor, Tensor]
 """Head, kernel and tail of a filter: see ``edge_matrices``."""
 
 
-def fit_matrix(window_length: int, polyorder: int) -> Tensor:
+def _fit_matrix(window_length: int, polyorder: int) -> Tensor:
     """Least-squares polynomial fit of one frame, as a matrix.
 
     Shape:
@@ -75,7 +75,7 @@ def edge_matrices(window_length: int, polyorder: int, align: Align) -> Edges:
     Raises:
         ValueError: if the frame is even or does not exceed the order, or the alignment is unknown.
     """
-    fit = fit_matrix(window_length, polyorder)
+    fit = _fit_matrix(window_length, polyorder)
     before, after = reach(window_length, align)
     late = window_length // 2 if align == "trailing" else 0
     place = (torch.arange(before + 1) - late).clamp(min=0)  # of a sample in the polynomial

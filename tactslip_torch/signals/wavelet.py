@@ -169,7 +169,7 @@ def branch_names(level: int) -> tuple[str, ...]:
     return tuple(f"{kind}{m}" for m in range(1, level + 1) for kind in "AD")
 
 
-def named_bank(wavelet: str) -> Bank:
+def _named_bank(wavelet: str) -> Bank:
     """The filters of a discrete wavelet of PyWavelets, float64.
 
     Shape:
@@ -201,7 +201,7 @@ def highest_level(num_samples: int, wavelet: Wavelet = "rbio2.2") -> int:
         >>> highest_level(100, "rbio2.2"), highest_level(30, "db3")
         (4, 2)
     """
-    length = len(named_bank(wavelet)[0]) if isinstance(wavelet, str) else len(wavelet)
+    length = len(_named_bank(wavelet)[0]) if isinstance(wavelet, str) else len(wavelet)
     highest = int(pywt.dwt_max_level(num_samples, length)) if num_samples > 0 else 0
     if highest < 1:
         raise ValueError(
@@ -235,7 +235,7 @@ def wavelet_branches(
     Reference:
         ``pywt.wavedec`` and ``pywt.waverec`` with all but one coefficient array zeroed.
     """
-    bank = named_bank(wavelet) if isinstance(wavelet, str) else wavelet.bank
+    bank = _named_bank(wavelet) if isinstance(wavelet, str) else wavelet.bank
     num_samples = x.shape[-1]
     highest = highest_level(num_samples, wavelet)
     if not 1 <= level <= highest:

@@ -113,6 +113,14 @@ class Grid:
         low, high = np.searchsorted(self.blocks, [first, last + 1])
         return slice(int(low), int(high))
 
+    def ringing(
+        self, start_s: float, length_s: float, omega: float, decay: float
+    ) -> tuple[slice, Array]:
+        """A decaying sine of size 1 that starts at a time, and the rows it lies on."""
+        rows = self.overlapping(start_s, start_s + length_s)
+        since = np.maximum(self.time_s[rows] - start_s, 0.0)
+        return rows, np.exp(-decay * since) * np.sin(omega * since)
+
     def only(self, rows: slice) -> Grid:
         """A grid of some of the rows."""
         return Grid(self.blocks[rows], self.block_samples, self.sample_rate_hz)

@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.engines import usable_engine
+from tactslip_torch.runtime import usable_engine
 
 EngineName = Literal["auto", "compiled", "eager"]
 
@@ -632,8 +632,8 @@ def _carry_compiled(
         states,
         bristles,
         np.ascontiguousarray(lanes.pressure.detach().numpy()),
-        arm.detach().reshape(len(arm), -1).contiguous().numpy(),
-        load.detach().reshape(len(load), -1).contiguous().numpy(),
+        arm.detach().reshape(len(arm), shape.numel()).contiguous().numpy(),
+        load.detach().reshape(len(load), shape.numel()).contiguous().numpy(),
         step_s,
         GAMMA,
         PATIENCE,

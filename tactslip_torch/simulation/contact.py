@@ -39,7 +39,7 @@ from tactslip_torch.simulation.bristles import (
     stage_times_s,
 )
 from tactslip_torch.simulation.grasp import Grasp, Surface, draw_grasp, quasi_static_slips
-from tactslip_torch.simulation.scene import ArmStroke, Motion, Scene
+from tactslip_torch.simulation.scene import ArmStroke, Motion, Scene, next_starts_s
 
 SLIDE_RISE_S = 0.004
 """Time constant with which an element that let go reaches the arm's speed (ours)."""
@@ -128,8 +128,8 @@ class KinematicContact:
         grasp, recoil_s = self._grasp, self._scene.contact.recoil_s
         share, after = motion.grid.zeros(), self._grasp.shear_after
         presliding_mm, ratio = grasp.presliding_mm[element], grasp.surface.mu_ratio
-        next_starts_s = [*(stroke.start_s for stroke in motion.plan), np.inf][1:]
-        for number, (stroke, next_s) in enumerate(zip(motion.plan, next_starts_s, strict=True)):
+        nexts_s = next_starts_s(motion.plan)
+        for number, (stroke, next_s) in enumerate(zip(motion.plan, nexts_s, strict=True)):
             rows = motion.grid.overlapping(stroke.start_s, next_s)
             if rows.start == rows.stop:
                 continue
@@ -154,16 +154,14 @@ class KinematicContact:
         omega = 2 * np.pi * grasp.resonance_hz[element]
         decay = grasp.damping[element] * omega
         times_s = [time_s for slip in self.slips_of(element) for time_s in slip]
-        places = [grid.overlapping(t, t + 12.0 / decay) for t in times_s]
-        if all(rows.start == rows.stop for rows in places):
-            return volts
-        rng = generator(*scene.key("onset pulse"), element)
-        strengths = lognormal(rng, 0.3, (len(self.slips.start_s), 2))
+        strengths = lognormal(
+            generator(*scene.key("onset pulse"), element), 0.3, (len(self.slips.start_s), 2)
+        )
         full_v = scene.contact.onset_pulse_v * grasp.friction_n[element]
         sizes = (np.array(BURST_SHARES) * full_v * strengths).ravel()
-        for rows, start_s, size in zip(places, times_s, sizes, strict=True):
-            since = np.maximum(grid.time_s[rows] - start_s, 0.0)
-            volts[rows] += size * (np.exp(-decay * since) * np.sin(omega * since))
+        for start_s, size in zip(times_s, sizes, strict=True):
+            rows, wave = grid.ringing(start_s, 12.0 / decay, omega, decay)
+            volts[rows] += size * wave
         return volts
 
 
@@ -243,8 +241,7 @@ class BristleContact:
         normal_n = grasp.normal_n(element, motion.position_mm, motion.grid.time_s)
         static_n = grasp.surface.mu_s * normal_n
         friction_n, slide, inertia_n = motion.grid.zeros(), grid.zeros(), grid.zeros()
-        next_starts_s = [*(stroke.start_s for stroke in plan[1:]), np.inf]
-        for trace, stroke, next_s in zip(self._traces, plan, next_starts_s, strict=True):
+        for trace, stroke, next_s in zip(self._traces, plan, next_starts_s(plan), strict=True):
             stop_s = stroke.stop_s
             rows = motion.grid.overlapping(stop_s, next_s)
             t = motion.grid.time_s[rows]
@@ -390,9 +387,8 @@ def slides_of(scene: Scene, grasp: Grasp) -> list[Slide]:
     """The strokes of a scene that slide, ready to be integrated."""
     plan, rate_hz, down = scene.slides, scene.sample_rate_hz, grasp.touching
     lanes, rest = lanes_of(scene, grasp), quasi_static_slips(grasp, plan)
-    next_starts_s = [*(stroke.start_s for stroke in plan[1:]), np.inf]
     slides = []
-    for number, (stroke, next_s) in enumerate(zip(plan, next_starts_s, strict=True)):
+    for number, (stroke, next_s) in enumerate(zip(plan, next_starts_s(plan), strict=True)):
         settling_s = min(SETTLING_S, next_s - stroke.stop_s)
         first = int(np.floor(stroke.start_s * rate_hz))
         last = int(np.ceil((stroke.stop_s + settling_s) * rate_hz))

@@ -59,85 +59,55 @@ MAINS_BURST_S = (0.1, 1.0)
 _MAINS_RAMP_S = 0.02  # of a burst, at both ends
 
 
-class Common:
-    """The disturbances of one recording on a grid, ready to be mixed into channels.
+@dataclass(frozen=True, eq=False)
+class CommonWave:
+    """A signal that reaches every channel.
+
+    Args:
+        volts: at a wave of 1, of every channel, ``[C]``.
+        rows: of the grid where it is not zero.
+        wave: there, ``[k, B]``.
+    """
+
+    volts: Array
+    rows: slice
+    wave: Array
+
+
+def common_waves(scene: Scene, motion: Motion) -> list[CommonWave]:
+    """Mains, motor, arm, machine and knocks of one recording.
 
     Args:
         scene: whose disturbances.
         motion: the arm's own, and where; its plan may be empty.
     """
-
-    def __init__(self, scene: Scene, motion: Motion) -> None:
-        plan, grid = motion.plan, motion.grid
-        self.grid = grid
-        num = len(scene.hand)
-        parameters = scene.disturbances
-        session = generator(*scene.session_key("couplings"))
-        mains_v = 1e-3 * parameters.mains_mv * lognormal(session, parameters.mains_session_spread)
-        couplings = lognormal(session, 0.4, num)
-        self._mains_v = mains_v * couplings
-        self._mains_burst_v = 1e-3 * parameters.mains_burst_mv * couplings
-        motor_mv = _motor_level_mv(scene)
-        self._motor_v = 1e-3 * motor_mv * lognormal(session, 0.3, num)
-        signs = np.where(session.random((num, len(ARM_MODES_HZ))) < 0.5, -1.0, 1.0)
-        self._arm_v = (
-            1e-3
-            * parameters.arm_transient_mv
-            * signs
-            * lognormal(session, 0.4, (num, len(ARM_MODES_HZ)))
+    plan, grid, num, of = motion.plan, motion.grid, len(scene.hand), scene.disturbances
+    modes, everywhere, waves = len(ARM_MODES_HZ), slice(None), []
+    session = generator(*scene.session_key("couplings"))
+    mains_v = 1e-3 * of.mains_mv * lognormal(session, of.mains_session_spread)
+    couplings = lognormal(session, 0.4, num)
+    motor_mv = _motor_level_mv(scene)
+    motor_v = 1e-3 * motor_mv * lognormal(session, 0.3, num)
+    signs = np.where(session.random((num, modes)) < 0.5, -1.0, 1.0)
+    arm_v = 1e-3 * of.arm_transient_mv * signs * lognormal(session, 0.4, (num, modes))
+    bursts = mains_bursts(scene)
+    if of.mains_mv > 0 or bursts:
+        mains = _mains(scene, grid)
+        waves.append(CommonWave(mains_v * couplings, everywhere, mains))
+        if bursts:
+            stronger = _burst_envelope(bursts, grid) * mains
+            waves.append(CommonWave(1e-3 * of.mains_burst_mv * couplings, everywhere, stronger))
+    if plan and motor_mv > 0:
+        waves.append(CommonWave(motor_v, *_motor(scene, motion)))
+    if plan and of.arm_transient_mv > 0:
+        rows, ringing = _arm_ringing(scene, plan, grid)
+        waves += [CommonWave(v, rows, mode) for v, mode in zip(arm_v.T, ringing, strict=True)]
+    if of.machine_mv > 0:
+        machine_v = lognormal(generator(*scene.session_key("machine couplings")), 0.4, num)
+        waves.append(
+            CommonWave(1e-3 * of.machine_mv * machine_v, everywhere, machine_wave(scene, grid))
         )
-        self._mains_bursts = mains_bursts(scene)
-        hums = parameters.mains_mv > 0 or self._mains_bursts
-        self._mains = _mains(scene, grid) if hums else None
-        self._mains_envelope = _burst_envelope(self._mains_bursts, grid)
-        self._motor = _motor(scene, motion) if plan and motor_mv > 0 else None
-        rings = plan and parameters.arm_transient_mv > 0
-        self._arm = _arm_ringing(scene, plan, grid) if rings else None
-        self._bursts = _draw_bursts(scene)
-        self._machine = machine_wave(scene, grid) if parameters.machine_mv > 0 else None
-        session = generator(*scene.session_key("machine couplings"))
-        self._machine_v = 1e-3 * parameters.machine_mv * lognormal(session, 0.4, num)
-
-    def channel(self, index: int) -> Array:
-        """Volts of all disturbances in one channel, ``[K, B]``."""
-        volts = np.zeros(self.grid.time_s.shape)
-        if self._mains is not None:
-            volts += self._mains_v[index] * self._mains
-            if self._mains_bursts:
-                volts += self._mains_burst_v[index] * self._mains_envelope * self._mains
-        if self._motor is not None:
-            rows, motor = self._motor
-            volts[rows] += self._motor_v[index] * motor
-        if self._arm is not None:
-            rows, modes = self._arm
-            for gain, mode in zip(self._arm_v[index], modes, strict=True):
-                volts[rows] += gain * mode
-        if self._machine is not None:
-            volts += self._machine_v[index] * self._machine
-        self._add_bursts(index, volts)
-        return volts
-
-    def _add_bursts(self, index: int, volts: Array) -> None:
-        """Add the knocks that this channel feels."""
-        times, omegas, decays, sizes = self._bursts
-        for start_s, omega, decay, size in zip(times, omegas, decays, sizes[:, index], strict=True):
-            if size:
-                _ring(volts, self.grid, start_s, 12.0 / decay, omega, decay, size)
-
-
-def _ring(
-    volts: Array,
-    grid: Grid,
-    start_s: float,
-    length_s: float,
-    omega: float,
-    decay: float,
-    size: float,
-) -> None:
-    """Add a decaying sine that starts at a time, over the blocks of a length."""
-    rows = grid.overlapping(start_s, start_s + length_s)
-    since = np.maximum(grid.time_s[rows] - start_s, 0.0)
-    volts[rows] += size * np.exp(-decay * since) * np.sin(omega * since)
+    return waves + _knocks(scene, grid)
 
 
 def _mains(scene: Scene, grid: Grid) -> Array:
@@ -229,22 +199,22 @@ def _arm_ringing(
     return rows, modes
 
 
-def _draw_bursts(scene: Scene) -> tuple[Array, Array, Array, Array]:
-    """Knocks at random times: time, angular frequency, decay rate ``[n]``, volts ``[n, C]``.
-
-    Each reaches about half of the channels, strain gauges weakly (prior, ours).
-    """
-    parameters = scene.disturbances
+def _knocks(scene: Scene, grid: Grid) -> list[CommonWave]:
+    """Knocks at random times, each in about half of the channels, weakly in gauges (ours)."""
+    of, num_channels = scene.disturbances, len(scene.hand)
     rng = generator(*scene.key("bursts"))
-    num = int(rng.poisson(parameters.burst_rate_hz * scene.end_s))
-    times = scene.end_s * rng.random(num)
+    num = int(rng.poisson(of.burst_rate_hz * scene.end_s))
+    times_s = scene.end_s * rng.random(num)
     omegas = 2 * np.pi * 15.0 * 10.0 ** rng.random(num)
     decays = 1.0 / (0.005 * 10.0 ** rng.random(num))
-    reach = rng.random((num, len(scene.hand))) < 0.5
+    reach = rng.random((num, num_channels)) < 0.5
     share = np.array([1.0 if c.adapting == "fast" else 0.3 for c in scene.hand.channels])
-    sizes = 1e-3 * parameters.burst_mv * lognormal(rng, 0.5, (num, 1))
-    sizes = sizes * lognormal(rng, 0.5, (num, len(scene.hand))) * share * reach
-    return times, omegas, decays, sizes
+    sizes_v = 1e-3 * of.burst_mv * lognormal(rng, 0.5, (num, 1))
+    sizes_v = sizes_v * lognormal(rng, 0.5, (num, num_channels)) * share * reach
+    return [
+        CommonWave(size_v, *grid.ringing(time_s, 12.0 / decay, omega, decay))
+        for time_s, omega, decay, size_v in zip(times_s, omegas, decays, sizes_v, strict=True)
+    ]
 
 
 # --- a machine beside the hand --------------------------------------------------------------------
@@ -377,10 +347,10 @@ class Event:
         return self.start_s, self.end_s + SETTLE_S
 
 
-def _merged(stretches: list[Interval]) -> tuple[Interval, ...]:
-    """The union of stretches, ascending and apart; empty ones are left out."""
+def _merged(intervals: list[Interval]) -> tuple[Interval, ...]:
+    """The union of intervals, ascending and apart; empty ones are left out."""
     union: list[list[float]] = []
-    for start_s, end_s in sorted(stretches):
+    for start_s, end_s in sorted(intervals):
         if end_s <= start_s:
             continue
         if union and start_s <= union[-1][1]:
@@ -429,7 +399,7 @@ def _draw_events(
 
 
 def _place(rooms: list[Interval], share: float) -> float:
-    """The time at a share of the stretches' total length."""
+    """The time at a share of the intervals' total length."""
     lengths = np.array([end_s - start_s for start_s, end_s in rooms])
     reached = np.cumsum(lengths)
     room = min(int(np.searchsorted(reached, share * reached[-1], side="right")), len(rooms) - 1)
@@ -484,13 +454,13 @@ class Handled:
         """
         if not self._plan:
             return ((0.0, duration_s),)
-        stretches = [event.interval_s for event in (*self.taps, *self.grips)]
+        intervals = [event.interval_s for event in (*self.taps, *self.grips)]
         for number, stroke in enumerate(self._plan):
             later = [s.start_s for s in self._plan[number + 1 :] if s.slides]
             if not stroke.slides:
                 stop_s = min([stroke.stop_s + RINGING_S, *later])
-                stretches.append((stroke.start_s, stop_s))
-        return _merged([(start_s, min(end_s, duration_s)) for start_s, end_s in stretches])
+                intervals.append((stroke.start_s, stop_s))
+        return _merged([(start_s, min(end_s, duration_s)) for start_s, end_s in intervals])
 
     def shear_n(self, element: int, time_s: Array) -> Array:
         """Newtons of the carried object's inertia on an element; signed like a slide's friction."""
@@ -539,7 +509,8 @@ class Handled:
             swings = swing * rng.standard_normal(_KNOCK_MODES)
             heard = hertz < 0.4 * self._scene.sample_rate_hz
             for f, d, s in zip(hertz[heard], decay[heard], swings[heard], strict=True):
-                _ring(volts, grid, tap.start_s, 12.0 * longest, 2 * np.pi * f, d, s)
+                rows, wave = grid.ringing(tap.start_s, 12.0 * longest, 2 * np.pi * f, d)
+                volts[rows] += s * wave
         return volts
 
 
@@ -640,7 +611,7 @@ def disturb(
 ) -> None:
     """Change one touching element's vibration, in place: partial slip or sticking, local noise."""
     parameters = scene.imperfections
-    for start_s, end_s in partial_stretches(scene, _finger(scene, grasp, element)):
+    for start_s, end_s in partial_intervals(scene, _finger(scene, grasp, element)):
         rows = grid.overlapping(start_s, end_s)
         if rows.start == rows.stop:
             continue
@@ -663,11 +634,11 @@ def disturb(
             band[:] += level * noise
 
 
-def pickup(scene: Scene, grid: Grid) -> tuple[Array, Array] | None:
-    """Pick-up in volts at a channel of coupling 1, ``[K, B]``, and the couplings, ``[C]``."""
+def pickup(scene: Scene, grid: Grid) -> list[CommonWave]:
+    """Broadband pick-up with a sign of each channel's own; none where its parameter is zero."""
     size_mv = scene.imperfections.pickup_mv
     if size_mv == 0:
-        return None
+        return []
     session = generator(*scene.session_key("pick-up"))
     num = len(scene.hand)
     signs = np.where(session.random(num) < 0.5, -1.0, 1.0)
@@ -677,11 +648,11 @@ def pickup(scene: Scene, grid: Grid) -> tuple[Array, Array] | None:
     response = causal_response(f / (f + 20.0) / (1 + f / 200.0), unit_power=True)
     level = np.exp(LEVEL_SPREAD * wander(generator(*scene.key("pick-up level")), grid))
     noise = grid.coloured_noise(scene.key("pick-up"), response)
-    return 1e-3 * size_mv * level * noise, couplings
+    return [CommonWave(couplings, slice(None), 1e-3 * size_mv * level * noise)]
 
 
-def partial_stretches(scene: Scene, finger: str) -> tuple[Interval, ...]:
-    """When a finger slips or sticks on its own; stretches may overlap."""
+def partial_intervals(scene: Scene, finger: str) -> tuple[Interval, ...]:
+    """When a finger slips or sticks on its own; intervals may overlap."""
     rate_hz = scene.imperfections.partial_slips_per_s
     if rate_hz == 0:
         return ()

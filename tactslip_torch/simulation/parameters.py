@@ -2,7 +2,7 @@
 
 Defaults are the starting values of PHYSICS.md unless marked. Every ``*_spread`` is the standard
 deviation of the logarithm of a factor of median 1. Three parameters are *calibrated*: set once, by
-``python -m tactslip_torch.calibrate``, on seen-material test accuracy and the qualitative facts
+``python -m tactslip_torch calibrate``, on seen-material test accuracy and the qualitative facts
 alone, and frozen with where they come from in ``calibrated.json``. They move together along one
 line of difficulty: ``d`` prior standard deviations harder means less friction noise, longer
 presliding and more bursts, each by its own spread to the power ``d``.
@@ -264,14 +264,15 @@ class Contact(_Parameters):
         self._require("relaxation", self.relaxation[1] <= 1, "at most 1")
         loads = all(0 <= load < math.inf for _, load in self.finger_loads)
         self._require("finger_loads", loads, "finite and not negative")
-        touches = "no element in contact: Contact.{} must be {}, got {!r}"
         for name, holds, wanted in (
             ("lifted_fraction", self.lifted_fraction < 1, "below 1"),
-            ("touching", self.touching is None or bool(self.touching), "null or name a channel"),
+            ("touching", self.touching is None or bool(self.touching), "null or some channels"),
             ("load_n", self.load_n > 0, "positive"),
         ):
             if not holds:
-                raise ValueError(touches.format(name, wanted, getattr(self, name)))
+                raise ValueError(
+                    f"no element in contact: {name} must be {wanted}, got {getattr(self, name)!r}"
+                )
 
 
 @dataclass(frozen=True)

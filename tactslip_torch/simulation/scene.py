@@ -376,6 +376,11 @@ class ArmStroke:
         return np.where(self.distance_mm - travel_mm < ramp_mm, late, time)
 
 
+def next_starts_s(plan: tuple[ArmStroke, ...]) -> list[float]:
+    """Of each stroke of a plan, when the one behind it starts; infinite for the last."""
+    return [*(stroke.start_s for stroke in plan), math.inf][1:]
+
+
 class Motion:
     """A motion on a grid, computed once for all elements.
 

@@ -22,8 +22,8 @@ from tactslip_torch.simulation.blocks import Array, Grid, block_samples_for, gen
 from tactslip_torch.simulation.bristles import EngineName
 from tactslip_torch.simulation.contact import Contacts, StrokeTrace, scene_contact, traces_of
 from tactslip_torch.simulation.disturbances import (
-    Common,
     Handled,
+    common_waves,
     disturb,
     gain_factor,
     held_samples,
@@ -268,10 +268,13 @@ def _volts(
     """Volts of the channels asked for on the grid, ``[K, B]`` each."""
     history, _, now = grid.history
     driven = Motion(tuple(stroke for stroke in scene.arm if stroke.drives), grid)
-    front, common = draw_front(scene), Common(scene, driven)
+    front, common = draw_front(scene), common_waves(scene, driven) + pickup(scene, grid)
     field = shared_field(scene, grasp, Motion(scene.slides, grid))
     motion, handled = Motion(scene.slides, history), Handled(scene, grasp)
-    volts = {index: common.channel(index) for index in indices}
+    volts = {index: grid.zeros() for index in indices}
+    for wave in common:
+        for index in indices:
+            volts[index][wave.rows] += wave.volts[index] * wave.wave
     elements = {int(grasp.element_of_channel[index]) for index in indices}
     for element in sorted(elements & set(grasp.touching.tolist())):
         state = contact.element(element, grid, motion)
@@ -295,10 +298,6 @@ def _volts(
             else:
                 sensed = film_volts(scene, grid, shear_n, vibration, press_n)
             volts[index] += front.gain[index] * gain_factor(scene, index, grid) * sensed
-    if (common_mode := pickup(scene, grid)) is not None:
-        wave, couplings = common_mode
-        for index in indices:
-            volts[index] += couplings[index] * wave
     return {index: front_end(scene, front, index, grid, volts[index]) for index in indices}
 
 

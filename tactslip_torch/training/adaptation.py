@@ -25,10 +25,8 @@ from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.cache import cache_key
-from tactslip_torch.fitting import TrainingPass, solve_facts
 from tactslip_torch.model import abstention
 from tactslip_torch.model.abstention import abstention_of
 from tactslip_torch.model.calibration import fit_platt
@@ -41,9 +39,11 @@ from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.solve import solve_symmetric
 from tactslip_torch.onset.settings import KEY as ALARM
-from tactslip_torch.planning import adds_up
-from tactslip_torch.progress import bar
-from tactslip_torch.recipe import Recipe
+from tactslip_torch.runtime import bar
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.fitting import TrainingPass, solve_facts
+from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.selection import adds_up
 from tactslip_torch.training.statistics import (
     KnownBins,
     Machine,
@@ -71,7 +71,7 @@ class Solved(NamedTuple):
     scores: Tensor
 
 
-def class_scales(sums: SufficientStats, machine: Machine) -> Tensor:
+def _class_scales(sums: SufficientStats, machine: Machine) -> Tensor:
     """What the balance multiplies the weight of non-slip and of slip with, ``[2]``."""
     weight = sums.weight
     if machine.balance == "none":
@@ -102,7 +102,7 @@ def solve(statistics: Statistics) -> Solved:
     assert factor is not None  # as most_condition is given
     head = kernel.head(weights, sums.num_features)
     head.solved = report
-    scales = class_scales(sums, machine)
+    scales = _class_scales(sums, machine)
     roots = (scales[known.is_slip.long()] * known.weight).sqrt()
     targets = torch.where(known.is_slip, 1.0, -1.0).double()
     right = roots * (targets - head(known.z))
@@ -132,7 +132,7 @@ def _chunks(recording: Tensor) -> Iterator[list[Tensor]]:
         yield groups
 
 
-OF_ONE = 4.0
+_OF_ONE = 4.0
 """A single material may fall by so many margins: some 800 rehearsal tell its change to half a point
 at best, so a tighter limit would refuse by chance. Their mean is told several times better."""
 
@@ -164,7 +164,7 @@ class Verdict:
         """Why the change is not accepted, in a line with figures; ``None`` if it is.
 
         Args:
-            margin: that the mean may fall by; any one material by ``OF_ONE`` times as much.
+            margin: that the mean may fall by; any one material by ``_OF_ONE`` times as much.
         """
         if not self.falls:
             return None
@@ -175,10 +175,10 @@ class Verdict:
                 f"accuracy on average, {100 * margin:g} points are allowed"
             )
         worst = max(self.falls, key=lambda name: self.falls[name])
-        if self.falls[worst] > OF_ONE * margin:
+        if self.falls[worst] > _OF_ONE * margin:
             return (
                 f"{worst} falls from {100 * self.before[worst]:.2f} to "
-                f"{100 * self.after[worst]:.2f} % balanced accuracy, {100 * OF_ONE * margin:g} "
+                f"{100 * self.after[worst]:.2f} % balanced accuracy, {100 * _OF_ONE * margin:g} "
                 "points are allowed of one material"
             )
         return None
@@ -196,7 +196,7 @@ def compared(before: Solved, after: Solved) -> Verdict:
     return Verdict(*({name: of[name] for name in sorted(materials)} for of in scores))
 
 
-def since(before: Mapping[str, float], verdict: Verdict) -> Verdict:
+def _since(before: Mapping[str, float], verdict: Verdict) -> Verdict:
     """From an earlier ``before`` to a verdict's ``after``, of the materials in both."""
     both = sorted(before.keys() & verdict.after.keys())
     return Verdict({n: before[n] for n in both}, {n: verdict.after[n] for n in both})
@@ -231,8 +231,8 @@ FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 Where every training material in turn was new (simulated, ``benchmarks.adapting``), its own accuracy
 kept rising to about the last of these, and what the others lost rose with it.
 """
-MOST_WEIGHT = 8000.0  # of a bin; more has no room on the grid of the sums
-OF_MARGIN = 0.5
+_MOST_WEIGHT = 8000.0  # of a bin; more drowns the others
+_OF_MARGIN = 0.5
 """``auto`` spends this part of the margin: how far old materials fall is itself an estimate."""
 
 
@@ -291,7 +291,7 @@ def add(
         before: their machine.
         bins: of the recordings, by name; of one material.
         weight: of a bin, where one of training has 1; ``None`` for ``auto``, the largest of
-            ``FACTORS`` by which old materials keep ``OF_MARGIN`` of the margin, in all steps the
+            ``FACTORS`` by which old materials keep ``_OF_MARGIN`` of the margin, in all steps the
             margin; a weight that leads to no machine is too large.
         margin: that the old materials' mean may fall by.
 
@@ -324,7 +324,7 @@ def add(
             factor = FACTORS[middle]
             with suppress(ValueError):
                 changes[factor] = replace(change(factor * unit), factor=factor)
-            is_fine = factor in changes and changes[factor].problem(margin, OF_MARGIN) is None
+            is_fine = factor in changes and changes[factor].problem(margin, _OF_MARGIN) is None
             low, high = (middle, high) if is_fine else (low, middle)
         factor = FACTORS[low]
         chosen = changes.get(factor) or replace(change(factor * unit), factor=factor)
@@ -365,7 +365,7 @@ def _change(
 ) -> Change:
     verdict = compared(before, solved)
     first = statistics.steps[0].entry.get("old", {}).get("before") if statistics.steps else None
-    return Change(after, solved, verdict, since(first or verdict.before, verdict), weight)
+    return Change(after, solved, verdict, _since(first or verdict.before, verdict), weight)
 
 
 def undo(statistics: Statistics) -> tuple[Statistics, Tensor]:
@@ -411,9 +411,9 @@ def check_weight(weight: float | None) -> None:
     Raises:
         ValueError: if it is not positive, or too large.
     """
-    if weight is not None and not 0 < weight < MOST_WEIGHT:
+    if weight is not None and not 0 < weight < _MOST_WEIGHT:
         raise ValueError(
-            f"weight must be auto or a positive number below {MOST_WEIGHT:g}, got {weight:g}"
+            f"weight must be auto or a positive number below {_MOST_WEIGHT:g}, got {weight:g}"
         )
 
 
@@ -464,7 +464,7 @@ def _new_scores(
 
 log = logging.getLogger(__name__)
 
-JOURNAL = "adaptations"
+_JOURNAL = "adaptations"
 """Under which ``SlipDetector.info`` keeps the entries of all steps."""
 
 
@@ -491,7 +491,7 @@ def renewed(
     info = new.info
     info["solve"] = solve_facts(solved.head)
     info["num_bins"] = int(statistics.sums.count.sum())
-    info[JOURNAL] = [*info.get(JOURNAL, []), dict(entry)]
+    info[_JOURNAL] = [*info.get(_JOURNAL, []), dict(entry)]
     info["train_materials"] = [known.materials[i] for i in known.material.unique()]
     keys = info.get("train_recordings", {}) | {n: b.key for n, b in statistics.bins.items()}
     entries = statistics.sums.ledger.entries
@@ -510,7 +510,7 @@ def renewed(
 
 def _training_bins(statistics: Statistics, known: KnownBins) -> TrainingBins:
     """Known bins, each weighing as much as all that it stands for, the classes balanced."""
-    scales = class_scales(statistics.sums, statistics.machine)
+    scales = _class_scales(statistics.sums, statistics.machine)
     weights = scales[known.is_slip.long()] * known.represents
     return TrainingBins(known.z, known.is_slip, weights)
 

@@ -43,8 +43,8 @@ from tactslip_torch.onset.rules import Cusum, KOfN, Rule, rule_from_dict
 from tactslip_torch.onset.settings import KEY, AlarmSettings, calibration_of
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.onset.thresholds import Threshold, alarm_counts, alarm_rate, choose_threshold
-from tactslip_torch.progress import bar
 from tactslip_torch.report.reliability import weights_at_share
+from tactslip_torch.runtime import bar
 from tactslip_torch.training.stream_evaluation import (
     Clock,
     Stream,
@@ -208,7 +208,7 @@ class FalseAlarmBudget:
         return Method(scorer, settings, None)
 
 
-def methods_of(
+def _methods_of(
     budget: FalseAlarmBudget,
     rules: Mapping[str, Rule],
     main: str,
@@ -369,7 +369,7 @@ def events_of(
     return events
 
 
-def reliability_of(
+def _reliability_of(
     parts: Mapping[str, Sequence[Stream]], scorer: str, settings: AlarmSettings, clock: Clock
 ) -> dict[str, Any]:
     """Stated probabilities beside what happened: of each part, and of each of its materials.
@@ -592,7 +592,7 @@ class CalibratedAlarm:
             for name, scorer in scorers.items()
         }
         calibrating = streams.pop("calibrate")
-        methods = methods_of(
+        methods = _methods_of(
             self.budget(),
             self.made_rules(detector.pool.bin_samples),
             self.rule,
@@ -625,7 +625,7 @@ class CalibratedAlarm:
             "settings": settings.to_dict(),
             "streams": amounts,
             "methods": {name: method.to_dict() for name, method in methods.items()},
-            "reliability": reliability_of(usual, OURS, settings, clocks[OURS]),
+            "reliability": _reliability_of(usual, OURS, settings, clocks[OURS]),
             "events": {part: events[part] for part in usual},
             "scenes": {
                 scene: {

@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
-from tactslip_torch.files import load_table, save_table
 from tactslip_torch.ledger import Ledger, content_digest
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.planning import Plan
+from tactslip_torch.runtime import load_table, save_table
+from tactslip_torch.training.selection import Plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ class KnownBins(NamedTuple):
         return torch.tensor([name in recordings for name in self.recordings])[self.recording]
 
 
-def known_bins(
+def _known_bins(
     rehearsal: Rehearsal, bins: Mapping[str, RecordingBins], weights: Mapping[str, float]
 ) -> KnownBins:
     """Rehearsal, and all bins of recordings that came later and are in.
@@ -249,7 +249,7 @@ class Statistics:
 
     def known(self) -> KnownBins:
         """Bins that are in the sums and known one by one."""
-        return known_bins(self.rehearsal, self.bins, self.weights)
+        return _known_bins(self.rehearsal, self.bins, self.weights)
 
     def reweighed(
         self, weights: Mapping[str, float], bins: Mapping[str, RecordingBins] | None = None

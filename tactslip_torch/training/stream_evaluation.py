@@ -16,7 +16,7 @@ from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.onset.decisions import Decider, Decisions, Scorer, is_usable, score_stream
 from tactslip_torch.onset.events import Watched
 from tactslip_torch.onset.settings import AlarmSettings
-from tactslip_torch.workers import in_processes
+from tactslip_torch.runtime import in_processes
 
 Array = NDArray[Any]
 

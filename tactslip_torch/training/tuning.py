@@ -23,20 +23,20 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from tactslip_torch.data.splits import Split
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
-from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.calibration import Platt, fit_platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.leave_one_group_out import HeldOut, held_out_scores
 from tactslip_torch.model.scaling import FeatureScaler, signed_log
-from tactslip_torch.planning import Plan
-from tactslip_torch.progress import bar
-from tactslip_torch.recipe import Frame, Recipe
+from tactslip_torch.runtime import bar
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.learner import SlipLearner
+from tactslip_torch.training.recipe import Frame, Recipe
+from tactslip_torch.training.selection import Plan
 
-Setting = Literal["penalty", "offset", "scales"]
-SETTINGS: tuple[Setting, ...] = get_args(Setting)
+_Setting = Literal["penalty", "offset", "scales"]
+SETTINGS: tuple[_Setting, ...] = get_args(_Setting)
 
 
 class Tuned(NamedTuple):

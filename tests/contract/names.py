@@ -51,17 +51,17 @@ def solve_moments(stats, penalty):
 
 COMMANDS = {
     "train": f"-m {PACKAGE}.train",
-    "evaluate": f"-m {PACKAGE}.evaluate",
-    "detect": f"-m {PACKAGE}.detect",
-    "generate": f"-m {PACKAGE}.generate",
-    "data": f"-m {PACKAGE}.data_tool",
-    "export": f"-m {PACKAGE}.export",
-    "adapt": f"-m {PACKAGE}.adapt",
-    "importance": f"-m {PACKAGE}.sensors",
-    "crossval": f"-m {PACKAGE}.crossval",
-    "pareto": f"-m {PACKAGE}.pareto",
-    "certify": f"-m {PACKAGE}.certify",
-    "calibrate": f"-m {PACKAGE}.calibrate",
+    "evaluate": f"-m {PACKAGE} evaluate",
+    "detect": f"-m {PACKAGE} detect",
+    "generate": f"-m {PACKAGE} generate",
+    "data": f"-m {PACKAGE} data",
+    "export": f"-m {PACKAGE} export",
+    "adapt": f"-m {PACKAGE} adapt",
+    "importance": f"-m {PACKAGE} importance",
+    "crossval": f"-m {PACKAGE} crossval",
+    "pareto": f"-m {PACKAGE} pareto",
+    "certify": f"-m {PACKAGE} certify",
+    "calibrate": f"-m {PACKAGE} calibrate",
 }
 BATCH_FIT = "examples/batch_fit.py"
 """In the place of the command ``stats`` of 0.1.0."""
@@ -248,6 +248,6 @@ MOST_MEMORY, MOST_TIME = "isolate_gib", "isolate_s"
 
 def rate_in_set(path):
     """The rate at which a set of files takes a recording."""
-    from tactslip_torch.data.sets.stream import Stream, look
+    from tactslip_torch.data.file_recordings import Stream, look
 
     return look(path, Stream()).clock.sample_rate_hz

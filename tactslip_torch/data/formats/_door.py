@@ -22,8 +22,8 @@ from tactslip_torch.data.formats._isolation import isolated
 from tactslip_torch.data.formats._messages import is_bag, is_only_bag
 from tactslip_torch.data.formats._reading import AS_IT_SAYS, Archived, Opened, Reading
 from tactslip_torch.data.recording import Recording
-from tactslip_torch.files import whole_file
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.runtime import whole_file
 
 
 @dataclass(frozen=True)
