@@ -42,7 +42,7 @@ from tactslip_torch.files import whole_file
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import calibration_of
 from tactslip_torch.progress import bar
-from tactslip_torch.report.tables import BASELINES, splits_table
+from tactslip_torch.report.results import BASELINES, splits_table
 
 COMMAND = "python -m benchmarks.generalisation"
 PAGE = ROOT / "docs" / "generalisation.md"

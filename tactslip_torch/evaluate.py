@@ -40,9 +40,8 @@ from tactslip_torch.folds import merged_baselines
 from tactslip_torch.judging import event_numbers, together
 from tactslip_torch.learning import SlipLearner
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.report.answers import merged_answers
+from tactslip_torch.report.metrics import merged_answers, merged_metrics
 from tactslip_torch.report.results import print_results, write_results
-from tactslip_torch.report.scores import merged_metrics
 
 
 def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.scoring import Scorer
 from tactslip_torch.onset.settings import KEY
 from tactslip_torch.recipe import Recipe, stand_for
-from tactslip_torch.report.tuning import tuning_figure
+from tactslip_torch.report.results import tuning_figure
 from tactslip_torch.tuning.second_fit import settled_learner, tuned_maker
 from tactslip_torch.tuning.stage import Tuning
 

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from tactslip_torch.judging import event_numbers, together
-from tactslip_torch.report.answers import merged_answers
-from tactslip_torch.report.scores import merged_metrics, summed_metrics
+from tactslip_torch.report.metrics import merged_answers, merged_metrics, summed_metrics
 
 
 def combined(folds: dict[str, dict[str, Any]], of_rivals: bool) -> dict[str, Any]:

@@ -29,8 +29,13 @@ from tactslip_torch.onset.events import (
 )
 from tactslip_torch.onset.latch import latch, latch_start
 from tactslip_torch.onset.sequential import KOfN
-from tactslip_torch.report.answers import answer_counts, answer_metrics
-from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
+from tactslip_torch.report.metrics import (
+    answer_counts,
+    answer_metrics,
+    bin_metrics,
+    confusion_matrix,
+    split_metrics,
+)
 
 RULES: Mapping[str, KOfN] = MappingProxyType(
     {"first_transition": KOfN(1, 1), "two_of_three": KOfN(2, 3)}

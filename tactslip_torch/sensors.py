@@ -42,8 +42,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.progress import bar
 from tactslip_torch.recipe import Recipe, fit_frame, sample_groups, stand_for
-from tactslip_torch.report.hand_figure import sensors_figure
-from tactslip_torch.report.sensors import best_table, sensors_csv, sensors_table
+from tactslip_torch.report.importance import best_table, sensors_csv, sensors_figure, sensors_table
 
 FORMAT = "tactslip_torch sensors 1"
 _WHOLE_NUMBERS = {

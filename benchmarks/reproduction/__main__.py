@@ -38,7 +38,7 @@ from benchmarks.reproduction.runs import kept, run
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.facts import filtered, judge_facts
 from tactslip_torch.files import whole_file
-from tactslip_torch.report.figures import pipeline_figure
+from tactslip_torch.report.pipeline import pipeline_figure
 from tactslip_torch.simulation.knobs.calibrated import CALIBRATED_PATH
 from tactslip_torch.simulation.materials import SEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings

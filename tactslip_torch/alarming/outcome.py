@@ -17,7 +17,7 @@ from tactslip_torch.onset.events import EventRules, LatencyParts, event_metrics
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.progress import bar
-from tactslip_torch.report.reliability import weights_at_share
+from tactslip_torch.report.metrics import weights_at_share
 
 
 def events_of(
