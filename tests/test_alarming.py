@@ -31,7 +31,7 @@ from tactslip_torch.onset.decider import Decider
 from tactslip_torch.onset.sequential import Cusum, KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.report.alarm import alarm_figure, alarm_table, scenes_table
+from tactslip_torch.report.results import alarm_figure, alarm_table, scenes_table
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.train import train
 

@@ -20,7 +20,7 @@ from tactslip_torch.data.formats.registry import FORMATS, format_of
 from tactslip_torch.data.sets.datasets import FileRecordings
 from tactslip_torch.data.sets.inspection import inspected, oddities
 from tactslip_torch.data.sets.template import guessed, guesser, write_template
-from tactslip_torch.report.dataset import (
+from tactslip_torch.report.recordings import (
     Example,
     Trial,
     draw_dataset,

@@ -16,9 +16,14 @@ from test_commands import composed as composed_train
 from tactslip_torch.config import conf_dir
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.importance.raw_bins import draw_raw_bins
-from tactslip_torch.report.hand_drawing import _fingers, kind_colours
-from tactslip_torch.report.hand_figure import sensors_figure
-from tactslip_torch.report.sensors import best_table, sensors_csv, sensors_table
+from tactslip_torch.report.importance import (
+    _fingers,
+    best_table,
+    kind_colours,
+    sensors_csv,
+    sensors_figure,
+    sensors_table,
+)
 from tactslip_torch.sensors import _trained, main, sensors
 from tactslip_torch.train import train
 
