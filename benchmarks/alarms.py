@@ -18,7 +18,6 @@ from typing import Any
 from benchmarks.crossval import markdown
 from benchmarks.outcome import RESULTS, ROOT, between_markers
 from tactslip_torch.features.cache import source_digest
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.results import (
     alarm_figure,
     events_figure,
@@ -27,6 +26,7 @@ from tactslip_torch.report.results import (
     reliability_figure,
     scene_rows,
 )
+from tactslip_torch.runtime import whole_file
 
 COMMAND = "python -m benchmarks.alarms"
 MARKER = "onset"

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.data.labels import LabelRule
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.extremes import extreme_bins
 from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.training.datamodule import FeatureMaker
 
 RANDOM, TIED, NEAR_CONSTANT, DEGENERATE = "random", "tied", "near constant", "degenerate"
 KINDS = (RANDOM, TIED, NEAR_CONSTANT)

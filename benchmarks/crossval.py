@@ -1,6 +1,6 @@
 """Recipes on every choice of four held-out materials: ``python -m benchmarks.crossval``.
 
-Runs ``python -m tactslip_torch.crossval`` unless this code has, keeps its numbers and its figure in
+Runs ``python -m tactslip_torch crossval`` unless this code has, keeps its numbers and its figure in
 ``benchmarks/results``, and puts the tables between the markers in README.md.
 """
 
@@ -15,8 +15,8 @@ from pathlib import Path
 
 from benchmarks.outcome import RESULTS, ROOT, between_markers
 from tactslip_torch.features.cache import source_digest
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.crossval import crossval_figure, material_rows, split_rows
+from tactslip_torch.runtime import whole_file
 
 COMMAND = "python -m benchmarks.crossval"
 
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     made_by = options.run / "code.txt"
     code = " ".join([source_digest(ROOT / "tactslip_torch"), *options.overrides])
     if not made_by.exists() or made_by.read_text() != code:
-        command = [sys.executable, "-m", "tactslip_torch.crossval", *options.overrides]
+        command = [sys.executable, "-m", "tactslip_torch", "crossval", *options.overrides]
         done = subprocess.run([*command, f"hydra.run.dir={options.run}"], check=False)
         if done.returncode:
             raise SystemExit(done.returncode)

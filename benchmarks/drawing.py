@@ -11,7 +11,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 # Okabe and Ito, told apart by the colour-blind
 OURS, SECOND, THIRD, PEER, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#888888"

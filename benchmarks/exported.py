@@ -17,8 +17,8 @@ from torch import Tensor
 from benchmarks.clocks import say
 from benchmarks.detectors import Timed
 from benchmarks.engines import FLOAT32, FLOAT64
-from tactslip_torch.export import export_detector
-from tactslip_torch.graph.form import Layout, Precision
+from tactslip_torch.graph.export import export_detector
+from tactslip_torch.graph.form import Precision
 
 ORT = "onnxruntime, float32, with validity"
 Array = NDArray[Any]
@@ -65,22 +65,21 @@ def judge_of(model: Path | bytes, threads: int, context: int) -> Judge:
     return Judge(cut, lambda x: np.asarray(made.run(["score", "valid"], {"samples": x})[0]))
 
 
-def session(timed: Timed, threads: int, layout: Layout = "latency") -> Judge:
+def session(timed: Timed, threads: int) -> Judge:
     """Scores in float32 by onnxruntime.
 
     Args:
         timed: what is exported.
         threads: it may use.
-        layout: of the graph.
     """
     context = timed.detector("reference", FLOAT64).channel_filter.context
-    return judge_of(_content(timed, FLOAT32, layout), threads, context)
+    return judge_of(_content(timed, FLOAT32), threads, context)
 
 
 @lru_cache(maxsize=2)
-def _content(timed: Timed, precision: Precision, layout: Layout) -> bytes:
-    say(f"export to ONNX, {precision}, {layout}")
+def _content(timed: Timed, precision: Precision) -> bytes:
+    say(f"export to ONNX, {precision}")
     with tempfile.TemporaryDirectory(prefix="tactslip-bench-") as folder:
         detector = timed.detector("eager", FLOAT64)  # in its check the reference takes long
-        export_detector(detector, Path(folder), ("bin",), precision, layout, alone=False)
+        export_detector(detector, Path(folder), ("bin",), precision, alone=False)
         return (Path(folder) / "model.onnx").read_bytes()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.tables import limits
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 SIMULATED_LINE = "SIMULATED bins: what things cost, nothing about a real hand"
 QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"

@@ -19,7 +19,7 @@ from benchmarks.outcome import QUICK_LINE, RESULTS
 from benchmarks.rates import NOT_MEASURED, not_measured
 from benchmarks.sections import SECTIONS, Report, Section
 from benchmarks.tables import limits
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 ROOT = Path(__file__).parents[1]
 INTRODUCTION = """# Benchmarks

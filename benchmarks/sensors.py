@@ -1,6 +1,6 @@
 """Which sensors matter: ``python -m benchmarks.sensors [RUN/detector.pt]``.
 
-Runs ``python -m tactslip_torch.sensors`` with features selected anew in both ways, by the recipe's
+Runs ``tactslip importance`` with features selected anew in both ways, by the recipe's
 ranking and as many of each channel, for a detector of ``+exp=unseen4``: one that is given, or one
 trained for it. Prints the tables, and keeps numbers and figure in ``benchmarks/results``.
 """
@@ -20,8 +20,8 @@ from benchmarks.machine import machine_facts, versions
 from benchmarks.outcome import add_paths, heading, keep_by_default, refuse_paths, told
 from benchmarks.tables import Table
 from tactslip_torch.report.importance import (
-    RESELECT_WORDS,
     BEST_LINE,
+    RESELECT_WORDS,
     best_rows,
     lines_about,
     sensors_figure,
@@ -54,7 +54,7 @@ def measure(model: Path | None, overrides: Sequence[str]) -> dict[str, Any]:
         for name in SECTIONS:
             out = Path(folder) / name
             given = [f"model={model}", f"anew={name}", *overrides]
-            _run("tactslip_torch.sensors", *given, f"hydra.run.dir={out}")
+            _run("tactslip_torch.commands.importance", *given, f"hydra.run.dir={out}")
             sections[name] = json.loads((out / "sensors.json").read_text(encoding="utf-8"))
     return {
         "simulated": sections[SECTIONS[0]]["simulated"],

@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 
 from benchmarks.machine import machine_facts
 from benchmarks.outcome import refuse_paths
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.style import SIMULATED_LINE
+from tactslip_torch.runtime import whole_file
 
 try:
     import psutil

@@ -1,7 +1,7 @@
 """What tuning by gradient buys beside a grid: ``python -m benchmarks.tuning [--quick]``.
 
 Runs ``python -m tactslip_torch.train +exp=tuned`` with more and more to learn: C and c, the scales
-of features as well, the filters as well. Each way is judged on training materials held out from it
+of features as well. Each way is judged on training materials held out from it
 and, as a detector, on test and unseen materials of the **simulated** hand, beside the grid of its
 recipe by balanced accuracy and by loss. Prints a table, and keeps numbers and figure in
 ``benchmarks/results``.
@@ -25,7 +25,6 @@ from tactslip_torch.report.results import HELD_NOTE, WAYS, held_mean, tuning_fig
 LEARNED = {
     "C and c": "[penalty,offset]",
     "C, c and scales": "[penalty,offset,scales]",
-    "C, c, scales and filters": "[penalty,offset,scales,smoothing,wavelet]",
 }
 _QUICK = ["+exp=quick", "tuning=gradient", "tuning.bins=6", "tuning.steps=2"]
 _QUICK += ["recipe=robust", "recipe.num_features=8"]

@@ -15,18 +15,17 @@ from torch import Tensor
 
 from benchmarks.abstaining.sizes import Sizes
 from benchmarks.clocks import say
-from tactslip_torch.abstaining import held_out_scores
-from tactslip_torch.config import conf_dir
-from tactslip_torch.crossval import Materials
+from tactslip_torch.commands.crossval import Materials
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.splits import seen6
-from tactslip_torch.datamodule import SlipDataModule
-from tactslip_torch.experiment import feature_cache, feature_parts
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.planning import plan_detector
-from tactslip_torch.recipe import Recipe, stand_for
 from tactslip_torch.simulation import SEEN_MATERIALS
+from tactslip_torch.training.abstention import held_out_scores
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.training.experiment import feature_cache, feature_parts
+from tactslip_torch.training.recipe import Recipe, stand_for
+from tactslip_torch.training.selection import plan_detector
 
 ROLES = {"test": "held-out cycles of seen materials", "unseen": "materials never met"}
 

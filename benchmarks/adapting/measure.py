@@ -21,18 +21,23 @@ from torch import Tensor
 
 from benchmarks.adapting.sizes import Sizes
 from benchmarks.adapting.subject import Subject, divided, drawn, joined
-from tactslip_torch.adapting.acceptance import mean_recall
-from tactslip_torch.adapting.bins import RecordingBins
-from tactslip_torch.adapting.held_out import Solved, solve
-from tactslip_torch.adapting.renewal import renewed
-from tactslip_torch.adapting.statistics import Statistics, detector_digest
-from tactslip_torch.adapting.steps import FACTORS, add, taken, undo
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.fitting import TrainingPass
 from tactslip_torch.model.detector_file import Head
-from tactslip_torch.planning import plan_detector
-from tactslip_torch.progress import bar
+from tactslip_torch.runtime import bar
+from tactslip_torch.training.adaptation import (
+    FACTORS,
+    Solved,
+    add,
+    mean_recall,
+    renewed,
+    solve,
+    taken,
+    undo,
+)
+from tactslip_torch.training.fitting import TrainingPass
+from tactslip_torch.training.selection import plan_detector
+from tactslip_torch.training.statistics import RecordingBins, Statistics, detector_digest
 
 AUTO, SLIP_FREE, ONE, SHIFT, CEILING = "auto", "slip-free", "weight 1", "threshold", "ceiling"
 _SHARE_SEED = 1000  # of which recordings are judged; draws count from 0

@@ -16,18 +16,16 @@ from torch import Tensor
 
 from benchmarks.adapting.sizes import Sizes
 from benchmarks.reproduction.runs import run
-from tactslip_torch.adapting.bins import RecordingBins
-from tactslip_torch.adapting.reading import recording_bins
-from tactslip_torch.adapting.statistics import Statistics, statistics_of
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
-from tactslip_torch.experiment import feature_parts
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.progress import bar
-from tactslip_torch.recipe import Recipe
+from tactslip_torch.training.adaptation import recording_bins
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.statistics import RecordingBins, Statistics, statistics_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +93,7 @@ def subject_of(sizes: Sizes, folder: Path, cache: Path) -> Subject:
         instantiate(config.recipe, _convert_="all"),
         split,
         maker,
-        recording_bins(detector, maker, bar),
+        recording_bins(detector, maker),
     )
 
 

@@ -13,14 +13,14 @@ from torch import Tensor
 
 from benchmarks.clocks import say
 from benchmarks.dead_sensors.sizes import Sizes
-from tactslip_torch.config import conf_dir
-from tactslip_torch.experiment import feature_cache, feature_parts
-from tactslip_torch.feature_maker import FeatureMaker
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.calibration import Calibration, calibration_from_dict
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.planning import plan_detector
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.experiment import feature_cache, feature_parts
+from tactslip_torch.training.selection import plan_detector
 
 ROLES = {"test": "held-out cycles of seen materials", "unseen": "materials never met"}
 

@@ -1,6 +1,6 @@
 """What a deployed detector costs: ``python -m benchmarks.deployment [--detector detector.pt]``.
 
-The files of ``tactslip_torch.export`` in onnxruntime, beside what else there is to do: the pipeline
+The exported files in onnxruntime, beside what else there is to do: the pipeline
 exported as it is written, the engines of the package, ``torch.compile``, and the loop of SciPy and
 PyWavelets. In one run and in turns: latency of one bin and throughput of many on one and two
 threads, pushes of a stream, sizes of files, and a first score in a fresh process; beside every
@@ -84,7 +84,7 @@ def start_rows(files: Files, sizes: Sizes, folder: Path) -> list[dict[str, Any]]
     whole = folder / "bin.npy"
     np.save(whole, raw.numpy())
     jobs = {}
-    for way in (DEPLOYED, exported("float64", "latency")):
+    for way in (DEPLOYED, exported("float64")):
         model = files.paths[of_way(way, BIN)]
         cut = folder / f"{way.replace(', ', '-')}.npy"
         np.save(cut, judge_of(model, 1, ChannelFilter(WINDOW_LENGTHS).context).cut(raw))

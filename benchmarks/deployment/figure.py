@@ -95,7 +95,7 @@ def _trade(axes: Axes, sections: Mapping[str, Rows]) -> None:
         heights = label_heights(cluster)
         edge = 3 * max(mark.error for mark in cluster)
         for way, error, p50_us in cluster:
-            axes.plot(error, p50_us, "s" if way.endswith("bulk") else "o", color=colour(way), ms=6)
+            axes.plot(error, p50_us, "o", color=colour(way), ms=6)
             axes.plot([error, edge], [p50_us, heights[way]], color=colour(way), lw=0.6)
             axes.annotate(
                 way,
@@ -142,7 +142,7 @@ def _bulk(axes: Axes, rows: Rows) -> None:
         rates = [rate(row) for row in mine]
         style = ":" if way in peers else ("--" if "float64" in way else "-")
         shade = "#56b4e9" if way in shared else colour(way)
-        marker = "v^DX"[peers.index(way) % 4] if way in peers else "s" if "bulk" in way else "o"
+        marker = "v^DX"[peers.index(way) % 4] if way in peers else "o"
         chunks = [row["chunk"] for row in mine]
         middles = [of.median for of in rates]
         axes.plot(chunks, middles, style, marker=marker, ms=4, color=shade, label=way)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,13 +12,12 @@ from benchmarks.deployment.naive import NaivePipeline, export_naive
 from benchmarks.deployment.sizes import Sizes
 from benchmarks.deployment.subject import Subject
 from benchmarks.engines import FLOAT64, pool_of
-from tactslip_torch.export import export_detector
+from tactslip_torch.graph.export import export_detector
 from tactslip_torch.graph.facts import GraphKind
-from tactslip_torch.graph.form import Layout, Precision
+from tactslip_torch.graph.form import Precision
 from tactslip_torch.signals.filtering import ChannelFilter
 
 PRECISIONS: tuple[Precision, ...] = ("float32", "float64")
-LAYOUTS: tuple[Layout, ...] = ("latency", "bulk")
 BIN: GraphKind = "bin"
 STREAM: GraphKind = "stream"
 DETECTOR = "detector.pt"
@@ -27,13 +25,13 @@ NAIVE = {True: "naive export, all features", False: "naive export, needed featur
 """By whether the whole pool is made."""
 
 
-def exported(precision: str, layout: str) -> str:
+def exported(precision: str) -> str:
     """The name of a way by our export."""
-    return f"export, {precision}, {layout}"
+    return f"export, {precision}"
 
 
-EXPORTS = {exported(*form): form for form in product(PRECISIONS, LAYOUTS)}
-"""Every way by our export, with precision and layout."""
+EXPORTS = {exported(precision): precision for precision in PRECISIONS}
+"""Every way by our export, with its precision."""
 
 
 class Files(NamedTuple):
@@ -65,12 +63,12 @@ def make_files(subject: Subject, sizes: Sizes, folder: Path) -> Files:
     files = Files({DETECTOR: folder / DETECTOR}, {})
     detector = subject.detector("eager", FLOAT64)  # in its check the reference takes long
     detector.save(files.paths[DETECTOR])
-    for way, (precision, layout) in EXPORTS.items():
+    for way, precision in EXPORTS.items():
         say(f"deployment: {way}")
-        own = folder / f"{precision}-{layout}"
+        own = folder / precision
         own.mkdir()
         write = partial(
-            export_detector, detector, own, (BIN, STREAM), precision, layout, alone=sizes.has_starts
+            export_detector, detector, own, (BIN, STREAM), precision, alone=sizes.has_starts
         )
         files.seconds[way], _ = timed(write)
         for graph, name in ((BIN, "model.onnx"), (STREAM, "stream.onnx")):

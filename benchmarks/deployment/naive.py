@@ -23,12 +23,11 @@ from torch.nn.functional import conv1d
 from benchmarks.deployment.definitions import described
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.files import whole_file
 from tactslip_torch.hand import Adapting
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.signals.savgol import edge_matrices
+from tactslip_torch.runtime import whole_file
+from tactslip_torch.signals.filtering import ChannelFilter, edge_matrices
 from tactslip_torch.signals.spectrum import amplitude_spectrum, frequency_axis_hz
 from tactslip_torch.signals.wavelet import branch_names, wavelet_branches
 

@@ -7,7 +7,7 @@ from statistics import median
 from typing import Any
 
 from benchmarks.clocks import paired_ratio
-from benchmarks.deployment.files import BIN, EXPORTS, LAYOUTS, NAIVE, STREAM, exported, of_way
+from benchmarks.deployment.files import BIN, EXPORTS, NAIVE, STREAM, exported, of_way
 from benchmarks.deployment.sizes import PUSHES
 from benchmarks.deployment.start import PARTS
 from benchmarks.deployment.ways import LOOP, PRUNED_LOOP, at_once, engine_way
@@ -22,7 +22,7 @@ TIMES_NAIVE, TIMES_LOOP = 4.0, 300.0  # p50 of one bin on one thread
 LEAST_RATE, RATE_THREADS = 80_000.0, 2  # bins a second
 MOST_BYTES = 700_000
 MOST_ERROR = {"float32": 1e-3, "float64": 1e-9}  # standard deviations of the score
-DEPLOYED = exported("float32", "latency")
+DEPLOYED = exported("float32")
 Rows = Sequence[Mapping[str, Any]]
 
 
@@ -62,8 +62,7 @@ def limit_rows(sections: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _rate_limit(sections: Mapping[str, Any]) -> list[dict[str, Any]]:
-    ways = [exported("float32", layout) for layout in LAYOUTS]
-    ways += [at_once(way) for way in ways]
+    ways = [DEPLOYED, at_once(DEPLOYED)]
     rows = sections["bulk"]["rows"]
     each = [row for way in ways if (row := best_chunk(rows, way, RATE_THREADS)) is not None]
     best = max(each, key=lambda row: rate(row).median, default=None)
@@ -77,23 +76,22 @@ def _rate_limit(sections: Mapping[str, Any]) -> list[dict[str, Any]]:
 def _file_limits(sections: Mapping[str, Any]) -> list[dict[str, Any]]:
     limit, rows = f"< {MOST_BYTES / 1000:g} kB", sections["files"]["rows"]
     found = []
-    for layout in LAYOUTS:
-        for graph in (BIN, STREAM):
-            name = of_way(exported("float32", layout), graph)
-            row = row_of(rows, file=name)
-            if row is None:
-                found.append(not_measured(f"size, {name}", limit))
-                continue
-            is_met = row["bytes"] < MOST_BYTES
-            measured = f"{row['bytes'] / 1000:.0f} kB"
-            what = f"size, {name}"
-            found.append({"what": what, "measured": measured, "limit": limit, "ok": is_met})
+    for graph in (BIN, STREAM):
+        name = of_way(DEPLOYED, graph)
+        row = row_of(rows, file=name)
+        if row is None:
+            found.append(not_measured(f"size, {name}", limit))
+            continue
+        is_met = row["bytes"] < MOST_BYTES
+        measured = f"{row['bytes'] / 1000:.0f} kB"
+        what = f"size, {name}"
+        found.append({"what": what, "measured": measured, "limit": limit, "ok": is_met})
     return found
 
 
 def _error_limits(sections: Mapping[str, Any]) -> list[dict[str, Any]]:
     found = []
-    for way, (precision, _) in EXPORTS.items():
+    for way, precision in EXPORTS.items():
         most, row = MOST_ERROR[precision], row_of(sections["errors"]["rows"], way=way)
         what, limit = f"largest score error, {way}, sd", f"<= {most:g}, no flip"
         if row is None:

@@ -21,7 +21,7 @@ from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.quadratic import collapse
 from tactslip_torch.onset.settings import KEY
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.simulation.materials import UNSEEN_MATERIALS
+from tactslip_torch.simulation import UNSEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings
 
 HOP = 20

@@ -14,9 +14,7 @@ import torch
 from benchmarks.clocks import Way, on_threads, say, shuffled_rounds
 from benchmarks.formats.naive import NAIVE
 from benchmarks.formats.sizes import Sizes
-from tactslip_torch.data.formats.header import Archived
-from tactslip_torch.data.formats.reading import pieces
-from tactslip_torch.data.formats.registry import FORMATS, Format
+from tactslip_torch.data.formats import FORMATS, Archived, Format, pieces
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.simulation.source import SimulatedRecordings
 

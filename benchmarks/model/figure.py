@@ -13,7 +13,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 # Okabe and Ito, told apart by the colour-blind
 OURS, SECOND, PEER, THIRD, GREY = "#0072b2", "#e69f00", "#d55e00", "#009e73", "#888888"

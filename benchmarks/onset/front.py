@@ -17,14 +17,19 @@ from benchmarks.engines import ENGINES
 from benchmarks.onset.cost import push_seconds
 from benchmarks.onset.sizes import Sizes
 from benchmarks.onset.trained import alarming_of, at_hop, composed
-from tactslip_torch.alarming.methods import FITS, labelled, threshold_facts
-from tactslip_torch.alarming.outcome import amounts_of, events_of
-from tactslip_torch.alarming.stage import Alarming
-from tactslip_torch.alarming.watching import Clock, Stream, watch
-from tactslip_torch.deadline.front import nondominated
+from tactslip_torch.analysis.pareto import nondominated
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.training.alarm import (
+    FITS,
+    CalibratedAlarm,
+    amounts_of,
+    events_of,
+    labelled,
+    threshold_facts,
+)
+from tactslip_torch.training.stream_evaluation import Clock, Stream, watch
 
 JUDGED = ("test", "unseen")
 """Roles of streams that set nothing: other cycles of the materials trained on, and new ones."""
@@ -72,7 +77,7 @@ def front_of(sizes: Sizes, trained: Mapping[str, Mapping[str, Any]]) -> dict[str
 
 
 def watched_by(
-    alarming: Alarming, detectors: Mapping[str, SlipDetector], num_workers: int | None = None
+    alarming: CalibratedAlarm, detectors: Mapping[str, SlipDetector], num_workers: int | None = None
 ) -> dict[str, list[Stream]]:
     """The recordings of every role, as the detectors score them at the hop of the stage.
 
@@ -102,7 +107,7 @@ def every(stream: Stream, scorer: str, step: int) -> Stream:
 
 
 def judged(
-    stage: Alarming, streams: Mapping[str, Sequence[Stream]], scorer: str, clock: Clock
+    stage: CalibratedAlarm, streams: Mapping[str, Sequence[Stream]], scorer: str, clock: Clock
 ) -> tuple[dict[str, Any], AlarmSettings]:
     """The main rule, set on the streams that calibrate and judged on the others.
 
@@ -118,7 +123,7 @@ def judged(
     calibrating = streams["calibrate"]
     calibration = FITS[stage.calibration](*labelled(calibrating, scorer, clock))
     rule = stage.made_rules(clock.bin_samples)[stage.rule]
-    method = stage.promise().calibrated(scorer, rule, calibration, calibrating, clock)
+    method = stage.budget().calibrated(scorer, rule, calibration, calibrating, clock)
     assert method.threshold is not None
     parts = {role: streams[role] for role in JUDGED}
     events = events_of(parts, {scorer: method}, {scorer: clock}, {}, stage.level)

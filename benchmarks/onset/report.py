@@ -9,7 +9,7 @@ from benchmarks.onset.front import JUDGED, compute
 from benchmarks.outcome import heading
 from benchmarks.rates import information
 from benchmarks.tables import Table, limits, limits_last, number
-from tactslip_torch.alarming.stage import FIRST_TRANSITION, OURS
+from tactslip_torch.training.alarm import FIRST_TRANSITION, OURS
 
 SECTIONS = ("trained", "front", "rivals")
 ROLES = {"test": "materials trained on, other cycles", "unseen": "new materials"}

@@ -20,19 +20,19 @@ from benchmarks.onset.front import in_short
 from benchmarks.onset.sizes import Sizes
 from benchmarks.onset.trained import alarming_of, composed
 from benchmarks.peers.others import mini_rocket_ridge
-from tactslip_torch.alarming.stage import FIRST_TRANSITION, OURS
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.experiment import feature_parts
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.judgement import Judgement
 from tactslip_torch.onset.baselines import BaselineDetector
-from tactslip_torch.onset.scoring import Scorer
+from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.runtime import in_processes
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.workers import in_processes
+from tactslip_torch.training.alarm import FIRST_TRANSITION, OURS
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.experiment import feature_parts
 
 MINI_ROCKET = "MiniRocket and ridge"
 BASELINES: Mapping[str, Any] = {

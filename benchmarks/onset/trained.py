@@ -14,8 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from benchmarks.onset.sizes import Sizes
 from benchmarks.reproduction.runs import run
-from tactslip_torch.alarming.stage import Alarming
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.training.alarm import CalibratedAlarm
 
 
 def train_all(sizes: Sizes, folder: Path) -> dict[str, dict[str, Any]]:
@@ -61,7 +61,9 @@ def composed(sizes: Sizes, align: str) -> DictConfig:
         return compose("train", [*training_overrides(sizes, align), *sizes.streams])
 
 
-def alarming_of(config: DictConfig, hop_ms: float, hours: float, per_hour: float) -> Alarming:
+def alarming_of(
+    config: DictConfig, hop_ms: float, hours: float, per_hour: float
+) -> CalibratedAlarm:
     """The stage behind ``+exp=onset``: the protocol and its quiet alone, and the main rule.
 
     Args:
@@ -75,11 +77,11 @@ def alarming_of(config: DictConfig, hop_ms: float, hours: float, per_hour: float
     onset["streams"]["others"] = {quiet: onset["streams"]["others"][quiet]}
     onset["rules"] = {main: onset["rules"][main]}
     onset |= {"hours": hours, "false_alarms_per_hour": per_hour}
-    made: Alarming = instantiate(onset, _convert_="all")
+    made: CalibratedAlarm = instantiate(onset, _convert_="all")
     return at_hop(made, hop_ms, float(config.labels.bin_ms))
 
 
-def at_hop(alarming: Alarming, hop_ms: float, bin_ms: float) -> Alarming:
+def at_hop(alarming: CalibratedAlarm, hop_ms: float, bin_ms: float) -> CalibratedAlarm:
     """The same at another hop; the evidence of a decision is the part of its bin that is new."""
     new = min(1.0, hop_ms / bin_ms)
 

@@ -19,17 +19,17 @@ from torch import Tensor
 from benchmarks.arithmetic import ARITHMETIC, FLOAT64, NATIVE
 from benchmarks.clocks import say
 from benchmarks.precision.sizes import Sizes
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
-from tactslip_torch.experiment import feature_parts
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.planning import Plan, plan_detector
-from tactslip_torch.recipe import Recipe, bin_weights
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.recipe import Recipe, bin_weights
+from tactslip_torch.training.selection import Plan, plan_detector
 
 ROLES = ("test", "unseen")
 

@@ -15,7 +15,7 @@ from matplotlib.transforms import offset_copy
 from benchmarks.arithmetic import WIDE
 from benchmarks.machine import threads_text
 from benchmarks.model.figure import GREY, OURS, PEER
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 _DODGE_PT, _CLOSE = 7, 2.0  # points of one time stand side by side; labels nearer than this move
 

@@ -23,7 +23,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernel_elm import solve_kernel_elm_
 from tactslip_torch.model.kernels import lower_gram
 from tactslip_torch.model.quadratic import QuadraticForm, collapse
-from tactslip_torch.recipe import recalls_mean
+from tactslip_torch.training.recipe import recalls_mean
 
 OF_FLOAT32, IN_FLOAT32 = "float64, of float32 features", "float32 matrix"  # solves
 HALVES = {"bfloat16": torch.bfloat16, "float16": torch.float16}

@@ -15,17 +15,17 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from benchmarks.clocks import say
-from benchmarks.simulation.sizes import Sizes
-from tactslip_torch.config import conf_dir
-from tactslip_torch.crossval import Materials
+from benchmarks.simulation.sizes import Sizes, parameters_of
+from tactslip_torch.commands.crossval import Materials
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.splits import seen6
-from tactslip_torch.experiment import feature_parts
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.planning import plan_detector
-from tactslip_torch.recipe import recalls_mean, stand_for
 from tactslip_torch.simulation import SEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.recipe import recalls_mean, stand_for
+from tactslip_torch.training.selection import plan_detector
 
 Variant = tuple[str, float | None]
 """Rung and step."""
@@ -76,13 +76,12 @@ def accuracies(sizes: Sizes) -> list[dict[str, Any]]:
 def _materials(config: Any, variant: Variant, sizes: Sizes) -> Materials:
     rung, step_us = variant
     say(f"features of {len(SEEN_MATERIALS) * sizes.cycles} recordings: {rung}, {step_us}")
-    knobs = {} if step_us is None else {"step_us": step_us}
+    step = {} if step_us is None else {"step_us": step_us}
     source = SimulatedRecordings(
         seed=sizes.seed,
         cycles=sizes.cycles,
         materials=SEEN_MATERIALS,
-        fidelity=rung,
-        scene=knobs,
+        scene=parameters_of(rung) | step,
     )
     rule = instantiate(config.labels)
     split = seen6(source.ids, seen=SEEN_MATERIALS, train_share=sizes.train_share, seed=sizes.seed)[

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from benchmarks.clocks import say, shuffled_turns, timed
-from benchmarks.simulation.sizes import Sizes
+from benchmarks.simulation.sizes import NUM_BRISTLES, Sizes, parameters_of, scene_on
 from tactslip_torch.data.labels import LabelRule, label_bins, needed_windows
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -24,18 +24,14 @@ from tactslip_torch.simulation import (
     Stroke,
     paper_scenes,
     simulate,
+    simulate_many,
     timeline,
 )
-from tactslip_torch.simulation.batch import simulate_many
-from tactslip_torch.simulation.dynamics.contact import given
-from tactslip_torch.simulation.dynamics.drive import span_of
-from tactslip_torch.simulation.dynamics.physics import skins
-from tactslip_torch.simulation.dynamics.traces import traces_of
+from tactslip_torch.simulation.contact import slides_of, traces_of
 from tactslip_torch.simulation.grasp import draw_grasp
-from tactslip_torch.simulation.knobs import Dynamics
-from tactslip_torch.simulation.motion import arm_strokes
+from tactslip_torch.simulation.simulate import recording_of
 
-RUNGS = ("lugre", "patch")
+RUNGS = tuple(NUM_BRISTLES)
 MIDDLE_US = 250.0
 """The step at which engines are compared."""
 
@@ -45,15 +41,15 @@ FRAMES = {"SG": 51, "PVDF": 11}
 def at_step(scene: Scene, step_us: float) -> Scene:
     """The scene at a step; one that a sample of 500 us does not hold is sampled that coarsely."""
     rate_hz = min(scene.sample_rate_hz, 1e6 / step_us)
-    return replace(scene, dynamics=Dynamics(step_us=step_us), sample_rate_hz=rate_hz)
+    dynamics = replace(scene.dynamics, step_us=step_us)
+    return replace(scene, dynamics=dynamics, sample_rate_hz=rate_hz)
 
 
 def minute_costs(sizes: Sizes) -> list[dict[str, Any]]:
     """Seconds per simulated minute of 24 channels: integration, and all else."""
     materials = [SEEN_MATERIALS[n % len(SEEN_MATERIALS)] for n in range(sizes.recordings)]
     scenes = {
-        rung: [Scene(m, fidelity=rung, seed=sizes.seed) for m in materials]
-        for rung in ("kinematic", *RUNGS)
+        rung: [scene_on(rung, m, sizes.seed) for m in materials] for rung in ("kinematic", *RUNGS)
     }
     minutes = sum(timeline(scene).duration_s for scene in scenes["kinematic"]) / 60.0
     calls: dict[str, Callable[[], object]] = {
@@ -93,40 +89,32 @@ def _samples(scenes: Sequence[Scene]) -> None:
 
 
 def _given_samples(scenes: Sequence[Scene], traces: Any) -> None:
-    with given(dict(zip(scenes, traces, strict=True))):
-        _samples(scenes)
+    for scene, own in zip(scenes, traces, strict=True):
+        recording_of(scene, own)
 
 
 def _eager(rung: str, sizes: Sizes, minutes: float, samples: float) -> dict[str, Any]:
     """The eager engine on many short recordings together, by proportion of lanes and steps."""
     short = (Stroke(60.0, sizes.eager_mm, 0.1),)
-    scenes = [
-        Scene(
-            "M2",
-            fidelity=rung,
-            strokes=short,
-            contact=Contact(presliding_mm=(0.3, 0.3)),
-            dynamics=Dynamics(step_us=MIDDLE_US),
-            cycle=cycle,
-        )
-        for cycle in range(sizes.eager)
-    ]
+    scenes = paper_scenes(
+        cycles=sizes.eager,
+        materials=["M2"],
+        strokes=short,
+        presliding_mm=(0.3, 0.3),
+        step_us=MIDDLE_US,
+        **parameters_of(rung),
+    )
     say(f"cost: {rung}, eager, {len(scenes)} recordings together")
     seconds, _ = timed(lambda: traces_of(scenes, engine="eager"))
-    whole = Scene("M2", fidelity=rung)
+    whole = scene_on(rung, "M2")
     integration = seconds * lane_samples([whole]) / lane_samples(scenes) / minutes
     return _row(rung, MIDDLE_US, "eager", integration, samples)
 
 
 def lane_samples(scenes: Sequence[Scene]) -> int:
     """Samples times lanes that are integrated."""
-    total = 0
-    for scene in scenes:
-        plan = arm_strokes(scene.strokes, scene.acceleration_m_s2)
-        lanes = len(skins(scene, draw_grasp(scene)).mass_kg)
-        spans = (span_of(plan, number, scene.sample_rate_hz) for number in range(len(plan)))
-        total += lanes * sum(span.num for span in spans)
-    return total
+    slides = (slide for scene in scenes for slide in slides_of(scene, draw_grasp(scene)))
+    return sum(slide.num * len(slide.shear_n) for slide in slides)
 
 
 # --- parts of a batch ---------------------------------------------------------------------------
@@ -157,8 +145,8 @@ def parts(rung: str, sizes: Sizes) -> dict[str, float]:
             cycles=cycles,
             materials=materials,
             hand=apart_hand(),
-            fidelity=rung,
             contact=contact,
+            **parameters_of(rung),
         )
         return made[: sizes.batch]
 
@@ -191,7 +179,7 @@ def needed_seconds(rung: str, sizes: Sizes, processes: int = 2) -> dict[str, Any
         seed=sizes.seed,
         cycles=sizes.whole_cycles,
         materials=SEEN_MATERIALS + UNSEEN_MATERIALS,
-        fidelity=rung,
+        **parameters_of(rung),
     )
     say(f"needed windows of {len(scenes)} recordings, {rung}, {processes} processes")
     with ProcessPoolExecutor(processes, initializer=_ready, initargs=(rung,)) as pool:
@@ -208,7 +196,7 @@ def needed_seconds(rung: str, sizes: Sizes, processes: int = 2) -> dict[str, Any
 
 def _ready(rung: str) -> None:
     torch.set_num_threads(1)
-    _needed(Scene("M2", fidelity=rung))
+    _needed(scene_on(rung, "M2"))
 
 
 def _needed(scene: Scene) -> int:

@@ -11,17 +11,13 @@ from numpy.typing import NDArray
 
 from benchmarks.clocks import say
 from benchmarks.simulation.radau import radau
-from benchmarks.simulation.sizes import Sizes
-from tactslip_torch.simulation.dynamics import LaneState, integrate
-from tactslip_torch.simulation.dynamics.drive import StrokeDrive, loads_n, span_of, stroke_drive
-from tactslip_torch.simulation.dynamics.physics import Skins, lanes_of, skins
-from tactslip_torch.simulation.friction import shear_share
+from benchmarks.simulation.sizes import Sizes, scene_on
+from tactslip_torch.simulation import Scene, Stroke
+from tactslip_torch.simulation.blocks import Grid, block_samples_for
+from tactslip_torch.simulation.bristles import Lanes, LaneState, integrate, stage_times_s
+from tactslip_torch.simulation.contact import KinematicContact, Slide, slides_of
 from tactslip_torch.simulation.grasp import Grasp, draw_grasp
-from tactslip_torch.simulation.grid import Grid, block_samples_for
-from tactslip_torch.simulation.knobs import Stroke
-from tactslip_torch.simulation.ladder import scene_contact
-from tactslip_torch.simulation.motion import ArmStroke, Motion, arm_strokes
-from tactslip_torch.simulation.scene import Scene
+from tactslip_torch.simulation.scene import Motion
 
 Array = NDArray[np.float64]
 
@@ -38,9 +34,8 @@ class Element(NamedTuple):
     Attributes:
         scene: with one stroke.
         grasp: its.
-        stroke: as the arm runs it.
-        skin: of the element alone.
-        drive: of its lane.
+        slide: its stroke.
+        lanes: skin and bristles of the element alone.
         until_s: end of what is compared, from the first sample.
         truth: spring force and slip speed at some times, by Radau.
         onset_s: from the first sample, by Radau.
@@ -49,9 +44,8 @@ class Element(NamedTuple):
 
     scene: Scene
     grasp: Grasp
-    stroke: ArmStroke
-    skin: Skins
-    drive: StrokeDrive
+    slide: Slide
+    lanes: Lanes
     until_s: float
     truth: Any
     onset_s: float
@@ -65,23 +59,21 @@ def elements(rung: str, sizes: Sizes) -> list[Element]:
 
 def _element(rung: str, material: str, speed_mm_s: float, sizes: Sizes) -> Element:
     say(f"Radau: {rung}, {material} at {speed_mm_s:g} mm/s")
-    scene = Scene(material, fidelity=rung, seed=sizes.seed, strokes=(Stroke(speed_mm_s),))
+    scene = scene_on(rung, material, sizes.seed, strokes=(Stroke(speed_mm_s),))
     grasp = draw_grasp(scene)
-    plan = arm_strokes(scene.strokes, scene.acceleration_m_s2)
-    span = span_of(plan, 0, scene.sample_rate_hz)
-    load = loads_n(scene, grasp, plan[0], span)[:, :1]
-    skin = skins(scene, grasp).only(slice(1))
-    drive = stroke_drive([(plan[0], span, load)], scene.sample_rate_hz, torch.device("cpu"))
+    (slide,) = slides_of(scene, grasp)
+    columns = {name: values[:1] for name, values in vars(slide.lanes).items()}
+    lanes = Lanes(**columns | {"pressure": slide.lanes.pressure})
     travel = np.asarray(grasp.presliding_mm[grasp.touching[0]])
-    free_s = float(plan[0].time_of_travel_s(travel)) - plan[0].start_s
+    free_s = float(slide.stroke.time_of_travel_s(travel)) - slide.stroke.start_s
     until_s = 1e-3 * round(1e3 * (1.2 * free_s + sizes.behind_s))
-    constants = {name: float(column[0]) for name, column in skin.columns().items()}
-    pressure = lanes_of([skin], torch.float64, torch.device("cpu")).pressure.numpy()
-    first_s = span.first / scene.sample_rate_hz
-    rate_hz, loads = scene.sample_rate_hz, load[:, 0]
+    constants = {name: float(column[0]) for name, column in columns.items() if name != "pressure"}
+    pressure = lanes.pressure.numpy()
+    first_s = slide.first / scene.sample_rate_hz
+    rate_hz, loads = scene.sample_rate_hz, slide.load_n[:, 0]
 
     def arm(time_s: float) -> float:
-        return 1e-3 * float(plan[0].speed_mm_s(np.asarray(first_s + time_s)))
+        return 1e-3 * float(slide.stroke.speed_mm_s(np.asarray(first_s + time_s)))
 
     def held(time_s: float) -> float:
         return float(np.interp(time_s * rate_hz, np.arange(len(loads)), loads))
@@ -91,7 +83,7 @@ def _element(rung: str, material: str, speed_mm_s: float, sizes: Sizes) -> Eleme
     slip = truth(near)[1]
     onset_s = onset(near, slip, np.array([arm(t) for t in near]))
     static_n = float(grasp.friction_n[grasp.touching[0]])
-    return Element(scene, grasp, plan[0], skin, drive, until_s, truth, onset_s, static_n)
+    return Element(scene, grasp, slide, lanes, until_s, truth, onset_s, static_n)
 
 
 def onset(time_s: Array, slip: Array, arm: Array) -> float:
@@ -114,13 +106,14 @@ def step_errors(rung: str, found: list[Element], step_us: float) -> dict[str, An
     """Worst error over elements: friction over static friction, and onset in seconds."""
     friction, onsets = [], []
     for element in found:
-        lanes = lanes_of([element.skin], torch.float64, torch.device("cpu"))
-        num = int(element.until_s / (1e-6 * step_us) + 1e-9)
-        trace, _ = integrate(lanes, LaneState.sticking(lanes), element.drive, num, 1e-6 * step_us)
+        lanes, num = element.lanes, int(element.until_s / (1e-6 * step_us) + 1e-9)
+        stages_s = stage_times_s(num, 1e-6 * step_us).numpy()
+        arms, loads = (torch.from_numpy(part[:, :1]) for part in element.slide.drive(stages_s))
+        trace, _ = integrate(lanes, LaneState.sticking(lanes), arms, loads, 1e-6 * step_us)
         time_s = 1e-6 * step_us * np.arange(1, num + 1, dtype=np.float64)
         force = trace.friction_n[:, 0].numpy()
         friction.append(np.abs(force - element.truth(time_s)[0]).max() / element.static_n)
-        arm = element.drive.speed_m_s(torch.from_numpy(time_s))[:, 0].numpy()
+        arm = element.slide.drive(time_s)[0][:, 0]
         onsets.append(abs(onset(time_s, trace.slip_m_s[:, 0].numpy(), arm) - element.onset_s))
     return {
         "rung": rung,
@@ -135,21 +128,18 @@ def kinematic_errors(found: list[Element]) -> dict[str, Any]:
     friction, onsets = [], []
     for element in found:
         scene = replace(element.scene, fidelity="kinematic")
-        rate_hz, plan = scene.sample_rate_hz, (element.stroke,)
-        model: Any = scene_contact(scene, element.grasp, plan)
+        rate_hz, first = scene.sample_rate_hz, element.slide.first
+        contact = KinematicContact(scene, element.grasp)
         lane = int(element.grasp.touching[0])
-        size, first = block_samples_for(rate_hz), int(np.floor(element.stroke.start_s * rate_hz))
-        num = int(element.until_s * rate_hz)
+        size, num = block_samples_for(rate_hz), int(element.until_s * rate_hz)
         grid = Grid(np.arange(first // size, (first + num) // size + 1), size, rate_hz)
         time_s = grid.time_s.ravel() - first / rate_hz
         inside = (time_s > 0) & (time_s <= element.until_s)
-        share = shear_share(
-            element.grasp, model.slips, Motion(plan, grid), lane, scene.contact.recoil_s
-        )
-        load = element.drive(torch.from_numpy(time_s[inside]))[1][:, 0].numpy()
+        share = contact.shear_share(lane, Motion(scene.slides, grid))
+        load = element.slide.drive(time_s[inside])[1][:, 0]
         force = element.grasp.surface.mu_s * load * share.ravel()[inside]
         friction.append(np.abs(force - element.truth(time_s[inside])[0]).max() / element.static_n)
-        onset_s = model.slips.start_s[0, lane] - first / rate_hz
+        onset_s = contact.slips.start_s[0, lane] - first / rate_hz
         onsets.append(abs(onset_s - element.onset_s))
     return {
         "rung": "kinematic",

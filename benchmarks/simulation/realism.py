@@ -26,7 +26,7 @@ import tactslip_torch
 from benchmarks.machine import machine_facts, versions
 from benchmarks.outcome import RESULTS, keep_numbers, refuse_paths
 from benchmarks.tables import Table
-from tactslip_torch.config import conf_dir, errors_in_one_line
+from tactslip_torch.commands.entry import conf_dir, errors_in_one_line
 from tactslip_torch.data.recording import RecordingSource, Timeline
 from tactslip_torch.features.cache import source_digest
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+from tactslip_torch.simulation import Scene, paper_scenes
 
 
 @dataclass(frozen=True)
@@ -60,3 +63,22 @@ QUICK = Sizes(
     accuracy_steps_us=(500.0,),
     whole_cycles=0,
 )
+
+
+NUM_BRISTLES = {"lugre": 1, "patch": 24}
+"""Of the rungs that integrate bristles."""
+
+
+def parameters_of(rung: str) -> dict[str, Any]:
+    """What makes a scene one of a rung, as ``paper_scenes`` takes it."""
+    if rung == "kinematic":
+        return {"fidelity": rung}
+    return {"fidelity": "bristles", "num_bristles": NUM_BRISTLES[rung]}
+
+
+def scene_on(rung: str, material: str, seed: int = 0, **others: Any) -> Scene:
+    """The first scene of a material on a rung."""
+    (scene,) = paper_scenes(
+        seed=seed, cycles=1, materials=[material], **parameters_of(rung), **others
+    )
+    return scene

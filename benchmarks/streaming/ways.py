@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decider import Decider, Decisions
-from tactslip_torch.onset.sequential import Cusum
+from tactslip_torch.onset.decisions import Decider, Decisions
+from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.simulation.source import SimulatedRecordings

@@ -70,7 +70,7 @@ def _bulk_calls(timed: Timed, sizes: Sizes, threads: int) -> tuple[Calls, dict[s
 
 
 def _exported(timed: Timed, samples: Tensor, threads: int) -> Callable[[], object]:
-    judge = session(timed, threads, "bulk")
+    judge = session(timed, threads)
     chunks = [judge.cut(chunk) for chunk in samples.split(_ONNX_CHUNK)]
     return lambda: [judge.run(chunk) for chunk in chunks]
 

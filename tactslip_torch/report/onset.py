@@ -24,7 +24,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.style import (
     ALARM,
     BLUE,
@@ -38,6 +37,7 @@ from tactslip_torch.report.style import (
     save,
     table,
 )
+from tactslip_torch.runtime import whole_file
 
 Array = NDArray[np.float64]
 Points = tuple[Array, Array]

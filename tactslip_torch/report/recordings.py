@@ -23,7 +23,6 @@ from matplotlib.patches import Patch
 from PIL import Image
 from torch import Tensor
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.onset import Array, Segments, envelope, lane_height
 from tactslip_torch.report.style import (
     BLUE,
@@ -41,6 +40,7 @@ from tactslip_torch.report.style import (
     stack,
     table,
 )
+from tactslip_torch.runtime import whole_file
 
 Channels = Sequence[Mapping[str, str]]
 """Rows of ``name``, ``kind``, ``finger``, ``segment``, ``adapting`` where the kind does not say it,

@@ -20,7 +20,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report import published
 from tactslip_torch.report.metrics import CLASSES, covered_shares
 from tactslip_torch.report.style import (
@@ -50,6 +49,7 @@ from tactslip_torch.report.style import (
     table,
     words,
 )
+from tactslip_torch.runtime import whole_file
 
 PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
 PAPER_SCENE_LINE = "of several scenes: materials and speeds are of the paper's scene alone"
@@ -59,7 +59,7 @@ BASELINES = {
     "logistic_regression_simple": "logistic regression on mean, std, rms",
     "random_forest_simple": "random forest on mean, std, rms",
 }
-"""What baselines (``tactslip_torch.baselines``) are called in tables."""
+"""What baselines (``tactslip_torch.training.baselines``) are called in tables."""
 _SCORES = {
     "accuracy": "accuracy %",
     "balanced_accuracy": "balanced %",
@@ -580,8 +580,8 @@ def _structure(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 HELD_NOTE = (
-    "held-out: mean log loss (nats) and balanced accuracy of each training group under C, c, "
-    "scales and filters that were chosen without it; ranking, ranges, K and, by way of the other "
+    "held-out: mean log loss (nats) and balanced accuracy of each training group under C, c "
+    "and scales that were chosen without it; ranking, ranges, K and, by way of the other "
     "groups' descents, the number of steps have seen it. The detectors behind the other columns "
     "choose by all groups, the first on more bins"
 )

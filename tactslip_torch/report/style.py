@@ -14,7 +14,7 @@ from typing import Any, Literal
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 SIMULATED_LINE = "SIMULATED data: numbers of a simulated hand, not of the paper's"
 
