@@ -18,9 +18,14 @@ from typing import Any
 from benchmarks.crossval import markdown
 from benchmarks.outcome import RESULTS, ROOT, between_markers
 from tactslip_torch.features.cache import source_digest
-from tactslip_torch.report.alarm import alarm_figure, kept_rows, promise_line, scene_rows
-from tactslip_torch.report.events import events_figure
-from tactslip_torch.report.reliability import reliability_figure
+from tactslip_torch.report.results import (
+    alarm_figure,
+    events_figure,
+    kept_rows,
+    promise_line,
+    reliability_figure,
+    scene_rows,
+)
 from tactslip_torch.runtime import whole_file
 
 COMMAND = "python -m benchmarks.alarms"

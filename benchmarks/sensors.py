@@ -19,17 +19,17 @@ from typing import Any
 from benchmarks.machine import machine_facts, versions
 from benchmarks.outcome import add_paths, heading, keep_by_default, refuse_paths, told
 from benchmarks.tables import Table
-from tactslip_torch.report.hand_figure import sensors_figure
-from tactslip_torch.report.sensors import (
-    ANEW_WORDS,
+from tactslip_torch.report.importance import (
     BEST_LINE,
+    RESELECT_WORDS,
     best_rows,
     lines_about,
+    sensors_figure,
     unit_rows,
     with_all_line,
 )
 
-SECTIONS = tuple(ANEW_WORDS)
+SECTIONS = tuple(RESELECT_WORDS)
 _COMMAND = [sys.executable, "-m"]
 
 
@@ -76,11 +76,11 @@ def tables(report: Mapping[str, Any]) -> dict[str, list[Table]]:
     for name, content in report["sections"].items():
         rows = {unit: unit_rows(content, unit) for unit in content["best"]}
         notes = dict.fromkeys(rows, "") | {"kind": "; ".join([*lines_about(content)])}
-        found[f"One by one, features anew {ANEW_WORDS[name]}"] = [
+        found[f"One by one, features anew {RESELECT_WORDS[name]}"] = [
             Table(cells[0], cells[1:], notes.get(unit, "")) for unit, cells in rows.items()
         ]
         rows = {unit: best_rows(content, unit) for unit in content["best"]}
-        found[f"The best few, features {ANEW_WORDS[name]}"] = [
+        found[f"The best few, features {RESELECT_WORDS[name]}"] = [
             Table(cells[0], cells[1:], with_all_line(content) if unit == "kind" else "")
             for unit, cells in rows.items()
         ]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from statistics import median, quantiles
 from typing import Any, NamedTuple
 
-from tactslip_torch.report.tables import aligned
+from tactslip_torch.report.style import table
 
 
 class Table(NamedTuple):
@@ -24,7 +24,7 @@ class Table(NamedTuple):
 
     def text(self) -> str:
         """Aligned columns."""
-        return "\n".join(filter(None, [aligned(self.header, self.rows), self.note]))
+        return "\n".join(filter(None, [table([self.header, *self.rows]), self.note]))
 
     def markdown(self) -> str:
         """A table of Markdown, numbers to the right."""

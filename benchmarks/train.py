@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.machine import machine_facts
 from benchmarks.outcome import refuse_paths
-from tactslip_torch.report.tables import SIMULATED_LINE
+from tactslip_torch.report.style import SIMULATED_LINE
 from tactslip_torch.runtime import whole_file
 
 try:

@@ -20,7 +20,7 @@ from benchmarks.machine import machine_facts, versions
 from benchmarks.outcome import add_paths, heading, keep_by_default, refuse_paths, told
 from benchmarks.reproduction.runs import run
 from benchmarks.tables import Table, limits
-from tactslip_torch.report.tuning import HELD_NOTE, WAYS, held_mean, tuning_figure
+from tactslip_torch.report.results import HELD_NOTE, WAYS, held_mean, tuning_figure
 
 LEARNED = {
     "C and c": "[penalty,offset]",

@@ -28,7 +28,7 @@ from tactslip_torch.onset.decisions import Decider
 from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.report.alarm import alarm_figure, alarm_table, scenes_table
+from tactslip_torch.report.results import alarm_figure, alarm_table, scenes_table
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.alarm import (
     FIRST_TRANSITION,

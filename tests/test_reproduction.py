@@ -181,7 +181,7 @@ def test_recall_beside_the_onset_is_of_all_bins_of_a_place_together():
 
 
 def test_the_places_are_all_that_runs_count():
-    from tactslip_torch.report.scores import POSITIONS
+    from tactslip_torch.report.metrics import POSITIONS
 
     ours = [place for places in beyond.PLACES.values() for place in places]
     assert ours == [place for place in POSITIONS if not place.startswith("<")]
@@ -611,7 +611,7 @@ def test_configuration_and_calibrated_knobs_are_part_of_the_code(tmp_path, monke
 
 
 def test_scores_are_those_of_the_metrics(tmp_path):
-    from tactslip_torch.report.scores import split_metrics
+    from tactslip_torch.report.metrics import split_metrics
 
     scores = split_metrics([[90, 10], [5, 45]])
     places = {"-1": {"recall": 0.5, "num_right": 3, "num_bins": 6}}

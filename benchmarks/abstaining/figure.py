@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from benchmarks.abstaining.report import mean_of
 from benchmarks.abstaining.ways import WAYS
 from benchmarks.drawing import GREY, LIGHT, OURS, PEER, SECOND, THIRD, finish
-from tactslip_torch.report.answers import CLASSES
+from tactslip_torch.report.metrics import CLASSES
 
 STYLES = dict(
     zip(WAYS, ((OURS, "o-"), (THIRD, "s-"), (PEER, "^--"), (SECOND, "v--")), strict=False)

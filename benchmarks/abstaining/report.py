@@ -10,7 +10,7 @@ from benchmarks.abstaining.splits import ROLES
 from benchmarks.abstaining.ways import WAYS
 from benchmarks.outcome import heading
 from benchmarks.tables import Table, limits, limits_last
-from tactslip_torch.report.answers import CLASSES
+from tactslip_torch.report.metrics import CLASSES
 
 SECTIONS = ("answers",)
 OURS = next(iter(WAYS))

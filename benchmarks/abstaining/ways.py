@@ -11,7 +11,7 @@ import torch
 from benchmarks.abstaining.splits import ROLES, Scored, SplitScores
 from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.conformal import answers, thresholds
-from tactslip_torch.report.answers import answer_counts, answer_metrics
+from tactslip_torch.report.metrics import answer_counts, answer_metrics
 
 Ends = tuple[float, float]
 """Below the first non-slip, from the second on slip."""

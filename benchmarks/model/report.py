@@ -7,7 +7,7 @@ from statistics import median
 from typing import Any
 
 from benchmarks.outcome import limits_table
-from tactslip_torch.report.tables import aligned
+from tactslip_torch.report.style import table
 
 SYNTHETIC_LINE = "SYNTHETIC features: what the machine costs, nothing about a hand"
 QUICK_LINE = "QUICK: sizes too small to mean anything, whatever stands under limits"
@@ -179,7 +179,7 @@ def _size_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
         for key, name in (("svc_over_head", "SVC / head"), ("sum_over_head", "largest sum / head"))
         for num in nums
     ]
-    return f"{aligned(header, rows)}\nhead and sum in float32, one thread; {', '.join(compared)}"
+    return f"{table([header, *rows])}\nhead and sum in float32, one thread; {', '.join(compared)}"
 
 
 def _accumulation_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
@@ -193,7 +193,7 @@ def _accumulation_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> st
         shares = of["update"][str(row["batch_bins"])].values()
         cells = [*(f"{value:.3f}" for value in each), *(f"{share:.2f}" for share in shares)]
         rows.append([f"batches of {row['batch_bins']}", *cells])
-    return f"{aligned(header, rows)}\ndsyrk and gemm of monomials that exist already, float64"
+    return f"{table([header, *rows])}\ndsyrk and gemm of monomials that exist already, float64"
 
 
 def _fit_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
@@ -209,7 +209,7 @@ def _fit_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
     ]
     title = f"fit of {numbers['num_bins']} bins"
     header = [title, "s", "/ KernelRidge", "accuracy %", "scores - KernelRidge"]
-    return f"{aligned(header, rows)}\naccuracy on {numbers['test_bins']} held-out bins"
+    return f"{table([header, *rows])}\naccuracy on {numbers['test_bins']} held-out bins"
 
 
 def _folds_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
@@ -221,7 +221,7 @@ def _folds_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
         seconds = [f"{median(row[f'{name}_s']):.2f}" for name in ("fit", "closed", "refits")]
         over = [f"{value:.2f}" for value in of["folds"][str(row["num_bins"])].values()]
         rows.append([f"{row['num_bins']} bins", *seconds, *over, f"{row['difference']:.1e}"])
-    return f"{aligned(header, rows)}\n/ refits: fit and folds in closed form / fit and refits"
+    return f"{table([header, *rows])}\n/ refits: fit and folds in closed form / fit and refits"
 
 
 def _any_size_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
@@ -230,7 +230,7 @@ def _any_size_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
     seconds = [f"{numbers[f'{name}_s']:.2f}" for name in ("generate", "accumulate", "solve")]
     memory = [f"{numbers[f'{name}_bytes'] / 1e9:.2f}" for name in ("peak", "resident")]
     row = [f"{numbers['num_bins']} bins", *seconds, *memory, f"{100 * numbers['accuracy']:.2f}"]
-    return aligned(header, [row])
+    return table([header, row])
 
 
 def _workers_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
@@ -244,7 +244,7 @@ def _workers_table(numbers: Mapping[str, Any], of: Mapping[str, Any]) -> str:
         seconds = [f"{row[name]:.2f}" for name in ("collect_s", "merge_s")]
         rows.append([str(row["processes"]), str(row["shards"]), *seconds, *same])
     note = f"{numbers['num_bins']} bins in batches of {numbers['batch_bins']}, merged in any order"
-    return f"{aligned(header, rows)}\n{note}; bits beside those of the first row"
+    return f"{table([header, *rows])}\n{note}; bits beside those of the first row"
 
 
 _TABLES = {

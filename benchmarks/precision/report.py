@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks.clocks import paired_ratio
 from benchmarks.machine import threads_text
 from benchmarks.outcome import limits_table
-from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.report.style import SIMULATED_LINE, table
 
 QUICK_LINE = "QUICK: too few bins and rounds to mean anything, whatever stands under limits"
 MOST_ERROR = 1e-3  # of float32, in standard deviations of the score, as the project has set itself
@@ -87,7 +87,7 @@ def _variants(report: Mapping[str, Any]) -> str:
         rows.append(cells)
     notes = ["errors of scores beside float64, in standard deviations of the score"]
     notes += [f"{row['name']}: {row['refused']}" for row in report["variants"] if row["refused"]]
-    return "\n".join([aligned(header, rows), *notes])
+    return "\n".join([table([header, *rows]), *notes])
 
 
 def _solves(solves: Sequence[Mapping[str, Any]]) -> str:
@@ -99,7 +99,7 @@ def _solves(solves: Sequence[Mapping[str, Any]]) -> str:
         rows.append([*cells, NONE if row["flipped"] is None else str(row["flipped"])])
     notes = [f"{row['name']}: {row['refused']}" for row in solves if row["refused"]]
     note = "errors of the solve alone: one set of float32 features, scored in float64"
-    return "\n".join([aligned(header, rows), note, *notes])
+    return "\n".join([table([header, *rows]), note, *notes])
 
 
 def _us(seconds: Sequence[float]) -> str:

@@ -20,7 +20,7 @@ from benchmarks.reproduction.results import (
     text,
 )
 from benchmarks.tables import Table
-from tactslip_torch.report.tables import BASELINES
+from tactslip_torch.report.results import BASELINES
 
 PLACES: Mapping[str, Sequence[str]] = {
     "-20 to -11": [str(place) for place in range(-20, -10)],

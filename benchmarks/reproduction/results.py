@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from tactslip_torch.report.scores import split_metrics, summed_metrics
+from tactslip_torch.report.metrics import split_metrics, summed_metrics
 
 Report = Mapping[str, Any]
 SCORES = {
