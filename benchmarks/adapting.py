@@ -31,16 +31,18 @@ from benchmarks.harness import (
     timed,
 )
 from benchmarks.subjects import FittedMachine, Trained
-from tactslip_torch.adapting.acceptance import mean_recall
-from tactslip_torch.adapting.bins import RecordingBins
-from tactslip_torch.adapting.held_out import Solved, solve
-from tactslip_torch.adapting.reading import recording_bins
-from tactslip_torch.adapting.statistics import Statistics, statistics_of
-from tactslip_torch.adapting.steps import FACTORS, add
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.detector_file import Head
-from tactslip_torch.progress import bar
+from tactslip_torch.training.adaptation import (
+    FACTORS,
+    Solved,
+    add,
+    mean_recall,
+    recording_bins,
+    solve,
+)
+from tactslip_torch.training.statistics import RecordingBins, Statistics, statistics_of
 
 AUTO, SLIP_FREE, ONE, SHIFT, CEILING = "auto", "slip-free", "weight 1", "threshold", "ceiling"
 BinsByName = dict[str, RecordingBins]
@@ -109,7 +111,7 @@ class Adapting(Benchmark[Sizes]):
         overrides = [*sizes.training, *job.overrides, "statistics=true"]
         trained = Trained.by(overrides, job.folder, job.folder / "cache")
         statistics = statistics_of(job.folder / "detector.pt", trained.detector)
-        bins = recording_bins(trained.detector, trained.maker, bar)
+        bins = recording_bins(trained.detector, trained.maker)
         subject = _Subject(trained, statistics, solve(statistics), bins)
         old = [subject.of(trained.recordings("test", m)) for m in trained.materials("test")]
         rows: list[dict[str, Any]] = []

@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks.harness import Table, say, write_text
 from benchmarks.reproduction.runs import code_digest
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 
 def result_of(module: str, overrides: Sequence[str], folder: Path, name: str) -> dict[str, Any]:

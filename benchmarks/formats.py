@@ -34,9 +34,7 @@ from benchmarks.harness import (
     say,
 )
 from benchmarks.subjects import Array
-from tactslip_torch.data.formats.header import Archived
-from tactslip_torch.data.formats.reading import pieces
-from tactslip_torch.data.formats.registry import FORMATS
+from tactslip_torch.data.formats import FORMATS, Archived, pieces
 from tactslip_torch.simulation.source import SimulatedRecordings
 
 LOAD, STRETCHES, SAVE, LIBRARY = "loaded whole", "read by stretches", "written", "by its library"

@@ -32,18 +32,16 @@ from torch import Tensor
 from benchmarks import RESULTS, ROOT
 from benchmarks.harness import between_markers
 from benchmarks.reproduction.runs import code_digest, run
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split, unseen4
-from tactslip_torch.datamodule import SlipDataModule
-from tactslip_torch.experiment import feature_cache, feature_parts
-from tactslip_torch.feature_maker import FeatureMaker, RecordingFeatures
 from tactslip_torch.features.bin_sample import bin_keys
-from tactslip_torch.files import whole_file
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import calibration_of
-from tactslip_torch.progress import bar
 from tactslip_torch.report.tables import BASELINES, splits_table
+from tactslip_torch.runtime import bar, whole_file
+from tactslip_torch.training.datamodule import FeatureMaker, RecordingFeatures, SlipDataModule
+from tactslip_torch.training.experiment import feature_cache, feature_parts
 
 COMMAND = "python -m benchmarks.generalisation"
 PAGE = ROOT / "docs" / "generalisation.md"

@@ -36,8 +36,8 @@ from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[imp
 
 from benchmarks import RESULTS, ROOT
 from benchmarks.reproduction.runs import code_digest
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import aligned
+from tactslip_torch.runtime import whole_file
 
 QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130

@@ -38,11 +38,11 @@ from benchmarks.peers.others import mini_rocket_ridge
 from benchmarks.reproduction.runs import run
 from benchmarks.subjects import Array, Trained, composed
 from tactslip_torch import AlarmSettings, FeaturePool, Judgement, SlipDetector, StreamingDetector
-from tactslip_torch.alarming.stage import Alarming
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.onset.baselines import BaselineDetector
-from tactslip_torch.onset.scoring import Scorer
+from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.alarm import CalibratedAlarm
 
 ROCKET = "MiniRocket and ridge"
 BASELINES: Mapping[str, Any] = {
@@ -209,7 +209,7 @@ class Onset(Benchmark[Sizes]):
 _DELAYS = ("median", "p95")
 
 
-def _stage(overrides: list[str], hop_ms: float, sizes: Sizes) -> Alarming:
+def _stage(overrides: list[str], hop_ms: float, sizes: Sizes) -> CalibratedAlarm:
     """The stage behind ``+exp=onset``: the protocol and its quiet alone, and the main rule."""
     onset: Any = OmegaConf.to_container(composed("train", overrides).onset, resolve=True)
     quiet, main = onset["slip_free"], onset["rule"]
@@ -220,11 +220,11 @@ def _stage(overrides: list[str], hop_ms: float, sizes: Sizes) -> Alarming:
         "false_alarms_per_hour": sizes.per_hour,
         "hop_ms": hop_ms,
     }
-    stage: Alarming = instantiate(onset, _convert_="all")
+    stage: CalibratedAlarm = instantiate(onset, _convert_="all")
     return stage
 
 
-def _protocol_samples(stage: Alarming) -> Tensor:
+def _protocol_samples(stage: CalibratedAlarm) -> Tensor:
     recording = next(one for one in stage.streams.ids if one.scene == PAPER_SCENE)
     return stage.streams.load(recording).samples.T.contiguous()
 

@@ -28,13 +28,13 @@ from benchmarks.generalisation import SCENE_WEIGHTS, config_of, recordings
 from benchmarks.reproduction.runs import code_digest
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import PAPER_SCENE, Split
-from tactslip_torch.experiment import feature_parts
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.files import whole_file
-from tactslip_torch.fitting import LinearSums
-from tactslip_torch.model_selection import candidates, fitted_frame
-from tactslip_torch.recipe import Recipe, sample_groups, stand_for
+from tactslip_torch.runtime import whole_file
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.fitting import LinearSums
+from tactslip_torch.training.recipe import Recipe, sample_groups, stand_for
+from tactslip_torch.training.selection import candidates, fitted_frame
 
 WEIGHTS = {
     "arm_motion": (0.3, 1.0, 3.0, 10.0),

@@ -21,13 +21,11 @@ from benchmarks.harness import say
 from benchmarks.reproduction.runs import run
 from benchmarks.selection import kept_selection
 from tactslip_torch import AlarmSettings, FeaturePool, HandLayout, SlipDetector
-from tactslip_torch.config import conf_dir
-from tactslip_torch.crossval import Materials
+from tactslip_torch.commands.crossval import Materials
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split, seen6
-from tactslip_torch.experiment import feature_parts
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.extractor import EngineName, FeatureExtractor
 from tactslip_torch.features.survey import Survey
@@ -36,12 +34,14 @@ from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import Polynomial, kernel_from_dict
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.onset.sequential import Cusum
+from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY
-from tactslip_torch.planning import plan_detector
-from tactslip_torch.recipe import Recipe, stand_for
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.recipe import Recipe, stand_for
+from tactslip_torch.training.selection import plan_detector
 
 Array = NDArray[Any]
 WINDOW_LENGTHS = (51,) * 14 + (11,) * 10

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
-from typing import TypeVar
 
+import numpy as np
+import pywt
 import torch
 
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.experiment import frame_lengths
 from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
@@ -17,16 +17,30 @@ from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.onset.sequential import Cusum
+from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY, AlarmSettings
-from tactslip_torch.recipe import Recipe
-from tactslip_torch.signals.filter_bank import WaveletFilters
 from tactslip_torch.signals.filtering import Align, ChannelFilter
-from tactslip_torch.signals.learnable import LearnableSmoothing
-from tactslip_torch.signals.lifting import LiftedWavelet
-from tactslip_torch.signals.wavelet import highest_level
+from tactslip_torch.signals.wavelet import WaveletFilters, highest_level
+from tactslip_torch.training.experiment import frame_lengths
+from tactslip_torch.training.recipe import Recipe
 
-Module = TypeVar("Module", LiftedWavelet, LearnableSmoothing)
+
+def own_wavelet() -> WaveletFilters:
+    """Filters that no name stands for."""
+    low, high, low_back, high_back = map(np.array, pywt.Wavelet("bior2.2").filter_bank)
+    return WaveletFilters("own", 1.25 * low, 1.25 * high, low_back / 1.25, high_back / 1.25)
+
+
+def own_kernels(channel_filter: ChannelFilter, seed: int = 7) -> dict[int, tuple[float, ...]]:
+    """Kernels near those of a filter, which sum to 1 and, if it is centred, are symmetric."""
+    generator = torch.Generator().manual_seed(seed)
+    kernels = {}
+    for length in {own for own in channel_filter.window_lengths if own > 1}:
+        kernel = channel_filter.kernel(channel_filter.window_lengths.index(length))
+        noise = torch.randn(length, generator=generator, dtype=torch.float64) / length
+        kernel = kernel + (noise if channel_filter.align == "causal" else noise + noise.flip(0))
+        kernels[length] = tuple((kernel / kernel.sum()).tolist())
+    return kernels
 
 
 @dataclass(frozen=True)
@@ -46,8 +60,7 @@ class AnyHand:
         offset: that it stands on.
         num_features: to select.
         polyorder: of the filter.
-        learned: how far wavelet and kernels of the filter are away from where learning starts, 0
-            for those themselves.
+        has_own_filters: whether wavelet and kernels of the filter are numbers of its own.
     """
 
     channels: dict[tuple[str, str], int]
@@ -62,7 +75,7 @@ class AnyHand:
     offset: float = 0.0
     num_features: int = 12
     polyorder: int = 1
-    learned: float = 0.0
+    has_own_filters: bool = False
 
     def layout(self) -> HandLayout:
         """The channels, kinds by turns."""
@@ -76,8 +89,8 @@ class AnyHand:
     def pool(self) -> FeaturePool:
         highest = min(4, highest_level(self.bin_samples, self.wavelet))
         wavelet: str | WaveletFilters = self.wavelet
-        if self.learned:
-            wavelet = self.moved(LiftedWavelet(self.wavelet)).frozen()
+        if self.has_own_filters:
+            wavelet = own_wavelet()
         return FeaturePool(
             self.layout(),
             self.rate_hz,
@@ -89,19 +102,9 @@ class AnyHand:
     def channel_filter(self) -> ChannelFilter:
         lengths = frame_lengths(self.layout(), self.frames)
         layer = ChannelFilter(lengths, self.polyorder, self.align)
-        if self.learned:
-            kernels = self.moved(LearnableSmoothing(layer)).frozen()
-            layer = ChannelFilter(lengths, self.polyorder, self.align, kernels)
+        if self.has_own_filters:
+            layer = ChannelFilter(lengths, self.polyorder, self.align, own_kernels(layer))
         return layer
-
-    def moved(self, module: Module) -> Module:
-        """With parameters that someone might have learned."""
-        generator = torch.Generator().manual_seed(7)
-        with torch.no_grad():
-            for parameter in module.parameters():
-                noise = torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)
-                parameter.copy_(self.learned * noise)
-        return module
 
     def noise(self, num: int, num_samples: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Raw bins, every other one slip, louder and smoother: ``[N, C, T]`` and ``[N]``."""
@@ -139,7 +142,7 @@ HANDS = {
     "one of 120 features by haar": AnyHand(
         {("electrode", "fast"): 1}, 2000.0, 100, 50, {"electrode": 11}, "haar", num_features=120
     ),
-    "learned filters": AnyHand(
+    "own filters": AnyHand(
         {("PVDF", "fast"): 2, ("SG", "slow"): 2},
         2000.0,
         100,
@@ -147,9 +150,9 @@ HANDS = {
         {"PVDF": 11, "SG": 51},
         offset=1.0,
         num_features=40,
-        learned=0.1,
+        has_own_filters=True,
     ),
-    "learned filters, causal": AnyHand(
+    "own filters, causal": AnyHand(
         {("PVDF", "fast"): 2, ("SG", "slow"): 1},
         2000.0,
         100,
@@ -157,7 +160,7 @@ HANDS = {
         {"PVDF": 11, "SG": 25},
         "bior2.2",
         align="causal",
-        learned=0.1,
+        has_own_filters=True,
     ),
     "64 unfiltered": AnyHand(
         {("barometer", "fast"): 64}, 92.0, 41, 20, {"barometer": None}, "sym4", align="trailing"

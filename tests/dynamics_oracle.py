@@ -1,4 +1,4 @@
-"""The dynamic rung's equations in plain NumPy, for SciPy's Radau, and elements to test with.
+"""The equations of skin and bristles in plain NumPy, for SciPy's Radau, and elements to test with.
 
 Written from PHYSICS.md and the model's definition; nothing of the scheme is used.
 """
@@ -12,7 +12,17 @@ import numpy as np
 import torch
 from scipy.integrate import solve_ivp
 
-from tactslip_torch.simulation.dynamics import Lanes
+from tactslip_torch.simulation.bristles import (
+    EngineName,
+    Lanes,
+    LaneState,
+    Trace,
+    integrate,
+    stage_times_s,
+)
+
+Drive = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+"""From times in s to the arm's speeds and loads."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +97,7 @@ def ramped(arm_m_s: float) -> Callable[[float], float]:
     return lambda t: arm_m_s * min(max((t - 0.002) / 0.02, 0.0), 1.0)
 
 
-def driven(
-    arm: Callable[[float], float], load: Callable[[float], float]
-) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
+def driven(arm: Callable[[float], float], load: Callable[[float], float]) -> Drive:
     """The same drive for lanes ``[L]``, all alike."""
 
     def drive(times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -99,3 +107,18 @@ def driven(
         return columns[:, :1], columns[:, 1:]
 
     return drive
+
+
+def carry(
+    lanes: Lanes,
+    state: LaneState,
+    drive: Drive,
+    num_steps: int,
+    step_s: float,
+    every: int = 1,
+    first_step: int = 0,
+    engine: EngineName = "auto",
+) -> tuple[Trace, LaneState]:
+    """``integrate`` under a drive that is a function of time."""
+    arm, load = drive(stage_times_s(num_steps, step_s, first_step))
+    return integrate(lanes, state, arm, load, step_s, every, engine)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from tactslip_torch import HandLayout, Recording
-from tactslip_torch.data.formats.registry import FORMATS
+from tactslip_torch.data.formats import FORMATS
 
 Writer = Callable[[Path], None]
 SAMPLES = np.random.default_rng(3).standard_normal((40, 3))

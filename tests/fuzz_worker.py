@@ -16,9 +16,8 @@ from pathlib import Path
 
 import torch
 
-from tactslip_torch.data.formats.reading import pieces
-from tactslip_torch.data.formats.registry import FORMATS
-from tactslip_torch.data.sets.manifest import read_manifest
+from tactslip_torch.data.formats import FORMATS, pieces
+from tactslip_torch.data.manifest import read_manifest
 
 MOST_PIECES = 40
 

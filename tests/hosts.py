@@ -18,8 +18,8 @@ from test_detector import random_detector
 
 from tactslip_torch import Scene, SlipDetector, simulate
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.onset.scoring import score_stream
-from tactslip_torch.onset.sequential import Cusum
+from tactslip_torch.onset.decisions import score_stream
+from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 
@@ -87,7 +87,7 @@ def exported(folder_factory: Any, precision: str = "float32") -> Path:
         folder_factory: pytest's ``tmp_path_factory``.
         precision: of the graphs.
     """
-    from tactslip_torch.export import export_detector
+    from tactslip_torch.graph.export import export_detector
 
     if precision not in _EXPORTED:
         folder: Path = folder_factory.mktemp(f"exported_{precision}")

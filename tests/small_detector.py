@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from tactslip_torch.certificate import certify
+from tactslip_torch.analysis.certificate import certify
 from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.graph.trials import simulated_stream
@@ -14,8 +14,8 @@ from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.onset.scoring import score_stream
-from tactslip_torch.onset.sequential import Cusum
+from tactslip_torch.onset.decisions import score_stream
+from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.signals.filtering import ChannelFilter
 

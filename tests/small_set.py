@@ -12,12 +12,12 @@ import torch
 
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.recipe import Recipe
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.recipe import Recipe
 
 SMALL_HAND = HandLayout(
     (Channel("SG1", "SG", "index", "distal"), Channel("PVDF1", "PVDF", "index", "distal"))

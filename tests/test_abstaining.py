@@ -11,7 +11,6 @@ import torch
 from small_detector import small_detector
 from small_set import SMALL_HAND
 
-from tactslip_torch.abstaining import Abstaining, abstention, groups_of, held_out_scores
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.abstention import KEY, Abstention, abstention_of
@@ -19,12 +18,12 @@ from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.conformal import thresholds
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.onset.answering import answer_of
-from tactslip_torch.onset.decider import Decider, Decisions
-from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.onset.decisions import Decider, Decisions, answer_of
+from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import AlarmSettings
-from tactslip_torch.planning import Plan, plan_detector
-from tactslip_torch.recipe import Recipe, stand_for
+from tactslip_torch.training.abstention import Abstaining, abstention, groups_of, held_out_scores
+from tactslip_torch.training.recipe import Recipe, stand_for
+from tactslip_torch.training.selection import Plan, plan_detector
 
 NUM_FEATURES = len(FeaturePool(SMALL_HAND).names)
 

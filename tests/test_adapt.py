@@ -14,22 +14,19 @@ from PIL import Image
 from test_commands import TINY, TinyRecordings, composed
 
 from tactslip_torch import SlipDetector
-from tactslip_torch import adapt as module
-from tactslip_torch.adapt import adapt
-from tactslip_torch.adapting.acceptance import Verdict
-from tactslip_torch.adapting.held_out import class_scales
-from tactslip_torch.adapting.lock import locked
-from tactslip_torch.adapting.statistics import Statistics, detector_digest
-from tactslip_torch.adapting.steps import add
-from tactslip_torch.config import conf_dir, one_line
+from tactslip_torch.commands import adapt as module
+from tactslip_torch.commands.adapt import adapt
+from tactslip_torch.commands.entry import conf_dir, one_line
+from tactslip_torch.commands.train import train
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.conformal import answers, thresholds
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
-from tactslip_torch.train import train
+from tactslip_torch.training.adaptation import Verdict, _class_scales, add
+from tactslip_torch.training.statistics import Statistics, detector_digest, locked
 
 TRAINING = (*TINY, "recipe=robust", "data.seed=0", "statistics=true", "coverage=0.5", "cache=off")
 SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0)
@@ -88,9 +85,9 @@ def test_training_leaves_statistics_that_make_its_detector(trained):
     assert found.detector == detector_digest(detector)
     machine = found.machine
     head = found.sums.solve(machine.penalty, machine.offset, balance=machine.balance)
-    z = found.witnesses.z
+    z = found.rehearsal.z
     torch.testing.assert_close(head(z), detector.head(z), rtol=1e-9, atol=1e-12)
-    assert sorted(set(found.witnesses.materials)) == ["A", "B"]
+    assert sorted(set(found.rehearsal.materials)) == ["A", "B"]
 
 
 def test_a_material_comes_in_and_all_is_said(run, files, trained, capsys):
@@ -146,7 +143,7 @@ def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files,
     kept = SlipDetector.load(run / "detector.pt").info["abstain"]
     statistics = Statistics.load(run / "statistics.pt")
     known, machine = statistics.known(), statistics.machine
-    weights = class_scales(statistics.sums, machine)[known.is_slip.long()] * known.represents
+    weights = _class_scales(statistics.sums, machine)[known.is_slip.long()] * known.represents
     scores = torch.empty_like(weights)
     groups = known.recording if left_out == "recording" else known.material
     for group in groups.unique():
@@ -178,7 +175,7 @@ def test_what_is_forgotten_leaves_the_machine_it_came_to(run, files, trained):
     add_c(run, files, "weight=3")
     adapt(settings(run, "action=forget", "material=C"), run / "results")
     old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
-    z = Statistics.load(run / "statistics.pt").witnesses.z
+    z = Statistics.load(run / "statistics.pt").rehearsal.z
     torch.testing.assert_close(new.head(z), old.head(z), rtol=1e-9, atol=1e-12)
     assert new.info["train_materials"] == ["A", "B"]
 
@@ -306,7 +303,7 @@ def test_graphs_of_the_detector_before_are_told(run, files, capsys):
     before = content(run)[0]
     of(before)
     add_c(run, files, "weight=2")
-    told = "model.onnx beside it: of another detector; python -m tactslip_torch.export model="
+    told = "model.onnx beside it: of another detector; python -m tactslip_torch export model="
     assert told in capsys.readouterr().out
     adapt(settings(run, "action=undo"), run / "results")
     assert told not in capsys.readouterr().out
@@ -385,7 +382,7 @@ def test_training_refuses_statistics_that_it_cannot_leave(tmp_path, overrides, m
 
 
 def test_the_command_ends_with_status_2_and_one_line(run):
-    command = [sys.executable, "-m", "tactslip_torch.adapt", f"model={run / 'nothing.pt'}"]
+    command = [sys.executable, "-m", "tactslip_torch", "adapt", f"model={run / 'nothing.pt'}"]
     ended = subprocess.run(
         [*command, f"hydra.run.dir={run / 'results'}"], capture_output=True, text=True, check=False
     )

@@ -7,20 +7,37 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.adapting import steps
-from tactslip_torch.adapting.acceptance import OF_ONE, Verdict, accuracies, compared, mean_recall
-from tactslip_torch.adapting.bins import RecordingBins, Witnesses, known_bins
-from tactslip_torch.adapting.held_out import class_scales, solve
-from tactslip_torch.adapting.statistics import Machine, Statistics
-from tactslip_torch.adapting.steps import FACTORS, OF_MARGIN, add, forget, taken, undo
 from tactslip_torch.features.bin_sample import BinSample
-from tactslip_torch.fitting import training_part
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.sufficient import SufficientStats
-from tactslip_torch.planning import Plan
-from tactslip_torch.recipe import Frame
+from tactslip_torch.training import adaptation as steps
+from tactslip_torch.training.adaptation import (
+    _OF_MARGIN,
+    _OF_ONE,
+    FACTORS,
+    Verdict,
+    _class_scales,
+    accuracies,
+    add,
+    compared,
+    forget,
+    mean_recall,
+    solve,
+    taken,
+    undo,
+)
+from tactslip_torch.training.fitting import training_part
+from tactslip_torch.training.recipe import Frame
+from tactslip_torch.training.selection import Plan
+from tactslip_torch.training.statistics import (
+    Machine,
+    RecordingBins,
+    Rehearsal,
+    Statistics,
+    _known_bins,
+)
 
 K, NUM_BINS = 3, 24
 MACHINE = Machine(0.05, 0.5, "weights")
@@ -42,12 +59,12 @@ def recordings(material, number, first_seed, turn=0.0):
 
 
 def statistics(trained):
-    """Of recordings whose bins are all witnesses."""
+    """Of recordings whose bins are all rehearsal."""
     sums = SufficientStats(K)
     for name, own in trained.items():
         sums.update(name, own.z, own.is_slip)
     sizes = torch.tensor([len(own.z) for own in trained.values()])
-    witnesses = Witnesses(
+    rehearsal = Rehearsal(
         torch.cat([own.z for own in trained.values()]),
         torch.cat([own.is_slip for own in trained.values()]),
         torch.ones(int(sizes.sum()), dtype=torch.float64),
@@ -55,7 +72,7 @@ def statistics(trained):
         tuple(trained),
         tuple(own.material for own in trained.values()),
     )
-    return Statistics(sums, MACHINE, {"bin_ms": 50.0}, witnesses, "digest", {}, {})
+    return Statistics(sums, MACHINE, {"bin_ms": 50.0}, rehearsal, "digest", {}, {})
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +102,7 @@ def fitted(bins, weights, scales):
 
 def test_a_known_bin_scores_as_by_the_machine_refitted_without_its_recording(old, trained, new):
     after = old.reweighed(dict.fromkeys(new, 2.5), new)
-    solved, scales = solve(after), class_scales(after.sums, MACHINE)
+    solved, scales = solve(after), _class_scales(after.sums, MACHINE)
     everyone = trained | new
     for name in ("b/2", "new/1"):
         others = [own for other, own in everyone.items() if other != name]
@@ -97,7 +114,7 @@ def test_a_known_bin_scores_as_by_the_machine_refitted_without_its_recording(old
 
 def test_added_recordings_are_in_the_machine_with_their_weight(old, trained, new):
     after = old.reweighed(dict.fromkeys(new, 7.0), new)
-    scales = class_scales(after.sums, MACHINE)
+    scales = _class_scales(after.sums, MACHINE)
     bins, weights = [*trained.values(), *new.values()], [1.0] * len(trained) + [7.0] * len(new)
     z = recording("any", 5).z
     expected = fitted(bins, weights, scales)(z)
@@ -188,10 +205,10 @@ def test_auto_takes_the_largest_weight_that_old_materials_allow(old, new):
     found = add(old, before, new, None, margin=0.1)
     chosen = found.factor
     assert found.tried[chosen] == found.verdict.mean_fall
-    assert found.verdict.problem(OF_MARGIN * 0.1) is None
+    assert found.verdict.problem(_OF_MARGIN * 0.1) is None
     (next_larger,) = [f for f in FACTORS if f > chosen][:1]
     by_hand = add(old, before, new, found.weight * next_larger / chosen, margin=0.1)
-    assert by_hand.verdict.problem(OF_MARGIN * 0.1) is not None
+    assert by_hand.verdict.problem(_OF_MARGIN * 0.1) is not None
     assert found.weight * 3 * NUM_BINS == pytest.approx(chosen * 4 * NUM_BINS)
 
 
@@ -279,7 +296,7 @@ def test_a_verdict_names_what_falls():
     assert Verdict(same, same).problem(0.0) is None
     mean = Verdict(same, {"a": 0.88, "b": 0.8}).problem(0.005)
     assert mean.startswith("old materials fall from 85.00 to 84.00 %")
-    one = Verdict(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7}).problem(0.04 / OF_ONE)
+    one = Verdict(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7}).problem(0.04 / _OF_ONE)
     assert one.startswith("b falls from 80.00 to 75.00 %")
     assert Verdict(same, {"a": 0.88, "b": 0.8}).problem(0.0101) is None
     assert Verdict({}, {}).problem(0.0) is None
@@ -301,8 +318,8 @@ def test_mean_recall_is_balanced_accuracy_or_that_of_the_one_class():
 
 
 def test_witnesses_give_way_to_all_bins_of_a_recording_that_is_taken_out(old, trained, new):
-    known = known_bins(
-        old.witnesses, {"a/0": trained["a/0"]} | new, {"a/0": 0.0} | dict.fromkeys(new, 3.0)
+    known = _known_bins(
+        old.rehearsal, {"a/0": trained["a/0"]} | new, {"a/0": 0.0} | dict.fromkeys(new, 3.0)
     )
     assert not bool(known.of(["a/0"]).any())
     assert set(known.weight[known.of(new)].tolist()) == {3.0}
@@ -325,7 +342,7 @@ def test_witnesses_are_bins_that_were_trained_on_under_undersampling(rng):
         is_slip = torch.arange(40) % 2 == 0
         sample.update(name, "m", features, is_slip)
         kept[name] = training_part(plan, name, features, is_slip)[0]
-    found = Witnesses.of(plan, sample.bins(), {"m/0": "m", "m/1": "m"})
+    found = Rehearsal.of(plan, sample.bins(), {"m/0": "m", "m/1": "m"})
     for number, name in enumerate(found.recordings):
         rows = found.z[found.recording == number]
         in_training = (rows[:, None] == kept[name]).all(-1).any(-1)

@@ -14,17 +14,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_commands import composed
 
-from tactslip_torch.experiment import feature_parts
-from tactslip_torch.export import export_detector
+from tactslip_torch.commands.train import train
 from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.rounding import is_rounding
+from tactslip_torch.graph.export import export_detector
 from tactslip_torch.graph.form import Window
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.recipe import Recipe
-from tactslip_torch.train import train
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.recipe import Recipe
 
 any_hand = pytest.mark.parametrize("name", HANDS)
 

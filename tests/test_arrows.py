@@ -20,24 +20,13 @@ ARROWS = {
     "report": (),
 }
 """Importer: what it may import beside itself and ``runtime``; what is not named may import all."""
-PART = {
-    "runtime": ("config", "files", "ledger", "plain", "progress", "threads", "workers"),
-    "features": ("engines",),
-    "deploy": ("graph", "export"),
-    "training": ("abstaining", "adapting", "alarming", "baselines", "datamodule", "experiment",
-                 "facts", "feature_maker", "fitting", "fold_training", "folds", "judging",
-                 "learning", "model_selection", "pace", "planning", "ranks", "recipe", "tuning",
-                 "validation"),
-    "analysis": ("bracket", "certificate", "deadline", "importance"),
-}  # fmt: skip
+PART = {"runtime": ("ledger",), "deploy": ("graph",)}
 """Modules and folders that stand for a part until they are in its folder."""
 KNOWN = (
-    ("alarming.", "report."),
-    ("certificate", "simulation."),
-    ("data.sets.", "signals.resampling"),
-    ("export", "certify"),
+    ("analysis.certificate", "simulation."),
+    ("data.file_recordings", "signals.resampling"),
+    ("graph.export", "commands.certify"),
     ("graph.trials", "simulation."),
-    ("simulation.", "engines"),
 )
 """Importer and imported, by how they begin: arrows that are still to be turned."""
 

@@ -7,18 +7,17 @@ import pytest
 import torch
 from test_commands import composed
 
-from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.sets.authors_raw import (
+from tactslip_torch.commands.train import train
+from tactslip_torch.data.manifest import Truth, read_manifest
+from tactslip_torch.data.public_sets import (
     STEMS,
     authors_raw,
     better_told,
     named_files,
     nominal,
 )
-from tactslip_torch.data.sets.manifest import read_manifest
-from tactslip_torch.data.sets.truth import Truth
+from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.train import train
 
 PROTOCOL = nominal((20.0, 40.0, 60.0), 100.0, 2.0)
 SHORT = {"speeds_mm_s": [100.0, 200.0], "distance_mm": 100.0, "pause_s": 1.2}

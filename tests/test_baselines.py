@@ -10,7 +10,11 @@ from small_detector import HAND
 from small_set import SmallSet, small_maker
 from test_learning import learn, unseen_c
 
-from tactslip_torch.baselines import (
+from tactslip_torch.features.bin_sample import BinSample
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.training.baselines import (
     KEY,
     Baselines,
     LogisticRegression,
@@ -18,11 +22,7 @@ from tactslip_torch.baselines import (
     RandomForest,
     SimpleStatistics,
 )
-from tactslip_torch.datamodule import SlipDataModule
-from tactslip_torch.features.bin_sample import BinSample
-from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.training.datamodule import SlipDataModule
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",
@@ -142,12 +142,12 @@ def test_the_forest_votes_as_scikit_learns_does():
     _, sample = sampled(60)
     rng = np.random.default_rng(4)
     columns = torch.from_numpy(rng.standard_normal((len(sample.is_slip), 6)))
-    made = ensemble.RandomForestClassifier(200, class_weight="balanced", random_state=0)
+    made = ensemble.RandomForestClassifier(100, class_weight="balanced", random_state=0)
     made.fit(columns.numpy(), sample.is_slip, sample_weight=sample.represents)
     others = torch.from_numpy(rng.standard_normal((400, 6)))
     found = RandomForest(columns, sample)(others)
     right = found.numpy() == made.predict(others.numpy())
-    assert right.mean() > 0.995  # equal votes are decided by rounding
+    assert right.mean() > 0.99  # equal votes are decided by rounding
 
 
 def test_bins_stand_for_those_they_were_drawn_from():
@@ -186,7 +186,7 @@ def test_the_pooled_number_survives_json(fitted):
 def test_a_learner_evaluates_them_and_a_saved_detector_those_it_keeps(tmp_path):
     from lightning import Trainer
 
-    from tactslip_torch.learning import SlipLearner
+    from tactslip_torch.training.learner import SlipLearner
 
     source = SmallSet()
     learner = learn(source, unseen_c(source))

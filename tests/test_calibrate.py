@@ -8,20 +8,25 @@ from types import MappingProxyType
 import pytest
 from test_commands import composed
 
-from tactslip_torch import calibrate as command
-from tactslip_torch.bracket import Point, chosen_point, next_difficulty
-from tactslip_torch.calibrate import calibrate, evaluate_point
+from tactslip_torch.commands import calibrate as command
+from tactslip_torch.commands.calibrate import (
+    Point,
+    calibrate,
+    chosen_point,
+    evaluate_point,
+    next_difficulty,
+)
+from tactslip_torch.commands.train import train
 from tactslip_torch.report import published
 from tactslip_torch.report.calibration import calibration_table
-from tactslip_torch.simulation import Contact, Disturbances, materials, paper_scenes
-from tactslip_torch.simulation.knobs.calibrated import (
+from tactslip_torch.simulation import Contact, Disturbances, paper_scenes, parameters
+from tactslip_torch.simulation.parameters import (
     CALIBRATED,
     CALIBRATED_PATH,
     PRIORS,
-    knobs_at,
+    parameters_at,
     read_calibrated,
 )
-from tactslip_torch.train import train
 
 SMALL = (
     "data.cycles=1",
@@ -122,12 +127,12 @@ def test_nothing_is_kept_where_the_facts_fail_at_the_start():
 
 
 def test_the_line_begins_at_the_starting_values_and_gets_harder():
-    assert knobs_at(0.0) == {
+    assert parameters_at(0.0) == {
         "friction_noise_mv": 8.0,  # PHYSICS.md, starting knobs
         "presliding_mm": (0.3, 3.0),
         "burst_rate_hz": 0.3,
     }
-    rows = [knobs_at(d) for d in (-1.0, 0.0, 1.0, 2.0)]
+    rows = [parameters_at(d) for d in (-1.0, 0.0, 1.0, 2.0)]
     noise = [row["friction_noise_mv"] for row in rows]
     assert noise == sorted(noise, reverse=True)
     for name in ("presliding_mm", "burst_rate_hz"):
@@ -139,7 +144,7 @@ def test_the_line_begins_at_the_starting_values_and_gets_harder():
 def test_every_place_within_the_bounds_is_a_scene():
     bounds = composed(name="calibrate").bounds
     for difficulty in bounds:
-        paper_scenes(cycles=1, materials=["M1"], **knobs_at(difficulty))
+        paper_scenes(cycles=1, materials=["M1"], **parameters_at(difficulty))
 
 
 def test_knobs_take_the_frozen_values():
@@ -155,39 +160,18 @@ def test_knobs_take_the_frozen_values():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("friction_noise_mv", None),
-        ("friction_noise_mv", -1.0),
-        ("friction_noise_mv", [1.0, 2.0]),
-        ("presliding_mm", 1.0),
-        ("presliding_mm", [1.0]),
-        ("burst_rate_hz", "often"),
-    ],
+    "text",
+    ["", "{", "[]", '{"values": null}', '{"values": {}}', '{"values": {"friction_noise_mv": []}}'],
 )
-def test_a_damaged_file_of_frozen_values_is_refused(tmp_path, name, value):
-    values = {"friction_noise_mv": 8.0, "presliding_mm": [0.3, 3.0], "burst_rate_hz": 0.3}
+def test_a_damaged_file_of_frozen_values_is_one_line(tmp_path, text):
     path = tmp_path / "calibrated.json"
-    path.write_text(json.dumps({"values": values}))
-    assert read_calibrated(path) == values | {"presliding_mm": (0.3, 3.0)}
-    path.write_text(json.dumps({"values": values | {name: value}}))
-    wanted = f"must hold {name} as .* positive, got .*; restore it from the release"
+    wanted = "must hold the calibrated parameters.*; restore it from the release"
     with pytest.raises(ValueError, match=wanted):
         read_calibrated(path)
-
-
-@pytest.mark.parametrize("text", ["", "{", '{"values": 3}', "[]", "null", "3", '{"values": null}'])
-def test_what_is_no_file_of_frozen_values_is_one_line(tmp_path, text):
-    path = tmp_path / "calibrated.json"
-    with pytest.raises(FileNotFoundError, match=r"no calibrated knobs .*restore it from the rel"):
-        read_calibrated(path)
     path.write_text(text)
-    with pytest.raises(ValueError, match=r"must hold .*; restore it from the release") as refusal:
+    with pytest.raises(ValueError, match=wanted) as refusal:
         read_calibrated(path)
     assert "\n" not in str(refusal.value)
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(ValueError, match=r"must hold JSON.*; restore it from the release"):
-        read_calibrated(path)
 
 
 # --- the command --------------------------------------------------------------------------------
@@ -225,7 +209,7 @@ def test_the_command_leaves_all_it_tried(found):
     assert json.loads((folder / "calibration.json").read_text()) == content
     assert [point["difficulty"] for point in content["points"]] == [0.0, -1.5]
     for point in content["points"]:
-        assert point["knobs"] == json.loads(json.dumps(knobs_at(point["difficulty"])))
+        assert point["knobs"] == json.loads(json.dumps(parameters_at(point["difficulty"])))
         assert {fact["name"] for fact in point["facts"]} >= {"sg_rise", "pvdf_slide_over_rest"}
     assert content["values"] == content["points"][1]["knobs"]  # closer to the target than d = 0
     assert content["target"]["accuracy"] == 0.9639
@@ -239,9 +223,9 @@ def test_the_command_leaves_all_it_tried(found):
 
 def test_unseen_materials_and_their_results_are_used_nowhere(tmp_path, found, monkeypatch):
     monkeypatch.setattr(published, "SPLITS", MappingProxyType({"test": published.SPLITS["test"]}))
-    monkeypatch.setattr(materials, "UNSEEN_MATERIALS", ())
+    monkeypatch.setattr(parameters, "UNSEEN_MATERIALS", ())
     for name in ("wood", "copper", "cloth", "iron"):  # they come back in the table's order
-        monkeypatch.delitem(materials.MATERIALS, name)
+        monkeypatch.delitem(parameters.MATERIALS, name)
     with pytest.raises(ValueError, match="unknown material 'iron'"):
         paper_scenes(cycles=1, materials=["iron"])  # they are gone indeed
     calibrate(tiny(), tmp_path)
@@ -271,7 +255,7 @@ def whole(found, frozen, monkeypatch):
     def composed_with(*overrides, holds=True):
         def point(_, difficulty):
             facts = [fact | {"holds": holds} for fact in found[0]["points"][1]["facts"]]
-            knobs = json.loads(json.dumps(knobs_at(difficulty)))
+            knobs = json.loads(json.dumps(parameters_at(difficulty)))
             scores = {"accuracy": 0.97, "accuracy_by_seed": [0.97, 0.97, 0.97]}
             return {
                 "difficulty": difficulty,
@@ -290,7 +274,7 @@ def test_write_freezes_the_values_that_knobs_then_take(tmp_path, frozen, whole):
     content = calibrate(whole(), tmp_path)
     assert content["difficulty"] in (0.0, 2.0)
     assert frozen.read_bytes() == (tmp_path / "calibration.json").read_bytes()
-    assert read_calibrated(frozen) == knobs_at(content["difficulty"])
+    assert read_calibrated(frozen) == parameters_at(content["difficulty"])
 
 
 def test_without_write_nothing_is_frozen(tmp_path, frozen):
@@ -322,7 +306,7 @@ def test_facts_that_fail_at_the_start_freeze_nothing(tmp_path, frozen, whole):
         ("+scene.mains_mv=300", "scene"),
         ("features.align=causal", "features"),
         ("data.cycles=2", "data"),
-        ("data.fidelity=lugre", "data"),
+        ("data.fidelity=bristles", "data"),
         ("others=confound", "others"),
     ],
 )
@@ -377,7 +361,7 @@ def test_what_is_no_calibration_is_refused(tmp_path, override, message):
 
 
 def test_bad_input_is_one_line_and_exit_status_2(tmp_path):
-    arguments = [sys.executable, "-m", "tactslip_torch.calibrate", "seeds=[3]"]
+    arguments = [sys.executable, "-m", "tactslip_torch", "calibrate", "seeds=[3]"]
     done = subprocess.run(arguments, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith("error: seeds must differ and be 1000 or more")

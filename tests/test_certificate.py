@@ -7,7 +7,7 @@ import pytest
 import torch
 from small_detector import NUM_FEATURES, certified, lying_detector, raw_bins, small_detector
 
-from tactslip_torch.certificate import FACTOR, certify, compare
+from tactslip_torch.analysis.certificate import FACTOR, certify, compare
 from tactslip_torch.model.rounding import rounding_bound
 from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 

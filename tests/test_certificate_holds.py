@@ -7,7 +7,7 @@ import pytest
 import torch
 from small_detector import NUM_FEATURES, certified, lying_detector, raw_bins, small_detector
 
-from tactslip_torch.certificate import (
+from tactslip_torch.analysis.certificate import (
     FACTOR,
     INSIDE_SHARE,
     LARGEST_RATIO,

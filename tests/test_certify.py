@@ -1,22 +1,19 @@
-"""``certify`` as a command: the files, the page, the exit status, and which bins it draws."""
+"""``certify`` as a command: the files, the exit status, and which bins it draws."""
 
 import hashlib
 import json
-import re
 import sys
-from html.parser import HTMLParser
 
 import pytest
 from hydra import compose, initialize_config_dir
 from small_detector import raw_bins, small_detector
 from test_commands import TinyRecordings
 
-from tactslip_torch.certificate import certify as measure
-from tactslip_torch.certify import _plain, certify, main
-from tactslip_torch.config import conf_dir
+from tactslip_torch.analysis.certificate import certify as measure
+from tactslip_torch.commands.certify import _plain, certify, main
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.features.cache import cache_key
-from tactslip_torch.report.certificate import number, verdict
-from tactslip_torch.report.certificate_page import MARK, certificate_page
+from tactslip_torch.report.certificate import certificate_figure, number, verdict
 from tactslip_torch.simulation.extremes import EXTREMES
 
 TINY = (
@@ -60,30 +57,14 @@ def written(tmp_path_factory):
     return folder, content
 
 
-class Reader(HTMLParser):
-    """What a page loads, and its text."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.loads, self.tags, self.text = [], [], ""
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self.loads += [value for key, value in attrs if key in ("src", "href", "srcset", "data")]
-
-    def handle_data(self, data):
-        self.text += data
-
-
 # What it leaves ----------------------------------------------------------------------------------
 
 
 def test_the_files_stand_beside_the_detector(written):
     folder, content = written
     assert sorted(path.name for path in folder.iterdir()) == [
-        "certificate.html",
         "certificate.json",
+        "certificate.png",
         "detector.pt",
     ]
     assert content["format"] == "tactslip_torch certificate 1"
@@ -112,50 +93,7 @@ def test_a_second_run_replaces_the_first_and_finds_the_same(tmp_path):
     before = (folder / "certificate.json").read_text()
     certify(composed(f"model={path}", f"out={tmp_path / 'out'}"))
     assert (folder / "certificate.json").read_text() == before
-    assert sorted(p.name for p in folder.iterdir()) == ["certificate.html", "certificate.json"]
-
-
-# The page ----------------------------------------------------------------------------------------
-
-
-def test_the_page_needs_nothing_else(written):
-    folder, content = written
-    page = (folder / "certificate.html").read_text(encoding="utf-8")
-    reader = Reader(page)
-    assert MARK in page
-    assert "script" not in reader.tags
-    assert "link" not in reader.tags
-    assert [load[:22] for load in reader.loads] == ["data:image/png;base64,"]
-    assert not re.search(r"https?://|url\(|@import", page)
-    assert verdict(content) in reader.text
-    for row in content["conditions"]:
-        assert row["name"] in reader.text
-    for kind in EXTREMES:
-        assert kind in reader.text
-    assert content["detector"]["sha256"] in reader.text
-
-
-def test_simulated_numbers_say_so(written):
-    _, content = written
-    found = measure(
-        small_detector(),
-        raw_bins(30),
-        {"test": raw_bins(9), "unseen": raw_bins(9)},
-        simulated=True,
-        extremes=2,
-    )
-    for simulated, word in ((True, "simulated data"), (False, "recorded data")):
-        content = content | {"simulated": simulated}
-        assert ("(simulated data)" in verdict(content)) is simulated
-        text = Reader(certificate_page(content, points_of(found))).text
-        assert word in text
-
-
-def points_of(found):
-    return {
-        name: (c.exact.abs().tolist(), c.error.tolist(), c.flips.tolist())
-        for name, c in found.sets.items()
-    }
+    assert sorted(p.name for p in folder.iterdir()) == ["certificate.json", "certificate.png"]
 
 
 @pytest.mark.parametrize(
@@ -169,13 +107,19 @@ def points_of(found):
         ),
     ],
 )
-def test_every_outcome_has_a_verdict_and_a_page(options, words, written):
+def test_every_outcome_has_a_verdict_and_a_figure(options, words, written):
     detector = small_detector(**options)
     found = measure(detector, raw_bins(30), simulated=True, extremes=2)
     rest = {k: v for k, v in written[1].items() if k in ("detector", "data", "versions")}
     content = _plain(found.facts() | rest)
     assert words in verdict(content)
-    assert verdict(content) in Reader(certificate_page(content, points_of(found))).text
+    points = {
+        name: (c.exact.abs().tolist(), c.error.tolist(), c.flips.tolist())
+        for name, c in found.sets.items()
+    }
+    assert certificate_figure(content, points).axes
+    recorded = content | {"simulated": False}
+    assert ["(simulated data)" in verdict(of) for of in (content, recorded)] == [True, False]
     json.dumps(content, allow_nan=False)
 
 
@@ -206,7 +150,7 @@ def test_the_exit_status_is_0_if_it_holds_and_1_if_not(tmp_path, monkeypatch, ca
     assert (status, lines) == (0, [])
     assert out.startswith("Holds: ")
     assert "no held-out" not in out
-    assert str(tmp_path / "certificate.html") in out
+    assert str(tmp_path / "certificate.json") in out
     (tmp_path / "b").mkdir()
     model = f"model={saved(tmp_path / 'b', gain=1e39)}"
     status, out, lines = run(monkeypatch, capsys, model)
@@ -214,9 +158,9 @@ def test_the_exit_status_is_0_if_it_holds_and_1_if_not(tmp_path, monkeypatch, ca
     assert out == ""
     (line,) = lines
     assert line.startswith("Does not hold: error of the head")
-    assert line.endswith("certificate.html")
+    assert line.endswith("certificate.json")
     assert json.loads((tmp_path / "b" / "certificate.json").read_text())["holds"] is False
-    assert (tmp_path / "b" / "certificate.html").is_file()
+    assert (tmp_path / "b" / "certificate.png").is_file()
 
 
 def test_nothing_judged_is_told(tmp_path, monkeypatch, capsys):
@@ -224,7 +168,6 @@ def test_nothing_judged_is_told(tmp_path, monkeypatch, capsys):
     status, out, lines = run(monkeypatch, capsys, model, "judge=[]")
     assert (status, lines) == (0, [])
     assert "; no held-out bins were judged" in out
-    assert "no held-out bins" in Reader((tmp_path / "certificate.html").read_text()).text
 
 
 def test_one_judged_role_may_be_named_alone(tmp_path):

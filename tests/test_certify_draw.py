@@ -6,11 +6,11 @@ from hydra.utils import instantiate
 from small_detector import small_detector
 from test_certify import composed, source
 
-from tactslip_torch.certify import draw_bins
+from tactslip_torch.commands.certify import draw_bins
 from tactslip_torch.data.labels import LabelRule, label_bins
 from tactslip_torch.data.splits import Split
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import cache_key
+from tactslip_torch.training.datamodule import FeatureMaker
 
 
 def drawn(number, role="train", seed=0, fold=None, rule=None):

@@ -3,10 +3,10 @@
 import pytest
 from test_certify import composed, run, saved
 
-from tactslip_torch.certify import certify
+from tactslip_torch.commands.certify import certify
 
 
-@pytest.mark.parametrize("name", ["certificate.json", "certificate.html"])
+@pytest.mark.parametrize("name", ["certificate.json"])
 def test_a_foreign_file_is_left_alone(name, tmp_path):
     path = saved(tmp_path)
     (tmp_path / name).write_text("mine")
@@ -48,7 +48,7 @@ def unread(*_):
 @pytest.mark.parametrize("value", ["abc", "1.5", "true", "null", "[2]", str(2**63)])
 @pytest.mark.parametrize("name", ["bins", "judged_bins", "extremes", "seed"])
 def test_what_is_no_number_is_refused_before_any_work(name, value, monkeypatch, capsys):
-    monkeypatch.setattr("tactslip_torch.certify.SlipDetector.load", unread)
+    monkeypatch.setattr("tactslip_torch.commands.certify.SlipDetector.load", unread)
     status, out, lines = run(monkeypatch, capsys, "model=any.pt", f"{name}={value}")
     assert (status, out) == (2, "")
     (line,) = lines
@@ -65,7 +65,7 @@ def test_a_negative_seed_is_refused(monkeypatch, capsys):
 
 @pytest.mark.parametrize("below", ["", "deeper"])
 def test_a_file_in_the_place_of_the_folder_is_refused_at_once(below, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("tactslip_torch.certify.measure", unread)
+    monkeypatch.setattr("tactslip_torch.commands.certify.measure", unread)
     model, taken = saved(tmp_path), tmp_path / "taken"
     taken.write_text("mine")
     arguments = (f"model={model}", f"out={taken / below}")

@@ -1,5 +1,7 @@
 """An even clock through timestamps: what is late, what is missing, and what cannot be."""
 
+from typing import NamedTuple
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -7,9 +9,17 @@ from hypothesis import strategies as st
 
 from tactslip_torch.data import clock as module
 from tactslip_torch.data.clock import EvenSamples, Gap, even_clock, nominal_rate, refuse_gaps
-from tactslip_torch.data.formats.reading import KeptTimes
 
 RATE = 2000.0
+
+
+class KeptTimes(NamedTuple):
+    """Times in memory."""
+
+    seconds: torch.Tensor
+
+    def read(self, first, stop):
+        return self.seconds[first:stop]
 
 
 class Kept:

@@ -16,11 +16,11 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
 from tactslip_torch import HandLayout, Recording, SlipDetector
-from tactslip_torch.config import conf_dir, errors_in_one_line, one_line
+from tactslip_torch.commands.entry import conf_dir, errors_in_one_line, one_line
+from tactslip_torch.commands.evaluate import evaluate
+from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.evaluate import evaluate
 from tactslip_torch.model.abstention import Abstention
-from tactslip_torch.train import train
 
 SCORES = {"accuracy", "balanced_accuracy", "non_slip_recall", "slip_recall"}
 ONE_SPLIT = SCORES | {

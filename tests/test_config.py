@@ -8,8 +8,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 from torch.utils.data import DataLoader
 
-from tactslip_torch import config
-from tactslip_torch.config import (
+from tactslip_torch.commands import entry as config
+from tactslip_torch.commands.entry import (
     conf_dir,
     errors_in_one_line,
     fail,

@@ -8,13 +8,13 @@ from hydra.errors import InstantiationException
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import ROLES, Split
-from tactslip_torch.experiment import feature_parts
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.recipe import Recipe
 from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.recipe import Recipe
 
 RECORDED = {"biotacsp_dos"}
 """Experiments on real recordings, which are not here: a folder of their layout stands in."""
@@ -125,7 +125,7 @@ def test_further_scenes_are_those_of_their_files_and_any_knob_can_be_set():
 
 
 @pytest.mark.parametrize(
-    "name", ["train", "evaluate", "generate", "stats", "certify", "crossval", "pareto", "calibrate"]
+    "name", ["train", "evaluate", "generate", "certify", "crossval", "pareto", "calibrate"]
 )
 def test_every_entry_point_on_recordings_takes_further_scenes(name):
     assert not composed(name=name).data.others

@@ -13,9 +13,10 @@ from hydra import compose, initialize_config_dir
 from small_set import RATE_HZ, SMALL_HAND, SmallTimeline
 from test_report import assert_drawn_atomically, rows_of
 
-from tactslip_torch.config import conf_dir
+from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.commands.evaluate import evaluate
+from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.evaluate import evaluate
 from tactslip_torch.report.confound import (
     by_detector,
     confound_figure,
@@ -24,7 +25,6 @@ from tactslip_torch.report.confound import (
 )
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
-from tactslip_torch.train import train
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",

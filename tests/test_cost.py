@@ -10,21 +10,18 @@ import torch
 from scipy.optimize import nnls
 from small_detector import HAND, small_detector
 
-from tactslip_torch.deadline.cost import (
+from tactslip_torch.analysis.latency import (
     GROUPS,
     CostModel,
+    Timing,
     _counted,
     _designs,
     _line,
-    _nonnegative,
-    measure_costs,
-    parts_of,
-    stand_in,
-)
-from tactslip_torch.deadline.timing import (
-    Timing,
+    _stand_in,
     main,
+    measure_costs,
     one_thread,
+    parts_of,
     time_calls,
     time_in_fresh_process,
 )
@@ -129,21 +126,8 @@ def test_designs_tell_all_groups_apart():
     price = model()
     truth = np.array([0.5, *price.group_us.values(), *price.part_us.values()])
     timings = rows @ truth
-    scaled = torch.from_numpy(rows / timings[:, None])
-    found = _nonnegative(scaled).numpy()
-    expected, _ = nnls(scaled.numpy(), np.ones(len(rows)), maxiter=10_000)
-    error = np.abs(rows @ found / timings - 1).max()
-    assert error <= np.abs(rows @ expected / timings - 1).max() + 1e-3
-    assert (found >= 0).all()
-
-
-def test_fit_equals_scipys_nonnegative_least_squares(rng):
-    rows = rng.uniform(0, 1, (40, 6))
-    rows[:, 2] *= -1  # best left at 0
-    found = _nonnegative(torch.from_numpy(rows)).numpy()
-    expected, _ = nnls(rows, np.ones(40))
-    np.testing.assert_allclose(found, expected, atol=1e-9)
-    assert found[2] == 0
+    found, _ = nnls(rows / timings[:, None], np.ones(len(rows)), maxiter=10_000)
+    assert np.abs(rows @ found / timings - 1).max() < 1e-3
 
 
 def test_a_bad_timing_does_not_move_the_line():
@@ -171,7 +155,7 @@ def test_measured_prices_are_of_this_machine():
 
 
 def test_a_stand_in_gives_finite_scores():
-    detector = stand_in(POOL, ChannelFilter([51, 51, 11, 11]), [0, 30, 100], "eager")
+    detector = _stand_in(POOL, ChannelFilter([51, 51, 11, 11]), [0, 30, 100], "eager")
     score = detector.judge_raw(torch.randn(7, 4, 150)).score
     assert score.isfinite().all()
 
@@ -185,8 +169,10 @@ class Played:
     def __init__(self, monkeypatch, *runs):
         self.now, self.switches = 0, 0
         self.left = iter([1, *(us for run in runs for us in run)])  # the first is not timed
-        monkeypatch.setattr("tactslip_torch.deadline.timing.time.perf_counter_ns", lambda: self.now)
-        monkeypatch.setattr("tactslip_torch.deadline.timing._interruptions", lambda: self.switches)
+        monkeypatch.setattr(
+            "tactslip_torch.analysis.latency.time.perf_counter_ns", lambda: self.now
+        )
+        monkeypatch.setattr("tactslip_torch.analysis.latency._interruptions", lambda: self.switches)
 
     def __call__(self, given):
         us = next(self.left)
@@ -223,7 +209,7 @@ def test_a_saved_detector_is_timed_in_a_process_of_its_own(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"timing .*gone.pt in a fresh process failed: .*gone.pt"):
         time_in_fresh_process(tmp_path / "gone.pt", 20)
     with pytest.raises(
-        SystemExit, match=r"usage: python -m tactslip_torch.deadline.timing detector.pt"
+        SystemExit, match=r"usage: python -m tactslip_torch.analysis.latency detector.pt"
     ):
         main([])
 
@@ -244,7 +230,7 @@ def test_threads_are_given_back():
 
 
 def test_the_module_runs_as_a_command():
-    command = [sys.executable, "-m", "tactslip_torch.deadline.timing"]
+    command = [sys.executable, "-m", "tactslip_torch.analysis.latency"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert "usage: python -m tactslip_torch.deadline.timing detector.pt" in done.stderr
+    assert "usage: python -m tactslip_torch.analysis.latency detector.pt" in done.stderr

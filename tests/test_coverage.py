@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.signals.coverage import KnownInputs, coverage
+from tactslip_torch.analysis.certificate import KnownInputs, coverage
 
 KINDS = {"SG1": "SG", "SG2": "SG", "PVDF1": "PVDF"}
 

@@ -9,10 +9,10 @@ import torch
 from small_set import SmallSet, small_maker, small_recipe
 from test_commands import composed
 
-from tactslip_torch.crossval import Materials, crossval, judge
+from tactslip_torch.commands.crossval import Materials, crossval, judge
 from tactslip_torch.data.splits import seen6
-from tactslip_torch.datamodule import SlipDataModule
 from tactslip_torch.report.crossval import PAPERS_UNSEEN, crossval_table, material_scores
+from tactslip_torch.training.datamodule import SlipDataModule
 
 TINY = (
     "data._target_=test_commands.TinyRecordings",

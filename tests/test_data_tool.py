@@ -14,12 +14,12 @@ from PIL import Image
 from test_commands import BAD_INPUT, composed
 from test_datasets import HAND, RATE_HZ, broken, manifest, ours, samples, table
 
-from tactslip_torch import data_tool
-from tactslip_torch.config import one_line
-from tactslip_torch.data.formats.registry import FORMATS, format_of
-from tactslip_torch.data.sets.datasets import FileRecordings
-from tactslip_torch.data.sets.inspection import inspected, oddities
-from tactslip_torch.data.sets.template import guessed, guesser, write_template
+from tactslip_torch.commands import data as data_tool
+from tactslip_torch.commands.entry import one_line
+from tactslip_torch.commands.train import train
+from tactslip_torch.data.file_recordings import FileRecordings, inspected, oddities
+from tactslip_torch.data.formats import FORMATS, format_of
+from tactslip_torch.data.manifest import guessed, guesser, write_template
 from tactslip_torch.report.dataset import (
     Example,
     Trial,
@@ -27,7 +27,6 @@ from tactslip_torch.report.dataset import (
     ranges_table,
     trials_table,
 )
-from tactslip_torch.train import train
 
 
 def run(action, root, *overrides):
@@ -433,7 +432,7 @@ def test_an_empty_folder_has_no_template(tmp_path):
 
 def command(*arguments, cwd):
     return subprocess.run(
-        [sys.executable, "-m", "tactslip_torch.data_tool", *map(str, arguments)],
+        [sys.executable, "-m", "tactslip_torch", "data", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=cwd,
@@ -473,7 +472,7 @@ def test_bad_input_is_one_line(root, overrides, line):
 
 def test_what_generate_writes_trains_as_the_simulation_does(tmp_path):
     """Of a hand of four channels; the same bins, features and scores, read and simulated."""
-    from tactslip_torch.generate import generate
+    from tactslip_torch.commands.generate import generate
 
     tiny = ("data._target_=test_commands.TinyRecordings", "materials=[A,B,C]", "cycles=4")
     generate(composed(*tiny, "num_workers=0", "figure=false", name="generate"), tmp_path / "set")

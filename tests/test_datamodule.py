@@ -5,13 +5,11 @@ from small_set import RATE_HZ, SmallSet, small_maker
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import random_bins, unseen4
-from tactslip_torch.datamodule import SlipDataModule
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.signals.savgol import savgol_filter
+from tactslip_torch.signals.filtering import ChannelFilter, savgol_filter
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 
 
 def split_of(source, **options):

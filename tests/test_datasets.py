@@ -13,15 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.data.formats.registry import named_format
+from tactslip_torch.data import file_recordings as digest
+from tactslip_torch.data import file_recordings as look_memory
+from tactslip_torch.data import file_recordings as survey
+from tactslip_torch.data.file_recordings import FileRecordings
+from tactslip_torch.data.formats import named_format
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.data.sets import digest, look_memory, survey
-from tactslip_torch.data.sets.datasets import FileRecordings
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.datamodule import FeatureMaker
 
 HAND = HandLayout(
     (

@@ -6,11 +6,11 @@ import pytest
 import torch
 from small_detector import small_detector
 
-from tactslip_torch.alarming.debounced import Debounced
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.onset.decider import Decider
-from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.onset.decisions import Decider
+from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.training.alarm import DebouncedAlarm
 
 
 def calibrated(**info):
@@ -22,7 +22,7 @@ def calibrated(**info):
 
 def test_it_is_kept_in_the_file_with_no_rate_promised(tmp_path):
     detector = calibrated()
-    assert Debounced(k=1, n=4, probability=0.8, slip_share=0.25)(detector) == {}
+    assert DebouncedAlarm(k=1, n=4, probability=0.8, slip_share=0.25)(detector) == {}
     detector.save(tmp_path / "a.pt")
     settings = AlarmSettings.of(type(detector).load(tmp_path / "a.pt"))
     assert settings.target_per_hour is None
@@ -36,7 +36,7 @@ def test_it_is_kept_in_the_file_with_no_rate_promised(tmp_path):
 
 def test_two_of_three_say_when():
     detector = calibrated()
-    Debounced(hop_ms=50.0)(detector)
+    DebouncedAlarm(hop_ms=50.0)(detector)
     settings = AlarmSettings.of(detector)
     rate, bin_samples = detector.pool.sample_rate_hz, detector.pool.bin_samples
     assert settings.hop_samples == round(0.05 * rate)
@@ -64,22 +64,22 @@ def test_two_of_three_say_when():
 )
 def test_numbers_that_cannot_be(options, said):
     with pytest.raises(ValueError, match=said):
-        Debounced(**options)
+        DebouncedAlarm(**options)
 
 
 def test_scores_without_a_calibration_are_refused():
     detector = small_detector(3)
     detector.info.pop("calibration", None)
     with pytest.raises(ValueError, match=r"training chose nothing; give several recipe\.penalties"):
-        Debounced()(detector)
+        DebouncedAlarm()(detector)
     detector = calibrated()
     with pytest.raises(ValueError, match=r"onset\.hop_ms=0\.3 is 0\.6 samples"):
-        Debounced(hop_ms=0.3)(detector)
+        DebouncedAlarm(hop_ms=0.3)(detector)
 
 
 def test_a_hop_is_half_a_bin_or_so_many_milliseconds():
-    assert Debounced().hop_samples(2000.0, 100) == 50
-    assert Debounced().hop_samples(2000.0, 1) == 1
-    assert Debounced(hop_ms=2.5).hop_samples(2000.0, 100) == 5
+    assert DebouncedAlarm().hop_samples(2000.0, 100) == 50
+    assert DebouncedAlarm().hop_samples(2000.0, 1) == 1
+    assert DebouncedAlarm(hop_ms=2.5).hop_samples(2000.0, 100) == 5
     with pytest.raises(ValueError, match=r"onset\.hop_ms=0\.3 is 0\.6 samples"):
-        Debounced(hop_ms=0.3).hop_samples(2000.0, 100)
+        DebouncedAlarm(hop_ms=0.3).hop_samples(2000.0, 100)

@@ -13,17 +13,15 @@ from PIL import Image
 from small_detector import HAND, small_detector
 
 from tactslip_torch import HandLayout, Recording
-from tactslip_torch import detect as module
-from tactslip_torch.config import conf_dir
-from tactslip_torch.data.formats import npz
-from tactslip_torch.data.formats.registry import FORMATS, Format
-from tactslip_torch.data.formats.stored_array import StoredSamples
-from tactslip_torch.detect import detect, main
+from tactslip_torch.commands import detect as module
+from tactslip_torch.commands.detect import detect, main
+from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.data.formats import FORMATS, Format
+from tactslip_torch.data.formats._arrays import ArraySamples
 from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.onset.decider import Decider
-from tactslip_torch.onset.scoring import score_stream
-from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.onset.decisions import Decider, score_stream
+from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.report.onset_table import COLUMNS
 
@@ -62,7 +60,7 @@ def quiet(duration_s=4.0, **changes):
 
 
 def save(path, content, hand=HAND):
-    npz.save(path, content, hand, {"recording": {"name": "taps"}})
+    FORMATS["npz"].save(path, content, hand, {"recording": {"name": "taps"}})
 
 
 @pytest.fixture(scope="module")
@@ -347,7 +345,7 @@ def test_missing_samples_and_dead_channels_are_flagged(model, tmp_path, capsys):
 
 
 def test_a_further_format_is_a_further_line(model, tmp_path, monkeypatch):
-    monkeypatch.setitem(FORMATS, "tac", Format("npz", ("tac",)))
+    monkeypatch.setitem(FORMATS, "tac", Format("npz", ("tac",), "_npz"))
     save(tmp_path / "a.tac", recording())
     assert len(heard(model, tmp_path, tmp_path / "out", "figure=false")["recordings"]) == 1
 
@@ -365,7 +363,7 @@ def test_files_of_one_stem_keep_their_figures_apart(model, tmp_path):
 
 def test_no_more_than_a_second_is_in_hand(model, tmp_path, monkeypatch):
     asked, pushed = [], []
-    read, push = StoredSamples.read, module.StreamingDetector.push
+    read, push = ArraySamples.read, module.StreamingDetector.push
 
     def watched(samples, first, stop):
         piece = read(samples, first, stop)
@@ -379,7 +377,7 @@ def test_no_more_than_a_second_is_in_hand(model, tmp_path, monkeypatch):
         return decisions
 
     held = []
-    monkeypatch.setattr(StoredSamples, "read", watched)
+    monkeypatch.setattr(ArraySamples, "read", watched)
     monkeypatch.setattr(module.StreamingDetector, "push", pushing)
     save(tmp_path / "a.npz", recording())
     heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
@@ -418,7 +416,8 @@ def test_a_damaged_file_in_a_folder_costs_the_others_nothing(model, tmp_path, mo
     assert status == 2
     (line,) = lines
     assert "2 of 5 recordings failed, first: " in line
-    assert "c.npz is damaged or no recording of ours; the others are in" in line
+    assert "c.npz is damaged or no recording of ours (Bad CRC-32" in line
+    assert "; the others are in" in line
     assert "of 2 slips 2 found" in out
     written = json.loads((tmp_path / "out" / "onsets.json").read_text())
     assert [entry["file"] for entry in written["recordings"]] == ["a.npz", "b.npz", "d.npz"]

@@ -11,7 +11,7 @@ import torch
 from small_detector import HAND, alarming_detector, raw_bins
 from test_detector import VARIANTS, noise, random_detector
 
-from tactslip_torch.export import export_detector, sidecar_facts, summary, worst_error
+from tactslip_torch.graph.export import export_detector, sidecar_facts, summary, worst_error
 from tactslip_torch.graph.form import Window
 from tactslip_torch.graph.trials import simulated_stream
 from tactslip_torch.model.calibration import probability
@@ -155,11 +155,3 @@ def test_every_head_and_scaler_comes_through(variant, precision, tmp_path):
     spread = float(detector.score_raw(noise(64)).std())
     np.testing.assert_allclose(got["score"], expected, rtol=0, atol=worst * spread)
     assert got["score"].dtype == precision
-
-
-def test_the_bulk_layout_gives_the_same(detector, exported, tmp_path):
-    paths = export_detector(detector, tmp_path, layout="bulk", alone=False)
-    samples = cropped(detector, raw_bins(64).float())
-    in_bulk, one = (run(path, samples=samples)["score"] for path in (paths[0], exported[0]))
-    assert sidecar_facts(paths[0])["layout"] == sidecar_facts(paths[1])["layout"] == "bulk"
-    np.testing.assert_allclose(in_bulk, one, rtol=0, atol=1e-4 * float(one.std()))

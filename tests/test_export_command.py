@@ -8,10 +8,11 @@ import sys
 import pytest
 from small_detector import alarming_detector, certified, small_detector
 
-from tactslip_torch import export, fold_training
-from tactslip_torch.certify import FORMAT as CERTIFICATE_FORMAT
-from tactslip_torch.export import export_detector, sidecar_facts, summary, worst_error
+from tactslip_torch.commands.certify import FORMAT as CERTIFICATE_FORMAT
+from tactslip_torch.graph import export
+from tactslip_torch.graph.export import export_detector, sidecar_facts, summary, worst_error
 from tactslip_torch.graph.facts import sidecar_path
+from tactslip_torch.training import experiment as fold_training
 
 pytestmark = pytest.mark.onnx
 
@@ -116,15 +117,15 @@ def test_the_command_leaves_what_the_detector_can_give(monkeypatch, capsys, tmp_
     detector.save(tmp_path / "detector.pt")
     made = []
 
-    def instead(of, folder, graphs, precision, layout, *, source):
-        made.append((str(folder), graphs, precision, layout, str(source)))
+    def instead(of, folder, graphs, precision, *, source):
+        made.append((str(folder), graphs, precision, str(source)))
         return ()
 
     monkeypatch.setattr(export, "export_detector", instead)
     model = f"model={tmp_path / 'detector.pt'}"
     assert command(monkeypatch, capsys, model) == (0, "", "")
     out = tmp_path / "out"
-    options = ("graph=stream", "precision=float64", "layout=bulk", f"output={out}")
+    options = ("graph=stream", "precision=float64", f"output={out}")
     assert command(monkeypatch, capsys, model, *options)[0] == 0
     command(monkeypatch, capsys, model, "graph=both")
     detector = small_detector()
@@ -132,10 +133,10 @@ def test_the_command_leaves_what_the_detector_can_give(monkeypatch, capsys, tmp_
     command(monkeypatch, capsys, model)
     source, here = str(tmp_path / "detector.pt"), str(tmp_path)
     assert made == [
-        (here, ("bin", "stream"), "float32", "latency", source),
-        (str(out), ("stream",), "float64", "bulk", source),
-        (here, ("bin", "stream"), "float32", "latency", source),
-        (here, ("bin",), "float32", "latency", source),
+        (here, ("bin", "stream"), "float32", source),
+        (str(out), ("stream",), "float64", source),
+        (here, ("bin", "stream"), "float32", source),
+        (here, ("bin",), "float32", source),
     ]
 
 
@@ -164,7 +165,7 @@ def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, name):
 def test_it_works_as_a_command(detector, tmp_path):
     detector.save(tmp_path / "detector.pt")
     done = subprocess.run(
-        [sys.executable, "-m", "tactslip_torch.export", "model=detector.pt", "output=out"],
+        [sys.executable, "-m", "tactslip_torch", "export", "model=detector.pt", "output=out"],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -8,8 +8,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from small_detector import alarming_detector, small_detector
 
-from tactslip_torch import export
-from tactslip_torch.export import export_detector
+from tactslip_torch.graph import export
+from tactslip_torch.graph.export import export_detector
 
 pytestmark = pytest.mark.onnx
 
@@ -31,7 +31,6 @@ def test_a_detector_without_alarm_gives_no_stream(tmp_path):
         ({"graphs": ["both"]}, "graphs must be bin or stream, or both, got both"),
         ({"graphs": []}, "got none"),
         ({"precision": "float16"}, "precision must be one of float32, float64, got 'float16'"),
-        ({"layout": "small"}, "layout must be one of latency, bulk, got 'small'"),
     ],
 )
 def test_another_choice_is_refused(detector, tmp_path, arguments, message):

@@ -10,7 +10,8 @@ import pytest
 import torch
 from engine_bins import assert_equals_reference, bins_of
 
-from tactslip_torch import FeaturePool, HandLayout, engines
+from tactslip_torch import FeaturePool, HandLayout
+from tactslip_torch import runtime as engines
 from tactslip_torch.features import extractor as module
 from tactslip_torch.features.extractor import FeatureExtractor
 

@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch
 
-from tactslip_torch.files import load_table, save_table, table_form, whole_file
+from tactslip_torch.runtime import load_table, save_table, table_form, whole_file
 
 
 def test_what_was_written_is_there(tmp_path):

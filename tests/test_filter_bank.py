@@ -11,8 +11,14 @@ from small_detector import HAND
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.rounding import is_rounding
 from tactslip_torch.onset.baselines import largest_detail
-from tactslip_torch.signals.filter_bank import WaveletFilters, as_wavelet, wavelet_fact
-from tactslip_torch.signals.wavelet import branch_matrix, highest_level, wavelet_branches
+from tactslip_torch.signals.wavelet import (
+    WaveletFilters,
+    as_wavelet,
+    branch_matrix,
+    highest_level,
+    wavelet_branches,
+    wavelet_fact,
+)
 
 FILTERS = ("dec_lo", "dec_hi", "rec_lo", "rec_hi")
 

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.signals.savgol import reach, savgol_filter
+from tactslip_torch.signals.filtering import ChannelFilter, reach, savgol_filter
 
 WINDOWS = [(1, 0), (3, 1), (5, 2), (11, 1), (51, 1), (51, 3), (11, 0), (7, 6)]
 WINDOW_OF_CHANNEL = [51, 11, 51, 5]

@@ -7,13 +7,14 @@ import pytest
 import torch
 from test_recipe import make_parts, surveyed, together
 
-from tactslip_torch import planning, validation
-from tactslip_torch.fitting import LinearSums, TrainingPass
 from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
 from tactslip_torch.model.class_gaussians import RESOLUTION
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.planning import Plan, plan_detector
-from tactslip_torch.recipe import Recipe, recalls_mean
+from tactslip_torch.training import selection as planning
+from tactslip_torch.training import selection as validation
+from tactslip_torch.training.fitting import LinearSums, TrainingPass
+from tactslip_torch.training.recipe import Recipe, recalls_mean
+from tactslip_torch.training.selection import Plan, plan_detector
 
 
 def quiet(items, what):
@@ -78,7 +79,7 @@ def test_scores_are_calibrated_by_machines_that_never_met_the_group(rng):
 def test_scores_that_tell_slip_backwards_are_not_calibrated(rng, caplog):
     features, is_slip = together(make_parts(rng))
     bins = TrainingBins(features.double(), is_slip)
-    assert validation._calibration(-is_slip.double(), bins) is None
+    assert validation._calibration(-is_slip.double(), bins.is_slip, bins.weights) is None
     assert "slip has the lower scores" in caplog.text
 
 

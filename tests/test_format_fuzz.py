@@ -24,7 +24,7 @@ from fuzzing import (
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tactslip_torch.data.formats.registry import FORMATS
+from tactslip_torch.data.formats import FORMATS
 
 
 @pytest.fixture(scope="module")

@@ -7,18 +7,17 @@ import pytest
 import torch
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
 
-from tactslip_torch.data.splits import seen6
-from tactslip_torch.datamodule import SlipDataModule
-from tactslip_torch.deadline.cost import GROUPS, CostModel
-from tactslip_torch.deadline.front import (
+from tactslip_torch.analysis.latency import GROUPS, CostModel, Latency, Limits
+from tactslip_torch.analysis.pareto import (
     Candidate,
+    Search,
+    Searcher,
     landmarks,
     nondominated,
     worth_naming,
     worth_timing,
 )
-from tactslip_torch.deadline.latency import Latency, Limits
-from tactslip_torch.deadline.search import Search, Searcher
+from tactslip_torch.data.splits import seen6
 from tactslip_torch.features.groups import allowed, of_fingers
 from tactslip_torch.features.names import FeatureName, pool_names
 from tactslip_torch.features.pool import FeaturePool
@@ -29,8 +28,9 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.recipe import Frame, fit_frame, recalls_mean, stand_for
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.recipe import Frame, fit_frame, recalls_mean, stand_for
 
 SMALL = {
     "sizes": [3, 6],
@@ -48,10 +48,6 @@ SMALL = {
 POOLED = {"statistics": [["mean"]], "pooled_sizes": [None, 4], "pooled_components": ["moments"]}
 RECIPE = small_recipe(balance="weights", compress=True, tail=0.01)
 HAND = HandLayout.paper24()
-
-
-def quietly(items, what):
-    return items
 
 
 def described(candidates):
@@ -79,7 +75,7 @@ def searcher(source=None, recipe=RECIPE, **changes):
 @pytest.fixture(scope="module")
 def searched():
     made = searcher(**POOLED)
-    return made, made.candidates(quietly)
+    return made, made.candidates()
 
 
 # Groups ----------------------------------------------------------------------------------------
@@ -169,7 +165,7 @@ def test_what_cannot_be_searched_is_refused(changes, message):
 def test_an_empty_selection_is_named():
     made = searcher(sizes=[500], channels=["gauges"])
     with pytest.raises(ValueError, match=r"an empty selection: no group .*=\['gauges'\]"):
-        made.candidates(quietly)
+        made.candidates()
 
 
 # What is found ---------------------------------------------------------------------------------
@@ -236,7 +232,7 @@ def test_the_number_of_threads_changes_nothing(searched):
     made, candidates = searched
     torch.set_num_threads(2)
     try:
-        assert described(made.candidates(quietly)) == described(candidates)
+        assert described(made.candidates()) == described(candidates)
     finally:
         torch.set_num_threads(1)
 
@@ -245,10 +241,10 @@ def test_test_cycles_teach_nothing():
     fold = seen6(SmallSet().ids, seen=["a", "b", "c"])[0]
     loud = SmallSet(gains=dict.fromkeys(fold.having("test"), 9.0))
     few = {"rankings": ["t"], "channels": ["all"], "components": ["all"], "degrees": [2]}
-    quiet = described(searcher(**few).candidates(quietly))
-    assert described(searcher(loud, **few).candidates(quietly)) == quiet
+    quiet = described(searcher(**few).candidates())
+    assert described(searcher(loud, **few).candidates()) == quiet
     loud = SmallSet(gains=dict.fromkeys(fold.having("train")[:3], 9.0))
-    assert described(searcher(loud, **few).candidates(quietly)) != quiet
+    assert described(searcher(loud, **few).candidates()) != quiet
 
 
 def test_pooled_candidates_of_every_group_size_and_degree(searched):
@@ -302,9 +298,9 @@ def test_a_pooled_score_is_that_of_everything_learned_without_the_material(searc
 
 def test_pooled_compute_is_of_all_channels_and_of_pooling():
     made = searcher(**POOLED, rankings=["t"], components=["all"], channels=["films"])
-    flat = made.candidates(quietly)
+    flat = made.candidates()
     made.costs = replace(made.costs, pooling_us=100.0, pooling_of_one_us=1.0)
-    for before, after in zip(flat, made.candidates(quietly), strict=True):
+    for before, after in zip(flat, made.candidates(), strict=True):
         num_pooled = len(after.selected) if after.columns != "channel" else 0
         more = 2.0 * (100 + num_pooled) if num_pooled else 0.0  # p99 is twice the median here
         assert after.latency.compute_us - before.latency.compute_us == pytest.approx(more)
@@ -318,16 +314,16 @@ def test_fingers_are_dropped_from_the_best_on():
     made = searcher(rankings=["t"], components=["all"])
     gauge, film = SMALL_HAND.channels
     made.pool = FeaturePool(HandLayout((gauge, replace(film, finger="thumb"))))
-    candidates = made.candidates(quietly)
+    candidates = made.candidates()
     best = next(c for c in candidates if c.channels == "all" and c.degree == 2)
     best = best._replace(frame=frame_of((0, 100)))
-    found = made.without_fingers(best, quietly)
+    found = made.without_fingers(best)
     assert {c.channels for c in found} == {"all without index", "all without thumb"}
     of_film = next(c for c in candidates if c.channels == "films" and len(c.selected) == 6)
     without = [c for c in found if c.channels == "all without index" and len(c.selected) == 6]
     assert without[0].selected == of_film.selected
     alone = best._replace(frame=frame_of((0,)))
-    assert made.without_fingers(alone, quietly) == []
+    assert made.without_fingers(alone) == []
 
 
 def test_each_finger_goes_that_is_missed_least(monkeypatch):
@@ -348,7 +344,7 @@ def test_each_finger_goes_that_is_missed_least(monkeypatch):
     monkeypatch.setattr(made, "_scored", played)
     one_of_each = [made._channel_of.index(channel) for channel in (0, 3, 6, 9, 12)]
     best = candidate(60.0, 100.0, 0.9)._replace(frame=frame_of(one_of_each))
-    found = made.without_fingers(best, quietly)
+    found = made.without_fingers(best)
     assert len(found) == 5 + 4 + 3 + 2
     kept = [max(c.balanced_accuracy for c in part) for part in (found[:5], found[5:9], found[9:12])]
     assert kept == pytest.approx([0.89, 0.87, 0.77])  # little, then middle, then the thumb
@@ -446,4 +442,4 @@ def test_what_is_close_to_the_limits_is_timed(rng):
 def test_look_ahead_is_that_of_the_filter():
     made = searcher(channels=["gauges"], rankings=["t"], degrees=[1], sizes=[3])
     made.filters = {"centred": ChannelFilter([51, 11], align="causal")}
-    assert {c.latency.look_ahead_ms for c in made.candidates(quietly)} == {0.0}
+    assert {c.latency.look_ahead_ms for c in made.candidates()} == {0.0}

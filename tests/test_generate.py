@@ -15,13 +15,12 @@ from oracles import savgol
 from test_commands import BAD_INPUT, TinyRecordings, composed
 
 from tactslip_torch import HandLayout, simulate
-from tactslip_torch import generate as module
-from tactslip_torch.config import folder_problem, one_line
+from tactslip_torch.commands import generate as module
+from tactslip_torch.commands.entry import folder_problem, one_line
+from tactslip_torch.commands.generate import generate, written_table
 from tactslip_torch.data.folder import RecordingFolder, Written, manifest_line
-from tactslip_torch.data.formats import npz
-from tactslip_torch.data.formats.registry import FORMATS, Format
+from tactslip_torch.data.formats import FORMATS, Format
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.generate import generate, written_table
 from tactslip_torch.simulation.scene import Scene
 from tactslip_torch.simulation.source import SimulatedRecordings
 
@@ -76,7 +75,7 @@ def test_files_hold_the_recordings_of_the_source_bit_for_bit(tmp_path, capsys):
     plain = Scene("M2", seed=5).to_dict()
     assert set(contents(tmp_path)) == {"M2_arm_motion_00.npz", "M6_arm_motion_00.npz"}
     for name in contents(tmp_path):
-        recording, hand, key = npz.load(tmp_path / name)
+        recording, hand, key = FORMATS["npz"].load(tmp_path / name)
         again = simulate(Scene.from_dict(key["recording"]))
         assert torch.equal(recording.samples, again.samples)
         assert recording.samples.isfinite().all()
@@ -100,7 +99,7 @@ def test_the_manifest_lists_the_files_with_their_truth(tmp_path):
     lines = manifest(tmp_path)
     assert [line["file"] for line in lines] == ["M2_arm_motion_00.npz", "M6_arm_motion_00.npz"]
     for line in lines:
-        recording = npz.load(tmp_path / line["file"]).recording
+        recording = FORMATS["npz"].load(tmp_path / line["file"]).recording
         assert (line["material"], line["cycle"]) == (recording.material, "0")
         assert (line["scene"], line["fidelity"], line["seed"]) == ("arm_motion", "kinematic", "0")
         assert line["simulated"] == "true"
@@ -195,7 +194,7 @@ def test_files_of_other_code_are_made_anew(tmp_path, monkeypatch):
     run(tmp_path)
     monkeypatch.setattr(module, "source_digest", lambda package: "changed")
     assert all(one.made for one in run(tmp_path))
-    assert {npz.load(p).key["code"] for p in tmp_path.glob("*.npz")} == {"changed"}
+    assert {FORMATS["npz"].load(p).key["code"] for p in tmp_path.glob("*.npz")} == {"changed"}
 
 
 def test_more_cycles_add_to_what_is_there(tmp_path):
@@ -319,7 +318,7 @@ def test_a_folder_that_cannot_be_made_is_said_in_one_line(tmp_path):
 def test_the_command_ends_with_one_line_and_status_2(tmp_path, argument, said):
     (tmp_path / "file").write_text("mine")
     done = subprocess.run(
-        [sys.executable, "-m", "tactslip_torch.generate", argument],
+        [sys.executable, "-m", "tactslip_torch", "generate", argument],
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -354,7 +353,7 @@ def test_the_figures_show_each_material_filtered(tmp_path, drawn):
     whole, near = drawn["recordings_paper.png"], drawn["onset_paper.png"]
     assert [row.title for row in whole[0]] == ["A", "B"]
     for row in whole[0]:
-        content, hand, _ = npz.load(tmp_path / f"{row.title}_paper_01.npz")
+        content, hand, _ = FORMATS["npz"].load(tmp_path / f"{row.title}_paper_01.npz")
         assert whole[1] == hand.to_rows()
         for channel, raw, seen in zip(hand.channels, content.samples, row.volts, strict=True):
             frame = 31 if channel.kind == "SG" else 11
@@ -389,10 +388,10 @@ def test_the_figures_are_written(tmp_path):
 
 def test_a_further_format_is_one_line(tmp_path, monkeypatch):
     """What a new format has to give, shown with one that keeps everything in another file."""
-    monkeypatch.setitem(FORMATS, "copy", Format("npz", ("copy",)))
+    monkeypatch.setitem(FORMATS, "copy", Format("npz", ("copy",), "_npz"))
     found = run(tmp_path, "format=copy", "cycles=1")
     assert [one.line["file"] for one in found] == ["A_paper_00.copy", "B_paper_00.copy"]
-    assert npz.load(tmp_path / "A_paper_00.copy").recording.material == "A"
+    assert FORMATS["npz"].load(tmp_path / "A_paper_00.copy").recording.material == "A"
     assert not any(one.made for one in run(tmp_path, "format=copy", "cycles=1"))
 
 
@@ -403,6 +402,6 @@ def test_a_line_of_the_manifest_says_what_the_recording_says(tmp_path):
     assert (line["file"], line["material"], line["scene"]) == ("a.npz", "A", "paper")
     assert (line["simulated"], line["fidelity"], line["seed"]) == ("false", "", "")
     assert json.loads(line["onsets_s"]) == list(content.onsets_s)
-    npz.save(tmp_path / "a.npz", content, source.hand, {})
-    again = npz.load(tmp_path / "a.npz").recording
+    FORMATS["npz"].save(tmp_path / "a.npz", content, source.hand, {})
+    again = FORMATS["npz"].load(tmp_path / "a.npz").recording
     assert manifest_line("a.npz", source.ids[0], again) == line

@@ -6,7 +6,7 @@ Which test holds the derivatives of each stage against finite differences:
 filter of recordings, and of bins       here; ``savgol_filter``: test_filtering
 wavelet branches, amplitude spectra     test_wavelet, test_spectrum
 each descriptor, first and second       test_descriptors, test_descriptors_mended
-the whole pool                          test_pool; smooth stand-ins: test_smooth
+the whole pool                          test_pool
 scaling, with its knee                  test_scaling; the fit of the scaler: here
 kernels, both solves, quadratic form    test_kernels, test_kernel_elm, test_quadratic
 the fit, its settings, held-out scores  test_differentiable_fit, test_held_out_gradient
@@ -15,7 +15,7 @@ probability                             here
 all of it at once                       here: training volts and stream to statistic, twice
 ======================================  =====================================================
 
-Mode and entropy step: they are left out by name, except where smooth stand-ins take their place.
+Mode and entropy step: they are left out by name.
 """
 
 import pytest
@@ -31,10 +31,8 @@ from tactslip_torch.model.kernel_elm import solve_kernel_elm
 from tactslip_torch.model.kernels import PAPER_KERNEL
 from tactslip_torch.model.quadratic import collapse
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.onset.decider import Decider, is_usable
-from tactslip_torch.onset.differentiable import stream_statistic
-from tactslip_torch.onset.scoring import score_stream
-from tactslip_torch.onset.sequential import BayesFilter, Cusum, KOfN
+from tactslip_torch.onset.decisions import Decider, is_usable, score_stream, stream_statistic
+from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -60,7 +58,7 @@ IN_USE = (
     "PVDF1 D1 freq band_energy_ratio",
 )
 SELECTED = [[str(name) for name in POOL.names].index(name) for name in IN_USE]
-RULES = [Cusum(drift=-1.0, evidence=0.5), BayesFilter(0.5, 0.3, 0.01, 0.4)]
+RULES = [Cusum(drift=-1.0, evidence=0.5), Cusum(drift=-0.5, evidence=0.4)]
 
 
 # ---------------------------------------------------------------------- stages not held elsewhere
@@ -164,17 +162,6 @@ def test_by_either_route_of_the_fit_and_to_its_settings(route, volts):
     assert gradgradcheck(chain, inputs, atol=1e-4, fast_mode=True)
 
 
-def test_with_smooth_stand_ins_nothing_is_left_out(volts):
-    pool = FeaturePool(HAND, bin_samples=SAMPLES, level=1, smooth=0.1)
-    selected = [*SELECTED, *(i for i, n in enumerate(POOL.names) if n.descriptor in STEPPING)]
-
-    def chain(raw, stream):
-        return statistic_of(raw, stream, RULES[1], True, 0.1, pool, selected)
-
-    assert gradcheck(chain, volts, atol=1e-5, fast_mode=True)
-    assert gradgradcheck(chain, volts, atol=1e-4, fast_mode=True)
-
-
 # ------------------------------------------------------------------------------ a detector's stream
 DETECTOR = detector_of()
 USUAL = score_stream(DETECTOR, signal(8000, 7), 20).score
@@ -219,7 +206,7 @@ def test_several_streams_at_once_and_float32():
 
 def test_gradients_of_a_stream_are_slopes(rng):
     """Along random directions of some volts each, against a central difference."""
-    settings = settings_of(BayesFilter(0.5, 0.3, 0.01, 0.4))
+    settings = settings_of(Cusum(drift=-0.5, evidence=0.4))
     samples = signal(300, 5).requires_grad_()
 
     def statistic(samples):

@@ -25,12 +25,12 @@ from tactslip_torch.model.abstention import KEY as ABSTAIN
 from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.sequential import Cusum
+from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 
 ORIGIN = Origin("1.2.3", "ab" * 32)
 IN_BOTH = {
-    *("format", "version", "graph", "precision", "layout", "channels", "kinds", "unit"),
+    *("format", "version", "graph", "precision", "channels", "kinds", "unit"),
     *("sample_rate_hz", "bin_samples", "context_before_samples", "context_after_samples"),
     *("features", "slip_if_score_at_least", "calibration", "slip_share", "abstain"),
     *("experiment", "train_materials", "simulated", "detector_sha256", "certificate"),
@@ -50,10 +50,10 @@ def alarming(settings=None):
 
 def test_a_bin_graph_says_what_a_host_must_know():
     detector = small_detector()
-    facts = model_facts(detector, Form("float64", "bulk"), ORIGIN)
+    facts = model_facts(detector, Form("float64"), ORIGIN)
     assert facts.keys() == IN_BOTH
     assert facts["format"] == FORMAT == "tactslip_torch onnx 1"
-    assert (facts["graph"], facts["precision"], facts["layout"]) == ("bin", "float64", "bulk")
+    assert (facts["graph"], facts["precision"]) == ("bin", "float64")
     assert facts["channels"] == ["SG1", "SG2", "PVDF1", "PVDF2"]
     assert facts["kinds"] == ["SG", "SG", "PVDF", "PVDF"]
     assert (facts["unit"], facts["sample_rate_hz"], facts["bin_samples"]) == ("V", 2000.0, 100)

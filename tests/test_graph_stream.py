@@ -17,8 +17,8 @@ from tactslip_torch.graph.stream import Timing, stream_graph
 from tactslip_torch.graph.value import F64
 from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.judgement import Judgement
-from tactslip_torch.onset.scoring import score_stream
-from tactslip_torch.onset.sequential import BayesFilter, Cusum, Hysteresis, KOfN
+from tactslip_torch.onset.decisions import score_stream
+from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -26,10 +26,7 @@ from tactslip_torch.signals.filtering import ChannelFilter
 RATE = 2000.0
 KINDS = ("all", "PVDF", "long")  # long: a frame that a causal bin does not hold
 ALIGNMENTS = ("centred", "causal", "trailing")
-RULES = {
-    rule.name: rule
-    for rule in (KOfN(2, 3), Hysteresis(0.5), BayesFilter(1.0, 0.3, 0.01, 0.2), Cusum(0.5, 0.5, 2))
-}
+RULES = {rule.name: rule for rule in (KOfN(2, 3), Cusum(0.5, 0.5, 2))}
 # Scores of the stand-in lie about 0, so that half of them speak for slip.
 CALIBRATIONS = {
     "platt": Platt(1.0, 0.0),
@@ -232,18 +229,16 @@ def test_a_decision_that_nothing_reaches_says_nothing(rule):
 
 
 def test_a_threshold_that_is_given_counts_for_that_push():
-    host, own = pair_of(rule="hysteresis")[0], pair_of(rule="hysteresis")[0]
+    host, own = pair_of(rule="k_of_n")[0], pair_of(rule="k_of_n")[0]
     samples = signal(1200, 8).T.numpy()
     for threshold in (0.3, 2.0, -np.inf, np.inf):
-        at_it, _ = pair_of(rule="hysteresis")
-        at_it.session = session_of(
-            "all", "centred", "hysteresis", "platt", 20, "float64", threshold
-        )
+        at_it, _ = pair_of(rule="k_of_n")
+        at_it.session = session_of("all", "centred", "k_of_n", "platt", 20, "float64", threshold)
         at_it.tail, at_it.state = host.tail, host.state
         expected, found = at_it.push(samples), host.push(samples, threshold)
         for name, value in expected.items():
             np.testing.assert_array_equal(found[name], value, err_msg=name)
-    usual, found = own.push(samples), pair_of(rule="hysteresis")[0].push(samples, 1.0)
+    usual, found = own.push(samples), pair_of(rule="k_of_n")[0].push(samples, 1.0)
     np.testing.assert_array_equal(found["alarm"], usual["alarm"])
 
 

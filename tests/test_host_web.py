@@ -244,7 +244,7 @@ def test_a_threshold_beyond_what_was_counted_is_told_as_such(threshold, said):
     ("ceiling", "low", "high"), [(8.0, 0.0, 8.0), (None, -3.0, 7.0)], ids=["bounded", "free"]
 )
 def test_the_slider_goes_by_the_statistic_where_no_rates_are_known(ceiling, low, high):
-    rule = {"name": "hysteresis", "ceiling": ceiling}
+    rule = {"name": "k_of_n", "ceiling": ceiling}
     told = scale_of({"threshold_curve": [], "threshold": 2.0, "rule": rule})
     assert told["title"] == "Alarm threshold"
     assert (told["thresholds"][0], told["thresholds"][-1]) == (low, high)

@@ -7,24 +7,24 @@ import pytest
 import torch
 from small_detector import HAND, raw_bins, small_detector
 
-from tactslip_torch.features.bin_sample import BinSample
-from tactslip_torch.features.selection import ClassMoments, t_scores
-from tactslip_torch.hand import HandLayout
-from tactslip_torch.importance.accuracy import (
-    balanced_accuracy,
-    difference,
-    draw_recordings,
-    tally,
-)
-from tactslip_torch.importance.choosing import (
+from tactslip_torch.analysis.importance import (
+    HELD_OUT,
     Ranking,
+    Refit,
+    _draw_recordings,
+    _side_by_side,
+    balanced_accuracy,
     best_first,
-    side_by_side,
+    difference,
+    first_order,
+    score_gradients,
+    tally,
     units_of,
     without,
 )
-from tactslip_torch.importance.gradient import first_order, score_gradients
-from tactslip_torch.importance.refit import HELD_OUT, Refit
+from tactslip_torch.features.bin_sample import BinSample
+from tactslip_torch.features.selection import ClassMoments, t_scores
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import PAPER_KERNEL
 from tactslip_torch.model.scaling import FeatureScaler
@@ -32,10 +32,6 @@ from tactslip_torch.model.scaling import FeatureScaler
 CHANNELS = ["a", "a", "b", "b", "c", "c"]  # of each feature
 UNITS = {name: frozenset(name) for name in "abc"}
 PENALTIES = (0.01, 0.1, 1.0)
-
-
-def quietly(items, what):
-    return items
 
 
 def sampled(seed, tells, groups="MNO", recordings=4, bins=12):
@@ -102,7 +98,7 @@ def test_a_draw_counts_a_recording_as_often_as_it_was_drawn():
     bins = sampled(4, {})
     is_right = torch.rand(len(bins.is_slip), generator=torch.Generator().manual_seed(1)) < 0.7
     found = tally(is_right, bins)
-    times = draw_recordings(found.group, 5, seed=2)
+    times = _draw_recordings(found.group, 5, seed=2)
     for draw, accuracy in zip(times, balanced_accuracy(found, times), strict=True):
         drawn = [r for r, count in enumerate(draw.tolist()) for _ in range(int(count))]
         assert float(accuracy) == pytest.approx(by_hand(is_right, bins, drawn))
@@ -231,19 +227,19 @@ def test_a_shared_ranking_takes_as_many_of_each_channel():
 def test_the_best_few_begin_with_what_tells_most_and_end_with_all():
     refit = refit_of({2: 1.5, 4: 0.9})
     ranking = ranking_of(refit)
-    steps = best_first(refit, ranking, UNITS, 9, quietly, "")
+    steps = best_first(refit, ranking, UNITS, 9, "")
     assert [name for name, _ in steps] == ["b", "c", "a"]
     assert [verdict.num_features for _, verdict in steps] == [2, 4, 6]
     alone = {name: refit(ranking(channels)).merit for name, channels in UNITS.items()}
     assert steps[0][1].merit == max(alone.values())
     assert steps[-1][1].tallies["test"].right.equal(refit(ranking("abc")).tallies["test"].right)
-    assert len(best_first(refit, ranking, UNITS, 2, quietly, "")) == 2
+    assert len(best_first(refit, ranking, UNITS, 2, "")) == 2
 
 
 def test_a_unit_without_a_feature_never_joins():
     refit = refit_of({2: 1.5})
     allowed = torch.tensor([False] * 2 + [True] * 4)
-    steps = best_first(refit, ranking_of(refit, 6, allowed), UNITS, 9, quietly, "")
+    steps = best_first(refit, ranking_of(refit, 6, allowed), UNITS, 9, "")
     assert sorted(name for name, _ in steps) == ["b", "c"]
 
 
@@ -253,7 +249,7 @@ def test_verdicts_come_in_order_and_alike_on_any_number_of_threads():
     found = []
     for threads in (1, 3):
         torch.set_num_threads(threads)
-        found.append(side_by_side(refit_of({2: 1.0}), selections))
+        found.append(_side_by_side(refit_of({2: 1.0}), selections))
     torch.set_num_threads(before)
     assert [verdict.num_features for verdict in found[0]] == [1, 2, 3, 1]
     assert [v.merit for v in found[0]] == [v.merit for v in found[1]]
@@ -264,7 +260,7 @@ def test_verdicts_come_in_order_and_alike_on_any_number_of_threads():
 
 def test_gradients_are_those_of_finite_differences():
     detector, samples = small_detector(2), raw_bins(3)
-    scores, gradients = score_gradients(detector, samples, quietly)
+    scores, gradients = score_gradients(detector, samples)
     torch.testing.assert_close(scores, detector.score_raw(samples))
     generator = torch.Generator().manual_seed(0)
     way = torch.randn(samples.shape, generator=generator, dtype=torch.float64)
@@ -277,7 +273,7 @@ def test_gradients_are_those_of_finite_differences():
 def test_a_channel_that_is_not_in_use_moves_nothing():
     detector = small_detector()
     samples = raw_bins(4)
-    _, gradients = score_gradients(detector, samples, quietly)
+    _, gradients = score_gradients(detector, samples)
     used = {name.channel for name in detector.selected_names}
     for index, name in enumerate(HAND.names):
         assert bool(gradients[:, index].any()) is (name in used)

@@ -8,8 +8,9 @@ import torch
 
 from tactslip_torch.data.labels import NO_POSITION, LabelRule, label_bins
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.feature_maker import RecordingFeatures, Stroke
-from tactslip_torch.judging import (
+from tactslip_torch.onset.events import LatencyParts
+from tactslip_torch.training.datamodule import RecordingFeatures, Stroke
+from tactslip_torch.training.learner import (
     BINS_APART,
     RULES,
     bin_scores,
@@ -18,7 +19,6 @@ from tactslip_torch.judging import (
     judged_bins,
     together,
 )
-from tactslip_torch.onset.events import LatencyParts
 
 RATE_HZ = 2000.0
 LATENCY = LatencyParts(look_ahead_s=0.0125, bin_s=0.05)

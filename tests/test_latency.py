@@ -2,12 +2,12 @@
 
 import pytest
 
-from tactslip_torch.deadline.latency import (
+from tactslip_torch.analysis.latency import (
     Latency,
     Limits,
+    _longest_hop,
     check_hops,
     least_latency_ms,
-    longest_hop,
     look_ahead_samples,
     shortest_hop,
 )
@@ -65,11 +65,11 @@ def test_what_is_missed_is_named():
 def test_hops():
     hops = [50.0, 5.0, 10.0, 25.0]
     parts = Latency(12.5, 50.0, 5.0, 300.0)
-    assert longest_hop(parts, hops, 200, 500).hop_ms == 50
-    assert longest_hop(parts, hops, 72.8, 500).hop_ms == 10
-    assert longest_hop(parts, hops, 72.7, 500).hop_ms == 5
-    assert longest_hop(parts, hops, 60, 500).hop_ms == 5  # none: the shortest
-    assert longest_hop(parts, hops, 200, 200).hop_ms == 5  # too slow at any
+    assert _longest_hop(parts, hops, 200, 500).hop_ms == 50
+    assert _longest_hop(parts, hops, 72.8, 500).hop_ms == 10
+    assert _longest_hop(parts, hops, 72.7, 500).hop_ms == 5
+    assert _longest_hop(parts, hops, 60, 500).hop_ms == 5  # none: the shortest
+    assert _longest_hop(parts, hops, 200, 200).hop_ms == 5  # too slow at any
     slow = Latency(0.0, 50.0, 5.0, 12_000.0)
     assert shortest_hop(slow, hops).hop_ms == 25
     assert shortest_hop(Latency(0.0, 50.0, 5.0, 60_000.0), hops).hop_ms == 50

@@ -11,9 +11,9 @@ from small_set import RATE_HZ, SmallSet, small_maker, small_recipe
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import random_bins, seen6, unseen4
-from tactslip_torch.datamodule import SlipDataModule
-from tactslip_torch.learning import SlipLearner
 from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.learner import SlipLearner
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",
@@ -290,11 +290,11 @@ def test_shuffled_labels_are_not_learned():
 @pytest.mark.slow
 def test_on_the_simulated_hand_the_score_is_neither_trivial_nor_perfect(tmp_path):
     from tactslip_torch.data.labels import LabelRule
-    from tactslip_torch.feature_maker import FeatureMaker
     from tactslip_torch.features.cache import FeatureCache
     from tactslip_torch.features.pool import FeaturePool
-    from tactslip_torch.recipe import Recipe
     from tactslip_torch.signals.filtering import ChannelFilter
+    from tactslip_torch.training.datamodule import FeatureMaker
+    from tactslip_torch.training.recipe import Recipe
 
     source = SimulatedRecordings(cycles=4, materials=["M1", "M2", "M3", "M4", "M5", "M6"])
     pool = FeaturePool(source.hand)

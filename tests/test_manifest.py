@@ -8,12 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactslip_torch.data.file_recordings import FileTimeline, on_time, scaled
 from tactslip_torch.data.folder import manifest_line
+from tactslip_torch.data.manifest import (
+    COLUMNS,
+    Truth,
+    manifest_of,
+    read_lines,
+    read_manifest,
+    truth_of,
+)
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.data.sets.manifest import COLUMNS, manifest_of, read_manifest
-from tactslip_torch.data.sets.manifest_lines import read_lines
-from tactslip_torch.data.sets.timeline import FileTimeline, on_time, scaled
-from tactslip_torch.data.sets.truth import Truth, truth_of
 
 FILES = ("a.csv", "b.csv", "c.csv")
 

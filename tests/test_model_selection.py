@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch import model_selection
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.model_selection import candidates, choose_model, fitted_frame, group_scores
-from tactslip_torch.recipe import Recipe, scene_weights, stand_for
+from tactslip_torch.training import selection as model_selection
+from tactslip_torch.training.recipe import FREE_CONSTANT, Recipe, scene_weights, stand_for
+from tactslip_torch.training.selection import candidates, choose_model, fitted_frame, group_scores
 
 HAND = HandLayout.from_rows(
     {"name": f"PVDF{i}", "kind": "PVDF", "finger": f"f{i}", "segment": "distal"} for i in range(4)
@@ -229,6 +229,9 @@ def test_recipes_that_cannot_be_are_refused(changes, message):
 
 
 def test_kernels_come_by_degree():
-    assert recipe(offsets=[0.5, 1.0]).kernels == tuple(
-        Polynomial(degree, c) for degree in (1, 2) for c in (0.5, 1.0)
+    # at degree 1 the offset weighs the constant alone, which is not penalised
+    assert recipe(offsets=[0.5, 1.0]).kernels == (
+        Polynomial(1, FREE_CONSTANT),
+        Polynomial(2, 0.5),
+        Polynomial(2, 1.0),
     )

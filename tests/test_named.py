@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
+from tactslip_torch.data.public_sets import listed, named_recordings
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.sets.named import listed, named_recordings
 
 PATTERN = r"(?P<scene>[nt])/(?P<material>[a-z]+)(?P<trial>\d+)\.csv"
 LABELS = {"n": "slip", "t": "non-slip"}

@@ -13,22 +13,22 @@ from small_detector import HAND, raw_bins, small_detector
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.onset.baselines import (
+    _VIBRATION_HZ,
     FLOOR_V,
-    VIBRATION_HZ,
     BaselineDetector,
     film_band_power,
     first_transition,
     largest_detail,
 )
-from tactslip_torch.onset.latch import latch, latch_start
-from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.decisions import score_stream
+from tactslip_torch.onset.rules import latch, latch_start
 from tactslip_torch.signals.filtering import ChannelFilter
 
 FILMS = HandLayout.paper24().indices("PVDF")
 SCORES = {"film_band_power": film_band_power, "largest_detail": largest_detail}
 
 
-def band_rms(x, rate=2000.0, band=VIBRATION_HZ):
+def band_rms(x, rate=2000.0, band=_VIBRATION_HZ):
     """Root mean square of what is left of a bin if all lines outside the band are taken out."""
     lines, hz = np.fft.rfft(x), np.fft.rfftfreq(len(x), 1 / rate)
     lines[(hz < band[0]) | (hz > band[1]) | (hz == 0)] = 0
@@ -223,7 +223,7 @@ def test_transitions_take_any_axes_and_are_causal(rng):
 def test_it_is_the_latch_without_debounce_and_pause(rng):
     llr = torch.from_numpy(rng.standard_normal((4, 100)))
     start = latch_start(llr[:, 0])
-    is_alarm, is_on, _ = latch(llr, 0.0, margin=0.0, rearm=1, refractory=0, state=start)
+    is_alarm, is_on, _ = latch(llr, 0.0, rearm=1, refractory=0, state=start)
     assert torch.equal(first_transition(llr >= 0), is_alarm)
     assert torch.equal(llr >= 0, is_on)
 

@@ -11,26 +11,23 @@ from matplotlib.figure import Figure
 from scipy import signal
 from test_commands import TinyRecordings, composed
 
-import tactslip_torch.pareto as command
+import tactslip_torch.commands.pareto as command
 from tactslip_torch import SlipDetector
+from tactslip_torch.analysis.latency import Latency, Limits, Timing
+from tactslip_torch.analysis.pareto import Candidate, Search, Timed, Workshop, distinct
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import seen6, unseen4
-from tactslip_torch.deadline.front import Candidate, distinct
-from tactslip_torch.deadline.latency import Latency, Limits
-from tactslip_torch.deadline.search import Search
-from tactslip_torch.deadline.timing import Timing
-from tactslip_torch.deadline.workshop import Timed, Workshop
-from tactslip_torch.feature_maker import FeatureMaker
 from tactslip_torch.features.groups import allowed
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.model_selection import Structure, fitted_frame
-from tactslip_torch.recipe import Frame, fit_frame
 from tactslip_torch.report.pareto import _plain_ticks, none_meets, pareto_table
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.recipe import Frame, fit_frame
+from tactslip_torch.training.selection import Structure, fitted_frame
 
 TINY = (
     "data._target_=test_commands.TinyRecordings",
@@ -263,7 +260,7 @@ def test_those_that_meet_the_limits_go_by_accuracy(monkeypatch, tmp_path):
         us = 100.0 * (len(met) + 2)
         return Timing(100.0, us, us, calls)
 
-    monkeypatch.setattr("tactslip_torch.deadline.workshop.time_detector", played)
+    monkeypatch.setattr("tactslip_torch.analysis.pareto.time_detector", played)
     slow = Timing(50.0, 900_000.0, 900_000.0, 20)
     monkeypatch.setattr(command, "time_in_fresh_process", lambda *a: slow)
     found = run(tmp_path, "deadline_ms=500", "compute_us=400", "tries=9")

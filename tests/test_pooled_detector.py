@@ -13,18 +13,16 @@ from hydra.utils import instantiate
 from test_commands import TINY, composed, run_train
 
 from tactslip_torch import SlipDetector
-from tactslip_torch.certificate import certify
-from tactslip_torch.export import export_detector
+from tactslip_torch.analysis.certificate import certify
+from tactslip_torch.analysis.importance import Refit, without
+from tactslip_torch.commands.importance import sensors
+from tactslip_torch.commands.train import train
 from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.graph.export import export_detector
 from tactslip_torch.graph.trials import simulated_bins
-from tactslip_torch.importance.choosing import without
-from tactslip_torch.importance.refit import Refit
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.onset.scoring import score_stream
+from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.sensors import sensors
-from tactslip_torch.stats import stats
-from tactslip_torch.train import train
 
 POOLED = ("recipe.use=pooled", "recipe.num_features=null", "recipe.degree=1")
 HOP = 50
@@ -326,13 +324,3 @@ def test_what_needs_channel_features_says_so(what, line, tmp_path):
         train(composed(*TINY, "cache=off", *what), tmp_path)
     assert str(caught.value).startswith(line)
     assert "\n" not in str(caught.value)
-
-
-def test_shards_need_channel_features_and_say_so(tmp_path):
-    overrides = [o for o in TINY if not o.startswith("export")]
-    config = composed(
-        *overrides, "recipe=general", "action=collect", f"out={tmp_path / 'a'}", name="stats"
-    )
-    with pytest.raises(ValueError, match=r"sums need a machine of degree 2 .* take recipe=robust"):
-        stats(config)
-    assert not (tmp_path / "a").exists()

@@ -23,7 +23,14 @@ def launched(folder, *overrides, torchrun=0):
     start = [sys.executable, "-m"]
     if torchrun:
         start += ["torch.distributed.run", f"--nproc_per_node={torchrun}", "--standalone", "-m"]
-    command = [*start, "tactslip_torch.train", *TINY, *MANY, f"hydra.run.dir={folder}", *overrides]
+    command = [
+        *start,
+        "tactslip_torch.train",
+        *TINY,
+        *MANY,
+        f"hydra.run.dir={folder}",
+        *overrides,
+    ]
     environment = {k: v for k, v in os.environ.items() if k != "TACTSLIP_TRACEBACK"}
     environment |= {"PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"}
     return subprocess.run(

@@ -10,7 +10,7 @@ from test_detector import random_detector
 
 from tactslip_torch import AlarmSettings
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.onset.sequential import KOfN
+from tactslip_torch.onset.rules import KOfN
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text()

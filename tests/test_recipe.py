@@ -8,15 +8,14 @@ import torch
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
 from test_learning import learn, unseen_c
 
+from tactslip_torch.analysis.pareto import Workshop
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.deadline.workshop import Workshop
 from tactslip_torch.features.groups import matching
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.learning import SlipLearner
-from tactslip_torch.planning import Plan, plan_detector
-from tactslip_torch.recipe import (
+from tactslip_torch.training.learner import SlipLearner
+from tactslip_torch.training.recipe import (
     Recipe,
     bin_weights,
     choose_frame,
@@ -24,6 +23,7 @@ from tactslip_torch.recipe import (
     recalls_mean,
     stand_for,
 )
+from tactslip_torch.training.selection import Plan, plan_detector
 
 NUM = 30
 

@@ -421,7 +421,7 @@ def test_what_is_said_of_seen_materials_switches_with_the_numbers():
 def test_the_verdicts_that_are_told_apart_are_those_of_the_calibration():
     from types import SimpleNamespace
 
-    from tactslip_torch.calibrate import _verdict
+    from tactslip_torch.commands.calibrate import _verdict
 
     config = SimpleNamespace(tolerance=0.005, bounds=(-2.0, 2.0))
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import stats
 
-from tactslip_torch.onset.resampling import Draws, Resampled
+from tactslip_torch.onset.events import Draws, Resampled
 
 
 def some(rng, num_recordings=12, num_values=40):

@@ -9,7 +9,7 @@ from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.rounding import is_rounding
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.recipe import Recipe
+from tactslip_torch.training.recipe import Recipe
 
 HAND = AnyHand({("PVDF", "fast"): 2, ("SG", "slow"): 1}, 2000.0, 64, 20, {}).layout()
 

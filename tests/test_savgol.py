@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.signals.savgol import (
+from tactslip_torch.signals.filtering import (
+    ChannelFilter,
     convolve_valid,
     edge_matrices,
     past_matrix,

@@ -7,7 +7,7 @@ import torch
 from small_detector import small_detector
 from streams import detector_of, signal
 
-from tactslip_torch.onset.scoring import Scores, score_stream
+from tactslip_torch.onset.decisions import Scores, score_stream
 
 HOP = 20
 LENGTHS = (51, 51, 11, 11)

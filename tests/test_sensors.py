@@ -13,14 +13,14 @@ from PIL import Image
 from test_commands import TINY
 from test_commands import composed as composed_train
 
-from tactslip_torch.config import conf_dir
+from tactslip_torch.analysis.importance import draw_raw_bins
+from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.commands.importance import _trained, main, sensors
+from tactslip_torch.commands.train import train
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.importance.raw_bins import draw_raw_bins
 from tactslip_torch.report.hand_drawing import _fingers, kind_colours
 from tactslip_torch.report.hand_figure import sensors_figure
 from tactslip_torch.report.sensors import best_table, sensors_csv, sensors_table
-from tactslip_torch.sensors import _trained, main, sensors
-from tactslip_torch.train import train
 
 SMALL = ("bins=20", "judged_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
 CHANNELS = ["SG1", "SG2", "PVDF1", "PVDF2"]
@@ -134,7 +134,7 @@ def test_tables_name_every_unit_and_number_of_sensors(found):
 
 def test_raw_bins_are_training_bins_of_both_classes_with_their_context(run):
     trained = _trained(run / "detector.pt", None)
-    raw, is_slip = draw_raw_bins(trained.maker, trained.fold, 24, lambda items, what: items)
+    raw, is_slip = draw_raw_bins(trained.maker, trained.fold, 24)
     assert raw.shape == (len(is_slip), 4, trained.detector.context_before + 125)
     assert int(is_slip.sum()) == len(is_slip) // 2 >= 12
     of_train = torch.cat(
@@ -142,7 +142,7 @@ def test_raw_bins_are_training_bins_of_both_classes_with_their_context(run):
     )
     starts = set(of_train[0].tolist())
     assert all(float(bin_[0, 0]) in starts for bin_ in raw)
-    again, _ = draw_raw_bins(trained.maker, trained.fold, 24, lambda items, what: items)
+    again, _ = draw_raw_bins(trained.maker, trained.fold, 24)
     assert torch.equal(raw, again)
     filtered = trained.detector.channel_filter.valid(raw.double())
     score = trained.detector(filtered)

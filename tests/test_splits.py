@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.data.session_split import leave_one_session_out
 from tactslip_torch.data.splits import (
     Split,
     are_rivals,
     confound,
     judged_once,
     leave_one_material_out,
+    leave_one_session_out,
     random_bins,
     seen6,
     unseen4,

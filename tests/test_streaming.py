@@ -13,16 +13,15 @@ from hypothesis import strategies as st
 from streams import detector_of, signal
 
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.onset.decider import Decider, Decisions, is_usable
-from tactslip_torch.onset.scoring import score_stream
-from tactslip_torch.onset.sequential import BayesFilter, Cusum, Hysteresis, KOfN
+from tactslip_torch.onset.decisions import Decider, Decisions, is_usable, score_stream
+from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.signals.filtering import ChannelFilter
 
 HOP = 20
 RATE = 2000.0
-RULES = [KOfN(2, 3), Hysteresis(0.5), BayesFilter(1.0, 0.3, HOP / RATE, 0.2), Cusum(0.5, 0.5, 2.0)]
+RULES = [KOfN(2, 3), Cusum(0.5, 0.5, 2.0)]
 DETECTORS = {
     (kind, align): detector_of(kind, align)
     for kind in ("all", "PVDF")

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.kernel_ridge import KernelRidge
 
-from tactslip_torch.files import load_table, save_table
 from tactslip_torch.model.sufficient import FORMAT, SufficientStats
+from tactslip_torch.runtime import load_table, save_table
 
 NUM = 4
 ABOUT = {"hand": {"name": "paper24", "channels": ["SG1", "PVDF1"]}, "scaler": "range"}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.threads import for_each, in_parts
+from tactslip_torch.runtime import for_each, in_parts
 
 
 @pytest.fixture(autouse=True)

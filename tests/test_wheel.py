@@ -66,7 +66,7 @@ def test_the_wheel_holds_nothing_else(unpacked):
 
 def test_the_wheel_comes_before_the_checkout(unpacked, tmp_path):
     """The editable install is on the path as well: without this the next tests prove nothing."""
-    code = "import tactslip_torch.config as c; print(c.__file__); print(c.conf_dir())"
+    code = "import tactslip_torch.commands.entry as c; print(c.__file__); print(c.conf_dir())"
     done = run(unpacked, tmp_path, "-c", code)
     assert done.returncode == 0, done.stderr
     module, conf = done.stdout.split()

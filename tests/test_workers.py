@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from tactslip_torch.workers import in_processes
+from tactslip_torch.runtime import in_processes
 
 
 @pytest.mark.parametrize("num_workers", [0, 1, 2, 3])

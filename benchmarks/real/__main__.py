@@ -40,8 +40,8 @@ from benchmarks.real.sizes import QUICK, Sizes
 from benchmarks.real.watched import drawn, watched, watched_figure
 from benchmarks.real.windows import composed, read_windows, recipe_of
 from benchmarks.reproduction.runs import code_digest
-from tactslip_torch.config import errors_in_one_line
-from tactslip_torch.files import whole_file
+from tactslip_torch.commands.entry import errors_in_one_line
+from tactslip_torch.runtime import whole_file
 
 RECIPES = ("general", "robust", "paper")
 """Of ours; the first is the one that limits are for."""

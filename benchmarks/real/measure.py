@@ -21,8 +21,8 @@ from benchmarks.real.sizes import Sizes
 from benchmarks.real.windows import Array, Windows
 from tactslip_torch.data.splits import Split
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.progress import bar
-from tactslip_torch.recipe import Recipe
+from tactslip_torch.runtime import bar
+from tactslip_torch.training.recipe import Recipe
 
 
 @dataclass(eq=False)

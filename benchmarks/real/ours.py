@@ -14,10 +14,10 @@ from torch import Tensor
 from benchmarks.real.method import Fitted, Method, Training
 from benchmarks.real.windows import Array, Windows
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.fitting import TrainingPass
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.planning import plan_detector
-from tactslip_torch.recipe import Recipe
+from tactslip_torch.training.fitting import TrainingPass
+from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.selection import plan_detector
 
 _AT_ONCE = 64
 

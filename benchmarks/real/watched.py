@@ -16,14 +16,14 @@ from omegaconf import DictConfig, OmegaConf
 from benchmarks.real.method import Training
 from benchmarks.real.ours import detector_of
 from benchmarks.real.windows import Array, Windows
-from tactslip_torch.alarming.debounced import Debounced
-from tactslip_torch.data.sets.datasets import FileRecordings
+from tactslip_torch.commands.detect import detect
+from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.splits import Split
-from tactslip_torch.detect import detect
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.progress import bar
-from tactslip_torch.recipe import Recipe
+from tactslip_torch.runtime import bar
+from tactslip_torch.training.alarm import DebouncedAlarm
+from tactslip_torch.training.recipe import Recipe
 
 HOP_MS = 40.0
 
@@ -52,7 +52,7 @@ def watched(
     """
     source = windows.maker.source
     assert isinstance(source, FileRecordings)
-    alarm = Debounced(HOP_MS)
+    alarm = DebouncedAlarm(HOP_MS)
     slips = dict(zip(windows.recording.tolist(), windows.is_slip.tolist(), strict=True))
     counts: dict[str, dict[str, int]] = {}
     shown = ""
@@ -88,7 +88,7 @@ def watched_figure(figure: Path) -> Path:
 
 
 def _through_detect(detector: SlipDetector, file: Path, config: DictConfig, folder: Path) -> None:
-    """What ``python -m tactslip_torch.detect`` does with that file."""
+    """What ``python -m tactslip_torch detect`` does with that file."""
     folder.mkdir(parents=True, exist_ok=True)
     detector.info |= {"simulated": False, "units": config.data.units}
     detector.save(folder / "detector.pt")

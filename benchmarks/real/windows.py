@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from benchmarks.real.sizes import Sizes
-from tactslip_torch.config import conf_dir, unknown_choice
+from tactslip_torch.commands.entry import conf_dir, unknown_choice
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split
-from tactslip_torch.experiment import feature_parts
-from tactslip_torch.feature_maker import FeatureMaker
-from tactslip_torch.progress import bar
-from tactslip_torch.recipe import Recipe
+from tactslip_torch.runtime import bar
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.recipe import Recipe
 
 Array = NDArray[Any]
 EXPERIMENT = "+exp=biotacsp_dos"

@@ -35,12 +35,11 @@ from benchmarks.reproduction.page import (
 )
 from benchmarks.reproduction.results import Report, runs_of
 from benchmarks.reproduction.runs import kept, run
+from tactslip_torch.analysis.signal_checks import filtered, judge_facts
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.facts import filtered, judge_facts
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.figures import pipeline_figure
-from tactslip_torch.simulation.knobs.calibrated import CALIBRATED_PATH
-from tactslip_torch.simulation.materials import SEEN_MATERIALS
+from tactslip_torch.runtime import whole_file
+from tactslip_torch.simulation.parameters import CALIBRATED_PATH, SEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings
 
 KEPT = RESULTS / KEPT_NAME

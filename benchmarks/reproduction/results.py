@@ -102,7 +102,7 @@ POOLED_NUMBER = "best_pooled_number"
 def baseline_percent(
     report: Report, experiment: str, role: str, score: str, baseline: str = POOLED_NUMBER
 ) -> list[float]:
-    """As ``percent``, of a baseline (``tactslip_torch.baselines``)."""
+    """As ``percent``, of a baseline (``tactslip_torch.training.baselines``)."""
     return list(baseline_by_seed(report, experiment, role, score, baseline).values())
 
 

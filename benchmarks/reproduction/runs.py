@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from benchmarks import ROOT
 from tactslip_torch.features.cache import source_digest
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 GROUPS = ("per_material", "per_speed", "per_scene")
 _MADE_BY = "made_by.txt"

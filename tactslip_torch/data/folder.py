@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tactslip_torch.data.formats.header import Archived
-from tactslip_torch.data.formats.reading import Opened
-from tactslip_torch.data.formats.registry import (
+from tactslip_torch.data.formats import (
+    Archived,
     Format,
+    Opened,
     endings,
     find_format,
     format_of,
     named_format,
 )
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 MANIFEST = "manifest.csv"
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.files import whole_file
+from tactslip_torch.runtime import whole_file
 
 log = logging.getLogger(__name__)
 

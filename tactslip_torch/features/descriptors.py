@@ -35,7 +35,7 @@ band energy ratio  eps (n + branches) ratio                         + (n/2 + 2) 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -249,7 +249,6 @@ def describe(
     scale: Tensor | None = None,
     reference: Tensor | None = None,
     frequency_hz: Tensor | None = None,
-    stand_ins: Mapping[str, Callable[[Sample], Tensor]] | None = None,
 ) -> Tensor:
     """The named descriptors of samples that are already settled (``settle``) where they must be.
 
@@ -259,7 +258,6 @@ def describe(
         scale: largest magnitude of the raw bin; default: that of ``x``.
         reference: the filtered raw bin, needed by ``correlation``.
         frequency_hz: the axis of a spectrum, needed by its centroid and spread.
-        stand_ins: what takes the place of the descriptor of that name (``smooth``).
 
     Shape:
         - x: ``[*, n]``; scale: ``[*]``; reference: broadcastable to ``x``; frequency_hz: ``[n]``
@@ -281,8 +279,7 @@ def describe(
     if not x.ndim or x.shape[-1] < 2:
         raise ValueError(f"a sample needs at least two values, got shape {tuple(x.shape)}")
     sample = Sample(x, scale, None if reference is None else Sample(reference), frequency_hz)
-    functions = _DESCRIPTORS | dict(stand_ins or {})
-    values = torch.stack([functions[name](sample) for name in names], dim=-1)
+    values = torch.stack([_DESCRIPTORS[name](sample) for name in names], dim=-1)
     if sample.is_ordinary:
         return values
     largest = torch.finfo(x.dtype).max

@@ -19,14 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.engines import usable_engine
 from tactslip_torch.features.eager.engine import EagerEngine
 from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool, saturating
-from tactslip_torch.plain import is_plain
-from tactslip_torch.threads import for_each
+from tactslip_torch.runtime import for_each, is_plain, usable_engine
 
 EngineName = Literal["auto", "compiled", "eager", "reference"]
 _LOG = logging.getLogger(__name__)
@@ -73,7 +71,7 @@ class FeatureExtractor:
         pool: what features there are.
         selected: pool indices of the features wanted, in the order of the output; default: all.
         engine: ``"auto"`` takes the compiled one where numba is installed, else the eager one. Its
-            first use on a machine takes some 20 s (``warm_up``). A smooth pool has the reference.
+            first use on a machine takes some 20 s (``warm_up``).
 
     Attributes:
         plan: the least work for these features.
@@ -105,8 +103,7 @@ class FeatureExtractor:
             )
         self.pool = pool
         self.selected = tuple(chosen)
-        usable = resolved(engine)
-        self.engine: EngineName = usable if pool.smooth is None else "reference"
+        self.engine: EngineName = resolved(engine)
         self.plan = make_plan(pool.hand, pool.level, self.names)
         self._index = None if selected is None else torch.tensor(self.selected)
         self._start()

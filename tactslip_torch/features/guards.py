@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.plain import is_recorded
+from tactslip_torch.runtime import is_recorded
 
 
 def is_constant(x: Tensor, scale: Tensor) -> Tensor:

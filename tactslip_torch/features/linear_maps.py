@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.signals.filter_bank import Wavelet
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
-from tactslip_torch.signals.wavelet import branch_matrix, branch_names
+from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names
 
 RANK_TOLERANCE = 1e-12
 """Singular values below this part of the largest are rounding."""

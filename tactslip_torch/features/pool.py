@@ -7,7 +7,6 @@ adapts slowly, a film one that adapts fast.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
@@ -24,13 +23,17 @@ from tactslip_torch.features.descriptors import (
 from tactslip_torch.features.guards import bounded_gradient, settle
 from tactslip_torch.features.guards import saturating as saturating
 from tactslip_torch.features.names import pool_names
-from tactslip_torch.features.smooth import stand_ins
 from tactslip_torch.features.transforms import amplitudes_by, branches_by
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.plain import is_recorded
-from tactslip_torch.signals.filter_bank import WaveletFilters, as_wavelet, wavelet_fact
+from tactslip_torch.runtime import is_recorded
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
-from tactslip_torch.signals.wavelet import branch_matrix, branch_names
+from tactslip_torch.signals.wavelet import (
+    WaveletFilters,
+    as_wavelet,
+    branch_matrix,
+    branch_names,
+    wavelet_fact,
+)
 
 Arithmetic = Literal["double", "native"]
 GAIN = 2.0**20
@@ -61,16 +64,14 @@ class FeaturePool(nn.Module):
         hand: the channels, in the order in which bins hold them.
         sample_rate_hz: of the bins.
         bin_samples: length of a bin; 100 (50 ms at 2 kHz) in the paper.
-        wavelet: its name or, of a learned one, its filters (or their ``to_dict``).
+        wavelet: its name or, of one without a name, its filters (or their ``to_dict``).
         level: number of wavelet levels.
         spectrum: ``"reference"`` (the authors') or ``"clean"`` (ours).
         arithmetic: ``"double"``, or ``"native"`` to compute in the dtype of the bins.
-        smooth: temperature of stand-ins for what steps or has kinks (``features.smooth`` has their
-            errors); None for the exact descriptors.
 
     Raises:
         ValueError: if the rate is not positive, the bin is too short for the levels, or the
-            arithmetic or the temperature none of those there are.
+            arithmetic none of those there are.
 
     Example:
         >>> pool = FeaturePool(HandLayout.paper24())
@@ -88,7 +89,6 @@ class FeaturePool(nn.Module):
         level: int = 4,
         spectrum: SpectrumMethod = "reference",
         arithmetic: Arithmetic = "double",
-        smooth: float | None = None,
     ) -> None:
         super().__init__()
         if not sample_rate_hz > 0:
@@ -104,8 +104,6 @@ class FeaturePool(nn.Module):
         self.level = level
         self.spectrum: SpectrumMethod = spectrum
         self.arithmetic: Arithmetic = arithmetic
-        self.smooth = smooth
-        self._ways: dict[str, Any] = {} if smooth is None else {"stand_ins": stand_ins(smooth)}
         self._gauges, self._films = list(hand.slow), list(hand.fast)
         self._inverses: dict[torch.dtype, Tensor] = {}
         self.names = pool_names(hand, level)
@@ -120,7 +118,7 @@ class FeaturePool(nn.Module):
 
     def facts(self) -> dict[str, Any]:
         """All arguments but the hand, as JSON-able values; ``FeaturePool(hand, **facts)``."""
-        exact = {
+        return {
             "sample_rate_hz": self.sample_rate_hz,
             "bin_samples": self.bin_samples,
             "wavelet": wavelet_fact(self.wavelet),
@@ -128,24 +126,6 @@ class FeaturePool(nn.Module):
             "spectrum": self.spectrum,
             "arithmetic": self.arithmetic,
         }
-        return exact if self.smooth is None else exact | {"smooth": self.smooth}
-
-    def with_branches(self, matrix: Tensor) -> FeaturePool:
-        """A light copy with other wavelet branches, to which gradients flow.
-
-        It is for learning: its ``wavelet`` and what is made of that know nothing of the matrix.
-
-        Shape:
-            - matrix: ``[2 * level, n, n]``, as ``LiftedWavelet.branch_matrix`` gives it
-
-        Raises:
-            ValueError: if the shape is another.
-        """
-        if matrix.shape != (expected := self._constants["branches"].shape):
-            raise ValueError(f"expected branches {tuple(expected)}, got {tuple(matrix.shape)}")
-        pool = copy.copy(self)
-        pool._constants = self._constants | {"branches": matrix}
-        return pool
 
     def forward(self, bins: Tensor) -> Tensor:
         """Features of filtered bins.
@@ -186,14 +166,12 @@ class FeaturePool(nn.Module):
             TIME_DESCRIPTORS,
             scale=branch_scale,
             reference=settle(films, scale)[..., None, :],
-            **self._ways,
         )
         in_frequency = describe(
             spectra,
             SPECTRUM_DESCRIPTORS,
             scale=branch_scale,
             frequency_hz=self._constant("frequency_hz", bins),
-            **self._ways,
         )
         ratios = band_energy_ratio(spectra).unflatten(-1, (self.level, 2))  # [*, films, level, 2]
         by_level = torch.cat(
@@ -276,7 +254,7 @@ class FeaturePool(nn.Module):
     def _of_gauges(self, bins: Tensor) -> Tensor:
         gauges = bins[..., self._gauges, :]
         scale = gauges.detach().abs().amax(-1)
-        values = describe(settle(gauges, scale), COMMON_DESCRIPTORS, scale=scale, **self._ways)
+        values = describe(settle(gauges, scale), COMMON_DESCRIPTORS, scale=scale)
         return values.flatten(-2)
 
     def _constant(self, name: str, like: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.plain import is_plain
+from tactslip_torch.runtime import is_plain
 
 STATISTICS = ("mean", "std", "min", "max", "median")
 SORTED = "sorted"

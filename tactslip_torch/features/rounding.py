@@ -14,8 +14,8 @@ from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.signals.filter_bank import Wavelet
 from tactslip_torch.signals.spectrum import SpectrumMethod
+from tactslip_torch.signals.wavelet import Wavelet
 
 _BINS = 128  # of noise
 _MOVE = 1e-13  # of its size, by which each sample is moved

@@ -22,7 +22,7 @@ from tactslip_torch.features.guards import (
     ordinary_sizes,
     stretch,
 )
-from tactslip_torch.plain import is_recorded
+from tactslip_torch.runtime import is_recorded
 
 
 class Sample:

@@ -29,7 +29,7 @@ class Judged(NamedTuple):
     Attributes:
         score: ``[B]``, in the precision of the form; at least 0 is slip.
         is_valid: ``[B]``, bool: every channel in use can be trusted.
-        is_usable: ``[B]``, bool: the score tells something (``onset.decider.is_usable``).
+        is_usable: ``[B]``, bool: the score tells something (``onset.decisions.is_usable``).
         variance: ``[B]``, float64, of the score; ``None``: of none.
     """
 
@@ -57,20 +57,13 @@ def judge_bins(
         graph: to which they are added; may be a body.
         detector: whose judgement.
         windows: raw samples in volts, of the channels in use alone, float64 or of the form.
-        form: precision and layout.
+        form: precision.
         dead: which channels of the hand are missing whatever they say, ``[C]``, bool.
 
     Shape:
         - windows: ``[B, channels, Window.length]``
 
-    Raises:
-        ValueError: if the detector's pool is smooth.
     """
-    if (smooth := detector.pool.smooth) is not None:
-        raise ValueError(
-            f"there are no nodes for smooth descriptors (smooth={smooth:g}); fit on exact ones to "
-            "export"
-        )
     front = Front(graph, detector, windows, form)
     features = selected_features(graph, detector, front, form)
     is_dead = dead.take(front.window.channels, 0)
@@ -97,7 +90,7 @@ def bin_graph(detector: SlipDetector, form: Form) -> Graph:
 
     Args:
         detector: whose judgement.
-        form: precision and layout.
+        form: precision.
 
     Shape:
         - in ``samples``: ``[batch, C, Window.length]``, volts, in the precision of the form
@@ -153,7 +146,6 @@ def selected_features(graph: Graph, detector: SlipDetector, front: Front, form: 
             made,
             places,
             dtype=form.dtype,
-            frugal=form.layout == "bulk",
             frequency_hz=axis,
         )
         for name in places:

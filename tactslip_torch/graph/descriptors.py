@@ -15,20 +15,20 @@ from tactslip_torch.graph.value import F64
 
 def mean(x: Shared) -> Part:
     """Arithmetic mean."""
-    places = x.of_rows(("mean",))
+    places = x.all_rows
     return x.in_volts(x.mean(places), places)
 
 
 def std(x: Shared) -> Part:
     """Standard deviation with ``n - 1``."""
-    places = x.of_rows(("std",))
+    places = x.all_rows
     square = x.variance().of(places) * (x.num / (x.num - 1))
     return x.in_volts(square.sqrt(), places)
 
 
 def cv(x: Shared) -> Part:
     """Standard deviation over the mean, whose magnitude counts as at least 1e-6 of the rms."""
-    places = x.of_rows(("cv",))
+    places = x.all_rows
     mean = x.mean(places)
     floor = mean.abs().max(x.rms(places) * CV_FLOOR)
     signed = x.graph.where(mean < 0.0, -floor, floor)
@@ -38,14 +38,14 @@ def cv(x: Shared) -> Part:
 
 def range_(x: Shared) -> Part:
     """Largest minus smallest."""
-    places = x.of_rows(("range",))
+    places = x.all_rows
     values = x.values(places)
     return x.in_volts((values.amax() - values.amin()).cast(F64), places)
 
 
 def mean_deviation(x: Shared) -> Part:
     """Mean absolute deviation."""
-    places = x.of_rows(("mean_deviation",))
+    places = x.all_rows
     return x.in_volts(x.centred().of(places).abs().mean().cast(F64), places)
 
 
@@ -66,7 +66,7 @@ def kurtosis(x: Shared) -> Part:
 
 def energy(x: Shared) -> Part:
     """Sum of squares."""
-    places = x.of_rows(("energy",))
+    places = x.all_rows
     mean, unit = x.mean(places), x.unit(places)
     square = mean * mean + x.variance().of(places)
     return Part(square * unit * unit * float(x.num), places)
@@ -74,7 +74,7 @@ def energy(x: Shared) -> Part:
 
 def peak_factor(x: Shared) -> Part:
     """Maximum over rms."""
-    places = x.of_rows(("peak_factor",))
+    places = x.all_rows
     largest = x.values(places).amax().cast(F64)
     if x.rows.mean is not None:
         largest = largest + x.mean(places)
@@ -83,7 +83,7 @@ def peak_factor(x: Shared) -> Part:
 
 def correlation(x: Shared) -> Part:
     """Correlation with the filtered bin; 0 if either is flat."""
-    places = x.of_rows(("correlation",), always=True)
+    places = x.of_rows(("correlation",))
     film = x.rows.film
     if film is None:
         raise ValueError("correlation needs the film that rows are branches of")
@@ -106,20 +106,20 @@ def spectral_spread(x: Shared) -> Part:
 
 def median(x: Shared) -> Part:
     """Middle value."""
-    places = x.of_rows(("median",), always=True)
+    places = x.of_rows(("median",))
     value = medians(x.values(places), x.num).cast(F64)
     return x.in_volts(x.with_mean(value, places), places)
 
 
 def iqr(x: Shared) -> Part:
     """Interquartile range."""
-    places = x.of_rows(("iqr",), always=True)
+    places = x.of_rows(("iqr",))
     return x.in_volts(interquartile(x.values(places), x.num).cast(F64), places)
 
 
 def mode(x: Shared) -> Part:
     """Most frequent value."""
-    places = x.of_rows(("mode",), always=True)
+    places = x.of_rows(("mode",))
     if x.rows.scale is None:
         raise ValueError("mode needs the scale of the bins that rows are of")
     scale = x.of_all(x.rows.scale, places)
@@ -129,7 +129,7 @@ def mode(x: Shared) -> Part:
 
 def entropy(x: Shared) -> Part:
     """Entropy of the amplitude histogram."""
-    places = x.of_rows(("entropy",), always=True)
+    places = x.of_rows(("entropy",))
     return Part(level_entropy(x.values(places), x.num, x.dtype), places)
 
 

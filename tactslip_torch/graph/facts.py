@@ -53,7 +53,6 @@ def model_facts(
         "version": origin.version,
         "graph": kind,
         "precision": form.precision,
-        "layout": form.layout,
         "channels": list(hand.names),
         "kinds": [channel.kind for channel in hand.channels],
         "unit": info.get("units", "V"),

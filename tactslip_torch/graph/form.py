@@ -1,4 +1,4 @@
-"""What a graph is made for: its numbers, its shape, and the samples that a bin needs."""
+"""What a graph is made for: its numbers, and the samples that a bin needs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from tactslip_torch.model.detector import SlipDetector
 
 Precision = Literal["float32", "float64"]
-Layout = Literal["latency", "bulk"]
 
 
 @dataclass(frozen=True)
@@ -20,22 +19,16 @@ class Form:
     Args:
         precision: of samples, scores and of all that there is one of per sample; what steps or
             cancels is float64 in either.
-        layout: ``"latency"``: as few nodes as can be, for one bin; ``"bulk"``: as little
-            arithmetic, for many.
 
     Raises:
-        ValueError: for another precision or layout.
+        ValueError: for another precision.
     """
 
     precision: Precision = "float32"
-    layout: Layout = "latency"
 
     def __post_init__(self) -> None:
-        for name, known in (("precision", get_args(Precision)), ("layout", get_args(Layout))):
-            if getattr(self, name) not in known:
-                raise ValueError(
-                    f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}"
-                )
+        if self.precision not in (known := get_args(Precision)):
+            raise ValueError(f"precision must be one of {', '.join(known)}, got {self.precision!r}")
 
     @property
     def dtype(self) -> np.dtype[Any]:

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.features.linear_maps import RANK_TOLERANCE, LinearMaps
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.signals.savgol import overlap_matrix
+from tactslip_torch.signals.filtering import ChannelFilter, overlap_matrix
 
 Matrix = NDArray[np.float64]
 GAUGE = -1

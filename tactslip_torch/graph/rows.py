@@ -77,7 +77,7 @@ class Front:
         graph: to which nodes are added.
         detector: whose plan.
         windows: raw samples of the channels in use, ``[B, channels, Window.length]``.
-        form: precision and layout.
+        form: precision.
 
     Attributes:
         is_missing: ``[B, channels]``, bool: a NaN or Inf is within the frame of the filter.

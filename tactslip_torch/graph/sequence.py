@@ -22,11 +22,10 @@ from tactslip_torch.model.calibration import (
     Isotonic,
     Platt,
 )
-from tactslip_torch.onset.sequential import NOTHING_YET, BayesFilter, Cusum, Hysteresis, KOfN, Rule
+from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN, Rule
 
 LATCH_START = (0.0, 0.0, 2.0**52)
 """Armed, with no alarm before; the last number counts on exactly in float64."""
-_LARGEST_EXPONENT = 600.0  # beyond it odds are all or nothing, and their products still finite
 
 END = int(np.iinfo(np.int64).max)
 """Of an axis, in a slice."""
@@ -80,27 +79,14 @@ def latest(mask: Value, start: Value, values: Value) -> Value:
 
 
 def rule_start(rule: Rule) -> list[float]:
-    """What is remembered before the first decision; of ``BayesFilter`` the odds against slip.
-
-    Raises:
-        ValueError: for a rule that no graph is written for.
-    """
-    match rule:
-        case KOfN():
-            return [NOTHING_YET] * (rule.n - 1)
-        case Hysteresis():
-            return []
-        case BayesFilter():
-            return [1 / (rule.slips_per_s * rule.slip_s)]
-        case Cusum():
-            return [0.0]
-    raise ValueError(f"no graph is written for the rule {rule!r}")
+    """What is remembered before the first decision."""
+    return [NOTHING_YET] * (rule.n - 1) if isinstance(rule, KOfN) else [0.0]
 
 
 def statistic_of(graph: Graph, rule: Rule, llr: Value, memory: Value) -> Walk:
     """The statistic of each decision, in the dtype of the ratios, and the memory behind the last.
 
-    To the bit what the rule's ``scan`` makes of them; ``BayesFilter`` to rounding of the ratios.
+    To the bit what the rule's ``scan`` makes of them.
 
     Args:
         graph: to which nodes are added.
@@ -111,20 +97,10 @@ def statistic_of(graph: Graph, rule: Rule, llr: Value, memory: Value) -> Walk:
     Shape:
         - llr, statistic: ``[k]``, k at least 1
         - memory: as many as ``rule_start`` gives, float64
-
-    Raises:
-        ValueError: as ``rule_start``.
     """
-    match rule:
-        case KOfN():
-            return _k_th_largest(rule, llr, memory)
-        case Hysteresis():
-            return llr, memory
-        case BayesFilter():
-            return _odds(graph, rule, llr, memory)
-        case Cusum():
-            return _sum(graph, rule, llr, memory)
-    raise ValueError(f"no graph is written for the rule {rule!r}")
+    if isinstance(rule, KOfN):
+        return _k_th_largest(rule, llr, memory)
+    return _sum(graph, rule, llr, memory)
 
 
 class Latched(NamedTuple):
@@ -145,20 +121,18 @@ def latched(
     graph: Graph,
     statistic: Value,
     level: Value,
-    low: Value,
     number: Value,
     memory: Value,
     *,
     rearm: int,
     refractory: int,
 ) -> Latched:
-    """Alarms as ``onset.latch`` raises them.
+    """Alarms as ``onset.rules`` raises them.
 
     Args:
         graph: to which nodes are added.
         statistic: finite.
         level: from which on an alarm is raised.
-        low: below which it counts towards re-arming; not above ``level``.
         number: of the decisions in their stream, float64.
         memory: whether an alarm stands, for how many decisions then the statistic was low, and
             decisions since the last alarm (``LATCH_START``); float64.
@@ -167,13 +141,13 @@ def latched(
 
     Shape:
         - statistic, number: ``[k]``, k at least 1
-        - level, low: ``[1]``
+        - level: ``[1]``
         - memory: ``[3]``
     """
     is_awake = (statistic.amax(0, keep=True) >= level) | (memory.slice(0, 1, 0) > 0.0)
 
     def watch(body: Graph) -> Latched:
-        given = (x.at(body) for x in (statistic, level, low, number, memory))
+        given = (x.at(body) for x in (statistic, level, number, memory))
         return _watched(body, *given, rearm=rearm, refractory=refractory)
 
     def sleep(body: Graph) -> Latched:
@@ -188,7 +162,6 @@ def _watched(
     graph: Graph,
     statistic: Value,
     level: Value,
-    low: Value,
     number: Value,
     memory: Value,
     *,
@@ -203,7 +176,7 @@ def _watched(
     on, below, since = graph.ops("Split", memory, dtypes=(F64,) * 3, axis=0, num_outputs=3)
     before = number.slice(0, 1, 0) - 1.0
     last = before - since
-    high = latest(statistic >= low, before - below, number)  # the last one that was not low
+    high = latest(statistic >= level, before - below, number)  # the last one that was not low
     rearmed = latest(number - high >= float(max(rearm, 1)), last - on, number)
     allowed = rearmed.min(number - float(refractory))
     allowed = graph.where(statistic >= level, allowed, -math.inf)
@@ -248,23 +221,6 @@ def _sum(graph: Graph, rule: Cusum, llr: Value, memory: Value) -> Walk:
     is_quiet = start + step.amax(0, keep=True) <= 0.0
     total = graph.if_(is_quiet, lambda body: [step.at(body)], walk)[0].clip(0.0, rule.ceiling)
     return total, _last(total).cast(F64)
-
-
-def _odds(graph: Graph, rule: BayesFilter, llr: Value, memory: Value) -> Walk:
-    """By the odds against slip, ``e``: ``(b + (1 - a) e) / (1 - b + a e)`` before the evidence."""
-    rate = rule.slips_per_s + 1 / rule.slip_s
-    change = -math.expm1(-rate * rule.hop_s)
-    begin, end = change * rule.slips_per_s / rate, change / (rule.slip_s * rate)
-    evidence = llr.cast(F64) * rule.evidence
-    weight = (-evidence.clip(-_LARGEST_EXPONENT, _LARGEST_EXPONENT)).exp()
-
-    def turn(body: Graph, state: Sequence[Value], rows: Sequence[Value]) -> Steps:
-        against = state[0]
-        ahead = (against * (1 - begin) + end) / (against * begin + (1 - end))
-        return [ahead * rows[0]], [ahead]
-
-    (after,), (ahead,) = graph.scan(turn, [memory.squeeze(0)], [weight])
-    return (evidence - ahead.log()).cast(llr.dtype), after.expand(0)
 
 
 def _between_knots(score: Value, scores: Sequence[float], llrs: Sequence[float]) -> Value:

@@ -17,7 +17,6 @@ from tactslip_torch.graph.value import F64, Value
 from tactslip_torch.graph.writer import Graph
 
 NEXT_TO_NOTHING = 1e-60  # variances of rows of order one are 0 or far above
-_MOST = 0.7  # of the rows: to pick more of them costs more than it spares
 _MOMENTS = (
     "mean",
     "std",
@@ -53,7 +52,6 @@ class Shared:
         rows: the rows.
         wanted: descriptors, each with the places of the rows it is wanted of, ascending.
         dtype: of the form; rows may be more exact.
-        frugal: make a part for the rows that want it alone, even if that takes another node.
         frequency_hz: of the lines, if rows are spectra.
     """
 
@@ -64,24 +62,23 @@ class Shared:
         wanted: Mapping[str, Sequence[int]],
         *,
         dtype: np.dtype[Any],
-        frugal: bool,
         frequency_hz: torch.Tensor,
     ) -> None:
         self.graph = graph
         self.rows = rows
         self.dtype = dtype
         self._wanted = wanted
-        self._frugal = frugal
         self._axis_hz = frequency_hz
         self._made: dict[str, Part] = {}
 
-    def of_rows(self, names: Iterable[str], always: bool = False) -> tuple[int, ...]:
-        """Places of the rows for which descriptors have to be made: all, if few are spared."""
-        whole = tuple(range(len(self.rows.rows)))
-        if not (self._frugal or always):
-            return whole
-        wanted = {place for name in names for place in self._wanted.get(name, ())}
-        return tuple(sorted(wanted)) if always or len(wanted) < _MOST * len(whole) else whole
+    @property
+    def all_rows(self) -> tuple[int, ...]:
+        """Places of all rows: to pick some of them costs more than it spares."""
+        return tuple(range(len(self.rows.rows)))
+
+    def of_rows(self, names: Iterable[str]) -> tuple[int, ...]:
+        """Places of the rows that one of these descriptors is wanted of."""
+        return tuple(sorted({place for name in names for place in self._wanted.get(name, ())}))
 
     def of_all(self, value: Value, places: Sequence[int]) -> Value:
         """The part at these places of what there is one of for every row."""
@@ -111,7 +108,7 @@ class Shared:
         """Values less their mean, of all rows that have a moment."""
 
         def make() -> Part:
-            places = self.of_rows(_MOMENTS)
+            places = self.all_rows
             values = self.values(places)
             if self.rows.mean is not None:
                 return Part(values, places)
@@ -121,7 +118,7 @@ class Shared:
 
     def plain_mean(self) -> Part:
         """Mean of a spectrum, in its dtype, ``[B, R', 1]``."""
-        places = self.of_rows(_MOMENTS)
+        places = self.all_rows
         return self.once("plain mean", lambda: Part(self.values(places).mean(keep=True), places))
 
     def squares(self) -> Part:
@@ -156,13 +153,13 @@ class Shared:
 
     def third(self) -> Part:
         """Mean cube."""
-        places = self.of_rows(("skewness",))
+        places = self.all_rows
         cubes = self.squares().of(places) * self.centred().of(places)
         return Part(cubes.mean().cast(F64), places)
 
     def fourth(self) -> Part:
         """Mean fourth power."""
-        places = self.of_rows(("kurtosis",))
+        places = self.all_rows
         squares = self.squares().of(places)
         return Part((squares * squares).mean().cast(F64), places)
 
@@ -185,7 +182,7 @@ class Shared:
 
         About the middle of the band, beside which neither is small, so that little cancels.
         """
-        places = self.of_rows(("spectral_centroid", "spectral_spread"), always=True)
+        places = self.of_rows(("spectral_centroid", "spectral_spread"))
         middle = float(self._axis_hz.mean())
         half = max(float((self._axis_hz - middle).abs().max()), 1.0)
         place = (self._axis_hz - middle) / half

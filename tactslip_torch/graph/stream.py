@@ -25,9 +25,9 @@ from tactslip_torch.graph.sequence import (
 from tactslip_torch.graph.value import BOOL, F64, I64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.sequential import NEUTRAL
+from tactslip_torch.onset.rules import NEUTRAL
 from tactslip_torch.onset.settings import AlarmSettings
-from tactslip_torch.signals.savgol import past_matrix
+from tactslip_torch.signals.filtering import past_matrix
 
 Judge = Callable[[Graph, SlipDetector, Value, Form, Value], Judged]
 
@@ -85,7 +85,7 @@ def stream_graph(
     Args:
         detector: whose judgement.
         settings: hop, calibration, rule and threshold.
-        form: precision and layout.
+        form: precision.
         judge: what makes scores of windows.
 
     Raises:
@@ -172,7 +172,6 @@ class _Deciding:
             graph,
             statistic,
             level,
-            level - settings.rule.margin if settings.rule.margin else level,
             number,
             of_latch,
             rearm=settings.decisions(settings.rearm_s, pool.sample_rate_hz),

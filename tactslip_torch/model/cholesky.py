@@ -17,7 +17,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from tactslip_torch.threads import for_each
+from tactslip_torch.runtime import for_each
 
 _PANEL = 384  # columns that are factorised at a time
 _TILE = 256  # rows of a panel, or right-hand sides, that one thread computes at a time

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model.cholesky import cholesky_solve, forward_solve
-from tactslip_torch.threads import for_each
+from tactslip_torch.runtime import for_each
 
 _ROWS = 256  # that one thread sums at a time
 _WIDTH = 512  # columns at a time: what fits a cache

@@ -24,7 +24,7 @@ from tactslip_torch.model.few_bins import FEW_BINS, FEW_FILTERED, FewBins
 from tactslip_torch.model.judgement import Judgement, Nonfinite, check_nonfinite, judged_in_parts
 from tactslip_torch.model.missing import Dead, MissingScores, without
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.plain import is_plain
+from tactslip_torch.runtime import is_plain
 from tactslip_torch.signals.filtering import ChannelFilter
 
 

@@ -10,17 +10,17 @@ from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.files import load_table, save_table, table_form
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.kernel_sum import KernelSum
 from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.model.quadratic import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.runtime import load_table, save_table, table_form
 from tactslip_torch.signals.filtering import ChannelFilter
 
-FORMAT = "tactslip_torch detector 2"
-EARLIER_FORMAT = "tactslip_torch detector 1"
+FORMAT = "tactslip_torch detector 3"
+_EARLIER_FORMATS = ("tactslip_torch detector 1", "tactslip_torch detector 2")
 
 Head = QuadraticForm | KernelSum
 """A quadratic form of fixed size, or the sum over training bins of a kernel that does not fold."""
@@ -72,10 +72,10 @@ def read_detector(path: str | os.PathLike[str]) -> DetectorParts:
     """
     name = os.fspath(path)
     try:
-        if table_form(path) == EARLIER_FORMAT:
+        if table_form(path) in _EARLIER_FORMATS:
             raise ValueError(
-                f"{name} was made by an earlier version; train again, or evaluate it with "
-                "that version"
+                f"{name} was made by version 0.1.0 or earlier; train again, or use it with that "
+                "version"
             )
         facts, state = load_table(path, FORMAT)
     except FileNotFoundError:
@@ -105,14 +105,14 @@ def _parts(facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> DetectorPar
         head = QuadraticForm(**part("head."))
     else:
         head = KernelSum(**part("head."), kernel=kernel_from_dict(facts["kernel"]))
-    hand, pooling = HandLayout.from_rows(facts["channels"]), facts.get("pooling")
+    hand, pooling = HandLayout.from_rows(facts["channels"]), facts["pooling"]
     return DetectorParts(
         FeaturePool(hand, **facts["pool"]),
         ChannelFilter(
             facts["window_lengths"],
             facts["polyorder"],
-            facts.get("align", "centred"),  # as all were before it was a choice
-            facts.get("kernels"),  # only of filters that were learned
+            facts["align"],
+            facts.get("kernels"),  # only where they are none of Savitzky-Golay's
         ),
         facts["selected"],
         FeatureScaler(**part("scaler.")),

@@ -31,7 +31,7 @@ from tactslip_torch.model.quadratic import (
     quadratic_features,
     sum_of_quadratic_features,
 )
-from tactslip_torch.threads import for_each
+from tactslip_torch.runtime import for_each
 
 MOST_ITERATIONS = 600
 TOLERANCE = 1e-9  # of the residuals, in units of the targets

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.quadratic import QuadraticForm
-from tactslip_torch.plain import has_values
+from tactslip_torch.runtime import has_values
 
 MOST_KEPT = 32
 """Masks whose matrices are kept, 460 KB each of 120 features."""

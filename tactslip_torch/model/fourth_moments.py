@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model.quadratic import num_quadratic_features
-from tactslip_torch.threads import for_each
+from tactslip_torch.runtime import for_each
 
 _CHUNK_BINS = 256  # summed in one product and rounded once; more no longer fit the cache
 _BLOCK = 8  # variables; more hold more sums twice, fewer make smaller products

@@ -35,7 +35,7 @@ from tactslip_torch.model.left_out import (
     products_within,
 )
 from tactslip_torch.model.quadratic import QuadraticForm
-from tactslip_torch.threads import for_each
+from tactslip_torch.runtime import for_each
 
 _ITERATIONS = 60  # that conjugate gradients usually take
 _WAIT = 30  # groups whose triangular solves take as long as reading a factor does

@@ -33,7 +33,7 @@ from tactslip_torch.model.left_out import (
     order_groups,
 )
 from tactslip_torch.model.once import once
-from tactslip_torch.threads import for_each
+from tactslip_torch.runtime import for_each
 
 _ROWS = 256  # of the kernel matrix that one thread makes at a time
 _TOGETHER = 256  # groups whose machines are kept at a time

@@ -8,9 +8,8 @@ from typing import Literal, NamedTuple, TypeVar, get_args
 import torch
 from torch import Tensor
 
-from tactslip_torch.plain import is_plain
-from tactslip_torch.signals.finite import refuse_nonfinite
-from tactslip_torch.threads import in_parts
+from tactslip_torch.runtime import in_parts, is_plain
+from tactslip_torch.signals.binning import refuse_nonfinite
 
 Nonfinite = Literal["mask", "raise"]
 _POLICIES = get_args(Nonfinite)

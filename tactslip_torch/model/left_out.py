@@ -16,7 +16,7 @@ from torch import Tensor
 from tactslip_torch.model.cholesky import cholesky_, cholesky_solve, forward_solve
 from tactslip_torch.model.condition import SolveReport
 from tactslip_torch.model.kernel_elm import solve_kernel_elm_
-from tactslip_torch.threads import for_each
+from tactslip_torch.runtime import for_each
 
 MOST_CONDITION = 1e10  # of all bins; above, the scores of a group left out lose their digits
 TILE = 256  # bins whose columns one thread solves at a time

@@ -12,7 +12,7 @@ from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector_file import Head
 from tactslip_torch.model.expected_score import ExpectedScore
 from tactslip_torch.model.quadratic import QuadraticForm
-from tactslip_torch.plain import has_values
+from tactslip_torch.runtime import has_values
 
 Dead = Sequence[str] | Tensor
 """Channels that are not to be listened to: their names, or a mask ``[C]``, bool."""

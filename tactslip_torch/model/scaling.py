@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from tactslip_torch.features.pooling import signed_log as signed_log
-from tactslip_torch.plain import is_plain
+from tactslip_torch.runtime import is_plain
 
 _COLUMNS = 128  # sorted at a time, which keeps memory small
 

@@ -18,7 +18,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from tactslip_torch.files import load_table, save_table
 from tactslip_torch.ledger import Ledger, content_digest, first_difference
 from tactslip_torch.model.cholesky import from_above
 from tactslip_torch.model.fourth_moments import (
@@ -31,6 +30,7 @@ from tactslip_torch.model.fourth_moments import (
 )
 from tactslip_torch.model.quadratic import QuadraticForm, from_primal
 from tactslip_torch.model.symmetric_solve import solve_symmetric_
+from tactslip_torch.runtime import load_table, save_table
 
 FORMAT = "tactslip_torch sums 1"
 _CLASSES = ("non-slip", "slip")

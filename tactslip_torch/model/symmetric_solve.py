@@ -57,7 +57,7 @@ from tactslip_torch.model.truncation import (
     light_bins,
     truncated,
 )
-from tactslip_torch.threads import for_each
+from tactslip_torch.runtime import for_each
 
 log = logging.getLogger(__name__)
 

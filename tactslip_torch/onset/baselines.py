@@ -20,13 +20,12 @@ from torch import Tensor
 from tactslip_torch.features.guards import are_ordinary, is_nowhere, stretch
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.judgement import Judgement
-from tactslip_torch.signals.filter_bank import Wavelet
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
-from tactslip_torch.signals.wavelet import branch_matrix, branch_names
+from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names
 
 BaselineName = Literal["film_band_power", "largest_detail"]
-VIBRATION_HZ = (5.0, 400.0)
+_VIBRATION_HZ = (5.0, 400.0)
 """Where the fast-adapting afferents of a hand answer, FA-I 5 to 50 Hz and FA-II 40 to 400 Hz.
 
 The films are the paper's fast-adapting elements. Johansson and Flanagan (2009), Nature Reviews
@@ -42,7 +41,7 @@ def film_band_power(
     bins: Tensor,
     films: Sequence[int] | Tensor,
     sample_rate_hz: float = 2000.0,
-    band_hz: tuple[float, float] = VIBRATION_HZ,
+    band_hz: tuple[float, float] = _VIBRATION_HZ,
 ) -> Tensor:
     """Log of the root of the power in a band, of the film that has most.
 

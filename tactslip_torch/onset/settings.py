@@ -9,7 +9,7 @@ from typing import Any
 
 from tactslip_torch.model.calibration import Calibration, calibration_from_dict
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.sequential import Rule, rule_from_dict
+from tactslip_torch.onset.rules import Rule, rule_from_dict
 
 KEY = "alarm"
 """Under which ``SlipDetector.info`` keeps the settings."""

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing import Dead, dead_names, without
-from tactslip_torch.onset.decider import Decider, Decisions, is_usable
-from tactslip_torch.onset.scoring import score_filtered
+from tactslip_torch.onset.decisions import Decider, Decisions, is_usable, score_filtered
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.signals.stream import FilterStream, SampleClock
 

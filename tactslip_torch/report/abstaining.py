@@ -11,9 +11,9 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.answers import CLASSES, covered_shares
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import whole_file
 
 _WORDS = {"non_slip": "non-slip", "slip": "slip"}
 _COLOURS = {"non_slip": "#0072B2", "slip": "#E69F00"}

@@ -8,8 +8,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import whole_file
 
 _BEFORE, _AFTER, _NEW = "#999999", "#0072B2", "#D55E00"
 

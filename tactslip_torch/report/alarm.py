@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import whole_file
 
 _ROLES = {"test stream": "#0072B2", "unseen stream": "#D55E00"}
 _NAMES = {"test stream": "seen materials", "unseen stream": "unseen materials"}

@@ -8,8 +8,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import whole_file
 
 _LINE, _TARGET, _KEPT, _FAILS = "#0072B2", "#666666", "#009E73", "#D55E00"
 

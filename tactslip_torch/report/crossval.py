@@ -10,8 +10,8 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import whole_file
 
 PAPERS_UNSEEN = frozenset({"iron", "cloth", "copper", "wood"})
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.envelope import Array, envelope
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import whole_file
 
 _SLIP, _QUIET, _REST = "#D55E00", "#0072B2", "#D9D9D9"  # Okabe and Ito's; grey: nothing is said
 _INK, _GREY = "#222222", "#666666"

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import whole_file
 
 Events = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """Numbers of events by role and rule."""

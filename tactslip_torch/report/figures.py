@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import FancyBboxPatch
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report import published
+from tactslip_torch.runtime import whole_file
 
 _INK, _GREY = "#222222", "#666666"
 _TITLE, _TEXT, _SMALL = 13, 10, 9  # font sizes in points

@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.hand_drawing import draw_hand, draw_shades, kind_colours
 from tactslip_torch.report.sensors import ANEW_WORDS, ROLE_WORDS
+from tactslip_torch.runtime import whole_file
 
 _ROLE_COLOURS = {"held_out": "#666666", "test": "#009E73", "unseen": "#D55E00"}
 _GREY, _GRID, _INK = "#666666", "#DDDDDD", "#222222"

@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.envelope import Array
 from tactslip_torch.report.onset_traces import Heard, Stretches, spans, status_at
+from tactslip_torch.runtime import whole_file
 
 REST, SLIP, ALARM = "#0072B2", "#E69F00", "#C6361B"
 _PALE_SLIP = "#FFF0CC"

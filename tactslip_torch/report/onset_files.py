@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.onset_table import COLUMNS, onset_rows
+from tactslip_torch.runtime import whole_file
 
 Keep = Callable[[Iterable[Sequence[Any]]], None]
 

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import whole_file
 
 _ALIGN_COLOURS = {"centred": "#0072B2", "causal": "#D55E00", "trailing": "#009E73"}
 _CHOSEN = "#009E73"

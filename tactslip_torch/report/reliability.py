@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import whole_file
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _INK, _GREY, _GRID = "#222222", "#666666", "#DDDDDD"

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.abstaining import answers_figure, answers_table
 from tactslip_torch.report.alarm import alarm_figure, alarm_table, scenes_table
 from tactslip_torch.report.confound import by_detector, confound_figure, confound_table
@@ -25,6 +24,7 @@ from tactslip_torch.report.tables import (
 )
 from tactslip_torch.report.tuning import tuning_tables
 from tactslip_torch.report.validation import validation_figure, validation_table
+from tactslip_torch.runtime import whole_file
 
 
 def write_results(

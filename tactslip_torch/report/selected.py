@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report import published
+from tactslip_torch.runtime import whole_file
 
 _KIND_COLOURS = {"SG": "#E69F00", "PVDF": "#0072B2"}
 _OTHER_COLOURS = ("#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#666666")

@@ -24,8 +24,8 @@ from matplotlib.patches import Patch
 from PIL import Image
 from torch import Tensor
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.envelope import Array, envelope
+from tactslip_torch.runtime import whole_file
 
 Channels = Sequence[Mapping[str, str]]
 """Rows of ``name``, ``kind``, ``finger``, ``segment``, ``adapting`` where the kind does not say it,

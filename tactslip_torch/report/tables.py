@@ -22,7 +22,7 @@ BASELINES = {
     "logistic_regression_simple": "logistic regression on mean, std, rms",
     "random_forest_simple": "random forest on mean, std, rms",
 }
-"""What baselines (``tactslip_torch.baselines``) are called in tables."""
+"""What baselines (``tactslip_torch.training.baselines``) are called in tables."""
 
 _SCORES = {
     "accuracy": "accuracy %",

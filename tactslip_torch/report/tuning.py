@@ -10,13 +10,13 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tactslip_torch.files import whole_file
 from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import whole_file
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 HELD_NOTE = (
-    "held-out: mean log loss (nats) and balanced accuracy of each training group under C, c, "
-    "scales and filters that were chosen without it; ranking, ranges, K and, by way of the other "
+    "held-out: mean log loss (nats) and balanced accuracy of each training group under C, c "
+    "and scales that were chosen without it; ranking, ranges, K and, by way of the other "
     "groups' descents, the number of steps met it. The detectors behind the other columns choose "
     "by all groups, the first on more bins"
 )

@@ -19,7 +19,7 @@ from torch import Tensor
 
 MOST = 50_000
 """Largest numerator and denominator of a ratio of rates."""
-NEAREST = 1e-7
+_NEAREST = 1e-7
 """Relative error that a ratio may be off: a sample in ten million."""
 MOST_CUT_S = 0.1
 """By so much parts that belong together may end apart."""
@@ -126,7 +126,7 @@ def _ratio(from_hz: float, to_hz: float) -> Fraction:
     exact = Fraction(repr(float(to_hz))) / Fraction(repr(float(from_hz)))  # as they are written
     least = min(exact, 1 / exact)  # so that it is the larger of the two numbers that is limited
     nearest = least.limit_denominator(MOST)
-    if nearest == 0 or abs(nearest / least - 1) > NEAREST:
+    if nearest == 0 or abs(nearest / least - 1) > _NEAREST:
         raise ValueError(
             f"from {from_hz:.10g} to {to_hz:.10g} Hz is no ratio of whole numbers up to {MOST}; "
             "resample to a rate further away, or less so, or state the rate that is meant"

@@ -14,8 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.signals.savgol import Edges, convolve_valid
+from tactslip_torch.signals.filtering import ChannelFilter, Edges, convolve_valid
 
 Array = NDArray[Any]
 

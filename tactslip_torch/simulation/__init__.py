@@ -1,21 +1,18 @@
 """The simulated hand: scenes in, recordings with exact truth out."""
 
-from tactslip_torch.simulation.batch import simulate_many
-from tactslip_torch.simulation.knobs import (
+from tactslip_torch.simulation.parameters import (
+    MATERIALS,
+    SEEN_MATERIALS,
+    UNSEEN_MATERIALS,
     Contact,
     Disturbances,
     Dynamics,
     Faults,
     Handling,
     Imperfections,
+    Material,
     Sensors,
     Stroke,
-)
-from tactslip_torch.simulation.materials import (
-    MATERIALS,
-    SEEN_MATERIALS,
-    UNSEEN_MATERIALS,
-    Material,
 )
 from tactslip_torch.simulation.scene import (
     FIDELITIES,
@@ -23,8 +20,7 @@ from tactslip_torch.simulation.scene import (
     Scene,
     paper_scenes,
 )
-from tactslip_torch.simulation.simulate import simulate
-from tactslip_torch.simulation.timeline import Timeline, timeline
+from tactslip_torch.simulation.simulate import Timeline, simulate, simulate_many, timeline
 
 __all__ = [
     "FIDELITIES",

@@ -1,10 +1,16 @@
-"""What a session and a recording are, drawn once: the contact's and the sensors' parameters.
+"""How the hand touches: what is drawn of a session and a recording, and the quasi-static contact.
 
 A *session* is one mounting of one material (the paper confounds the two): load shares, gains,
 noise floor, mains, offsets, the material's own friction and texture. A *recording* grasps anew:
 shares, lifted elements, presliding, offsets vary again, and less. An *element* is a segment of a
 finger, with all the channels in it. Every draw is made for the whole hand, whichever channels
 are asked for.
+
+While an element sticks, the arm's travel stretches its skin and the friction force grows in
+proportion. At ``mu_s N`` it lets go, falls to ``mu_k N`` and slides until, shortly before the arm
+stops, the remaining travel is taken up by the skin again. Over the pause the shear relaxes;
+the next stroke starts with what is left and needs only the rest of the presliding travel.
+PHYSICS.md, friction and skin; the rules are those of a Coulomb slider behind a spring.
 """
 
 from __future__ import annotations
@@ -14,28 +20,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.simulation.materials import MATERIALS, Material
-from tactslip_torch.simulation.randomness import Array, Key, generator, log_uniform, lognormal
-from tactslip_torch.simulation.scene import PAPER, Scene
+from tactslip_torch.simulation.blocks import Array, generator, log_uniform, lognormal
+from tactslip_torch.simulation.parameters import MATERIALS, Material
+from tactslip_torch.simulation.scene import ArmStroke, Scene
 
 MAX_PRESLIDING_FACTOR = 1.5
 """Largest factor of an element's presliding travel on the recording's (``Scene`` relies on it)."""
 
+RESTICK_SHARE = 0.5
+"""Share of the shear lost at letting go that the skin takes up again as the arm stops (ours)."""
 
-def session_key(scene: Scene, purpose: str) -> Key:
-    """The key of a draw that all recordings of a session share."""
-    return (scene.seed, "session", _session(scene), purpose)
-
-
-def recording_key(scene: Scene, purpose: str) -> Key:
-    """The key of a draw that belongs to one recording."""
-    kind = () if scene.name == PAPER else (scene.name,)
-    return (scene.seed, "recording", _session(scene), scene.material, scene.cycle, *kind, purpose)
-
-
-def _session(scene: Scene) -> str | int:
-    """The session's name; a scene always has one."""
-    return scene.material if scene.session is None else scene.session
+RUNOUT_PERIOD_MM = 180.0
+"""Travel over which the normal load rises and falls (prior, ours)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +57,11 @@ class Surface:
     wavelength_mm: float | None
 
 
-def draw_surface(scene: Scene) -> Surface:
+def _surface(scene: Scene) -> Surface:
     """The material's parameters: per session, friction a little per recording too."""
     material, contact = MATERIALS[scene.material], scene.contact
-    rng = generator(*session_key(scene, "surface"), scene.material)
-    session_mu, again = rng.standard_normal(), generator(*recording_key(scene, "mu"))
+    rng = generator(*scene.session_key("surface"), scene.material)
+    session_mu, again = rng.standard_normal(), generator(*scene.key("mu"))
     mu_s = material.mu_s * float(
         np.exp(contact.friction_spread * (session_mu + 0.2 * again.standard_normal()))
     )
@@ -101,6 +97,7 @@ class Grasp:
         relaxation_time_s: its time constant, ``[E]``.
         resonance_hz: the skin's resonance, ``[E]``.
         damping: its damping ratio, ``[E]``.
+        runout: relative change of load along the travel.
         runout_phase: radians, ``[E]``.
         surface: what it touches.
     """
@@ -112,6 +109,7 @@ class Grasp:
     relaxation_time_s: Array
     resonance_hz: Array
     damping: Array
+    runout: float
     runout_phase: Array
     surface: Surface
 
@@ -125,12 +123,41 @@ class Grasp:
         """Friction at which each element lets go, ``[E]``."""
         return self.surface.mu_s * self.load_n
 
+    @property
+    def shear_after(self) -> float:
+        """Shear when the arm has stopped after a slide, as a share of ``mu_s N``."""
+        ratio = self.surface.mu_ratio
+        return ratio + RESTICK_SHARE * (1.0 - ratio)
+
+    def normal_n(
+        self, element: int | NDArray[np.int64], position_mm: Array, time_s: Array
+    ) -> Array:
+        """Load in newtons: the surface's run-out over travel, and creep after the grasp.
+
+        Shape:
+            - position_mm, time_s, output: any one shape; with several elements ``[E]`` the times
+              are ``[*, 1]`` and the output is ``[*, E]``
+        """
+        angle = 2 * np.pi / RUNOUT_PERIOD_MM * position_mm
+        runout = self.runout * np.sin(angle + self.runout_phase[element])
+        since_grasp_s = np.maximum(time_s, 0.0) + 1.0
+        creep = np.exp(-since_grasp_s / (5.0 * self.relaxation_time_s[element]))
+        normal_n: Array = (
+            self.load_n[element] * (1.0 + runout) * (1.0 + 0.3 * self.relaxation[element] * creep)
+        )
+        return normal_n
+
+    def relaxed(self, rest_s: Array, element: int | slice = slice(None)) -> Array:
+        """Share of the shear left after a rest."""
+        decay = -np.expm1(-rest_s / self.relaxation_time_s[element])
+        return np.asarray(1.0 - self.relaxation[element] * decay, dtype=np.float64)
+
 
 def draw_grasp(scene: Scene) -> Grasp:
     """The recording's contact. At least one element touches: the one nearest to touching."""
     contact, element_of_channel, loads = scene.contact, *_elements(scene)
     num = len(loads)
-    session, rng = generator(*session_key(scene, "contact")), generator(*recording_key(scene, "g"))
+    session, rng = generator(*scene.session_key("contact")), generator(*scene.key("g"))
     loads = loads * lognormal(session, contact.session_share_spread, num)
     loads = loads * lognormal(rng, contact.recording_share_spread, num)
     chance = np.where(loads > 0, rng.random(num), -1.0)
@@ -150,8 +177,9 @@ def draw_grasp(scene: Scene) -> Grasp:
         relaxation_time_s=np.full(num, log_uniform(rng, contact.relaxation_time_s)),
         resonance_hz=middle_hz * lognormal(session, 0.1, num),
         damping=np.full(num, log_uniform(session, contact.skin_damping)),
+        runout=contact.runout,
         runout_phase=2 * np.pi * rng.random(num),
-        surface=draw_surface(scene),
+        surface=_surface(scene),
     )
 
 
@@ -172,3 +200,39 @@ def _elements(scene: Scene) -> tuple[NDArray[np.int64], Array]:
     )
     loads = [contact.load_n * finger_loads.get(p[0], 1.0) * (p in allowed) for p in order]
     return np.array([order.index(place) for place in places]), np.array(loads)
+
+
+@dataclass(frozen=True, eq=False)
+class Slips:
+    """Every slip of every element; arrays over S strokes that slide and E elements.
+
+    One slip a stroke: where an element sticks and slips, from the first letting go to the last
+    sticking, the stick phases between included.
+
+    Args:
+        start_s: when the element lets go, ``[S, E]``; NaN for elements that do not touch.
+        end_s: when it sticks again for good, ``[S, E]``.
+        shear_before: quasi-static shear at the start of each stroke, as a share of ``mu_s N``,
+            ``[S, E]``.
+    """
+
+    start_s: Array
+    end_s: Array
+    shear_before: Array
+
+
+def quasi_static_slips(grasp: Grasp, plan: tuple[ArmStroke, ...]) -> Slips:
+    """When each element lets go and sticks again, over a plan of strokes that slide."""
+    shape = (len(plan), len(grasp.load_n))
+    start_s, end_s, before = np.empty(shape), np.empty(shape), np.zeros(shape)
+    restick_mm = (grasp.shear_after - grasp.surface.mu_ratio) * grasp.presliding_mm
+    for number, stroke in enumerate(plan):
+        if number:
+            pause_s = stroke.start_s - plan[number - 1].stop_s
+            before[number] = grasp.shear_after * grasp.relaxed(np.asarray(pause_s))
+        travel_mm = (1.0 - before[number]) * grasp.presliding_mm
+        start_s[number] = stroke.time_of_travel_s(travel_mm)
+        end_s[number] = stroke.time_of_travel_s(stroke.distance_mm - restick_mm)
+    lifted = grasp.load_n <= 0
+    start_s[:, lifted] = end_s[:, lifted] = np.nan
+    return Slips(start_s, end_s, before)

@@ -1,27 +1,40 @@
-"""A scene: everything that determines one simulated recording, and the paper's set of them."""
+"""A scene: everything that determines one simulated recording, and how its arm moves.
+
+Times in seconds from the start of the recording, positions in millimetres from where the arm was
+then.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.simulation.knobs import (
+from tactslip_torch.simulation.blocks import Array, Grid, Key
+from tactslip_torch.simulation.parameters import (
+    MATERIALS,
+    SEEN_MATERIALS,
+    UNSEEN_MATERIALS,
     Contact,
     Disturbances,
     Dynamics,
     Faults,
     Handling,
     Imperfections,
+    Moves,
     Sensors,
     Stroke,
 )
-from tactslip_torch.simulation.materials import MATERIALS, SEEN_MATERIALS, UNSEEN_MATERIALS
 
-FIDELITIES = ("kinematic", "lugre", "patch")
-"""The rungs that exist, cheapest first."""
+FIDELITIES = ("kinematic", "bristles")
+"""How contacts are modelled: by closed forms, or by skin and bristles integrated in time."""
+
+_FORMER_FIDELITIES = {"lugre": "num_bristles=1", "patch": "its 24 bristles"}
 
 SIMULATION_VERSION = 2
 """Raised whenever the samples of some scene change; part of ``Scene.to_dict``, so of cache keys."""
@@ -47,8 +60,8 @@ PAPER = "paper"
 class Scene:
     """What is simulated. Equal scenes give equal bytes.
 
-    On the dynamic rungs they do by one engine in one release: by numba's kernel or, without numba,
-    by torch, which round apart. Provenance and the keys of ``SimulatedRecordings`` name which.
+    With bristles they do by one engine in one release: by numba's kernel or, without numba, by
+    torch, which round apart. Provenance and the keys of ``SimulatedRecordings`` name which.
 
     Args:
         material: id in ``MATERIALS``.
@@ -61,20 +74,20 @@ class Scene:
         disturbances: what is not slip.
         handling: what loads the contact without sliding.
         faults: what is broken behind the sensors.
-        dynamics: knobs of the dynamic rungs.
+        dynamics: of the bristles.
         imperfections: what makes channels differ without slip; none by default.
         tail_s: rest behind the last stroke, or all there is.
         acceleration_m_s2: of the arm, at each start and stop.
         sample_rate_hz: samples per second and channel.
-        fidelity: the rung to simulate on, one of ``FIDELITIES``.
+        fidelity: of the contact, one of ``FIDELITIES``.
         seed: of the whole set.
         session: the mounting: noise floor, mains, offsets, gains and load shares belong to it.
             ``None`` stands for the material's id: one session per material, as in the paper.
         cycle: index of the recording within its session.
 
     Raises:
-        ValueError: if the material or rung is unknown, there is neither stroke nor rest, a rate or
-            acceleration is not positive, no element can touch, kinetic friction exceeds static,
+        ValueError: if the material or fidelity is unknown, there is neither stroke nor rest, a rate
+            or acceleration is not positive, no element can touch, kinetic friction exceeds static,
             or a stroke is too short to slip.
 
     Example:
@@ -111,8 +124,10 @@ class Scene:
         if self.session is None:
             object.__setattr__(self, "session", self.material)
         if self.fidelity not in FIDELITIES:
+            former = _FORMER_FIDELITIES.get(str(self.fidelity))
+            remedy = f"; instead of it take bristles with {former}" if former else ""
             raise ValueError(
-                f"unknown fidelity {self.fidelity!r}; there is {', '.join(FIDELITIES)}"
+                f"unknown fidelity {self.fidelity!r}; there is {', '.join(FIDELITIES)}{remedy}"
             )
         for name in ("sample_rate_hz", "acceleration_m_s2"):
             value = getattr(self, name)
@@ -122,6 +137,21 @@ class Scene:
             raise ValueError(f"tail_s must be finite and not negative, got {self.tail_s}")
         self._require_strokes()
         self._require_contact()
+
+    def key(self, purpose: str) -> Key:
+        """The key of a draw that belongs to the recording alone."""
+        kind = () if self.name == PAPER else (self.name,)
+        session = self._session
+        return (self.seed, "recording", session, self.material, self.cycle, *kind, purpose)
+
+    def session_key(self, purpose: str) -> Key:
+        """The key of a draw that all recordings of the session share."""
+        return (self.seed, "session", self._session, purpose)
+
+    @property
+    def _session(self) -> str | int:
+        """The session's name; a scene always has one."""
+        return self.material if self.session is None else self.session
 
     def _require_strokes(self) -> None:
         """Refuse strokes that may end before they slip: each that slides has an onset."""
@@ -155,6 +185,36 @@ class Scene:
                 f"contact.mu_k must not exceed mu_s, got {contact.mu_k} above {self.material}'s "
                 f"{material.mu_s}; set contact.mu_s too"
             )
+
+    @cached_property
+    def arm(self) -> tuple[ArmStroke, ...]:
+        """The strokes as the arm runs them, one after the other.
+
+        A stroke at speed v over the distance d lasts ``d/v + v/a``, so the paper's nominal onsets
+        of 2, 9 and 13.5 s become arm starts at 2, 9.04 and 13.62 s.
+        """
+        plan, now_s, here_mm = [], 0.0, 0.0
+        a = 1000.0 * self.acceleration_m_s2
+        for stroke in self.strokes:
+            distance_mm = stroke.distance_mm
+            peak = min(stroke.speed_mm_s, math.sqrt(a * distance_mm))
+            start_s = now_s + stroke.pause_s
+            now_s = start_s + distance_mm / peak + peak / a
+            plan.append(
+                ArmStroke(start_s, here_mm, a, peak, peak / a, now_s, distance_mm, stroke.moves)
+            )
+            here_mm += distance_mm if stroke.slides else 0.0
+        return tuple(plan)
+
+    @property
+    def slides(self) -> tuple[ArmStroke, ...]:
+        """The strokes in which hand and object move against each other."""
+        return tuple(stroke for stroke in self.arm if stroke.slides)
+
+    @property
+    def end_s(self) -> float:
+        """When all is over; not yet a whole number of samples."""
+        return (self.arm[-1].stop_s if self.arm else 0.0) + self.tail_s
 
     def to_dict(self) -> dict[str, Any]:
         """The scene as plain JSON types, without loss: with its version, a cache key.
@@ -256,3 +316,91 @@ def _grouped(overrides: Mapping[str, Any]) -> dict[str, Any]:
             f"and the fields of {', '.join(group.__name__ for group in _GROUPS.values())}"
         )
     return values
+
+
+@dataclass(frozen=True)
+class ArmStroke:
+    """One stroke as the arm runs it: a trapezoid of speed, or a triangle if it is short.
+
+    Args:
+        start_s: when the arm begins to move.
+        origin_mm: how far the hand has slid before.
+        acceleration_mm_s2: of both ramps.
+        peak_mm_s: highest speed, the steady one unless the stroke is short.
+        ramp_s: duration of each ramp.
+        stop_s: when the arm is at rest again.
+        distance_mm: travel.
+        moves: who does: see ``Stroke``.
+    """
+
+    start_s: float
+    origin_mm: float
+    acceleration_mm_s2: float
+    peak_mm_s: float
+    ramp_s: float
+    stop_s: float
+    distance_mm: float
+    moves: Moves = "hand"
+
+    @property
+    def slides(self) -> bool:
+        """Whether hand and object move against each other."""
+        return self.moves != "both"
+
+    @property
+    def drives(self) -> bool:
+        """Whether the arm moves."""
+        return self.moves != "object"
+
+    def travel_mm(self, time_s: Array) -> Array:
+        """Distance from the stroke's origin, clamped before and after the stroke."""
+        t = np.clip(time_s - self.start_s, 0.0, self.stop_s - self.start_s)
+        up: Array = np.minimum(t, self.ramp_s)
+        down: Array = np.maximum(t - (self.stop_s - self.start_s - self.ramp_s), 0.0)
+        half = 0.5 * self.acceleration_mm_s2
+        return half * up * up + self.peak_mm_s * (t - up) - half * down * down
+
+    def speed_mm_s(self, time_s: Array) -> Array:
+        """Speed; zero outside the stroke."""
+        ramp = np.minimum(time_s - self.start_s, self.stop_s - time_s)
+        return np.clip(self.acceleration_mm_s2 * ramp, 0.0, self.peak_mm_s)
+
+    def time_of_travel_s(self, travel_mm: Array) -> Array:
+        """When the arm has come so far; the inverse of ``travel_mm`` within the stroke."""
+        ramp_mm = 0.5 * self.acceleration_mm_s2 * self.ramp_s**2
+        early = np.sqrt(2 * np.minimum(travel_mm, ramp_mm) / self.acceleration_mm_s2)
+        left_mm = np.clip(self.distance_mm - travel_mm, 0.0, ramp_mm)
+        late = self.stop_s - np.sqrt(2 * left_mm / self.acceleration_mm_s2)
+        middle = self.start_s + self.ramp_s + (travel_mm - ramp_mm) / self.peak_mm_s
+        time = np.where(travel_mm <= ramp_mm, self.start_s + early, middle)
+        return np.where(self.distance_mm - travel_mm < ramp_mm, late, time)
+
+
+def next_starts_s(plan: tuple[ArmStroke, ...]) -> list[float]:
+    """Of each stroke of a plan, when the one behind it starts; infinite for the last."""
+    return [*(stroke.start_s for stroke in plan), math.inf][1:]
+
+
+class Motion:
+    """A motion on a grid, computed once for all elements.
+
+    Args:
+        plan: the strokes that count: those that slide for the contact's motion, those that the
+            arm drives for its own.
+        grid: where.
+
+    Attributes:
+        travel_mm: of every stroke from its own origin, ``[K, B]`` each.
+        position_mm: over all strokes, ``[K, B]``.
+    """
+
+    def __init__(self, plan: tuple[ArmStroke, ...], grid: Grid) -> None:
+        self.plan, self.grid = plan, grid
+        self.travel_mm = tuple(stroke.travel_mm(grid.time_s) for stroke in plan)
+        self.position_mm: Array = sum(self.travel_mm, np.zeros(grid.time_s.shape))
+
+    @cached_property
+    def speed_mm_s(self) -> Array:
+        """Speed over all strokes, ``[K, B]``."""
+        speeds = (stroke.speed_mm_s(self.grid.time_s) for stroke in self.plan)
+        return sum(speeds, np.zeros(self.grid.time_s.shape))

@@ -1,39 +1,95 @@
-"""A scene in, a recording out.
+"""A scene in, its truth and its recording out.
 
-Arm motion, contact on the scene's rung, handling, vibration, imperfections, sensors, faults. Only
-the channels and the stretches of time that are asked for are computed; elements out of contact cost
-no friction.
+Arm motion, contact, handling, vibration, imperfections, sensors, faults. Only the channels and the
+intervals of time that are asked for are computed; elements out of contact cost no friction.
+
+The hand's elements do not let go together. Its *onset* is when elements that carry half of the
+normal load have let go (the load-weighted median of their breakaways); its sliding ends when
+elements that carry half of it stick again. Both are read from the contact, not from the arm.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from tactslip_torch.data.recording import Recording
-from tactslip_torch.simulation.contact import ContactModel
-from tactslip_torch.simulation.disturbances import Common
-from tactslip_torch.simulation.faults import held_samples, recorded_channels, stuck_volts
-from tactslip_torch.simulation.grasp import Grasp, draw_grasp
-from tactslip_torch.simulation.grid import Grid, block_samples_for
-from tactslip_torch.simulation.handling import Handled
-from tactslip_torch.simulation.imperfections import disturb, gain_factor, load_factor, pickup
-from tactslip_torch.simulation.ladder import scene_contact
-from tactslip_torch.simulation.motion import ArmStroke, Motion, arm_strokes, last_stop_s
-from tactslip_torch.simulation.randomness import Array
-from tactslip_torch.simulation.scene import SIMULATION_VERSION, Scene
+from tactslip_torch.simulation.blocks import Array, Grid, block_samples_for, generator
+from tactslip_torch.simulation.bristles import EngineName
+from tactslip_torch.simulation.contact import Contacts, StrokeTrace, scene_contact, traces_of
+from tactslip_torch.simulation.disturbances import (
+    Handled,
+    common_waves,
+    disturb,
+    gain_factor,
+    held_samples,
+    load_factor,
+    pickup,
+    recorded_channels,
+    stuck_volts,
+)
+from tactslip_torch.simulation.grasp import Grasp, Slips, draw_grasp
+from tactslip_torch.simulation.scene import SIMULATION_VERSION, Motion, Scene
 from tactslip_torch.simulation.sensors import (
     draw_front,
+    element_vibration,
     film_volts,
     front_end,
     gauge_volts,
+    shared_field,
 )
-from tactslip_torch.simulation.timeline import Timeline, timeline_of
-from tactslip_torch.simulation.vibration import element_vibration, shared_field
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """When what happens, one entry per stroke that slides unless said otherwise.
+
+    Args:
+        duration_s: of the recording, a whole number of samples.
+        num_samples: the same in samples.
+        speeds_mm_s: steady speeds.
+        onsets_s: when the contact begins to slide, exact.
+        annotated_onsets_s: the same as a person would mark it, with jitter.
+        sliding_s: ``(onset, end)`` of each slide. With bristles a slide of a tacky material
+            includes its stick phases.
+        arm_s: ``(start, stop)`` of every stroke that the arm drives, sliding or not.
+        non_slip_s: intervals without slip in which the hand is handled, ascending and apart: what
+            a detector of motors or knocks would call slip.
+        slip_s: none: every onset is known.
+        missing_s: none: dropped samples repeat the last, as loggers do.
+    """
+
+    duration_s: float
+    num_samples: int
+    speeds_mm_s: tuple[float, ...]
+    onsets_s: tuple[float, ...]
+    annotated_onsets_s: tuple[float, ...]
+    sliding_s: tuple[tuple[float, float], ...]
+    arm_s: tuple[tuple[float, float], ...]
+    non_slip_s: tuple[tuple[float, float], ...] = ()
+    slip_s: tuple[tuple[float, float], ...] = ()
+    missing_s: tuple[tuple[float, float], ...] = ()
+
+
+def timeline(scene: Scene) -> Timeline:
+    """What is true of the scene's recording, without simulating its samples.
+
+    Raises:
+        ValueError: if the contact cannot take the handling that is asked for: see ``Handled``.
+
+    Example:
+        >>> truth = timeline(Scene("M5"))
+        >>> [round(onset) for onset in truth.onsets_s]
+        [2, 9, 14]
+        >>> truth.arm_s[0][0] < truth.onsets_s[0]
+        True
+    """
+    grasp = draw_grasp(scene)
+    return _timeline(scene, grasp, scene_contact(scene, grasp).slips)
 
 
 def simulate(
@@ -47,7 +103,7 @@ def simulate(
 
     Args:
         scene: what to simulate.
-        windows: ``(start_s, end_s)`` stretches to compute, ``None`` for all. Samples from
+        windows: ``(start_s, end_s)`` intervals to compute, ``None`` for all. Samples from
             ``round(start_s * rate)`` up to ``round(end_s * rate)``; they equal those of the whole
             recording. The cost is that of the blocks of a quarter second that they touch.
         channels: names of the channels to compute, ``None`` for all.
@@ -67,26 +123,97 @@ def simulate(
     """
     if not dtype.is_floating_point:
         raise ValueError(f"dtype must be floating, got {dtype}")
-    plan = arm_strokes(scene.strokes, scene.acceleration_m_s2)
+    return recording_of(scene, None, windows, channels, dtype)
+
+
+def simulate_many(
+    scenes: Iterable[Scene],
+    *,
+    windows: Sequence[Sequence[tuple[float, float]] | None] | None = None,
+    channels: Iterable[str] | None = None,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float64,
+    engine: EngineName = "auto",
+    at_once: int = 32,
+) -> Iterator[Recording]:
+    """The recordings of several scenes, in their order, each when it is asked for.
+
+    Bristles of many recordings are integrated side by side, on any device. The compiled engine
+    carries lanes by 16, which the elements of one recording nearly fill, so there this saves
+    little; the eager engine makes few large calls of what would be many small ones.
+
+    On the CPU in float64, engine ``"auto"``, each has the bytes that ``simulate`` gives it; by the
+    eager engine, in float32 or on a GPU what it differs by is the integration's rounding.
+
+    Args:
+        scenes: of any fidelity; kinematic ones are simulated one by one.
+        windows: of every scene, as ``simulate`` takes them; ``None`` for all of all.
+        channels: names of the channels to compute, ``None`` for all.
+        device: where bristles are integrated; sensors are simulated on the CPU.
+        dtype: in which bristles are integrated, float32 or float64; samples are float32.
+        engine: ``"compiled"`` or ``"eager"``, ``"auto"`` for what there is.
+        at_once: how many recordings are integrated together.
+
+    Raises:
+        ValueError: as ``simulate``; or if there are not as many windows as scenes, or ``at_once``
+            is not positive.
+
+    Example:
+        >>> scenes = [Scene("M2", fidelity="bristles", cycle=cycle) for cycle in range(2)]
+        >>> [len(recording.onsets_s) for recording in simulate_many(scenes, channels=["SG1"])]
+        [3, 3]
+    """
+    scenes = list(scenes)
+    if at_once < 1:
+        raise ValueError(f"at_once must be at least 1, got {at_once}")
+    if windows is not None and len(windows) != len(scenes):
+        raise ValueError(f"expected windows of each of {len(scenes)} scenes, got {len(windows)}")
+    wanted = [None] * len(scenes) if windows is None else list(windows)
+    if channels is not None and not isinstance(channels, str):
+        channels = list(channels)
+
+    def made() -> Iterator[Recording]:
+        for start in range(0, len(scenes), at_once):
+            some = scenes[start : start + at_once]
+            distinct = list(dict.fromkeys(one for one in some if one.fidelity == "bristles"))
+            found = traces_of(distinct, device=device, dtype=dtype, engine=engine)
+            traces = dict(zip(distinct, found, strict=True))
+            for scene, own in zip(some, wanted[start : start + at_once], strict=True):
+                yield recording_of(scene, traces.get(scene), own, channels)
+
+    return made()
+
+
+def recording_of(
+    scene: Scene,
+    traces: tuple[StrokeTrace, ...] | None,
+    windows: Sequence[tuple[float, float]] | None = None,
+    channels: Iterable[str] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> Recording:
+    """``simulate`` with the traces of bristles that are integrated already, or ``None``."""
     grasp = draw_grasp(scene)
-    model = scene_contact(scene, grasp, plan)
-    truth = timeline_of(scene, plan, grasp, model.slips)
+    contact = scene_contact(scene, grasp, traces)
+    truth = _timeline(scene, grasp, contact.slips)
     wanted = _wanted_samples(scene, truth, windows)
     indices = _channel_indices(scene, channels)
     volts = np.full((len(scene.hand), truth.num_samples), np.nan)
     recorded, stuck = recorded_channels(scene), stuck_volts(scene)
-    felt = sorted({recorded[index] for index in indices if index not in stuck})
     if wanted and indices:
-        held = held_samples(scene, truth.num_samples)
-        grid = _covering_grid(scene, held, wanted)
-        rows = _volts(scene, plan, grasp, model, grid, felt)
-        runs = _runs(held, grid, wanted)
-        for index in indices:
-            for run, source in runs:
+        held = held_samples(scene, truth.num_samples)  # by every sample, the one that stands there
+        size = block_samples_for(scene.sample_rate_hz)
+        blocks = np.unique(np.concatenate([held[first:last] // size for first, last in wanted]))
+        grid = Grid(blocks, size, scene.sample_rate_hz)
+        sensed = sorted({recorded[index] for index in indices if index not in stuck})
+        rows = _volts(scene, grasp, contact, grid, sensed)
+        for first, last in wanted:
+            block, offset = np.divmod(held[first:last], size)
+            source = np.searchsorted(blocks, block) * size + offset
+            for index in indices:
                 if index in stuck:
-                    volts[index, run] = stuck[index]
+                    volts[index, first:last] = stuck[index]
                 else:
-                    volts[index, run] = rows[recorded[index]].reshape(-1)[source]
+                    volts[index, first:last] = rows[recorded[index]].reshape(-1)[source]
     return Recording(
         samples=torch.from_numpy(volts).to(dtype),
         sample_rate_hz=scene.sample_rate_hz,
@@ -96,57 +223,82 @@ def simulate(
         sliding_s=truth.sliding_s,
         annotated_onsets_s=truth.annotated_onsets_s,
         non_slip_s=truth.non_slip_s,
-        provenance=_provenance(scene, model),
+        provenance=_provenance(scene, contact),
     )
 
 
+def _timeline(scene: Scene, grasp: Grasp, slips: Slips) -> Timeline:
+    """The timeline of a scene whose contact is known."""
+    down = grasp.touching
+    onsets = [_weighted_median(row[down], grasp.load_n[down]) for row in slips.start_s]
+    sticking = [np.nan_to_num(row[down], nan=-np.inf) for row in slips.end_s]  # never slid
+    ends = [_weighted_median(row, grasp.load_n[down]) for row in sticking]
+    num_samples = math.ceil(scene.end_s * scene.sample_rate_hz - 1e-6)
+    duration_s = num_samples / scene.sample_rate_hz
+    return Timeline(
+        duration_s=duration_s,
+        num_samples=num_samples,
+        speeds_mm_s=tuple(stroke.speed_mm_s for stroke in scene.strokes if stroke.slides),
+        onsets_s=tuple(onsets),
+        annotated_onsets_s=tuple(_annotated(scene, onsets, ends)),
+        sliding_s=tuple(zip(onsets, ends, strict=True)),
+        arm_s=tuple((stroke.start_s, stroke.stop_s) for stroke in scene.arm if stroke.drives),
+        non_slip_s=Handled(scene, grasp).intervals_s(duration_s),
+    )
+
+
+def _annotated(scene: Scene, onsets: list[float], ends: list[float]) -> list[float]:
+    """Onsets with a person's jitter, kept inside the recording and before the slide's end."""
+    jitter_s = 1e-3 * scene.disturbances.label_jitter_ms
+    draws = generator(*scene.key("annotation")).standard_normal(len(onsets))
+    marks = np.asarray(onsets) + jitter_s * np.clip(draws, -3.0, 3.0)
+    return [max(0.0, min(m, e)) for m, e in zip(marks.tolist(), ends, strict=True)]
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    """The value at which half of the weight is reached."""
+    order = np.argsort(values, kind="stable")
+    reached = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(reached, 0.5 * reached[-1])])
+
+
 def _volts(
-    scene: Scene,
-    plan: tuple[ArmStroke, ...],
-    grasp: Grasp,
-    model: ContactModel,
-    grid: Grid,
-    indices: list[int],
+    scene: Scene, grasp: Grasp, contact: Contacts, grid: Grid, indices: list[int]
 ) -> dict[int, Array]:
     """Volts of the channels asked for on the grid, ``[K, B]`` each."""
-    _, _, now = grid.history
-    driven = Motion(tuple(stroke for stroke in plan if stroke.drives), grid)
-    sliding = Motion(tuple(stroke for stroke in plan if stroke.slides), grid)
-    duration_s = last_stop_s(plan) + scene.tail_s
-    front, common = draw_front(scene), Common(scene, driven, duration_s)
-    field = shared_field(scene, grasp, sliding)
-    volts = {index: common.channel(index) for index in indices}
+    history, _, now = grid.history
+    driven = Motion(tuple(stroke for stroke in scene.arm if stroke.drives), grid)
+    front, common = draw_front(scene), common_waves(scene, driven) + pickup(scene, grid)
+    field = shared_field(scene, grasp, Motion(scene.slides, grid))
+    motion, handled = Motion(scene.slides, history), Handled(scene, grasp)
+    volts = {index: grid.zeros() for index in indices}
+    for wave in common:
+        for index in indices:
+            volts[index][wave.rows] += wave.volts[index] * wave.wave
     elements = {int(grasp.element_of_channel[index]) for index in indices}
-    contact_of, handled = model.on(grid), Handled(scene, grasp, plan)
     for element in sorted(elements & set(grasp.touching.tolist())):
-        contact = contact_of(element)
-        vibration = element_vibration(scene, grasp, contact, field, element)
-        disturb(scene, grasp, contact, element, grid, vibration, duration_s)
-        normal_n, shear_n, press_n = contact.normal_n, contact.friction_n, None
-        if (factor := load_factor(scene, element, grid.history[0])) is not None:
+        state = contact.element(element, grid, motion)
+        vibration = element_vibration(scene, grasp, state, field, element)
+        disturb(scene, grasp, state, element, grid, vibration)
+        normal_n, shear_n, press_n = state.normal_n, state.friction_n, None
+        if (factor := load_factor(scene, element, history)) is not None:
             normal_n, shear_n = normal_n * factor, shear_n * factor
             for band in (vibration.high, vibration.low):
                 band *= np.sqrt(factor[now])
         if not handled.is_idle:
-            press_n = handled.press_n(element, normal_n, grid.history[0])
+            press_n = handled.press_n(element, normal_n, history)
             normal_n = normal_n + press_n
-            shear_n = shear_n + handled.shear_n(element, grid.history[0].time_s)
+            shear_n = shear_n + handled.shear_n(element, history.time_s)
             vibration.high[:] += handled.knock_v(element, grid)
         for index in indices:
             if grasp.element_of_channel[index] != element:
                 continue
             if scene.hand.channels[index].adapting == "slow":
-                felt = gauge_volts(scene, normal_n[now], shear_n[now], vibration)
+                sensed = gauge_volts(scene, normal_n[now], shear_n[now], vibration)
             else:
-                felt = film_volts(scene, grid, shear_n, vibration, press_n)
-            volts[index] += front.gain[index] * gain_factor(scene, index, grid) * felt
-    if (common_mode := pickup(scene, grid)) is not None:
-        wave, couplings = common_mode
-        for index in indices:
-            volts[index] += couplings[index] * wave
-    return {
-        index: front_end(scene, front, index, grid, volts[index], duration_s) for index in indices
-    }
+                sensed = film_volts(scene, grid, shear_n, vibration, press_n)
+            volts[index] += front.gain[index] * gain_factor(scene, index, grid) * sensed
+    return {index: front_end(scene, front, index, grid, volts[index]) for index in indices}
 
 
 def _wanted_samples(
@@ -181,28 +333,9 @@ def _channel_indices(scene: Scene, channels: Iterable[str] | None) -> list[int]:
     return [index for index, name in enumerate(names) if name in asked]
 
 
-def _covering_grid(scene: Scene, held: NDArray[np.int64], wanted: list[tuple[int, int]]) -> Grid:
-    """The blocks of the samples that stand in the wanted ones."""
-    size = block_samples_for(scene.sample_rate_hz)
-    blocks = [np.unique(held[first:last] // size) for first, last in wanted]
-    return Grid(np.unique(np.concatenate(blocks)), size, scene.sample_rate_hz)
-
-
-def _runs(
-    held: NDArray[np.int64], grid: Grid, wanted: list[tuple[int, int]]
-) -> list[tuple[slice, NDArray[np.int64]]]:
-    """Every window, and where on the grid, its blocks in a row, its samples come from."""
-    size = grid.block_samples
-    runs = []
-    for first, last in wanted:
-        block, offset = np.divmod(held[first:last], size)
-        runs.append((slice(first, last), np.searchsorted(grid.blocks, block) * size + offset))
-    return runs
-
-
-def _provenance(scene: Scene, model: ContactModel) -> dict[str, object]:
+def _provenance(scene: Scene, contact: Contacts) -> dict[str, object]:
     """Where the recording comes from."""
-    facts = {
+    provenance: dict[str, object] = {
         "simulated": True,
         "fidelity": scene.fidelity,
         "seed": scene.seed,
@@ -213,4 +346,6 @@ def _provenance(scene: Scene, model: ContactModel) -> dict[str, object]:
         "simulation_version": SIMULATION_VERSION,
         "numpy_version": np.__version__,
     }
-    return facts | ({"integrator": dict(model.integrator)} if model.integrator else {})
+    if contact.integrator:
+        provenance["integrator"] = dict(contact.integrator)
+    return provenance

@@ -8,11 +8,10 @@ from typing import Any
 
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.simulation.dynamics.stepper import integrator
-from tactslip_torch.simulation.materials import SEEN_MATERIALS, UNSEEN_MATERIALS
+from tactslip_torch.simulation.bristles import integrator
+from tactslip_torch.simulation.parameters import SEEN_MATERIALS, UNSEEN_MATERIALS
 from tactslip_torch.simulation.scene import PAPER, Scene, paper_scenes
-from tactslip_torch.simulation.simulate import simulate
-from tactslip_torch.simulation.timeline import Timeline, timeline
+from tactslip_torch.simulation.simulate import Timeline, simulate, timeline
 
 
 class SimulatedRecordings:
@@ -23,10 +22,10 @@ class SimulatedRecordings:
         cycles: recordings per material, session and kind of scene.
         materials: ids in ``MATERIALS``.
         channels: rows for ``HandLayout.from_rows``; ``None`` for the paper's hand.
-        fidelity: the rung to simulate on, one of ``FIDELITIES``.
-        scene: overrides of any knob of the scenes; ``name`` is the kind they are.
+        fidelity: of the contact, one of ``FIDELITIES``.
+        scene: overrides of any parameter of the scenes; ``name`` is the kind they are.
         others: further kinds of scenes by name, with their overrides; ``cycles`` among them is
-            the kind's own number. They start from the same knobs as ``scene``.
+            the kind's own number. They start from the same parameters as ``scene``.
         sessions: mountings of every material, each with all its cycles and kinds of scenes. The
             first one's recordings are those of a set with one session; further ones are named
             "2", "3" and so on, and draw everything that belongs to a mounting anew: noise floor,
@@ -81,7 +80,7 @@ class SimulatedRecordings:
         return timeline(self._scenes[recording])
 
     def key(self, recording: RecordingId) -> Mapping[str, Any]:
-        """The scene as plain values and, on a dynamic rung, what integrates it here."""
+        """The scene as plain values and, with bristles, what integrates it here."""
         scene = self._scenes[recording]
         if scene.fidelity == "kinematic":
             return scene.to_dict()
@@ -90,7 +89,7 @@ class SimulatedRecordings:
     def load(
         self, recording: RecordingId, windows: Sequence[tuple[float, float]] | None = None
     ) -> Recording:
-        """Simulate the recording, or the stretches of it that are asked for."""
+        """Simulate the recording, or the intervals of it that are asked for."""
         return simulate(self._scenes[recording], windows=windows)
 
 

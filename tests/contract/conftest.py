@@ -91,6 +91,14 @@ def trained(request, trained_by) -> Trained:
     return trained_by(request.param)
 
 
+@pytest.fixture(
+    scope="session", params=["selected", pytest.param("general", marks=pytest.mark.slow)]
+)
+def trained_or_slow(request, trained_by) -> Trained:
+    """The same, the default among the slow tests: for what trains once more."""
+    return trained_by(request.param)
+
+
 @pytest.fixture(scope="session")
 def selected(trained_by) -> Trained:
     """The one of few features."""

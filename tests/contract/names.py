@@ -51,19 +51,20 @@ def solve_moments(stats, penalty):
 
 COMMANDS = {
     "train": f"-m {PACKAGE}.train",
-    "evaluate": f"-m {PACKAGE}.evaluate",
-    "detect": f"-m {PACKAGE}.detect",
-    "generate": f"-m {PACKAGE}.generate",
-    "data": f"-m {PACKAGE}.data_tool",
-    "export": f"-m {PACKAGE}.export",
-    "adapt": f"-m {PACKAGE}.adapt",
-    "importance": f"-m {PACKAGE}.sensors",
-    "crossval": f"-m {PACKAGE}.crossval",
-    "pareto": f"-m {PACKAGE}.pareto",
-    "certify": f"-m {PACKAGE}.certify",
-    "calibrate": f"-m {PACKAGE}.calibrate",
-    "stats": f"-m {PACKAGE}.stats",  # may leave: DESIGN.md
+    "evaluate": f"-m {PACKAGE} evaluate",
+    "detect": f"-m {PACKAGE} detect",
+    "generate": f"-m {PACKAGE} generate",
+    "data": f"-m {PACKAGE} data",
+    "export": f"-m {PACKAGE} export",
+    "adapt": f"-m {PACKAGE} adapt",
+    "importance": f"-m {PACKAGE} importance",
+    "crossval": f"-m {PACKAGE} crossval",
+    "pareto": f"-m {PACKAGE} pareto",
+    "certify": f"-m {PACKAGE} certify",
+    "calibrate": f"-m {PACKAGE} calibrate",
 }
+BATCH_FIT = "examples/batch_fit.py"
+"""In the place of the command ``stats`` of 0.1.0."""
 BAD_INPUT_STATUS = 2
 TRACEBACK_VARIABLE = "TACTSLIP_TRACEBACK"
 
@@ -227,20 +228,26 @@ WEB_OPTIONS = ("--model", "--recording", "--output")
 # Recordings in files ---------------------------------------------------------------------------
 
 from tactslip_torch.data.clock import even_clock  # noqa: E402
-from tactslip_torch.data.formats.reading import Reading, pieces  # noqa: E402
-from tactslip_torch.data.formats.registry import (  # noqa: E402
+from tactslip_torch.data.formats import (  # noqa: E402
     FORMATS,
+    Reading,
     endings,
     find_format,
     format_of,
     named_format,
     open_file,
+    pieces,
 )
 
-EXTRA_OF_FORMATS = {
-    "h5py": "formats",
-    "mcap": "formats",
-    "rosbags": "formats",
-    "pyarrow": "parquet",
-}
-"""By the library that reads or writes a format the extra that brings it."""
+INSTALL_FORMATS = 'pip install "tactslip-torch[formats]"'
+"""What brings the library of a format that is not installed."""
+ISOLATED = {"isolate": True}
+MOST_MEMORY, MOST_TIME = "isolate_gib", "isolate_s"
+"""Of ``Reading``: in a process of its own, with so much memory and time."""
+
+
+def rate_in_set(path):
+    """The rate at which a set of files takes a recording."""
+    from tactslip_torch.data.file_recordings import Stream, look
+
+    return look(path, Stream()).clock.sample_rate_hz

@@ -134,7 +134,7 @@ def _carry_out(folder: Path, arguments: Sequence[str]) -> None:
     os._exit(status)
 
 
-def wait_for(path: Path, timeout_s: float = 60.0) -> None:
+def wait_for(path: Path, timeout_s: float = 600.0) -> None:
     """Wait until a file is there."""
     end = time.monotonic() + timeout_s
     while not path.exists():

@@ -120,7 +120,6 @@ MISTAKES = {
         settings(action="convert", root_of_data="{root}", format="docx", output="to"),
         "'docx' npz text",
     ),
-    "shard beyond": ("stats", settings(action="collect", out="x", shard="3/2"), "shard 3/2"),
 }
 
 
@@ -156,6 +155,7 @@ def test_a_mistake_is_one_line_and_a_failing_exit(command, places, name, tmp_pat
     assert not missing, ran.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", COMMANDS)
 def test_a_misspelt_key_is_refused_by_every_command(command, which, tmp_path):
     """By Hydra's own message, in several lines, with the key in it."""
@@ -166,8 +166,9 @@ def test_a_misspelt_key_is_refused_by_every_command(command, which, tmp_path):
     assert "Traceback" not in ran.err
 
 
+@pytest.mark.slow
 def test_a_traceback_is_there_for_whoever_asks(tmp_path):
-    """In a process of its own, as a user starts it; a broken recording is named too."""
+    """In a process of its own, as a user starts it."""
     told = settings(model="missing.pt")
     done = subprocess.run(
         [sys.executable, *arguments_of("evaluate", *told)],

@@ -1,5 +1,6 @@
 """What a fit may depend on, how it goes on after a kill, and folds that are left out."""
 
+import contextlib
 import os
 import signal
 
@@ -45,24 +46,24 @@ def trained_on(detector):
 # Nothing of a held-out recording is learned ------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def with_other_recordings(command, trained, tmp_path_factory):
+@pytest.fixture
+def with_other_recordings(command, tmp_path):
     """Trains once more on the set with other samples in some recordings."""
 
-    def again(names):
-        folder = tmp_path_factory.mktemp("other")
-        root = write_set(folder / "set", dict.fromkeys(names, 1))
-        return train(command, folder, trained.overrides, root=root, cache=folder / "cache")
+    def again(trained, names):
+        root = write_set(tmp_path / "set", dict.fromkeys(names, 1))
+        return train(command, tmp_path, trained.overrides, root=root, cache=tmp_path / "cache")
 
     return again
 
 
-def test_held_out_recordings_change_no_number_of_the_fit(trained, with_other_recordings):
+def test_held_out_recordings_change_no_number_of_the_fit(trained_or_slow, with_other_recordings):
     """Neither those of held-out materials nor the test trials; their own scores do change."""
+    trained = trained_or_slow
     everything = {f"{m}/{t}" for m in (*SEEN, *HELD_OUT_MATERIALS) for t in TRIALS}
     training = trained_on(trained.detector)
     assert training < everything
-    other = with_other_recordings(everything - training)
+    other = with_other_recordings(trained, everything - training)
     assert trained_on(other.detector) == training
     torch.testing.assert_close(
         scores_of(other.detector), scores_of(trained.detector), rtol=1e-12, atol=1e-12
@@ -74,27 +75,29 @@ def test_held_out_recordings_change_no_number_of_the_fit(trained, with_other_rec
     assert told[TEST] != found[TEST] or told[HELD_OUT] != found[HELD_OUT]
 
 
-def test_a_training_recording_does_change_the_fit(selected, trained, with_other_recordings):
+def test_a_training_recording_does_change_the_fit(selected, with_other_recordings):
     """So that the test above would notice a leak."""
-    if trained is not selected:
-        pytest.skip("one recipe is enough")
-    one = min(trained_on(trained.detector))
-    other = with_other_recordings({one})
-    assert (scores_of(other.detector) - scores_of(trained.detector)).abs().max() > 1e-6
+    other = with_other_recordings(selected, {min(trained_on(selected.detector))})
+    assert (scores_of(other.detector) - scores_of(selected.detector)).abs().max() > 1e-6
 
 
 # Going on after a kill ---------------------------------------------------------------------------
 
 
-def test_a_killed_run_goes_on_behind_its_last_pass(command, trained, tmp_path):
+def test_a_killed_run_goes_on_behind_its_last_pass(command, trained_or_slow, tmp_path):
     """Killed once the first pass is written; what is made then is the detector of a whole run."""
+    trained = trained_or_slow
     overrides = trained.again(statistics=False)  # which need the first pass in one go
-    pid = command.start(tmp_path, "train", *overrides, *settings(folder="run"))
-    wait_for(tmp_path / "run" / CHECKPOINT)
-    os.kill(pid, signal.SIGKILL)
-    assert command.wait().status == -signal.SIGKILL
-    assert not (tmp_path / "run" / DETECTOR).exists()
-    resumed = train(command, tmp_path / "again", overrides, resume=tmp_path / "run")
+    for attempt in ("1", "2", "3"):  # on a busy machine a run may end first
+        run = tmp_path / attempt / "run"
+        pid = command.start(tmp_path / attempt, "train", *overrides, *settings(folder="run"))
+        wait_for(run / CHECKPOINT)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        if command.wait().status == -signal.SIGKILL and not (run / DETECTOR).exists():
+            break
+    assert not (run / DETECTOR).exists()
+    resumed = train(command, tmp_path / "again", overrides, resume=run)
     torch.testing.assert_close(
         scores_of(resumed.detector), scores_of(trained.detector), rtol=1e-12, atol=1e-12
     )

@@ -1,1 +1,39 @@
-"""Files of recordings: ours, and those that people have; a module a format, one registry."""
+"""Recordings in files of every format: NumPy, text, HDF5, MAT, Parquet, MCAP and rosbag2."""
+
+from tactslip_torch.data.formats._door import (
+    FORMATS,
+    Format,
+    endings,
+    find_format,
+    format_of,
+    named_format,
+    open_file,
+)
+from tactslip_torch.data.formats._reading import (
+    AS_IT_SAYS,
+    Archived,
+    Opened,
+    Reading,
+    Samples,
+    Times,
+    is_number,
+    pieces,
+)
+
+__all__ = [
+    "AS_IT_SAYS",
+    "FORMATS",
+    "Archived",
+    "Format",
+    "Opened",
+    "Reading",
+    "Samples",
+    "Times",
+    "endings",
+    "find_format",
+    "format_of",
+    "is_number",
+    "named_format",
+    "open_file",
+    "pieces",
+]

@@ -1,0 +1,1 @@
+"""What a detector needs, costs and loses: sensors, latency, precision."""

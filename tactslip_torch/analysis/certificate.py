@@ -1,0 +1,378 @@
+"""What float32 does to a detector, measured against float64, with a margin for its decisions.
+
+The float32 pipeline is ``copy.deepcopy(detector).float()``, the float64 one the detector as
+fitted; both score the same bins. Calibration bins and a rigorous bound of the head set the margin.
+Held-out bins only check it, and generated extremes show what becomes of broken sensors. What lies
+outside the inputs that the calibration bins cover was never tried.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.features.pool import VALIDITY
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.rounding import error_facts, gradient_facts, head_facts, score_sd
+from tactslip_torch.signals.binning import refuse_nonfinite
+from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
+
+
+class Coverage(NamedTuple):
+    """Ranges of the channels of bins.
+
+    Attributes:
+        low_v: ``[*, C]``, least raw sample, volts.
+        high_v: ``[*, C]``, greatest.
+        span_v: ``[*, C]``, span of the filtered bin.
+        relative_span: ``[*, C]``, that over its magnitude; 0 for a zero one.
+    """
+
+    low_v: Tensor
+    high_v: Tensor
+    span_v: Tensor
+    relative_span: Tensor
+
+
+def coverage(samples: Tensor, filtered: Tensor) -> Coverage:
+    """What each bin covers.
+
+    Shape:
+        - samples: ``[*, C, T]``, raw, volts; filtered: ``[*, C, n]``
+        - output: ``[*, C]`` each
+    """
+    span, magnitude = filtered.amax(-1) - filtered.amin(-1), filtered.abs().amax(-1)
+    is_zero = magnitude == 0
+    relative = torch.where(is_zero, 0.0, span / torch.where(is_zero, 1.0, magnitude))
+    low, high = samples.amin(-1).to(relative), samples.amax(-1).to(relative)
+    return Coverage(low, high, span, relative)
+
+
+class KnownInputs:
+    """The inputs that bins cover together; channels of a kind share a range.
+
+    Args:
+        bins: ``[N, C]`` each, those that are known.
+        kinds: of the channels by name, in the order of the bins.
+        used: names of the channels that matter; default all.
+
+    Example:
+        >>> bins = coverage(torch.tensor([[[-1.0, 1.0], [-2.0, 2.0]]]), torch.ones(1, 2, 1))
+        >>> new = coverage(torch.tensor([[[1.5, 1.5], [0.0, 0.0]]]), torch.ones(1, 2, 1))
+        >>> KnownInputs(bins, {"SG1": "SG", "SG2": "SG"}).cover(new)
+        tensor([True])
+        >>> KnownInputs(bins, {"SG1": "SG", "PVDF1": "PVDF"}).cover(new)
+        tensor([False])
+    """
+
+    def __init__(
+        self, bins: Coverage, kinds: Mapping[str, str], used: Iterable[str] | None = None
+    ) -> None:
+        self._names = tuple(kinds)
+        self._kinds = {
+            kind: [place for place, name in enumerate(kinds) if kinds[name] == kind]
+            for kind in dict.fromkeys(kinds.values())
+        }
+        self._used = {self._names.index(name) for name in (kinds if used is None else used)}
+        low, high, span, relative = bins
+        self._covered = Coverage(low.amin(0), high.amax(0), span.amin(0), relative.amin(0))
+
+    def cover(self, bins: Coverage) -> Tensor:
+        """Whether every channel that matters lies within the range of its kind.
+
+        Shape:
+            - bins: ``[N, C]`` each; output: ``[N]``, bool
+        """
+        inside = torch.ones(len(bins.low_v), dtype=torch.bool, device=bins.low_v.device)
+        for places in self._kinds.values():
+            known = self._range(places)
+            own = Coverage(*(part[:, [i for i in places if i in self._used]] for part in bins))
+            inside &= ((own.low_v >= known.low_v) & (own.high_v <= known.high_v)).all(-1)
+            inside &= (own.span_v >= known.span_v).all(-1)
+            inside &= (own.relative_span >= known.relative_span).all(-1)
+        return inside
+
+    def facts(self) -> dict[str, Any]:
+        """Least and greatest samples and least spans, by kind and by channel."""
+
+        def of(places: list[int]) -> dict[str, float]:
+            return {name: float(x) for name, x in self._range(places)._asdict().items()}
+
+        return {
+            "kinds": {kind: of(places) for kind, places in self._kinds.items()},
+            "channels": {name: of([place]) for place, name in enumerate(self._names)},
+        }
+
+    def _range(self, places: list[int]) -> Coverage:
+        low, high, span, relative = (part[places] for part in self._covered)
+        return Coverage(low.min(), high.max(), span.min(), relative.min())
+
+
+FACTOR = 4
+WORST_SD = 1e-3  # largest score error allowed on recordings, in standard deviations of the score
+INSIDE_SHARE = 0.01  # fewer of the held-out bins may lie inside the margin
+LARGEST_RATIO = 1e4  # a bound further above the worst error seen says too little
+_RULE = f"{FACTOR} x the worst error on calibration bins, plus the bound of the head if it has one"
+_CHUNK_BINS, _GRADIENT_BINS = 16, 128
+
+_Watch = Callable[[Iterable[Any], str, str], Iterable[Any]]
+"""Shows how far a loop is: takes its items, what it does, and what an item is."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Bins scored in float32 and in float64.
+
+    Args:
+        exact: ``[N]``, scores in float64.
+        rounded: ``[N]``, scores in float32.
+        stages: ``[N]`` each, what the score changed by the rounding in ``features`` (filter and
+            descriptors), ``scaler`` and ``head``; their sum is ``rounded - exact``.
+        scaled: ``[N, K]``, scaled features in float64.
+        scaled_error: ``[N, K]``, how far those in float32 are off.
+        is_valid: ``[N]``, bool, as the float32 pipeline flags it.
+        covers: what each bin covers of the input.
+    """
+
+    exact: Tensor
+    rounded: Tensor
+    stages: Mapping[str, Tensor]
+    scaled: Tensor
+    scaled_error: Tensor
+    is_valid: Tensor
+    covers: Coverage
+
+    @property
+    def error(self) -> Tensor:
+        """``[N]``, size of the score error; infinite where a score is not finite."""
+        return (self.rounded - self.exact).abs().nan_to_num(nan=math.inf, posinf=math.inf)
+
+    @property
+    def flips(self) -> Tensor:
+        """``[N]``, bool: float32 decides otherwise than float64."""
+        return (self.rounded >= 0) != (self.exact >= 0)
+
+
+def _quietly(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
+    return items
+
+
+def compare(
+    detector: SlipDetector, samples: Tensor, what: str = "bins", watch: _Watch = _quietly
+) -> Comparison:
+    """Score bins in float32 and in float64, stage by stage.
+
+    Shape:
+        - samples: ``[N, C, n + 2 * context]``, volts, finite
+
+    Raises:
+        ValueError: if there is no bin, or a sample is not finite.
+    """
+    if samples.ndim != 3 or not len(samples):
+        raise ValueError(f"expected {what} [N, C, n], at least one, got {tuple(samples.shape)}")
+    refuse_nonfinite(samples, detector.pool.hand.names, "leave the recording out, or repair it")
+    double, single = copy.deepcopy(detector).double(), copy.deepcopy(detector).float()
+    chunks = watch(samples.split(_CHUNK_BINS), what, f"x{_CHUNK_BINS} bins")
+    with torch.no_grad():
+        parts = [_compared(double, single, chunk) for chunk in chunks]
+    whole = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    stages = {name: whole.pop(name) for name in ("features", "scaler", "head")}
+    covers = Coverage(*(whole.pop(name) for name in Coverage._fields))
+    return Comparison(stages=stages, covers=covers, **whole)
+
+
+def _compared(double: SlipDetector, single: SlipDetector, samples: Tensor) -> dict[str, Tensor]:
+    features, scaled, exact, _ = _tapped(double, samples.double())
+    features32, scaled32, rounded, is_valid = _tapped(single, samples.float())
+    by_features = double.head(double.scaler(features32.double()))
+    by_scaler = double.head(scaled32.double())
+    covers = coverage(samples, double.channel_filter.valid(samples.double()))
+    return {
+        "exact": exact,
+        "rounded": rounded.double(),
+        "features": by_features - double.head(double.scaler(features)),
+        "scaler": by_scaler - by_features,
+        "head": rounded.double() - by_scaler,
+        "scaled": scaled,
+        "scaled_error": (scaled32.double() - scaled).abs(),
+        "is_valid": is_valid,
+        **covers._asdict(),
+    }
+
+
+def _tapped(detector: SlipDetector, samples: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What the scaler was given, what the head was given, score and validity."""
+    taken: list[Tensor] = []
+    stages = (detector.scaler, detector.head)
+    hooks = [m.register_forward_pre_hook(lambda _, given: taken.extend(given)) for m in stages]
+    try:
+        score, is_valid, *_ = detector.judge_raw(samples)
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return taken[0], taken[1], score, is_valid
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """What ``certify`` found.
+
+    Args:
+        content: as ``facts()`` hands out.
+        sets: ``calibration``, the held-out ones and the kinds of extremes, bin by bin.
+    """
+
+    content: Mapping[str, Any]
+    sets: Mapping[str, Comparison]
+
+    @property
+    def holds(self) -> bool:
+        """Whether no condition failed."""
+        return bool(self.content["holds"])
+
+    def facts(self) -> dict[str, Any]:
+        """Everything that was found, as plain values; infinite where the head overflows."""
+        return dict(self.content)
+
+
+def certify(
+    detector: SlipDetector,
+    calibration: Tensor,
+    held_out: Mapping[str, Tensor] | None = None,
+    *,
+    simulated: bool,
+    extremes: int = 100,
+    seed: int = 0,
+    watch: _Watch = _quietly,
+) -> Certificate:
+    """Measure what float32 does to a detector, and within which margin its decisions stand.
+
+    Args:
+        detector: as fitted.
+        calibration: raw training bins with their context; they set the margin and the range.
+        held_out: others by name; they check the certificate and set nothing.
+        simulated: whether the bins come from a simulation.
+        extremes: generated bins of each kind of ``EXTREMES``.
+        seed: of the extremes and of the search for the worst error of the head.
+        watch: shows how far it is.
+
+    Shape:
+        - calibration, held_out: ``[N, C, n + 2 * context]``, volts, finite
+
+    Raises:
+        ValueError: if a set is empty or not finite, has a name that the certificate uses itself, or
+            calibration scores are not finite or all the same.
+    """
+    given = {"calibration": calibration} | dict(held_out or {})
+    if taken := sorted({"calibration", *EXTREMES} & {*(held_out or {})}):
+        raise ValueError(f"a held-out set may not be named {taken[0]!r}, a name of our own; rename")
+    sets = {name: compare(detector, bins, name, watch) for name, bins in given.items()}
+    base = sets["calibration"]
+    sd = score_sd(base.exact)
+    generator = torch.Generator().manual_seed(seed)
+    size = (extremes, *calibration.shape[1:])
+    kinds = {
+        kind: compare(detector, extreme_bins(kind, size, generator, torch.float32), kind)
+        for kind in watch(EXTREMES, "extremes", "kinds")
+    }
+    head = head_facts(detector.head, base.scaled, seed)
+    worst = float(base.error.max())
+    margin = (head["bound"] or 0.0) + FACTOR * worst
+    kinds_of = {channel.name: channel.kind for channel in detector.pool.hand.channels}
+    known = KnownInputs(base.covers, kinds_of, {n.channel for n in detector.extractor.names})
+    double = copy.deepcopy(detector).double()
+    thinned = calibration[:: -(-len(calibration) // _GRADIENT_BINS)].double()
+    content: dict[str, Any] = {
+        "simulated": simulated,
+        "seed": seed,
+        "threads": torch.get_num_threads(),
+        "dtype": {"judged": "float32", "reference": "float64", "inside": detector.pool.arithmetic},
+        "score_sd": sd,
+        "margin": {
+            "score": margin,
+            "sd": margin / sd,
+            "rule": _RULE,
+            "worst_calibration_error": worst,
+        },
+        "head": head,
+        "sets": {name: _set_facts(c, detector, margin, sd, known) for name, c in sets.items()},
+        "extremes": {k: _set_facts(c, detector, margin, sd, known) for k, c in kinds.items()},
+        "condition_numbers": {
+            "solve": detector.info.get("solve", "not recorded"),
+            "score": {
+                "per_scaled_feature": gradient_facts(double.head, base.scaled),
+                "per_volt": gradient_facts(double.score_raw, thinned),
+            },
+        },
+        "range": known.facts() | {"validity": VALIDITY},
+    }
+    content["conditions"] = _conditions(content)
+    content["holds"] = all(row["holds"] is not False for row in content["conditions"])
+    return Certificate(content, sets | kinds)
+
+
+def _set_facts(
+    compared: Comparison, detector: SlipDetector, margin: float, sd: float, known: KnownInputs
+) -> dict[str, Any]:
+    inside = compared.exact.abs() <= margin
+    flips, outside = compared.flips & inside, compared.flips & ~inside
+    by_feature = compared.scaled_error.amax(0)
+    worst = by_feature.argmax()
+    return {
+        "bins": len(inside),
+        "invalid": int((~compared.is_valid).sum()),
+        "outside_range": int((~known.cover(compared.covers)).sum()),
+        "not_finite": int((~compared.rounded.isfinite()).sum()),
+        "error": error_facts(compared.error, sd),
+        "error_of_valid": error_facts(compared.error[compared.is_valid], sd),
+        "stages": {name: error_facts(x.abs(), sd) for name, x in compared.stages.items()},
+        "worst_feature": {
+            "name": str(detector.selected_names[int(worst)]),
+            "scaled_error": float(by_feature[worst]),
+        },
+        "inside_margin": {"bins": int(inside.sum()), "share": float(inside.double().mean())},
+        "flips": {
+            "inside_margin": int(flips.sum()),
+            "outside_margin": int(outside.sum()),
+            "outside_margin_valid": int((outside & compared.is_valid).sum()),
+        },
+    }
+
+
+def _conditions(content: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What was checked, ``holds`` being ``None`` where it is open; a held-out set may refute."""
+    rows: list[dict[str, Any]] = []
+
+    def check(name: str, found: float | None, wanted: str, holds: bool | None) -> None:
+        rows.append({"name": name, "found": found, "wanted": wanted, "holds": holds})
+
+    head = content["head"]
+    seen, bound = head["worst_seen"], head["bound"]
+    wanted = "a bound: this head has none" if bound is None else f"<= {bound:.2e}, its bound"
+    within = None
+    if bound is not None:  # what it is compared with is rounded as well
+        within = seen <= bound + head["reference_bound"] and not head["overflows"]
+    check("error of the head, worst seen", seen, wanted, within)
+    tight = None if head["ratio"] is None else head["ratio"] <= LARGEST_RATIO
+    check("bound of the head / worst seen", head["ratio"], f"<= {LARGEST_RATIO:g}", tight)
+    for name, facts in content["sets"].items():
+        worst = facts["error"]["worst_sd"]
+        check(f"{name}: worst error, sd", worst, f"<= {WORST_SD:g}", worst <= WORST_SD)
+        flips = facts["flips"]["outside_margin"]
+        check(f"{name}: flips outside the margin", flips, "0", flips == 0)
+        if name != "calibration":
+            share = facts["inside_margin"]["share"]
+            wanted = f"< {INSIDE_SHARE:g}"
+            check(f"{name}: share inside the margin", share, wanted, share < INSIDE_SHARE)
+    kinds = content["extremes"].values()
+    flips = sum(facts["flips"]["outside_margin_valid"] for facts in kinds)
+    check("valid extremes: flips outside the margin", flips, "0", flips == 0)
+    silent = sum(facts["not_finite"] for facts in kinds)
+    check("extremes: scores that are not finite", silent, "0", silent == 0)
+    return rows

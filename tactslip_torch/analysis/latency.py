@@ -1,0 +1,657 @@
+"""The latency of a detector: waiting, which is exact, and computing, which is measured here.
+
+*Waiting* is plain arithmetic of samples. The worst case is that of an onset just behind the start
+of a bin. That bin is not wholly in slip, so the next one decides, a hop later: hop + bin +
+look-ahead of the filter + compute. The four are kept apart everywhere, for what one robot may
+ignore (the look-ahead of a film, 2.5 ms) another may not. Bins that straddle the onset often say
+slip earlier; nothing here counts on it.
+
+*Computing* is timed with one bin and one thread, as a live loop calls it, from raw samples to the
+decision; ``python -m tactslip_torch.analysis.latency detector.pt [calls [engine]]`` prints a line
+of JSON, p50 and p99 in microseconds. Calls in which the system gave the processor to someone else
+(an involuntary context switch, where the system counts them) are left out, and their fraction is
+told, as is the p99 of all calls with them: what they took says how busy the machine was, and a
+robot keeps a processor for its loop. The bins are ordinary ones: one with a NaN goes another way,
+which takes longer.
+
+*A cost model* prunes searches. A feature needs parts: a film that is read, a branch that is formed,
+its spectrum, a sort, a column. What a selection costs is the sum over the parts it needs, each
+counted once, and over the groups of parts it needs at all: a group has a price of its own, for
+calls that happen once however many rows there are. Pooling over channels has a price, and one more
+for each feature it reads. Prices are fitted to timings of ``FeatureExtractor`` with one bin and one
+thread; what is stated of a detector is timed as a whole.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+from torch import Tensor
+
+from tactslip_torch.features.extractor import EngineName, FeatureExtractor
+from tactslip_torch.features.plan import ORDERED, Plan, make_plan
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pooling import ChannelPooling, pooled_names
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.runtime import bar
+from tactslip_torch.signals.filtering import ChannelFilter
+
+DEFINITION = (
+    "worst case, from the onset of slip to the decision of the first bin that lies wholly in slip: "
+    "look-ahead of the filter for the channels in use + bin + hop (the onset falls just behind a "
+    "bin's start) + compute (p99 of a call with one bin, one thread, on a processor of its own)"
+)
+
+
+@dataclass(frozen=True)
+class Latency:
+    """What the time from onset to decision is made of.
+
+    Args:
+        look_ahead_ms: samples behind the bin that the filter waits for.
+        bin_ms: until a bin is full.
+        hop_ms: between bins; a decision every so often, so compute must be shorter.
+        compute_us: from the last sample to the decision.
+
+    Raises:
+        ValueError: if a part is negative, or bin or hop is nothing.
+
+    Example:
+        >>> Latency(2.5, 50.0, 5.0, 300.0).worst_ms
+        57.8
+    """
+
+    look_ahead_ms: float
+    bin_ms: float
+    hop_ms: float
+    compute_us: float
+
+    def __post_init__(self) -> None:
+        for name in ("look_ahead_ms", "bin_ms", "hop_ms", "compute_us"):
+            value = getattr(self, name)
+            may_be_nothing = name in ("look_ahead_ms", "compute_us")
+            if not (value > 0 or (value == 0 and may_be_nothing)):
+                wanted = "not be negative" if may_be_nothing else "be positive"
+                raise ValueError(f"{name} must {wanted}, got {value}")
+
+    @property
+    def samples_ms(self) -> float:
+        """The part that no faster computer shortens: look-ahead, bin and hop."""
+        return self.look_ahead_ms + self.bin_ms + self.hop_ms
+
+    @property
+    def worst_ms(self) -> float:
+        """From onset to decision, at worst."""
+        return self.samples_ms + self.compute_us / 1000
+
+    @property
+    def load(self) -> float:
+        """Share of one processor that computing takes."""
+        return self.compute_us / 1000 / self.hop_ms
+
+    def misses(self, deadline_ms: float, compute_us: float) -> list[str]:
+        """Which of the limits are not met, in words; none if all are.
+
+        Args:
+            deadline_ms: for ``worst_ms``.
+            compute_us: for compute.
+        """
+        found = []
+        if self.worst_ms > deadline_ms:
+            found.append(f"latency {self.worst_ms:.2f} ms above deadline_ms={deadline_ms:g}")
+        if self.compute_us > compute_us:
+            found.append(f"compute {self.compute_us:.0f} us above compute_us={compute_us:g}")
+        if self.load >= 1:
+            found.append(f"compute {self.compute_us:.0f} us not below the hop {self.hop_ms:g} ms")
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """All parts and what they come to, JSON-able."""
+        return {
+            "worst_ms": self.worst_ms,
+            "look_ahead_ms": self.look_ahead_ms,
+            "bin_ms": self.bin_ms,
+            "hop_ms": self.hop_ms,
+            "compute_us": self.compute_us,
+            "load": self.load,
+        }
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a detector has to keep.
+
+    Args:
+        deadline_ms: from the onset of slip to the decision, at worst.
+        compute_us: from the last sample to the decision, p99.
+        hops_ms: between bins, to choose from.
+
+    Raises:
+        ValueError: for limits that are no finite positive numbers.
+    """
+
+    deadline_ms: float
+    compute_us: float
+    hops_ms: Sequence[float]
+
+    def __post_init__(self) -> None:
+        check_number("deadline_ms", self.deadline_ms)
+        check_number("compute_us", self.compute_us)
+
+    def latency(self, parts: Latency, compute_us: float, headroom: float = 1.0) -> Latency:
+        """The same parts with another compute, and the longest hop that keeps the limits.
+
+        Where a hop keeps them with ``headroom`` times the compute as well, the longest of those.
+        """
+        for factor in (headroom, 1.0):
+            given = replace(parts, compute_us=factor * compute_us)
+            found = _longest_hop(given, self.hops_ms, self.deadline_ms, self.compute_us)
+            if not self.misses(found):
+                break
+        return replace(found, compute_us=compute_us)
+
+    def misses(self, latency: Latency) -> list[str]:
+        """Which limits are not kept, in words."""
+        return latency.misses(self.deadline_ms, self.compute_us)
+
+    def headroom(self, latency: Latency) -> float:
+        """How many times its compute a detector could take; less than 1 if it misses a limit."""
+        left_us = 1000 * min(self.deadline_ms - latency.samples_ms, latency.hop_ms)
+        return min(self.compute_us, left_us) / latency.compute_us
+
+
+def check_number(
+    name: str, value: object, *, least: float | None = None, whole: bool = False
+) -> None:
+    """Refuse what is no finite number, positive or of at least so much, and whole if it has to be.
+
+    Raises:
+        ValueError: that names it.
+
+    Example:
+        >>> check_number("tries", 0, whole=True)
+        Traceback (most recent call last):
+        ValueError: tries must be a positive whole number, got 0
+    """
+    kinds = int if whole else (int, float)
+    if isinstance(value, kinds) and not isinstance(value, bool) and math.isfinite(value):
+        is_enough = value > 0 if least is None else value >= least
+        if is_enough:
+            return
+    kind = "whole number" if whole else "finite number"
+    wanted = f"a positive {kind}" if least is None else f"a {kind} of at least {least:g}"
+    raise ValueError(f"{name} must be {wanted}, got {value!r}")
+
+
+def check_hops(hops_ms: Sequence[float], sample_rate_hz: float) -> None:
+    """Refuse hops that are no whole number of samples.
+
+    Raises:
+        ValueError: that names the first.
+    """
+    for hop in hops_ms:
+        samples = hop * sample_rate_hz / 1000
+        if not math.isclose(samples, round(samples), rel_tol=1e-9):
+            raise ValueError(
+                f"search.hops_ms: {hop:g} ms are {samples:g} samples at {sample_rate_hz:g} Hz, "
+                f"expected a whole number; give a multiple of {1000 / sample_rate_hz:g} ms"
+            )
+
+
+def look_ahead_samples(channel_filter: ChannelFilter, channels: Iterable[int]) -> int:
+    """Samples behind a bin that must be there before the channels in use can be filtered.
+
+    Args:
+        channel_filter: of the whole hand.
+        channels: indices of those in use.
+
+    Raises:
+        ValueError: if there is no channel.
+
+    Example:
+        >>> look_ahead_samples(ChannelFilter([51, 11]), [1])
+        5
+    """
+    used = list(channels)
+    if not used:
+        raise ValueError("no channel is in use, expected at least one; select a feature")
+    return max(channel_filter.reaches[channel][1] for channel in used)
+
+
+def least_latency_ms(bin_ms: float, hops_ms: Sequence[float], look_ahead_ms: float) -> float:
+    """What no computer comes below: compute of nothing, at the shortest hop."""
+    return Latency(look_ahead_ms, bin_ms, min(hops_ms), 0.0).worst_ms
+
+
+def _longest_hop(
+    parts: Latency, hops_ms: Sequence[float], deadline_ms: float, compute_us: float
+) -> Latency:
+    """The same with the longest hop that meets the limits, which spares the processor most.
+
+    The shortest hop that compute fits into where none does; the longest of all if none is longer
+    than compute.
+
+    Example:
+        >>> _longest_hop(Latency(12.5, 50.0, 5.0, 300.0), [5.0, 10.0, 25.0], 80.0, 500.0).hop_ms
+        10.0
+    """
+    all_of_them = [
+        Latency(parts.look_ahead_ms, parts.bin_ms, hop, parts.compute_us)
+        for hop in sorted(hops_ms, reverse=True)
+    ]
+    meeting = [each for each in all_of_them if not each.misses(deadline_ms, compute_us)]
+    if meeting:
+        return meeting[0]
+    return shortest_hop(parts, hops_ms)
+
+
+def shortest_hop(parts: Latency, hops_ms: Sequence[float]) -> Latency:
+    """The same with the shortest hop that compute fits into; the longest of all if into none."""
+    hops = sorted(hops_ms)
+    hop = next((each for each in hops if parts.compute_us / 1000 < each), hops[-1])
+    return Latency(parts.look_ahead_ms, parts.bin_ms, hop, parts.compute_us)
+
+
+try:
+    from resource import RUSAGE_THREAD, getrusage
+except ImportError:  # only Linux counts for each thread
+    getrusage = None  # type: ignore[assignment]
+
+
+class Timing(NamedTuple):
+    """Microseconds of a call: of several runs, the median of their medians and of their p99.
+
+    Attributes:
+        p50_us: half of the calls take no longer.
+        p99_us: 99 of 100 calls take no longer.
+        p99_all_us: the same with the calls that were interrupted.
+        calls: counted in each run.
+        interrupted: share of all calls that were interrupted, and not counted.
+    """
+
+    p50_us: float
+    p99_us: float
+    p99_all_us: float
+    calls: int
+    interrupted: float = 0.0
+
+
+def time_calls(
+    call: Callable[[Tensor], object], inputs: Sequence[Tensor], calls: int, runs: int = 3
+) -> Timing:
+    """Time a call on one input after the other, each by itself.
+
+    Of a machine so busy that hardly a call is left alone, interrupted ones count too.
+    """
+    for given in inputs:
+        call(given)
+    middles, ends, ends_of_all, lost, made = [], [], [], 0, 0
+    for _ in range(runs):
+        taken: list[int] = []
+        spoilt: list[int] = []
+        while len(taken) < calls and len(spoilt) < calls:
+            given = inputs[made % len(inputs)]
+            switches = _interruptions()
+            started = time.perf_counter_ns()
+            call(given)
+            spent = time.perf_counter_ns() - started
+            (taken if _interruptions() == switches else spoilt).append(spent)
+            made += 1
+        lost += len(spoilt)
+        counted = sorted(taken if len(taken) == calls else taken + spoilt)
+        middles.append(counted[len(counted) // 2] / 1000)
+        ends.append(_p99(counted))
+        ends_of_all.append(_p99(sorted(taken + spoilt)))
+    return Timing(median(middles), median(ends), median(ends_of_all), calls, lost / made)
+
+
+def time_detector(detector: SlipDetector, calls: int, runs: int = 3) -> Timing:
+    """Time ``judge_raw`` of one ordinary bin, float32, as a live loop calls it."""
+    pool = detector.pool
+    inputs = single_bins(pool, pool.bin_samples + 2 * detector.channel_filter.context)
+    with torch.inference_mode():
+        return time_calls(detector.judge_raw, inputs, calls, runs)
+
+
+def time_in_fresh_process(
+    path: str | os.PathLike[str], calls: int, engine: EngineName = "auto"
+) -> Timing:
+    """``time_detector`` of a saved detector in a process that has done nothing else.
+
+    Raises:
+        ValueError: if that process fails; its last line is named.
+    """
+    command = [sys.executable, "-m", "tactslip_torch.analysis.latency", os.fspath(path), str(calls)]
+    command.append(engine)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        said = (done.stderr.strip() or f"exit status {done.returncode}").splitlines()[-1]
+        raise ValueError(f"timing {os.fspath(path)} in a fresh process failed: {said}")
+    return Timing(**json.loads(done.stdout.splitlines()[-1]))
+
+
+def _p99(taken_ns: Sequence[int]) -> float:
+    """What 99 of 100 sorted calls do not exceed, in microseconds."""
+    return taken_ns[-(-99 * len(taken_ns) // 100) - 1] / 1000
+
+
+def _interruptions() -> int:
+    """How often this thread has lost the processor against its will; 0 where nobody counts."""
+    return 0 if getrusage is None else getrusage(RUSAGE_THREAD).ru_nivcsw
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One intra-op thread, as a live loop has."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def single_bins(pool: FeaturePool, num_samples: int) -> list[Tensor]:
+    """Single ordinary bins in volts, ``[1, C, num_samples]`` each, float32."""
+    generator = torch.Generator().manual_seed(0)
+    shape = (32, 1, len(pool.hand), num_samples)
+    return list(0.1 * torch.randn(shape, generator=generator) + 1)
+
+
+GROUPS: Mapping[str, str] = {
+    "gauges": "a gauge read and described",
+    "films": "a film read",
+    "branches": "a wavelet branch formed",
+    "spectra": "a spectrum of a branch formed",
+    "energies": "energies of all branches of a film",
+    "moments": "mean, spread, shape and extremes of a row",
+    "sorts": "a row sorted, for median, mode and iqr",
+    "histograms": "entropy of a row",
+    "correlations": "correlation of a branch with its film",
+    "lines": "centroid and spread of a spectrum",
+    "columns": "a column written",
+}
+"""Groups of work, and what one part of each is."""
+_OF_ROW = {"gauge": "gauges", "time": "branches", "freq": "spectra"}
+_OF_DESCRIPTOR = dict.fromkeys(ORDERED, "sorts") | {
+    "entropy": "histograms",
+    "correlation": "correlations",
+    "spectral_centroid": "lines",
+    "spectral_spread": "lines",
+}
+
+_Part = tuple[str, tuple[object, ...]]  # a group, and which of it; none of it: the group as such
+
+
+@dataclass(frozen=True)
+class CostModel:
+    """What a call with one bin costs, by what it needs.
+
+    Args:
+        base_us: of a call that does nothing.
+        group_us: by group, once if any of its parts is needed.
+        part_us: by group, of each of its parts.
+        rest_us: what filter, scaling, head and checks add.
+        rest_of_one_us: and more for each number that the machine takes.
+        tail: p99 over p50, usually.
+        error: median relative error on the timings it was fitted to.
+        pooling_us: what pooling over channels adds.
+        pooling_of_one_us: and more for each feature that is pooled.
+    """
+
+    base_us: float
+    group_us: Mapping[str, float]
+    part_us: Mapping[str, float]
+    rest_us: float
+    rest_of_one_us: float
+    tail: float
+    error: float
+    pooling_us: float = 0.0
+    pooling_of_one_us: float = 0.0
+
+    def features_us(self, parts: set[_Part]) -> float:
+        """Median time of the features that need these parts."""
+        return self.base_us + sum(self._price(part) for part in parts)
+
+    def compute_us(self, parts: set[_Part], num_columns: int, num_pooled: int = 0) -> float:
+        """p99 of a whole call, from raw samples to the decision.
+
+        Args:
+            parts: that the features need.
+            num_columns: numbers that the machine takes.
+            num_pooled: features that they are pooled of; 0 if they are features themselves.
+        """
+        rest_us = self.rest_us + num_columns * self.rest_of_one_us
+        if num_pooled:
+            rest_us += self.pooling_us + num_pooled * self.pooling_of_one_us
+        return self.tail * (self.features_us(parts) + rest_us)
+
+    def bill(self, needed: Sequence[set[_Part]]) -> tuple[Tensor, Tensor]:
+        """What ``rank_per_cost`` takes: which parts each feature needs, and their prices.
+
+        A column's price holds its share of the rest, and is never nothing.
+
+        Shape:
+            - first output: ``[F, P]``, bool
+            - second output: ``[P]``, whole nanoseconds
+        """
+        parts = sorted(set().union(*needed), key=repr)
+        place = {part: index for index, part in enumerate(parts)}
+        needs = torch.zeros(len(needed), len(parts), dtype=torch.bool)
+        for row, own in enumerate(needed):
+            needs[row, [place[part] for part in own]] = True
+        prices = [round(1000 * self._price(part)) for part in parts]
+        for index, (group, which) in enumerate(parts):
+            if group == "columns" and which:
+                prices[index] += max(round(1000 * self.rest_of_one_us), 1)
+        return needs, torch.tensor(prices)
+
+    def facts(self) -> dict[str, Any]:
+        """All prices, JSON-able."""
+        return {
+            "base_us": self.base_us,
+            "groups": {
+                name: {"group_us": self.group_us[name], "part_us": self.part_us[name], "part": what}
+                for name, what in GROUPS.items()
+            },
+            "rest_us": self.rest_us,
+            "rest_of_one_us": self.rest_of_one_us,
+            "pooling_us": self.pooling_us,
+            "pooling_of_one_us": self.pooling_of_one_us,
+            "p99_over_p50": self.tail,
+            "median_relative_error": self.error,
+        }
+
+    def _price(self, part: _Part) -> float:
+        group, which = part
+        return self.part_us[group] if which else self.group_us[group]
+
+
+def parts_of(plan: Plan) -> list[set[_Part]]:
+    """The parts that each column of a plan needs; those of several features are the union."""
+    needed: list[set[_Part]] = [{("columns", (place,))} for place in range(plan.num_features)]
+    for wanted in plan.wanted:
+        row = plan.rows[wanted.row]
+        own = needed[wanted.place]
+        own.add((_OF_ROW[row.kind], (row.channel, row.branch)))
+        if row.kind != "gauge":
+            own.add(("films", (row.channel,)))
+        own.add((_OF_DESCRIPTOR.get(wanted.descriptor, "moments"), tuple(row)))
+    for share in plan.shares:
+        needed[share.place] |= {("films", (share.channel,)), ("energies", (share.channel,))}
+    return [own | {(group, ()) for group, _ in own} for own in needed]
+
+
+def measure_costs(
+    pool: FeaturePool,
+    channel_filter: ChannelFilter,
+    sizes: Sequence[int],
+    engine: EngineName = "auto",
+    statistics: Sequence[str] = (),
+    *,
+    calls: int = 100,
+) -> CostModel:
+    """Fit the model to timings on this machine.
+
+    Args:
+        pool: what features there are.
+        channel_filter: of the hand.
+        sizes: numbers of features for which the rest is timed.
+        engine: what computes features.
+        statistics: over channels, whose pooling is timed; none: it is not.
+        calls: of each selection, in each of three runs.
+    """
+    needed = parts_of(make_plan(pool.hand, pool.level, pool.names))
+    bins = single_bins(pool, pool.bin_samples)
+    timings, sizes = [], sorted(set(sizes))
+    layers = list(_layers(pool, statistics)) if statistics else []
+    designs = list(_designs(needed, sizes))
+    with one_thread():
+        for selected in bar(designs, "cost of feature groups"):
+            extractor = FeatureExtractor(pool, selected, engine)
+            timings.append(time_calls(extractor, bins, calls))
+
+        def whole(selected: Sequence[int], layer: ChannelPooling | None = None) -> Timing:
+            return time_detector(_stand_in(pool, channel_filter, selected, engine, layer), calls)
+
+        rest, tails, pooling = [], [], []
+        for size in sizes:
+            some = _spread(range(len(pool.names)), size)
+            of_features = time_calls(FeatureExtractor(pool, some, engine), bins, calls)
+            of_all = whole(some)
+            tails.append(of_all.p99_us / of_all.p50_us)
+            rest.append(of_all.p50_us - of_features.p50_us)
+        rest_us, rest_of_one_us = _line(sizes, rest)
+        for layer in layers:
+            some = [pool.names.index(name) for name in layer.inputs]
+            of_features = time_calls(FeatureExtractor(pool, some, engine), bins, calls)
+            of_head_us = rest_us + len(layer.names) * rest_of_one_us
+            pooling.append(whole(some, layer).p50_us - of_features.p50_us - of_head_us)
+    lengths = [len(layer.inputs) for layer in layers]
+    pooling_us, pooling_of_one_us = _line(lengths, pooling) if layers else (0.0, 0.0)
+    taken = torch.tensor([timing.p50_us for timing in timings], dtype=torch.float64)
+    counts = torch.stack([_counted(set().union(*(needed[i] for i in s))) for s in designs])
+    rows = (counts / taken[:, None]).numpy()
+    prices = torch.from_numpy(
+        nnls(rows, np.ones(len(rows)), maxiter=10_000)[0]
+    )  # relative errors count
+    names = list(GROUPS)
+    return CostModel(
+        base_us=float(prices[0]),
+        group_us=dict(zip(names, prices[1 : 1 + len(names)].tolist(), strict=True)),
+        part_us=dict(zip(names, prices[1 + len(names) :].tolist(), strict=True)),
+        rest_us=rest_us,
+        rest_of_one_us=rest_of_one_us,
+        tail=median(tails),
+        error=float(((counts @ prices) / taken - 1).abs().median()),
+        pooling_us=pooling_us,
+        pooling_of_one_us=pooling_of_one_us,
+    )
+
+
+def _stand_in(
+    pool: FeaturePool,
+    channel_filter: ChannelFilter,
+    selected: Sequence[int],
+    engine: EngineName = "auto",
+    layer: ChannelPooling | None = None,
+) -> SlipDetector:
+    """A detector that nobody trained, which takes as long as one that somebody did."""
+    num = len(selected) if layer is None else len(layer.names)
+    generator = torch.Generator().manual_seed(num)
+    bend = torch.randn(num, num, generator=generator, dtype=torch.float64)
+    ends = torch.ones(num, dtype=torch.float64)
+    head = QuadraticForm(bend + bend.T, bend[0].clone(), torch.tensor(0.5, dtype=torch.float64))
+    scaler = FeatureScaler(-ends, ends, ends)
+    return SlipDetector(pool, channel_filter, selected, scaler, head, pooling=layer, engine=engine)
+
+
+def _layers(pool: FeaturePool, statistics: Sequence[str]) -> Iterator[ChannelPooling]:
+    """Layers that nobody fitted, of few to many columns."""
+    names = pooled_names(pool.hand, pool.names, statistics)
+    kinds = len(pool.hand.kinds)
+    for number in (8, 60, 240):
+        some = [names[index] for index in _spread(range(len(names)), max(number, kinds))]
+        families = {(n.channel, n.component, n.domain, n.descriptor) for n in some}
+        used = {name.channel for name in some}
+        zeros = torch.zeros(len(some)), torch.zeros(len(used))
+        yield ChannelPooling(pool.hand, some, torch.ones(len(families)), *zeros)
+
+
+def _designs(needed: Sequence[set[_Part]], sizes: Sequence[int]) -> Iterator[list[int]]:
+    """Selections that tell the groups apart: each group with one, some and all of its parts."""
+    for group in GROUPS:
+        first: dict[_Part, int] = {}  # of each part of the group, the feature that needs fewest
+        for index, own in enumerate(needed):
+            for part in own:
+                if part[0] == group and part[1]:
+                    known = first.setdefault(part, index)
+                    first[part] = min(known, index, key=lambda i: len(needed[i]))
+        places = sorted(set(first.values()))
+        for number in sorted({1, 4, 16, min(len(places), 80)}):
+            if 0 < number <= len(places):
+                yield _spread(places, number)
+    generator = torch.Generator().manual_seed(0)
+    for size in sizes:
+        for _ in range(3):
+            order = torch.randperm(len(needed), generator=generator)
+            yield order[:size].sort().values.tolist()
+
+
+def _spread(places: Sequence[int], number: int) -> list[int]:
+    """So many of the places, evenly."""
+    return [places[index * len(places) // number] for index in range(min(number, len(places)))]
+
+
+def _counted(parts: set[_Part]) -> Tensor:
+    """How many of each group there are, behind a 1 for the call and 0 or 1 for each group."""
+    counts = [1.0]
+    counts += [float((group, ()) in parts) for group in GROUPS]
+    counts += [float(sum(p[0] == group and p[1] != () for p in parts)) for group in GROUPS]
+    return torch.tensor(counts, dtype=torch.float64)
+
+
+def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
+    """Height at 0 and slope, neither negative: medians, which one bad timing does not move.
+
+    Reference:
+        Sen (1968), Journal of the American Statistical Association 63, 1379-1389.
+    """
+    points = list(zip(x, y, strict=True))
+    slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.combinations(points, 2)]
+    slope = max(median(slopes), 0.0) if slopes else 0.0
+    return max(median(height - slope * place for place, height in points), 0.0), slope
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print the timing of a saved detector as a line of JSON."""
+    if not 1 <= len(arguments) <= 3:
+        raise SystemExit(
+            "usage: python -m tactslip_torch.analysis.latency detector.pt [calls [engine]]"
+        )
+    path, calls, engine = [*arguments, *("1000", "auto")[len(arguments) - 1 :]]
+    with one_thread():
+        detector = SlipDetector.load(Path(path), cast(EngineName, engine))
+        timing = time_detector(detector, int(calls), runs=5)
+    print(json.dumps(timing._asdict()))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,266 @@
+"""Sets of recordings in files: ``python -m tactslip_torch data action=check root=FOLDER``.
+
+``check`` lists every problem and everything worth a look, with file and line; exit status 2 where
+there is a problem. ``summary`` prints what there is and draws it. ``convert to=h5 output=FOLDER``
+writes the set in another format; what was finished before is kept. ``label_template`` writes a
+manifest to fill in. ``data=authors_raw`` does the first three for the authors' own files.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import hydra
+import numpy as np
+from hydra.utils import get_object, instantiate
+from omegaconf import DictConfig
+
+import tactslip_torch
+from tactslip_torch.commands.entry import (
+    conf_dir,
+    errors_in_one_line,
+    fail,
+    one_line,
+    run_entry_point,
+)
+from tactslip_torch.data.conversion import Conversion
+from tactslip_torch.data.file_recordings import FileRecordings, Inspected, inspected, oddities
+from tactslip_torch.data.folder import Written, write_manifest
+from tactslip_torch.data.manifest import Problem, write_template
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.report.dataset import (
+    Example,
+    Trial,
+    dataset_figure,
+    ranges_table,
+    trials_table,
+)
+from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import in_processes
+
+FIGURE = Path("outputs/data_tool.png")
+
+
+def check(config: DictConfig) -> int:
+    """Print every problem and warning of a set; how many problems there are.
+
+    Raises:
+        ValueError: if the set cannot be looked at at all.
+        FileNotFoundError: if there is no folder or manifest.
+    """
+    source = _source(config, strict=False)
+    problems, warnings = list(source.problems), list(source.warnings)
+    if config.samples and source.ids:
+        for recording, found in _inspect_all(config, source):
+            entry = source.entry(recording)
+            if isinstance(found, str):
+                problems.append(Problem(entry.place, f"{entry.file}: {found}"))
+            else:
+                odd = oddities(source, found)
+                warnings += [Problem(entry.place, f"{entry.file}: {what}") for what in odd]
+    for line in (*(f"problem: {p}" for p in problems), *(f"warning: {w}" for w in warnings)):
+        print(line)
+    if source.ids:
+        print(f"channels: {', '.join(source.hand.names)}")
+    print(_headline(source, problems, warnings))
+    return len(problems)
+
+
+def summary(config: DictConfig) -> list[Trial]:
+    """Print what a set holds, and draw it; what is told of each recording.
+
+    Raises:
+        ValueError: if no recording can be read.
+        FileNotFoundError: if there is no folder or manifest.
+    """
+    source = _source(config, strict=False)
+    hand = source.hand  # refuses a set of which nothing can be read
+    trials = [_trial(source, recording) for recording in source.ids]
+    print("\n" + trials_table(trials, simulated=source.is_simulated))
+    if any(trial.num_onsets for trial in trials):
+        print("labels= takes up to a second before each onset as non-slip; it is not counted here")
+    ranges = np.full((len(hand), 2), np.nan)
+    if config.samples:
+        found = [one for _, one in _inspect_all(config, source) if isinstance(one, Inspected)]
+        if found:
+            with np.errstate(all="ignore"):
+                ranges[:, 0] = np.fmin.reduce([one.least for one in found])
+                ranges[:, 1] = np.fmax.reduce([one.greatest for one in found])
+    print("\n" + ranges_table(hand.to_rows(), ranges, source.units))
+    print("\n" + _headline(source, source.problems, source.warnings))
+    path = FIGURE if config.output is None else Path(config.output)
+    what = "SIMULATED recordings" if source.is_simulated else "Recordings"
+    title = f"{what} in {source.root.resolve().name}"
+    dataset_figure(trials, _example(source), path, title=title)
+    print(f"figure in {path}")
+    return trials
+
+
+def convert(config: DictConfig) -> list[Written]:
+    """Write a set in another format; what was written or found finished.
+
+    Raises:
+        ValueError: if the set has problems, or a recording cannot be read: what was finished
+            before stays.
+        FileNotFoundError: if there is no folder or manifest.
+    """
+    started = time.perf_counter()
+    for name in ("to", "output"):
+        if config[name] is None:
+            raise ValueError(f"no value for {name}; give to=FORMAT and output=FOLDER")
+    source = _source(config, skip_failed=bool(config.skip_failed or config.data.skip_failed))
+    version = tactslip_torch.__version__
+    job = Conversion(source, Path(str(config.output)), str(config.to), version)
+    job.check()
+
+    def one(recording: RecordingId) -> Written | str:
+        try:
+            return job.convert(recording)
+        except (ValueError, OSError) as error:
+            entry = source.entry(recording)
+            what = str(Problem(entry.place, f"{entry.file}: {one_line(error)}"))
+            if config.skip_failed:
+                return what
+            raise ValueError(
+                f"{what}; those that were finished are kept in {job.folder}, skip_failed=true "
+                "goes on without this one"
+            ) from error
+
+    found = list(in_processes(one, source.ids, "converting", "recording", config.num_workers))
+    done = [each for each in found if isinstance(each, Written)]
+    failed = [*map(str, source.problems), *(each for each in found if isinstance(each, str))]
+    for what in failed:
+        print(f"left out: {what}")
+    if not done:
+        raise ValueError(f"no recording could be converted, first: {failed[0]}")
+    write_manifest(job.folder, done)
+    print("\n" + _converted_table(done, failed, time.perf_counter() - started))
+    print(f"\nrecordings in {job.folder}")
+    return done
+
+
+def label_template(config: DictConfig) -> Path:
+    """Write a manifest of all that can be read in a folder, to be filled in."""
+    output = None if config.output is None else Path(str(config.output))
+    written = write_template(Path(str(config.root)), str(config.pattern), output)
+    print(
+        f"{written.path} lists {written.num_files} recordings, {written.num_guessed} of them with "
+        f"what pattern={config.pattern} tells; fill in onsets_s, sliding_s, slip_s and non_slip_s "
+        "(as 2.0; 9.0 and 2-7; 9-11.5) or label (slip, non-slip), then action=check"
+    )
+    return written.path
+
+
+ACTIONS: dict[str, Callable[[DictConfig], object]] = {
+    "check": check,
+    "summary": summary,
+    "convert": convert,
+    "label_template": label_template,
+}
+
+
+def _source(config: DictConfig, **options: bool) -> FileRecordings:
+    """The set of the ``data`` section, which must be one of files."""
+    if getattr(get_object(config.data._target_), "is_simulated", False) is True:
+        raise ValueError("data must be a set of files, such as data=files or data=authors_raw")
+    source: FileRecordings = instantiate(config.data, _convert_="all", **options)
+    return source
+
+
+def _inspect_all(
+    config: DictConfig, source: FileRecordings
+) -> list[tuple[RecordingId, Inspected | str]]:
+    """What the samples of every recording are, or why they cannot be read."""
+
+    def one(recording: RecordingId) -> Inspected | str:
+        try:
+            return inspected(source, recording)
+        except (ValueError, OSError) as error:
+            return one_line(error)
+
+    found = in_processes(one, source.ids, "reading samples", "recording", config.num_workers)
+    return list(zip(source.ids, found, strict=True))
+
+
+def _headline(
+    source: FileRecordings, problems: Sequence[Problem], warnings: Sequence[Problem]
+) -> str:
+    """What there is, in a line."""
+    counts = f"{_number(problems, 'problem')}, {_number(warnings, 'warning')}"
+    if not source.ids:
+        return f"no recording can be read: {counts}"
+    seconds = sum(source.timeline(recording).duration_s for recording in source.ids)
+    materials = list(dict.fromkeys(recording.material for recording in source.ids))
+    said = f"{SIMULATED_LINE}\n" if source.is_simulated else ""
+    return (
+        f"{said}{_number(source.ids, 'recording')} of {_number(materials, 'material')}, "
+        f"{seconds:.1f} s, {_number(source.hand.channels, 'channel')} at "
+        f"{source.sample_rate_hz:g} Hz in {source.units}: {counts}"
+    )
+
+
+def _number(of: Sequence[object], what: str) -> str:
+    return f"{len(of)} {what}{'' if len(of) == 1 else 's'}"
+
+
+def _trial(source: FileRecordings, recording: RecordingId) -> Trial:
+    times = source.timeline(recording)
+    return Trial(
+        recording.material,
+        recording.scene,
+        times.duration_s,
+        sum(end - start for start, end in (*times.sliding_s, *times.slip_s)),
+        sum(end - start for start, end in times.non_slip_s),
+        len(times.onsets_s),
+    )
+
+
+def _example(source: FileRecordings) -> Example:
+    """The first recording of which most is told."""
+
+    def told(recording: RecordingId) -> int:
+        times = source.timeline(recording)
+        return bool(times.onsets_s or times.slip_s) + bool(times.non_slip_s)
+
+    recording = max(source.ids, key=told)
+    content = source.load(recording)
+    return Example(
+        f"{recording} ({source.entry(recording).file})",
+        content.samples.double().numpy(),
+        source.hand.names,
+        content.sample_rate_hz,
+        content.units,
+        content.onsets_s,
+        (*content.sliding_s, *content.slip_s),
+        content.non_slip_s,
+    )
+
+
+def _converted_table(done: Sequence[Written], failed: Sequence[str], seconds: float) -> str:
+    cells = [
+        str(len(done)),
+        str(sum(one.made for one in done)),
+        str(len(failed)),
+        f"{sum(one.duration_s for one in done):.1f}",
+        f"{sum(one.num_bytes for one in done) / 1e6:.1f}",
+    ]
+    table = aligned(["recordings", "made now", "left out", "seconds of signal", "MB"], [cells])
+    return f"{table}\ntook {seconds:.1f} s"
+
+
+@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="data_tool")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    with errors_in_one_line():
+        if config.action not in ACTIONS:
+            known = ", ".join(ACTIONS)
+            raise ValueError(f"action must be one of {known}, got {config.action!r}")
+        found = ACTIONS[config.action](config)
+        if config.action == "check" and found:
+            fail(f"{found} problems in {config.root}, listed above")
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

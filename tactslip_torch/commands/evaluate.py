@@ -1,0 +1,146 @@
+"""Judge a saved detector: ``python -m tactslip_torch evaluate model=detector.pt split=unseen4``.
+
+Prints the tables and writes the figures that ``train`` does, for any set, labels and split. Says so
+where recordings the detector was trained on are among those it is judged on. Recordings that
+several folds hold out are judged once.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from tactslip_torch.commands.entry import (
+    conf_dir,
+    errors_in_one_line,
+    run_entry_point,
+)
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.recording import RecordingSource
+from tactslip_torch.data.splits import Split, judged_once
+from tactslip_torch.features.cache import cache_key
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.report.answers import merged_answers
+from tactslip_torch.report.results import print_results, write_results
+from tactslip_torch.report.scores import merged_metrics
+from tactslip_torch.runtime import is_first_process
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.training.experiment import (
+    DTYPES,
+    common_facts,
+    feature_cache,
+    feature_rows,
+    make_trainer,
+    merged_baselines,
+    save_config,
+)
+from tactslip_torch.training.learner import SlipLearner, event_numbers, together
+
+
+def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
+    """Judge the detector of ``config.model`` and write the results.
+
+    Args:
+        config: composed from ``conf/evaluate.yaml``.
+        folder: where results go.
+
+    Returns:
+        The content of ``metrics.json``.
+
+    Raises:
+        ValueError: for bad input, in one line.
+        FileNotFoundError: if there is no such detector.
+    """
+    started = time.perf_counter()
+    detector = SlipDetector.load(config.model)
+    source: RecordingSource = instantiate(config.data, _convert_="all")
+    rule: LabelRule = instantiate(config.labels)
+    folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
+    is_first = is_first_process()
+    if is_first:
+        save_config(config, folder)
+    parts: dict[str, dict[str, Any]] = {}
+    baselines: dict[str, dict[str, Any]] = {}
+    events: list[dict[str, Any]] = []
+    answers: dict[str, dict[str, Any]] = {}
+    overlaps = {fold.name: overlap(detector, source, fold) for fold in folds}
+    with feature_cache(config.cache) as cache:
+        filters = detector.channel_filter
+        dtype = DTYPES[detector.info.get("features_dtype", "float64")]
+        maker = FeatureMaker(source, detector.pool, filters, rule, cache, dtype)
+        for fold in folds if is_first else ():
+            _note(fold, overlaps[fold.name])
+        once = judged_once(folds)
+        for fold in once:
+            learner = SlipLearner(detector.pool, filters, detector=detector)
+            place = folder if len(once) == 1 else folder / fold.name  # each its own logs
+            trainer = make_trainer(config.trainer, place)
+            data = SlipDataModule(maker, fold, config.num_workers)
+            trainer.test(learner, datamodule=data, verbose=False)
+            parts[fold.name] = learner.metrics["splits"]
+            baselines[fold.name] = learner.metrics["baselines"]
+            events.append(learner.events)
+            for role, of_role in learner.metrics.get("answers", {}).items():
+                answers.setdefault(role, {})[fold.name] = of_role
+    roles = list(dict.fromkeys(role for splits in parts.values() for role in splits))
+    metrics = common_facts(source, detector.pool, config) | {
+        "splits": {
+            role: merged_metrics([splits[role] for splits in parts.values() if role in splits])
+            for role in roles
+        },
+        "baselines": learner.metrics["baselines"]
+        if len(once) == 1
+        else merged_baselines(baselines),
+        "events": event_numbers(together(events)),
+        "answers": {role: merged_answers(of_role) for role, of_role in answers.items()},
+        "selected": [str(name) for name in detector.selected_names],
+        "timing_s": {"total": time.perf_counter() - started},
+        "overlap": overlaps,
+        "detector": detector.info,
+    }
+    rows = feature_rows(detector.selected_names, source.hand)
+    if is_first:
+        write_results(folder, metrics, rows)
+        print_results(metrics, rows)
+        print(f"\nresults in {folder}")
+    return metrics
+
+
+def overlap(detector: SlipDetector, source: RecordingSource, fold: Split) -> dict[str, list[str]]:
+    """What a fold holds out that the detector was trained on: recordings, and materials.
+
+    Recordings are compared by everything that determines them, not by name.
+    """
+    known = set(detector.info.get("train_recordings", {}).values())
+    held_out = fold.having("test", "unseen")
+    materials = {recording.material for recording in fold.having("unseen")}
+    return {
+        "recordings": [str(r) for r in held_out if cache_key(source.key(r)) in known],
+        "unseen_materials": sorted(materials & set(detector.info.get("train_materials", []))),
+    }
+
+
+def _note(fold: Split, found: dict[str, list[str]]) -> None:
+    for what, names in found.items():
+        if names:
+            print(
+                f"note: the detector was trained on {len(names)} {what.replace('_', ' ')} that "
+                f"{fold.name} holds out (such as {names[0]}): not a held-out score"
+            )
+
+
+@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="evaluate")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    with errors_in_one_line():
+        evaluate(config, Path(HydraConfig.get().runtime.output_dir))
+
+
+if __name__ == "__main__":
+    run_entry_point(main)

@@ -1,0 +1,159 @@
+"""Simulated recordings as files: ``python -m tactslip_torch generate``.
+
+    python -m tactslip_torch generate materials=[M1,M6] cycles=3 hydra.run.dir=recordings
+
+One file per recording, whole or absent, and behind the last of them ``manifest.csv``, which lists
+exactly the recordings of this run. In a folder that holds some already, those of the same scene
+and code are kept and the others made. Two figures show a recording of each material: whole, and
+around an onset as in the paper's signal figure.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import hydra
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig, ListConfig
+
+import tactslip_torch
+from tactslip_torch.commands.entry import (
+    conf_dir,
+    errors_in_one_line,
+    fail,
+    folder_problem,
+    run_entry_point,
+)
+from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written, write_manifest
+from tactslip_torch.data.recording import RecordingId, RecordingSource
+from tactslip_torch.features.cache import source_digest
+from tactslip_torch.report.signals import SignalRow, signals_figure
+from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.runtime import bar, in_processes
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.experiment import frame_lengths, save_config
+
+BEFORE_S, AFTER_S = 2.0, 3.0  # of the onset drawn close up: five seconds, as in the paper
+
+
+def generate(config: DictConfig, folder: Path) -> list[Written]:
+    """Write the recordings of a configuration, their manifest and figures.
+
+    Args:
+        config: composed from ``conf/generate.yaml``.
+        folder: where they go.
+
+    Returns:
+        What was written or found, in the order of the manifest.
+
+    Raises:
+        ValueError: for bad input, in one line; no file is touched then.
+    """
+    started = time.perf_counter()
+    if not isinstance(config.materials, ListConfig):
+        raise ValueError(f"materials must be a list such as [M1,M6], got {config.materials!r}")
+    count = config.num_workers
+    if count is not None and not (isinstance(count, int) and count >= 0):
+        raise ValueError(f"num_workers must be null or a number of processes, got {count!r}")
+    source: RecordingSource = instantiate(config.data, _convert_="all")
+    made_by = {
+        "code": source_digest(Path(tactslip_torch.__file__).parent),
+        "libraries": {"numpy": np.__version__, "torch": torch.__version__},
+    }
+    files = RecordingFolder(source, folder, config.format, made_by)
+    shown = _shown(config, source) if config.figure else {}
+    smooth = _filter(config, source)
+    files.check()
+    save_config(config, folder)
+    (folder / MANIFEST).unlink(missing_ok=True)  # it must not speak of files that are replaced
+    written = list(in_processes(files.write, source.ids, "recordings", "recording", count))
+    write_manifest(folder, written)
+    seconds = time.perf_counter() - started
+    for scene in bar(shown, "figures", "scene") if shown else ():
+        _draw(files, shown[scene], smooth, scene, config.stroke)
+    print("\n" + written_table(written, seconds))
+    print(f"\nrecordings in {folder}")
+    return written
+
+
+def written_table(written: Sequence[Written], seconds: float) -> str:
+    """How many recordings of each scene there are, how long, how large, and how many were made."""
+    scenes = list(dict.fromkeys(one.line["scene"] for one in written))
+    groups = {scene: [one for one in written if one.line["scene"] == scene] for scene in scenes}
+    if len(groups) > 1:
+        groups["all"] = list(written)
+    cells = [
+        [
+            scene,
+            str(len(own)),
+            str(sum(one.made for one in own)),
+            f"{sum(one.duration_s for one in own):.1f}",
+            f"{sum(one.num_bytes for one in own) / 1e6:.1f}",
+        ]
+        for scene, own in groups.items()
+    ]
+    table = aligned(["scene", "recordings", "made now", "seconds of signal", "MB"], cells)
+    simulated = any(one.line["simulated"] == "true" for one in written)
+    return "\n".join([*([SIMULATED_LINE] if simulated else []), table, f"took {seconds:.1f} s"])
+
+
+def _shown(config: DictConfig, source: RecordingSource) -> dict[str, list[RecordingId]]:
+    """The recordings to draw, by scene: of the first session."""
+    first = [recording for recording in source.ids if not recording.session]
+    of_cycle = [recording for recording in first if recording.cycle == config.cycle]
+    if source.ids and not of_cycle:
+        most = max(recording.cycle for recording in source.ids)
+        raise ValueError(f"cycle must lie in 0..{most} to be drawn, got {config.cycle}")
+    if not (isinstance(config.stroke, int) and config.stroke >= 1):
+        raise ValueError(f"stroke counts from 1, got {config.stroke!r}")
+    scenes = dict.fromkeys(recording.scene for recording in of_cycle)
+    return {scene: [r for r in of_cycle if r.scene == scene] for scene in scenes}
+
+
+def _filter(config: DictConfig, source: RecordingSource) -> ChannelFilter:
+    """The filter of the ``features`` section."""
+    features = config.features
+    lengths = frame_lengths(source.hand, features.frames)
+    return ChannelFilter(lengths, features.polyorder, features.align)
+
+
+def _draw(
+    files: RecordingFolder,
+    recordings: Sequence[RecordingId],
+    channel_filter: ChannelFilter,
+    scene: str,
+    stroke: int,
+) -> None:
+    """Both figures of a scene, from the files."""
+    rows = []
+    for recording in recordings:
+        content, hand, _ = files.load(recording)
+        volts = channel_filter(content.samples.double())
+        truth = content.onsets_s, content.sliding_s, content.non_slip_s
+        rows.append(SignalRow(recording.material, volts, content.sample_rate_hz, *truth))
+    origin = content.provenance
+    known = [f"{name} {origin[name]}" for name in ("fidelity", "seed") if name in origin]
+    what = "SIMULATED recordings" if origin.get("simulated") else "Recordings"
+    title = ", ".join([f"{what}: scene {scene}", f"cycle {recordings[0].cycle}", *known])
+    views = [row.around(stroke, BEFORE_S, AFTER_S) for row in rows]
+    for name, seen in ((f"recordings_{scene}.png", None), (f"onset_{scene}.png", views)):
+        signals_figure(rows, hand.to_rows(), files.folder / name, title=title, views=seen)
+
+
+@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="generate")
+def main(config: DictConfig) -> None:
+    """Entry point."""
+    with errors_in_one_line():
+        generate(config, Path(HydraConfig.get().runtime.output_dir))
+
+
+if __name__ == "__main__":
+    if problem := folder_problem(sys.argv[1:]):
+        fail(problem)
+    run_entry_point(main)

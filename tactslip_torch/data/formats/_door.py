@@ -1,0 +1,206 @@
+"""Files of recordings: which format they are of, read and written through one door.
+
+Whatever a library raises of a file becomes one line that names it (``guarded``); nothing in a file
+is executed; what it claims is held against its size before anything is allocated; files are written
+to a temporary name and renamed. ``reading.isolate`` reads in a process of its own (``_isolation``).
+"""
+
+from __future__ import annotations
+
+import importlib
+import secrets
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from tactslip_torch.data.formats._faults import Refused, check_file, guarded
+from tactslip_torch.data.formats._header import facts_of
+from tactslip_torch.data.formats._isolation import isolated
+from tactslip_torch.data.formats._messages import is_bag, is_only_bag
+from tactslip_torch.data.formats._reading import AS_IT_SAYS, Archived, Opened, Reading
+from tactslip_torch.data.recording import Recording
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.runtime import whole_file
+
+
+@dataclass(frozen=True)
+class Format:
+    """How recordings are kept in files.
+
+    Args:
+        name: of the format.
+        endings: of its files, the first that of files that are written.
+        module: beside this one, with its functions ``write``, ``read`` and ``facts``.
+        of: what stands behind the names of these functions, if the module has several formats.
+        is_folder: whether a recording is a folder, known by ``metadata.yaml``.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    module: str
+    of: str = ""
+    is_folder: bool = False
+
+    def save(
+        self, path: Path, recording: Recording, hand: HandLayout, key: Mapping[str, Any]
+    ) -> None:
+        """Write a recording, whole or not at all; equal input, equal bytes.
+
+        Args:
+            path: of the file or folder.
+            recording: samples in float32 or float64; tuples in its provenance come back as lists.
+            hand: its channels, in the order of its rows.
+            key: JSON-able facts that determined the samples, kept to find the file again.
+
+        Raises:
+            ValueError: if the format's library is absent, the hand has another number of channels,
+                the samples another dtype, a word holds a NUL, provenance or key is not JSON-able,
+                or the format cannot hold that much.
+        """
+        facts = facts_of(recording, hand, key)
+        samples = recording.samples.detach().cpu().contiguous().numpy()
+        whole = _whole_folder if self.is_folder else whole_file
+        with whole(path) as temporary:
+            try:
+                self._function("write")(temporary, samples, facts)
+            except Refused as error:
+                raise Refused(f"{path} {error}".replace(str(temporary), str(path))) from None
+
+    def load(self, path: Path) -> Archived:
+        """Read a recording of ours, bit for bit (of text a NaN is a NaN).
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is damaged or no file of ours.
+        """
+        with self.open(path) as opened:
+            if opened.archived is None:
+                raise Refused(f"{path} is no recording of ours")
+            samples = opened.samples.read(0, opened.samples.num_samples)
+            recording = replace(opened.archived.recording, samples=samples)
+            return opened.archived._replace(recording=recording)
+
+    def key(self, path: Path) -> dict[str, Any]:
+        """Read no more of a recording of ours than its key; errors as ``load``."""
+        self._check(path)
+        with guarded(path):
+            facts = self._function("facts")(path)
+            if facts is None:
+                raise Refused(f"{path} is no recording of ours")
+            return dict(facts["key"])
+
+    @contextmanager
+    def open(self, path: Path, how: Reading = AS_IT_SAYS) -> Iterator[Opened]:
+        """Open a file, ours or another's, to read its samples by stretches.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: in one line that names the file, if it is damaged, its library is absent, or
+                it does not show which samples are meant.
+        """
+        self._check(path)
+        with ExitStack() as stack:
+            if how.isolate:
+                opened = isolated(path, how, stack)
+            else:
+                with guarded(path):
+                    opened = self._function("read")(path, how, stack)
+            yield opened
+
+    def _check(self, path: Path) -> None:
+        if not self.is_folder:
+            check_file(path)
+        elif not path.is_dir():
+            raise FileNotFoundError(f"no folder at {path}")
+
+    def _function(self, name: str) -> Callable[..., Any]:
+        module = importlib.import_module(f"tactslip_torch.data.formats.{self.module}")
+        function: Callable[..., Any] = getattr(module, f"{name}{self.of}")
+        return function
+
+
+FORMATS = {
+    form.name: form
+    for form in (
+        Format("npz", ("npz", "npy"), "_npz"),
+        Format("text", ("csv", "tsv", "txt", "dat", "lvm"), "_text"),
+        Format("hdf5", ("h5", "hdf5", "he5"), "_hdf5"),
+        Format("mat", ("mat",), "_mat"),
+        Format("mcap", ("mcap",), "_messages", "_mcap"),
+        Format("parquet", ("parquet",), "_parquet"),
+        Format("rosbag2", ("bag2",), "_messages", "_rosbag2", is_folder=True),
+    )
+}
+"""By name."""
+
+
+def endings() -> tuple[str, ...]:
+    """Endings of files that can be read."""
+    return tuple(ending for form in FORMATS.values() for ending in form.endings)
+
+
+def find_format(path: Path) -> Format | None:
+    """The format of a file, or of a folder that is a bag; None if there is none."""
+    if path.is_dir():
+        return FORMATS["rosbag2"] if is_bag(path) else None
+    ending = "" if path.name.startswith(".") else path.suffix[1:].lower()
+    return next((f for f in FORMATS.values() if ending in f.endings and not f.is_folder), None)
+
+
+def format_of(path: Path) -> Format:
+    """The format of a file or bag.
+
+    Raises:
+        FileNotFoundError: if there is nothing.
+        ValueError: if it is of no format that is known.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"no file or folder at {path}")
+    found = find_format(path)
+    if found is None:
+        known = " or ".join(f".{ending}" for ending in endings())
+        raise ValueError(f"{path} must end in {known} to be read as a recording")
+    return found
+
+
+def named_format(name: str) -> Format:
+    """The format of that name, or of files with that ending, such as ``npz`` or ``h5``.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    for form in FORMATS.values():
+        if name == form.name or name in form.endings:
+            return form
+    raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {name!r}")
+
+
+@contextmanager
+def open_file(path: Path, how: Reading = AS_IT_SAYS) -> Iterator[Opened]:
+    """Open a recording of any format; errors as ``format_of`` and ``Format.open``."""
+    with format_of(path).open(path, how) as opened:
+        yield opened
+
+
+@contextmanager
+def _whole_folder(path: Path) -> Iterator[Path]:
+    """A folder to write, put in the place of ``path`` when all went well.
+
+    Raises:
+        ValueError: if something other than a bag is there.
+    """
+    if path.exists() and not is_only_bag(path):
+        raise Refused(f"{path} is there and no folder of rosbag2; give another name")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    around = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    around.mkdir()
+    try:
+        yield around / path.name
+        if path.exists():
+            path.rename(around / f"{path.name}.before")
+        (around / path.name).rename(path)
+    finally:
+        shutil.rmtree(around)

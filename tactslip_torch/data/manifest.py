@@ -1,0 +1,754 @@
+"""The lines of a manifest as a person wrote it, CSV or YAML, before anything is made of them.
+
+Nothing in the file is executed: of YAML only its nodes are read, as text and lists of text.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import json
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Literal, NamedTuple, cast
+
+import yaml  # type: ignore[import-untyped]
+
+from tactslip_torch.data.formats import endings, find_format
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.runtime import whole_file
+
+Cell = str | list["Cell"]
+"""What stands under a column: text or, in YAML, lists of text."""
+
+MOST_BYTES = 64 * 2**20
+"""Of a manifest; a larger file is none."""
+MOST_YAML_BYTES = 4 * 2**20  # which takes a hundred times longer to read
+MOST_DEPTH = 16  # of lists and mappings in YAML; one in another takes a stack, and ever longer
+_SEPARATORS = (",", ";", "\t")
+_YAML = (".yaml", ".yml")
+
+
+class Problem(NamedTuple):
+    """Something wrong with a set of recordings.
+
+    Args:
+        place: file and, where there is one, line, such as ``"manifest.csv:12"``.
+        what: is wrong, and what to do.
+    """
+
+    place: str
+    what: str
+
+    def __str__(self) -> str:
+        return " ".join(f"{self.place}: {self.what}".split())
+
+
+class Line(NamedTuple):
+    """One recording as it is written: the cells by column, and where they stand."""
+
+    place: str
+    cells: dict[str, Cell]
+
+
+class Lines(NamedTuple):
+    """All of a manifest.
+
+    Args:
+        columns: every column, small letters, with where it was met first.
+        lines: of recordings, in order.
+        problems: of what could not be read at all.
+    """
+
+    columns: dict[str, str]
+    lines: tuple[Line, ...]
+    problems: tuple[Problem, ...]
+
+
+def read_lines(path: Path) -> Lines:
+    """The lines of a CSV or YAML file; what is wrong with it is among the problems.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no text at all, or its name ends in neither.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no manifest at {path}")
+    if path.suffix.lower() not in (".csv", *_YAML):
+        raise ValueError(f"{path} must end in .csv, .yaml or .yml to be read as a manifest")
+    most = MOST_YAML_BYTES if path.suffix.lower() in _YAML else MOST_BYTES
+    if (size := path.stat().st_size) > most:
+        hint = "; write it as .csv" if most < size <= MOST_BYTES else ""
+        raise ValueError(f"{path} is no manifest: it has {size} bytes, at most {most} do{hint}")
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise ValueError(f"{path.name}:{line}: no UTF-8 text; save it as UTF-8") from None
+    read = _yaml_lines if path.suffix.lower() in _YAML else _csv_lines
+    return read(text, path.name)
+
+
+def _csv_lines(text: str, name: str) -> Lines:
+    """Rows of a table with a header, its separator found from that."""
+    head = text.partition("\n")[0]
+    separator = max(_SEPARATORS, key=head.count)
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+    columns: list[str] = []
+    lines: list[Line] = []
+    problems: list[Problem] = []
+    last = 0
+    while True:
+        try:
+            row = next(rows, None)
+        except csv.Error as error:
+            problems.append(Problem(f"{name}:{last + 1}", f"cannot be read as CSV: {error}"))
+            break
+        if row is None:
+            break
+        place, last = f"{name}:{last + 1}", rows.line_num
+        if not any(cell.strip() for cell in row):
+            continue
+        if not columns:
+            columns = [_column(cell) for cell in row]
+            twice = {c for c in columns if c and columns.count(c) > 1}
+            problems += [Problem(place, f"column {c[:60]!r} is there twice") for c in sorted(twice)]
+        elif len(row) != len(columns):
+            problems.append(
+                Problem(
+                    place,
+                    f"has {len(row)} cells, the header {len(columns)}; put in quotes "
+                    f"what holds a {separator!r}",
+                )
+            )
+        else:
+            pairs = zip(columns, row, strict=True)
+            lines.append(Line(place, {column: cell.strip() for column, cell in pairs if column}))
+    return Lines(dict.fromkeys(filter(None, columns), f"{name}:1"), tuple(lines), tuple(problems))
+
+
+def _yaml_lines(text: str, name: str) -> Lines:
+    """A list of mappings, alone or under ``recordings``."""
+    found = Lines({}, (), ())
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    depth = 0
+    try:
+        for event in yaml.parse(text, Loader=loader):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if depth > MOST_DEPTH:
+                return found._replace(problems=(Problem(name, "is nested too deeply"),))
+            if isinstance(event, yaml.AliasEvent):  # a few stand for more than memory holds
+                what = "aliases, as *name, are not read"
+                return found._replace(
+                    problems=(Problem(f"{name}:{event.start_mark.line + 1}", what),)
+                )
+        node = yaml.compose(text, Loader=loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        what = getattr(error, "problem", None) or error
+        place = f"{name}:{mark.line + 1}" if mark else name
+        return found._replace(problems=(Problem(place, f"cannot be read as YAML: {what}"),))
+    if isinstance(node, yaml.MappingNode) and len(node.value) == 1:
+        key, inner = node.value[0]
+        node = inner if key.value == "recordings" else node
+    if not isinstance(node, yaml.SequenceNode):
+        what = "must be a list of recordings, as - {file: a.csv, material: wood}"
+        return found._replace(problems=(Problem(f"{name}:1", what),))
+    columns: dict[str, str] = {}
+    lines: list[Line] = []
+    problems: list[Problem] = []
+    for item in node.value:
+        place = f"{name}:{item.start_mark.line + 1}"
+        if not isinstance(item, yaml.MappingNode):
+            problems.append(Problem(place, "must be a mapping, as {file: a.csv, material: wood}"))
+            continue
+        cells: dict[str, Cell] = {}
+        for key, value in item.value:
+            here = f"{name}:{key.start_mark.line + 1}"
+            column, cell = _column(str(key.value)), _cell(value)
+            columns.setdefault(column, here)
+            if column in cells:
+                problems.append(Problem(here, f"{column[:60]!r} is there twice"))
+            if cell is None:
+                problems.append(Problem(here, f"{column[:60]} must be a value or a list of values"))
+            cells[column] = cell or ""
+        lines.append(Line(place, cells))
+    return Lines(columns, tuple(lines), tuple(problems))
+
+
+def _cell(node: yaml.Node) -> Cell | None:
+    """Text or lists of text; ``None`` for what is neither."""
+    if isinstance(node, yaml.ScalarNode):
+        return "" if node.tag == "tag:yaml.org,2002:null" else str(node.value).strip()
+    if not isinstance(node, yaml.SequenceNode):
+        return None
+    cells = [_cell(item) for item in node.value]
+    return None if None in cells else [cell for cell in cells if cell is not None]
+
+
+def _column(text: str) -> str:
+    return "_".join(text.lower().split())
+
+
+Stretch = tuple[float, float]
+Label = Literal["slip", "non-slip"]
+MOMENTS = ("onsets_s", "annotated_onsets_s", "speeds_mm_s")
+STRETCHES = ("sliding_s", "slip_s", "non_slip_s", "missing_s")
+TRUTH_COLUMNS = (*MOMENTS, *STRETCHES, "label")
+_LABELS: dict[str, Label] = {"slip": "slip", "nonslip": "non-slip", "noslip": "non-slip"}
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_SPAN = re.compile(rf"({_NUMBER})\s*(?:-|\N{{EN DASH}}|\.\.|to)\s*({_NUMBER}|end)")
+_TOUCH_S = 1e-6  # by less than that stretches only touch
+
+
+@dataclass(frozen=True)
+class Truth:
+    """When a recording slips, as far as somebody said.
+
+    Args:
+        onsets_s: when a slide begins; those of ``sliding_s`` where only they were given.
+        annotated_onsets_s: the same as a person marked them, where both are known.
+        speeds_mm_s: one for all strokes, or one per onset.
+        sliding_s: start and end of the slide behind each onset.
+        slip_s: stretches that are slip, begun nobody knows when.
+        non_slip_s: stretches that are not.
+        missing_s: stretches whose samples are not to be used.
+        label: of all of the recording.
+    """
+
+    onsets_s: tuple[float, ...] = ()
+    annotated_onsets_s: tuple[float, ...] = ()
+    speeds_mm_s: tuple[float, ...] = ()
+    sliding_s: tuple[Stretch, ...] = ()
+    slip_s: tuple[Stretch, ...] = ()
+    non_slip_s: tuple[Stretch, ...] = ()
+    missing_s: tuple[Stretch, ...] = ()
+    label: Label | None = None
+
+    @property
+    def is_labelled(self) -> bool:
+        """Whether any bin follows from it."""
+        return bool(self.onsets_s or self.slip_s or self.non_slip_s or self.label)
+
+
+def truth_of(cells: Mapping[str, Cell]) -> tuple[Truth | None, list[str]]:
+    """The truth that the cells of a line tell, ``None`` if they are all empty, and what is wrong.
+
+    Example:
+        >>> truth_of({"onsets_s": "2.0; 9.0", "non_slip_s": "0-1.5"})[0].onsets_s
+        (2.0, 9.0)
+        >>> truth_of({"onsets_s": "2,5"})[1]
+        ["onsets_s: '2,5' is no number; write decimals with a point, and 2.0; 9.0 for several"]
+    """
+    given = {name: cells[name] for name in TRUTH_COLUMNS if cells.get(name)}
+    if not given:
+        return None, []
+    parts: dict[str, object] = {}
+    problems: list[str] = []
+    for name, cell in given.items():
+        try:
+            if name == "label":
+                parts[name] = _label(cell)
+            elif name in MOMENTS:
+                parts[name] = _moments(cell)
+            else:
+                parts[name] = _stretches(cell)
+        except ValueError as error:
+            problems.append(f"{name}: {error}")
+    if problems:
+        return None, problems
+    truth = _completed(Truth(**parts))  # type: ignore[arg-type]  # by name
+    return truth, _contradictions(truth)
+
+
+def _completed(truth: Truth) -> Truth:
+    """Onsets where only slides or annotations are known, and a speed for every onset."""
+    onsets = truth.onsets_s or truth.annotated_onsets_s
+    onsets = onsets or tuple(start for start, _ in truth.sliding_s)
+    speeds = truth.speeds_mm_s
+    speeds = speeds * len(onsets) if len(speeds) == 1 else speeds
+    return Truth(**{**vars(truth), "onsets_s": onsets, "speeds_mm_s": speeds})
+
+
+def _contradictions(truth: Truth) -> list[str]:
+    """What cannot all be true, whatever the recording is."""
+    found = []
+    for name in MOMENTS[:2]:
+        moments = getattr(truth, name)
+        if any(later <= earlier for earlier, later in pairwise(moments)):
+            found.append(f"{name} must ascend, got {_shown(moments)}")
+        if any(moment < 0 for moment in moments):
+            found.append(f"{name} must not lie before the start, got {_shown(moments)}")
+    if any(speed < 0 for speed in truth.speeds_mm_s):
+        found.append(f"speeds_mm_s must not be negative, got {_shown(truth.speeds_mm_s)}")
+    for name in ("annotated_onsets_s", "sliding_s", "speeds_mm_s"):
+        values = getattr(truth, name)
+        if values and len(values) != len(truth.onsets_s):
+            found.append(
+                f"{len(values)} {name} for {len(truth.onsets_s)} onsets; give one for each"
+            )
+    for name in STRETCHES:
+        for start, end in getattr(truth, name):
+            if not 0 <= start < end:
+                found.append(f"{name}: {start:g}-{end:g} must end behind its start, from 0 on")
+    found = found or _overlaps(truth)
+    if truth.label and (truth.onsets_s or truth.slip_s or truth.non_slip_s):
+        found.append(
+            f"label {truth.label} says all of it, and onsets or stretches are given as well; "
+            "give one of both"
+        )
+    return found
+
+
+def _overlaps(truth: Truth) -> list[str]:
+    """Stretches that cannot both be, of a truth whose numbers are fine one by one."""
+    found = []
+    for name in STRETCHES:
+        for clash in _clashes(getattr(truth, name)):
+            found.append(f"{name}: {clash} overlap or stand in the wrong order")
+    for clash in _clashes((*truth.sliding_s, *truth.slip_s), truth.non_slip_s):
+        found.append(f"slip and non-slip overlap: {clash}")
+    for clash in _clashes(truth.sliding_s, truth.slip_s):
+        found.append(f"sliding_s and slip_s overlap: {clash}")
+    if len(truth.sliding_s) == len(truth.onsets_s):
+        for onset, (_, end) in zip(truth.onsets_s, truth.sliding_s, strict=True):
+            if onset >= end:
+                found.append(
+                    f"the onset at {onset:g} s is not before the end of its slide, {end:g} s"
+                )
+    return found
+
+
+def _clashes(ones: Iterable[Stretch], others: Iterable[Stretch] | None = None) -> list[str]:
+    """Stretches that overlap: neighbours of one list, or one of each of two."""
+    pairs = pairwise(ones) if others is None else ((a, b) for a in ones for b in others)
+    return [
+        f"{a[0]:g}-{a[1]:g} and {b[0]:g}-{b[1]:g}"
+        for a, b in pairs
+        if min(a[1], b[1]) - max(a[0], b[0]) > _TOUCH_S or (others is None and b < a)
+    ]
+
+
+def _label(cell: Cell) -> Label:
+    text = cell if isinstance(cell, str) else str(cell)
+    known = _LABELS.get(re.sub(r"[\s_-]", "", text.lower()))
+    if known is None:
+        raise ValueError(f"must be slip, non-slip or empty, got {text[:40]!r}")
+    return known
+
+
+def _moments(cell: Cell) -> tuple[float, ...]:
+    return tuple(_number(item) for item in _items(cell))
+
+
+def _stretches(cell: Cell) -> tuple[Stretch, ...]:
+    found = []
+    for item in _items(cell):
+        if isinstance(item, list) and len(item) == 2:
+            found.append((_number(item[0]), _end(item[1])))
+        elif isinstance(item, str) and (span := _SPAN.fullmatch(item)):
+            found.append((_number(span[1]), _end(span[2])))
+        else:
+            raise ValueError(
+                f"{str(item)[:40]!r} is no stretch; write 2-7; 9-11.5 or [[2, 7], ...]"
+            )
+    return tuple(found)
+
+
+def _items(cell: Cell) -> list[Cell]:
+    """The parts of a cell; JSON is read to text, so that numbers are judged in one place."""
+    if isinstance(cell, list):
+        return cell
+    if not cell.startswith("["):
+        return [part.strip() for part in cell.split(";") if part.strip()]
+    try:
+        read = json.loads(cell, parse_float=str, parse_int=str, parse_constant=str)
+    except (ValueError, RecursionError):
+        raise ValueError(f"{cell[:40]!r} is no list; write [2.0, 9.0] or 2.0; 9.0") from None
+    return cast("list[Cell]", read)
+
+
+def _number(item: object) -> float:
+    if isinstance(item, str) and re.fullmatch(_NUMBER, item) and math.isfinite(float(item)):
+        return float(item)
+    raise ValueError(
+        f"{str(item)[:40]!r} is no number; write decimals with a point, and 2.0; 9.0 for several"
+    )
+
+
+def _end(item: object) -> float:
+    return math.inf if item == "end" else _number(item)
+
+
+def _shown(values: Iterable[float]) -> str:
+    return "; ".join(f"{value:g}" for value in values)
+
+
+NAMES = ("manifest.csv", "manifest.yaml", "manifest.yml")
+ALIASES = {"object": "material", "cycle": "trial"}
+COLUMNS = ("file", "material", "trial", "scene", "session", *TRUTH_COLUMNS, "sample_rate_hz")
+_IGNORED = ("simulated", "fidelity", "seed")
+"""Further columns of what ``generate`` writes: files say this themselves."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A recording of a set, before its file is opened.
+
+    Args:
+        place: where it is said, such as ``"manifest.csv:12"``.
+        file: its file or folder, relative to the root of the set.
+        recording: its name.
+        truth: what is said of it; ``None`` if nothing is, so that the file itself has the word.
+        sample_rate_hz: if it is said.
+        is_nominal: whether the truth is a plan for all alike, so that a slide that its recording
+            does not hold to the end is cut there.
+    """
+
+    place: str
+    file: str
+    recording: RecordingId
+    truth: Truth | None = None
+    sample_rate_hz: float | None = None
+    is_nominal: bool = False
+
+
+class Listing(NamedTuple):
+    """The recordings of a set, what is wrong with the list, and what may be."""
+
+    entries: tuple[Entry, ...]
+    problems: tuple[Problem, ...] = ()
+    warnings: tuple[Problem, ...] = ()
+
+
+def manifest_of(root: Path, given: str | None = None) -> Path:
+    """The manifest of a set: the one given, relative to the root or not, or one of ``NAMES``.
+
+    Raises:
+        FileNotFoundError: if there is no such folder or manifest.
+        ValueError: if there are several.
+    """
+    if not root.is_dir():
+        raise FileNotFoundError(f"no folder at {root}")
+    if given is not None:
+        return next((path for path in (root / given, Path(given)) if path.is_file()), root / given)
+    found = [root / name for name in NAMES if (root / name).is_file()]
+    if len(found) > 1:
+        names = " and ".join(path.name for path in found)
+        raise ValueError(f"{root} has {names}; say which, as manifest={found[0].name}")
+    if not found:
+        raise FileNotFoundError(
+            f"no {' or '.join(NAMES)} in {root}; python -m tactslip_torch data "
+            f"action=label_template root={root} writes one to fill in"
+        )
+    return found[0]
+
+
+def read_manifest(path: Path, root: Path) -> Listing:
+    """The recordings that a manifest lists, and every problem of every line.
+
+    Trials that are not numbered are numbered in their order within material and scene.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no text.
+    """
+    columns, lines, unreadable = read_lines(path)
+    problems, warnings = list(unreadable), []
+    for column, place in columns.items():
+        if wrong := _misspelt(column):
+            problems.append(Problem(place, wrong))
+        elif ALIASES.get(column, column) not in (*COLUMNS, *_IGNORED):
+            warnings.append(Problem(place, f"column {column[:60]!r} is not read"))
+    known = {ALIASES.get(column, column) for column in columns}
+    if missing := [column for column in ("file", "material") if column not in known]:
+        if columns:
+            problems.append(Problem(f"{path.name}:1", f"no column {' and no '.join(missing)}"))
+        elif not problems:
+            problems.append(Problem(path.name, "is empty; it must list file and material"))
+        return Listing((), tuple(problems), tuple(warnings))
+    if not lines and not problems:
+        problems.append(Problem(path.name, "lists no recording"))
+    drafts = []
+    for line in lines:
+        draft, wrong_here = _draft(line, root)
+        problems += [Problem(line.place, wrong) for wrong in wrong_here]
+        drafts += [draft] if draft else []
+    entries = tuple(_numbered(drafts))
+    problems += _twice(entries)
+    warnings += _alike(entries)
+    return Listing(entries, tuple(problems), tuple(warnings))
+
+
+class _Draft(NamedTuple):
+    """A line that can be read, its trial not yet numbered if it was left empty."""
+
+    place: str
+    file: str
+    material: str
+    trial: int | None
+    scene: str
+    session: str
+    truth: Truth | None
+    rate: float | None
+
+
+def _draft(line: Line, root: Path) -> tuple[_Draft | None, list[str]]:
+    """A line as far as it can be read, and all that is wrong with it."""
+    cells = {ALIASES.get(column, column): cell for column, cell in line.cells.items()}
+    problems = []
+    words = {}
+    for column in ("file", "material", "trial", "scene", "session", "sample_rate_hz"):
+        cell = cells.get(column, "")
+        if not isinstance(cell, str):
+            problems.append(f"{column} must be one value, got a list")
+            cell = ""
+        words[column] = cell
+    file = words["file"]
+    if problem := file_problem(root, file):
+        problems.append(problem)
+    if not words["material"]:
+        problems.append("no material")
+    trial, rate = words["trial"], words["sample_rate_hz"]
+    if trial and not (trial.isascii() and trial.isdigit() and len(trial) < 10):
+        problems.append(
+            f"trial must be a whole number from 0, got {trial[:40]!r}; empty ones are numbered in "
+            "their order"
+        )
+    if rate and not _is_rate(rate):
+        problems.append(f"sample_rate_hz must be a positive number, got {rate[:40]!r}")
+    truth, wrong = truth_of(cells)
+    problems += wrong
+    if problems:
+        return None, problems
+    return _Draft(
+        line.place,
+        PurePosixPath(*PureWindowsPath(file).parts).as_posix(),
+        words["material"],
+        int(trial) if trial else None,
+        words["scene"] or RecordingId.scene,
+        words["session"],
+        truth,
+        float(rate) if rate else None,
+    ), []
+
+
+def file_problem(root: Path, file: str) -> str | None:
+    """Why a file that a manifest names cannot be taken: it is not there, or not inside the root."""
+    if not file or "\0" in file:
+        return "no file" if not file else f"file {file[:60]!r} holds a NUL"
+    path = PureWindowsPath(file)  # knows both kinds of slashes, and drives
+    if path.anchor or ".." in path.parts:
+        return f"file {file[:200]!r} must lie inside the folder; give it relative to that"
+    place = root.joinpath(*path.parts)
+    try:
+        real = place.resolve()
+        exists = place.exists()
+    except (OSError, RuntimeError) as error:  # of a name too long, or a loop of links
+        return f"file {file[:60]!r}... cannot be opened: {getattr(error, 'strerror', error)}"
+    if not real.is_relative_to(root.resolve()):
+        return f"file {file[:200]!r} is a link out of the folder; copy it there"
+    if exists:
+        return None
+    near = place.parent if place.parent.is_dir() else root
+    close = difflib.get_close_matches(place.name, [p.name for p in near.iterdir()], 1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return f"no file {file[:200]!r} in the folder{hint}"
+
+
+def _numbered(drafts: list[_Draft]) -> Iterator[Entry]:
+    """Entries; an empty trial gets the next number free for its material, scene and session."""
+    used: dict[tuple[str, str, str], set[int]] = {}
+    for draft in drafts:
+        own = used.setdefault((draft.material, draft.scene, draft.session), set())
+        own |= {draft.trial} if draft.trial is not None else set()
+    for place, file, material, trial, scene, session, truth, rate in drafts:
+        if trial is None:
+            own = used[material, scene, session]
+            trial = next(number for number in range(len(own) + 1) if number not in own)
+            own.add(trial)
+        yield Entry(place, file, RecordingId(material, trial, scene, session), truth, rate)
+
+
+def _twice(entries: Iterable[Entry]) -> list[Problem]:
+    """Recordings and files that were listed before."""
+    found = []
+    first: dict[object, str] = {}
+    for entry in entries:
+        trial = entry.recording
+        session = f", session {trial.session}" if trial.session else ""
+        for key, what in (
+            (trial, f"trial {trial.cycle} of {trial.material}, scene {trial.scene}{session},"),
+            (entry.file, f"file {entry.file!r}"),
+        ):
+            if key in first:
+                found.append(Problem(entry.place, f"{what} was listed in {first[key]}"))
+            first.setdefault(key, entry.place)
+    return found
+
+
+def _alike(entries: Iterable[Entry]) -> list[Problem]:
+    """Materials that differ in case or blanks alone."""
+    found: dict[str, Entry] = {}
+    doubts = []
+    for entry in entries:
+        material = entry.recording.material
+        other = found.setdefault("".join(material.lower().split()), entry)
+        if other.recording.material != material:
+            what = f"material {material!r} is not the {other.recording.material!r} of {other.place}"
+            doubts.append(Problem(entry.place, what))
+    return doubts
+
+
+def _misspelt(column: str) -> str | None:
+    known = (*COLUMNS, *ALIASES)
+    close = difflib.get_close_matches(column, known, 1, cutoff=0.8)
+    if column in (*known, *_IGNORED) or not close:
+        return None
+    return f"unknown column {column[:60]!r}; did you mean {close[0]!r}?"
+
+
+def _is_rate(text: str) -> bool:
+    try:
+        return 0 < float(text) < math.inf
+    except ValueError:
+        return False
+
+
+def better_told(listing: Listing, told: Listing) -> Listing:
+    """A listing in which files that another tells of have its truth; the others keep theirs."""
+    by_file = {entry.file: entry for entry in told.entries}
+    entries = []
+    for entry in listing.entries:
+        other = by_file.pop(entry.file, None)
+        if other is not None and other.truth is not None:
+            entry = replace(entry, place=other.place, truth=other.truth, is_nominal=False)
+        entries.append(entry)
+    strangers = [
+        Problem(other.place, f"file {file!r} has no name that says what it is")
+        for file, other in by_file.items()
+    ]
+    return Listing(
+        tuple(entries),
+        (*listing.problems, *told.problems, *strangers),
+        (*listing.warnings, *told.warnings),
+    )
+
+
+FIELDS = {"material": r"[^/]+?", "trial": r"\d+", "scene": r"[^/]+?", "label": r"[^/]+?"}
+"""What a pattern may name, and what each stands for."""
+TEMPLATE_COLUMNS = (
+    *("file", "material", "trial", "scene"),
+    *("onsets_s", "sliding_s", "slip_s", "non_slip_s", "label"),
+)
+_BETWEEN = "-_. "
+
+
+class Template(NamedTuple):
+    """A manifest that was written.
+
+    Args:
+        path: of it.
+        num_files: it lists.
+        num_guessed: of which the pattern told anything.
+    """
+
+    path: Path
+    num_files: int
+    num_guessed: int
+
+
+def found_files(root: Path) -> list[str]:
+    """Every recording in a folder and its folders, relative to it; of a bag the folder.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if there is no recording in it.
+    """
+    if not root.is_dir():
+        raise FileNotFoundError(f"no folder at {root}")
+    found: list[str] = []
+    folders = [root]
+    while folders:
+        for path in sorted(folders.pop().iterdir()):
+            if path.name.startswith(".") or path.name in NAMES:
+                continue
+            if find_format(path) is not None:
+                found.append(path.relative_to(root).as_posix())
+            elif path.is_dir() and not path.is_symlink():
+                folders.append(path)
+    if not found:
+        known = ", ".join(f".{ending}" for ending in endings())
+        raise ValueError(f"no recording in {root}; files that can be read end in {known}")
+    return sorted(found)
+
+
+def guesser(pattern: str) -> re.Pattern[str]:
+    """A pattern as an expression for names without their ending.
+
+    Blanks, dots, strokes and underlines around a material or scene are no part of it.
+
+    Raises:
+        ValueError: if it names what is none of ``FIELDS``, or one twice, or nothing.
+
+    Example:
+        >>> guesser("{material}{trial}").fullmatch("oil paper-slip_07").groupdict()
+        {'material': 'oil paper-slip', 'trial': '07'}
+    """
+    parts = re.split(r"\{(\w*)\}", pattern)
+    names = parts[1::2]
+    if not names or set(names) - set(FIELDS) or len(set(names)) < len(names):
+        raise ValueError(
+            f"pattern must name each of {', '.join(f'{{{name}}}' for name in FIELDS)} at most "
+            f"once, as {{material}}_{{trial}}, got {pattern!r}"
+        )
+    expression = ""
+    for place, part in enumerate(parts):
+        if place % 2:
+            between = f"[{re.escape(_BETWEEN)}]*" if part in ("material", "scene") else ""
+            expression += f"(?P<{part}>{FIELDS[part]}){between}"
+        else:
+            expression += "[^/]*".join(re.escape(piece) for piece in part.split("*"))
+    return re.compile(expression)
+
+
+def guessed(file: str, pattern: str) -> dict[str, str]:
+    """What a pattern tells of a file by its name, or by its path if the pattern has a stroke."""
+    path = Path(file)
+    name = path.with_suffix("").as_posix() if "/" in pattern else path.stem
+    found = guesser(pattern).fullmatch(name)
+    return found.groupdict() if found else {}
+
+
+def write_template(root: Path, pattern: str, path: Path | None = None) -> Template:
+    """Write a manifest of all recordings of a folder, its label columns empty.
+
+    Args:
+        root: the folder.
+        pattern: of names.
+        path: of the manifest; ``None`` for ``manifest.csv`` in the folder.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if there is a manifest already, no recording, or the pattern is none.
+    """
+    there = [root / name for name in NAMES] if path is None else [path]
+    for other in there:
+        if other.exists():
+            raise ValueError(f"{other} is there already; move it away, or give output=FILE")
+    path = root / NAMES[0] if path is None else path
+    guesses = {file: guessed(file, pattern) for file in found_files(root)}
+    with (
+        whole_file(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as stream,
+    ):
+        table = csv.DictWriter(stream, TEMPLATE_COLUMNS, restval="", lineterminator="\n")
+        table.writeheader()
+        table.writerows({"file": file, **guess} for file, guess in guesses.items())
+    return Template(path, len(guesses), sum(map(bool, guesses.values())))

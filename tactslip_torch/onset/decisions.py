@@ -1,0 +1,424 @@
+"""From recordings to scores, and from scores to decisions and alarms.
+
+``score_stream`` scores a whole recording, one bin every hop; ``Decider`` makes decisions and alarms
+of scores, piece by piece, for streams and whole recordings alike; ``answer_of`` is what a bin says
+alone; ``stream_statistic`` is all of it with gradients, from raw volts to the statistic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.model.abstention import abstention_of
+from tactslip_torch.model.calibration import probability
+from tactslip_torch.model.conformal import UNSURE, answers
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.judgement import Judgement
+from tactslip_torch.model.widening import widened_llr
+from tactslip_torch.onset.rules import NEUTRAL, Latch, latch, latch_start
+from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.signals.filtering import ChannelFilter
+
+
+class Scores(NamedTuple):
+    """Judgements of N bins of a recording, in order.
+
+    Attributes:
+        score: ``[N]``, dtype of the samples; at least 0 means slip.
+        is_valid: ``[N]``, bool: whether it can be relied on.
+        is_missing: ``[N, C]``, bool: the channel holds a NaN or Inf and was left out.
+        variance: ``[N]``, of the score; 0 where no channel in use is missing.
+    """
+
+    score: Tensor
+    is_valid: Tensor
+    is_missing: Tensor
+    variance: Tensor
+
+
+class Bins(Protocol):
+    """What is asked of a pool: how long bins are, and in what they are computed."""
+
+    @property
+    def bin_samples(self) -> int:
+        """Samples of a bin."""
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Of the samples."""
+
+    def widen(self, x: Tensor) -> Tensor:
+        """Samples in the dtype that is computed in."""
+
+
+class Scorer(Protocol):
+    """What is asked of a detector: ``SlipDetector``, or a baseline that judges filtered bins."""
+
+    @property
+    def pool(self) -> Bins:
+        """How long bins are, and in what they are computed."""
+
+    @property
+    def channel_filter(self) -> ChannelFilter:
+        """The frames of all channels."""
+
+    @property
+    def needed_index(self) -> Tensor:
+        """Channels in use, ascending; the others are not filtered."""
+
+    @property
+    def look_ahead(self) -> int:
+        """Samples behind a bin that its score waits for."""
+
+    def judge(self, bins: Tensor, *, given: torch.dtype) -> Judgement:
+        """Judge filtered bins ``[N, C, n]``, of samples that were ``given`` in a dtype."""
+
+
+def score_stream(detector: Scorer, samples: Tensor, hop_samples: int, chunk: int = 1024) -> Scores:
+    """Score every bin of a recording that begins a whole number of hops from its start.
+
+    The recording is filtered whole, each channel in use, and judged some bins at a time. A NaN
+    makes the bins within its frame's reach not valid. A recording shorter than a bin or a frame
+    has no scores.
+
+    Args:
+        detector: whose judgement.
+        samples: the recording, volts; may hold NaN.
+        hop_samples: distance of the bins' starts.
+        chunk: bins at once, for memory.
+
+    Shape:
+        - samples: ``[C, T]``, float32 or float64
+
+    Raises:
+        ValueError: if hop or chunk is no positive number, or samples are not of this hand.
+    """
+    _check(detector, samples)
+    if hop_samples < 1 or chunk < 1:
+        raise ValueError(f"hop_samples and chunk must be positive, got {hop_samples} and {chunk}")
+    with torch.no_grad():
+        samples = samples.detach()
+        if samples.shape[-1] < _longest_frame(detector):
+            return score_filtered(detector, samples[:, :0], hop_samples, samples.dtype, chunk)
+        wide = detector.pool.widen(samples)
+        filtered = detector.channel_filter(wide, detector.needed_index.tolist())
+        return score_filtered(detector, filtered, hop_samples, samples.dtype, chunk)
+
+
+def score_filtered(
+    detector: Scorer, filtered: Tensor, hop_samples: int, given: torch.dtype, chunk: int = 1024
+) -> Scores:
+    """Score every bin that fits into filtered samples ``[C, m]``, the first at their start.
+
+    Args:
+        detector: whose judgement.
+        filtered: in the dtype that is computed in.
+        hop_samples: distance of the bins' starts.
+        given: dtype that the samples came in.
+        chunk: bins at once, for memory.
+    """
+    length = detector.pool.bin_samples
+    if filtered.shape[-1] < length:
+        none = filtered.new_empty(0, len(filtered))
+        empty = none.new_empty(0, dtype=given)
+        return Scores(empty, none.bool()[:, 0], none.bool(), empty)
+    bins = filtered.unfold(-1, length, hop_samples).transpose(0, 1)  # [N, C, n], a view
+    judged = [detector.judge(part.contiguous(), given=given) for part in bins.split(chunk)]
+    return Scores(*judged[0]) if len(judged) == 1 else Scores(*_together(judged))
+
+
+def _check(detector: Scorer, samples: Tensor) -> None:
+    """Refuse what is no recording of the detector's hand.
+
+    Raises:
+        ValueError: if there are other axes or channels.
+    """
+    num_channels = len(detector.channel_filter.window_lengths)
+    if samples.ndim != 2 or len(samples) != num_channels:
+        raise ValueError(
+            f"expected a recording [{num_channels}, T] (channels, time), got {tuple(samples.shape)}"
+        )
+
+
+def _together(judged: Sequence[Judgement]) -> list[Tensor]:
+    return [torch.cat(parts) for parts in zip(*judged, strict=True)]
+
+
+def _longest_frame(detector: Scorer) -> int:
+    """Samples of the longest frame that a channel in use is filtered by."""
+    lengths = detector.channel_filter.window_lengths
+    return max(lengths[int(channel)] for channel in detector.needed_index)
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """An alarm, as it was raised.
+
+    Args:
+        alarm_s: when it could be raised: the end of the deciding bin and the look-ahead.
+        onset_s: when the slip is thought to have begun, no later than that.
+        score: of the deciding bin.
+        probability: that the deciding bin is slip.
+        statistic: of the rule.
+        is_valid: whether every channel in use could be trusted.
+    """
+
+    alarm_s: float
+    onset_s: float
+    score: float
+    probability: float
+    statistic: float
+    is_valid: bool
+
+
+class Decisions(NamedTuple):
+    """One entry per decision, in order; of several streams at once, one row each.
+
+    Attributes:
+        number: of the decision in its stream, from 0, ``[m]``, int64.
+        available_s: when it can be made, ``[m]``, float64.
+        onset_s: when the slip began that it speaks of, as far as it can tell, ``[*, m]``, float64.
+        score: at least 0 is slip, ``[*, m]``.
+        llr: log likelihood ratio; ``NEUTRAL`` where the score tells nothing, ``[*, m]``.
+        probability: of slip, by the bin alone, ``[*, m]``.
+        statistic: of the rule, ``[*, m]``.
+        is_valid: whether every channel in use could be trusted, ``[*, m]``.
+        is_alarm: whether it raises an alarm, ``[*, m]``.
+        is_on: whether an alarm stands after it: the contact's status, ``[*, m]``.
+    """
+
+    number: Tensor
+    available_s: Tensor
+    onset_s: Tensor
+    score: Tensor
+    llr: Tensor
+    probability: Tensor
+    statistic: Tensor
+    is_valid: Tensor
+    is_alarm: Tensor
+    is_on: Tensor
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """The alarms that were raised, in order; of one stream."""
+        return tuple(
+            Alarm(
+                alarm_s=float(self.available_s[i]),
+                onset_s=float(self.onset_s[i]),
+                score=float(self.score[i]),
+                probability=float(self.probability[i]),
+                statistic=float(self.statistic[i]),
+                is_valid=bool(self.is_valid[i]),
+            )
+            for i in self.is_alarm.nonzero().flatten().tolist()
+        )
+
+
+class Decider:
+    """Scores in, decisions out; its memory has a fixed size.
+
+    Args:
+        settings: calibration, rule, threshold.
+        sample_rate_hz: of the stream.
+        bin_samples: length of a bin.
+        look_ahead: samples behind its bin that a decision waits for.
+
+    Example:
+        >>> from tactslip_torch.model.calibration import Platt
+        >>> from tactslip_torch.onset.rules import KOfN
+        >>> settings = AlarmSettings(20, Platt(4.0, 0.0), KOfN(2, 3), 1.0, target_per_hour=1.0)
+        >>> decider = Decider(settings, 2000.0, bin_samples=100, look_ahead=25)
+        >>> score = torch.tensor([-1.0, -1.0, 0.5, -1.0, 0.6, 0.7])
+        >>> [round(alarm.alarm_s, 4) for alarm in decider.decide(score, score.isfinite()).alarms]
+        [0.1025]
+    """
+
+    def __init__(
+        self, settings: AlarmSettings, sample_rate_hz: float, bin_samples: int, look_ahead: int
+    ) -> None:
+        self.settings = settings
+        self._rate = sample_rate_hz
+        self._first = bin_samples + look_ahead
+        self._rearm = settings.decisions(settings.rearm_s, sample_rate_hz)
+        self._refractory = settings.decisions(settings.refractory_s, sample_rate_hz)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything; the next decision is number 0 of a stream that begins at 0."""
+        self._number = 0  # Python's integers do not end
+        self._state: tuple[Tensor, Latch, Tensor] | None = None
+
+    def decide(
+        self,
+        score: Tensor,
+        is_valid: Tensor,
+        is_usable: Tensor | None = None,
+        variance: Tensor | None = None,
+    ) -> Decisions:
+        """The next decisions.
+
+        Args:
+            score: of bins, in order.
+            is_valid: whether every channel in use could be trusted; handed on.
+            is_usable: whether the score tells anything (``is_usable``); where not, the evidence is
+                ``NEUTRAL``. By default ``is_valid``.
+            variance: of scores that are expected ones; evidence is the weaker for it. Default: 0.
+
+        Shape:
+            - all: ``[*, m]``; m may be 0, the streams ``*`` are always the same
+        """
+        settings = self.settings
+        if self._state is None:
+            like = score.new_zeros(score.shape[:-1])
+            none = torch.zeros(like.shape, dtype=torch.int64)
+            self._state = settings.rule.start(like), latch_start(like), none
+        of_rule, of_latch, run = self._state
+        if variance is None:
+            llr = settings.calibration.llr(score)
+        else:
+            llr = widened_llr(settings.calibration, score, variance)
+        tells = is_valid if is_usable is None else is_usable
+        llr = torch.where(tells & llr.isfinite(), llr, NEUTRAL)
+        statistic, of_rule = settings.rule.scan(llr, of_rule)
+        is_alarm, is_on, of_latch = latch(
+            statistic,
+            settings.threshold,
+            rearm=self._rearm,
+            refractory=self._refractory,
+            state=of_latch,
+        )
+        number = torch.arange(self._number, self._number + score.shape[-1])
+        runs = _run_starts(llr, number, run)
+        self._state = of_rule, of_latch, runs[..., -1] if len(number) else run
+        self._number += len(number)
+        available_s = self._available_s(number)
+        began_s = self._available_s(torch.minimum(runs, number)) - settings.lead_s
+        return Decisions(
+            number,
+            available_s,
+            torch.minimum(began_s, available_s),
+            score,
+            llr,
+            probability(llr, settings.slip_share),
+            statistic,
+            is_valid,
+            is_alarm,
+            is_on,
+        )
+
+    def _available_s(self, number: Tensor) -> Tensor:
+        samples = number * self.settings.hop_samples + self._first
+        return samples.double() / self._rate
+
+
+def _run_starts(llr: Tensor, number: Tensor, before: Tensor) -> Tensor:
+    """Where the unbroken run of positive ratios up to each decision began, ``[*, m]``.
+
+    Behind a decision that is not positive the next one would begin it: its own number and 1.
+    """
+    starts = torch.where(llr > 0, before[..., None], number + 1)
+    return starts.cummax(-1).values if len(number) else starts
+
+
+def is_usable(score: Tensor, is_missing: Tensor, needed_index: Tensor) -> Tensor:
+    """Whether a score tells anything: it is finite, and some channel in use was there.
+
+    A hand that lost a sensor goes on feeling with the others: the score is the one expected without
+    it, the decision is flagged as not valid and still counts, the less the less certain the score
+    is. One that lost them all feels nothing.
+
+    Shape:
+        - score, output: ``[*]``
+        - is_missing: ``[*, C]``
+        - needed_index: ``[channels in use]``
+    """
+    return score.isfinite() & ~is_missing.index_select(-1, needed_index).all(-1)
+
+
+def answer_of(detector: SlipDetector, decisions: Decisions) -> Tensor:
+    """1 for slip, 0 for non-slip, -1 for unsure.
+
+    By the detector's thresholds, without any by the sign of the score. Unsure too where a sensor in
+    use is dead or broken: thresholds were set on recordings in which all felt.
+
+    Shape:
+        - output: ``[*, m]`` as the decisions, int8
+    """
+    found = abstention_of(detector)
+    sure = found.answer(decisions.score) if found else answers(decisions.score, 0.0, 0.0)
+    return sure.masked_fill(~decisions.is_valid, UNSURE)
+
+
+class StreamStatistic(NamedTuple):
+    """One entry per decision, in order, ``[*, m]`` each, dtype of the samples.
+
+    Attributes:
+        score: at least 0 is slip.
+        llr: log likelihood ratio; ``NEUTRAL``, without gradient, where the score tells nothing.
+        probability: of slip, by the bin alone.
+        statistic: of the rule; an alarm is raised where it reaches ``settings.threshold``.
+    """
+
+    score: Tensor
+    llr: Tensor
+    probability: Tensor
+    statistic: Tensor
+
+
+def stream_statistic(
+    detector: SlipDetector, settings: AlarmSettings, samples: Tensor
+) -> StreamStatistic:
+    """Every decision on whole recordings, differentiable in the raw samples.
+
+    Gradients are those of the values: 0 through a feature that is clipped, through a channel that
+    counts as missing and through entropy; one-sided at ties. All
+    features of the pool are made on the way: a few seconds of stream at once, not hours.
+
+    Args:
+        detector: fitted on this hand.
+        settings: hop, calibration and rule; ``AlarmSettings.of(detector)`` are those in its file.
+        samples: recordings in volts; a channel with a NaN or Inf in a bin's reach is left out
+            of that bin.
+
+    Shape:
+        - samples: ``[*, C, T]``, float32 or float64, ``T`` at least a bin and the longest frame
+        - output: ``[*, m]`` each, ``m = (T - n) // hop + 1``
+
+    Raises:
+        ValueError: if samples are not of this hand or too short for a decision.
+
+    Example:
+        The gradient of the highest statistic, volt by volt, summed up for each channel:
+
+        >>> detector = SlipDetector.load("onset.pt")  # doctest: +SKIP
+        >>> samples = recording.samples.clone().requires_grad_()  # doctest: +SKIP
+        >>> found = stream_statistic(detector, AlarmSettings.of(detector), samples)
+        ... # doctest: +SKIP
+        >>> (pull,) = torch.autograd.grad(found.statistic.max(), samples)  # doctest: +SKIP
+        >>> pull.abs().sum(-1)  # doctest: +SKIP
+    """
+    detector.channel_filter.check(samples)
+    used = detector.needed_index.tolist()
+    length = detector.pool.bin_samples
+    shortest = max(length, *(detector.channel_filter.window_lengths[i] for i in used))
+    if samples.shape[-1] < shortest:
+        raise ValueError(
+            f"expected at least {shortest} samples, a bin and the longest frame in use, "
+            f"got {samples.shape[-1]}; give a longer recording"
+        )
+    filtered = detector.channel_filter(detector.pool.widen(samples), used)
+    bins = filtered.unfold(-1, length, settings.hop_samples).movedim(-3, -2)  # [*, m, C, n]
+    is_used = torch.zeros(len(detector.pool.hand), 1, dtype=torch.bool, device=bins.device)
+    is_used[used] = True
+    bins = torch.where(is_used | bins.isfinite(), bins, 0.0)  # or 0 times NaN comes back
+    score, _, is_missing, variance = detector.judge(bins, given=samples.dtype)
+    llr = widened_llr(settings.calibration, score, variance)
+    tells = is_usable(score, is_missing, detector.needed_index) & llr.isfinite()
+    llr = torch.where(tells, llr, NEUTRAL)
+    statistic, _ = settings.rule.scan(llr, settings.rule.start(llr[..., 0]))
+    return StreamStatistic(score, llr, probability(llr, settings.slip_share), statistic)

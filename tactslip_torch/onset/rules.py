@@ -1,0 +1,319 @@
+"""Sequential rules: log likelihood ratios of decisions in, one statistic per decision, alarms out.
+
+A single bin decides too little: at the paper's error rates a hand that watches every bin would
+raise an alarm each second. A rule gathers evidence over several decisions, of which the paper's
+outlook asks for a probability model. Every rule is causal, keeps a state of fixed size, and makes
+the same statistic whatever pieces a stream comes in.
+
+An alarm is an event: raised where the statistic reaches a threshold, it stands until the statistic
+has been low for a while, and only then may the next one come (``latch``). Where the threshold has
+to lie is not decided here (``onset.thresholds``).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar, NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
+
+NEUTRAL = 0.0
+"""The log likelihood ratio of a decision that says nothing; it stands for invalid ones."""
+
+NOTHING_YET = -1e30
+"""What ``KOfN`` takes for decisions before the first; finite, and below every real one."""
+
+_LONG_AGO = 2**62  # decisions since an alarm that never was
+_FEW = 8  # rows up to which plain numbers are quicker than tensors
+
+
+@dataclass(frozen=True)
+class KOfN:
+    """The k-th largest of the last n log likelihood ratios.
+
+    It reaches a threshold exactly if k of the last n do: the usual debounce. Among fewer than k
+    decisions it is ``NOTHING_YET``. At ties the gradient goes to one of the equals.
+
+    Raises:
+        ValueError: unless ``1 <= k <= n``.
+    """
+
+    k: int
+    n: int
+    name: ClassVar[str] = "k_of_n"
+    ceiling: ClassVar[float] = math.inf
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.k <= self.n:
+            raise ValueError(f"k must lie between 1 and n, got k={self.k} and n={self.n}")
+
+    def start(self, like: Tensor) -> Tensor:
+        """No decision yet: ``[*] -> [*, n - 1]``."""
+        return like.new_full((*like.shape, self.n - 1), NOTHING_YET)
+
+    def scan(self, llr: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """The k-th largest of each decision and the ``n - 1`` before it, and the state after them.
+
+        Finite ratios up to 1e30 of either sign give finite statistics and gradients; whatever is
+        not valid, or not finite, the caller makes ``NEUTRAL``. Differentiable in both arguments.
+
+        Shape:
+            - llr, statistic: ``[*, T]``, ``T`` may be 0
+            - state: ``[*, n - 1]``
+        """
+        _check_state(llr, state, self.n - 1)
+        if llr.shape[-1] == 0:
+            return llr, state
+        known = torch.cat([state, llr], dim=-1)  # [*, n - 1 + T]
+        statistic = known.unfold(-1, self.n, 1).kthvalue(self.n - self.k + 1, dim=-1).values
+        return statistic, known[..., known.shape[-1] - self.n + 1 :].clone()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Name, k and n, as ``rule_from_dict`` reads them."""
+        return {"name": self.name, **asdict(self)}
+
+
+@dataclass(frozen=True)
+class Cusum:
+    """Evidence for slip since it last seemed certain that there is none.
+
+    ``S = clamp(S + evidence * (llr - drift), 0, ceiling)``, from 0. Page's test is drift 0 and no
+    ceiling; a drift lets ratios that are a little positive for long fade, and the ceiling bounds
+    how long the sum takes to come down after a slip. The gradient passes where a bound is met
+    exactly, and is 0 beyond.
+
+    Args:
+        drift: ratio that a decision must exceed to add to the sum.
+        evidence: fraction of a ratio that is new, in (0, 1]; overlapping bins tell less than as
+            many apart, and hop / bin is the natural value.
+        ceiling: largest sum; infinite for none.
+
+    Raises:
+        ValueError: if drift is not finite, evidence out of range or the ceiling not positive.
+
+    Reference:
+        Page (1954), Biometrika 41, 100-115.
+    """
+
+    drift: float = 0.0
+    evidence: float = 1.0
+    ceiling: float = math.inf
+    name: ClassVar[str] = "cusum"
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.drift):
+            raise ValueError(f"drift must be finite, got {self.drift}")
+        if not 0 < self.evidence <= 1:
+            raise ValueError(f"evidence must lie in (0, 1], got {self.evidence}")
+        if not self.ceiling > 0:
+            raise ValueError(f"ceiling must be positive, got {self.ceiling}")
+
+    def start(self, like: Tensor) -> Tensor:
+        """Nothing gathered: ``[*] -> [*, 1]``."""
+        return like.new_zeros((*like.shape, 1))
+
+    def scan(self, llr: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """The sum after each decision, and the state after them; else as ``KOfN.scan``.
+
+        Shape:
+            - llr, statistic: ``[*, T]``, ``T`` may be 0
+            - state: ``[*, 1]``
+        """
+        _check_state(llr, state, 1)
+        total = state[..., 0]
+        statistic = []
+        for step in _by_decision(self.evidence * (llr - self.drift)):
+            total = (total + step).clamp(0.0, self.ceiling)
+            statistic.append(total)
+        return torch.stack(statistic, dim=-1) if statistic else llr, total.unsqueeze(-1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Name, drift, evidence and ceiling, None for an infinite one."""
+        plain = {"name": self.name, **asdict(self)}
+        return plain if self.ceiling < math.inf else {**plain, "ceiling": None}
+
+
+Rule: TypeAlias = KOfN | Cusum
+"""From log likelihood ratios to a statistic, which never exceeds ``ceiling``."""
+
+RULES: Mapping[str, type[KOfN | Cusum]] = {rule.name: rule for rule in (KOfN, Cusum)}
+"""Every rule by its name."""
+
+
+def rule_from_dict(plain: Mapping[str, Any]) -> Rule:
+    """The rule that ``to_dict`` wrote.
+
+    Raises:
+        ValueError: if there is no such rule, or a number of it is missing, unknown or refused.
+    """
+    numbers = dict(plain)
+    name = numbers.pop("name", None)
+    if name not in RULES:
+        raise ValueError(f"no sequential rule is called {name!r}; there are {', '.join(RULES)}")
+    if numbers.get("ceiling", 0) is None:
+        numbers["ceiling"] = math.inf
+    try:
+        return RULES[name](**numbers)
+    except TypeError as error:
+        raise ValueError(f"numbers of the rule {name!r} do not fit: {error}") from error
+
+
+class Latch(NamedTuple):
+    """What is remembered between two decisions, ``[*]`` each.
+
+    Attributes:
+        is_on: in alarm, so no other can be raised.
+        below: decisions in a row below the threshold.
+        since: decisions since the last alarm.
+    """
+
+    is_on: Tensor
+    below: Tensor
+    since: Tensor
+
+
+def latch_start(like: Tensor) -> Latch:
+    """Armed, with no alarm before: ``[*] -> [*]`` each; only shape and device of ``like`` count."""
+    return Latch(
+        torch.zeros(like.shape, dtype=torch.bool, device=like.device),
+        torch.zeros(like.shape, dtype=torch.int64, device=like.device),
+        torch.full(like.shape, _LONG_AGO, dtype=torch.int64, device=like.device),
+    )
+
+
+def latch(
+    statistic: Tensor, threshold: Tensor | float, *, rearm: int, refractory: int, state: Latch
+) -> tuple[Tensor, Tensor, Latch]:
+    """Which decisions raise an alarm, and whether one stands after each.
+
+    An alarm is raised where the latch is armed, the statistic is at or above the threshold and the
+    last alarm is at least ``refractory`` decisions back. It stands until ``rearm`` decisions in a
+    row, at least one, lie below the threshold; from that decision on the latch is armed again. A
+    statistic that is NaN is neither above nor below. No gradient flows.
+
+    Args:
+        statistic: what a rule made of the decisions.
+        threshold: in the statistic's unit; taken in its dtype.
+        rearm: decisions in a row that must be low.
+        refractory: shortest distance of two alarms, in decisions.
+        state: of ``latch_start`` or an earlier call.
+
+    Shape:
+        - statistic: ``[*, T]``, ``T`` may be 0; threshold and state broadcast against ``[*]``:
+          thresholds ``[G, 1]`` and ``R`` streams make everything ``[G, R]``
+        - output: is_alarm ``[*, T]``, is_on ``[*, T]``, state ``[*]``
+
+    Raises:
+        ValueError: if rearm or refractory is negative.
+    """
+    level = _level(statistic, threshold, rearm, refractory)
+    shape = torch.broadcast_shapes(statistic.shape[:-1], level.shape, state.is_on.shape)
+    if statistic.shape[-1] == 0:
+        nothing = torch.zeros((*shape, 0), dtype=torch.bool, device=statistic.device)
+        return nothing, nothing.clone(), Latch(*(part.expand(shape).clone() for part in state))
+    if 0 < math.prod(shape) <= _FEW:
+        return _row_by_row(statistic, level.expand(shape), rearm, refractory, state)
+    rows = (part.expand(shape) for part in state)
+    steps = list(_walk(_by_decision(statistic.detach()), level, rearm, refractory, *rows))
+    alarms, standing, *_ = zip(*steps, strict=True)
+    return torch.stack(alarms, dim=-1), torch.stack(standing, dim=-1), Latch(*steps[-1][1:])
+
+
+def count_alarms(
+    statistic: Tensor,
+    threshold: Tensor | float,
+    *,
+    rearm: int,
+    refractory: int,
+    skipped: Tensor | None = None,
+) -> Tensor:
+    """How many alarms ``latch`` raises from its start, without keeping which: ``[*]``, int64.
+
+    Takes what ``latch`` takes. ``skipped``, ``[*, T]``, is how many decisions were left out before
+    each, all below the threshold.
+
+    Raises:
+        ValueError: if rearm or refractory is negative.
+    """
+    level = _level(statistic, threshold, rearm, refractory)
+    shape = torch.broadcast_shapes(statistic.shape[:-1], level.shape)
+    count = torch.zeros(shape, dtype=torch.int64, device=statistic.device)
+    gaps = itertools.repeat(0) if skipped is None else _by_decision(skipped)
+    decisions = _by_decision(statistic.detach())
+    for step in _walk(decisions, level, rearm, refractory, *latch_start(count), gaps):
+        count += step[0]
+    return count
+
+
+def _level(statistic: Tensor, threshold: Tensor | float, rearm: int, refractory: int) -> Tensor:
+    """The threshold in the statistic's dtype."""
+    if rearm < 0 or refractory < 0:
+        raise ValueError(f"rearm and refractory must not be negative, got {rearm} and {refractory}")
+    return torch.as_tensor(threshold, dtype=statistic.dtype, device=statistic.device).detach()
+
+
+def _walk(
+    statistic: Iterable[Any],
+    level: Any,
+    rearm: int,
+    refractory: int,
+    is_on: Any,
+    below: Any,
+    since: Any,
+    skipped: Iterable[Any] = itertools.repeat(0),
+) -> Iterator[tuple[Any, Any, Any, Any]]:
+    """Decision by decision: whether it raises an alarm, and the parts of the state after it.
+
+    The definition, for tensors ``[*]`` and for plain numbers alike. ``skipped`` decisions before
+    each were low; re-armed among them is re-armed before the decision, so one look is enough.
+    """
+    in_a_row = max(rearm, 1)
+    for x, gap in zip(statistic, skipped, strict=False):
+        is_low = x < level
+        run = below + gap + is_low
+        is_on = is_on & (run < in_a_row)
+        since = since + gap + 1
+        is_alarm = (is_on ^ True) & (x >= level) & (since >= refractory)
+        is_on, below, since = is_on | is_alarm, run * is_low, since * (is_alarm ^ True)
+        yield is_alarm, is_on, below, since
+
+
+def _row_by_row(
+    statistic: Tensor, level: Tensor, rearm: int, refractory: int, state: Latch
+) -> tuple[Tensor, Tensor, Latch]:
+    """``latch`` by plain numbers, which for a few rows are quicker than tensors."""
+    shape, size = level.shape, statistic.shape[-1]
+    rows = zip(
+        statistic.detach().expand(*shape, size).reshape(-1, size).tolist(),
+        *(part.expand(shape).flatten().tolist() for part in (level, *state)),
+        strict=True,
+    )
+    alarms, standing, ends = [], [], []
+    for values, threshold, *before in rows:
+        steps = list(_walk(values, threshold, rearm, refractory, *before))
+        alarms.append([step[0] for step in steps])
+        standing.append([step[1] for step in steps])
+        ends.append(steps[-1][1:])
+    device = statistic.device
+    return (
+        torch.tensor(alarms, device=device).view(*shape, size),
+        torch.tensor(standing, device=device).view(*shape, size),
+        Latch(*(torch.tensor(part, device=device).view(shape) for part in zip(*ends, strict=True))),
+    )
+
+
+def _check_state(llr: Tensor, state: Tensor, size: int) -> None:
+    if llr.ndim == 0 or state.shape != (*llr.shape[:-1], size):
+        raise ValueError(
+            f"expected llr [*, T] and the state [*, {size}] that start or scan gave, "
+            f"got {tuple(llr.shape)} and {tuple(state.shape)}"
+        )
+
+
+def _by_decision(x: Tensor) -> tuple[Tensor, ...]:
+    """``[*, T]`` as ``T`` contiguous tensors ``[*]``: the same kernels run for any ``T``."""
+    return x.movedim(-1, 0).contiguous().unbind(0)

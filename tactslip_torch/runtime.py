@@ -1,0 +1,422 @@
+"""What every part may use: threads, processes, progress bars, and files that are written whole."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import secrets
+import threading
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+from tqdm.auto import tqdm
+
+from tactslip_torch.ledger import content_digest
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_POOLS: dict[tuple[int, int], ThreadPoolExecutor] = {}  # by process and number of threads
+_MAKING = threading.Lock()
+
+
+def for_each(function: Callable[[Item], object], items: Iterable[Item]) -> None:
+    """Call ``function`` on every item, on ``torch.get_num_threads()`` threads at once.
+
+    Inside ``function`` there is one intra-op thread, always: what it computes from its item alone
+    has the same bits for any number of threads. Items are begun in order and must not write to
+    the same memory. With one thread (so also inside ``function``) the calls are made here, one
+    after the other. Grad mode and inference mode are the caller's.
+
+    Args:
+        function: of one item; what it returns is dropped.
+        items: the pieces of work.
+
+    Raises:
+        Exception: what ``function`` raised, once nothing runs any more; items not begun by then
+            are left out.
+
+    Example:
+        >>> squares = torch.zeros(5)
+        >>> for_each(lambda i: squares[i].fill_(i * i), range(5))
+        >>> squares
+        tensor([ 0.,  1.,  4.,  9., 16.])
+    """
+    number = torch.get_num_threads()
+    if number == 1:
+        for item in items:
+            function(item)
+        return
+    queue = deque(items)
+    grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    def work() -> None:
+        with torch.inference_mode(inference), torch.set_grad_enabled(grad):
+            try:
+                while queue:
+                    try:
+                        item = queue.popleft()  # atomic
+                    except IndexError:  # another thread took the last one
+                        return
+                    function(item)
+            finally:
+                queue.clear()
+
+    pool = _pool(number)
+    futures = [pool.submit(work) for _ in range(min(number, len(queue)))]
+    try:
+        wait(futures)
+    finally:  # if interrupted, what still runs writes to the caller's memory
+        queue.clear()
+        wait(futures)
+    for future in futures:
+        future.result()
+
+
+def in_parts(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """What ``function`` returns for every item, in their order, made by ``for_each``.
+
+    Example:
+        >>> in_parts(torch.sum, torch.arange(6).split(4))
+        [tensor(6), tensor(9)]
+    """
+    results: dict[int, Result] = {}
+
+    def call(index: int) -> None:
+        results[index] = function(items[index])
+
+    for_each(call, range(len(items)))
+    return [results[index] for index in range(len(items))]
+
+
+def _pool(number: int) -> ThreadPoolExecutor:
+    """The pool of this process with ``number`` threads, all of them started and single-threaded.
+
+    ``torch.set_num_threads`` counts for the thread that calls it and for every thread that has not
+    asked or computed yet: so each asks before it sets, and the caller's number is set again once
+    all have set theirs.
+    """
+    key = (os.getpid(), number)
+    with _MAKING:
+        if key not in _POOLS:
+            pool = ThreadPoolExecutor(number, thread_name_prefix=f"tactslip-{number}")
+            ready = threading.Barrier(number)
+
+            def start() -> None:
+                torch.get_num_threads()
+                torch.set_num_threads(1)
+                ready.wait()  # so that no thread takes the start of another
+
+            try:
+                wait([pool.submit(start) for _ in range(number)])
+            finally:
+                torch.set_num_threads(number)
+            _POOLS[key] = pool
+        return _POOLS[key]
+
+
+def _renew_lock() -> None:
+    global _MAKING
+    _MAKING = threading.Lock()  # a thread of the parent may have held it
+
+
+os.register_at_fork(after_in_child=_renew_lock)
+
+
+def is_recorded() -> bool:
+    """Whether what runs is being written down as a graph, in which no value may be looked at."""
+    is_traced = torch.jit.is_tracing()  # type: ignore[attr-defined,no-untyped-call]
+    return bool(is_traced or torch.compiler.is_compiling())
+
+
+def has_values(x: Tensor) -> bool:
+    """Whether a decision may be taken on the values, wherever they lie and whatever comes along.
+
+    Not so where a graph is recorded or ``x`` is transformed (vmap, func.grad, jvp).
+    """
+    if is_recorded():
+        return False
+    try:
+        x.detach().flatten()[:0].cpu().numpy()  # of what is transformed not even nothing
+    except RuntimeError:
+        return False
+    return True
+
+
+def is_plain(x: Tensor) -> bool:
+    """Whether only values are asked for, and lie in memory that can be looked at.
+
+    Not so where a gradient or a tangent is carried along, a graph is recorded, ``x`` is transformed
+    (vmap), or lies on another device than the CPU.
+    """
+    if x.device.type != "cpu" or is_recorded() or (x.requires_grad and torch.is_grad_enabled()):
+        return False
+    try:
+        x.detach().numpy()  # under vmap and other transforms there is no memory to look at
+        return forward_ad.unpack_dual(x).tangent is None
+    except RuntimeError:
+        return False
+
+
+def usable_engine(
+    engine: str, known: Sequence[str], load_kernels: Callable[[], object], work: str
+) -> str:
+    """The engine that carries out the work here: ``"auto"`` becomes compiled or eager.
+
+    Args:
+        engine: a name.
+        known: names there are.
+        load_kernels: imports the compiled kernels; a second, once, and only if numba is there.
+        work: what is done by the engine, for the warning where numba cannot be used.
+
+    Raises:
+        ValueError: for an unknown engine, or ``"compiled"`` where numba cannot be used.
+    """
+    if engine not in known:
+        raise ValueError(f"engine must be one of {', '.join(known)}, got {engine!r}")
+    if engine not in ("auto", "compiled"):
+        return engine
+    is_installed, trouble = find_spec("numba") is not None, _trouble(load_kernels)
+    if engine == "compiled" and trouble:
+        raise ValueError(
+            f'engine "compiled" needs numba, which {trouble}; pip install '
+            '"tactslip_torch[fast]", or use engine "eager"'
+        )
+    if trouble and is_installed:
+        warnings.warn(f"numba {trouble}; {work} by engine eager", stacklevel=4)
+    return "eager" if trouble else "compiled"
+
+
+def _trouble(load_kernels: Callable[[], object]) -> str:
+    """Why kernels cannot be compiled here; empty if they can."""
+    if find_spec("numba") is None:
+        return "is not installed"
+    try:
+        load_kernels()
+    except Exception as error:  # another numba or NumPy than it was made for
+        return f"cannot be used: {str(error).splitlines()[0]}"
+    return ""
+
+
+@contextmanager
+def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary name beside ``path`` to write to; renamed to ``path`` when all went well.
+
+    A failure leaves what was at ``path`` before, and no temporary file.
+
+    Example:
+        >>> with whole_file(getfixture("tmp_path") / "a.txt") as temporary:
+        ...     _ = temporary.write_text("all of it")
+        >>> (getfixture("tmp_path") / "a.txt").read_text()
+        'all of it'
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unique = secrets.token_hex(4)  # process ids repeat on other hosts and in containers
+    temporary = path.with_name(f".{path.stem}.{unique}.tmp{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def save_table(
+    path: str | os.PathLike[str], form: str, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]
+) -> None:
+    """Write tensors and JSON-able facts to one file, whole or not at all.
+
+    The same facts and tensors give the same bytes. Of a view, no more is written than it shows.
+
+    Args:
+        path: of the file.
+        form: names format and version; ``load_table`` wants the same.
+        facts: kept as JSON text.
+        tensors: by name.
+    """
+    text = json.dumps(facts, sort_keys=True)
+    content = {
+        "format": form,
+        "facts": text,
+        "tensors": {name: _alone(tensors[name]) for name in sorted(tensors)},
+        "digest": _digest(text, tensors),
+    }
+    with whole_file(path) as temporary, temporary.open("wb") as file:
+        torch.save(content, file)  # handed a path, it would write its name into the file
+
+
+def load_table(path: str | os.PathLike[str], form: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Facts and tensors of a file that ``save_table`` wrote; nothing in it is executed.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it has another format, or is damaged.
+    """
+    name = os.fspath(path)
+    content = _read(path)
+    if content["format"] != form:
+        raise ValueError(f"{name} must be of format {form!r}, got {content['format']!r}")
+    try:
+        facts, tensors = content["facts"], content["tensors"]
+        is_whole = content["digest"] == _digest(facts, tensors)
+    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError):
+        is_whole = False
+    if not is_whole:
+        raise ValueError(f"{name} is damaged; make it again")
+    return json.loads(facts), tensors
+
+
+def table_form(path: str | os.PathLike[str]) -> str:
+    """The format that ``save_table`` named in a file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged or no such file.
+    """
+    return str(_read(path)["format"])
+
+
+def _read(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What ``save_table`` wrote, unchecked but for its format being text."""
+    name = os.fspath(path)
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"no file at {name}") from None
+    except Exception as error:  # torch.load raises many kinds for a file that is not its own
+        raise ValueError(f"{name} is damaged or no file of ours; make it again") from error
+    if not isinstance(content, dict) or not isinstance(content.get("format"), str):
+        raise ValueError(f"{name} is damaged or no file of ours; make it again")
+    return content
+
+
+def _alone(tensor: Tensor) -> Tensor:
+    """The values without a larger storage around them, which ``torch.save`` would write too."""
+    tensor = tensor.detach().cpu().contiguous()
+    is_all = tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
+    return tensor if is_all else tensor.clone()
+
+
+def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
+    names = sorted(tensors)
+    head = torch.frombuffer(bytearray((text + "\n".join(names)).encode()), dtype=torch.uint8)
+    return content_digest(head, *(tensors[name] for name in names))
+
+
+LEAD = 31
+
+
+def bar(
+    items: Iterable[Any], what: str, unit: str = "step", total: int | None = None
+) -> Iterable[Any]:
+    """``items`` with a progress bar on standard error that shows rate and time left."""
+    if total is None and isinstance(items, Sized):
+        total = len(items)
+    shown: Iterable[Any] = tqdm(
+        items, desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", dynamic_ncols=True
+    )
+    return shown
+
+
+class Ticker:
+    """A bar that is moved by hand, as of work on several threads.
+
+    Args:
+        what: is done.
+        unit: of a step.
+        total: number of steps, at most.
+    """
+
+    def __init__(self, what: str, unit: str, total: int) -> None:
+        self._bar = tqdm(
+            desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", dynamic_ncols=True, smoothing=0
+        )
+
+    def __enter__(self) -> Ticker:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.close()
+
+    def tick(self) -> None:
+        """A step is done."""
+        self._bar.update()
+
+
+_function: Callable[[Any], Any] | None = None
+"""What the processes of ``in_processes`` call."""
+
+
+def in_processes(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    what: str,
+    unit: str,
+    num_workers: int | None = None,
+) -> Iterator[Result]:
+    """What ``function`` returns for every item, in their order, with a progress bar.
+
+    Processes are forked, so the function may hold anything; each computes on one thread. Where
+    nothing can be forked, or one process is enough, the work is done here.
+
+    Args:
+        function: of one item; its results are pickled (tensors would each keep a file open: hand
+            on arrays).
+        items: small things that say what to do.
+        what: is done, for the bar.
+        unit: of an item, for the bar.
+        num_workers: ``None`` for as many as there are processors, at most 8.
+
+    Raises:
+        ValueError: if there is no such number of processes.
+        Exception: what ``function`` raised; what was not begun is left out.
+    """
+    if num_workers is not None and (type(num_workers) is not int or num_workers < 0):
+        raise ValueError(f"num_workers must be null or a number from 0, got {num_workers!r}")
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    count = min(min(available, 8) if num_workers is None else num_workers, len(items))
+    if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
+        yield from map(function, bar(items, what, unit))
+        return
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(count, context, _start, (function,)) as pool:
+        try:
+            found = pool.map(_call, items)
+            yield from bar(found, what, unit, total=len(items))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _start(function: Callable[[Any], Any]) -> None:
+    global _function
+    _function = function
+    torch.set_num_threads(1)
+
+
+def _call(item: Any) -> Any:
+    assert _function is not None  # _start
+    return _function(item)
+
+
+def is_first_process() -> bool:
+    """Whether this is the only process of a run, or the one that writes and speaks for all."""
+    return process_number() == 0
+
+
+def process_number() -> int:
+    """The rank of this process in its run, by what torchrun, Lightning or SLURM has set."""
+    for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK"):
+        if name in os.environ:
+            return int(os.environ[name])
+    return 0

@@ -1,0 +1,1 @@
+"""Stages of training: the alarm of a detector, settings by gradient, adaptation."""

@@ -1,0 +1,419 @@
+"""Features of one recording: simulated or read, filtered, cut into bins, described, and cached."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import lightning as L
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+import tactslip_torch
+from tactslip_torch.data.labels import (
+    LabelledBins,
+    LabelRule,
+    clear_of,
+    label_bins,
+    needed_windows,
+    shuffled,
+)
+from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource, Timeline
+from tactslip_torch.data.splits import ROLES, Split
+from tactslip_torch.features.cache import FeatureCache, cache_key, source_digest
+from tactslip_torch.features.extractor import EngineName, FeatureExtractor
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.signals.binning import bins_at
+from tactslip_torch.signals.filtering import ChannelFilter, extended
+
+
+class Stroke(NamedTuple):
+    """The exact truth about a stroke that slides."""
+
+    onset_s: float
+    slide_end_s: float
+    speed_mm_s: float
+
+
+class RecordingFeatures(NamedTuple):
+    """What the learner sees of one recording.
+
+    Attributes:
+        strokes: in the order of their numbers; empty where nothing slides.
+        hop_s: distance of neighbouring bins.
+
+    Shape:
+        - features: ``[N, F]``, float32, the whole pool
+        - is_slip: ``[N]``, bool
+        - speed_mm_s: ``[N]``, steady speed of the stroke of each bin, 0 for bins of no stroke
+        - position, stroke: ``[N]``, place beside the onset and number of the stroke, as
+          ``LabelledBins`` has them
+        - ends_s: ``[N]``, float64, when the last sample of each bin is in
+        - roles: role to ``[N]``, bool
+    """
+
+    recording: RecordingId
+    features: Tensor
+    is_slip: Tensor
+    speed_mm_s: Tensor
+    position: Tensor
+    stroke: Tensor
+    ends_s: Tensor
+    strokes: tuple[Stroke, ...]
+    hop_s: float
+    roles: dict[str, Tensor]
+    seconds: dict[str, float]
+
+
+class FeatureMaker:
+    """Features of a recording of a source, computed or from the cache.
+
+    Args:
+        source: the recordings.
+        pool: the features; its bin length and rate must fit source and rule.
+        channel_filter: the filter of each channel.
+        rule: where the bins lie and what they are.
+        cache: where features are kept, if they are.
+        dtype: in which features are computed; they are handed on in float32.
+        engine: what computes them.
+
+    Raises:
+        ValueError: if rate, channels or bin length of the parts disagree, or the engine is none
+            that can be used.
+    """
+
+    def __init__(
+        self,
+        source: RecordingSource,
+        pool: FeaturePool,
+        channel_filter: ChannelFilter,
+        rule: LabelRule,
+        cache: FeatureCache | None = None,
+        dtype: torch.dtype = torch.float64,
+        engine: EngineName = "auto",
+    ) -> None:
+        if pool.hand != source.hand:
+            raise ValueError(
+                f"the features expect {len(pool.hand)} channels {pool.hand.names[0]}.."
+                f"{pool.hand.names[-1]}, the recordings have {len(source.hand)} "
+                f"{source.hand.names[0]}..{source.hand.names[-1]}; use the hand of the recordings"
+            )
+        if pool.sample_rate_hz != source.sample_rate_hz:
+            raise ValueError(
+                f"the features expect {pool.sample_rate_hz:g} Hz, the recordings have "
+                f"{source.sample_rate_hz:g} Hz; make the features for that rate, or resample"
+            )
+        bin_samples = round(rule.bin_ms * source.sample_rate_hz / 1000)
+        if pool.bin_samples != bin_samples:
+            raise ValueError(
+                f"the features expect bins of {pool.bin_samples} samples, labels.bin_ms="
+                f"{rule.bin_ms:g} makes bins of {bin_samples}"
+            )
+        self.source = source
+        self.pool = pool
+        self.extractor = FeatureExtractor(pool, engine=engine)
+        self.channel_filter = channel_filter
+        self.rule = rule
+        self.cache = cache
+        self.dtype = dtype
+        self._code = source_digest(Path(tactslip_torch.__file__).parent)
+        self._libraries = [version(name) for name in ("torch", "numpy", "ptwt", "PyWavelets")]
+
+    def __call__(self, recording: RecordingId, split: Split) -> RecordingFeatures:
+        """Features, labels and roles of one recording.
+
+        Raises:
+            ValueError: if bins leave the recording or a sample they need is not finite.
+        """
+        times = self.source.timeline(recording)
+        bins = self.lay_bins(times)
+        seconds: dict[str, float] = {}
+        features = self._features(recording, times, bins, seconds)
+        is_slip = bins.is_slip
+        if self.rule.shuffle_seed is not None:
+            place = self.source.ids.index(recording)
+            is_slip = shuffled(is_slip, self.rule.shuffle_seed, place)
+        speeds = torch.tensor([*times.speeds_mm_s, 0.0])[bins.stroke]  # -1, of no stroke: the 0
+        slides = zip(times.onsets_s, times.sliding_s, times.speeds_mm_s, strict=True)
+        return RecordingFeatures(
+            recording,
+            features,
+            is_slip,
+            speeds,
+            bins.position,
+            bins.stroke,
+            (bins.starts + bins.bin_samples).double() / self.source.sample_rate_hz,
+            tuple(Stroke(onset_s, end_s, speed) for onset_s, (_, end_s), speed in slides),
+            (self.rule.bin_ms if self.rule.hop_ms is None else self.rule.hop_ms) / 1000,
+            split.bin_roles(recording, len(is_slip)),
+            seconds,
+        )
+
+    def key(self, recording: RecordingId) -> str:
+        """A digest of everything that determines the features of a recording."""
+        return self._key(recording, self.lay_bins(self.source.timeline(recording)))
+
+    def filtered_bins(self, recording: RecordingId) -> tuple[Tensor, LabelledBins]:
+        """The filtered bins ``[N, C, n]`` that features are taken from, and their labels."""
+        times = self.source.timeline(recording)
+        bins = self.lay_bins(times)
+        return self._filter(recording, self._load(recording, times, bins), bins), bins
+
+    def raw_bins(self, recording: RecordingId, index: Tensor) -> Tensor:
+        """Some bins of a recording before filtering, with the context that it takes.
+
+        At the ends of a recording the context is what ``extended`` makes of it. Samples are as they
+        are: a NaN or Inf stays.
+
+        Args:
+            recording: of the source.
+            index: numbers of bins, ``[m]``, among those that ``__call__`` hands on.
+
+        Shape:
+            - output: ``[m, C, context_before + n + context_after]``, in the maker's dtype
+
+        Raises:
+            ValueError: if a bin leaves the recording.
+        """
+        times = self.source.timeline(recording)
+        bins = self.lay_bins(times)
+        loaded = self._load(recording, times, bins)
+        whole = extended(loaded.samples.to(self.dtype), self.channel_filter)
+        context = self.channel_filter.context_before + self.channel_filter.context_after
+        return bins_at(whole, bins.starts[index], bins.bin_samples + context)
+
+    def lay_bins(self, times: Timeline) -> LabelledBins:
+        """Where the bins of a recording lie, and what they are; no sample is needed for that.
+
+        Bins that would need missing samples are left out.
+        """
+        onsets = times.annotated_onsets_s if self.rule.onsets == "annotated" else times.onsets_s
+        rate = self.source.sample_rate_hz
+        bins = label_bins(
+            self.rule,
+            onsets,
+            times.sliding_s,
+            times.duration_s,
+            rate,
+            times.non_slip_s,
+            times.slip_s,
+        )
+        if not times.missing_s:
+            return bins
+        before, after = (max(reach) for reach in zip(*self.channel_filter.reaches, strict=True))
+        return clear_of(bins, times.missing_s, before, after, rate)
+
+    def _features(
+        self,
+        recording: RecordingId,
+        times: Timeline,
+        bins: LabelledBins,
+        seconds: dict[str, float],
+    ) -> Tensor:
+        started = time.perf_counter()
+        key = self._key(recording, bins)
+        cached = None if self.cache is None else self.cache.load(key)
+        if cached is not None and cached.shape == (len(bins.starts), len(self.pool.names)):
+            seconds["read_cache"] = time.perf_counter() - started
+            return cached
+        loaded = self._load(recording, times, bins)
+        seconds["simulate" if self.source.is_simulated else "read"] = _lap(started, seconds)
+        filtered = self._filter(recording, loaded, bins)
+        seconds["filter"] = _lap(started, seconds)
+        with torch.no_grad():
+            features = self.extractor(filtered).float()
+        seconds["features"] = _lap(started, seconds)
+        if self.cache is not None:
+            self.cache.store(key, features)
+        seconds["write_cache"] = _lap(started, seconds)
+        return features
+
+    def _load(self, recording: RecordingId, times: Timeline, bins: LabelledBins) -> Recording:
+        context = self.channel_filter.context_before  # never fewer than behind
+        windows = needed_windows(bins, context, times.duration_s, self.source.sample_rate_hz)
+        return self.source.load(recording, windows)
+
+    def _filter(self, recording: RecordingId, loaded: Recording, bins: LabelledBins) -> Tensor:
+        filtered = self.channel_filter(loaded.samples.to(self.dtype))
+        cut = bins_at(filtered, bins.starts, bins.bin_samples)  # [N, C, n]
+        bad = (~cut.isfinite()).nonzero()
+        if len(bad):
+            index, channel, _ = bad[0].tolist()
+            raise ValueError(self._broken(recording, loaded, int(bins.starts[index]), channel))
+        return cut
+
+    def _broken(self, recording: RecordingId, loaded: Recording, start: int, channel: int) -> str:
+        """What to say of a channel whose filtered bin from sample ``start`` on is not finite."""
+        before, after = self.channel_filter.reaches[channel]
+        begin = max(start - before, 0)
+        near = loaded.samples[channel, begin : start + self.pool.bin_samples + after]
+        place = int((~near.isfinite()).nonzero()[0])
+        return (
+            f"{recording}: channel {self.pool.hand.names[channel]}, sample {begin + place} "
+            f"({(begin + place) / self.source.sample_rate_hz:.4f} s) is {float(near[place])}; "
+            "repair or leave out the recording"
+        )
+
+    def _key(self, recording: RecordingId, bins: LabelledBins) -> str:
+        pool = self.pool
+        facts: dict[str, Any] = {
+            "recording": dict(self.source.key(recording)),
+            "starts": bins.starts.tolist(),
+            "bin_samples": bins.bin_samples,
+            "wavelet": [pool.facts()["wavelet"], pool.level],
+            "spectrum": [pool.spectrum, pool.arithmetic],
+            "filter": list(self.channel_filter.facts().values()),
+            "dtype": str(self.dtype),
+            "engine": self.extractor.engine,
+            "code": self._code,
+            "libraries": self._libraries,
+        }
+        return cache_key(facts)
+
+
+def _lap(started: float, seconds: dict[str, float]) -> float:
+    """Seconds since ``started`` that no earlier stage has."""
+    return time.perf_counter() - started - sum(seconds.values())
+
+
+_UNITS = {
+    "simulate": "recordings",
+    "read": "recordings",
+    "features": "bins",
+    "read_cache": "recordings",
+}
+
+
+class Pace:
+    """What recordings took, added up.
+
+    Attributes:
+        seconds: that workers spent on each stage, summed over them.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._done: dict[str, Counter[str]] = {}
+
+    def add(self, made: RecordingFeatures) -> None:
+        """Count a recording."""
+        for stage, seconds in made.seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+            done = self._done.setdefault(stage, Counter())
+            done.update(recordings=1, bins=len(made.is_slip))
+
+    def rates(self) -> dict[str, str]:
+        """Of one worker, for people."""
+        return {
+            stage: f"{self._done[stage][unit] / max(self.seconds[stage], 1e-9):.0f} {unit}/s"
+            for stage, unit in _UNITS.items()
+            if stage in self._done
+        }
+
+
+NOTHING: Any = ()
+"""A batch of no recording."""
+
+
+class SlipDataModule(L.LightningDataModule):
+    """Recordings of a split as batches of one recording each, made by workers.
+
+    The training loader holds the recordings with training bins, always in one order; the test
+    loader all that have a role. Of several processes each gets every so-many-th recording: none
+    is padded with recordings of another, as Lightning's own sampler would.
+
+    Args:
+        maker: makes features of a recording.
+        split: who has which role.
+        num_workers: processes that make features; 0 makes them in this one, ``None`` takes as
+            many as there are processors, at most 8, shared by the processes of a machine.
+    """
+
+    def __init__(self, maker: FeatureMaker, split: Split, num_workers: int | None = None) -> None:
+        super().__init__()
+        self.maker = maker
+        self.split = split
+        processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+        self.num_workers = min(processors, 8) if num_workers is None else num_workers
+        self._shares_processors = num_workers is None
+
+    def train_dataloader(self) -> DataLoader[RecordingFeatures]:
+        """This process's share of the recordings with training bins.
+
+        Lightning keeps training in step, so a share that is one short ends in ``NOTHING``.
+        """
+        part, parts = self._share()
+        num = -(-len(self.split.having("train")) // parts)
+        return self.loader(["train"], part, parts, at_least=num)
+
+    def test_dataloader(self) -> DataLoader[RecordingFeatures]:
+        """This process's share of the recordings with a role."""
+        return self.loader(list(ROLES), *self._share())
+
+    def fingerprint(self) -> str:
+        """A digest of everything that determines the training bins; for resuming."""
+        split = self.split
+        features = {
+            str(recording): self.maker.key(recording) for recording in split.having("train")
+        }
+        shared = [split.test_share_of_bins, split.seed, self.maker.rule.shuffle_seed]
+        return cache_key({"features": features, "shared": shared})
+
+    def transfer_batch_to_device(self, batch: Any, device: Any, dataloader_idx: int) -> Any:
+        """Features stay where they are: moments and solve run in float64 on the processor."""
+        return batch
+
+    def loader(
+        self, roles: Sequence[str], part: int = 0, parts: int = 1, at_least: int = 0
+    ) -> DataLoader[RecordingFeatures]:
+        """Recordings with any of the roles, every ``parts``-th of them from ``part`` on.
+
+        Behind them ``NOTHING`` until there are ``at_least`` so many.
+
+        Raises:
+            ValueError: if there are more parts than recordings.
+        """
+        recordings = self.split.having(*roles)
+        if parts > len(recordings):
+            raise ValueError(
+                f"{parts} processes or shards for {len(recordings)} recordings; use fewer"
+            )
+        workers = self.num_workers
+        if self._shares_processors and self.trainer is not None:
+            workers = max(1, workers // self.trainer.num_devices)
+        return DataLoader(
+            _SplitRecordings(self.maker, self.split, recordings[part::parts], at_least),
+            batch_size=None,
+            num_workers=workers,
+            persistent_workers=workers > 0,
+        )
+
+    def _share(self) -> tuple[int, int]:
+        if self.trainer is None:
+            return 0, 1
+        return self.trainer.global_rank, self.trainer.world_size
+
+
+class _SplitRecordings(Dataset[RecordingFeatures]):
+    def __init__(
+        self, maker: FeatureMaker, split: Split, recordings: list[RecordingId], at_least: int
+    ) -> None:
+        self.maker = maker
+        self.split = split
+        self.recordings = recordings
+        self.at_least = at_least
+
+    def __len__(self) -> int:
+        return max(len(self.recordings), self.at_least)
+
+    def __getitem__(self, index: int) -> RecordingFeatures:
+        if index >= len(self.recordings):
+            nothing: RecordingFeatures = NOTHING
+            return nothing
+        return self.maker(self.recordings[index], self.split)

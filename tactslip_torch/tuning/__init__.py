@@ -1,1 +1,0 @@
-"""Settings learned by gradient through the closed-form fit."""

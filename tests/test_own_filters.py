@@ -1,0 +1,110 @@
+"""Filters of one's own, given as numbers: features, cache, statistics and files."""
+
+import pytest
+import torch
+from any_hands import own_kernels, own_wavelet
+from small_detector import HAND, raw_bins, small_detector
+from small_set import SMALL_HAND, SmallSet
+
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.splits import unseen4
+from tactslip_torch.features.cache import FeatureCache
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.detector_file import FORMAT
+from tactslip_torch.runtime import load_table, save_table
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.datamodule import FeatureMaker
+
+RECORDING = RecordingId("a", 0)
+
+
+WAVELET = own_wavelet()
+KERNELS = own_kernels(ChannelFilter([51, 11]))
+
+
+def maker_of(source, wavelet="rbio2.2", kernels=None, cache=None):
+    pool = FeaturePool(SMALL_HAND, wavelet=wavelet)
+    return FeatureMaker(source, pool, ChannelFilter([51, 11], kernels=kernels), LabelRule(), cache)
+
+
+def split_of(source):
+    return unseen4(source.ids, seen=["a", "b"], unseen=["c"])[0]
+
+
+def test_features_are_those_of_the_filters():
+    source = SmallSet()
+    own, plain = maker_of(source, WAVELET, KERNELS), maker_of(source)
+    bins, _ = plain.filtered_bins(RECORDING)
+    made = own(RECORDING, split_of(source)).features
+    pool = FeaturePool(SMALL_HAND, wavelet=WAVELET)
+    torch.testing.assert_close(made, pool(own.filtered_bins(RECORDING)[0]).float())
+    assert not torch.allclose(own.filtered_bins(RECORDING)[0], bins, rtol=1e-2)
+
+
+def test_other_filters_are_another_entry_of_the_cache(tmp_path):
+    source, cache = SmallSet(), FeatureCache(tmp_path)
+    choices = [
+        {},
+        {"wavelet": WAVELET},
+        {"kernels": KERNELS},
+        {"kernels": own_kernels(ChannelFilter([51, 11]), seed=4)},
+    ]
+    for _ in range(2):
+        for choice in choices:
+            maker_of(source, cache=cache, **choice)(RECORDING, split_of(source))
+    assert source.loads == len(choices)
+
+
+@pytest.fixture
+def detector():
+    plain = small_detector(engine="eager")
+    pool = FeaturePool(HAND, wavelet=WAVELET)
+    layer = ChannelFilter([51, 51, 11, 11], kernels=KERNELS)
+    return SlipDetector(pool, layer, plain.selected, plain.scaler, plain.head, plain.info)
+
+
+@pytest.mark.parametrize("engine", ["reference", "eager", "compiled"])
+def test_a_detector_comes_back_with_its_filters_in_any_engine(tmp_path, detector, engine):
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    detector.save(tmp_path / "detector.pt")
+    loaded = SlipDetector.load(tmp_path / "detector.pt", engine=engine)
+    assert loaded.extractor.engine == engine
+    assert loaded.pool.wavelet == detector.pool.wavelet
+    assert loaded.channel_filter.kernels == detector.channel_filter.kernels
+    samples = raw_bins(30, seed=1)
+    expected = small_detector(engine="eager").score_raw(samples)
+    score = loaded.score_raw(samples)
+    torch.testing.assert_close(score, detector.score_raw(samples), rtol=1e-9, atol=1e-9)
+    assert not torch.allclose(score, expected, rtol=1e-3)
+
+
+def test_a_file_without_own_filters_has_none(tmp_path):
+    small_detector().save(tmp_path / "detector.pt")
+    facts, _ = load_table(tmp_path / "detector.pt", FORMAT)
+    assert "kernels" not in facts
+    assert facts["pool"]["wavelet"] == "rbio2.2"
+    assert SlipDetector.load(tmp_path / "detector.pt").channel_filter.kernels == {}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda facts: facts["kernels"].update({"11": [0.1] * 11}),
+        lambda facts: facts["kernels"].update({"nine": [1.0]}),
+        lambda facts: facts["pool"]["wavelet"].update({"dec_lo": [1.0] * 6}),
+        lambda facts: facts["pool"]["wavelet"].pop("name"),
+    ],
+    ids=["kernel sum", "kernel length", "no wavelet", "no name"],
+)
+def test_damaged_filters_are_named_in_one_line(tmp_path, detector, change):
+    path = tmp_path / "detector.pt"
+    detector.save(path)
+    facts, tensors = load_table(path, FORMAT)
+    change(facts)
+    save_table(path, FORMAT, facts, tensors)
+    with pytest.raises(ValueError, match="is a damaged detector: ") as error:
+        SlipDetector.load(path)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,504 @@
+"""Sequential rules and the latch against plain loops: any cut, gradients, extremes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from oracles import assert_manners
+from torch import Tensor
+
+from tactslip_torch.onset.rules import (
+    NOTHING_YET,
+    RULES,
+    Cusum,
+    KOfN,
+    Latch,
+    Rule,
+    count_alarms,
+    latch,
+    latch_start,
+    rule_from_dict,
+)
+
+LIST = (
+    KOfN(1, 1),
+    KOfN(1, 4),
+    KOfN(2, 3),
+    KOfN(5, 5),
+    KOfN(7, 20),
+    Cusum(),
+    Cusum(drift=0.3, evidence=0.2, ceiling=3.0),
+)
+RULE = pytest.mark.parametrize("rule", LIST, ids=lambda rule: str(rule))
+DTYPE = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["f32", "f64"])
+
+
+def scan(rule: Rule, llr: Tensor) -> Tensor:
+    return rule.scan(llr, rule.start(llr.new_zeros(llr.shape[:-1])))[0]
+
+
+def bytes_of(x: Tensor) -> bytes:
+    return x.numpy().tobytes()
+
+
+# ------------------------------------------------------------------------------------ the oracles
+def k_of_n(rule: KOfN, llrs: list[float]) -> list[float]:
+    last: deque[float] = deque(maxlen=rule.n)
+    found = []
+    for llr in llrs:
+        last.append(llr)
+        ranked = sorted(last, reverse=True)
+        found.append(ranked[rule.k - 1] if len(ranked) >= rule.k else NOTHING_YET)
+    return found
+
+
+def cusum(rule: Cusum, llrs: list[float]) -> list[float]:
+    total, found = 0.0, []
+    for llr in llrs:
+        total = min(max(total + rule.evidence * (llr - rule.drift), 0.0), rule.ceiling)
+        found.append(total)
+    return found
+
+
+ORACLES: dict[str, Callable[..., list[float]]] = {
+    "k_of_n": k_of_n,
+    "cusum": cusum,
+}
+
+
+@RULE
+@pytest.mark.parametrize(("dtype", "tol"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
+@pytest.mark.parametrize("num", [1, 2, 200])
+def test_equals_the_definition(rule: Rule, dtype, tol, num, rng: np.random.Generator) -> None:
+    llr = torch.from_numpy(3 * rng.standard_normal((3, num))).to(dtype)
+    expected = [ORACLES[rule.name](rule, row) for row in llr.tolist()]
+    got = scan(rule, llr)
+    torch.testing.assert_close(
+        got,
+        torch.tensor(expected, dtype=dtype),
+        rtol=tol,
+        atol=tol * (num if dtype.itemsize == 4 else 1),
+    )
+
+
+@RULE
+def test_manners(rule: Rule, rng: np.random.Generator, device: torch.device) -> None:
+    llr = torch.from_numpy(3 * rng.standard_normal((4, 30))).to(device)
+    assert_manners(lambda x: scan(rule, x), llr)
+    assert_manners(lambda x: scan(rule, x), llr.float(), rtol=1e-5)
+
+
+@RULE
+@DTYPE
+@given(data=st.data())
+def test_any_cut_gives_the_same_bits(rule: Rule, dtype: torch.dtype, data: st.DataObject) -> None:
+    seed = data.draw(st.integers(0, 2**20))
+    shape = data.draw(st.sampled_from([(), (1,), (5,), (2, 3), (3, 0)]))
+    source = torch.Generator().manual_seed(seed)
+    llr = 3 * torch.randn(*shape, 40, dtype=dtype, generator=source)
+    state = rule.start(llr[..., 0])
+    whole, end = rule.scan(llr, state)
+    cuts = sorted(data.draw(st.lists(st.integers(0, 40), max_size=12)))
+    pieces = []
+    for first, last in zip([0, *cuts], [*cuts, 40], strict=True):
+        piece, state = rule.scan(llr[..., first:last], state)
+        assert piece.shape == (*shape, last - first)
+        pieces.append(piece)
+    assert bytes_of(torch.cat(pieces, -1)) == bytes_of(whole)
+    assert bytes_of(state) == bytes_of(end)
+
+
+@RULE
+def test_a_state_holds_nothing_but_itself(rule: Rule) -> None:
+    # a view would keep the whole of every piece alive
+    llr = torch.randn(2, 500, generator=torch.Generator().manual_seed(0))
+    _, state = rule.scan(llr, rule.start(llr[:, 0]))
+    if state.numel():
+        assert state.untyped_storage().nbytes() == state.numel() * state.element_size()
+
+
+@RULE
+@given(where=st.integers(0, 39), by=st.floats(-1e30, 1e30), seed=st.integers(0, 2**20))
+def test_later_decisions_change_nothing_before(rule: Rule, where, by, seed) -> None:
+    llr = torch.randn(2, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    other = llr.clone()
+    other[:, where:] = by
+    assert torch.equal(scan(rule, llr)[:, :where], scan(rule, other)[:, :where])
+    if by > 100 and rule.name != "k_of_n":  # and the decision itself does count
+        assert bool((scan(rule, llr)[:, where] != scan(rule, other)[:, where]).all())
+
+
+@RULE
+@DTYPE
+def test_no_decision_at_all(rule: Rule, dtype: torch.dtype) -> None:
+    for shape in [(), (3,), (2, 3)]:
+        state = rule.start(torch.zeros(shape, dtype=dtype))
+        statistic, after = rule.scan(torch.zeros(*shape, 0, dtype=dtype), state)
+        assert (statistic.shape, statistic.dtype) == ((*shape, 0), dtype)
+        assert torch.equal(after, state)
+        assert after.dtype == dtype
+
+
+# ------------------------------------------------------------------------------------- gradients
+@RULE
+def test_gradients(rule: Rule, rng: np.random.Generator) -> None:
+    llr = torch.from_numpy(rng.standard_normal((2, 9)))
+    _, state = rule.scan(llr.roll(1, -1) + 0.01, rule.start(llr[:, 0]))
+    if isinstance(rule, KOfN):  # no decision counts until it is one
+        state = torch.from_numpy(rng.standard_normal(state.shape))
+    llr.requires_grad_()
+    state = state.detach().requires_grad_(bool(state.numel()))
+    if not state.numel():  # gradcheck takes no empty tensor
+        assert torch.autograd.gradcheck(lambda x: rule.scan(x, state)[0], (llr,), eps=1e-6)
+        return
+    assert torch.autograd.gradcheck(rule.scan, (llr, state), eps=1e-6)
+
+
+@RULE
+@DTYPE
+@pytest.mark.parametrize("kind", ["ones", "huge", "least", "zeros", "steps"])
+def test_finite_at_extremes_and_ties(rule: Rule, dtype: torch.dtype, kind: str) -> None:
+    llr = {
+        "ones": torch.ones(12),
+        "huge": torch.full((12,), 1e30),
+        "least": torch.full((12,), -1e30),
+        "zeros": torch.zeros(12),
+        "steps": torch.tensor([1e30, -1e30, 0.0, 0.0, -1e30, 1e30] * 2),
+    }[kind].to(dtype)
+    llr.requires_grad_()
+    statistic = scan(rule, llr)
+    assert bool(statistic.isfinite().all())
+    statistic.sum().backward()
+    assert llr.grad is not None
+    assert bool(llr.grad.isfinite().all())
+
+
+# ----------------------------------------------------------------------------------------- k of n
+@given(data=st.data())
+def test_k_of_n_reaches_a_threshold_if_k_of_the_last_n_do(data: st.DataObject) -> None:
+    n = data.draw(st.integers(1, 8))
+    k = data.draw(st.integers(1, n))
+    llrs = data.draw(st.lists(st.integers(-3, 3), min_size=1, max_size=30))
+    threshold = data.draw(st.integers(-3, 3))
+    got = scan(KOfN(k, n), torch.tensor(llrs, dtype=torch.float64)) >= threshold
+    hits = [llr >= threshold for llr in llrs]
+    assert got.tolist() == [sum(hits[max(0, t - n + 1) : t + 1]) >= k for t in range(len(hits))]
+
+
+def test_k_of_n_says_least_before_k_decisions() -> None:
+    assert scan(KOfN(3, 5), torch.tensor([9.0, 8.0, 7.0])).tolist() == pytest.approx(
+        [NOTHING_YET, NOTHING_YET, 7.0]
+    )
+
+
+# ---------------------------------------------------------------------------------------- CUSUM
+@given(llrs=st.lists(st.floats(-50, 50), min_size=1, max_size=60), drift=st.floats(-2, 2))
+def test_cusum_without_ceiling_is_the_sum_above_its_minimum(llrs: list[float], drift) -> None:
+    steps = np.array(llrs) - drift
+    sums = np.cumsum(steps)
+    least = np.minimum.accumulate(np.minimum(sums, 0))
+    got = scan(Cusum(drift=drift), torch.tensor(llrs, dtype=torch.float64))
+    np.testing.assert_allclose(got.numpy(), sums - least, atol=1e-9)
+
+
+def test_ceiling_bounds_how_long_the_sum_takes_to_come_down() -> None:
+    rule = Cusum(drift=0.5, evidence=0.5, ceiling=10.0)
+    statistic = scan(rule, torch.cat([torch.full((200,), 5.0), torch.zeros(60)]))
+    assert float(statistic.max()) == 10.0
+    assert int((statistic[200:] > 0).sum()) == 39  # 10 / 0.25, and the last of them is 0
+
+
+# ----------------------------------------------------------------------------------- as plain data
+@RULE
+def test_survives_json(rule: Rule) -> None:
+    plain = json.loads(json.dumps(rule.to_dict(), allow_nan=False))
+    assert rule_from_dict(plain) == rule
+    assert type(rule_from_dict(plain)) is RULES[rule.name]
+
+
+@pytest.mark.parametrize(
+    ("plain", "said"),
+    [
+        ({"name": "viterbi"}, "no sequential rule is called 'viterbi'; there are k_of_n, "),
+        ({}, "no sequential rule is called None"),
+        ({"name": "k_of_n", "k": 2}, "do not fit.*'n'"),
+        ({"name": "cusum", "drift": 0, "slope": 1}, "do not fit.*'slope'"),
+        ({"name": "bayes"}, "no sequential rule is called 'bayes'; there are k_of_n, cusum"),
+        ({"name": "k_of_n", "k": 4, "n": 3}, "k=4 and n=3"),
+    ],
+)
+def test_no_such_rule(plain: dict, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as error:
+        rule_from_dict(plain)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: KOfN(0, 3), "between 1 and n, got k=0"),
+        (lambda: KOfN(4, 3), "between 1 and n, got k=4"),
+        (lambda: Cusum(evidence=1.1), r"evidence must lie in \(0, 1\], got 1.1"),
+        (lambda: Cusum(drift=math.inf), "drift must be finite"),
+        (lambda: Cusum(ceiling=0.0), "ceiling must be positive"),
+        (lambda: Cusum(ceiling=math.nan), "ceiling must be positive"),
+    ],
+)
+def test_numbers_that_make_no_rule(make: Callable[[], Rule], said: str) -> None:
+    with pytest.raises(ValueError, match=said) as error:
+        make()
+    assert "\n" not in str(error.value)
+
+
+@RULE
+def test_a_state_of_other_streams_is_refused(rule: Rule) -> None:
+    state = rule.start(torch.zeros(3))
+    with pytest.raises(ValueError, match=r"expected llr \[\*, T\].*got \(2, 7\)"):
+        rule.scan(torch.zeros(2, 7), state)
+    with pytest.raises(ValueError, match="expected llr"):
+        rule.scan(torch.tensor(1.0), state)
+
+
+# ===================================================================================== the latch
+PLAIN = {"rearm": 1, "refractory": 0}
+
+
+def by_hand(
+    values: list[float], threshold: float, rearm: int, refractory: int
+) -> tuple[list[bool], list[bool]]:
+    """The definition, by the times of what happened and no counters."""
+    last_alarm, last_not_low, armed = -math.inf, -math.inf, True
+    alarms, standing = [], []
+    for t, value in enumerate(values):
+        if value >= threshold:
+            last_not_low = t
+        if not armed and t - last_not_low >= max(rearm, 1):
+            armed = True
+        alarm = armed and value >= threshold and t - last_alarm >= refractory
+        if alarm:
+            armed, last_alarm = False, t
+        alarms.append(alarm)
+        standing.append(not armed)
+    return alarms, standing
+
+
+def raised(values: list[float], threshold: float = 1.0, **how) -> list[int]:
+    """The numbers of the decisions that raise an alarm."""
+    statistic = torch.tensor(values)
+    state = latch_start(statistic[0])
+    return latch(statistic, threshold, **{**PLAIN, **how}, state=state)[0].nonzero()[:, 0].tolist()
+
+
+def drawn(seed: int) -> list[int]:
+    """Whole numbers, so that a statistic meets a threshold exactly, and often."""
+    source = np.random.default_rng(seed)
+    return source.integers(-4, 5, size=source.integers(1, 61)).tolist()
+
+
+drawn_values = st.integers(0, 2**40).map(drawn)  # hypothesis draws short plain lists
+drawn_times = st.fixed_dictionaries(
+    {
+        "rearm": st.integers(0, 5),
+        "refractory": st.integers(0, 9),
+    }
+)
+
+
+# --------------------------------------------------------------------------------- the definition
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("copies", [1, 30])  # plain numbers and tensors
+@given(values=drawn_values, threshold=st.integers(-3, 4), how=drawn_times)
+def test_the_latch_equals_its_definition(dtype, copies, values, threshold, how) -> None:
+    statistic = torch.tensor(values, dtype=dtype).expand(copies, -1)
+    state = latch_start(statistic[:, 0])
+    is_alarm, is_on, _ = latch(statistic, float(threshold), **how, state=state)
+    alarms, standing = by_hand(values, threshold, **how)
+    assert is_alarm.tolist() == [alarms] * copies
+    assert is_on.tolist() == [standing] * copies
+    assert count_alarms(statistic, threshold, **how).tolist() == [sum(alarms)] * copies
+
+
+@pytest.mark.parametrize("num_rows", [1, 3, 12])
+@given(seed=st.integers(0, 2**20), cuts=st.lists(st.integers(0, 50), max_size=10), how=drawn_times)
+def test_any_cut_gives_the_same_alarms(num_rows, seed, cuts, how) -> None:
+    source = torch.Generator().manual_seed(seed)
+    statistic = torch.randint(-4, 5, (num_rows, 50), generator=source).float()
+    state = latch_start(statistic[:, 0])
+    *whole, end = latch(statistic, 1.0, **how, state=state)
+    pieces = []
+    for first, last in zip([0, *sorted(cuts)], [*sorted(cuts), 50], strict=True):
+        *piece, state = latch(statistic[:, first:last], 1.0, **how, state=state)
+        assert [part.shape for part in piece] == [(num_rows, last - first)] * 2
+        assert [part.dtype for part in piece] == [torch.bool] * 2
+        pieces.append(piece)
+    for k in range(2):
+        assert torch.equal(torch.cat([piece[k] for piece in pieces], -1), whole[k])
+    for got, expected in zip(state, end, strict=True):
+        assert torch.equal(got, expected)
+        assert got.dtype == expected.dtype
+
+
+@given(seed=st.integers(0, 2**20), where=st.integers(0, 49))
+def test_later_decisions_change_no_alarm_before(seed: int, where: int) -> None:
+    statistic = torch.randn(50, generator=torch.Generator().manual_seed(seed))
+    other = statistic.clone()
+    other[where:] = 100.0
+    state = latch_start(statistic[0])
+    for got, changed in zip(
+        latch(statistic, 0.5, rearm=2, refractory=3, state=state)[:2],
+        latch(other, 0.5, rearm=2, refractory=3, state=state)[:2],
+        strict=True,
+    ):
+        assert torch.equal(got[:where], changed[:where])
+
+
+# ----------------------------------------------------------------------------------- one by one
+def test_an_alarm_is_raised_once() -> None:
+    assert raised([0, 1, 2, 3, 2, 1, 1, 0, 0]) == [1]
+    assert raised([1, 0, 1, 0, 1]) == [0, 2, 4]
+
+
+def test_at_the_threshold_is_an_alarm_and_not_low() -> None:
+    assert raised([1.0], threshold=1.0) == [0]
+    assert raised([0.999], threshold=1.0) == []
+    assert raised([3, 3, 2.9, 3], threshold=3.0) == [0, 3]
+
+
+def test_rearming_takes_so_many_low_decisions_in_a_row() -> None:
+    dips = [2, 0, 2, 0, 0, 2, 0, 0, 0, 2]
+    assert raised(dips, rearm=1) == [0, 2, 5, 9]
+    assert raised(dips, rearm=2) == [0, 5, 9]
+    assert raised(dips, rearm=3) == [0, 9]
+    assert raised(dips, rearm=4) == [0]
+
+
+def test_zero_decisions_to_rearm_are_one() -> None:
+    assert raised([2, 2, 2, 0, 2], rearm=0) == [0, 4]
+
+
+def test_refractory_time_puts_an_alarm_off_and_does_not_lose_it() -> None:
+    assert raised([2, 0, 2, 0, 2, 0, 2], refractory=3) == [0, 4]
+    assert raised([2, 0, 2, 2, 2, 2], refractory=4) == [0, 4]
+    assert raised([2, 0, 2, 0], refractory=4) == [0]
+
+
+def test_status_ends_when_the_latch_is_armed_again() -> None:
+    statistic = torch.tensor([0.0, 2, 2, 0, 0, 0, 2])
+    _, is_on, state = latch(statistic, 1.0, rearm=2, refractory=0, state=latch_start(statistic[0]))
+    assert is_on.tolist() == [False, True, True, True, False, False, True]
+    assert [int(part) for part in state] == [1, 0, 0]
+
+
+def test_what_is_remembered() -> None:
+    statistic = torch.tensor([2.0, 0, 0, 0])
+    start = latch_start(statistic[0])
+    assert not start.is_on
+    state = latch(statistic, 1.0, rearm=9, refractory=0, state=start)[2]
+    assert (bool(state.is_on), int(state.below), int(state.since)) == (True, 3, 3)
+
+
+@pytest.mark.parametrize("copies", [1, 30])
+def test_what_is_no_number_is_neither_above_nor_below(copies: int) -> None:
+    statistic = torch.tensor([2, 0, math.nan, 0, 2, 0, 0, 2]).expand(copies, -1)
+    state = latch_start(statistic[:, 0])
+    is_alarm = latch(statistic, 1.0, rearm=2, refractory=0, state=state)[0]
+    assert is_alarm[0].nonzero()[:, 0].tolist() == [0, 7]
+    infinite = torch.tensor([-math.inf, math.inf, -math.inf, math.inf]).expand(copies, -1)
+    assert count_alarms(infinite, 1e30, **PLAIN).tolist() == [2] * copies
+    assert count_alarms(infinite, math.inf, **PLAIN).tolist() == [2] * copies
+
+
+# ------------------------------------------------------------------------------------- shapes
+def test_thresholds_broadcast_against_streams(rng: np.random.Generator) -> None:
+    statistic = torch.from_numpy(rng.standard_normal((5, 80)))
+    levels = torch.tensor([-0.5, 0.0, 0.7, 1.5])
+    how = {"rearm": 2, "refractory": 4}
+    state = latch_start(torch.zeros(4, 5))
+    is_alarm, is_on, end = latch(statistic, levels[:, None], **how, state=state)
+    assert is_alarm.shape == is_on.shape == (4, 5, 80)
+    assert end.is_on.shape == (4, 5)
+    # a state of the streams alone is spread over the thresholds
+    again = latch(statistic, levels[:, None], **how, state=latch_start(statistic[:, 0]))[0]
+    assert torch.equal(again, is_alarm)
+    for g, level in enumerate(levels.tolist()):
+        for r, row in enumerate(statistic):
+            alone, on, after = latch(row, level, **how, state=latch_start(row[0]))
+            assert torch.equal(alone, is_alarm[g, r])
+            assert torch.equal(on, is_on[g, r])
+            assert [int(part) for part in after] == [int(part[g, r]) for part in end]
+    counts = count_alarms(statistic, levels[:, None], **how)
+    assert torch.equal(counts, is_alarm.sum(-1))
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 0), (2, 30)])
+def test_no_decision_leaves_the_state(shape: tuple[int, ...]) -> None:
+    state = Latch(torch.ones(shape, dtype=torch.bool), torch.full(shape, 3), torch.full(shape, 5))
+    is_alarm, is_on, after = latch(torch.zeros(*shape, 0), 1.0, **PLAIN, state=state)
+    assert is_alarm.shape == is_on.shape == (*shape, 0)
+    assert is_alarm.dtype == is_on.dtype == torch.bool
+    assert all(torch.equal(a, b) for a, b in zip(state, after, strict=True))
+    assert (
+        count_alarms(torch.zeros(*shape, 0), 1.0, **PLAIN).tolist() == torch.zeros(shape).tolist()
+    )
+
+
+def test_no_stream_is_no_trouble() -> None:
+    statistic = torch.zeros(0, 7)
+    is_alarm, is_on, state = latch(statistic, 1.0, **PLAIN, state=latch_start(statistic[:, 0]))
+    assert is_alarm.shape == is_on.shape == (0, 7)
+    assert state.since.shape == (0,)
+
+
+@pytest.mark.parametrize("num_rows", [2, 40])
+def test_inputs_stay_as_they_are(num_rows: int) -> None:
+    statistic = torch.randn(num_rows, 20, generator=torch.Generator().manual_seed(1))
+    statistic.requires_grad_()
+    state = latch_start(statistic[:, 0])
+    before = [part.clone() for part in (statistic, *state)]
+    is_alarm, _, _ = latch(statistic, 0.0, rearm=2, refractory=3, state=state)
+    assert all(torch.equal(a, b) for a, b in zip(before, (statistic, *state), strict=True))
+    assert not is_alarm.requires_grad
+    strided = torch.stack([statistic, statistic + 1], dim=-1)[..., 0]
+    again = latch(strided, 0.0, rearm=2, refractory=3, state=state)[0]
+    assert torch.equal(again, is_alarm)
+
+
+def test_threshold_counts_in_the_dtype_of_the_statistic() -> None:
+    # 0.1 in float32 is above 0.1; the statistic is that very number
+    assert raised([0.1], threshold=0.1) == [0]
+
+
+def test_on_the_device_of_the_statistic(device: torch.device) -> None:
+    statistic = torch.tensor([0.0, 2, 0, 2], device=device).expand(12, -1)
+    for rows in (statistic, statistic[:2]):
+        state = latch_start(rows[:, 0])
+        is_alarm, is_on, state = latch(rows, 1.0, **PLAIN, state=state)
+        assert {x.device.type for x in (is_alarm, is_on, *state)} == {device.type}
+
+
+@pytest.mark.parametrize("wrong", [{"rearm": -1}, {"refractory": -2}])
+def test_negative_settings_are_refused(wrong: dict) -> None:
+    statistic = torch.zeros(3)
+    with pytest.raises(ValueError, match="must not be negative") as error:
+        latch(statistic, 1.0, **{**PLAIN, **wrong}, state=latch_start(statistic[0]))
+    assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match="must not be negative"):
+        count_alarms(statistic, 1.0, **{**PLAIN, **wrong})
+
+
+def test_skipped_decisions_count_as_low_ones() -> None:
+    values = [2.0, 0, 0, 0, 2, 0, 2, 2]
+    kept, skipped = torch.tensor([2.0, 2, 2, 2]), torch.tensor([0, 3, 1, 0])
+    for rearm in range(6):
+        for refractory in range(9):
+            how = {"rearm": rearm, "refractory": refractory}
+            expected = sum(by_hand(values, 1.0, **how)[0])
+            assert int(count_alarms(kept, 1.0, **how, skipped=skipped)) == expected

@@ -1,0 +1,419 @@
+"""Rates with intervals, and the threshold for a target, against brute force and fresh streams."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chi2
+from test_rules import by_hand, drawn_times, drawn_values
+from torch import Tensor
+
+from tactslip_torch.onset import thresholds
+from tactslip_torch.onset.rules import Cusum, KOfN, Rule
+from tactslip_torch.onset.thresholds import (
+    AlarmRate,
+    alarm_counts,
+    alarm_rate,
+    choose_threshold,
+    poisson_interval,
+)
+
+PLAIN = {"rearm": 1, "refractory": 0}
+RAW = KOfN(1, 1)  # the statistic is the ratio
+
+
+# ---------------------------------------------------------------------------- the Poisson interval
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 10, 37, 200, 5000, 100_000])
+@pytest.mark.parametrize("level", [0.5, 0.95, 0.999])
+def test_poisson_interval_is_that_of_chi_square(count: int, level: float) -> None:
+    tail = (1 - level) / 2
+    low = chi2.ppf(tail, 2 * count) / 2 if count else 0.0
+    high = chi2.isf(tail, 2 * count + 2) / 2
+    assert poisson_interval(count, level) == pytest.approx((low, high), rel=1e-9, abs=1e-300)
+
+
+def test_poisson_interval_between_whole_counts() -> None:
+    expected = chi2.ppf(0.025, 5) / 2, chi2.isf(0.025, 7) / 2
+    assert poisson_interval(2.5) == pytest.approx(expected, rel=1e-9)
+
+
+def test_no_alarm_in_an_hour_leaves_three_point_seven_possible() -> None:
+    found = alarm_rate([0, 0], [0.5, 0.5])
+    assert (found.alarms, found.per_hour, found.low) == (0, 0, 0)
+    assert found.high == pytest.approx(math.log(40))  # exp(-high) = 0.025
+
+
+@pytest.mark.parametrize(("count", "level"), [(-1, 0.95), (math.inf, 0.9), (1, 0.0), (1, 1.0)])
+def test_poisson_interval_of_nonsense(count: float, level: float) -> None:
+    with pytest.raises(ValueError, match=r"must not be negative|must lie between"):
+        poisson_interval(count, level)
+
+
+# ------------------------------------------------------------------------------------ the rate
+def test_rate_is_alarms_by_hours() -> None:
+    found = alarm_rate(torch.tensor([3, 0, 1]), torch.tensor([0.5, 1.0, 0.5]), level=0.9)
+    assert (found.alarms, found.hours, found.per_hour, found.level) == (4, 2.0, 2.0, 0.9)
+    assert 0 < found.low < 2 < found.high
+
+
+def test_one_recording_has_the_poisson_interval() -> None:
+    found = alarm_rate([7], [2.0])
+    assert (2 * found.low, 2 * found.high) == pytest.approx(poisson_interval(7))
+
+
+def test_recordings_that_agree_do_not_narrow_the_interval() -> None:
+    found = alarm_rate([2] * 20, [1.0] * 20)
+    assert (20 * found.low, 20 * found.high) == pytest.approx(poisson_interval(40))
+
+
+def bootstrap(counts: np.ndarray, hours: np.ndarray, level: float) -> np.ndarray:
+    source = np.random.default_rng(5)
+    drawn = source.integers(len(counts), size=(20_000, len(counts)))
+    return np.quantile(
+        counts[drawn].sum(1) / hours[drawn].sum(1), [(1 - level) / 2, (1 + level) / 2]
+    )
+
+
+def test_interval_holds_the_bootstrap_and_that_of_clusters() -> None:
+    # in ten recordings all alarms, in ninety none
+    counts = np.array([12, 9, 1, 30, 5, 8, 14, 3, 2, 6] + [0] * 90)
+    hours = np.linspace(0.5, 1.5, 100)
+    found = alarm_rate(counts.tolist(), hours.tolist(), level=0.9)
+    drawn = bootstrap(counts, hours, 0.9)
+    total = counts.sum()
+    expected = total * hours / hours.sum()
+    size = ((counts - expected) ** 2).sum() / total * 100 / 99
+    low, high = chi2.ppf(0.05, 2 * total / size) / 2, chi2.isf(0.05, 2 * total / size + 2) / 2
+    assert found.low == pytest.approx(min(drawn[0], low * size / hours.sum()), rel=0.05)
+    assert found.high == pytest.approx(max(drawn[1], high * size / hours.sum()), rel=0.05)
+    assert found.high > 1.3 * poisson_interval(int(total), 0.9)[1] / hours.sum()
+
+
+def test_bootstrap_alone_sets_an_end_that_it_reaches_farther() -> None:
+    # short recordings full of alarms: which are drawn decides how long was watched
+    counts, hours = np.array([40, 40, 0, 0]), np.array([0.001, 0.001, 1.0, 1.0])
+    found = alarm_rate(counts.tolist(), hours.tolist())
+    assert found.high == pytest.approx(bootstrap(counts, hours, 0.95)[1], rel=0.01)
+    assert found.high == pytest.approx(40_000)  # four short ones, one time in sixteen
+
+
+def test_interval_by_seed_level_and_unit() -> None:
+    counts, hours = [0, 4, 1, 0, 9, 0], [1.0, 1.0, 2.0, 1.0, 1.5, 1.0]
+    found = alarm_rate(counts, hours, seed=3)
+    assert found == alarm_rate(counts, hours, seed=3)
+    wider = alarm_rate(counts, hours, level=0.99, seed=3)
+    assert wider.low < found.low < found.high < wider.high
+    halved = alarm_rate(counts, [2 * h for h in hours], seed=3)
+    assert (halved.per_hour, halved.low, halved.high) == pytest.approx(
+        (found.per_hour / 2, found.low / 2, found.high / 2)
+    )
+
+
+def test_recordings_not_watched_at_all_are_not_drawn() -> None:
+    found = alarm_rate([40, 40, 0, 0, 0], [0.001, 0.001, 1.0, 1.0, 0.0])
+    assert found.high == pytest.approx(40_000)  # drawn alone it would have no rate
+
+
+@pytest.mark.parametrize(
+    ("counts", "hours", "said"),
+    [
+        ([1, 2], [1.0], r"one count and one number of hours .* got \(2,\) and \(1,\)"),
+        ([[1]], [[1.0]], "one count and one number of hours"),
+        ([], [], "some time must have been watched, got 0 alarms in 0 h"),
+        ([0], [0.0], "some time must have been watched"),
+        ([-1, 3], [1.0, 1.0], "must not be negative"),
+        ([1, 3], [-1.0, 2.0], "must not be negative"),
+        ([1], [math.nan], "some time must have been watched"),
+    ],
+)
+def test_rate_of_nonsense(counts, hours, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as error:
+        alarm_rate(counts, hours)
+    assert "\n" not in str(error.value)
+
+
+def clustered(source: np.random.Generator, num: int, total: float, size: float) -> np.ndarray:
+    """Counts of recordings: clusters come by chance, each of a geometric number of alarms."""
+    clusters = source.poisson(total / size / num, num)
+    return np.array([source.geometric(1 / size, c).sum() if c else 0 for c in clusters])
+
+
+@pytest.mark.parametrize(
+    ("total", "size", "at_least"),
+    # nominal 0.95; measured with 1000 draws of another seed: 0.96, 0.95, 0.94, 0.88
+    [(60, 1, 0.93), (60, 3, 0.90), (60, 6, 0.88), (10, 3, 0.80)],
+)
+def test_coverage_on_clustered_streams(
+    total: int, size: int, at_least: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # 100 recordings of 6 minutes: 60 alarms of 20 clusters and so on. The last, of three clusters
+    # that were seen, is where any method without a model falls short, and says how far.
+    monkeypatch.setattr(thresholds, "_NUM_RESAMPLES", 400)
+    source = np.random.default_rng(total + size)
+    hours = torch.full((100,), 0.1)
+    drawn = [torch.from_numpy(clustered(source, 100, total, size)) for _ in range(150)]
+    found = [alarm_rate(counts, hours, seed=i) for i, counts in enumerate(drawn)]
+    true = total / 10
+    covered = np.mean([one.low <= true <= one.high for one in found])
+    assert covered >= at_least
+    # not by being vacuous: a normal interval that knows the clusters is so wide
+    known = 2 * 1.96 * math.sqrt(total * (2 * size - 1)) / 10
+    assert np.median([one.high - one.low for one in found]) < 1.4 * known
+    if size > 1:  # and Poisson's alone would not do
+        ends = [poisson_interval(int(counts.sum())) for counts in drawn]
+        assert np.mean([low <= total <= high for low, high in ends]) < covered - 0.1
+
+
+# ------------------------------------------------------------------------------- the threshold
+def smooth(noise: Tensor, memory: int) -> Tensor:
+    """Means over so many neighbours, of unit variance: ``[*, T + memory - 1] -> [*, T]``."""
+    sums = torch.nn.functional.pad(noise, (1, 0)).double().cumsum(-1)
+    return ((sums[..., memory:] - sums[..., :-memory]) / math.sqrt(memory)).float()
+
+
+def brute(statistics: list[list[float]], allowed: int, how: dict[str, int]) -> tuple[float, int]:
+    """The definition: every value tried, from the top, until one raises too many."""
+    values = {x for row in statistics for x in row}
+    top = max(values)
+    tried = sorted(values)
+    best, alarms = float(np.nextafter(np.float32(top), np.float32(np.inf))), 0
+    for threshold in reversed(tried):
+        found = sum(sum(by_hand(row, threshold, **how)[0]) for row in statistics)
+        if found > allowed:
+            break
+        best, alarms = threshold, found
+    return best, alarms
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_threshold_is_that_of_brute_force(seed: int) -> None:
+    # whole numbers, so that many values are equal
+    source = np.random.default_rng(seed)
+    lengths = source.integers(1, 26, size=source.integers(1, 5))
+    recordings = [source.integers(-3, 7, size=length).tolist() for length in lengths]
+    allowed = int(source.integers(0, 9))
+    how = {"rearm": int(source.integers(0, 5)), "refractory": int(source.integers(0, 7))}
+    statistics = [torch.tensor(row, dtype=torch.float32) for row in recordings]
+    hop_s = 3600 / sum(lengths)  # an hour in all
+    found = choose_threshold(statistics, RAW, hop_s, allowed + 0.5, **how)
+    assert (found.value, found.rate.alarms) == brute(recordings, allowed, how)
+    assert found.reached
+    assert found.target_per_hour == allowed + 0.5
+    assert found.rate.hours == pytest.approx(1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_threshold_in_long_streams(dtype: torch.dtype) -> None:
+    # alarms of some hundred decisions each, so that the search needs several passes
+    source = torch.Generator().manual_seed(0)
+    statistics = list(smooth(torch.randn(8, 4299, generator=source), 300).to(dtype))
+    how = {"rearm": 60, "refractory": 90}
+    hop_s, target = 3600 / 32_000, 40
+    found = choose_threshold(statistics, RAW, hop_s, target, **how)
+    top = torch.cat(statistics).max()
+    every = torch.cat(statistics).unique()
+    tried = every[(every >= found.value) & (every <= top)]
+    assert len(tried) > 1000
+    counts = alarm_counts(statistics, tried[:: len(tried) // 10], **how).sum(-1)
+    hours = sum(map(len, statistics)) * hop_s / 3600
+    assert bool((counts <= target * hours).all())
+    assert found.rate.per_hour <= target
+    below = every[every < found.value][-1:]
+    assert int(alarm_counts(statistics, below, **how).sum()) > target * hours
+
+
+def test_equal_values_are_one_threshold() -> None:
+    statistics = [torch.tensor([0.0, 5.0])] + [torch.tensor([0.0, 1.0])] * 11
+    found = choose_threshold(statistics, RAW, 150.0, 6, **PLAIN)
+    assert (found.value, found.rate.alarms) == (5, 1)
+
+
+def test_a_lower_threshold_with_fewer_alarms_is_not_taken() -> None:
+    # at 1 the two peaks are one alarm, at 2 two
+    statistics = [torch.tensor([0.0, 2, 1, 2, 0, 0, 0, 0])]
+    hop_s = 3600 / 8
+    assert alarm_counts(statistics, [1.0, 2.0], **PLAIN).tolist() == [[1], [2]]
+    found = choose_threshold(statistics, RAW, hop_s, 1, **PLAIN)
+    assert found.value == np.nextafter(np.float32(2), np.float32(3))
+    assert found.rate.alarms == 0
+
+
+@pytest.mark.parametrize("num", [3, 7, 11, 33, 66, 97, 333])
+def test_as_many_alarms_as_the_target_allows_to_the_last(num: int) -> None:
+    # single peaks, all different: a threshold at the k-th raises k
+    peaks = torch.arange(num * 10.0)
+    statistics = list(torch.stack([peaks + 1, -torch.ones_like(peaks)], -1).reshape(num, -1))
+    for allowed in (1, 3, 29):
+        target = allowed * 3600 / (num * 20 * 0.01)
+        found = choose_threshold(statistics, RAW, 0.01, target, **PLAIN)
+        assert (found.rate.alarms, found.value) == (allowed, num * 10 - allowed + 1)
+        assert found.rate.per_hour == pytest.approx(target)
+
+
+def test_too_few_hours_allow_none_and_say_what_that_proves() -> None:
+    source = torch.Generator().manual_seed(0)
+    statistics = [torch.randn(360, generator=source) for _ in range(10)]  # 36 s in all
+    found = choose_threshold(statistics, RAW, 0.01, 1.0, **PLAIN)
+    assert found.value > max(float(row.max()) for row in statistics)
+    assert (found.rate.alarms, found.reached) == (0, True)
+    assert found.rate.high == pytest.approx(math.log(40) / 0.01)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_constant_streams(dtype: torch.dtype) -> None:
+    statistics = [torch.full((50,), 0.3, dtype=dtype)] * 4
+    hop_s = 3600 / 200
+    found = choose_threshold(statistics, RAW, hop_s, 3, **PLAIN)  # each would raise one
+    assert found.value > float(statistics[0][0])
+    assert found.value == pytest.approx(0.3)
+    assert (found.rate.alarms, found.reached) == (0, True)
+    found = choose_threshold(statistics, RAW, hop_s, 4, **PLAIN)
+    assert (found.value, found.rate.alarms) == (float(statistics[0][0]), 4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_ceiling_that_is_too_low_is_said(dtype: torch.dtype) -> None:
+    rule = Cusum(ceiling=3.1)  # which is no float32
+    ceiling = float(torch.tensor(3.1, dtype=dtype))
+    llr = torch.tensor([5.0, -9, 5, -9, 5, -9, 5, -9, 1, -9, 1, -9], dtype=dtype)
+    statistics = [rule.scan(llr, rule.start(llr[0]))[0]] * 2
+    found = choose_threshold(statistics, rule, 3600 / 24, 7, **PLAIN)
+    assert (found.reached, found.value) == (False, ceiling)
+    assert (found.rate.alarms, found.rate.per_hour) == (8, 8)
+    found = choose_threshold(statistics, rule, 3600 / 24, 8, **PLAIN)  # itself a threshold
+    assert (found.reached, found.value, found.rate.alarms) == (True, ceiling, 8)
+
+
+def test_calibration_may_set_a_ceiling_that_the_rule_does_not_know() -> None:
+    statistics = [torch.tensor([2.0, 0, 2, 0, 1, 0])]
+    found = choose_threshold(statistics, RAW, 600.0, 1, **PLAIN, ceiling=2.0)
+    assert (found.value, found.reached, found.rate.alarms) == (2.0, False, 2)
+    found = choose_threshold(statistics, RAW, 600.0, 1, **PLAIN, ceiling=4.0)
+    assert found.reached
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_busy_streams_of_which_not_all_is_tried(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    # in one of the eight what was tried misleads, and the count at the value found mends it
+    source = torch.Generator().manual_seed(seed)
+    statistics = list(torch.randn(6, 500, generator=source).cumsum(-1))
+    args = (statistics, RAW, 3600 / 3000, 40)
+    exact = choose_threshold(*args, rearm=2, refractory=3)
+    monkeypatch.setattr(thresholds, "_WORK", 1)
+    monkeypatch.setattr(thresholds, "_FEWEST", 64)
+    found = choose_threshold(*args, rearm=2, refractory=3)
+    assert found.rate.alarms <= 40
+    assert found.value == pytest.approx(exact.value, abs=5)  # of a range of about 60
+
+
+def test_statistics_stay_as_they_are() -> None:
+    statistics = [torch.randn(99, generator=torch.Generator().manual_seed(0)) for _ in range(2)]
+    before = [row.clone() for row in statistics]
+    first = choose_threshold(statistics, RAW, 1.0, 200, **PLAIN)
+    assert first == choose_threshold(statistics, RAW, 1.0, 200, **PLAIN)
+    assert all(torch.equal(a, b) for a, b in zip(before, statistics, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("statistics", "hop_s", "target", "said"),
+    [
+        ([], 0.01, 1.0, "no decision to count alarms in; give at least one recording"),
+        ([torch.zeros(0)], 0.01, 1.0, "no decision to count alarms in"),
+        ([torch.tensor([math.nan])], 0.01, 1.0, "recording 0 must be a row of finite numbers"),
+        ([torch.zeros(3)], 0.0, 1.0, "hop_s must be positive, got 0.0"),
+        ([torch.zeros(3)], 0.01, 0.0, "false_alarms_per_hour must be positive, got 0.0"),
+        ([torch.zeros(3)], 0.01, math.nan, "false_alarms_per_hour must be positive"),
+    ],
+)
+def test_what_no_threshold_can_be_set_on(statistics, hop_s, target, said: str) -> None:
+    with pytest.raises(ValueError, match=said) as error:
+        choose_threshold(statistics, RAW, hop_s, target, **PLAIN)
+    assert "\n" not in str(error.value)
+
+
+# ------------------------------------------------------------------------- counts in recordings
+@given(
+    recordings=st.lists(drawn_values, min_size=1, max_size=4),
+    threshold=st.integers(-3, 5),
+    how=drawn_times,
+)
+def test_counts_in_recordings_are_those_of_the_latch(recordings, threshold: int, how) -> None:
+    statistics = [torch.tensor(row, dtype=torch.float32) for row in recordings]
+    counts = alarm_counts(statistics, [float(threshold), float(threshold) - 1], **how)
+    assert counts.dtype == torch.int64
+    assert counts.tolist() == [
+        [sum(by_hand(row, level, **how)[0]) for row in recordings]
+        for level in (threshold, threshold - 1)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_counts_in_long_sparse_recordings(seed: int) -> None:
+    # alarms whose memory reaches over many decisions that were left out
+    source = torch.Generator().manual_seed(seed)
+    statistics = [torch.randn(num, generator=source).double() for num in (3000, 1, 0, 2500)]
+    how = {"rearm": 12, "refractory": 30}
+    levels = [1.5, 2.2, 2.8, 9.0]
+    counts = alarm_counts(statistics, levels, **how)
+    assert counts.tolist() == [
+        [sum(by_hand(row.tolist(), level, **how)[0]) for row in statistics] for level in levels
+    ]
+    assert counts[0].sum() > 50  # something was counted
+
+
+@pytest.mark.parametrize(
+    ("statistics", "said"),
+    [
+        ([], "no decision to count alarms in"),
+        ([torch.zeros(0)], "no decision to count alarms in"),
+        ([torch.zeros(2), torch.zeros(2, 3)], r"recording 1 must be a row .* got shape \(2, 3\)"),
+        ([torch.tensor([0.0, math.nan])], "recording 0 must be a row of finite numbers"),
+        ([torch.tensor([0.0, math.inf])], "recording 0 must be a row of finite numbers"),
+    ],
+)
+def test_what_is_no_recording_is_refused(statistics: list[Tensor], said: str) -> None:
+    with pytest.raises(ValueError, match=said) as error:
+        alarm_counts(statistics, [1.0], **PLAIN)
+    assert "\n" not in str(error.value)
+
+
+def test_no_threshold_gives_no_row() -> None:
+    assert alarm_counts([torch.zeros(3)], [], **PLAIN).shape == (0, 1)
+
+
+# ------------------------------------------------------------------------------- fresh streams
+HOW = {"rearm": 5, "refractory": 20}
+
+
+@pytest.mark.parametrize(
+    ("rule", "memory"),
+    [
+        (RAW, 1),
+        (RAW, 10),
+        (Cusum(0.0, 0.2, 40.0), 10),
+    ],
+    ids=str,
+)
+def test_fresh_streams_have_the_target_rate(rule: Rule, memory: int) -> None:
+    # 30 recordings of 20 s to choose on and 30 fresh ones, 40 times over; a decision shares what it
+    # saw with ``memory`` neighbours. Ten alarms are allowed, so the threshold as well as the fresh
+    # count have some 3 of noise: the interval of a fresh count need not hold the target in 95 of
+    # 100, and was seen to in 88 to 93, with means of 59 to 66 an hour.
+    source = torch.Generator().manual_seed(memory)
+    llr = 2 * smooth(torch.randn(40, 60, 1999 + memory, generator=source), memory) - 2
+    statistics, _ = rule.scan(llr, rule.start(llr[..., 0]))
+    fresh: list[AlarmRate] = []
+    for chosen_on, others in zip(statistics[:, :30], statistics[:, 30:], strict=True):
+        found = choose_threshold(list(chosen_on), rule, 0.01, 60.0, **HOW)
+        assert found.reached
+        assert found.rate.alarms <= 10
+        counts = alarm_counts(list(others), [found.value], **HOW)
+        fresh.append(alarm_rate(counts[0], torch.full((30,), 20 / 3600)))
+    assert sum(one.low <= 60 <= one.high for one in fresh) >= 30
+    mean = np.mean([one.per_hour for one in fresh])
+    assert mean == pytest.approx(60, abs=13)  # a standard error is 60 sqrt(2 / 10 / 40) = 4
