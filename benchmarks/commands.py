@@ -19,19 +19,19 @@ from benchmarks.reproduction.runs import code_digest
 from tactslip_torch.runtime import whole_file
 
 
-def result_of(module: str, overrides: Sequence[str], folder: Path, name: str) -> dict[str, Any]:
-    """The JSON file ``name`` that ``python -m tactslip_torch.module`` leaves in the folder.
+def result_of(command: str, overrides: Sequence[str], folder: Path, name: str) -> dict[str, Any]:
+    """The JSON file ``name`` that ``tactslip COMMAND`` leaves in the folder.
 
     Raises:
         RuntimeError: if the command fails, which has said why.
     """
     made_by, note = " ".join([code_digest(), *overrides]), folder / "made_by.txt"
     if not note.exists() or note.read_text(encoding="utf-8") != made_by:
-        command = [sys.executable, "-m", f"tactslip_torch.{module}", *overrides]
-        command.append(f"hydra.run.dir='{folder}'")
-        say(" ".join(command[1:]))
-        if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
-            raise RuntimeError(f"tactslip_torch.{module} failed; see above")
+        given = ["-m", "tactslip_torch", command, *overrides, f"hydra.run.dir='{folder}'"]
+        say(" ".join(given))
+        done = subprocess.run([sys.executable, *given], stdout=subprocess.DEVNULL, check=False)
+        if done.returncode:
+            raise RuntimeError(f"tactslip {command} failed; see above")
         write_text(note, made_by)
     found: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
     return found

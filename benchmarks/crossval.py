@@ -1,8 +1,6 @@
 """Recipes on every choice of held-out materials: ``python -m benchmarks.crossval [key=value ...]``.
 
-Runs ``python -m tactslip_torch.crossval`` and puts its tables into README.md. With
-``python -m benchmarks.crossval '~recipes.paper' '~recipes.robust'`` the general recipe alone, which
-takes longest, has a table of its own there.
+Runs ``tactslip crossval`` and puts its tables into README.md.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from tactslip_torch.report.crossval import material_rows, split_rows
 
 @dataclass(frozen=True)
 class Sizes:
-    """Overrides of ``tactslip_torch.crossval``, before those of the command line."""
+    """Overrides of ``tactslip crossval``, before those of the command line."""
 
     overrides: tuple[str, ...] = ()
 
@@ -66,8 +64,8 @@ class Crossval(Benchmark[Sizes]):
 
     def section(self, report: Report) -> str:
         """The tables alone: README.md says the rest."""
-        shown = " ".join(f"'{each}'" for each in report["overrides"])
-        command = f"`python -m benchmarks.crossval {shown}`".replace(" `", "`")
+        shown = [f"'{each}'" for each in report["overrides"]]
+        command = f"`{' '.join([f'python -m benchmarks.{self.name}', *shown])}`"
         tables = [table.markdown() for table in self.tables(report["numbers"]).values()]
         kind = "Simulated" if report["simulated"] else "Recorded"
         return "\n\n".join([f"{kind} ({command}, code {report['code']}):", *tables])

@@ -517,7 +517,10 @@ class Benchmark(ABC, Generic[S]):
         if given.render:
             if not path.exists():
                 parser.error(f"--render needs {path}; leave --render out, which measures")
-            self.publish(json.loads(path.read_text(encoding="utf-8")), folder)
+            report = json.loads(path.read_text(encoding="utf-8"))
+            if "numbers" not in report:
+                parser.error(f"{path} was kept by earlier code; leave --render out, which measures")
+            self.publish(report, folder)
             return 0
         runs = (folder / "runs" if given.quick else outputs) / self.name
         sizes = self.quick if given.quick else self.sizes

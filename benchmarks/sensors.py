@@ -1,6 +1,6 @@
 """Which sensors matter: ``python -m benchmarks.sensors [key=value ...]``.
 
-Trains ``+exp=unseen4`` and runs ``python -m tactslip_torch.sensors`` on it with features selected
+Trains ``+exp=unseen4`` and runs ``tactslip importance`` on it with features selected
 anew in both ways, by the recipe's ranking and as many of each channel.
 """
 
@@ -26,7 +26,7 @@ from tactslip_torch.report.sensors import (
 
 @dataclass(frozen=True)
 class Sizes:
-    """Overrides of the training and of ``tactslip_torch.sensors``."""
+    """Overrides of the training and of ``tactslip importance``."""
 
     training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
     overrides: tuple[str, ...] = ()
@@ -55,7 +55,7 @@ class Sensors(Benchmark[Sizes]):
         for way in ANEW_WORDS:
             overrides = [f"model={detector / 'detector.pt'}", f"anew={way}"]
             overrides += [*job.sizes.overrides, *job.overrides]
-            found[way] = result_of("sensors", overrides, job.folder / way, "sensors.json")
+            found[way] = result_of("importance", overrides, job.folder / way, "sensors.json")
         return {"ways": found, "folder": str(job.folder / next(iter(ANEW_WORDS)))}
 
     def tables(self, numbers: Report) -> dict[str, Table]:

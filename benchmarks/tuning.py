@@ -18,7 +18,6 @@ from benchmarks.reproduction.runs import run
 LEARNED = {
     "C and c": "[penalty,offset]",
     "C, c and scales": "[penalty,offset,scales]",
-    "C, c, scales and filters": "[penalty,offset,scales,smoothing,wavelet]",
 }
 GRID = {"recipe": "grid, by balanced accuracy", "grid": "grid, by loss"}
 
