@@ -191,10 +191,10 @@ def _thresholds(
             found = thresholds(held[left_out], sample.is_slip, unit, coverage)
             yield way, coverage, found.low, found.high
         reach = math.log(coverage / (1 - coverage))
-        ends = [-math.inf, math.inf]
+        low, high = -math.inf, math.inf
         if platt.slope:
-            ends = [(side * reach - platt.offset) / platt.slope for side in (-1, 1)]
-        yield "probability threshold", coverage, *ends
+            low, high = ((side * reach - platt.offset) / platt.slope for side in (-1, 1))
+        yield "probability threshold", coverage, low, high
         yield "never abstaining", coverage, 0.0, 0.0
 
 

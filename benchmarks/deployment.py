@@ -270,13 +270,15 @@ def _streams(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str
     scores = {}
     for precision in PRECISIONS:
         dtype = DTYPES[precision]
-        for name, make in {
-            f"onnxruntime, {precision}": partial(StreamSession, folder / precision / "stream.onnx"),
+        file = folder / precision / "stream.onnx"
+        ways: dict[str, Callable[[], Any]] = {
+            f"onnxruntime, {precision}": partial(StreamSession, file),
             f"tactslip_torch, {precision}": partial(
                 StreamingDetector, main.detector(dtype), dtype=dtype
             ),
-        }.items():
-            watched: Any = make()
+        }
+        for name, make in ways.items():
+            watched = make()
             each = [_scores_of(watched.push(piece)) for piece in np.array_split(part, 20)]
             scores[name] = np.concatenate(each)
             pushes[name] = make().push

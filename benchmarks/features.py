@@ -146,8 +146,8 @@ def feature_error(found: Tensor, reference: Tensor) -> float:
 
 
 def _extractor(dtype: torch.dtype) -> FeatureExtractor:
-    arithmetic = "native" if dtype == FLOAT32 else "double"
-    return FeatureExtractor(FeaturePool(HAND, arithmetic=arithmetic))
+    pool = FeaturePool(HAND, arithmetic="native" if dtype == FLOAT32 else "double")
+    return FeatureExtractor(pool)
 
 
 def _looped(bin_: Any, names: Any) -> Any:

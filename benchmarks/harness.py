@@ -323,7 +323,8 @@ def bars(
         places = [place + height * (step - (len(series) - 1) / 2) for place in range(len(names))]
         shown = [(place, of) for place, of in zip(places, values, strict=True) if of is not None]
         color = COLORS[step % len(COLORS)]
-        axes.barh(*zip(*shown, strict=True), color=color, height=0.9 * height, label=label)
+        at, widths = [place for place, _ in shown], [value for _, value in shown]
+        axes.barh(at, widths, color=color, height=0.9 * height, label=label)
         for place, value in shown:
             axes.annotate(
                 number(value), (value, place), (3, 0), textcoords="offset points", va="center",

@@ -10,6 +10,7 @@ import gc
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -187,7 +188,7 @@ def _naive(detector: SlipDetector, samples: Array, hop: int) -> Callable[[], Any
     whole = torch.from_numpy(samples.T.copy())
     length = detector.context_before + detector.pool.bin_samples + detector.context_after
     starts = range(0, whole.shape[-1] - length, hop)
-    each = iter(list(starts) * 1000)
+    each = cycle(starts)
     return lambda: detector.judge_raw(whole[None, :, (at := next(each)) : at + length])
 
 
@@ -203,7 +204,7 @@ def _times(row: Report) -> Spread:
 def _growth_mb(numbers: Report) -> float:
     memory = numbers["memory"]
     looks = zip(memory["at_s"], memory["resident_bytes"], strict=True)
-    settled = [resident for at_s, resident in looks if at_s >= numbers["settled_s"]]
+    settled: list[float] = [resident for at_s, resident in looks if at_s >= numbers["settled_s"]]
     return (max(settled) - settled[0]) / 1e6
 
 

@@ -254,11 +254,8 @@ def small_recipe(
     config: DictConfig, train_bins: int, num_features: int, penalties: Sequence[float] = ()
 ) -> Recipe:
     """The default recipe on a sample of bins."""
-    recipe = replace(
-        instantiate(config.recipes.robust, _convert_="all"),
-        sample_bins=train_bins,
-        num_features=num_features,
-    )
+    whole: Recipe = instantiate(config.recipes.robust, _convert_="all")
+    recipe = replace(whole, sample_bins=train_bins, num_features=num_features)
     return replace(recipe, penalties=tuple(penalties)) if penalties else recipe
 
 

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 SUBJECTS = [
     path.stem
     for path in sorted((ROOT / "benchmarks").glob("*.py"))
-    if "Benchmark" in path.read_text(encoding="utf-8") and path.stem != "harness"
+    if "(Benchmark[Sizes])" in path.read_text(encoding="utf-8")
 ]
 """Benchmarks of the harness, one a file; ``crossval_general`` is another's."""
 OTHERS = {

@@ -193,8 +193,8 @@ class Reproduction(Benchmark[Sizes]):
                 for fold, color in zip(FOLDS, (PEER, OURS), strict=True):
                     for place, scene in enumerate(scenes):
                         values = list(scene_recalls(runs, fold, role, scene).values())
-                        label = f"trained on {FOLDS[fold]}" if place == 0 else None
-                        axes.plot(values, [place] * len(values), "o", color=color, label=label)
+                        words = f"trained on {FOLDS[fold]}" if place == 0 else None
+                        axes.plot(values, [place] * len(values), "o", color=color, label=words)
                 axes.set_xlabel(f"mean recall of the classes there are, %, {role}")
                 axes.grid(axis="x", color=LIGHT)
             panels[0].set_yticks(range(len(scenes)), scenes, fontsize=8)

@@ -221,6 +221,7 @@ def _strokes(runs: Runs) -> Table:
 def _ablations(runs: Runs) -> Table:
     """With a part of the signals or of the scene, and the best pooled number with a threshold."""
     rows = []
+    ways: list[tuple[str, str, str | None]]
     ways = [(name, words, None) for name, words in ABLATIONS.items() if name in runs]
     if "unseen4" in runs:
         ways.insert(1, ("unseen4", "the best single pooled number with a threshold", POOLED))
