@@ -1,1 +1,6 @@
-"""What is timed, and the scripts that print the tables; run from a checkout, not installed."""
+"""What is timed and compared, one file a subject; run from a checkout, not installed."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"

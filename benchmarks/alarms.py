@@ -1,89 +1,76 @@
-"""One false alarm an hour, kept or not: ``python -m benchmarks.alarms``.
+"""One false alarm an hour, asked for and kept: ``python -m benchmarks.alarms [key=value ...]``.
 
-Runs ``python -m tactslip_torch.train +exp=onset`` unless a run is given or this code has made it,
-keeps its numbers and figures in ``benchmarks/results``, and puts the tables between the markers in
-README.md.
+Runs ``python -m tactslip_torch.train +exp=onset`` and puts its tables into README.md.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import subprocess
-import sys
-from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.crossval import markdown
-from benchmarks.outcome import RESULTS, ROOT, between_markers
-from tactslip_torch.features.cache import source_digest
-from tactslip_torch.report.results import (
-    alarm_figure,
-    events_figure,
-    kept_rows,
-    promise_line,
-    reliability_figure,
-    scene_rows,
-)
-from tactslip_torch.runtime import whole_file
+from matplotlib.figure import Figure
 
-COMMAND = "python -m benchmarks.alarms"
-MARKER = "onset"
+from benchmarks.commands import result_of, table_of, take_figures
+from benchmarks.harness import Benchmark, Job, Report, Table
+from benchmarks.onset import QUICK_STREAMS, QUICK_TRAINING
+from tactslip_torch.report.results import kept_rows, promise_line, scene_rows
+
 _KEPT = ("simulated", "experiment", "seed", "versions", "events", "alarm")
 
 
-def text_of(metrics: Mapping[str, Any]) -> str:
-    """What README says of a run.
+@dataclass(frozen=True)
+class Sizes:
+    """Overrides of ``tactslip_torch.train``, before those of the command line."""
 
-    Args:
-        metrics: the content of ``metrics.json``, with ``alarm``.
-    """
-    kind = "Simulated" if metrics["simulated"] else "Recorded"
-    settings = metrics["alarm"]["settings"]
-    hop_ms = 1e3 * settings["hop_samples"] / metrics["alarm"]["sample_rate_hz"]
-    lines = [
-        f"{kind}, seed {metrics['seed']}, a decision every {hop_ms:g} ms (`{COMMAND}`); "
-        f"{promise_line(metrics)}:",
-        markdown(kept_rows(metrics)),
-        "Scenes that fool, by the same threshold; the methods to the right by theirs:",
-        markdown(scene_rows(metrics)),
-    ]
-    return "\n\n".join(lines)
+    overrides: tuple[str, ...] = ("+exp=onset",)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point."""
-    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument("--run", type=Path, help="folder of a run of +exp=onset that is there")
-    parser.add_argument("overrides", nargs="*", help="passed on, such as onset.hours=1")
-    options = parser.parse_args(arguments)
-    run = options.run or ROOT / "outputs" / "onset" / "benchmark"
-    if options.run is None:
-        made_by = run / "code.txt"
-        code = " ".join([source_digest(ROOT / "tactslip_torch"), *options.overrides])
-        if not made_by.exists() or made_by.read_text() != code:
-            command = [sys.executable, "-m", "tactslip_torch.train", "+exp=onset"]
-            command += [*options.overrides, f"hydra.run.dir={run}"]
-            done = subprocess.run(command, check=False)
-            if done.returncode:
-                raise SystemExit(done.returncode)
-            made_by.write_text(code)
-    found = json.loads((run / "metrics.json").read_text())
-    metrics = {key: found[key] for key in _KEPT}
-    with whole_file(RESULTS / "alarms.json") as temporary:
-        temporary.write_text(json.dumps(metrics) + "\n")
-    alarm_figure(metrics, RESULTS / "alarms.png")
-    streams = {role: own for role, own in metrics["events"].items() if role.endswith("stream")}
-    events_figure({**metrics, "events": streams}, RESULTS / "alarms_delay.png")
-    reliability = metrics["alarm"]["reliability"]
-    reliability_figure(
-        reliability, RESULTS / "alarms_reliability.png", simulated=metrics["simulated"]
+class Alarms(Benchmark[Sizes]):
+    """The alarm of ``+exp=onset``."""
+
+    name = "alarms"
+    title = "Alarms"
+    about = "false alarms an hour, asked for and kept, and how late slips are found"
+    page, markers = "README.md", "onset"
+    sizes = Sizes()
+    quick = Sizes(
+        ("+exp=onset", *QUICK_TRAINING, *QUICK_STREAMS, "onset.hours=0.002", "onset.hop_ms=50")
     )
-    readme = ROOT / "README.md"
-    with whole_file(readme) as temporary:
-        temporary.write_text(between_markers(readme.read_text(), MARKER, text_of(metrics)))
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """What the training leaves, and where."""
+        overrides = [*job.sizes.overrides, *job.overrides]
+        metrics = result_of("train", overrides, job.folder, "metrics.json")
+        return {key: metrics[key] for key in _KEPT} | {"folder": str(job.folder)}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """What was kept of the target, and confounders."""
+        settings = numbers["alarm"]["settings"]
+        hop_ms = 1e3 * settings["hop_samples"] / numbers["alarm"]["sample_rate_hz"]
+        about = f"Seed {numbers['seed']}, a decision every {hop_ms:g} ms; {promise_line(numbers)}."
+        confounders = "By the same threshold; the methods to the right by theirs."
+        return {
+            "Alarms": table_of(kept_rows(numbers), about),
+            "Confounders": table_of(scene_rows(numbers), confounders),
+        }
+
+    def section(self, report: Report) -> str:
+        """The tables alone: README.md says the rest."""
+        tables = [table.markdown() for table in self.tables(report["numbers"]).values()]
+        kind = "Simulated" if report["numbers"]["simulated"] else "Recorded"
+        command = f"`python -m benchmarks.alarms`, code {report['code']}"
+        return "\n\n".join([f"{kind} ({command}):", *tables])
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """The training has drawn it."""
+
+    def figures(self, report: Report, path: Path) -> None:
+        """Those of the training: alarms, delays, reliability."""
+        names = {"alarm.png": "", "events.png": "_delay", "reliability.png": "_reliability"}
+        given = {old: path.with_stem(f"{path.stem}{new}") for old, new in names.items()}
+        take_figures(Path(report["numbers"]["folder"]), given)
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(Alarms().run())

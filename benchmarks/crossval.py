@@ -1,65 +1,82 @@
-"""Recipes on every choice of four held-out materials: ``python -m benchmarks.crossval``.
+"""Recipes on every choice of held-out materials: ``python -m benchmarks.crossval [key=value ...]``.
 
-Runs ``python -m tactslip_torch crossval`` unless this code has, keeps its numbers and its figure in
-``benchmarks/results``, and puts the tables between the markers in README.md.
+Runs ``tactslip crossval`` and puts its tables into README.md.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import subprocess
-import sys
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from benchmarks.outcome import RESULTS, ROOT, between_markers
-from tactslip_torch.features.cache import source_digest
-from tactslip_torch.report.crossval import crossval_figure, material_rows, split_rows
-from tactslip_torch.runtime import whole_file
+from matplotlib.figure import Figure
 
-COMMAND = "python -m benchmarks.crossval"
-
-
-def markdown(rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table of a header and rows."""
-    lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+from benchmarks.commands import result_of, table_of, take_figures
+from benchmarks.harness import Benchmark, Job, Report, Table
+from tactslip_torch.report.crossval import material_rows, split_rows
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point."""
-    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument("--run", type=Path, default=ROOT / "outputs" / "crossval" / "0")
-    text = "of the markers in README.md and of the files in benchmarks/results"
-    parser.add_argument("--name", default="crossval", help=text)
-    parser.add_argument("overrides", nargs="*", help="passed on, such as num_unseen=1")
-    options = parser.parse_args(arguments)
-    made_by = options.run / "code.txt"
-    code = " ".join([source_digest(ROOT / "tactslip_torch"), *options.overrides])
-    if not made_by.exists() or made_by.read_text() != code:
-        command = [sys.executable, "-m", "tactslip_torch", "crossval", *options.overrides]
-        done = subprocess.run([*command, f"hydra.run.dir={options.run}"], check=False)
-        if done.returncode:
-            raise SystemExit(done.returncode)
-        made_by.write_text(code)
-    found = json.loads((options.run / "crossval.json").read_text())
-    with whole_file(RESULTS / f"{options.name}.json") as temporary:
-        temporary.write_text(json.dumps(found) + "\n")
-    crossval_figure(found, RESULTS / f"{options.name}.png")
-    named = [] if options.name == "crossval" else [f"--name {options.name}"]
-    shown = " ".join([COMMAND, *named, *(f"'{each}'" for each in options.overrides)])
-    kind = "simulated" if found["simulated"] else "recorded"
-    note = (
-        f"Balanced accuracy, %, {kind}, seed {found['seed']}; machines fitted on "
-        f"{found['train_bins']} bins of each material and class (`{shown}`, code "
-        f"{code.split()[0]}):"
+@dataclass(frozen=True)
+class Sizes:
+    """Overrides of ``tactslip crossval``, before those of the command line."""
+
+    overrides: tuple[str, ...] = ()
+
+
+class Crossval(Benchmark[Sizes]):
+    """Every choice of four held-out materials."""
+
+    name = "crossval"
+    title = "Every choice of held-out materials"
+    about = "balanced accuracy, %, on every choice of held-out materials"
+    page = "README.md"
+    sizes = Sizes()
+    quick = Sizes(
+        (
+            "data.cycles=4",
+            "materials=[M1,M2,iron]",
+            "num_unseen=1",
+            "train_bins=20",
+            "judged_bins=20",
+            "~recipes.paper",
+            "~recipes.general",
+            "recipes.robust.num_features=10",
+            "recipes.robust.penalties=[0.001]",
+        )
     )
-    text = "\n\n".join([note, markdown(split_rows(found)), markdown(material_rows(found))])
-    readme = ROOT / "README.md"
-    with whole_file(readme) as temporary:
-        temporary.write_text(between_markers(readme.read_text(), options.name, text))
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """What the command leaves, and where."""
+        overrides = [*job.sizes.overrides, *job.overrides]
+        found = result_of("crossval", overrides, job.folder, "crossval.json")
+        return found | {"folder": str(job.folder), "overrides": overrides}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """By choice and by material."""
+        note = (
+            f"Balanced accuracy, %, seed {numbers['seed']}; machines fitted on "
+            f"{numbers['train_bins']} bins of each material and class."
+        )
+        return {
+            "By choice": table_of(split_rows(numbers), note),
+            "By material": table_of(material_rows(numbers)),
+        }
+
+    def section(self, report: Report) -> str:
+        """The tables alone: README.md says the rest."""
+        shown = [f"'{each}'" for each in report["overrides"]]
+        command = f"`{' '.join([f'python -m benchmarks.{self.name}', *shown])}`"
+        tables = [table.markdown() for table in self.tables(report["numbers"]).values()]
+        kind = "Simulated" if report["simulated"] else "Recorded"
+        return "\n\n".join([f"{kind} ({command}, code {report['code']}):", *tables])
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """The command has drawn it."""
+
+    def figures(self, report: Report, path: Path) -> None:
+        """That of the command."""
+        take_figures(Path(report["numbers"]["folder"]), {"crossval.png": path})
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(Crossval().run())

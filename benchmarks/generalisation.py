@@ -29,7 +29,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from torch import Tensor
 
-from benchmarks.outcome import RESULTS, ROOT, between_markers
+from benchmarks import RESULTS, ROOT
+from benchmarks.harness import between_markers
 from benchmarks.reproduction.runs import code_digest, run
 from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.recording import RecordingId, RecordingSource

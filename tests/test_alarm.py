@@ -12,8 +12,6 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from small_set import RATE_HZ, SMALL_HAND
 
-from benchmarks.alarms import text_of
-from benchmarks.outcome import RESULTS, ROOT, between_markers
 from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
@@ -536,10 +534,3 @@ def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
         len(live.push(torch.randn(1000, 24)).number)
         == (1000 - 100 - live.detector.look_ahead) // 50 + 1
     )
-
-
-# ---------------------------------------------------------------------------------- what is stored
-def test_readme_says_what_the_stored_run_found():
-    stored = json.loads((RESULTS / "alarms.json").read_text())
-    readme = (ROOT / "README.md").read_text()
-    assert between_markers(readme, "onset", text_of(stored)) == readme

@@ -3,54 +3,94 @@
 import json
 import subprocess
 import sys
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.harness import Benchmark, Table, between_markers, interleaved, paired_ratio
+
 ROOT = Path(__file__).parents[1]
-BENCHMARKS = {
-    "abstaining": "--json --figure",
-    "adapting": "--run",
-    "dead_sensors": "--json --figure",
-    "deployment": "--json --figure",
-    "features": "--json --figure",
-    "formats": "--json --figure",
+SUBJECTS = [
+    path.stem
+    for path in sorted((ROOT / "benchmarks").glob("*.py"))
+    if "(Benchmark[Sizes])" in path.read_text(encoding="utf-8")
+]
+"""Benchmarks of the harness, one a file; ``crossval_general`` is another's."""
+OTHERS = {
     "generalisation": "--runs --cache",
-    "gradients": "--json --figure",
-    "latency": "--json --figure",
-    "model": "--json --figure",
-    "onset": "--json --figure --runs",
-    "precision": "--json --figure",
     "real": "--runs",
-    "reproduction": "--runs",
     "scene_weights": "--cache",
-    "simulation": "--json --figure",
-    "simulation.realism": "--json",
-    "streaming": "--json --figure",
-    "throughput": "--json --figure",
-    "train": "--json",
-    "tuning": "--json --figure",
 }
-"""Options that take a path: where results of a quick run go."""
-ENDS = {"--json": "numbers.json", "--figure": "drawing.png"}
+"""Options that take a folder, where results of a quick run go."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", BENCHMARKS)
+@pytest.mark.parametrize("name", [*SUBJECTS, "reproduction"])
+def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path) -> None:
+    arguments = ["--quick", "--out", str(tmp_path)]
+    if name == "realism":
+        arguments.append(f"data.root={_real_set(tmp_path / 'set')}")
+    _run(name, *arguments)
+    assert json.loads((tmp_path / f"{name}.json").read_text())["quick"]
+    assert (tmp_path / f"{name}.md").read_text().count("|") > 10
+    assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+    _run(name, "--render", *arguments)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OTHERS)
 def test_a_benchmark_runs_in_its_smallest_form(name: str, tmp_path: Path) -> None:
     arguments = ["--quick"]
-    for option in BENCHMARKS[name].split():
-        arguments += [option, str(tmp_path / ENDS.get(option, option.strip("-")))]
-    if name in ("real", "simulation.realism"):
+    for option in OTHERS[name].split():
+        arguments += [option, str(tmp_path / option.strip("-"))]
+    if name == "real":
         arguments.append(f"data.root={_real_set(tmp_path / 'set')}")
+    _run(name, *arguments)
+
+
+@pytest.mark.parametrize("name", [*SUBJECTS, "reproduction"])
+def test_a_section_has_its_place_in_a_page(name: str) -> None:
+    module = import_module(f"benchmarks.{name}" + (".__main__" * (name == "reproduction")))
+    (subject,) = (
+        of
+        for of in vars(module).values()
+        if isinstance(of, type) and issubclass(of, Benchmark) and of.__module__ == module.__name__
+    )
+    page = (ROOT / subject.page).read_text(encoding="utf-8")
+    marker = subject.markers or subject.name
+    assert f"<!-- {marker} -->" in page
+    assert f"<!-- /{marker} -->" in page
+
+
+def test_calls_are_timed_in_turns_and_ratios_are_those_of_rounds() -> None:
+    made: list[str] = []
+    calls = {name: partial(made.append, name) for name in "ab"}
+    timings = interleaved(calls, rounds=3, block_s=0)
+    assert sorted(timings) == ["a", "b"]
+    assert [len(of.rounds) for of in timings.values()] == [3, 3]
+    assert made[-6:].count("a") == 3
+    assert paired_ratio([1.0, 6.0, 3.0], [1.0, 3.0, 2.0]).median == 1.5
+
+
+def test_a_table_has_numbers_to_the_right_and_words_to_the_left() -> None:
+    table = Table(["what", "us", "why"], [["a", "1.5 (1 to 2)", "so"], ["b", "-", "so"]])
+    assert table.markdown().split("\n")[1] == "| --- | ---: | --- |"
+
+
+def test_only_what_stands_between_the_markers_is_replaced() -> None:
+    text = "before\n<!-- a -->\nold\n<!-- /a -->\nbehind"
+    assert between_markers(text, "a", "new") == text.replace("old", "new")
+    with pytest.raises(ValueError, match="not both there"):
+        between_markers(text, "b", "new")
+
+
+def _run(name: str, *arguments: str) -> None:
     command = [sys.executable, "-m", f"benchmarks.{name}", *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
-    if "--json" in arguments:
-        assert json.loads((tmp_path / ENDS["--json"]).read_text())
-    if "--figure" in arguments:
-        assert (tmp_path / ENDS["--figure"]).stat().st_size > 10_000
 
 
 def _real_set(root: Path) -> Path:

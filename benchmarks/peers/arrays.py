@@ -1,13 +1,10 @@
 """The features of the paper's pool in batched NumPy: whole arrays, plain formulas.
 
-``hard`` has the two ways to what costs most: ``BY_ROW``, the slow oracle, takes mode and entropy in
-a loop over rows and powers as formulas write them; ``VECTORISED`` does without loop and powers.
 Constants are replaced as the package replaces them; nothing else is guarded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -17,20 +14,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 EPS = float(np.finfo(np.float64).eps)
-
-
-class Way(NamedTuple):
-    """How what costs most is taken; values are ``[*, n]``.
-
-    Attributes:
-        mode: of sorted values and the distance ``[*]`` up to which neighbours count as equal.
-        entropy: of sorted values that are not all equal.
-        powers: second, third and fourth.
-    """
-
-    mode: Callable[[Array, Array], Array]
-    entropy: Callable[[Array], Array]
-    powers: Callable[[Array], tuple[Array, Array, Array]]
+TOP_LEVEL = 255
 
 
 class Maps(NamedTuple):
@@ -43,7 +27,7 @@ class Maps(NamedTuple):
 
 
 def features(
-    bins: Array, num_gauges: int, way: Way, sample_rate_hz: float = 2000.0, chunk_bins: int = 16
+    bins: Array, num_gauges: int, sample_rate_hz: float = 2000.0, chunk_bins: int = 16
 ) -> Array:
     """The whole pool of filtered bins whose gauges come first, in chunks that fit the cache.
 
@@ -51,17 +35,12 @@ def features(
         - bins: ``[N, C, n]``
         - output: ``[N, F]``
     """
-    parts = [
-        np.concatenate(
-            [
-                _gauges(bins[start : start + chunk_bins, :num_gauges], way),
-                _films(bins[start : start + chunk_bins, num_gauges:], way, sample_rate_hz),
-            ],
-            axis=1,
-        )
-        for start in range(0, len(bins), chunk_bins)
+    chunks = (bins[start : start + chunk_bins] for start in range(0, len(bins), chunk_bins))
+    made = [
+        np.concatenate([_gauges(x[:, :num_gauges]), _films(x[:, num_gauges:], sample_rate_hz)], 1)
+        for x in chunks
     ]
-    return np.concatenate(parts)
+    return np.concatenate(made)
 
 
 @lru_cache
@@ -81,19 +60,15 @@ def maps(num: int, wavelet: str = "rbio2.2") -> Maps:
     return Maps(np.stack(branches), is_approximation, 1 << (length - 1).bit_length(), scale)
 
 
-def describe(x: Array, scale: Array, way: Way) -> list[Array]:
-    """The 13 descriptors that everything has.
-
-    Shape:
-        - x: ``[*, n]``; scale: ``[*]``; each output: ``[*]``
-    """
+def _describe(x: Array, scale: Array) -> list[Array]:
+    """The 13 descriptors that everything has, of ``[*, n]`` and its scale ``[*]``, each ``[*]``."""
     num = x.shape[-1]
     ordered = np.sort(x, axis=-1)
     low, high = ordered[..., 0], ordered[..., -1]
     is_flat = low == high
     mean = x.mean(-1)
     d = x - mean[..., None]
-    square, cube, fourth = way.powers(d)
+    square = d * d
     variance = np.where(is_flat, 1.0, square.mean(-1))
     std = np.where(is_flat, 0.0, np.sqrt(variance * (num / (num - 1))))
     energy = (x * x).sum(-1)
@@ -102,55 +77,81 @@ def describe(x: Array, scale: Array, way: Way) -> list[Array]:
     is_zero = rms == 0
     quarter = np.quantile(ordered, [0.25, 0.75], axis=-1, method="hazen")
     spread = np.where(is_flat[..., None], np.arange(num), ordered)  # any that are not all equal
-    entropy = np.where(is_flat, 0.0, way.entropy(spread))
     return [
         mean,
         (ordered[..., (num - 1) // 2] + ordered[..., num // 2]) / 2,
-        way.mode(ordered, 1e-12 * scale),
+        _modes(ordered, 1e-12 * scale),
         high - low,
         np.where(is_flat, 0.0, np.abs(d).mean(-1)),
         std,
         std / np.where(is_zero, 1.0, np.where(mean < 0, -floor, floor)),
         quarter[1] - quarter[0],
-        np.where(is_flat, 0.0, cube.mean(-1) / variance**1.5),
-        np.where(is_flat, 3.0, fourth.mean(-1) / variance**2),
+        np.where(is_flat, 0.0, (square * d).mean(-1) / variance**1.5),
+        np.where(is_flat, 3.0, (square * square).mean(-1) / variance**2),
         energy,
-        entropy,
+        np.where(is_flat, 0.0, _entropies(spread)),
         np.where(is_zero, 0.0, high / np.where(is_zero, 1.0, rms)),
     ]
 
 
-def settle(x: Array, scale: Array) -> Array:
+def _modes(ordered: Array, tolerance: Array) -> Array:
+    """First value of the longest run of neighbours no further apart than a tolerance."""
+    rank = _rank(np.diff(ordered, axis=-1) > tolerance[..., None])
+    last = rank.argmax(-1)[..., None]
+    first = last - np.take_along_axis(rank, last, axis=-1)
+    return np.take_along_axis(ordered, first, axis=-1)[..., 0]
+
+
+def _entropies(ordered: Array) -> Array:
+    """Entropy of 256 levels, which serve as the edges of NumPy's histogram."""
+    low, high = ordered[..., :1], ordered[..., -1:]
+    level = np.floor(TOP_LEVEL * (ordered - low) / (high - low) + 0.5 + 1e-9)
+    is_new = (np.diff(level, axis=-1) != 0) & (level[..., 1:] != TOP_LEVEL)  # the top one joins
+    num = ordered.shape[-1]
+    fraction = np.arange(num + 1) / num
+    growth = np.diff(-fraction * np.log2(fraction + EPS))
+    entropy: Array = growth[_rank(is_new)].sum(-1)
+    return entropy
+
+
+def _rank(is_new: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Position of each value in its run; ``is_new`` of all but the first."""
+    place = np.arange(is_new.shape[-1] + 1)
+    start = np.zeros((*is_new.shape[:-1], len(place)), dtype=np.int64)
+    np.maximum.accumulate(np.where(is_new, place[1:], 0), axis=-1, out=start[..., 1:])
+    return place - start
+
+
+def _settle(x: Array, scale: Array) -> Array:
     """A span that is rounding beside the bin's magnitude is replaced by the mean."""
     is_constant = np.ptp(x, axis=-1) < 16 * EPS * scale
     return np.where(is_constant[..., None], x.mean(-1, keepdims=True), x)
 
 
-def _gauges(x: Array, way: Way) -> Array:
+def _gauges(x: Array) -> Array:
     scale = np.abs(x).max(-1)
-    return np.stack(describe(settle(x, scale), scale, way), axis=-1).reshape(len(x), -1)
+    return np.stack(_describe(_settle(x, scale), scale), axis=-1).reshape(len(x), -1)
 
 
-def _films(x: Array, way: Way, sample_rate_hz: float) -> Array:
+def _films(x: Array, sample_rate_hz: float) -> Array:
     num_bins, num_films, num = x.shape
     linear = maps(num)
     scale = np.abs(x).max(-1)  # [N, films]
     branches = np.einsum("bij,nfi->nfbj", linear.branches, x, optimize=True)
     wide = np.broadcast_to(scale[..., None], branches.shape[:-1])
-    settled = settle(branches, wide)
+    settled = _settle(branches, wide)
     is_gone = (np.ptp(settled, axis=-1) == 0) & ~linear.is_approximation
     branches = np.where(is_gone[..., None], 0.0, settled)
-    lines = np.fft.rfft(branches, linear.num_fft)[..., :num]
-    spectra = np.abs(lines) * linear.line_scale
+    spectra = np.abs(np.fft.rfft(branches, linear.num_fft)[..., :num]) * linear.line_scale
 
-    in_time = [*describe(branches, wide, way), _correlation(branches, settle(x, scale))]
+    in_time = [*_describe(branches, wide), _correlation(branches, _settle(x, scale))]
     frequency_hz = np.arange(num) * sample_rate_hz / num
     total = spectra.sum(-1)
     weights = spectra / np.where(total == 0, 1.0, total)[..., None]
     centroid = weights @ frequency_hz
     distance = frequency_hz - centroid[..., None]
     moments = [centroid, np.sqrt((weights * distance * distance).sum(-1))]
-    in_frequency = [*describe(spectra, wide, way), *moments]
+    in_frequency = [*_describe(spectra, wide), *moments]
 
     energy = (spectra * spectra).sum(-1)  # [N, films, branches]
     whole = energy.sum(-1, keepdims=True)
@@ -158,8 +159,8 @@ def _films(x: Array, way: Way, sample_rate_hz: float) -> Array:
 
     level = len(linear.is_approximation) // 2
     by_level = [
-        np.stack(part, axis=-1).reshape(num_bins, num_films, level, -1)  # A and D of a level
-        for part in (in_time, in_frequency)
+        np.stack(of, axis=-1).reshape(num_bins, num_films, level, -1)  # A and D of a level
+        for of in (in_time, in_frequency)
     ]
     of_film = np.concatenate(by_level, axis=-1).reshape(num_bins, num_films, -1)
     ratios = ratio.reshape(num_bins, num_films, level, 2).swapaxes(-1, -2)

@@ -22,16 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.clocks import on_threads
-from benchmarks.machine import machine_facts, versions
-from benchmarks.outcome import (
+from benchmarks import RESULTS, ROOT
+from benchmarks.harness import (
     EXIT_INTERRUPTED,
-    RESULTS,
-    ROOT,
-    add_paths,
-    keep_figure,
     keep_numbers,
-    refuse_paths,
+    machine_facts,
+    on_threads,
+    versions,
 )
 from benchmarks.real.bootstrap import differences
 from benchmarks.real.figure import figure
@@ -125,14 +122,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--report", action="store_true", help="write from what is kept")
     parser.add_argument("--runs", type=Path, metavar="FOLDER", help="of kept rows (outputs/real)")
     parser.add_argument("--page", type=Path, metavar="FILE", help="REAL_DATA.md, unless --quick")
-    add_paths(parser)
+    for name in ("json", "figure"):
+        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help="(benchmarks/results)")
     parsed = parser.parse_intermixed_args(arguments)
     folder = parsed.runs or ROOT / "outputs" / f"real{'-quick' * parsed.quick}"
     place = folder if parsed.quick else RESULTS
     parsed.json = parsed.json or place / "real.json"
     parsed.figure = parsed.figure or place / "real.png"
     parsed.page = parsed.page or (folder if parsed.quick else ROOT) / "REAL_DATA.md"
-    refuse_paths(parser, parsed, "json", "figure", "page")
+    for path in (parsed.json, parsed.figure, parsed.page):
+        path.parent.mkdir(parents=True, exist_ok=True)
     if wrong := [text for text in parsed.overrides if "=" not in text]:
         parser.error(f"overrides are key=value, got {wrong[0]!r}")
     if parsed.report and not parsed.json.exists():
@@ -150,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with whole_file(watched_figure(parsed.figure)) as temporary:
             shutil.copy(drawn(report["sections"]["watched"], folder), temporary)
     print(report_text(report))
-    keep_figure(figure, report, parsed.figure)
+    figure(report, parsed.figure)
     with whole_file(parsed.page) as temporary:
         temporary.write_text(page(report, parsed.figure, parsed.page), encoding="utf-8")
     print(f"page in {parsed.page}")

@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.drawing import GREY, LIGHT, OURS, PEER, SECOND, THIRD, finish
+from benchmarks.harness import GREY, LIGHT, OURS, PEER, SECOND, THIRD, finish
 
 _RIVALS = (
     PEER,

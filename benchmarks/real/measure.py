@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.clocks import Way as Timed
-from benchmarks.clocks import on_threads, paired_ratio, shuffled_rounds
+from benchmarks.harness import interleaved, on_threads, paired_ratio
 from benchmarks.peers.rockets import MINI_ROCKET, MULTI_ROCKET_HYDRA
 from benchmarks.real.baselines import same_features, simple_baselines
 from benchmarks.real.method import Fitted, Method, Training
@@ -120,7 +119,8 @@ def clocked(
         calls[f"{name}, batched"] = partial(of.last.judge, batch)
         calls[f"{name}, alone"] = partial(of.last.judge, batch[-1:].copy())
     with on_threads(1):
-        rounds = shuffled_rounds({n: Timed(call) for n, call in calls.items()}, sizes.rounds, 0)
+        timings = interleaved(calls, sizes.rounds)
+    rounds = {name: of.per_round for name, of in timings.items()}
     rows: dict[str, Any] = {}
     for name in names:
         rows[name] = {"batch": counts[name], "differs": differs[name]}

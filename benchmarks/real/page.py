@@ -8,11 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.outcome import QUICK_LINE
+from benchmarks.harness import QUICK_LINE
 from benchmarks.real.bootstrap import COVERAGE
 from benchmarks.real.report import tables
 from benchmarks.real.watched import watched_figure
-from benchmarks.reproduction.page import shown
 
 COMMAND = "python -m benchmarks.real"
 SOURCE = "github.com/yayaneath/BioTacSP-DoS"
@@ -71,7 +70,7 @@ def page(report: Report, figure: Path, place: Path) -> str:
 
 
 def _shown(of: Mapping[str, Any], name: str) -> list[str]:
-    return [shown(table) for table in of[name]]
+    return [table.markdown() for table in of[name]]
 
 
 def _introduction(report: Report) -> str:

@@ -6,9 +6,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from benchmarks.outcome import QUICK_LINE
+from benchmarks.harness import QUICK_LINE, Table, limits, number
 from benchmarks.real.bootstrap import in_words
-from benchmarks.tables import Table, limits, number
 
 AIM_BALANCED, AIM_AUC = 0.952, 0.99
 TIMES_FASTER = 10.0

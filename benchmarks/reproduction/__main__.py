@@ -1,118 +1,210 @@
-"""Published numbers beside ours: ``python -m benchmarks.reproduction [--seeds 5] [--quick]``.
+"""Published numbers beside ours: ``python -m benchmarks.reproduction [key=value ...]``.
 
-Trains every experiment on every seed. Runs in ``--runs`` that this very code, configuration and
-calibration finished are kept, so it resumes; seeds come one after the other, and experiments that
-share features stand together, so that most are made once. Keeps ``benchmarks/results/
-reproduction.json`` and draws the figures beside it, writes ``REPRODUCTION.md`` and the table
-between the markers in ``README.md``. ``--report`` does the latter from what is kept. With
-``--quick``, or with a part of the experiments, all of it but README.md goes to a folder in
-``outputs``, and no tracked file is touched.
+Trains every experiment on every seed. Runs that this very code finished are kept, so it resumes.
+Writes the tables of REPRODUCTION.md and of README.md between their markers, and the figures.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
-import time
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from statistics import mean
+from typing import Any
 
-import torch
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf
 
-from benchmarks.machine import machine_facts
-from benchmarks.outcome import EXIT_INTERRUPTED, RESULTS, ROOT, between_markers
-from benchmarks.reproduction.experiments import EXPERIMENTS, SEEDS, overrides_of
-from benchmarks.reproduction.figure import confound_figure, places_figure, seeds_figure
+from benchmarks import ROOT
+from benchmarks.harness import (
+    GREY,
+    LIGHT,
+    OURS,
+    PEER,
+    Benchmark,
+    Job,
+    Report,
+    Table,
+    between_markers,
+    finish,
+    write_text,
+)
 from benchmarks.reproduction.page import (
-    COMMAND,
-    FIGURES,
-    KEPT_NAME,
-    is_part,
-    page,
+    FOLDS,
+    all_tables,
+    scene_recalls,
+    scenes_of,
     short_table,
 )
-from benchmarks.reproduction.results import Report, runs_of
+from benchmarks.reproduction.results import POOLED, percent, recall_beside_onset, roles_of
 from benchmarks.reproduction.runs import kept, run
 from tactslip_torch.analysis.signal_checks import filtered, judge_facts
 from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.report import published
 from tactslip_torch.report.pipeline import pipeline_figure
-from tactslip_torch.runtime import whole_file
 from tactslip_torch.simulation.parameters import CALIBRATED_PATH, SEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings
 
-KEPT = RESULTS / KEPT_NAME
-OUTPUTS = ROOT / "outputs"
+_PAPER = "recipe=paper"
+EXPERIMENTS: Mapping[str, tuple[tuple[str, ...], int]] = {
+    # these use the features of one set of recordings ...
+    "unseen4": (("+exp=unseen4", _PAPER), 5),
+    "unseen4 robust": (("+exp=unseen4", "recipe=robust"), 5),
+    "random_bins": (("+exp=random_bins", _PAPER), 5),
+    "shuffled": (("+exp=seen6", _PAPER, "labels.shuffle_seed=1"), 1),
+    "SG means only": (
+        ("+exp=unseen4", _PAPER, "recipe.among={kind:SG,descriptor:mean}"),
+        3,
+    ),
+    "PVDF only": (("+exp=unseen4", _PAPER, "recipe.among={kind:PVDF}"), 2),
+    # ... these of another ...
+    "half_second": (("+exp=unseen4", _PAPER, "labels=half_second"), 5),
+    "half_second random_bins": (("+exp=random_bins", _PAPER, "labels=half_second"), 5),
+    # ... and each of these its own
+    "motor_off": (("+exp=unseen4", _PAPER, "scene=motor_off"), 2),
+    "motor_only": (("+exp=unseen4", _PAPER, "scene=motor_only"), 2),
+    "confound": (("+exp=confound",), 2),
+}
+"""Overrides and seeds of each, in the order that shares most features."""
 
 
-class Place(NamedTuple):
-    """Where results go.
+@dataclass(frozen=True)
+class Sizes:
+    """Seeds at most, experiments, and overrides of every run."""
 
-    Attributes:
-        folder: of the JSON and the figures.
-        page: REPRODUCTION.md.
-        readme: whose block is replaced, or none.
-    """
-
-    folder: Path
-    page: Path
-    readme: Path | None
-
-    @classmethod
-    def of(cls, quick: bool, names: Collection[str]) -> Place:
-        """The tracked files for all experiments in earnest, else a folder of its own."""
-        if not quick and not is_part(names):
-            return cls(RESULTS, ROOT / "REPRODUCTION.md", ROOT / "README.md")
-        folder = OUTPUTS / ("reproduction-quick" if quick else "reproduction-part")
-        return cls(folder, folder / "REPRODUCTION.md", None)
+    seeds: int = 5
+    experiments: tuple[str, ...] = tuple(EXPERIMENTS)
+    overrides: tuple[str, ...] = ()
+    cycles: int = 3
 
 
-def measure(
-    seeds: int, names: Sequence[str], folder: Path, quick: bool, all_seeds: bool = False
-) -> dict[str, Any]:
-    """The report: every experiment on every seed, JSON-able.
+class Reproduction(Benchmark[Sizes]):
+    """Every experiment on every seed."""
 
-    Args:
-        seeds: how many, from 0.
-        names: of the experiments.
-        folder: of runs and of the cache of features.
-        quick: whether few recordings are enough.
-        all_seeds: for every experiment, also for those that take fewer.
+    name = "reproduction"
+    title = "Published numbers beside ours"
+    about = "every number of ours is SIMULATED, the paper's are of a real hand"
+    page, markers = "REPRODUCTION.md", "results"
+    sizes = Sizes()
+    quick = Sizes(
+        1,
+        ("random_bins", "unseen4", "confound"),
+        ("data.cycles=2", "split.train_share=0.5", "recipe.sample_bins=60"),
+        1,
+    )
 
-    Raises:
-        RuntimeError: if a training fails.
-    """
-    machine = machine_facts()
-    runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-    versions: dict[str, str] = {}
-    started = time.perf_counter()
-    for seed in range(seeds):
-        for name in names:
-            if seed >= EXPERIMENTS[name].num_seeds(seeds) and not all_seeds:
-                continue
-            overrides = [*overrides_of(name, quick), f"seed={seed}"]
-            place = folder / f"{name.replace(' ', '-')}-{seed}"
-            metrics = run(f"{name}, seed {seed}", overrides, place, folder / "cache")
-            runs[name].append(kept(metrics, place))
-            versions = {of: metrics["versions"][of] for of in ("tactslip_torch", "torch")}
-        minutes = (time.perf_counter() - started) / 60
-        print(f"seed {seed} of {seeds}: {minutes:.1f} min so far", file=sys.stderr, flush=True)
-    return {
-        "simulated": True,
-        "quick": quick,
-        "seeds": seeds,
-        "machine": machine,
-        "versions": versions,
-        "commands": {name: overrides_of(name, quick) for name in names},
-        "calibrated": json.loads(CALIBRATED_PATH.read_text(encoding="utf-8")),
-        "signals": [signals(seed, 1 if quick else 3) for seed in range(seeds)],
-        "runs": runs,
-    }
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Trainings, one after the other, and checks of the signals."""
+        runs: dict[str, list[dict[str, Any]]] = {name: [] for name in job.sizes.experiments}
+        commands = {}
+        for seed in range(job.sizes.seeds):
+            for name in runs:
+                overrides, seeds = EXPERIMENTS[name]
+                given = [*overrides, *job.sizes.overrides, *job.overrides]
+                if job.is_quick and name == "confound":
+                    others = OmegaConf.load(ROOT / "conf" / "others" / "confound.yaml")
+                    given += [f"others.{o}.cycles=2" for o in map(str, others) if o != "defaults"]
+                commands[name] = " ".join(given)
+                if seed < seeds:
+                    folder = job.folder / f"{name.replace(' ', '-')}-{seed}"
+                    cache = job.folder / "cache"
+                    metrics = run(f"{name}, seed {seed}", [*given, f"seed={seed}"], folder, cache)
+                    runs[name].append(kept(metrics, folder))
+        return {
+            "runs": runs,
+            "commands": commands,
+            "calibrated": json.loads(CALIBRATED_PATH.read_text(encoding="utf-8")),
+            "signals": [_signals(seed, job.sizes.cycles) for seed in range(job.sizes.seeds)],
+        }
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """All of REPRODUCTION.md, and what was run."""
+        rows = [
+            [
+                name,
+                f"`train {numbers['commands'][name]}`",
+                str(len(of)),
+                f"{sum(run['seconds'] for run in of) / 60:.1f}",
+            ]
+            for name, of in numbers["runs"].items()
+        ]
+        ran = Table(["experiment", "command", "seeds", "minutes"], rows)
+        return {**all_tables(numbers), "What was run": ran}
+
+    def publish(self, report: Report, folder: Path) -> None:
+        """The page, and the table between the markers of README.md."""
+        super().publish(report, folder)
+        if not report["quick"]:
+            path, table = ROOT / "README.md", short_table(report["numbers"]["runs"]).markdown()
+            text = path.read_text(encoding="utf-8")
+            write_text(path, between_markers(text, "reproduction", table))
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Balanced accuracy of every seed, the paper's as a bar."""
+        runs, axes = numbers["runs"], drawing.subplots()
+        names = [(name, role) for name in runs for role in roles_of(runs, name)]
+        beside = {("random_bins", "test"), ("unseen4", "unseen")}
+        for place, (name, role) in enumerate(names):
+            for baseline, marker, color in ((POOLED, "|", PEER), (None, "o", OURS)):
+                values = percent(runs, name, role, "balanced_accuracy", baseline=baseline)
+                axes.plot(values, [place] * len(values), marker, color=color, alpha=0.7, ms=5)
+            if (name, role) in beside:
+                x = 100 * (published.SPLITS[role].balanced_accuracy or 0)
+                axes.plot([x, x], [place - 0.4, place + 0.4], color="black", lw=2)
+        for marker, color, label in (
+            ("o", OURS, "ours, a dot a seed"),
+            ("|", PEER, "best pooled number"),
+        ):
+            axes.plot([], [], marker, color=color, label=label)
+        axes.plot([], [], color="black", lw=2, label="paper, real hand")
+        axes.set_yticks(range(len(names)), [", ".join(of) for of in names], fontsize=6)
+        axes.set_ylim(len(names) - 0.4, -0.6)
+        axes.set_xlabel("balanced accuracy, %")
+        axes.grid(axis="x", color=LIGHT)
+        drawing.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+
+    def figures(self, report: Report, path: Path) -> None:
+        """Every seed, recall beside the onset, scenes, and the pipeline."""
+        super().figures(report, path)
+        runs = report["numbers"]["runs"]
+        drawing = Figure(figsize=(8.4, 3.6), layout="constrained")
+        axes = drawing.subplots()
+        for name, color in (("unseen4", OURS), ("unseen4 robust", PEER)):
+            for role, style in (("test", "o-"), ("unseen", "s--")):
+                found = {
+                    place: recall_beside_onset(
+                        runs, name, role, [str(place) if place < 20 else "20+"]
+                    )
+                    for place in range(-20, 21)
+                }
+                means = {place: mean(values) for place, values in found.items() if values}
+                label = f"{name}, {role}"
+                axes.plot(list(means), list(means.values()), style, color=color, ms=3, label=label)
+        axes.axvline(-0.5, color=GREY, ls="--", lw=1)
+        axes.set_xlabel("bins of 50 ms beside the labelled onset: non-slip before 0, slip from 0")
+        axes.set_ylabel("recall, %, mean of seeds")
+        axes.legend(frameon=False, fontsize=8)
+        finish(drawing, report, "Recall beside the onset", path.with_stem(f"{path.stem}_places"))
+        if "confound" in runs:
+            drawing = Figure(figsize=(9.2, 4.4), layout="constrained")
+            panels, scenes = drawing.subplots(1, 2, sharey=True), scenes_of(runs)
+            for axes, role in zip(panels, ("test", "unseen"), strict=True):
+                for fold, color in zip(FOLDS, (PEER, OURS), strict=True):
+                    for place, scene in enumerate(scenes):
+                        values = list(scene_recalls(runs, fold, role, scene).values())
+                        words = f"trained on {FOLDS[fold]}" if place == 0 else None
+                        axes.plot(values, [place] * len(values), "o", color=color, label=words)
+                axes.set_xlabel(f"mean recall of the classes there are, %, {role}")
+                axes.grid(axis="x", color=LIGHT)
+            panels[0].set_yticks(range(len(scenes)), scenes, fontsize=8)
+            panels[0].legend(frameon=False, fontsize=8)
+            finish(drawing, report, "Slip or the arm", path.with_stem(f"{path.stem}_confound"))
+        pipeline_figure(path.with_name("pipeline.png"))
 
 
-def signals(seed: int, cycles: int) -> list[dict[str, Any]]:
-    """What the paper says of its signals, judged on recordings of seen materials of a seed."""
+def _signals(seed: int, cycles: int) -> list[dict[str, Any]]:
+    """What the paper says of its signals, checked on recordings of seen materials of a seed."""
     source = SimulatedRecordings(seed=seed, cycles=cycles, materials=list(SEEN_MATERIALS))
     recordings = {
         material: [
@@ -124,61 +216,5 @@ def signals(seed: int, cycles: int) -> list[dict[str, Any]]:
     return judge_facts(recordings)
 
 
-def write(report: Report, place: Place) -> None:
-    """Figures, REPRODUCTION.md and perhaps the block in README.md, of what is kept."""
-    if runs_of(report, "unseen4"):
-        places_figure(report, place.folder / FIGURES["places"])
-    if runs_of(report, "confound"):
-        confound_figure(report, place.folder / FIGURES["confound"])
-    seeds_figure(report, place.folder / FIGURES["seeds"])
-    pipeline_figure(place.folder / "pipeline.png")
-    texts = {place.page: page(report, place.folder.relative_to(place.page.parent).as_posix())}
-    if place.readme is not None:
-        before = place.readme.read_text(encoding="utf-8")
-        texts[place.readme] = between_markers(before, "reproduction", short_table(report))
-    for path, content in texts.items():
-        with whole_file(path) as temporary:
-            temporary.write_text(content, encoding="utf-8")
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status."""
-    parser = argparse.ArgumentParser(
-        prog=COMMAND, description="Train the published experiments and write REPRODUCTION.md."
-    )
-    parser.add_argument(
-        "--seeds", type=int, default=SEEDS, metavar="N", help="how many (%(default)s)"
-    )
-    parser.add_argument("--runs", type=Path, metavar="FOLDER", help="of runs and cached features")
-    parser.add_argument("--experiments", nargs="+", default=list(EXPERIMENTS), choices=EXPERIMENTS)
-    parser.add_argument("--quick", action="store_true", help="few recordings, to see that it runs")
-    parser.add_argument("--all-seeds", action="store_true", help="for every experiment")
-    parser.add_argument("--report", action="store_true", help="write from what is kept, train none")
-    parsed = parser.parse_args(arguments)
-    if parsed.seeds < 1:
-        parser.error(f"--seeds must be at least 1, got {parsed.seeds}")
-    names = [name for name in EXPERIMENTS if name in parsed.experiments]
-    place = Place.of(parsed.quick, names)
-    path = place.folder / KEPT_NAME
-    if parsed.report and not path.exists():
-        parser.error(f"--report needs {path}; leave --report out, which trains and writes it")
-    if not parsed.report:
-        torch.set_num_threads(1)  # trainings use the processors
-        folder = parsed.runs or OUTPUTS / f"reproduction{'-quick' * parsed.quick}"
-        try:
-            report = measure(parsed.seeds, names, folder.resolve(), parsed.quick, parsed.all_seeds)
-        except RuntimeError as error:
-            print(f"error: {error}", file=sys.stderr)
-            return 1
-        except KeyboardInterrupt:
-            return EXIT_INTERRUPTED
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as temporary:
-            temporary.write_text(json.dumps(report, allow_nan=False) + "\n", encoding="utf-8")
-    write(json.loads(path.read_text(encoding="utf-8")), place)
-    print(f"{place.page} from {path}")
-    return 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(Reproduction().run())

@@ -12,7 +12,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from benchmarks.outcome import ROOT
+from benchmarks import ROOT
 from tactslip_torch.features.cache import source_digest
 from tactslip_torch.runtime import whole_file
 

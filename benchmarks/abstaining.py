@@ -1,0 +1,217 @@
+"""What abstaining buys: ``python -m benchmarks.abstaining``.
+
+Machines of the simulated hand on several choices of held-out materials. Thresholds of abstention
+are set on held-out scores of their training bins for several coverages: with recordings as units
+(ours), with bins as units, and by a threshold of the probability.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from statistics import mean
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from benchmarks.harness import COLORS, LIGHT, Benchmark, Job, Report, Table, percent, say
+from benchmarks.subjects import SEEN_ROLE, FittedMachine, composed, small_recipe, surveyed
+from tactslip_torch.model.calibration import fit_platt
+from tactslip_torch.model.conformal import answers, thresholds
+from tactslip_torch.report.metrics import CLASSES, answer_counts, answer_metrics
+from tactslip_torch.simulation import SEEN_MATERIALS
+from tactslip_torch.training.abstention import held_out_scores
+
+OURS = "recordings as units, ours"
+MEASURES = {
+    "covered": "coverage %",
+    "abstained": "abstained %",
+    "right": "balanced accuracy of the others %",
+}
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Args:
+        overrides: of the configuration of ``crossval``: materials and cycles.
+        num_held_out: materials left out of a split.
+        splits: how many choices of them, the paper's first.
+        train_bins: of each seen material and class to fit and calibrate on.
+        judged_bins: of each material and class, at most, to evaluate on.
+        num_features: K.
+        penalties: to choose C from.
+        coverages: that are asked for.
+    """
+
+    overrides: tuple[str, ...] = ()
+    num_held_out: int = 4
+    splits: int = 8
+    train_bins: int = 200
+    judged_bins: int = 600
+    num_features: int = 60
+    penalties: tuple[float, ...] = (1e-4, 1e-3, 1e-2)
+    coverages: tuple[float, ...] = (0.8, 0.9, 0.95, 0.97, 0.99)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """Scores, truth and recordings of bins, each ``[n]``."""
+
+    score: Tensor
+    is_slip: Tensor
+    recording: Tensor
+
+
+class Abstaining(Benchmark[Sizes]):
+    """Ways to abstain."""
+
+    name = "abstaining"
+    title = "Abstaining"
+    about = (
+        "bins of recordings whose truth is in the answer, and bins without an answer, by how the "
+        "thresholds of abstention were set"
+    )
+    sizes = Sizes()
+    quick = Sizes(
+        ("data.cycles=4", "data.materials=[M1,M4,iron]"),
+        num_held_out=1,
+        splits=2,
+        train_bins=30,
+        judged_bins=40,
+        num_features=20,
+        penalties=(1e-3,),
+        coverages=(0.5, 0.8),
+    )
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """A row for each split, way, coverage and role."""
+        sizes = job.sizes
+        config = composed("crossval", [*sizes.overrides, *job.overrides])
+        source = instantiate(config.data, _convert_="all")
+        names = sorted({recording.material for recording in source.ids})
+        share, seed = config.train_share, config.seed
+        materials = surveyed(
+            source, config, names, sizes.train_bins, sizes.judged_bins, share, seed
+        )
+        recipe = small_recipe(config, sizes.train_bins, sizes.num_features, sizes.penalties)
+        rows = []
+        for held_out in _choices(names, sizes):
+            say(f"abstaining: without {', '.join(held_out)}")
+            seen = [name for name in names if name not in held_out]
+            machine = FittedMachine.of(materials.survey_of(seen), recipe)
+            evaluated = {
+                "test": materials.bins_of(seen, ("test",)),
+                "unseen": materials.bins_of(held_out, ("train", "test")),
+            }
+            bins = {
+                role: _Scored(machine.scores(of.features), of.is_slip, of.recording)
+                for role, of in evaluated.items()
+            }
+            for way, coverage, low, high in _thresholds(machine, sizes.coverages):
+                for role, of in bins.items():
+                    row = {"way": way, "asked": coverage, "role": role, "held_out": held_out}
+                    rows.append(row | _evaluated(of, low, high, coverage))
+        return {"rows": rows}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Means over splits by role."""
+        rows = numbers["rows"]
+        found = {}
+        for role, words in SEEN_ROLE.items():
+            cells = []
+            for way, asked in dict.fromkeys((row["way"], row["asked"]) for row in rows):
+                these = [
+                    row for row in rows
+                    if (row["way"], row["asked"], row["role"]) == (way, asked, role)
+                ]  # fmt: skip
+                values = [mean(row[name] for row in these) for name in MEASURES]
+                least = min(row["covered"] for row in these)
+                cells.append([way, f"{100 * asked:g}", *map(percent, values), percent(least)])
+            num = len({tuple(row["held_out"]) for row in rows})
+            note = f"Means over {num} choices of held-out materials."
+            header = ["thresholds by", "asked %", *MEASURES.values(), "least coverage %"]
+            found[f"{role}: {words}"] = Table(header, cells, note)
+        return found
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Coverage kept against coverage asked for."""
+        panels = drawing.subplots(1, len(SEEN_ROLE), sharey=True)
+        for axes, (role, words) in zip(panels, SEEN_ROLE.items(), strict=True):
+            rows = [row for row in numbers["rows"] if row["role"] == role]
+            for color, way in zip(COLORS, dict.fromkeys(row["way"] for row in rows), strict=False):
+                asked = sorted({row["asked"] for row in rows})
+                kept = [
+                    mean(r["covered"] for r in rows if (r["way"], r["asked"]) == (way, of))
+                    for of in asked
+                ]
+                axes.plot(asked, kept, "o-", color=color, label=way)
+            axes.plot(asked, asked, "--", color=LIGHT)
+            axes.set_title(words, fontsize=10)
+            axes.set_xlabel("coverage asked for")
+        panels[0].set_ylabel("coverage kept")
+        handles = panels[0].get_legend_handles_labels()
+        drawing.legend(*handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+
+
+def _choices(names: Sequence[str], sizes: Sizes) -> list[tuple[str, ...]]:
+    """The paper's held-out materials where they are as many, then others by a seed."""
+    every = list(itertools.combinations(sorted(names), sizes.num_held_out))
+    papers = tuple(sorted(set(names) - set(SEEN_MATERIALS)))
+    first = [papers] if papers in every else []
+    others = [choice for choice in every if choice not in first]
+    return [*first, *random.Random(0).sample(others, len(others))][: sizes.splits]
+
+
+def _thresholds(
+    machine: FittedMachine, coverages: Sequence[float]
+) -> Iterator[tuple[str, float, float, float]]:
+    """Way, coverage, and the scores below and above which a bin has an answer."""
+    sample = machine.survey.sample.bins()
+    every = torch.arange(len(sample.is_slip))
+    groups = {"bin": every, "recording": sample.recording, "material": sample.group}
+    held = {
+        name: held_out_scores(machine.plan, machine.recipe, machine.survey, group)
+        for name, group in groups.items()
+    }
+    platt = fit_platt(held["material"], sample.is_slip, machine.weights)
+    for coverage in coverages:
+        for way, left_out, unit in (
+            (OURS, "recording", sample.recording),
+            ("the same, material left out", "material", sample.recording),
+            ("bins as units", "bin", every),
+        ):
+            found = thresholds(held[left_out], sample.is_slip, unit, coverage)
+            yield way, coverage, found.low, found.high
+        reach = math.log(coverage / (1 - coverage))
+        low, high = -math.inf, math.inf
+        if platt.slope:
+            low, high = ((side * reach - platt.offset) / platt.slope for side in (-1, 1))
+        yield "probability threshold", coverage, low, high
+        yield "never abstaining", coverage, 0.0, 0.0
+
+
+def _evaluated(bins: _Scored, low: float, high: float, coverage: float) -> dict[str, Any]:
+    given = answers(bins.score, low, high)
+    counts = {
+        str(name): answer_counts(bins.is_slip[mine], given[mine])
+        for name in bins.recording.unique().tolist()
+        for mine in [bins.recording == name]
+    }
+    found = answer_metrics(counts, coverage)
+    return {
+        "covered": mean(found[name]["coverage"] or 0.0 for name in CLASSES),
+        "abstained": found["unsure"],
+        "right": found["sure_balanced_accuracy"] or 0.0,
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(Abstaining().run())

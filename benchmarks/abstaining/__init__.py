@@ -1,1 +1,0 @@
-"""Answers that may be unsure: what they were asked to cover, and what they cover."""

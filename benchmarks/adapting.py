@@ -1,0 +1,329 @@
+"""A new material from a few recordings: ``python -m benchmarks.adapting``.
+
+Held-out materials are brought to a trained detector, recording by recording. Ways: ``auto`` (the
+weight that old materials allow), ``slip-free`` (the same, of bins without slip alone), ``weight 1``
+(what fitting again on everything gives, features and scaling kept), ``threshold`` (the machine
+stays, its threshold moves) and ``ceiling`` (trained on the whole training share of the new material
+too, features ranked and scaled anew).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import mean, median
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from benchmarks.harness import (
+    COLORS,
+    Benchmark,
+    Job,
+    Report,
+    Table,
+    limit,
+    limits,
+    percent,
+    say,
+    timed,
+)
+from benchmarks.subjects import FittedMachine, Trained
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.features.survey import Survey
+from tactslip_torch.model.detector_file import Head
+from tactslip_torch.training.adaptation import (
+    FACTORS,
+    Solved,
+    add,
+    mean_recall,
+    recording_bins,
+    solve,
+)
+from tactslip_torch.training.statistics import RecordingBins, Statistics, statistics_of
+
+AUTO, SLIP_FREE, ONE, SHIFT, CEILING = "auto", "slip-free", "weight 1", "threshold", "ceiling"
+BinsByName = dict[str, RecordingBins]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Args:
+        training: overrides of ``tactslip_torch.train``; its held-out materials are the new ones.
+        counts: recordings that are added.
+        draws: of which recordings.
+        train_share: of a new material's recordings, from which they are drawn; everything is
+            evaluated on the others.
+        limited: the count that limits are on.
+        margin: that old materials may lose on average.
+    """
+
+    training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
+    counts: tuple[int, ...] = (1, 2, 5, 10)
+    draws: int = 3
+    train_share: float = 0.8
+    limited: int = 5
+    margin: float = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class _Subject:
+    """The trained detector, its statistics, and the bins of every recording by name."""
+
+    trained: Trained
+    statistics: Statistics
+    before: Solved
+    bins: BinsByName
+
+    def of(self, recordings: Sequence[RecordingId]) -> BinsByName:
+        return {str(one): self.bins[str(one)] for one in recordings}
+
+
+class Adapting(Benchmark[Sizes]):
+    """New materials by count, way and draw."""
+
+    name = "adapting"
+    title = "A new material from a few recordings"
+    about = "balanced accuracy on a new material and on the old ones, by recordings that are added"
+    sizes = Sizes()
+    quick = Sizes(
+        (
+            "+exp=quick",
+            "recipe=robust",
+            "data.cycles=4",
+            "recipe.num_features=10",
+            "recipe.penalties=[0.0003]",
+            "split.train_share=0.75",
+        ),
+        counts=(1, 2),
+        draws=1,
+        train_share=0.6,
+        limited=2,
+    )
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Every new material, way, count and draw; weights on training materials; one step."""
+        sizes = job.sizes
+        overrides = [*sizes.training, *job.overrides, "statistics=true"]
+        trained = Trained.by(overrides, job.folder, job.folder / "cache")
+        statistics = statistics_of(job.folder / "detector.pt", trained.detector)
+        bins = recording_bins(trained.detector, trained.maker)
+        subject = _Subject(trained, statistics, solve(statistics), bins)
+        old = [subject.of(trained.recordings("test", m)) for m in trained.materials("test")]
+        rows: list[dict[str, Any]] = []
+        for material in trained.materials("unseen"):
+            say(f"adapting: {material} is new")
+            order = _drawn(trained.recordings("unseen", material), 1000)
+            num = round(sizes.train_share * len(order))
+            pool, new = order[:num], subject.of(order[num:])
+            row = {"material": material, "way": "before", "count": 0}
+            rows.append(row | _scores(subject.before.head, new, old))
+            for way, count, draw in _jobs(sizes):
+                chosen = subject.of(_drawn(pool, draw)[:count])
+                row = {"material": material, "way": way, "count": len(chosen)}
+                rows.append(row | _adapted(subject, way, chosen, new, old, sizes))
+            row = {"material": material, "way": CEILING, "count": len(pool)}
+            rows.append(row | _ceiling(trained, pool, order[num:]))
+        material = trained.materials("unseen")[0]
+        some = subject.of(trained.recordings("unseen", material)[: sizes.limited])
+        seconds, _ = timed(lambda: add(statistics, subject.before, some, None, 1.0))
+        return {
+            "rows": rows,
+            "weights": list(_weights(subject, sizes)),
+            "add_s": seconds,
+            "limited": sizes.limited,
+            "margin": sizes.margin,
+        }
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Limits, new and old materials, and how the weight was chosen."""
+        rows = numbers["rows"]
+        materials = list(dict.fromkeys(row["material"] for row in rows))
+        found = {}
+        for key, title in (("new", "New material"), ("old", "Old materials' test recordings")):
+            cells = []
+            for way, count in dict.fromkeys((row["way"], row["count"]) for row in rows):
+                texts = []
+                for material in materials:
+                    at = (material, way, count)
+                    values = [
+                        row[key] for row in rows
+                        if (row["material"], row["way"], row["count"]) == at
+                    ]  # fmt: skip
+                    lowest, highest = (
+                        percent(min(values, default=0)),
+                        percent(max(values, default=0)),
+                    )
+                    middle = percent(median(values)) if values else "-"
+                    texts.append(f"{middle} ({lowest} to {highest})" if len(values) > 1 else middle)
+                cells.append([way, str(count), *texts])
+            note = "Balanced accuracy, %, median of draws (lowest to highest)."
+            found[title] = Table(["way", "recordings", *materials], cells, note)
+        factors = dict.fromkeys(row["factor"] for row in numbers["weights"])
+        cells = []
+        for factor in factors:
+            these = [row for row in numbers["weights"] if row["factor"] == factor]
+            cells.append(
+                [f"{factor:g}", *(percent(mean(row[key] for row in these)) for key in _KEYS)]
+            )
+        note = "Where each training material in turn is new; means over them."
+        weights = Table(["weight of a new bin", "new %", "old %"], cells, note)
+        before = mean(row["old"] for row in rows if row["way"] == "before")
+        limited = [
+            row["old"] for row in rows if (row["way"], row["count"]) == (AUTO, numbers["limited"])
+        ]
+        goals = [
+            limit(f"old materials lose, points, auto, {numbers['limited']} recordings",
+                  100 * (before - mean(limited)), 100 * numbers["margin"]),
+            limit(f"s to add {numbers['limited']} recordings whose features are there",
+                  numbers["add_s"], 10.0),
+        ]  # fmt: skip
+        return {"Limits": limits(goals), **found, "How the weight was chosen": weights}
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """New and old against the number of recordings."""
+        panels = drawing.subplots(1, 2)
+        rows = numbers["rows"]
+        for axes, key, title in zip(panels, _KEYS, ("new material", "old materials"), strict=True):
+            for place, way in enumerate((AUTO, SLIP_FREE, ONE, SHIFT)):
+                these = [row for row in rows if row["way"] in (way, "before")]
+                counts = sorted({row["count"] for row in these})
+                means = [mean(100 * r[key] for r in these if r["count"] == of) for of in counts]
+                axes.plot(counts, means, "o-", color=COLORS[place], label=way)
+            axes.set_title(title, fontsize=10)
+            axes.set_xlabel("recordings added")
+        panels[0].set_ylabel("balanced accuracy, %, mean of materials")
+        panels[0].legend(frameon=False, fontsize=8)
+
+
+_KEYS = ("new", "old")
+
+
+def _jobs(sizes: Sizes) -> Iterator[tuple[str, int, int]]:
+    for way in (AUTO, ONE, SHIFT, SLIP_FREE):
+        for count in sizes.counts:
+            yield from ((way, count, draw) for draw in range(sizes.draws))
+
+
+def _drawn(recordings: Sequence[RecordingId], seed: int) -> list[RecordingId]:
+    """The recordings in a random order."""
+    generator = torch.Generator().manual_seed(seed)
+    return [recordings[at] for at in torch.randperm(len(recordings), generator=generator).tolist()]
+
+
+def _adapted(
+    subject: _Subject,
+    way: str,
+    chosen: BinsByName,
+    new: BinsByName,
+    old: Sequence[BinsByName],
+    sizes: Sizes,
+) -> dict[str, float]:
+    """Scores after these recordings are brought to the detector in one way."""
+    head = subject.before.head
+    if way == SHIFT:
+        return _scores(head, new, old, best_shift(head, *_joined(chosen)))
+    if way == ONE:
+        after = subject.statistics.reweighed(dict.fromkeys(chosen, 1.0), chosen)
+        machine = after.machine
+        solved = after.sums.solve(machine.penalty, machine.offset, balance=machine.balance)
+        return _scores(solved, new, old)
+    if way == SLIP_FREE:
+        chosen = {
+            name: replace(own, z=own.z[~own.is_slip], is_slip=own.is_slip[~own.is_slip])
+            for name, own in chosen.items()
+        }
+    change = add(subject.statistics, subject.before, chosen, None, sizes.margin)
+    is_accepted = change.problem(sizes.margin) is None
+    return _scores(change.solved.head if is_accepted else head, new, old)
+
+
+def _ceiling(
+    trained: Trained, added: Sequence[RecordingId], new: Sequence[RecordingId]
+) -> dict[str, float]:
+    """Trained on these recordings of the new material too: ranked, scaled and chosen anew."""
+    survey = Survey(len(trained.maker.pool.names), trained.recipe.sample_bins)
+    for recording in [*trained.recordings("train"), *added]:
+        made = trained.maker(recording, trained.split)
+        survey.update(str(recording), recording.material, made.features, made.is_slip)
+    num = len(trained.detector.selected)
+    machine = FittedMachine.of(survey, replace(trained.recipe, num_features=num))
+
+    def score(recordings: Sequence[RecordingId]) -> float:
+        made = [trained.maker(recording, trained.split) for recording in recordings]
+        scores = torch.cat([machine.scores(one.features) for one in made])
+        return mean_recall(scores >= 0, torch.cat([one.is_slip for one in made]))
+
+    old = [score(trained.recordings("test", name)) for name in trained.materials("test")]
+    return {"new": score(new), "old": mean(old)}
+
+
+def _weights(subject: _Subject, sizes: Sizes) -> Iterator[dict[str, Any]]:
+    """What weights do where each training material in turn is new: ``FACTORS`` rests on this.
+
+    Features and scaling saw the material. No new material, and no test recording, is among it.
+    """
+    trained = subject.trained
+    materials = trained.materials("train")
+    total = sum(len(own.z) for own in subject.of(trained.recordings("train")).values())
+    for material in materials:
+        mine = subject.of(trained.recordings("train", material))
+        order = _drawn(trained.recordings("train", material), 0)
+        bins, others = subject.of(order[: sizes.limited]), subject.of(order[sizes.limited :])
+        without = subject.statistics.reweighed(dict.fromkeys(mine, 0.0), mine)
+        average = (total - sum(len(own.z) for own in mine.values())) / (len(materials) - 1)
+        unit = average / sum(len(own.z) for own in bins.values())
+        for factor in (0.0, *FACTORS):
+            solved = solve(without.reweighed(dict.fromkeys(bins, factor * unit), bins))
+            old = [
+                mean_recall((solved.scores >= 0)[of], solved.known.is_slip[of])
+                for place, name in enumerate(solved.known.materials)
+                if name != material and bool((of := solved.known.material == place).any())
+            ]
+            new = _score(solved.head, others or bins, 0.0)
+            yield {"material": material, "factor": factor, "new": new, "old": mean(old)}
+
+
+def best_shift(head: Head, z: Tensor, is_slip: Tensor) -> float:
+    """What to add to scores so that balanced accuracy on these bins is best.
+
+    Example:
+        >>> best_shift(lambda z: z[:, 0], torch.tensor([[-2.0], [-1.0]]), torch.tensor([0, 1]) > 0)
+        1.5
+    """
+    scores = head(z).sort()
+    truth = is_slip[scores.indices].double()
+    zero = truth.new_zeros(1)
+    missed, quiet = torch.cat([zero, truth.cumsum(0)]), torch.cat([zero, (1 - truth).cumsum(0)])
+    recalls = (missed[-1] - missed) / missed[-1].clamp(min=1) + quiet / quiet[-1].clamp(min=1)
+    place = int(recalls.argmax())
+    values = scores.values
+    return -float((values[max(place - 1, 0)] + values[min(place, len(values) - 1)]) / 2)
+
+
+def _joined(bins: Mapping[str, RecordingBins]) -> tuple[Tensor, Tensor]:
+    own = list(bins.values())
+    return torch.cat([one.z for one in own]), torch.cat([one.is_slip for one in own])
+
+
+def _score(head: Head, bins: BinsByName, shift: float) -> float:
+    z, is_slip = _joined(bins)
+    return float(mean_recall(head(z) + shift >= 0, is_slip))
+
+
+def _scores(
+    head: Head, new: BinsByName, old: Sequence[BinsByName], shift: float = 0.0
+) -> dict[str, float]:
+    """Of the new material, and the mean over old ones."""
+    return {
+        "new": _score(head, new, shift),
+        "old": mean(_score(head, bins, shift) for bins in old),
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(Adapting().run())

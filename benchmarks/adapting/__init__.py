@@ -1,1 +1,0 @@
-"""How much of a new material a few recordings bring, and what the old ones pay."""

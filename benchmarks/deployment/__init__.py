@@ -1,1 +1,0 @@
-"""What a deployed detector costs: ``python -m benchmarks.deployment``."""

@@ -1,0 +1,159 @@
+"""The whole pool of features beside its peers: ``python -m benchmarks.features``.
+
+Seconds and errors of all features of simulated bins, by the package, by NumPy with PyWavelets, and
+by MiniRocket and TSFEL, which make other features of the same bins and so have no error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from benchmarks.harness import (
+    Benchmark,
+    Job,
+    Report,
+    Spread,
+    Table,
+    bars,
+    interleaved,
+    number,
+    on_threads,
+)
+from benchmarks.peers import arrays, loop, others
+from benchmarks.subjects import FLOAT32, FLOAT64, labelled_bins
+from tactslip_torch import FeatureExtractor, FeaturePool, HandLayout
+
+HAND = HandLayout.paper24()
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Args:
+        bins: of a call of the package and of MiniRocket.
+        slow_bins: of a call of the reference and of NumPy.
+        num_kernels: of MiniRocket.
+        threads: of everything that takes threads.
+        rounds: of every call.
+    """
+
+    bins: int = 4096
+    slow_bins: int = 256
+    num_kernels: int = 10_000
+    threads: int = 2
+    rounds: int = 7
+
+
+class Features(Benchmark[Sizes]):
+    """All features of simulated bins, by the package and by its peers."""
+
+    name = "features"
+    title = "Features: the whole pool"
+    about = "all features of filtered simulated bins of 24 channels and 50 ms"
+    sizes = Sizes()
+    quick = Sizes(bins=32, slow_bins=4, num_kernels=168, rounds=2)
+    libraries = ("numba", "PyWavelets", "ptwt", "tsfel", "aeon")
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Every way once a round."""
+        sizes = job.sizes
+        some, _ = labelled_bins(1)
+        bins = some[torch.arange(sizes.bins) % len(some)].clone()
+        few = bins[: sizes.slow_bins]
+        rocket = others.mini_rocket(bins[:64].numpy(), sizes.threads, sizes.num_kernels)
+        names = [(n.channel, n.component, n.domain, n.descriptor) for n in FeaturePool(HAND).names]
+        windows = bins.float().numpy()
+        ways: dict[str, tuple[int, Callable[[], Any]]] = {
+            "tactslip_torch, float64": (len(bins), partial(_extractor(FLOAT64), bins)),
+            "tactslip_torch, float32": (len(bins), partial(_extractor(FLOAT32), bins.float())),
+            "reference, float64": (len(few), partial(FeaturePool(HAND), few)),
+            "NumPy and PyWavelets, batched": (
+                len(few),
+                partial(arrays.features, few.numpy(), 14),
+            ),
+            "SciPy and PyWavelets, a loop": (
+                1,
+                partial(_looped, few[0].numpy(), names),
+            ),
+            "aeon MiniRocket, transform": (len(windows), partial(rocket.transform, windows)),
+            "TSFEL, all features": (1, partial(others.tsfel_features(), few[0].numpy())),
+        }
+        with torch.inference_mode(), on_threads(sizes.threads):
+            calls = {name: call for name, (_, call) in ways.items()}
+            timings = interleaved(calls, sizes.rounds, block_s=0)
+            truth = torch.as_tensor(calls["reference, float64"]())
+            rows = []
+            for name, (num, call) in ways.items():
+                found = torch.as_tensor(np.atleast_2d(call()))
+                is_same = found.shape[1] == truth.shape[1] and "Rocket" not in name
+                rows.append(
+                    {
+                        "way": name,
+                        "features": found.shape[1],
+                        "bins": num,
+                        "seconds": timings[name].per_round,
+                        "error": feature_error(found, truth) if is_same else None,
+                    }
+                )
+        return {"threads": sizes.threads, "rows": rows}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Time of a bin and error of each way."""
+        rows = [
+            [
+                row["way"],
+                str(row["features"]),
+                Spread.of(row["seconds"], 1e6 / row["bins"]).text(),
+                str(row["bins"]),
+                "-" if row["error"] is None else number(row["error"]),
+            ]
+            for row in numbers["rows"]
+        ]
+        note = (
+            f"{numbers['threads']} threads where a way takes threads. Error: the largest, over "
+            "the larger of the reference's magnitude and its column's standard deviation; of "
+            "entropy and mode, which step, the 99th percentile. NaN of the loop, which has no "
+            "rule for constants, is left out."
+        )
+        header = ["way", "features", "us a bin", "bins a call", "error"]
+        return {"Time and error": Table(header, rows, note)}
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Time of a bin."""
+        rows = numbers["rows"]
+        values = [Spread.of(row["seconds"], 1e6 / row["bins"]).median for row in rows]
+        bars(drawing.subplots(), [row["way"] for row in rows], {"time": values}, "us a bin")
+
+
+def feature_error(found: Tensor, reference: Tensor) -> float:
+    """The largest relative error; of descriptors that step, the 99th percentile."""
+    num = min(len(found), len(reference))
+    size = torch.maximum(reference[:num].abs(), reference.std(0, correction=0))
+    distance = (found[:num].double() - reference[:num]).abs()
+    relative = torch.where(distance == 0, 0.0, distance / size).nan_to_num(0.0, posinf=0.0)
+    steps = [str(name).endswith(("entropy", "mode")) for name in FeaturePool(HAND).names]
+    is_step = torch.tensor(steps)
+    return float(max(relative[:, ~is_step].max(), relative[:, is_step].quantile(0.99)))
+
+
+def _extractor(dtype: torch.dtype) -> FeatureExtractor:
+    pool = FeaturePool(HAND, arithmetic="native" if dtype == FLOAT32 else "double")
+    return FeatureExtractor(pool)
+
+
+def _looped(bin_: Any, names: Any) -> Any:
+    with others.quiet():
+        return loop.features(bin_, names, HAND.names)
+
+
+if __name__ == "__main__":
+    raise SystemExit(Features().run())

@@ -1,1 +1,0 @@
-"""What features and scores cost: ``python -m benchmarks.features``."""

@@ -1,0 +1,241 @@
+"""Reading and writing times beside the libraries: ``python -m benchmarks.formats``.
+
+One simulated recording in every format: written, loaded whole, read by stretches, and read by the
+format's own library alone with the lines that anybody would write first. All are checked to read
+what was written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from benchmarks.harness import (
+    Benchmark,
+    Job,
+    Report,
+    Spread,
+    Table,
+    bars,
+    interleaved,
+    limit,
+    limits,
+    number,
+    on_threads,
+    paired_ratio,
+    say,
+)
+from benchmarks.subjects import Array
+from tactslip_torch.data.formats import FORMATS, Archived, pieces
+from tactslip_torch.simulation.source import SimulatedRecordings
+
+LOAD, STRETCHES, SAVE, LIBRARY = "loaded whole", "read by stretches", "written", "by its library"
+LIMITED = ("npz", "hdf5", "mcap")
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Args:
+        duration_s: of the recording.
+        stretch_ms: read at a time where it is not read whole.
+        rounds: of every call.
+    """
+
+    duration_s: float = 14.0
+    stretch_ms: float = 100.0
+    rounds: int = 15
+
+
+class Formats(Benchmark[Sizes]):
+    """Every format, read and written in turns."""
+
+    name = "formats"
+    title = "Files"
+    about = "a simulated recording of 24 channels at 2 kHz in float32, in every format on 1 thread"
+    sizes = Sizes()
+    quick = Sizes(duration_s=1.0, rounds=2)
+    libraries = ("h5py", "mcap", "rosbags", "pyarrow")
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Seconds of every way, each of which is checked first."""
+        sizes = job.sizes
+        written = _recording(sizes.duration_s)
+        samples = written.recording.samples
+        stretch = round(sizes.stretch_ms * 1e-3 * written.recording.sample_rate_hz)
+        with TemporaryDirectory() as folder, on_threads(1):
+            calls: dict[str, Callable[[], Any]] = {}
+            files = {name: Path(folder, f"a.{of.endings[0]}") for name, of in FORMATS.items()}
+            for name, path in files.items():
+                of = FORMATS[name]
+                calls[f"{name} {SAVE}"] = partial(of.save, path, *written)
+                of.save(path, *written)
+                calls[f"{name} {LOAD}"] = partial(of.load, path)
+                calls[f"{name} {STRETCHES}"] = partial(_by_stretches, name, path, stretch)
+                calls[f"{name} {LIBRARY}"] = partial(_LIBRARIES[name][1], path)
+                for found in (
+                    of.load(path).recording.samples,
+                    _by_stretches(name, path, stretch),
+                    _LIBRARIES[name][1](path),
+                ):
+                    if not np.array_equal(np.asarray(found), samples.numpy()):
+                        raise ValueError(f"{name}: what was read is not what was written")
+            say(f"formats: {sizes.rounds} rounds of {len(calls)} calls")
+            timings = interleaved(calls, sizes.rounds)
+            rows = [
+                {
+                    "format": name,
+                    "ending": FORMATS[name].endings[0],
+                    "bytes": _bytes(path),
+                    "library": _LIBRARIES[name][0],
+                    "seconds": {
+                        way: timings[f"{name} {way}"].per_round
+                        for way in (LOAD, STRETCHES, SAVE, LIBRARY)
+                    },
+                }
+                for name, path in files.items()
+            ]
+        return {"rows": rows, "sample_bytes": samples.numel() * samples.element_size()}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Limits, reading and writing."""
+        rows = numbers["rows"]
+        goals = [
+            limit(f".{row['ending']} {way}", Spread.of(row["seconds"][way], 1e3).median, 100, "ms")
+            for row in rows
+            if row["format"] in LIMITED
+            for way in (LOAD, STRETCHES)
+        ]
+        reading = [
+            [
+                f".{row['ending']}",
+                *(Spread.of(row["seconds"][way], 1e3).text() for way in (LOAD, STRETCHES)),
+                row["library"],
+                Spread.of(row["seconds"][LIBRARY], 1e3).text(),
+                number(paired_ratio(row["seconds"][LIBRARY], row["seconds"][LOAD]).median),
+            ]
+            for row in rows
+        ]
+        writing = [
+            [
+                f".{row['ending']}",
+                Spread.of(row["seconds"][SAVE], 1e3).text(),
+                f"{row['bytes'] / 1e3:,.0f}",
+                number(row["bytes"] / numbers["sample_bytes"]),
+            ]
+            for row in rows
+        ]
+        header = ["file", "whole, ms", "by stretches, ms", "library", "its ms", "library / whole"]
+        return {
+            "Limits": limits(goals, "median"),
+            "Reading": Table(header, reading),
+            "Writing": Table(["file", "ms", "kB", "bytes / samples"], writing),
+        }
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Three bars a format."""
+        rows = numbers["rows"]
+        series = {
+            way: [Spread.of(row["seconds"][way], 1e3).median for row in rows]
+            for way in (LOAD, STRETCHES, LIBRARY)
+        }
+        bars(drawing.subplots(), [f".{r['ending']}" for r in rows], series, "ms to read all")
+
+
+def _recording(duration_s: float) -> Archived:
+    source = SimulatedRecordings(cycles=1, materials=["M1"])
+    whole = source.load(source.ids[0])
+    count = round(duration_s * whole.sample_rate_hz)
+    whole = replace(whole, samples=whole.samples[:, :count].float().contiguous())
+    return Archived(whole, source.hand, dict(source.key(source.ids[0])))
+
+
+def _by_stretches(name: str, path: Path, stretch: int) -> torch.Tensor:
+    with FORMATS[name].open(path) as opened:
+        return torch.cat(list(pieces(opened.samples, stretch)), 1)
+
+
+def _bytes(path: Path) -> int:
+    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    return sum(file.stat().st_size for file in files)
+
+
+# ------------------------------------------------------------------ samples by libraries alone
+def _npz(path: Path) -> Array:
+    with np.load(path) as content:
+        return np.asarray(content["samples"])
+
+
+def _text(path: Path) -> Array:
+    return np.loadtxt(path, delimiter=",", skiprows=2, dtype=np.float32)[:, 1:].T
+
+
+def _hdf5(path: Path) -> Array:
+    import h5py  # type: ignore[import-untyped]
+
+    with h5py.File(path) as file:
+        return np.asarray(file["samples"][()])
+
+
+def _mat(path: Path) -> Array:
+    from scipy.io import loadmat
+
+    return np.asarray(loadmat(path)["samples"])
+
+
+def _parquet(path: Path) -> Array:
+    from pyarrow import parquet  # type: ignore[import-untyped]
+
+    columns = parquet.read_table(path, use_threads=False).columns[1:]
+    return np.stack([column.to_numpy() for column in columns])
+
+
+def _mcap(path: Path) -> Array:
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        messages = make_reader(file).iter_messages()
+        return _decoded([(message.data, schema.name) for schema, _, message in messages if schema])
+
+
+def _rosbag2(path: Path) -> Array:
+    from rosbags.rosbag2 import Reader
+
+    with Reader(path) as bag:
+        return _decoded([(raw, connection.msgtype) for connection, _, raw in bag.messages()])
+
+
+def _decoded(messages: list[tuple[bytes, str]]) -> Array:
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    blocks = []
+    for raw, name in messages:
+        kind = name if "/msg/" in name else name.replace("/", "/msg/")
+        message: Any = store.deserialize_cdr(raw, kind)
+        blocks.append(message.data.reshape([axis.size for axis in message.layout.dim]))
+    return np.asarray(np.concatenate(blocks).T)
+
+
+_LIBRARIES: dict[str, tuple[str, Callable[[Path], Array]]] = {
+    "npz": ("numpy.load", _npz),
+    "text": ("numpy.loadtxt", _text),
+    "hdf5": ("h5py", _hdf5),
+    "mat": ("scipy.io.loadmat", _mat),
+    "mcap": ("mcap and rosbags", _mcap),
+    "rosbag2": ("rosbags", _rosbag2),
+    "parquet": ("pyarrow.parquet", _parquet),
+}
+"""By the format: its library, and all samples ``[C, T]`` by it."""
+
+if __name__ == "__main__":
+    raise SystemExit(Formats().run())

@@ -1,1 +1,0 @@
-"""What reading and writing a recording costs in every format."""

@@ -1,0 +1,232 @@
+"""Gradients through the fit, beside autograd through the factorisation.
+
+``python -m benchmarks.gradients``: a loss on other bins, or of groups left out, and its gradient in
+features, C, c and weights; each in a process of its own, with the memory that it took.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from statistics import median
+from typing import Any, Literal
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from benchmarks.harness import (
+    Benchmark,
+    Job,
+    Report,
+    Spread,
+    Table,
+    bars,
+    in_fresh_process,
+    number,
+    peak_bytes,
+    say,
+)
+from benchmarks.model import synthetic_bins
+from tactslip_torch.model.fit import TrainingBins, fit_machine, fit_quadratic
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.leave_one_group_out import HeldOut, held_out_scores
+
+Kind = Literal["fit", "left out"]
+FORWARD, OURS, PEER = "forward alone", "differentiable", "autograd"
+NUM_GROUPS, NUM_SCORED, PENALTY, OFFSET = 6, 1000, 1.0, 0.5
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A fit to go back through.
+
+    Args:
+        kind: the machine of all bins, or the scores of groups left out.
+        num_bins: to fit.
+        num_features: of them.
+        has_peer: whether autograd goes through the same.
+    """
+
+    kind: Kind
+    num_bins: int
+    num_features: int
+    has_peer: bool
+
+    def __str__(self) -> str:
+        return f"{self.kind}, {self.num_bins:,} x {self.num_features}"
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Problems, rounds of every way, and threads of every process."""
+
+    problems: tuple[Problem, ...] = (
+        Problem("fit", 8000, 120, has_peer=True),
+        Problem("fit", 2000, 120, has_peer=True),
+        Problem("left out", 4800, 120, has_peer=False),
+        Problem("left out", 2000, 60, has_peer=True),
+    )
+    rounds: int = 3
+    threads: int = 2
+
+
+class Gradients(Benchmark[Sizes]):
+    """Every way of every problem, in turns."""
+
+    name = "gradients"
+    title = "Gradients through the fit"
+    about = "a loss and its gradient in features, C, c and weights, on synthetic bins"
+    sizes = Sizes()
+    quick = Sizes(
+        (Problem("fit", 200, 12, has_peer=True), Problem("left out", 200, 12, has_peer=True)),
+        rounds=1,
+    )
+    is_simulated = False
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Seconds and bytes of every round, each in a process of its own."""
+        rows: dict[tuple[Problem, str], list[Any]] = {}
+        for _ in range(job.sizes.rounds):
+            for problem in job.sizes.problems:
+                for way in (FORWARD, OURS, *([PEER] if problem.has_peer else [])):
+                    say(f"gradients: {problem}, {way}")
+                    given = {"problem": asdict(problem), "way": way, "threads": job.sizes.threads}
+                    answer = in_fresh_process("benchmarks.gradients:one_way", **given)
+                    rows.setdefault((problem, way), []).append(answer)
+        return {
+            "threads": job.sizes.threads,
+            "rows": [
+                {"problem": str(problem), "way": way, "rounds": found}
+                for (problem, way), found in rows.items()
+            ],
+        }
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Seconds, memory and difference of every way."""
+        cells = []
+        for row in numbers["rows"]:
+            rounds, first = row["rounds"], row["rounds"][0]
+            peer = _row(numbers, row["problem"], PEER)
+            differs = "-"
+            if peer is not None and row["way"] == OURS:
+                theirs = torch.tensor(peer["rounds"][0]["gradient"])
+                off = torch.tensor(first["gradient"]) - theirs
+                differs = number(float((off.abs() / theirs.abs()).max()))
+            backward = [of["backward_s"] for of in rounds if of["backward_s"] is not None]
+            cells.append(
+                [
+                    f"{row['problem']}: {row['way']}",
+                    Spread.of([of["forward_s"] for of in rounds]).text(),
+                    Spread.of(backward).text() if backward else "-",
+                    number(median(of["bytes"] for of in rounds) / 1e6),
+                    differs,
+                ]
+            )
+        header = ["bins x features", "forward, s", "backward, s", "memory, MB", "off autograd"]
+        note = f"{numbers['threads']} threads; memory: the most beyond what was held before."
+        return {"Forward and back": Table(header, cells, note)}
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Seconds of forward and back."""
+        rows = numbers["rows"]
+        series = {
+            way: [
+                median(of["forward_s"] + (of["backward_s"] or 0.0) for of in row["rounds"])
+                for row in rows
+            ]
+            for way in ("forward and back",)
+        }
+        names = [f"{row['problem']}: {row['way']}" for row in rows]
+        bars(drawing.subplots(), names, series, "s, with a way back: forward and back")
+
+
+def one_way(problem: Report, way: str, threads: int) -> dict[str, Any]:
+    """One loss and its gradient, after a small one that loads and starts what there is.
+
+    Returns:
+        ``forward_s``, ``backward_s`` (``None`` of the way that has none), ``bytes``, the most
+        beyond what was held before, ``loss``, and ``gradient``, its size along drawn directions.
+    """
+    torch.set_num_threads(threads)
+    given = Problem(**problem)
+    _loss(given, way, *_learned(min(300, given.num_bins), given.num_features))
+    tensors = _learned(given.num_bins, given.num_features)
+    before, started = peak_bytes(), time.perf_counter()
+    loss = _loss(given, way, *tensors)
+    forward_s = time.perf_counter() - started
+    backward_s, gradient = None, None
+    if way != FORWARD:
+        started = time.perf_counter()
+        slopes = torch.autograd.grad(loss, tensors)
+        backward_s = time.perf_counter() - started
+        generator = torch.Generator().manual_seed(0)
+        draws = [torch.randn(s.shape, generator=generator, dtype=s.dtype) for s in slopes]
+        gradient = [float((s * draw).sum()) for s, draw in zip(slopes, draws, strict=True)]
+    return {
+        "forward_s": forward_s,
+        "backward_s": backward_s,
+        "bytes": peak_bytes() - before,
+        "loss": loss.item(),
+        "gradient": gradient,
+    }
+
+
+def _learned(num_bins: int, num_features: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What a gradient is wanted of: features, C, c and weights."""
+    z, _ = synthetic_bins(num_bins, num_features)
+    penalty, offset = (torch.tensor(of, dtype=torch.float64) for of in (PENALTY, OFFSET))
+    weights = torch.linspace(0.5, 1.5, num_bins, dtype=torch.float64)
+    for tensor in (z, penalty, offset, weights):
+        tensor.requires_grad_()
+    return z, penalty, offset, weights
+
+
+def _loss(
+    problem: Problem, way: str, z: Tensor, penalty: Tensor, offset: Tensor, weights: Tensor
+) -> Tensor:
+    """Mean logistic loss on other bins, or of groups left out."""
+    _, is_slip = synthetic_bins(len(z), problem.num_features)
+    groups = torch.arange(len(z)) % NUM_GROUPS
+    new, new_is_slip = synthetic_bins(NUM_SCORED, problem.num_features, seed=1)
+    targets = torch.where(is_slip, 1.0, -1.0).double()
+    fixed = TrainingBins(z.detach(), is_slip, weights.detach())
+    kernel = Polynomial(2, offset.item())
+
+    def by_autograd(rows: Tensor, of: Tensor) -> Tensor:
+        """Scores of rows by a fit to others, as anybody would write it first."""
+        system = (z[of] @ z[of].mT + offset) ** 2 + torch.diag(1 / (penalty * weights[of]))
+        beta = torch.cholesky_solve(targets[of, None], torch.linalg.cholesky(system))[:, 0]
+        return (rows @ z[of].mT + offset) ** 2 @ beta
+
+    if problem.kind == "fit":
+        every = torch.ones_like(is_slip)
+        if way == FORWARD:
+            scores = fit_machine(fixed, penalty.item(), kernel)(new)
+        elif way == OURS:
+            scores = fit_quadratic(z, is_slip, penalty, offset, weights)(new)
+        else:
+            scores = by_autograd(new, every)
+        truth = new_is_slip
+    else:
+        truth = is_slip
+        if way == FORWARD:
+            scores = HeldOut(fixed, groups, kernel).at(penalty.item()).scores
+        elif way == OURS:
+            scores = held_out_scores(z, is_slip, groups, penalty, offset, weights)
+        else:
+            scores = torch.zeros_like(targets)
+            for group in groups.unique():
+                own = groups == group
+                scores = scores.index_put((own,), by_autograd(z[own], ~own))
+    return softplus(torch.where(truth, -scores, scores)).mean()
+
+
+def _row(numbers: Report, problem: str, way: str) -> Report | None:
+    rows = (row for row in numbers["rows"] if (row["problem"], row["way"]) == (problem, way))
+    return next(rows, None)
+
+
+if __name__ == "__main__":
+    raise SystemExit(Gradients().run())

@@ -1,1 +1,0 @@
-"""What the way back through a fit costs: ``python -m benchmarks.gradients``."""

@@ -1,0 +1,553 @@
+"""The harness of all benchmarks: arguments, timing, machine, JSON, tables, figure, page section.
+
+A subject is a class derived from ``Benchmark`` in a file of its own; ``python -m benchmarks.NAME``
+measures it, prints its tables, and writes ``NAME.json``, ``NAME.png`` and its section of
+BENCHMARKS.md between ``<!-- NAME -->`` and ``<!-- /NAME -->``. ``--quick`` measures very little, to
+see that it runs, and touches no tracked file; ``--render`` writes the same from the kept JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import random
+import re
+import subprocess
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from statistics import mean, median, quantiles
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
+from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[import-untyped]
+
+from benchmarks import RESULTS, ROOT
+from benchmarks.reproduction.runs import code_digest
+from tactslip_torch.runtime import whole_file
+
+QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+
+Report = Mapping[str, Any]
+"""What a benchmark keeps: ``numbers`` that it measured, and what they were measured on."""
+
+
+# ------------------------------------------------------------------------------------- timing
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of every single call, by round."""
+
+    rounds: list[list[float]]
+
+    @property
+    def per_round(self) -> list[float]:
+        """Mean seconds of a call, of each round."""
+        return [mean(calls) for calls in self.rounds]
+
+    def summary(self) -> dict[str, Any]:
+        """``seconds`` by round, and percentiles of single calls; JSON-able."""
+        every = [seconds for calls in self.rounds for seconds in calls]
+        p50, p99 = np.percentile(every, [50, 99]).tolist()
+        return {"seconds": self.per_round, "p50_s": p50, "p99_s": p99, "calls": len(every)}
+
+
+def interleaved(
+    calls: Mapping[str, Callable[[], object]],
+    rounds: int,
+    seed: int = 0,
+    *,
+    block_s: float = 2e-3,
+    most_calls: int = 1000,
+) -> dict[str, Timing]:
+    """Time several calls in turns, so that drift of the machine and of its caches hits all alike.
+
+    Every round makes a block of each call in a new random order, after one that is not timed.
+
+    Args:
+        calls: by name.
+        rounds: of every call.
+        seed: of the orders.
+        block_s: a short call is repeated for about so long in a round.
+        most_calls: in a round.
+    """
+    shuffle = random.Random(seed)
+    repeats = {}
+    for name, call in calls.items():
+        least = min(timed(call)[0] for _ in range(3 if block_s else 1))
+        repeats[name] = max(1, min(most_calls, round(block_s / max(least, 1e-9))))
+    found: dict[str, list[list[float]]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name in shuffle.sample(list(calls), len(calls)):
+            if repeats[name] > 1:
+                calls[name]()
+            found[name].append([timed(calls[name])[0] for _ in range(repeats[name])])
+    return {name: Timing(of) for name, of in found.items()}
+
+
+def timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds of a call, and what it returned."""
+    started = time.perf_counter()
+    result = call()
+    return time.perf_counter() - started, result
+
+
+def paired_ratio(seconds: Sequence[float], others: Sequence[float]) -> Spread:
+    """What ``seconds`` are of ``others``, round by round: drift between rounds cancels.
+
+    Example:
+        >>> paired_ratio([1.0, 6.0, 3.0], [1.0, 3.0, 2.0])
+        Spread(median=1.5, low=1.25, high=1.75)
+    """
+    return Spread.of([a / b for a, b in zip(seconds, others, strict=True)])
+
+
+@contextmanager
+def on_threads(number: int) -> Iterator[None]:
+    """So many threads for PyTorch and every BLAS."""
+    before = torch.get_num_threads()
+    with threadpool_limits(number):
+        torch.set_num_threads(number)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
+
+
+def in_fresh_process(function: str, **arguments: Any) -> Any:
+    """The result of ``module:function`` in a process of its own; arguments and result as JSON.
+
+    Raises:
+        RuntimeError: if the process ends without a result.
+    """
+    module, _, name = function.partition(":")
+    code = f"import json, sys\nfrom {module} import {name} as call\n"
+    code += "print(json.dumps(call(**json.load(sys.stdin))))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        input=json.dumps(arguments),
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+        cwd=ROOT,
+    )
+    if done.returncode:
+        raise RuntimeError(f"{function} failed in a process of its own; see above")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def peak_bytes() -> int:
+    """Most memory that this process has had resident."""
+    path = Path("/proc/self/status")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    for line in lines:
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024
+    import resource  # not on Windows; on Linux it would count the parent before exec
+
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024
+
+
+def say(text: str) -> None:
+    """A progress line on standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+# ------------------------------------------------------------------------------------ machine
+def machine_facts() -> dict[str, str]:
+    """Processor, cores this process may use, and how busy the machine is already."""
+    every = os.cpu_count() or 1
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else every
+    facts = {"processor": _processor_name(), "cores": f"{usable} of {every} cores"}
+    if hasattr(os, "getloadavg"):
+        facts["load"] = f"load {os.getloadavg()[0]:.1f} before the runs"
+    return facts
+
+
+def _processor_name() -> str:
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return next(iter(names), platform.processor() or platform.machine())
+
+
+def versions(more: Sequence[str] = ()) -> dict[str, str]:
+    """Of the libraries that do the work, of more of them, and of the BLAS in them."""
+    names = ("torch", "numpy", "scipy", "scikit-learn", "tactslip_torch", *more)
+    found = {"python": platform.python_version()} | {name: metadata.version(name) for name in names}
+    of_torch = re.search(r"BLAS_INFO=(\w+)", torch.__config__.show())
+    blas = {
+        f"{info['internal_api']} {info['version']}"
+        for info in threadpool_info()
+        if info["user_api"] == "blas"
+    }
+    known = [f"{of_torch[1]} in torch"] if of_torch else []
+    return found | {"BLAS": " and ".join([*known, *sorted(blas)])}
+
+
+# ------------------------------------------------------------------------------------- tables
+class Spread(NamedTuple):
+    """The median of some numbers and their quartiles."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Sequence[float], factor: float = 1.0) -> Spread:
+        """Median and quartiles, in another unit by a factor.
+
+        Example:
+            >>> Spread.of([3.0, 1.0, 2.0])
+            Spread(median=2.0, low=1.5, high=2.5)
+        """
+        scaled = [factor * value for value in values]
+        if len(scaled) < 2:
+            return cls(*scaled * 3)
+        low, _, high = quantiles(scaled, n=4, method="inclusive")
+        return cls(median(scaled), low, high)
+
+    def text(self, digits: int = 3) -> str:
+        """``median (low to high)``."""
+        middle, low, high = (number(value, digits) for value in self)
+        return f"{middle} ({low} to {high})"
+
+
+class Table(NamedTuple):
+    """A table that a terminal and a Markdown file show alike.
+
+    Attributes:
+        header: of the columns; the first heads the names of the rows.
+        rows: cells.
+        note: a line below it.
+    """
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+
+    def text(self) -> str:
+        """Aligned columns."""
+        return "\n".join(filter(None, [table([self.header, *self.rows]), self.note]))
+
+    def markdown(self) -> str:
+        """A table of Markdown, columns of numbers to the right and of words to the left."""
+        is_number = [
+            place > 0 and all(re.match(r"[+-]?\d|-?$", cell) for cell in column)
+            for place, column in enumerate(zip(*self.rows, strict=True))
+        ] or [False] * len(self.header)
+        rule = ["---:" if of else "---" for of in is_number]
+        lines = [f"| {' | '.join(cells)} |" for cells in (self.header, rule, *self.rows)]
+        return "\n".join([*lines, *(["", self.note] if self.note else [])])
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number to some significant digits, without an exponent where it is short.
+
+    Example:
+        >>> [number(value) for value in (0.01234, 12.345, 123456.0, 1.2e-11)]
+        ['0.0123', '12.3', '123,456', '1.2e-11']
+    """
+    if value and abs(value) < 1e-4:
+        return f"{value:.1e}"
+    if abs(value) >= 10**digits:
+        return f"{value:,.0f}"
+    return f"{value:.{digits}g}"
+
+
+def percent(value: float) -> str:
+    """A fraction in percent."""
+    return f"{100 * value:.2f}"
+
+
+def limit(what: str, measured: float, most: float, unit: str = "") -> dict[str, Any]:
+    """A row of ``limits``: what was measured, and the most that was set for it."""
+    text = f"{number(measured)} {unit}".strip()
+    bound = f"<= {number(most)} {unit}".strip()
+    return {"what": what, "measured": text, "limit": bound, "ok": bool(measured <= most)}
+
+
+def limits(rows: Sequence[Mapping[str, Any]], measured: str = "measured") -> Table:
+    """Every limit beside what was measured, met or missed.
+
+    Args:
+        rows: with ``what``, ``measured``, ``limit`` and ``ok``, which is ``None`` where there is
+            nothing to judge.
+        measured: heads the second column.
+    """
+    words = {True: "met", False: "MISSED", None: "-"}
+    cells = [[row["what"], row["measured"], row["limit"], words[row["ok"]]] for row in rows]
+    return Table(["limits", measured, "limit", ""], cells)
+
+
+# ------------------------------------------------------------------------------------ figures
+# Okabe and Ito, told apart by the colour-blind
+OURS, SECOND, THIRD, PEER, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#888888"
+COLORS = (OURS, PEER, THIRD, SECOND, "#cc79a7", "#56b4e9", GREY)
+LIGHT = "#dddddd"
+
+
+def bars(
+    axes: Axes,
+    names: Sequence[str],
+    series: Mapping[str, Sequence[float | None]],
+    about: str,
+    *,
+    is_log: bool = True,
+) -> None:
+    """Horizontal bars, the first on top, each with its value; a colour and a legend by series.
+
+    Args:
+        axes: to draw on.
+        names: of the groups of bars.
+        series: values by their meaning, one a name; ``None`` leaves a bar out.
+        about: labels the axis of values.
+        is_log: whether that axis is logarithmic.
+    """
+    height = 0.8 / len(series)
+    for step, (label, values) in enumerate(series.items()):
+        places = [place + height * (step - (len(series) - 1) / 2) for place in range(len(names))]
+        shown = [(place, of) for place, of in zip(places, values, strict=True) if of is not None]
+        color = COLORS[step % len(COLORS)]
+        at, widths = [place for place, _ in shown], [value for _, value in shown]
+        axes.barh(at, widths, color=color, height=0.9 * height, label=label)
+        for place, value in shown:
+            axes.annotate(
+                number(value), (value, place), (3, 0), textcoords="offset points", va="center",
+                size=7,
+            )  # fmt: skip
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    if is_log:
+        axes.set_xscale("log")
+        plain_decades(axes.xaxis)
+    axes.margins(x=0.12)
+    axes.set_xlabel(about)
+    axes.grid(axis="x", color=LIGHT)
+    if len(series) > 1:
+        axes.legend(fontsize=8, frameon=False)
+
+
+def plain_decades(axis: Axis) -> None:
+    """Write decades as numbers, and nothing between them."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def finish(drawing: Figure, report: Report, about: str, path: Path) -> None:
+    """Title, bare frames, and the file.
+
+    Args:
+        drawing: with its axes drawn.
+        report: tells whether it was quick, and whether data are simulated.
+        about: the title; that data are simulated is added.
+        path: of the PNG.
+    """
+    for axes in drawing.axes:
+        axes.set_axisbelow(True)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    quick = "; QUICK, means nothing" if report["quick"] else ""
+    simulated = ", simulated" if report.get("simulated", True) else ""
+    drawing.suptitle(f"{about}{simulated}{quick}", fontsize=11)
+    with whole_file(path) as temporary:
+        drawing.savefig(temporary, dpi=160, format="png", facecolor="white")
+
+
+# -------------------------------------------------------------------------------------- files
+def keep_numbers(report: Report, path: Path) -> None:
+    """Write a report as JSON, whole or not at all, and say where."""
+    write_text(path, json.dumps(report, indent=1, allow_nan=False) + "\n")
+    print(f"\nnumbers in {path}")
+
+
+def write_text(path: Path, content: str) -> None:
+    """Write a file, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as temporary:
+        temporary.write_text(content, encoding="utf-8")
+
+
+def between_markers(text: str, name: str, content: str) -> str:
+    """``text`` with what stands between ``<!-- name -->`` and ``<!-- /name -->`` replaced.
+
+    Raises:
+        ValueError: if a marker is missing.
+    """
+    start, end = f"<!-- {name} -->", f"<!-- /{name} -->"
+    if start not in text or end not in text:
+        raise ValueError(f"the markers {start} and {end} are not both there")
+    before, rest = text.split(start, 1)
+    return f"{before}{start}\n{content}\n{end}{rest.split(end, 1)[1]}"
+
+
+# --------------------------------------------------------------------------------- benchmarks
+S = TypeVar("S")
+
+
+@dataclass(frozen=True)
+class Job(Generic[S]):
+    """What a benchmark is asked to measure.
+
+    Attributes:
+        sizes: how much.
+        folder: of trainings, kept between runs.
+        overrides: ``key=value`` of the command line, for the commands that it runs.
+        is_quick: whether the sizes are too small to mean anything.
+    """
+
+    sizes: S
+    folder: Path
+    overrides: tuple[str, ...] = ()
+    is_quick: bool = False
+
+
+class Benchmark(ABC, Generic[S]):
+    """A subject: what it measures, and how that is shown.
+
+    Attributes:
+        name: of its module, files and markers.
+        title: heads its section.
+        about: what was measured, in a line.
+        sizes: of a measurement.
+        quick: sizes that only show that it runs.
+        libraries: whose versions matter besides those of all benchmarks.
+        markers: between which its section stands.
+        page: that holds them.
+        is_simulated: whether its data are.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    about: ClassVar[str]
+    sizes: S
+    quick: S
+    libraries: ClassVar[tuple[str, ...]] = ()
+    page: ClassVar[str] = "BENCHMARKS.md"
+    markers: ClassVar[str] = ""
+    is_simulated: ClassVar[bool] = True
+
+    @abstractmethod
+    def measure(self, job: Job[S]) -> dict[str, Any]:
+        """The numbers, JSON-able."""
+
+    @abstractmethod
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Tables by title."""
+
+    @abstractmethod
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Fill the figure."""
+
+    def figures(self, report: Report, path: Path) -> None:
+        """Write the figure."""
+        drawing = Figure(figsize=(8.2, 4.8), layout="constrained")
+        self.draw(report["numbers"], drawing)
+        finish(drawing, report, self.title, path)
+
+    def section(self, report: Report) -> str:
+        """What stands between the markers of the page, in Markdown."""
+        ran_on = ", ".join(report["machine"].values())
+        used = ", ".join(f"{name} {of}" for name, of in report["versions"].items())
+        parts = [
+            f"## {self.title}",
+            f"`python -m benchmarks.{self.name}`, on {ran_on}; {used}; code {report['code']}.",
+            *([f"**{QUICK_LINE}.**"] if report["quick"] else []),
+            f"{self.about[:1].upper()}{self.about[1:]}.",
+            f"![{self.title}](benchmarks/results/{self.name}.png)",
+        ]
+        for title, table in self.tables(report["numbers"]).items():
+            parts += [f"### {title}", table.markdown()]
+        return "\n\n".join(parts)
+
+    def text(self, report: Report) -> str:
+        """What is printed."""
+        lines = [
+            self.about,
+            f"machine   {', '.join(report['machine'].values())}",
+            f"versions  {', '.join(f'{name} {of}' for name, of in report['versions'].items())}",
+            *(["SIMULATED: nothing about a real hand"] if report["simulated"] else []),
+            *([QUICK_LINE] if report["quick"] else []),
+        ]
+        tables = self.tables(report["numbers"]).items()
+        return "\n\n".join(["\n".join(lines), *(f"{of}\n{table.text()}" for of, table in tables)])
+
+    def publish(self, report: Report, folder: Path) -> None:
+        """Print tables; write figure and page section, of a quick run a page of its own."""
+        print(self.text(report))
+        self.figures(report, folder / f"{self.name}.png")
+        page = folder / f"{self.name}.md" if report["quick"] else ROOT / self.page
+        markers, content = self.markers or self.name, self.section(report)
+        if report["quick"]:
+            write_text(page, content + "\n")
+        else:
+            write_text(page, between_markers(page.read_text(encoding="utf-8"), markers, content))
+        print(f"section in {page}")
+
+    def run(self, arguments: Sequence[str] | None = None) -> int:
+        """Entry point; the exit status."""
+        parser = argparse.ArgumentParser(
+            prog=f"python -m benchmarks.{self.name}", description=f"{self.title}: {self.about}."
+        )
+        text = "very little, to see that it runs; no tracked file is touched"
+        parser.add_argument("--quick", action="store_true", help=text)
+        parser.add_argument("--render", action="store_true", help="show the kept numbers again")
+        text = "of numbers, figure and, if quick, the page (benchmarks/results, quick: outputs)"
+        parser.add_argument("--out", type=Path, metavar="FOLDER", help=text)
+        text = "passed on to the commands that are run"
+        parser.add_argument("overrides", nargs="*", metavar="key=value", help=text)
+        given = parser.parse_intermixed_args(arguments)
+        outputs = ROOT / "outputs" / "benchmarks"
+        folder = (given.out or (outputs / "quick" if given.quick else RESULTS)).resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{self.name}.json"
+        if given.render:
+            if not path.exists():
+                parser.error(f"--render needs {path}; leave --render out, which measures")
+            report = json.loads(path.read_text(encoding="utf-8"))
+            if "numbers" not in report:
+                parser.error(f"{path} was kept by earlier code; leave --render out, which measures")
+            self.publish(report, folder)
+            return 0
+        runs = (folder / "runs" if given.quick else outputs) / self.name
+        sizes = self.quick if given.quick else self.sizes
+        job = Job(sizes, runs, tuple(given.overrides), given.quick)
+        try:
+            report = self._report(job)
+        except KeyboardInterrupt:
+            return EXIT_INTERRUPTED
+        except (FileNotFoundError, ValueError, RuntimeError) as error:
+            if os.environ.get("TACTSLIP_TRACEBACK"):
+                raise
+            print(f"error: {error}", file=sys.stderr)
+            return EXIT_FAILED if isinstance(error, RuntimeError) else EXIT_BAD_INPUT
+        keep_numbers(report, path)
+        self.publish(report, folder)
+        return 0
+
+    def _report(self, job: Job[S]) -> dict[str, Any]:
+        machine = machine_facts()  # before the load of the measurement
+        numbers = self.measure(job)
+        return {
+            "code": code_digest(),
+            "simulated": self.is_simulated,
+            "quick": job.is_quick,
+            "machine": machine,
+            "versions": versions(self.libraries),
+            "settings": asdict(job.sizes),  # type: ignore[call-overload]
+            "overrides": list(job.overrides),
+            "numbers": numbers,
+        }

@@ -1,0 +1,214 @@
+"""From one raw bin to its score, beside named peers: ``python -m benchmarks.latency``.
+
+Single calls on one thread: the package, its file in onnxruntime, the obvious loop over SciPy and
+PyWavelets, MiniRocket with ridge, and heads of scikit-learn behind our features. Prints seconds and
+how far scores are from the reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import cycle
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.svm import SVC
+
+from benchmarks.deployment import BinSession
+from benchmarks.harness import (
+    Benchmark,
+    Job,
+    Report,
+    Table,
+    bars,
+    interleaved,
+    limit,
+    limits,
+    number,
+    on_threads,
+    say,
+)
+from benchmarks.peers import loop, others
+from benchmarks.subjects import (
+    FLOAT32,
+    FLOAT64,
+    WINDOW_LENGTHS,
+    MainJobDetector,
+    labelled_bins,
+    raw_bins,
+)
+from tactslip_torch import FeaturePool, HandLayout
+from tactslip_torch.graph.export import export_detector
+from tactslip_torch.signals.filtering import ChannelFilter
+
+OURS, REFERENCE, ORT = "tactslip_torch, float32", "reference, float64", "onnxruntime, float32"
+OTHER_MACHINES = ("MiniRocket and ridge", "tactslip_torch, float64, SVC head")
+MOST_S = 1e-3
+Score = Callable[[Any], Any]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Args:
+        recordings: simulated, to whose bins heads are fitted.
+        bins: raw bins that calls take in turn, all held against the reference.
+        looped: of these, by the loop.
+        rounds: of every call.
+        block_s: a quick call is repeated for so long in a round.
+        num_kernels: of MiniRocket.
+    """
+
+    recordings: int = 8
+    bins: int = 64
+    looped: int = 4
+    rounds: int = 40
+    block_s: float = 0.02
+    num_kernels: int = 10_000
+
+
+class Latency(Benchmark[Sizes]):
+    """One bin at a time on one thread."""
+
+    name = "latency"
+    title = "Latency"
+    about = (
+        "one raw bin of 24 channels with its context to a score, the features that the main job "
+        "selects, one bin at a time on 1 thread"
+    )
+    sizes = Sizes()
+    quick = Sizes(recordings=1, bins=4, looped=1, rounds=2, block_s=2e-3, num_kernels=168)
+    libraries = ("numba", "PyWavelets", "onnxruntime", "aeon")
+
+    @torch.inference_mode()
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Seconds of single calls of every way, and errors of its scores."""
+        sizes = job.sizes
+        samples = raw_bins(sizes.bins)
+        with on_threads(1):
+            ways = self._ways(sizes)
+        with on_threads(1):  # of the libraries loaded by now as well
+            say(f"latency: {sizes.rounds} rounds of {len(ways)} ways")
+            calls = {name: _in_turn(score, samples) for name, score in ways.items()}
+            timings = interleaved(calls, sizes.rounds, block_s=sizes.block_s, most_calls=60)
+            exact = _scores(ways[REFERENCE], samples)
+            rows = []
+            for name, score in ways.items():
+                some = samples[: sizes.looped] if "loop" in name else samples
+                found = _scores(score, some)
+                error = np.abs(found - exact[: len(found)]).max() / max(exact.std(), 1e-12)
+                is_other = name in OTHER_MACHINES
+                row = {"way": name, "error": None if is_other else float(error)}
+                rows.append(row | timings[name].summary())
+        return {"rows": rows}
+
+    def _ways(self, sizes: Sizes) -> dict[str, Score]:
+        """From one raw bin ``[1, C, n + 2 * context]``, float32, to its score."""
+        main = MainJobDetector.fitted(sizes.recordings)
+        fast, exact = main.detector(FLOAT32), main.detector(FLOAT64)
+        slow = main.detector(FLOAT64, "reference")
+        support, targets = main.z.numpy(), main.training.targets.numpy()
+        svc = SVC(kernel="poly", degree=2, gamma=1.0, coef0=main.kernel.offset)
+        svc.fit(support, targets)
+        ridge = KernelRidge(
+            alpha=1 / main.penalty, kernel="poly", degree=2, gamma=1.0, coef0=main.kernel.offset
+        ).fit(support, targets)
+
+        def scaled(x: Any) -> Any:
+            bins = exact.channel_filter.valid(x.double())
+            return exact.scaler(exact.extractor(bins)).numpy()
+
+        with TemporaryDirectory(prefix="tactslip-bench-") as folder:
+            say("latency: export to ONNX")
+            export_detector(exact, Path(folder), ("bin",), "float32")
+            session = BinSession(Path(folder) / "model.onnx", threads=1)
+        return {
+            OURS: fast.score_raw,
+            "tactslip_torch, float32, with validity": lambda x: fast.judge_raw(x).score,
+            "tactslip_torch, float64": lambda x: exact.score_raw(x.double()),
+            REFERENCE: lambda x: slow.score_raw(x.double()),
+            ORT: session.scores,
+            "SciPy and PyWavelets, a loop, kernel sum": _loop(main),
+            "MiniRocket and ridge": _rocket(sizes),
+            "tactslip_torch, float64, SVC head": lambda x: svc.decision_function(scaled(x)),
+            "tactslip_torch, float64, KernelRidge head": lambda x: ridge.predict(scaled(x)),
+        }
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Seconds and errors of every way."""
+        rows = numbers["rows"]
+        ours = next(row for row in rows if row["way"] == OURS)
+        cells = [
+            [
+                row["way"],
+                number(1e6 * row["p50_s"]),
+                number(1e6 * row["p99_s"]),
+                f"{number(row['p50_s'] / ours['p50_s'])} x",
+                "-" if row["error"] is None else number(row["error"]),
+            ]
+            for row in rows
+        ]
+        header = ["way", "median, us", "99th percentile, us", "of ours", "error"]
+        note = "Error of scores in standard deviations of the reference's; - another machine."
+        goal = limit("a bin to its score, float32", 1e3 * ours["p50_s"], 1e3 * MOST_S, "ms")
+        return {"Limits": limits([goal]), "One bin to its score": Table(header, cells, note)}
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Median and tail of every way."""
+        rows = numbers["rows"]
+        series = {
+            "median": [1e6 * row["p50_s"] for row in rows],
+            "99th percentile": [1e6 * row["p99_s"] for row in rows],
+        }
+        bars(drawing.subplots(), [row["way"] for row in rows], series, "us from a bin to its score")
+
+
+def _in_turn(score: Score, samples: torch.Tensor) -> Callable[[], Any]:
+    """A call that takes the next bin every time."""
+    each: Iterator[torch.Tensor] = cycle([one[None].contiguous() for one in samples])
+    return lambda: score(next(each))
+
+
+def _scores(score: Score, samples: torch.Tensor) -> Any:
+    return np.array([float(np.ravel(score(one[None]))[0]) for one in samples])
+
+
+def _loop(main: MainJobDetector) -> Score:
+    """The loop over the features in use: filter, features, scaling and kernel sum."""
+    pool, machine = FeaturePool(HandLayout.paper24()), main.kernel_sum()
+    context = ChannelFilter(WINDOW_LENGTHS).context
+    chosen = [pool.names[index] for index in main.selected]
+    names = [(n.channel, n.component, n.domain, n.descriptor) for n in chosen]
+    channels = list(dict.fromkeys(name.channel for name in chosen))  # the others are not filtered
+    rows = [pool.hand.names.index(channel) for channel in channels]
+    lengths = [WINDOW_LENGTHS[row] for row in rows]
+    support, beta = np.asarray(machine.support), np.asarray(machine.beta)
+
+    def score(samples: Any) -> Any:
+        filtered = loop.savgol(samples[0, rows].double().numpy(), lengths, 1, context)
+        with others.quiet():
+            x = torch.from_numpy(loop.features(filtered, names, channels))
+        z = main.scaler(x).numpy()
+        return loop.kernel_score(z, support, beta, main.kernel.offset, main.kernel.degree)
+
+    return score
+
+
+def _rocket(sizes: Sizes) -> Score:
+    bins, is_slip = labelled_bins(sizes.recordings)
+    say("latency: MiniRocket")
+    targets = np.where(is_slip.numpy(), 1.0, -1.0)
+    scores = others.mini_rocket_ridge(bins.numpy(), targets, 1, sizes.num_kernels)
+    filters = ChannelFilter(WINDOW_LENGTHS)
+    return lambda samples: scores(filters.valid(samples.double()).float().numpy())
+
+
+if __name__ == "__main__":
+    raise SystemExit(Latency().run())

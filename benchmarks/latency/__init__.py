@@ -1,1 +1,0 @@
-"""What one bin costs: ``python -m benchmarks.latency``."""

@@ -1,0 +1,240 @@
+"""The kernel machine beside scikit-learn: ``python -m benchmarks.model``.
+
+Fits, scoring and folds in closed form on synthetic features, beside ``KernelRidge``, ``SVC`` and
+refitting every fold; and a fit by statistics of any number of bins, in a process of its own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.svm import SVC
+from torch import Tensor
+
+from benchmarks.harness import (
+    Benchmark,
+    Job,
+    Report,
+    Spread,
+    Table,
+    bars,
+    in_fresh_process,
+    interleaved,
+    number,
+    on_threads,
+    peak_bytes,
+    percent,
+    say,
+)
+from tactslip_torch import SufficientStats
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.kernels import KernelSum, Polynomial
+from tactslip_torch.model.leave_one_group_out import HeldOut
+
+PENALTY, OFFSET, BATCH = 1.0, 0.5, 4096
+KERNEL = Polynomial(2, OFFSET)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Args:
+        num_features: K.
+        fitted: training bins of a fit.
+        test_bins: whose scores are compared.
+        folded: training bins of fits and folds.
+        num_folds: of them.
+        any_bins: accumulated in a process of its own.
+        rounds: of every call.
+        threads: of fits; scoring has one.
+    """
+
+    num_features: int = 120
+    fitted: tuple[int, ...] = (2_000, 8_000)
+    test_bins: int = 4_000
+    folded: int = 4_800
+    num_folds: int = 6
+    any_bins: int = 200_000
+    rounds: int = 3
+    threads: int = 2
+
+
+class Model(Benchmark[Sizes]):
+    """Fits, scores, folds and statistics."""
+
+    name = "model"
+    title = "Kernel machine at any size"
+    about = "the kernel machine of degree 2 on synthetic features, beside scikit-learn"
+    sizes = Sizes()
+    quick = Sizes(12, (200,), 100, folded=240, any_bins=10_000, rounds=1)
+    is_simulated = False
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Fits and scores by size, folds, and any number of bins."""
+        sizes = job.sizes
+        with on_threads(sizes.threads):
+            fits = [row for num_bins in sizes.fitted for row in _fits(num_bins, sizes)]
+            folds = _folds(sizes)
+        say(f"model: statistics of {sizes.any_bins:,} bins in a fresh process")
+        given = {"num_bins": sizes.any_bins, "num_features": sizes.num_features}
+        any_size = in_fresh_process("benchmarks.model:accumulate", threads=sizes.threads, **given)
+        return {"fits": fits, "folds": folds, "any_size": any_size | given}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Fits, folds and any size."""
+        fits = [
+            [
+                f"{row['way']}, {row['num_bins']:,} bins",
+                Spread.of(row["fit_s"]).text(),
+                number(1e6 * row["score_s"]),
+                percent(row["accuracy"]),
+                "-" if row["off"] is None else number(row["off"]),
+            ]
+            for row in numbers["fits"]
+        ]
+        folds = [[name, Spread.of(of).text()] for name, of in numbers["folds"]["seconds"].items()]
+        of = numbers["any_size"]
+        whole = [
+            ["bins", f"{of['num_bins']:,}"],
+            ["bins a second", f"{of['num_bins'] / of['add_s']:,.0f}"],
+            ["s to solve", number(of["solve_s"])],
+            ["peak memory, MB", f"{of['peak_bytes'] / 1e6:,.0f}"],
+        ]
+        header = ["machine", "fit, s", "a score, us", "accuracy %", "off KernelRidge"]
+        note = "A score: one bin on 1 thread. Off: the largest difference of scores."
+        folded = f"Largest difference of held-out scores: {number(numbers['folds']['off'])}."
+        return {
+            "Fits": Table(header, fits, note),
+            "Folds": Table(["folds", "s"], folds, folded),
+            "Any number of bins": Table(["statistics in a process of its own", ""], whole),
+        }
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Seconds of fits and of a score."""
+        fits, scores = drawing.subplots(1, 2, sharey=True)
+        rows = numbers["fits"]
+        names = [f"{row['way']}, {row['num_bins']:,}" for row in rows]
+        bars(fits, names, {"fit": [Spread.of(row["fit_s"]).median for row in rows]}, "s a fit")
+        bars(scores, names, {"score": [1e6 * row["score_s"] for row in rows]}, "us a score")
+
+
+def synthetic_bins(num_bins: int, num_features: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Bounded, correlated features ``[N, K]`` in float64, and labels ``[N]`` by a quadratic rule.
+
+    They are correlated about as the main job's scaled features are; noise mislabels some bins.
+    """
+    rule = np.random.default_rng(num_features)
+    mix = 0.25 * rule.normal(size=(16, num_features)) * np.arange(1.0, 17)[:, None] ** -0.7
+    directions = rule.normal(size=(3, num_features)) / np.sqrt(num_features)
+    draws = np.random.default_rng([seed, 1])
+    common = draws.normal(size=(num_bins, 16)) @ mix
+    z = np.tanh(common + 0.15 * draws.normal(size=(num_bins, num_features)))
+    a, b, c = directions @ z.T / (directions @ z.T).std(1, keepdims=True)
+    score = a * b + c + 0.3 * draws.normal(size=num_bins)
+    return torch.from_numpy(z), torch.from_numpy(score > 0)
+
+
+def accumulate(num_bins: int, num_features: int, threads: int) -> dict[str, float]:
+    """Seconds and memory of statistics of so many bins, and of their solution."""
+    torch.set_num_threads(threads)
+    stats = SufficientStats(num_features)
+    z, is_slip = synthetic_bins(BATCH, num_features)
+    started = time.perf_counter()
+    for number_of_batch in range(-(-num_bins // BATCH)):
+        stats.update(f"batch {number_of_batch}", z, is_slip)
+    added = time.perf_counter()
+    stats.solve(PENALTY, OFFSET, balance="none")
+    solved = time.perf_counter()
+    return {
+        "add_s": added - started,
+        "solve_s": solved - added,
+        "peak_bytes": float(peak_bytes()),
+    }
+
+
+def _fits(num_bins: int, sizes: Sizes) -> list[dict[str, Any]]:
+    say(f"model: fits to {num_bins:,} bins")
+    z, is_slip = synthetic_bins(num_bins, sizes.num_features)
+    new, truth = synthetic_bins(sizes.test_bins, sizes.num_features, seed=1)
+    bins = TrainingBins(z, is_slip)
+    targets = bins.targets.numpy()
+    options = {"kernel": "poly", "degree": 2, "gamma": 1.0, "coef0": OFFSET}
+    ridge, svc = KernelRidge(alpha=1 / PENALTY, **options), SVC(C=PENALTY, **options)
+
+    def by_statistics() -> Any:
+        stats = SufficientStats(sizes.num_features)
+        for place, some in enumerate(torch.arange(num_bins).split(BATCH)):
+            stats.update(f"batch {place}", z[some], is_slip[some])
+        return stats.solve(PENALTY, OFFSET, balance="none")
+
+    calls: dict[str, Callable[[], Any]] = {
+        "fit_machine": partial(fit_machine, bins, PENALTY, KERNEL),
+        "SufficientStats": by_statistics,
+        "KernelRidge": partial(ridge.fit, z.numpy(), targets),
+        "SVC": partial(svc.fit, z.numpy(), targets),
+    }
+    fits = interleaved(calls, sizes.rounds, block_s=0)
+    head = fit_machine(bins, PENALTY, KERNEL)
+    beta = PENALTY * (bins.targets - head(z))
+    scorers: dict[str, Callable[[Tensor], Any]] = {
+        "fit_machine": head,
+        "SufficientStats": by_statistics(),
+        "KernelRidge": lambda x: ridge.predict(x.numpy()),
+        "SVC": lambda x: svc.decision_function(x.numpy()),
+        "kernel sum": KernelSum(z, beta, KERNEL),
+    }
+    one = new[:1].clone()
+    with torch.inference_mode(), on_threads(1):
+        times = interleaved({n: partial(of, one) for n, of in scorers.items()}, 20 * sizes.rounds)
+    exact = np.asarray(scorers["KernelRidge"](new))
+    rows = []
+    for way, scorer in scorers.items():
+        scores = np.asarray(scorer(new))
+        rows.append(
+            {
+                "way": way,
+                "num_bins": num_bins,
+                "fit_s": fits[way if way in fits else "fit_machine"].per_round,
+                "score_s": times[way].summary()["p50_s"],
+                "accuracy": float(((scores >= 0) == truth.numpy()).mean()),
+                "off": None if way == "SVC" else float(np.abs(scores - exact).max()),
+            }
+        )
+    return rows
+
+
+def _folds(sizes: Sizes) -> dict[str, Any]:
+    say(f"model: {sizes.num_folds} folds of {sizes.folded:,} bins")
+    z, is_slip = synthetic_bins(sizes.folded, sizes.num_features)
+    groups = torch.arange(len(z)) % sizes.num_folds
+
+    def refits() -> Tensor:
+        scores = torch.empty(len(z), dtype=torch.float64)
+        for group in groups.unique():
+            rest = groups != group
+            head = fit_machine(TrainingBins(z[rest], is_slip[rest]), PENALTY, KERNEL)
+            scores[~rest] = head(z[~rest])
+        return scores
+
+    bins = TrainingBins(z, is_slip)
+    calls: dict[str, Callable[[], Any]] = {
+        "one fit": partial(fit_machine, bins, PENALTY, KERNEL),
+        "fit and folds in closed form": lambda: HeldOut(bins, groups, KERNEL).at(PENALTY).scores,
+        "refits": refits,
+    }
+    timings = interleaved(calls, sizes.rounds, block_s=0)
+    off = (calls["fit and folds in closed form"]() - refits()).abs().max()
+    return {"seconds": {n: of.per_round for n, of in timings.items()}, "off": float(off)}
+
+
+if __name__ == "__main__":
+    raise SystemExit(Model().run())

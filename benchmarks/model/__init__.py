@@ -1,1 +1,0 @@
-"""What the kernel machine costs at any size: ``python -m benchmarks.model``."""

@@ -1,0 +1,289 @@
+"""What hop and filter buy, and peers on equal terms: ``python -m benchmarks.onset``.
+
+Detectors of ``+exp=onset`` behind each filter watch the same simulated streams at several hops,
+with thresholds for the same rate of false alarms; film band power, the largest detail and
+MiniRocket with ridge are calibrated and evaluated alike at one hop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle, product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, cast
+
+import numpy as np
+import torch
+from hydra.utils import instantiate
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from benchmarks.harness import (
+    COLORS,
+    Benchmark,
+    Job,
+    Report,
+    Table,
+    interleaved,
+    number,
+    on_threads,
+    percent,
+    say,
+)
+from benchmarks.peers.others import mini_rocket_ridge
+from benchmarks.reproduction.runs import run
+from benchmarks.subjects import Array, Trained, composed
+from tactslip_torch import AlarmSettings, FeaturePool, Judgement, SlipDetector, StreamingDetector
+from tactslip_torch.data.splits import PAPER_SCENE
+from tactslip_torch.onset.baselines import BaselineDetector
+from tactslip_torch.onset.decisions import Scorer
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.alarm import CalibratedAlarm
+
+ROCKET = "MiniRocket and ridge"
+BASELINES: Mapping[str, Any] = {
+    "film band power": "film_band_power",
+    "largest detail": "largest_detail",
+}
+ROLES = {"test stream": "seen materials", "unseen stream": "held-out materials"}
+QUICK_TRAINING = (
+    "data.cycles=2",
+    "data.materials=[M1,M6,iron]",
+    "split.seen=[M1,M6]",
+    "split.unseen=[iron]",
+    "split.train_share=0.5",
+    "others.held.cycles=2",
+    "others.held.tail_s=2",
+    "others.knocked.cycles=2",
+    "others.knocked.tail_s=2",
+    "others.arm_motion.cycles=2",
+    "recipe.num_features=20",
+    "recipe.penalties=[0.003]",
+)
+QUICK_STREAMS = (
+    "onset.streams.cycles=4",
+    "onset.streams.others.held.cycles=4",
+    "onset.streams.others.held.tail_s=5",
+)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Args:
+        training: overrides of ``tactslip_torch.train +exp=onset``, the same for every filter.
+        streams: further overrides, of the recordings that are watched.
+        aligns: filters, a detector is trained behind each; peers stand beside the first.
+        hops_ms: distances of decisions; peers have the last.
+        hours: of slip-free stream to calibrate on, as many to check on, seen and held out.
+        per_hour: false alarms that thresholds are set for.
+        peer_recordings: of training, to whose bins MiniRocket's ridge is fitted.
+        num_kernels: of MiniRocket.
+        rounds: of timed pushes.
+    """
+
+    training: tuple[str, ...] = (
+        "data.cycles=8",
+        "others.held.cycles=2",
+        "others.knocked.cycles=2",
+        "others.arm_motion.cycles=4",
+        "recipe.penalties=[0.001,0.003,0.01]",
+    )
+    streams: tuple[str, ...] = ("onset.streams.cycles=20", "onset.streams.others.held.cycles=14")
+    aligns: tuple[str, ...] = ("centred", "causal", "trailing")
+    hops_ms: tuple[float, ...] = (5.0, 10.0, 25.0, 50.0)
+    hours: float = 0.5
+    per_hour: float = 20.0
+    peer_recordings: int = 60
+    num_kernels: int = 10_000
+    rounds: int = 60
+
+
+class Onset(Benchmark[Sizes]):
+    """Hops, filters and peers."""
+
+    name = "onset"
+    title = "Alarms: hops, filters and peers"
+    about = (
+        "detectors of +exp=onset on simulated streams, thresholds set for the same rate of false "
+        "alarms on streams without slip"
+    )
+    sizes = Sizes()
+    quick = Sizes(
+        QUICK_TRAINING,
+        QUICK_STREAMS,
+        ("centred", "causal"),
+        (25.0, 50.0),
+        hours=0.002,
+        peer_recordings=3,
+        num_kernels=168,
+        rounds=2,
+    )
+    libraries = ("aeon",)
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Train behind every filter, watch at every hop, and time pushes."""
+        sizes = job.sizes
+        rows: list[dict[str, Any]] = []
+        pushes: dict[str, Callable[[], Any]] = {}
+        for align, hop_ms in product(sizes.aligns, sizes.hops_ms):
+            training = ["+exp=onset", f"features.align={align}", *sizes.training]
+            folder = job.folder / align
+            with TemporaryDirectory(prefix="tactslip-bench-") as cache:  # some gigabytes
+                run(f"detector, {align}", [*training, "onset=none"], folder, Path(cache))
+            detector = SlipDetector.load(folder / "detector.pt")
+            peers: dict[str, Scorer] = {}
+            if (align, hop_ms) == (sizes.aligns[0], sizes.hops_ms[-1]):
+                peers = _peers(detector, [*training, "onset=none"], folder, sizes)
+            say(f"onset: {align}, a decision every {hop_ms:g} ms")
+            stage = _stage([*training, *sizes.streams], hop_ms, sizes)
+            found = stage(detector, peers)
+            samples = _protocol_samples(stage)
+            for method, of in found["methods"].items():
+                is_ours = method == found["rule"]
+                if not of["calibrated"] or (of["scorer"] == "detector" and not is_ours):
+                    continue
+                scorer = cast(SlipDetector, peers.get(of["scorer"], detector))
+                live = StreamingDetector(scorer, AlarmSettings.of(detector))
+                name = f"{align}, hop {hop_ms:g} ms" + ("" if is_ours else f", {method}")
+                pushes[name] = _next_hop(live, samples)
+                events = {role: found["events"][role][method] for role in ROLES}
+                row = {"way": name, "hop_ms": hop_ms, "is_ours": is_ours, "align": align}
+                look_ahead_ms = 1e3 * detector.look_ahead / detector.pool.sample_rate_hz
+                rows.append(row | {"look_ahead_ms": look_ahead_ms, "events": events})
+        with on_threads(1):
+            timings = interleaved(pushes, sizes.rounds)
+        for row in rows:
+            row["push_s"] = timings[row["way"]].summary()["p50_s"]
+        return {"rows": rows, "per_hour": sizes.per_hour}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Delay, slips found and false alarms on both kinds of materials, and compute."""
+        header = ["method", "false alarms an hour", "found %", "early %", "delay ms", "p95 ms"]
+        found = {}
+        for role, words in ROLES.items():
+            rows = []
+            for row in numbers["rows"]:
+                events = row["events"][role]
+                delay = events["delay_ms"]
+                rate = events["false_alarms_per_hour"]
+                rows.append(
+                    [
+                        row["way"],
+                        "-" if rate is None else number(rate["value"]),
+                        *(percent(events[name]["value"]) for name in ("found", "early")),
+                        *("-" if delay is None else f"{delay[q]['value']:.1f}" for q in _DELAYS),
+                        f"{row['look_ahead_ms']:g}",
+                        number(1e5 * row["push_s"] / row["hop_ms"]),
+                    ]
+                )
+            note = f"Thresholds were set for {numbers['per_hour']:g} false alarms an hour."
+            columns = [*header, "look-ahead ms", "% of a core"]
+            found[f"On {words}"] = Table(columns, rows, note)
+        return found
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Median delay against slips that are not found."""
+        panels = drawing.subplots(1, len(ROLES), sharey=True)
+        for axes, (role, words) in zip(panels, ROLES.items(), strict=True):
+            for place, row in enumerate(numbers["rows"]):
+                events = row["events"][role]
+                if events["delay_ms"] is None:
+                    continue
+                x, y = events["delay_ms"]["median"]["value"], 1 - events["found"]["value"]
+                color = COLORS[place % len(COLORS)]
+                marker = "o" if row["is_ours"] else "s"
+                axes.plot(x, 100 * y, marker, color=color, label=row["way"])
+            axes.set_title(words, fontsize=10)
+            axes.set_xlabel("median delay, ms")
+        panels[0].set_ylabel("slips not found, %")
+        handles = panels[0].get_legend_handles_labels()
+        drawing.legend(*handles, loc="outside lower center", ncols=3, frameon=False, fontsize=7)
+
+
+_DELAYS = ("median", "p95")
+
+
+def _stage(overrides: list[str], hop_ms: float, sizes: Sizes) -> CalibratedAlarm:
+    """The stage behind ``+exp=onset``: the protocol and its quiet alone, and the main rule."""
+    onset: Any = OmegaConf.to_container(composed("train", overrides).onset, resolve=True)
+    quiet, main = onset["slip_free"], onset["rule"]
+    onset["streams"]["others"] = {quiet: onset["streams"]["others"][quiet]}
+    onset["rules"] = {main: onset["rules"][main]}
+    onset |= {
+        "hours": sizes.hours,
+        "false_alarms_per_hour": sizes.per_hour,
+        "hop_ms": hop_ms,
+    }
+    stage: CalibratedAlarm = instantiate(onset, _convert_="all")
+    return stage
+
+
+def _protocol_samples(stage: CalibratedAlarm) -> Tensor:
+    recording = next(one for one in stage.streams.ids if one.scene == PAPER_SCENE)
+    return stage.streams.load(recording).samples.T.contiguous()
+
+
+def _next_hop(live: StreamingDetector, samples: Tensor) -> Callable[[], Any]:
+    """A call that pushes the next hop, once every push makes a decision."""
+    hop = live.settings.hop_samples
+    pieces = cycle(samples[: len(samples) // hop * hop].split(hop))
+    while not len(live.push(next(pieces)).number):
+        pass
+    return lambda: live.push(next(pieces))
+
+
+@dataclass(frozen=True, eq=False)
+class _RocketDetector:
+    """MiniRocket in the place of a ``SlipDetector``: the same hand, filter and bins."""
+
+    pool: FeaturePool
+    channel_filter: ChannelFilter
+    scores: Callable[[Array], Array]
+
+    @property
+    def needed_index(self) -> Tensor:
+        """All channels, ``[C]``."""
+        return torch.arange(len(self.pool.hand))
+
+    @property
+    def look_ahead(self) -> int:
+        """Samples behind a bin that the longest frame takes in."""
+        return self.channel_filter.context_after
+
+    def judge(self, bins: Tensor, *, given: torch.dtype) -> Judgement:
+        """Score filtered bins ``[N, C, n]``; a channel that is missing counts as silent."""
+        is_missing = self.pool.is_missing(bins)
+        is_valid = (self.pool.is_alive(bins) & ~is_missing).all(-1)
+        windows = torch.where(is_missing[..., None], 0.0, bins).float().contiguous()
+        score = torch.from_numpy(np.asarray(self.scores(windows.numpy()))).reshape(-1).to(given)
+        return Judgement(score, is_valid, is_missing, torch.zeros_like(score))
+
+
+def _peers(
+    detector: SlipDetector, overrides: list[str], folder: Path, sizes: Sizes
+) -> dict[str, Scorer]:
+    """Baselines, and MiniRocket with ridge on bins of some training recordings."""
+    trained = Trained.by(overrides, folder, folder / "cache")
+    order = np.random.default_rng(0).permutation(len(trained.recordings("train")))
+    some = [trained.recordings("train")[at] for at in order[: sizes.peer_recordings]]
+    made = [trained.maker.filtered_bins(recording) for recording in some]
+    windows = torch.cat([bins for bins, _ in made]).float().numpy()
+    targets = torch.cat([torch.where(laid.is_slip, 1.0, -1.0) for _, laid in made]).numpy()
+    say(f"onset: MiniRocket and ridge on {len(windows)} bins")
+    scores = mini_rocket_ridge(windows, targets, 1, sizes.num_kernels)
+    shared = partial(_RocketDetector, detector.pool, detector.channel_filter)
+    baselines: dict[str, Scorer] = {
+        name: BaselineDetector(key, detector.pool, detector.channel_filter)
+        for name, key in BASELINES.items()
+    }
+    return baselines | {ROCKET: shared(scores)}
+
+
+if __name__ == "__main__":
+    raise SystemExit(Onset().run())

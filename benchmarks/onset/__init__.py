@@ -1,1 +1,0 @@
-"""What alarms cost and buy: hops and filters as a front, and other methods at equal terms."""

@@ -1,0 +1,202 @@
+"""What fidelity levels and time steps of the simulated hand cost, and what they change.
+
+``python -m benchmarks.simulation``: seconds per simulated minute, difference of samples and onsets
+to the smallest step, and detectors trained on one level and evaluated on all. Held against Radau,
+the equations are in the tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+
+from benchmarks.harness import (
+    Benchmark,
+    Job,
+    Report,
+    Spread,
+    Table,
+    bars,
+    interleaved,
+    number,
+    on_threads,
+    percent,
+    say,
+)
+from benchmarks.subjects import FittedMachine, composed, small_recipe, surveyed
+from tactslip_torch.simulation import (
+    SEEN_MATERIALS,
+    Dynamics,
+    Scene,
+    simulate,
+    timeline,
+)
+from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.training.recipe import recalls_mean
+
+LEVELS: dict[str, tuple[str, dict[str, int]]] = {
+    "kinematic": ("kinematic", {}),
+    "one bristle": ("bristles", {"num_bristles": 1}),
+    "bristles": ("bristles", {}),
+}
+"""Fidelity and parameters of the friction by level."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Args:
+        steps_us: of the integration, the smallest first: the others are held against it.
+        recordings: simulated in a call.
+        rounds: of every call.
+        materials: that detectors are trained on and evaluated on.
+        cycles: of each of them.
+        train_bins: of each material and class.
+        num_features: K.
+    """
+
+    steps_us: tuple[float, ...] = (31.25, 62.5, 125.0, 250.0, 500.0)
+    recordings: int = 3
+    rounds: int = 5
+    materials: tuple[str, ...] = tuple(SEEN_MATERIALS)
+    cycles: int = 20
+    train_bins: int = 200
+    num_features: int = 60
+
+
+class Simulation(Benchmark[Sizes]):
+    """Fidelity levels and steps."""
+
+    name = "simulation"
+    title = "The simulated hand"
+    about = "fidelity levels and time steps: cost, difference to the smallest step, and accuracy"
+    sizes = Sizes()
+    quick = Sizes(
+        (250.0, 500.0), 1, 1, materials=("M1", "M2"), cycles=4, train_bins=20, num_features=10
+    )
+    libraries = ("numba",)
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Costs and differences by level and step; accuracies by level."""
+        with on_threads(1):
+            return {"costs": _costs(job.sizes), "accuracies": _accuracies(job)}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Costs and accuracies."""
+        costs = [
+            [
+                row["level"],
+                "-" if row["step_us"] is None else f"{row['step_us']:g}",
+                Spread.of(row["seconds"]).text(),
+                *("-" if row[key] is None else number(row[key]) for key in ("off", "onset_ms")),
+            ]
+            for row in numbers["costs"]
+        ]
+        levels = list(numbers["accuracies"])
+        accuracies = [
+            [f"trained on {level}", *(percent(of[other]) for other in levels)]
+            for level, of in numbers["accuracies"].items()
+        ]
+        header = ["level", "step, us", "s a minute of 24 channels", "samples off", "onset off, ms"]
+        note = (
+            "Off: the root mean square difference of samples to those of the smallest step, over "
+            "their standard deviation, the worst kind of channel; and the largest of onsets."
+        )
+        columns = ["balanced accuracy, %", *(f"on {level}" for level in levels)]
+        about = "Held-out cycles of seen materials; the same cycles on every level."
+        return {
+            "Levels and steps": Table(header, costs, note),
+            "Trained on one level, evaluated on another": Table(columns, accuracies, about),
+        }
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Cost of levels and steps."""
+        rows = numbers["costs"]
+        names = [
+            row["level"] if row["step_us"] is None else f"{row['level']}, {row['step_us']:g} us"
+            for row in rows
+        ]
+        values = {"cost": [Spread.of(row["seconds"]).median for row in rows]}
+        bars(drawing.subplots(), names, values, "s per simulated minute")
+
+
+def _costs(sizes: Sizes) -> list[dict[str, Any]]:
+    scenes: dict[tuple[str, float | None], list[Scene]] = {}
+    for level, (fidelity, given) in LEVELS.items():
+        made = [Scene(m, fidelity=fidelity) for m in SEEN_MATERIALS[: sizes.recordings]]
+        for step_us in (None,) if fidelity == "kinematic" else sizes.steps_us:
+            if step_us is not None:
+                dynamics = Dynamics(step_us=step_us, **given)
+                made = [replace(scene, dynamics=dynamics) for scene in made]
+            scenes[level, step_us] = made
+    some = next(iter(scenes.values()))
+    minutes = sum(timeline(scene).duration_s for scene in some) / 60
+    say(f"simulation: {sizes.rounds} rounds of {len(scenes)} levels and steps")
+    calls: dict[str, Callable[[], Any]] = {
+        str(at): partial(_simulated, of) for at, of in scenes.items()
+    }
+    timings = interleaved(calls, sizes.rounds, block_s=0)
+    rows = []
+    for (level, step_us), of in scenes.items():
+        off, onset_ms = None, None
+        if step_us not in (None, sizes.steps_us[0]):
+            off, onset_ms = _difference(of, scenes[level, sizes.steps_us[0]])
+        seconds = [taken / minutes for taken in timings[str((level, step_us))].per_round]
+        row = {"level": level, "step_us": step_us, "seconds": seconds}
+        rows.append(row | {"off": off, "onset_ms": onset_ms})
+    return rows
+
+
+def _simulated(scenes: list[Scene]) -> list[Any]:
+    return [simulate(scene) for scene in scenes]
+
+
+def _difference(scenes: list[Scene], finest: list[Scene]) -> tuple[float, float]:
+    """Worst relative difference of samples by kind of channel, and of onsets in ms."""
+    off, onset_ms = 0.0, 0.0
+    kinds = [channel.kind for channel in scenes[0].hand.channels]
+    for own, exact in zip(_simulated(scenes), _simulated(finest), strict=True):
+        for kind in dict.fromkeys(kinds):
+            rows = torch.tensor([of == kind for of in kinds])
+            truth = exact.samples[rows].double()
+            distance = (own.samples[rows].double() - truth).square().mean().sqrt()
+            off = max(off, float(distance / truth.std(1).mean()))
+        for a, b in zip(own.onsets_s, exact.onsets_s, strict=True):
+            onset_ms = max(onset_ms, 1e3 * abs(a - b))
+    return off, onset_ms
+
+
+@torch.no_grad()
+def _accuracies(job: Job[Sizes]) -> dict[str, dict[str, float]]:
+    """Balanced accuracy on held-out cycles by the level trained on and the one evaluated on."""
+    sizes = job.sizes
+    config = composed("crossval", job.overrides)
+    recipe = small_recipe(config, sizes.train_bins, sizes.num_features)
+    kept = {}
+    for level, (fidelity, given) in LEVELS.items():
+        say(f"simulation: features of {level}")
+        source = SimulatedRecordings(
+            cycles=sizes.cycles, materials=list(sizes.materials), fidelity=fidelity, scene=given
+        )
+        kept[level] = surveyed(
+            source, config, sizes.materials, sizes.train_bins, 2000, config.train_share, 0
+        )
+    found: dict[str, dict[str, float]] = {}
+    for level, materials in kept.items():
+        machine = FittedMachine.of(materials.survey_of(sizes.materials), recipe)
+        found[level] = {}
+        for other, of in kept.items():
+            bins = of.bins_of(sizes.materials, ("test",))
+            is_right = machine.scores(bins.features) >= 0
+            found[level][other] = recalls_mean(is_right, bins.is_slip, bins.represents) or 0.0
+    return found
+
+
+if __name__ == "__main__":
+    raise SystemExit(Simulation().run())

@@ -1,0 +1,216 @@
+"""How fast a stream is watched, and in what memory: ``python -m benchmarks.streaming``.
+
+Pushes to ``StreamingDetector`` by their size and by the hop of decisions, beside the naive way, a
+bin with all its context for every decision; and the resident memory along an hour of stream.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from benchmarks.harness import (
+    Benchmark,
+    Job,
+    Report,
+    Spread,
+    Table,
+    bars,
+    in_fresh_process,
+    interleaved,
+    limit,
+    limits,
+    number,
+    on_threads,
+    say,
+)
+from benchmarks.subjects import (
+    RATE_HZ,
+    Array,
+    MainJobDetector,
+    alarm_settings,
+    endless,
+    stream_samples,
+)
+from tactslip_torch import SlipDetector, StreamingDetector
+
+HOP, PUSH = 20, 200
+"""The settings that the limit is about: a decision every 10 ms, pushes of 100 ms."""
+LEAST_TIMES, MOST_GROWTH_MB = 20.0, 2.0
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured.
+
+    Args:
+        recordings: simulated, to whose bins the head is fitted, and which are the stream.
+        pushes: samples of a push, at ``HOP``.
+        hops: samples between decisions, at ``PUSH`` and of the naive way.
+        rounds: of every way.
+        watched_s: of the stream, while the memory is looked at.
+        settled_s: of the stream, until the memory has to stay where it is.
+    """
+
+    recordings: int = 8
+    pushes: tuple[int, ...] = (1, 20, 200, 2000)
+    hops: tuple[int, ...] = (10, 20, 50, 100)
+    rounds: int = 20
+    watched_s: float = 3600.0
+    settled_s: float = 300.0
+
+
+class Streaming(Benchmark[Sizes]):
+    """Pushes, and memory along a stream."""
+
+    name = "streaming"
+    title = "Streams"
+    about = (
+        "a simulated stream of 24 channels at 2 kHz in float32, watched with the features that "
+        "the main job selects on 1 thread; times faster than the stream runs"
+    )
+    sizes = Sizes()
+    quick = Sizes(1, pushes=(20, 200), hops=(20, 100), rounds=2, watched_s=6.0, settled_s=2.0)
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Seconds of pushes by way, and resident memory."""
+        sizes = job.sizes
+        detector = MainJobDetector.fitted(sizes.recordings).detector()
+        samples = stream_samples(sizes.recordings)
+        pairs = [(HOP, push) for push in sizes.pushes]
+        pairs += [(hop, PUSH) for hop in sizes.hops if (hop, PUSH) not in pairs]
+        ways = [("stream", hop, push) for hop, push in pairs]
+        ways += [("naive", hop, hop) for hop in sizes.hops]
+        with on_threads(1), torch.no_grad():
+            calls: dict[str, Callable[[], Any]] = {}
+            for kind, hop, push in ways:
+                if kind == "naive":
+                    call = _naive(detector, samples, hop)
+                else:
+                    stream = StreamingDetector(detector, alarm_settings(hop), dtype=torch.float32)
+                    call = partial(_next_push, stream, endless(samples, push))
+                    for _ in range(round(RATE_HZ / push)):
+                        call()  # until every push makes its decisions
+                calls[f"{kind} {hop} {push}"] = call
+            say(f"streaming: {sizes.rounds} rounds of {len(calls)} ways")
+            timings = interleaved(calls, sizes.rounds, block_s=0.1, most_calls=2000)
+        rows = [
+            {"way": kind, "hop": hop, "push": push, **timings[f"{kind} {hop} {push}"].summary()}
+            for kind, hop, push in ways
+        ]
+        say(f"streaming: {sizes.watched_s:g} s of stream in a fresh process")
+        memory = in_fresh_process(f"benchmarks.{self.name}:watch", seconds=sizes.watched_s)
+        return {"rows": rows, "memory": memory, "settled_s": sizes.settled_s}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """Limits, speed and memory."""
+        main = next(r for r in numbers["rows"] if (r["way"], r["hop"], r["push"]) == _MAIN)
+        growth = _growth_mb(numbers)
+        goals = [
+            limit(f"load at hop {_ms(HOP)} ms, pushes of {_ms(PUSH)} ms", 1 / _times(main).median,
+                  1 / LEAST_TIMES, "of a core"),
+            limit("resident memory, growth after it has settled", growth, MOST_GROWTH_MB, "MB"),
+        ]  # fmt: skip
+        speed = [
+            [
+                f"{row['way']}, hop {_ms(row['hop'])} ms, pushes of {_ms(row['push'])} ms",
+                _times(row).text(),
+                number(1e6 * row["p50_s"]),
+                number(1e6 * row["p99_s"]),
+            ]
+            for row in numbers["rows"]
+        ]
+        memory = numbers["memory"]
+        cells = [
+            ["stream watched, s", number(memory["at_s"][-1])],
+            ["resident at its end, MB", number(memory["resident_bytes"][-1] / 1e6)],
+            ["growth since it settled, MB", number(growth)],
+            ["held by the stream itself, kB", number(memory["state_bytes"] / 1e3)],
+        ]
+        header = ["way", "times faster", "median push, us", "99th percentile, us"]
+        return {
+            "Limits": limits(goals),
+            "Speed": Table(header, speed, "naive: a bin with all its context for every decision."),
+            "Memory": Table(["memory", ""], cells),
+        }
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Speed by way, and memory over time."""
+        speed, memory = drawing.subplots(2, 1, height_ratios=[2, 1])
+        rows = numbers["rows"]
+        names = [f"{r['way']}, hop {_ms(r['hop'])}, push {_ms(r['push'])} ms" for r in rows]
+        bars(speed, names, {"speed": [_times(row).median for row in rows]}, "times faster")
+        found = numbers["memory"]
+        memory.plot(found["at_s"], np.asarray(found["resident_bytes"]) / 1e6)
+        memory.set_xlabel("s of stream")
+        memory.set_ylabel("resident, MB")
+
+
+_MAIN = ("stream", HOP, PUSH)
+
+
+def watch(seconds: float) -> dict[str, Any]:
+    """Watch so much of a stream, and look at the resident memory of this process every second."""
+    torch.set_num_threads(1)
+    detector = MainJobDetector.fitted(1).detector()
+    stream = StreamingDetector(detector, alarm_settings(HOP), dtype=torch.float32)
+    samples = endless(stream_samples(1), PUSH)
+    at_s: list[float] = []
+    resident: list[int] = []
+    state_bytes, each_s = 0, max(1.0, seconds / 400)
+    gc.collect()
+    for number_of_push in range(round(seconds * RATE_HZ / PUSH) + 1):
+        stream.push(next(samples))
+        now_s = number_of_push * PUSH / RATE_HZ
+        if now_s >= len(at_s) * each_s:
+            at_s.append(now_s)
+            resident.append(_resident_bytes())
+            state_bytes = max(state_bytes, stream.state_bytes)
+    return {"at_s": at_s, "resident_bytes": resident, "state_bytes": state_bytes}
+
+
+def _resident_bytes() -> int:
+    import psutil
+
+    return int(psutil.Process().memory_info().rss)
+
+
+def _naive(detector: SlipDetector, samples: Array, hop: int) -> Callable[[], Any]:
+    """Every bin from the raw samples around it, at a distance of ``hop``."""
+    whole = torch.from_numpy(samples.T.copy())
+    length = detector.context_before + detector.pool.bin_samples + detector.context_after
+    starts = range(0, whole.shape[-1] - length, hop)
+    each = cycle(starts)
+    return lambda: detector.judge_raw(whole[None, :, (at := next(each)) : at + length])
+
+
+def _next_push(stream: StreamingDetector, samples: Iterator[Array]) -> None:
+    stream.push(next(samples))
+
+
+def _times(row: Report) -> Spread:
+    """Seconds of stream over seconds of watching it."""
+    return Spread.of([row["push"] / RATE_HZ / seconds for seconds in row["seconds"]])
+
+
+def _growth_mb(numbers: Report) -> float:
+    memory = numbers["memory"]
+    looks = zip(memory["at_s"], memory["resident_bytes"], strict=True)
+    settled: list[float] = [resident for at_s, resident in looks if at_s >= numbers["settled_s"]]
+    return (max(settled) - settled[0]) / 1e6
+
+
+def _ms(samples: int) -> str:
+    return f"{1e3 * samples / RATE_HZ:g}"
+
+
+if __name__ == "__main__":
+    raise SystemExit(Streaming().run())

@@ -1,1 +1,0 @@
-"""What a stream costs: ``python -m benchmarks.streaming``."""

@@ -1,0 +1,262 @@
+"""What is measured on: bins, streams, a detector of the main job's size, and trained detectors."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from numpy.typing import NDArray
+from omegaconf import DictConfig
+from torch import Tensor
+
+from benchmarks.harness import say
+from benchmarks.reproduction.runs import run
+from benchmarks.selection import kept_selection
+from tactslip_torch import AlarmSettings, FeaturePool, HandLayout, SlipDetector
+from tactslip_torch.commands.crossval import Materials
+from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.recording import RecordingId, RecordingSource
+from tactslip_torch.data.splits import Split, seen6
+from tactslip_torch.features.cache import FeatureCache
+from tactslip_torch.features.extractor import EngineName, FeatureExtractor
+from tactslip_torch.features.survey import Survey
+from tactslip_torch.model.calibration import Platt
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.kernels import KernelSum, Polynomial, kernel_from_dict
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.onset.rules import Cusum
+from tactslip_torch.onset.settings import KEY
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.training.datamodule import FeatureMaker
+from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.recipe import Recipe, stand_for
+from tactslip_torch.training.selection import plan_detector
+
+Array = NDArray[Any]
+WINDOW_LENGTHS = (51,) * 14 + (11,) * 10
+RATE_HZ = 2000.0
+FLOAT32, FLOAT64 = torch.float32, torch.float64
+SEEN_ROLE = {"test": "held-out cycles of seen materials", "unseen": "held-out materials"}
+
+
+# ----------------------------------------------------------------------------- bins and streams
+@cache
+def _recordings(num: int) -> tuple[SimulatedRecordings, list[RecordingId]]:
+    materials = [f"M{index}" for index in range(1, 7)]
+    source = SimulatedRecordings(cycles=-(-num // 6), materials=materials)
+    return source, sorted(source.ids, key=lambda each: (each.cycle, each.material))[:num]
+
+
+@cache
+def labelled_bins(num_recordings: int) -> tuple[Tensor, Tensor]:
+    """Filtered bins ``[N, C, n]`` of simulated recordings, and which are slip; read-only."""
+    source, ids = _recordings(num_recordings)
+    maker = FeatureMaker(
+        source, FeaturePool(source.hand), ChannelFilter(WINDOW_LENGTHS), LabelRule()
+    )
+    parts = [maker.filtered_bins(recording) for recording in ids]
+    return torch.cat([bins for bins, _ in parts]), torch.cat([laid.is_slip for _, laid in parts])
+
+
+@cache
+def stream_samples(num_recordings: int) -> Array:
+    """Simulated recordings, one behind the other, ``[T, 24]`` float32; read-only."""
+    source, ids = _recordings(num_recordings)
+    parts = [source.load(recording).samples.float().numpy().T for recording in ids]
+    return np.ascontiguousarray(np.concatenate(parts))
+
+
+def raw_bins(num: int, num_recordings: int = 1) -> Tensor:
+    """Raw bins of simulated recordings with their context, ``[num, 24, 150]``, float32."""
+    samples = torch.from_numpy(stream_samples(num_recordings)).T
+    length = 100 + 2 * ChannelFilter(WINDOW_LENGTHS).context
+    starts = torch.linspace(0, samples.shape[-1] - length, num).long().tolist()
+    return torch.stack([samples[:, start : start + length] for start in starts]).contiguous()
+
+
+def endless(samples: Array, num: int) -> Iterator[Array]:
+    """Pieces of ``num`` samples, over and over; what does not fill a piece is passed over."""
+    while True:
+        for start in range(0, len(samples) - num + 1, num):
+            yield samples[start : start + num]
+
+
+# ------------------------------------------------------------ a detector of the main job's size
+@dataclass(frozen=True, eq=False)
+class MainJobDetector:
+    """The kept selection with a head fitted to some simulated bins.
+
+    Time does not depend on what a head has learned; its size does, and that is the main job's.
+    """
+
+    selected: tuple[int, ...]
+    scaler: FeatureScaler = field(repr=False)
+    z: Tensor = field(repr=False)
+    is_slip: Tensor = field(repr=False)
+    kernel: Polynomial
+    penalty: float
+
+    @classmethod
+    @torch.no_grad()
+    def fitted(cls, num_recordings: int) -> MainJobDetector:
+        """Fit to the bins of so many simulated recordings."""
+        selection = kept_selection()
+        pool = FeaturePool(HandLayout.paper24())
+        place = {str(name): index for index, name in enumerate(pool.names)}
+        selected = tuple(place[name] for name in selection["names"])
+        bins, is_slip = labelled_bins(num_recordings)
+        features = FeatureExtractor(pool, selected)(bins)
+        scaler = FeatureScaler.fit(features, compress=True)
+        kernel = kernel_from_dict(selection["trained"]["kernel"])
+        assert isinstance(kernel, Polynomial)  # both recipes have one
+        penalty = float(selection["trained"]["penalty"])
+        return cls(selected, scaler, scaler(features), is_slip, kernel, penalty)
+
+    @property
+    def training(self) -> TrainingBins:
+        """The bins that heads are fitted to."""
+        return TrainingBins(self.z, self.is_slip)
+
+    def detector(
+        self, dtype: torch.dtype = FLOAT64, engine: EngineName = "auto", hop: int = 20
+    ) -> SlipDetector:
+        """A detector of its own, which computes in this dtype, with settings for streams."""
+        pool = FeaturePool(
+            HandLayout.paper24(), arithmetic="native" if dtype == FLOAT32 else "double"
+        )
+        head = fit_machine(self.training, self.penalty, self.kernel)
+        scaler = copy.deepcopy(self.scaler)
+        made = SlipDetector(
+            pool, ChannelFilter(WINDOW_LENGTHS), self.selected, scaler, head, engine=engine
+        )
+        made.info = {"simulated": True, KEY: alarm_settings(hop).to_dict()}
+        return made.to(dtype).eval()
+
+    def kernel_sum(self) -> KernelSum:
+        """The same machine as a sum over the bins it was fitted to."""
+        head = fit_machine(self.training, self.penalty, self.kernel)
+        beta = self.penalty * (self.training.targets - head(self.z))
+        return KernelSum(self.z, beta, self.kernel)
+
+
+def alarm_settings(hop: int) -> AlarmSettings:
+    """Usual settings of a stream; what they say of a bin does not matter here."""
+    rule = Cusum(drift=0.1, evidence=min(1.0, hop / 100), ceiling=10.0)
+    return AlarmSettings(hop, Platt(1.0, 0.0), rule, 8.0, target_per_hour=1.0)
+
+
+# -------------------------------------------------------------------------- trained detectors
+def composed(name: str, overrides: Sequence[str]) -> DictConfig:
+    """A configuration by its overrides."""
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return compose(name, list(overrides))
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A detector that ``tactslip_torch.train`` has left, and how to its recordings' features."""
+
+    folder: Path
+    detector: SlipDetector = field(repr=False)
+    recipe: Recipe
+    split: Split
+    maker: FeatureMaker = field(repr=False)
+    metrics: dict[str, Any] = field(repr=False)
+
+    @classmethod
+    def by(cls, overrides: Sequence[str], folder: Path, cache_folder: Path) -> Trained:
+        """Train, or take what this very code trained in the folder.
+
+        Raises:
+            RuntimeError: if the training fails.
+        """
+        metrics = run(folder.name, overrides, folder, cache_folder)
+        config = composed("train", overrides)
+        source, rule = instantiate(config.data, _convert_="all"), instantiate(config.labels)
+        (split,) = instantiate(config.split, _convert_="all")(source.ids)
+        pool, filters, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
+        cached = FeatureCache(cache_folder)
+        maker = FeatureMaker(source, pool, filters, rule, cached, dtype, engine)
+        recipe = instantiate(config.recipe, _convert_="all")
+        detector = SlipDetector.load(folder / "detector.pt")
+        return cls(folder, detector, recipe, split, maker, metrics)
+
+    def recordings(self, role: str, material: str | None = None) -> list[RecordingId]:
+        """Those of a role and, if it is given, of a material."""
+        return [one for one in self.split.having(role) if material in (None, one.material)]
+
+    def materials(self, role: str) -> list[str]:
+        """Of the recordings of a role, ascending."""
+        return sorted({one.material for one in self.recordings(role)})
+
+
+def surveyed(
+    source: RecordingSource,
+    config: DictConfig,
+    seen: Sequence[str],
+    train_bins: int,
+    judged_bins: int,
+    train_share: float,
+    seed: int,
+) -> Materials:
+    """What one pass over all recordings keeps of each material, split by cycle."""
+    rule = instantiate(config.labels)
+    by_cycle = seen6(source.ids, seen=list(seen), train_share=train_share, seed=seed)[0]
+    pool, filters, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
+    maker = FeatureMaker(source, pool, filters, rule, None, dtype, engine)
+    materials = Materials(pool, train_bins, judged_bins)
+    for place, recording in enumerate(source.ids):
+        if place % 20 == 0:
+            say(f"features of recording {place} of {len(source.ids)}")
+        materials.update(maker(recording, by_cycle), by_cycle.roles[recording])
+    return materials
+
+
+@dataclass(frozen=True, eq=False)
+class FittedMachine:
+    """A machine of sampled training bins, as a recipe makes it."""
+
+    plan: Any
+    survey: Survey
+    recipe: Recipe
+    weights: Tensor
+    head: Any
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, survey: Survey, recipe: Recipe) -> FittedMachine:
+        """Rank, scale, choose K and C, and fit."""
+        plan = plan_detector(recipe, survey, _quietly)
+        sample = survey.sample.bins()
+        weights = stand_for(sample, recipe, survey.moments.count.tolist())
+        training = TrainingBins(plan.frame(sample.features), sample.is_slip, weights)
+        return cls(plan, survey, recipe, weights, fit_machine(training, plan.penalty, plan.kernel))
+
+    @torch.no_grad()
+    def scores(self, features: Tensor) -> Tensor:
+        """Of bins by their whole pool, ``[N, F]`` to ``[N]``."""
+        scores: Tensor = self.head(self.plan.frame(features))
+        return scores
+
+
+def small_recipe(
+    config: DictConfig, train_bins: int, num_features: int, penalties: Sequence[float] = ()
+) -> Recipe:
+    """The default recipe on a sample of bins."""
+    whole: Recipe = instantiate(config.recipes.robust, _convert_="all")
+    recipe = replace(whole, sample_bins=train_bins, num_features=num_features)
+    return replace(recipe, penalties=tuple(penalties)) if penalties else recipe
+
+
+def _quietly(items: Iterable[Any], what: str) -> Iterable[Any]:
+    return items

@@ -1,1 +1,0 @@
-"""What many bins cost: ``python -m benchmarks.throughput``."""
