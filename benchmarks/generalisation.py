@@ -400,7 +400,7 @@ def _hard(report: Mapping[str, Any]) -> list[str]:
         "",
         "The protocol on a simulated hand whose channels differ without slip, as real ones do",
         "([how it was held against a real one](../benchmarks/results/realism.json): "
-        "`python -m benchmarks.simulation.realism`).",
+        "`python -m benchmarks.realism`).",
         f"Seeds {', '.join(own)}; code {report['code']['hard']}.",
         "",
         "| | nested validation | test | held-out materials |",
