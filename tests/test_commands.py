@@ -618,7 +618,7 @@ def failures(tmp_path_factory):
     """All of them at once: each spends its time importing."""
     started = {
         name: subprocess.Popen(
-            [sys.executable, "-m", f"tactslip_torch.{entry}", *arguments],
+            [sys.executable, "-m", "tactslip_torch", entry, *arguments],
             cwd=tmp_path_factory.mktemp("failure"),
             env=environment(),
             stdout=subprocess.PIPE,
@@ -717,7 +717,7 @@ def test_every_experiment_runs_fast(name, tmp_path):
 
 
 def run_entry(folder, entry, *arguments):
-    command = [sys.executable, "-m", f"tactslip_torch.{entry}", *arguments]
+    command = [sys.executable, "-m", "tactslip_torch", entry, *arguments]
     return subprocess.run(
         command, cwd=folder, env=environment(), capture_output=True, text=True, check=False
     )

@@ -453,7 +453,7 @@ def test_a_file_of_an_earlier_version_is_named_as_such(number, tmp_path):
 
 def test_a_later_format_is_refused(saved):
     content = torch.load(saved, weights_only=True)
-    torch.save(content | {"format": "tactslip_torch detector 3"}, saved)
+    torch.save(content | {"format": "tactslip_torch detector 9"}, saved)
     with pytest.raises(ValueError, match="must be of format 'tactslip_torch detector 3', got"):
         SlipDetector.load(saved)
 
