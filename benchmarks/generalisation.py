@@ -38,7 +38,7 @@ from tactslip_torch.data.splits import Split, unseen4
 from tactslip_torch.features.bin_sample import bin_keys
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import calibration_of
-from tactslip_torch.report.tables import BASELINES, splits_table
+from tactslip_torch.report.results import BASELINES, splits_table
 from tactslip_torch.runtime import bar, whole_file
 from tactslip_torch.training.datamodule import FeatureMaker, RecordingFeatures, SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_parts

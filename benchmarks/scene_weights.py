@@ -30,9 +30,9 @@ from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import PAPER_SCENE, Split
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.runtime import whole_file
 from tactslip_torch.training.experiment import feature_parts
-from tactslip_torch.training.fitting import LinearSums
 from tactslip_torch.training.recipe import Recipe, sample_groups, stand_for
 from tactslip_torch.training.selection import candidates, fitted_frame
 
@@ -90,10 +90,10 @@ def error_rows(
             by_scene = dict.fromkeys(recipe.scene_weights, weights[-1])
             by_scene |= dict(zip(WEIGHTS, weights[:-1], strict=False))
             each = stand_for(training, replace(recipe, scene_weights=by_scene), counts)
-            sums = LinearSums(frame.size)
-            sums.update(z, training.is_slip, each)
+            sums = SufficientStats(frame.size, degree=1)
+            sums.update("training", z, training.is_slip, each)
             says = torch.zeros_like(slip)
-            says[is_out] = sums.solve(PENALTY, 1.0, "none")(others) >= 0
+            says[is_out] = sums.solve(PENALTY, 1.0, balance="none")(others) >= 0
 
             def share(one: str, truth: bool, says: Tensor = says, is_out: Tensor = is_out) -> float:
                 mine = is_out & is_of[one] & (slip == truth)

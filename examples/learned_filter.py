@@ -16,8 +16,8 @@ from torch.nn.functional import softplus
 
 from tactslip_torch import FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.hand import Channel
-from tactslip_torch.model.differentiable_fit import fit_quadratic
-from tactslip_torch.model.held_out_gradient import held_out_scores
+from tactslip_torch.model.fit import fit_quadratic
+from tactslip_torch.model.leave_one_group_out import held_out_scores
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -50,7 +50,7 @@ def main(path: str = "learned_filter.pt", steps: int = 25) -> list[float]:
         scaler = FeatureScaler.fit(features.detach(), compress=True)
         scores = held_out_scores(scaler(features), is_slip, groups, PENALTY)
         loss = softplus(torch.where(is_slip, -4.0, 4.0) * scores).mean()
-        losses.append(float(loss))
+        losses.append(float(loss.detach()))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -10,9 +10,7 @@ from tactslip_torch.graph.trials import simulated_stream
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.rules import Cusum

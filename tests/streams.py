@@ -5,7 +5,7 @@ import torch
 from small_detector import small_detector
 
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 

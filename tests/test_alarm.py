@@ -19,14 +19,14 @@ from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.baselines import first_transition
 from tactslip_torch.onset.decisions import Decider
 from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.report.alarm import alarm_figure, alarm_table, scenes_table
+from tactslip_torch.report.results import alarm_figure, alarm_table, scenes_table
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.alarm import (
     FIRST_TRANSITION,

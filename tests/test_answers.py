@@ -6,13 +6,13 @@ import pytest
 import torch
 from PIL import Image
 
-from tactslip_torch.report.abstaining import answers_figure, answers_table
-from tactslip_torch.report.answers import (
+from tactslip_torch.report.metrics import (
     answer_counts,
     answer_metrics,
     covered_shares,
     merged_answers,
 )
+from tactslip_torch.report.results import answers_figure, answers_table
 
 # truth by row (non-slip, slip), answer by column (unsure, non-slip, slip)
 RECORDINGS = {

@@ -15,7 +15,7 @@ from tactslip_torch.analysis.certificate import (
     certify,
     compare,
 )
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.simulation.extremes import EXTREMES
 
 

@@ -17,14 +17,15 @@ from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.commands.evaluate import evaluate
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.report.confound import (
+from tactslip_torch.report.metrics import bin_metrics, confusion_matrix, split_metrics
+from tactslip_torch.report.results import (
     by_detector,
     confound_figure,
     confound_rows,
     confound_table,
+    print_results,
+    write_results,
 )
-from tactslip_torch.report.results import print_results, write_results
-from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",

@@ -20,8 +20,8 @@ from tactslip_torch.commands.train import train
 from tactslip_torch.data.file_recordings import FileRecordings, inspected, oddities
 from tactslip_torch.data.formats import FORMATS, format_of
 from tactslip_torch.data.manifest import guessed, guesser, write_template
-from tactslip_torch.report.dataset import (
-    Example,
+from tactslip_torch.report.recordings import (
+    DrawnRecording,
     Trial,
     draw_dataset,
     ranges_table,
@@ -177,7 +177,7 @@ def drawn(num_channels=3, **changes):
         "non_slip_s": ((0.0, 0.5),),
     }
     trials = [Trial("wood", "paper", 3.0, 1.0, 0.5, 1), Trial("iron", "paper", 6.0, 0.0, 0.0, 0)]
-    return draw_dataset(trials, Example(**(example | changes)), title="a set")
+    return draw_dataset(trials, DrawnRecording(**(example | changes)), title="a set")
 
 
 def test_the_figure_shows_seconds_and_labels():

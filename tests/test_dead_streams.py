@@ -6,8 +6,7 @@ from small_detector import HAND, alarming_detector, raw_bins
 
 from tactslip_torch.graph.trials import simulated_stream
 from tactslip_torch.model.calibration import Isotonic, Platt
-from tactslip_torch.model.class_gaussians import ClassGaussians
-from tactslip_torch.model.widening import widened_llr
+from tactslip_torch.model.missing_channels import ClassGaussians, widened_llr
 from tactslip_torch.onset.decisions import Decider, score_stream
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector

@@ -23,7 +23,7 @@ from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import Decider, score_stream
 from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import AlarmSettings
-from tactslip_torch.report.onset_table import COLUMNS
+from tactslip_torch.report.onset import COLUMNS
 
 RATE_HZ = 2000.0
 SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0, lead_s=0.02)

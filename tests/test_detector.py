@@ -10,9 +10,7 @@ import torch
 
 from tactslip_torch import FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.model.detector_file import FORMAT
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.kernels import Polynomial, RadialBasis
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm, RadialBasis
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import load_table, save_table
 from tactslip_torch.signals.binning import bins_at

@@ -13,9 +13,14 @@ from tactslip_torch.onset.events import (
     event_metrics,
     pooled_metrics,
 )
-from tactslip_torch.report.events import events_figure, events_table, has_events
-from tactslip_torch.report.results import print_results, write_results
-from tactslip_torch.report.scores import split_metrics
+from tactslip_torch.report.metrics import split_metrics
+from tactslip_torch.report.results import (
+    events_figure,
+    events_table,
+    has_events,
+    print_results,
+    write_results,
+)
 
 RULES = EventRules(settle_s=0.1)
 REASON = "nobody looked"

@@ -1,16 +1,19 @@
+import pickle
+
 import numpy as np
 import pytest
 import torch
 from sklearn.kernel_ridge import KernelRidge
 
 from tactslip_torch.model import fit
-from tactslip_torch.model.fit import (
-    TrainingBins,
-    fit_machine,
+from tactslip_torch.model.fit import TrainingBins, fit_machine, fit_quadratic
+from tactslip_torch.model.kernels import (
+    PAPER_KERNEL,
+    KernelSum,
+    Polynomial,
+    QuadraticForm,
+    RadialBasis,
 )
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.kernels import PAPER_KERNEL, Polynomial, RadialBasis
-from tactslip_torch.model.quadratic import QuadraticForm, num_quadratic_features
 
 FOLDING = [PAPER_KERNEL, Polynomial(2, 1.5), Polynomial(2, 0.0), Polynomial(1, 0.5)]
 KEEPING = [Polynomial(3, 0.5), Polynomial(4, 1.0), RadialBasis(0.3)]
@@ -80,7 +83,7 @@ def test_bins_that_do_not_fit_together_are_refused(is_slip, weights, message):
 @pytest.mark.parametrize("num_bins", [8, 10, 11, 60])
 def test_every_machine_equals_kernel_ridge(num_bins, kernel, weighted, rng):
     """Three features have ten monomials: the dual up to ten bins, the primal above if it folds."""
-    assert num_quadratic_features(3) == 10
+    assert PAPER_KERNEL.num_monomials(3) == 10
     bins = draw(rng, num_bins, weighted=weighted)
     new = rng.uniform(-1, 1, (20, 3))
     for penalty in (0.05, 3.0):
@@ -113,14 +116,29 @@ def test_the_two_routes_agree(num_features, num_bins, kernel, weighted, rng):
 
 
 @pytest.mark.parametrize(("kernel", "crossover"), [(PAPER_KERNEL, 16), (Polynomial(1, 0.5), 4)])
-def test_many_bins_go_through_the_primal_and_few_do_not(kernel, crossover, rng, monkeypatch):
-    few, many = draw(rng, crossover), draw(rng, crossover + 1)
-    monkeypatch.setattr(fit, "solve_kernel_elm_", None)  # the primal has no need of it
-    fit_machine(many, 0.3, kernel)
-    fit_machine(few, 0.3, kernel, route="primal")
-    for bins, route in ((few, "auto"), (many, "dual")):
-        with pytest.raises(TypeError):
-            fit_machine(bins, 0.3, kernel, route=route)
+def test_many_bins_go_through_the_primal_and_few_do_not(kernel, crossover, rng):
+    num = kernel.num_monomials(3)
+    for num_bins, size in ((crossover, crossover), (crossover + 1, num)):
+        assert fit_machine(draw(rng, num_bins), 0.3, kernel).solved.size == size
+        assert fit_machine(draw(rng, num_bins), 0.3, kernel, "primal").solved.size == num
+        assert fit_machine(draw(rng, num_bins), 0.3, kernel, "dual").solved.size == num_bins
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_bin_that_weighs_1e14_does_not_drown_the_others(degree, rng, monkeypatch):
+    """X'WX holds bins of weight 1 to 2 % beside it; the dual holds all."""
+    bins, kernel = draw(rng, 40), Polynomial(degree, 0.5)
+    weights = torch.ones(40).double()
+    weights[3] = 1e14
+    bins = TrainingBins(bins.features, bins.is_slip, weights)
+    assert fit_machine(bins, 1.0, kernel).solved.size == 40
+    refused = r"weights from 1\.0e\+00 to 1\.0e\+14 .* loses [2-9]e-02 of the lightest bin"
+    with pytest.raises(ValueError, match=refused):
+        fit_machine(bins, 1.0, kernel, route="primal")
+    monkeypatch.setattr(fit, "_MOST_DUAL", 39)
+    with pytest.raises(ValueError, match=refused):
+        fit_machine(bins, 1.0, kernel)
+    assert fit_machine(bins, 1e-13, kernel, route="primal").solved.method == "cholesky"
 
 
 @pytest.mark.parametrize("kernel", KEEPING, ids=str)
@@ -137,32 +155,6 @@ def test_a_kernel_that_does_not_fold_says_what_it_costs_and_has_no_primal(kernel
 def test_an_unknown_route_is_refused(rng):
     with pytest.raises(ValueError, match="route must be 'auto', 'primal' or 'dual', got 'back'"):
         fit_machine(draw(rng, 5), 0.3, route="back")
-
-
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("kernel", [PAPER_KERNEL, Polynomial(1, 0.5)], ids=str)
-@pytest.mark.parametrize("chunk", [1, 7, 20, 39, 41])
-def test_chunks_leave_no_seam(chunk, kernel, weighted, rng, monkeypatch):
-    bins = draw(rng, 40, weighted=weighted)
-    whole = fit_machine(bins, 0.3, kernel)
-    monkeypatch.setattr(fit, "CHUNK_BINS", chunk)
-    cut = fit_machine(bins, 0.3, kernel)
-    for name, value in whole.state_dict().items():
-        torch.testing.assert_close(cut.state_dict()[name], value, rtol=1e-11, atol=1e-12)
-
-
-@pytest.mark.parametrize("kernel", [PAPER_KERNEL, Polynomial(1, 0.5)], ids=str)
-def test_progress_sees_every_chunk(kernel, rng, monkeypatch):
-    monkeypatch.setattr(fit, "CHUNK_BINS", 16)
-    seen = []
-
-    def progress(items, what):
-        for item in items:
-            seen.append((item, what))
-            yield item
-
-    fit_machine(draw(rng, 40), 0.3, kernel, progress)
-    assert seen == [(0, "normal equations"), (16, "normal equations"), (32, "normal equations")]
 
 
 @pytest.mark.parametrize("kernel", [PAPER_KERNEL, Polynomial(1, 0.5), RadialBasis(0.3)], ids=str)
@@ -217,4 +209,115 @@ def test_no_bins_are_no_machine(route):
         fit_machine(none, 1.0, route=route)
 
 
-# Validation ----------------------------------------------------------------------------------
+def test_a_head_remembers_its_solve_and_its_file_does_not(rng):
+    for kernel, names in (
+        (PAPER_KERNEL, {"quadratic", "linear", "constant"}),
+        (RadialBasis(1.0), {"support", "beta"}),
+    ):
+        machine = fit_machine(draw(rng, 8), 1.0, kernel)
+        assert set(machine.state_dict()) == names
+        assert pickle.loads(pickle.dumps(machine)).solved == machine.solved
+
+
+# Differentiable fits ---------------------------------------------------------------------------
+
+ROUTES = pytest.mark.parametrize("route", ["primal", "dual"])
+
+
+def drawn(rng, num_bins, num_features):
+    """Features, targets that are any numbers, C, c and weights; a gradient is wanted of all."""
+    z = torch.from_numpy(rng.uniform(-1, 1, (num_bins, num_features)))
+    targets, weights = rng.standard_normal(num_bins), rng.uniform(0.2, 3, num_bins)
+    numbers = [torch.tensor(value, dtype=torch.float64) for value in (0.7, 0.4)]
+    inputs = z, torch.from_numpy(targets), *numbers, torch.from_numpy(weights)
+    return tuple(tensor.requires_grad_() for tensor in inputs)
+
+
+def by_gram_matrix(new):
+    """Scores of new bins from the whole Gram matrix and through the solve."""
+
+    def solve(z, targets, penalty, offset, weights):
+        gram = (z @ z.mT + offset) ** 2
+        beta = torch.linalg.solve(gram + torch.diag(1 / (penalty * weights)), targets)
+        return (new @ z.mT + offset) ** 2 @ beta
+
+    return solve
+
+
+@ROUTES
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize(("penalty", "num_bins"), [(1e-3, 12), (0.3, 60), (1e4, 60)])
+def test_the_differentiable_fit_is_that_of_fit_machine(num_bins, penalty, weighted, route, rng):
+    bins = draw(rng, num_bins, 4, weighted)
+    expected = fit_machine(bins, penalty, Polynomial(2, 0.3), route=route)
+    actual = fit_quadratic(bins.features, bins.is_slip, penalty, 0.3, bins.weights, route)
+    assert actual.solved.size == expected.solved.size
+    for name, value in expected.state_dict().items():
+        scale = max(1.0, float(value.abs().max()))
+        torch.testing.assert_close(getattr(actual, name), value, rtol=0, atol=1e-10 * scale)
+
+
+@ROUTES
+@pytest.mark.parametrize(("num_bins", "num_features"), [(12, 2), (5, 3)])
+def test_derivatives_are_right_once_and_twice(num_bins, num_features, route, rng, monkeypatch):
+    """More bins than monomials, and fewer; in several chunks."""
+    monkeypatch.setattr(fit, "_CHUNK_BINS", 5)
+    new = torch.from_numpy(rng.uniform(-1, 1, (3, num_features)))
+    inputs = drawn(rng, num_bins, num_features)
+
+    def scores(*inputs):
+        return fit_quadratic(*inputs, route=route)(new)
+
+    assert torch.autograd.gradcheck(scores, inputs)
+    assert torch.autograd.gradgradcheck(scores, inputs)
+    expected = torch.autograd.grad(by_gram_matrix(new)(*inputs).sum(), inputs)
+    for one, other in zip(
+        torch.autograd.grad(scores(*inputs).sum(), inputs), expected, strict=True
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-9)
+
+
+def test_an_offset_of_nothing(rng):
+    """The dual has a derivative there; the primal has one of everything else, or says so."""
+    z, targets, penalty, _, weights = drawn(rng, 12, 2)
+    new, nothing = torch.ones(1, 2).double(), torch.zeros(()).double().requires_grad_()
+    inputs = z, targets, penalty, nothing, weights
+    with pytest.raises(ValueError, match=r"no derivative by an offset .* of 0; .* route='dual'"):
+        fit_quadratic(*inputs, route="primal")
+    expected = torch.autograd.grad(by_gram_matrix(new)(*inputs).sum(), inputs)
+    dual = torch.autograd.grad(fit_quadratic(*inputs, route="dual")(new).sum(), inputs)
+    others = z, targets, penalty, weights
+    primal = fit_quadratic(z, targets, penalty, 0.0, weights, route="primal")(new).sum()
+    found = torch.autograd.grad(primal, others)
+    for one, other in zip((*dual, *found), (*expected, *expected[:3], expected[4]), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-10)
+
+
+def test_single_precision_is_promoted_and_gets_its_gradient(rng):
+    z, targets, *_ = (tensor.detach().float() for tensor in drawn(rng, 12, 4))
+    machine = fit_quadratic(z.requires_grad_(), targets, 0.7)
+    assert machine.linear.dtype == torch.float64
+    (slope,) = torch.autograd.grad(machine.quadratic.sum(), z)
+    double = z.detach().double().requires_grad_()
+    (expected,) = torch.autograd.grad(fit_quadratic(double, targets, 0.7).quadratic.sum(), double)
+    torch.testing.assert_close(slope, expected.float())
+
+
+@ROUTES
+def test_what_cannot_be_differentiated_is_refused(route, rng):
+    z, targets, *_ = (tensor.detach() for tensor in drawn(rng, 12, 3))
+    for penalty in (0.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match=rf"positive and finite penalty .* C={penalty}; fit_"):
+            fit_quadratic(z, targets, penalty)
+    with pytest.raises(ValueError, match=r"one N, got \(12, 3\), \(11,\)"):
+        fit_quadratic(z, targets[1:], 1.0)
+    with pytest.raises(ValueError, match=r"needs bins .* got 0 bins"):
+        fit_quadratic(z[:0], targets[:0], 1.0)
+    with pytest.raises(ValueError, match=r"offset .* at least 0, got -0.5"):
+        fit_quadratic(z, targets, 1.0, -0.5)
+    with pytest.raises(ValueError, match="weights must be positive"):
+        fit_quadratic(z, targets, 1.0, weights=-torch.ones(12))
+    with pytest.raises(ValueError, match="must be finite, got nan"):
+        fit_quadratic(z, targets * torch.nan, 1.0, route=route)
+    with pytest.raises(ValueError, match=r"penalty=1e\+18.*, wanted up to 1e\+12; lower"):
+        fit_quadratic(z.repeat(4, 1)[:, [0, 0]], targets.repeat(4), 1e18, route=route)

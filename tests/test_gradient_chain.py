@@ -8,8 +8,8 @@ wavelet branches, amplitude spectra     test_wavelet, test_spectrum
 each descriptor, first and second       test_descriptors, test_descriptors_mended
 the whole pool                          test_pool
 scaling, with its knee                  test_scaling; the fit of the scaler: here
-kernels, both solves, quadratic form    test_kernels, test_kernel_elm, test_quadratic
-the fit, its settings, held-out scores  test_differentiable_fit, test_held_out_gradient
+kernels, both solves, quadratic form    test_kernels, test_solve
+the fit, its settings, held-out scores  test_fit, test_leave_one_group_out
 log likelihood ratio, each rule         test_calibration, test_sequential
 probability                             here
 all of it at once                       here: training volts and stream to statistic, twice
@@ -26,11 +26,10 @@ from torch.autograd import gradcheck, gradgradcheck
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import Isotonic, Platt, probability
-from tactslip_torch.model.differentiable_fit import fit_quadratic
-from tactslip_torch.model.kernel_elm import solve_kernel_elm
-from tactslip_torch.model.kernels import PAPER_KERNEL
-from tactslip_torch.model.quadratic import collapse
+from tactslip_torch.model.fit import fit_quadratic
+from tactslip_torch.model.kernels import PAPER_KERNEL, collapse
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.model.solve import solve_kernel_elm
 from tactslip_torch.onset.decisions import Decider, is_usable, score_stream, stream_statistic
 from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.settings import AlarmSettings

@@ -14,7 +14,7 @@ from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.trials import KINDS, degenerate_bins, noise_bins
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.signals.filtering import ChannelFilter

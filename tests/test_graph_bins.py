@@ -12,9 +12,7 @@ from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.rows import Front
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.kernels import RadialBasis
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import KernelSum, QuadraticForm, RadialBasis
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins

@@ -13,7 +13,7 @@ from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.runs import runner, session_of
 from tactslip_torch.graph.stream import stream_graph
 from tactslip_torch.model.calibration import Isotonic, Platt
-from tactslip_torch.model.widening import widened_llr
+from tactslip_torch.model.missing_channels import widened_llr
 from tactslip_torch.onset.settings import AlarmSettings
 
 pytestmark = pytest.mark.onnx

@@ -8,9 +8,9 @@ import torch
 from test_detector import noise, random_detector
 
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.detector_file import FORMAT
+from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import load_table, save_table
 from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins

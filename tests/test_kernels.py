@@ -10,11 +10,14 @@ from scipy.spatial.distance import cdist
 from tactslip_torch.model import kernels
 from tactslip_torch.model.kernels import (
     PAPER_KERNEL,
-    Cost,
+    KernelSum,
     Polynomial,
+    QuadraticForm,
     RadialBasis,
+    collapse,
+    gram_matrix,
     kernel_from_dict,
-    lower_gram,
+    machine_of,
 )
 
 KERNELS = [
@@ -97,24 +100,18 @@ def test_gradients_where_bins_coincide(rng):
     )
 
 
-# The triangle --------------------------------------------------------------------------------
+# The Gram matrix ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kernel", KERNELS, ids=str)
 @pytest.mark.parametrize("num_bins", [1, 8, 9, 20])
-def test_the_lower_triangle_is_that_of_the_kernel(kernel, num_bins, rng, monkeypatch):
+def test_the_gram_matrix_is_that_of_the_kernel(kernel, num_bins, rng, monkeypatch):
     """Eight rows are filled at a time: below one block, one whole one, more than two."""
     monkeypatch.setattr(kernels, "_GRAM_ROWS", 8)
-    z = rng.uniform(-1, 1, (num_bins, 3))
-    actual = lower_gram(kernel, torch.from_numpy(z)).tril()
-    np.testing.assert_allclose(actual, np.tril(by_definition(kernel, z, z)), rtol=0, atol=1e-12)
-
-
-def test_the_triangle_follows_the_dtype_and_has_no_gradient(rng):
-    z = torch.from_numpy(rng.standard_normal((5, 3))).float().requires_grad_()
-    gram = lower_gram(PAPER_KERNEL, z)
-    assert gram.dtype == torch.float32
-    assert not gram.requires_grad
+    z = torch.from_numpy(rng.uniform(-1, 1, (num_bins, 3))).requires_grad_()
+    actual = gram_matrix(kernel, z)
+    assert not actual.requires_grad
+    torch.testing.assert_close(actual, kernel(z, z).detach(), rtol=0, atol=1e-12)
 
 
 # What they are -------------------------------------------------------------------------------
@@ -165,5 +162,100 @@ def test_gamma_is_positive(gamma):
         RadialBasis(gamma)
 
 
-def test_a_cost_reads_as_words():
-    assert str(Cost(14520, 58084)) == "14.5 k multiply-adds a bin and 58.1 kB"
+# Explicit features ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("offset", [0.0, 0.5, 3.0])
+@pytest.mark.parametrize("num_features", [1, 2, 10])
+def test_monomials_multiply_to_the_kernel(num_features, offset, degree, rng):
+    z, beta = (torch.from_numpy(rng.standard_normal(s)) for s in ((6, num_features), 6))
+    kernel = Polynomial(degree, offset)
+    phi = kernel.monomials(z)
+    assert phi.shape == (6, kernel.num_monomials(num_features))
+    torch.testing.assert_close(phi @ phi.mT, kernel(z, z), rtol=1e-11, atol=1e-11)
+    total = kernel.sum_of_monomials(z, beta)
+    torch.testing.assert_close(total, phi.mT @ beta, rtol=1e-11, atol=1e-11)
+    weights = torch.from_numpy(rng.standard_normal(phi.shape[1]))
+    head = kernel.head(weights, num_features)
+    torch.testing.assert_close(head(z), phi @ weights, rtol=1e-11, atol=1e-11)
+    assert head.is_linear == (degree == 1)
+    assert torch.autograd.gradcheck(kernel.monomials, z.requires_grad_())
+
+
+def test_7381_monomials_of_the_papers_120_and_no_other_number_of_weights():
+    assert PAPER_KERNEL.num_monomials(120) == 7381
+    with pytest.raises(ValueError, match=r"15 weights for 4.*\(14,\)"):
+        PAPER_KERNEL.head(torch.zeros(14), 4)
+
+
+# Heads ----------------------------------------------------------------------------------------
+
+
+def drawn(rng, num_bins=20, num_features=4):
+    support = torch.from_numpy(rng.uniform(-1, 1, (num_bins, num_features)))
+    return support, torch.from_numpy(rng.standard_normal(num_bins))
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=str)
+def test_a_head_is_the_sum_over_its_bins(kernel, rng, device):
+    support, beta = drawn(rng)
+    head = machine_of(support, beta, kernel).to(device)
+    assert isinstance(head, QuadraticForm if kernel.collapses else KernelSum)
+    z = torch.from_numpy(rng.uniform(-1, 1, (6, 4))).to(device)
+    terms = by_definition(kernel, z.cpu().numpy(), support.numpy()) * beta.numpy()
+    error = np.abs(head(z).cpu().numpy() - terms.sum(-1))
+    assert (error <= 1e-11 * np.abs(terms).sum(-1)).all()
+    single = machine_of(support, beta, kernel).to(device).float()
+    oracles.assert_manners(lambda z: (head if z.dtype == torch.float64 else single)(z), z)
+    assert torch.autograd.gradcheck(head, z.requires_grad_())
+    bad = torch.zeros(2, 4, dtype=torch.float64, device=device)
+    bad[1, 2] = torch.nan
+    assert head(bad).isnan().tolist() == [False, True]
+    numbers = sum(value.numel() for value in head.state_dict().values())
+    assert (head.num_features, head.cost.num_bytes) == (4, 8 * numbers)
+
+
+def test_a_form_is_folded_in_float64_and_gradients_reach_its_bins(rng):
+    """20 000 terms that cancel: sums in float32 would be off in the third digit."""
+    support = torch.from_numpy(rng.uniform(-1, 1, (20000, 3))).float()
+    beta = torch.from_numpy(rng.choice([-1e4, 1e4], 20000)).float()
+    z = torch.from_numpy(rng.uniform(-1, 1, (5, 3)))
+    terms = PAPER_KERNEL(z, support.double()) * beta
+    error = (collapse(support, beta)(z) - terms.sum(-1)).abs()
+    assert bool((error <= 1e-10 * terms.abs().sum(-1)).all())
+    few = [part.requires_grad_() for part in drawn(rng, 5, 3)]
+    for kernel in (PAPER_KERNEL, Polynomial(1), RadialBasis(0.3)):
+        assert torch.autograd.gradcheck(lambda s, b, k=kernel: machine_of(s, b, k)(z), few)
+
+
+def test_costs_of_the_papers_head_and_of_a_sum(rng):
+    """14 520 multiply-adds and 58 kB, whatever the number of bins; of a sum with each of them."""
+    for num_bins in (3, 300):
+        form = collapse(*drawn(rng, num_bins, 120)).float()
+        assert str(form.cost) == "14.5 k multiply-adds a bin and 58.1 kB"
+        assert form.cost.multiply_adds == 120 * 120 + 120
+    kept = KernelSum(*drawn(rng, 100, 9), RadialBasis(0.25))
+    assert kept.cost == (1000, 8000)
+    for part in ("RadialBasis(gamma=0.25)", "100 training bins", "1.0 k multiply-adds", "8.0 kB"):
+        assert part in kept.cost_note
+    wide = machine_of(*drawn(rng, 3, 1001), PAPER_KERNEL)
+    assert isinstance(wide, KernelSum)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: collapse(torch.zeros(2, 3), torch.ones(2), Polynomial(3)), r"does not fold .*Sum"),
+        (lambda: KernelSum(torch.zeros(5, 2), torch.zeros(4), Polynomial(3)), r"\(5, 2\) and \(4,"),
+        (lambda: KernelSum(torch.zeros(5), torch.zeros(5), Polynomial(3)), r"\(5,\) and \(5,\)"),
+        (
+            lambda: QuadraticForm(*map(torch.zeros, ((2, 3), (3,), ()))),
+            r"\(2, 3\), \(3,\) and \(\)",
+        ),
+        (lambda: QuadraticForm(*map(torch.zeros, ((3, 3), (3,), (1,)))), r"\(3, 3\), \(3,\) and "),
+    ],
+)
+def test_what_makes_no_head_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -6,10 +6,8 @@ import pytest
 import torch
 from small_detector import HAND, raw_bins, small_detector
 
-from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.expected_score import ExpectedScore
-from tactslip_torch.model.missing import dead_mask, without
+from tactslip_torch.model.missing_channels import ClassGaussians, ExpectedScore, dead_mask, without
 
 
 def with_gaussians(**options):

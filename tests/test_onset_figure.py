@@ -9,18 +9,27 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 from PIL import Image
 
-from tactslip_torch.report.envelope import RunningEnvelope, envelope
-from tactslip_torch.report.onset import ALARM, REST, SLIP, draw_onsets, onset_figure
-from tactslip_torch.report.onset_table import (
+from tactslip_torch.report.onset import (
+    ALARM,
     COLUMNS,
+    REST,
+    SLIP,
+    Heard,
+    RunningEnvelope,
+    Tally,
+    Traces,
     alarm_outcome,
+    draw_onsets,
+    envelope,
+    onset_figure,
     onset_rows,
     onsets_summary,
     onsets_table,
     onsets_title,
+    spans,
+    status_at,
+    view_of,
 )
-from tactslip_torch.report.onset_tally import Tally
-from tactslip_torch.report.onset_traces import Heard, Traces, spans, status_at, view_of
 
 RATE_HZ, HOP_S = 2000.0, 0.01
 seeds = st.integers(0, 2**32 - 1)

@@ -6,7 +6,7 @@ import torch
 from matplotlib.image import imread
 
 from tactslip_torch.model.calibration import reliability
-from tactslip_torch.report.reliability import (
+from tactslip_torch.report.results import (
     interval_by_recording,
     reliability_figure,
     reliability_table,

@@ -27,8 +27,8 @@ from tactslip_torch.report import (
     splits_table,
     timing_table,
 )
-from tactslip_torch.report.scores import merged_metrics
-from tactslip_torch.report.tables import PAPER_LINE
+from tactslip_torch.report.metrics import merged_metrics
+from tactslip_torch.report.results import PAPER_LINE
 
 SCORE_KEYS = {
     "accuracy",

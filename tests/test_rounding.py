@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tactslip_torch.model import rounding
-from tactslip_torch.model.quadratic import QuadraticForm, collapse
+from tactslip_torch.model.kernels import QuadraticForm, collapse
 from tactslip_torch.model.rounding import gamma, rounding_bound, worst_error
 
 U = Fraction(1, 2**24)

@@ -18,9 +18,14 @@ from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.commands.importance import _trained, main, sensors
 from tactslip_torch.commands.train import train
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.report.hand_drawing import _fingers, kind_colours
-from tactslip_torch.report.hand_figure import sensors_figure
-from tactslip_torch.report.sensors import best_table, sensors_csv, sensors_table
+from tactslip_torch.report.importance import (
+    _fingers,
+    best_table,
+    kind_colours,
+    sensors_csv,
+    sensors_figure,
+    sensors_table,
+)
 
 SMALL = ("bins=20", "judged_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
 CHANNELS = ["SG1", "SG2", "PVDF1", "PVDF2"]

@@ -9,8 +9,13 @@ from matplotlib.colors import to_rgba
 from PIL import Image
 
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.report.envelope import envelope
-from tactslip_torch.report.signals import SignalRow, channel_colours, draw_signals, signals_figure
+from tactslip_torch.report.onset import envelope
+from tactslip_torch.report.recordings import (
+    SignalRow,
+    channel_colours,
+    draw_signals,
+    signals_figure,
+)
 
 HAND = HandLayout.paper24()
 CHANNELS = HAND.to_rows()

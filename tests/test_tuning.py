@@ -11,8 +11,8 @@ from tactslip_torch.data.splits import unseen4
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.held_out_gradient import held_out_scores
 from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.leave_one_group_out import held_out_scores
 from tactslip_torch.training.recipe import Recipe
 from tactslip_torch.training.selection import plan_detector
 from tactslip_torch.training.tuning import (

@@ -2,7 +2,7 @@
 
 from matplotlib.image import imread
 
-from tactslip_torch.report.validation import validation_figure, validation_table
+from tactslip_torch.report.results import validation_figure, validation_table
 
 KERNEL = {"kind": "polynomial", "degree": 2, "offset": 0.5}
 

@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tactslip_torch.report.scores import split_metrics, summed_metrics
+from tactslip_torch.report.metrics import split_metrics, summed_metrics
 
 Runs = Mapping[str, Sequence[Mapping[str, Any]]]
 """Of each experiment, one a seed, as ``runs.kept`` has them."""

@@ -48,7 +48,7 @@ from tactslip_torch.features.plan import ORDERED, Plan, make_plan
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling, pooled_names
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import bar
 from tactslip_torch.signals.filtering import ChannelFilter

@@ -30,14 +30,14 @@ from tactslip_torch.data.file_recordings import FileRecordings, Inspected, inspe
 from tactslip_torch.data.folder import Written, write_manifest
 from tactslip_torch.data.manifest import Problem, write_template
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.report.dataset import (
-    Example,
+from tactslip_torch.report.recordings import (
+    DrawnRecording,
     Trial,
     dataset_figure,
     ranges_table,
     trials_table,
 )
-from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.report.style import SIMULATED_LINE, table
 from tactslip_torch.runtime import in_processes
 
 FIGURE = Path("outputs/data_tool.png")
@@ -93,7 +93,7 @@ def summary(config: DictConfig) -> list[Trial]:
     path = FIGURE if config.output is None else Path(config.output)
     what = "SIMULATED recordings" if source.is_simulated else "Recordings"
     title = f"{what} in {source.root.resolve().name}"
-    dataset_figure(trials, _example(source), path, title=title)
+    dataset_figure(trials, _example(source), hand.names, path, title=title)
     print(f"figure in {path}")
     return trials
 
@@ -217,7 +217,7 @@ def _trial(source: FileRecordings, recording: RecordingId) -> Trial:
     )
 
 
-def _example(source: FileRecordings) -> Example:
+def _example(source: FileRecordings) -> DrawnRecording:
     """The first recording of which most is told."""
 
     def told(recording: RecordingId) -> int:
@@ -226,15 +226,14 @@ def _example(source: FileRecordings) -> Example:
 
     recording = max(source.ids, key=told)
     content = source.load(recording)
-    return Example(
+    return DrawnRecording(
         f"{recording} ({source.entry(recording).file})",
-        content.samples.double().numpy(),
-        source.hand.names,
+        content.samples,
         content.sample_rate_hz,
-        content.units,
         content.onsets_s,
         (*content.sliding_s, *content.slip_s),
         content.non_slip_s,
+        content.units,
     )
 
 
@@ -246,8 +245,8 @@ def _converted_table(done: Sequence[Written], failed: Sequence[str], seconds: fl
         f"{sum(one.duration_s for one in done):.1f}",
         f"{sum(one.num_bytes for one in done) / 1e6:.1f}",
     ]
-    table = aligned(["recordings", "made now", "left out", "seconds of signal", "MB"], [cells])
-    return f"{table}\ntook {seconds:.1f} s"
+    header = ["recordings", "made now", "left out", "seconds of signal", "MB"]
+    return f"{table([header, cells])}\ntook {seconds:.1f} s"
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="data_tool")

@@ -36,7 +36,7 @@ from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing import dead_names
+from tactslip_torch.model.missing_channels import dead_names
 from tactslip_torch.onset.decisions import Decisions, answer_of
 from tactslip_torch.onset.events import (
     EventRules,
@@ -48,17 +48,20 @@ from tactslip_torch.onset.events import (
 )
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.report.onset import onset_figure
-from tactslip_torch.report.onset_files import decisions_file, plain, write_onsets
-from tactslip_torch.report.onset_table import (
+from tactslip_torch.report.onset import (
+    DecisionCounts,
+    Traces,
     alarm_outcome,
+    decisions_file,
+    onset_figure,
     onset_rows,
     onsets_summary,
     onsets_table,
     onsets_title,
+    plain,
+    view_of,
+    write_onsets,
 )
-from tactslip_torch.report.onset_tally import Tally
-from tactslip_torch.report.onset_traces import Traces, view_of
 from tactslip_torch.runtime import bar
 from tactslip_torch.training.experiment import save_config, versions
 
@@ -153,7 +156,7 @@ def _hear(
         view = view_of(config.view, entry["duration_s"])
         drawn = _drawn(detector.pool.hand)
         traces = Traces(drawn, rate, stream.hop_s, view, units_of(detector))
-        tally = Tally(archived.recording.onsets_s if archived else ())
+        tally = DecisionCounts(archived.recording.onsets_s if archived else ())
 
         def take(decisions: Decisions) -> None:
             parts = decisions._asdict() | {"answer": answer_of(detector, decisions)}
@@ -178,14 +181,14 @@ def _hear(
     if config.figure:
         alarms = [(alarm["alarm_s"], alarm["onset_s"]) for alarm in entry["alarms"]]
         onsets, slides = (truth.onsets_s, truth.sliding_s) if truth else ((), ())
-        heard = traces.heard(alarms, onsets, slides, is_known=truth is not None)
+        heard = traces.summary(alarms, onsets, slides, is_known=truth is not None)
         title = onsets_title(entry, of_simulated=bool(detector.info.get("simulated")))
         onset_figure(heard, folder / f"{name}_onsets.png", title=title)
     return entry, events
 
 
 def _events(
-    entry: dict[str, Any], truth: Recording, tally: Tally, stream: StreamingDetector
+    entry: dict[str, Any], truth: Recording, tally: DecisionCounts, stream: StreamingDetector
 ) -> RecordingEvents:
     """A recording's alarms against its truth; both into its entry."""
     alarms = entry["alarms"]

@@ -26,9 +26,8 @@ from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, judged_once
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.report.answers import merged_answers
+from tactslip_torch.report.metrics import merged_answers, merged_metrics
 from tactslip_torch.report.results import print_results, write_results
-from tactslip_torch.report.scores import merged_metrics
 from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import (

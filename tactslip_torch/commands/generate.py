@@ -33,8 +33,8 @@ from tactslip_torch.commands.entry import (
 from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written, write_manifest
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.features.cache import source_digest
-from tactslip_torch.report.signals import SignalRow, signals_figure
-from tactslip_torch.report.tables import SIMULATED_LINE, aligned
+from tactslip_torch.report.recordings import DrawnRecording, signals_figure
+from tactslip_torch.report.style import marked, table
 from tactslip_torch.runtime import bar, in_processes
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.experiment import frame_lengths, save_config
@@ -98,9 +98,9 @@ def written_table(written: Sequence[Written], seconds: float) -> str:
         ]
         for scene, own in groups.items()
     ]
-    table = aligned(["scene", "recordings", "made now", "seconds of signal", "MB"], cells)
+    header = ["scene", "recordings", "made now", "seconds of signal", "MB"]
     simulated = any(one.line["simulated"] == "true" for one in written)
-    return "\n".join([*([SIMULATED_LINE] if simulated else []), table, f"took {seconds:.1f} s"])
+    return marked(simulated, table([header, *cells]), f"took {seconds:.1f} s")
 
 
 def _shown(config: DictConfig, source: RecordingSource) -> dict[str, list[RecordingId]]:
@@ -136,7 +136,7 @@ def _draw(
         content, hand, _ = files.load(recording)
         volts = channel_filter(content.samples.double())
         truth = content.onsets_s, content.sliding_s, content.non_slip_s
-        rows.append(SignalRow(recording.material, volts, content.sample_rate_hz, *truth))
+        rows.append(DrawnRecording(recording.material, volts, content.sample_rate_hz, *truth))
     origin = content.provenance
     known = [f"{name} {origin[name]}" for name in ("fidelity", "seed") if name in origin]
     what = "SIMULATED recordings" if origin.get("simulated") else "Recordings"

@@ -41,8 +41,7 @@ from tactslip_torch.features.selection import t_scores
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import kernel_from_dict
-from tactslip_torch.report.hand_figure import sensors_figure
-from tactslip_torch.report.sensors import best_table, sensors_csv, sensors_table
+from tactslip_torch.report.importance import best_table, sensors_csv, sensors_figure, sensors_table
 from tactslip_torch.runtime import bar, whole_file
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import DTYPES, feature_cache, save_config, versions

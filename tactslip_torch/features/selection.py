@@ -1,58 +1,49 @@
 """Which features to keep: a t-test on class moments (paper section IV-D, REFERENCE.md section 5).
 
-Moments are gathered in passes over recordings and merge exactly, so a ranking needs one look at
-each bin, and the ranking of a validation fold is a merge of what the other groups gathered.
+Moments are gathered in passes over recordings and merge, so a ranking needs one look at each bin,
+and the ranking of a validation fold is a merge of what the other groups gathered.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import cached_property
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.exact_sums import ExactSums, Totals
-
 ScoreVariance = Literal["pooled", "welch"]
 CLASS_NAMES = ("non-slip", "slip")
 _BLOCK = 128  # features whose correlations are looked at together
-_GRID = 2.0**26  # an inner product of unit vectors on a grid so fine is exact in float64
 
 
 class ClassMoments:
     """Count, mean and sum of squared deviations of every feature in both classes.
 
-    Exact sums stand behind them: moments do not depend on the order of bins or on how they were
-    sharded, and a constant feature has no spread at all.
+    The order of bins, and how they are sharded, shows in the last digits alone; a constant feature
+    has no spread at all.
 
     Args:
         num_features: length of a feature vector.
+
+    Attributes:
+        count: bins of each class so far, ``[2]``, float64, non-slip first.
+        mean: ``[2, F]``, float64; 0 without bins.
+        sum_sq_dev: sums of squared deviations from the mean, ``[2, F]``, float64.
+
+    Reference:
+        Chan, Golub and LeVeque (1983), The American Statistician 37(3), 242-247, for the merge.
     """
 
     def __init__(self, num_features: int) -> None:
-        self._sums = ExactSums(num_features, num_classes=2)
+        self.count = torch.zeros(2, dtype=torch.float64)
+        self.mean = torch.zeros(2, num_features, dtype=torch.float64)
+        self.sum_sq_dev = torch.zeros_like(self.mean)
 
     @property
     def num_features(self) -> int:
         """Length of a feature vector."""
-        return self._sums.words.shape[2]
-
-    @property
-    def count(self) -> Tensor:
-        """Bins of each class so far, ``[2]``, float64, non-slip first."""
-        return self._sums.count.double()
-
-    @property
-    def mean(self) -> Tensor:
-        """``[2, F]``, float64; 0 without bins."""
-        return self._totals.mean
-
-    @property
-    def sum_sq_dev(self) -> Tensor:
-        """Sums of squared deviations from the mean, ``[2, F]``, float64."""
-        return self._totals.sum_sq_dev
+        return self.mean.shape[1]
 
     def update(self, features: Tensor, labels: Tensor) -> None:
         """Add bins; nothing on an error.
@@ -64,19 +55,30 @@ class ClassMoments:
         Raises:
             ValueError: for another shape or dtype, or a value that is not finite.
         """
-        self._check(features, labels)
-        self._sums.update(features, labels.bool())
-        self.__dict__.pop("_totals", None)
-
-    def remove(self, features: Tensor, labels: Tensor) -> None:
-        """Take out bins that were added, exactly.
-
-        Raises:
-            ValueError: as for ``update``, or if what would remain cannot be moments of bins.
-        """
-        self._check(features, labels)
-        self._sums.remove(features, labels.bool())
-        self.__dict__.pop("_totals", None)
+        if labels.ndim != 1 or features.shape != (len(labels), self.num_features):
+            raise ValueError(
+                f"expected features [N, {self.num_features}] and labels [N], "
+                f"got {tuple(features.shape)} and {tuple(labels.shape)}"
+            )
+        if features.dtype != torch.float32:
+            raise ValueError(
+                f"moments are those of float32 features, got {features.dtype}; "
+                "hand float32, as the data module does"
+            )
+        features, labels = features.detach().cpu(), labels.cpu().bool()
+        if not bool(features.isfinite().all()):
+            row, column = (~features.isfinite()).nonzero()[0].tolist()
+            raise ValueError(
+                f"expected finite values, got {float(features[row, column])} in row {row}, "
+                f"column {column}"
+            )
+        part = ClassMoments(self.num_features)
+        for label, own in enumerate((features[~labels].double(), features[labels].double())):
+            if len(own):
+                away = own - own[0]  # exactly 0 if constant
+                part.count[label], part.mean[label] = len(own), own[0] + away.mean(0)
+                part.sum_sq_dev[label] = (away - away.mean(0)).square().sum(0)
+        self._add(part)
 
     def merge(self, other: ClassMoments) -> ClassMoments:
         """The moments of both sets of bins together, as a new object.
@@ -100,37 +102,31 @@ class ClassMoments:
                 raise ValueError(
                     f"cannot merge moments of {total.num_features} and {part.num_features} features"
                 )
-            total._sums.merge(part._sums)
+            total._add(part)
         if total is None:
             raise ValueError("no moments to merge")
         return total
 
     def state_dict(self) -> dict[str, Tensor]:
         """Plain tensors, for files and checkpoints."""
-        return self._sums.state_dict()
+        return {"count": self.count, "mean": self.mean, "sum_sq_dev": self.sum_sq_dev}
 
     @classmethod
     def from_state_dict(cls, state: dict[str, Tensor]) -> ClassMoments:
         """The moments that ``state_dict`` described."""
         moments = cls(0)
-        moments._sums = ExactSums.from_state_dict(state)
+        moments.count, moments.mean = state["count"], state["mean"]
+        moments.sum_sq_dev = state["sum_sq_dev"]
         return moments
 
-    @cached_property
-    def _totals(self) -> Totals:
-        return self._sums.totals()
-
-    def _check(self, features: Tensor, labels: Tensor) -> None:
-        if labels.ndim != 1 or features.shape != (len(labels), self.num_features):
-            raise ValueError(
-                f"expected features [N, {self.num_features}] and labels [N], "
-                f"got {tuple(features.shape)} and {tuple(labels.shape)}"
-            )
-        if features.dtype != torch.float32:
-            raise ValueError(
-                f"moments are exact sums of float32 features, got {features.dtype}; "
-                "hand float32, as the data module does"
-            )
+    def _add(self, other: ClassMoments) -> None:
+        count = self.count + other.count
+        share = (other.count / count.clamp(min=1))[:, None]
+        apart = other.mean - self.mean
+        between = apart.square() * share * self.count[:, None]
+        self.sum_sq_dev = self.sum_sq_dev + other.sum_sq_dev + between
+        self.mean = torch.where(self.count[:, None] > 0, self.mean + apart * share, other.mean)
+        self.count = count
 
 
 def t_scores(moments: ClassMoments, variance: ScoreVariance = "pooled") -> Tensor:
@@ -171,6 +167,8 @@ def t_scores(moments: ClassMoments, variance: ScoreVariance = "pooled") -> Tenso
 def rank_features(scores: Tensor, num: int) -> Tensor:
     """The best features, best first; ties by pool index, NaN last.
 
+    Scores are compared in float32, so that the rounding of sums decides between no two features.
+
     Shape:
         - scores: ``[F]``
         - output: ``[num]``, int64
@@ -184,7 +182,7 @@ def rank_features(scores: Tensor, num: int) -> Tensor:
     """
     if not 1 <= num <= len(scores):
         raise ValueError(f"num must lie in 1..{len(scores)}, got {num}")
-    comparable = torch.where(scores.isnan(), -1.0, scores)
+    comparable = torch.where(scores.isnan(), -1.0, scores).float()
     return comparable.argsort(descending=True, stable=True)[:num]
 
 
@@ -196,8 +194,7 @@ def rank_distinct(
     Goes down the ranking and skips a feature whose correlation with one already taken exceeds
     ``most_correlation``. Where fewer than ``num`` remain, the best of the skipped ones follow.
     Correlation is the absolute one of Pearson within classes: of deviations from the mean of the
-    bin's class, over all bins; that of a constant is 0. Deviations are rounded to a grid, on
-    which inner products are exact, so the choice does not depend on the number of threads.
+    bin's class, over all bins; that of a constant is 0.
 
     Args:
         scores: of all features, as for ``rank_features``.
@@ -242,12 +239,12 @@ def rank_distinct(
 
 
 def unit_deviations(features: Tensor, is_slip: Tensor) -> Tensor:
-    """Deviations from class means, about of norm ``_GRID`` and integer, ``[F, n]``, float64."""
+    """Deviations from class means, of norm 1 or, of a constant, 0: ``[F, n]``, float64."""
     moments = ClassMoments(features.shape[1])
     moments.update(features, is_slip)
     size = moments.sum_sq_dev.sum(0).sqrt()
     deviations = features.cpu() - moments.mean[is_slip.cpu().long()]
-    return (deviations * (_GRID / torch.where(size == 0, 1.0, size))).round().T.contiguous()
+    return (deviations / torch.where(size == 0, 1.0, size)).T.contiguous()
 
 
 def _correlation(a: Tensor, b: Tensor) -> Tensor:

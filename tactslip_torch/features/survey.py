@@ -1,4 +1,4 @@
-"""What a first pass over training recordings learns, the same bits for any order and sharding."""
+"""What a first pass over training recordings learns."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from tactslip_torch.graph.trials import (
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.judgement import Judgement
-from tactslip_torch.model.widening import widened_llr
+from tactslip_torch.model.missing_channels import widened_llr
 from tactslip_torch.onset.settings import calibration_of
 
 BATCHES = (1, 7, 0, 56)

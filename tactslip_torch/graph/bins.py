@@ -19,7 +19,7 @@ from tactslip_torch.graph.value import BOOL, F64, I64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.calibration import Calibration
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.onset.settings import calibration_of
 
 

@@ -20,9 +20,8 @@ from tactslip_torch.graph.sequence import llr_of
 from tactslip_torch.graph.value import F64, I64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.calibration import Calibration
-from tactslip_torch.model.class_gaussians import ClassGaussians
-from tactslip_torch.model.expected_score import Precision
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
+from tactslip_torch.model.missing_channels import ClassGaussians, Precision
 
 
 class _Mask(NamedTuple):

@@ -20,7 +20,7 @@ from tactslip_torch.graph.stream import Timing
 from tactslip_torch.graph.trials import dead_masks, simulated_stream, unit_of
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing import Dead
+from tactslip_torch.model.missing_channels import Dead
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector_file import Head
+from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 

@@ -18,11 +18,10 @@ from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool, saturating
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.model.agreement import check_parts
-from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector_file import Head, damaged, read_detector, write_detector
 from tactslip_torch.model.few_bins import FEW_BINS, FEW_FILTERED, FewBins
 from tactslip_torch.model.judgement import Judgement, Nonfinite, check_nonfinite, judged_in_parts
-from tactslip_torch.model.missing import Dead, MissingScores, without
+from tactslip_torch.model.missing_channels import ClassGaussians, Dead, MissingScores, without
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import is_plain
 from tactslip_torch.signals.filtering import ChannelFilter

@@ -11,10 +11,8 @@ from torch import Tensor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.class_gaussians import ClassGaussians
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.kernels import kernel_from_dict
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import KernelSum, QuadraticForm, kernel_from_dict
+from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import load_table, save_table, table_form
 from tactslip_torch.signals.filtering import ChannelFilter

@@ -18,7 +18,7 @@ from torch import Tensor
 from tactslip_torch.features.pool import LARGEST_SAMPLE, FeaturePool, saturating
 from tactslip_torch.model.detector_file import Head
 from tactslip_torch.model.judgement import Judgement
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
 
 Array = np.ndarray[Any, Any]

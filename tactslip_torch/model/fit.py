@@ -1,43 +1,43 @@
-"""Fitting the machine to training bins by the cheaper route (REFERENCE.md section 5)."""
+"""Fitting the machine to training bins by the cheaper route (REFERENCE.md section 5).
+
+On targets of +-1 the kernel extreme learning machine (paper section IV-E) is kernel ridge
+regression with ``alpha = 1 / C``. Two routes to the same machine: dual, one unknown per training
+bin, and primal, one unknown per monomial of the features.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
-from tactslip_torch.model.cholesky import from_above
-from tactslip_torch.model.fourth_moments import ProductSums, add_products_, normal_matrix
-from tactslip_torch.model.kernel_elm import (
-    check_weights,
-    solve_kernel_elm_,
-    solve_normal_equations_,
-)
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, lower_gram
-from tactslip_torch.model.quadratic import (
+from tactslip_torch.model.kernels import (
+    PAPER_KERNEL,
+    Head,
+    Kernel,
+    KernelSum,
+    Polynomial,
     QuadraticForm,
     collapse,
-    from_primal,
-    num_quadratic_features,
-    sum_of_quadratic_features,
+    gram_matrix,
+    machine_of,
 )
-from tactslip_torch.model.truncation import LARGEST_LOSS, lost_in_sums
+from tactslip_torch.model.moments import ProductSums
+from tactslip_torch.model.solve import check_weights, solve_by_autograd, solve_symmetric
 
 log = logging.getLogger(__name__)
 
 Route = Literal["auto", "primal", "dual"]
-Progress = Callable[[Iterable[int], str], Iterable[int]]
-"""Wraps a range so that its progress shows; gets the range and what is being done."""
 
-CHUNK_BINS = 2048
-MOST_QUADRATIC = 1000
+_CHUNK_BINS = 2048  # whose monomials are held at a time
+_MOST_CONDITION = 1e12  # of a fit that is differentiated
 _MOST_DUAL = 16_384  # bins whose Gram matrix (2 GiB) is worth keeping the light ones
+_LARGEST_LOSS = 1e-3  # of what the lightest bin says, in a sum with the heaviest
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,13 @@ class TrainingBins:
         """+1 for slip, -1 for non-slip, ``[N]``."""
         return torch.where(self.is_slip, 1.0, -1.0).to(self.features)
 
+    @property
+    def sample_weight(self) -> Tensor:
+        """Weights, 1 each if there are none, ``[N]``, float64."""
+        if self.weights is None:
+            return torch.ones_like(self.is_slip, dtype=torch.float64)
+        return self.weights.double()
+
     def double(self) -> TrainingBins:
         """The same bins in float64."""
         weights = None if self.weights is None else self.weights.double()
@@ -81,71 +88,129 @@ class TrainingBins:
 
 
 def fit_machine(
-    bins: TrainingBins,
-    penalty: float,
-    kernel: Kernel = PAPER_KERNEL,
-    progress: Progress | None = None,
-    route: Route = "auto",
-) -> QuadraticForm | KernelSum:
+    bins: TrainingBins, penalty: float, kernel: Kernel = PAPER_KERNEL, route: Route = "auto"
+) -> Head:
     """Solve the kernel machine, and fold it into its quadratic form where the kernel folds.
 
     Through the primal or the dual, whichever ``takes_dual`` finds cheaper; both give the same
-    machine. The primal takes one matrix of monomials by monomials (7381 for 120 features) whatever
-    the number of bins; the dual takes one of bins by bins. In float64, and however close to
-    singular (``symmetric_solve``); ``solved`` of the machine says how it went. Weights so far apart
-    that sums of the primal would lose the lightest bin take the dual up to 16384 bins.
+    machine. The primal takes two matrices of monomials by monomials (7381 for 120 features)
+    whatever the number of bins; the dual takes two of bins by bins. In float64, and however close
+    to singular (``solve``); ``solved`` of the machine says how it went. Weights so far apart that
+    sums of the primal would lose the lightest bin take the dual up to 16384 bins.
 
     Args:
         bins: scaled training bins; float32 is promoted exactly.
         penalty: the paper's ``C``; ``inf`` for the pseudo-inverse.
         kernel: of the machine.
-        progress: shows the progress of the primal's accumulation.
         route: ``"auto"``, or the one to take.
 
     Raises:
         ValueError: if a number is not finite, the primal is asked of a kernel that does not fold,
             or it would lose the lightest bin to rounding.
     """
-    if route not in ("auto", "primal", "dual"):
-        raise ValueError(f"route must be 'auto', 'primal' or 'dual', got {route!r}")
     if len(bins.features) == 0:
         raise ValueError("a machine needs training bins, got none; add bins of both classes")
     bins = bins.double()
-    if isinstance(kernel, Polynomial) and kernel.collapses:
-        if not goes_dual(bins, penalty, kernel, route):
-            solve = _solve_linear_primal if kernel.degree == 1 else _solve_quadratic_primal
-            return solve(bins, penalty, kernel.offset, progress)
-    elif route == "primal":
-        raise ValueError(f"{kernel} has no primal of fixed size; take route='dual' or 'auto'")
-    gram = lower_gram(kernel, bins.features)
-    beta, report = solve_kernel_elm_(
-        gram,
-        bins.targets,
-        penalty,
-        bins.weights,
-        restore=lambda spoilt: lower_gram(kernel, bins.features, spoilt),
-    )
-    machine = machine_of(bins.features, beta, kernel)
-    if isinstance(machine, KernelSum):
-        log.info(machine.cost_note)
+    if not _goes_dual(bins, penalty, kernel, route):
+        assert isinstance(kernel, Polynomial)
+        layout = ProductSums(bins.features.shape[1], kernel.degree)
+        total = bins.features.new_zeros(layout.num_held)
+        layout.add_(total, bins.features, bins.sample_weight)
+        normal = layout.normal_matrix(total, kernel.offset)
+        moment = kernel.sum_of_monomials(bins.features, bins.sample_weight * bins.targets)
+        solved, report, _ = solve_symmetric(normal, moment, penalty, name="X'WX", in_span=True)
+        machine: Head = kernel.head(solved, bins.features.shape[1])
+    else:
+        gram = gram_matrix(kernel, bins.features)
+        beta, report, _ = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
+        machine = machine_of(bins.features, beta, kernel)
+        if isinstance(machine, KernelSum):
+            log.info(machine.cost_note)
     machine.solved = report
     return machine
 
 
-def machine_of(support: Tensor, beta: Tensor, kernel: Kernel) -> QuadraticForm | KernelSum:
-    """A kernel sum, folded where its kernel folds and that makes it smaller.
+def fit_quadratic(
+    z: Tensor,
+    targets: Tensor,
+    penalty: Tensor | float,
+    offset: Tensor | float = 0.5,
+    weights: Tensor | None = None,
+    route: Route = "auto",
+) -> QuadraticForm:
+    """The machine of ``fit_machine`` with ``Polynomial(2, offset)``, differentiable.
 
-    A quadratic form has a number for each pair of features: of more than ``MOST_QUADRATIC``
-    features and fewer bins than that, the sum over bins is the smaller one.
+    Its numbers, and so its scores, know where they come from: any number of times differentiable
+    in ``z``, real ``targets``, ``penalty``, ``offset`` and ``weights``.
+
+    Args:
+        z: scaled features of the bins; promoted to float64.
+        targets: +1 for slip and -1 for non-slip, or any numbers; bool is taken as ``is_slip``.
+        penalty: the paper's ``C``, positive and finite; a number or a tensor of one.
+        offset: the kernel's ``c``, at least 0; likewise; positive if the primal is to
+            have a derivative by it.
+        weights: positive weight of each bin; default 1.
+        route: ``"auto"``, which is that of ``fit_machine``, or the one to take.
 
     Shape:
-        - support: ``[N, K]``; beta: ``[N]``
+        - z: ``[N, K]``; targets, weights: ``[N]``
+
+    Raises:
+        ValueError: if shapes disagree, a value is outside its range or not finite, or the
+            condition is above 1e12.
+
+    Example:
+        >>> z = torch.tensor([[0.9], [0.2], [-0.7]]).double()
+        >>> penalty = torch.tensor(1.0, requires_grad=True)
+        >>> machine = fit_quadratic(z, torch.tensor([True, True, False]), penalty)
+        >>> (slope,) = torch.autograd.grad(machine(z).square().sum(), penalty)
+        >>> bool(slope > 0)  # a larger C follows the targets more closely
+        True
     """
-    is_wide = support.shape[1] > max(MOST_QUADRATIC, len(support))
-    is_quadratic = isinstance(kernel, Polynomial) and kernel.degree == 2
-    if kernel.collapses and not (is_wide and is_quadratic):
-        return collapse(support, beta, kernel)
-    return KernelSum(support, beta, kernel)
+    z = z.double()
+    if targets.dtype == torch.bool:
+        targets = torch.where(targets, 1.0, -1.0)
+    targets = targets.to(z)
+    c, offset = (torch.as_tensor(x, dtype=z.dtype, device=z.device) for x in (penalty, offset))
+    bins = TrainingBins(z.detach(), targets.detach() > 0, weights).double()
+    if len(z) == 0 or not 0 < c.item() < math.inf:
+        raise ValueError(
+            f"a fit to be differentiated needs bins and a positive and finite penalty (the paper's "
+            f"C), got {len(z)} bins and C={c.item()}; fit_machine takes an infinite one"
+        )
+    weights = bins.sample_weight
+    is_dual = _goes_dual(bins, c.item(), Polynomial(2, offset.item()), route)
+    kernel = Polynomial(2, offset)  # type: ignore[arg-type]  # a tensor, to be derived by
+    if is_dual:
+        system, right, ridge = kernel(z, z), targets, 1 / (c * weights)
+    else:
+        if offset.requires_grad and not offset.item() > 0:
+            raise ValueError(
+                f"through the primal the machine has no derivative by an offset (the paper's c) of "
+                f"{offset.item():g}; take a positive one, or route='dual'"
+            )
+
+        def normal(z: Tensor, weights: Tensor, offset: Tensor) -> Tensor:
+            monomials = Polynomial(2, offset).monomials(z)  # type: ignore[arg-type]
+            return monomials.mT @ (monomials * weights[:, None])
+
+        chunks = zip(z.split(_CHUNK_BINS), weights.split(_CHUNK_BINS), strict=True)
+        system = torch.stack(
+            [checkpoint(normal, *chunk, offset, use_reentrant=False) for chunk in chunks]
+        ).sum(0)
+        right, ridge = kernel.sum_of_monomials(z, weights * targets), (1 / c).expand(len(system))
+    _, report, _ = solve_symmetric(
+        system,
+        right,
+        c.item(),
+        weights if is_dual else None,
+        name="gram" if is_dual else "X'WX",
+        most_condition=_MOST_CONDITION,
+    )
+    solved = solve_by_autograd(system + ridge.diag(), right)
+    machine = collapse(z, solved, kernel) if is_dual else kernel.head(solved, z.shape[1])
+    machine.solved = report
+    return machine
 
 
 def takes_dual(kernel: Kernel, num_bins: int, num_features: int) -> bool:
@@ -156,77 +221,42 @@ def takes_dual(kernel: Kernel, num_bins: int, num_features: int) -> bool:
     """
     if not isinstance(kernel, Polynomial) or not kernel.collapses:
         return True
+    num_monomials = kernel.num_monomials(num_features)
     if kernel.degree == 1:
-        return num_bins <= num_features + 1
+        return num_bins <= num_monomials
     sums = math.comb(num_features + 4, 4) * num_bins
-    return num_bins**3 <= num_quadratic_features(num_features) ** 3 + 6 * sums
+    return num_bins**3 <= num_monomials**3 + 6 * sums
 
 
-def goes_dual(bins: TrainingBins, penalty: float, kernel: Polynomial, route: Route) -> bool:
+def check_route(route: str, kernel: Kernel) -> None:
+    """Refuse an unknown route, and the primal of a kernel that does not fold.
+
+    Raises:
+        ValueError: if it is one.
+    """
+    if route not in ("auto", "primal", "dual"):
+        raise ValueError(f"route must be 'auto', 'primal' or 'dual', got {route!r}")
+    if route == "primal" and not kernel.collapses:
+        raise ValueError(f"{kernel} has no primal of fixed size; take route='dual' or 'auto'")
+
+
+def _goes_dual(bins: TrainingBins, penalty: float, kernel: Kernel, route: Route) -> bool:
     """Whether the dual is asked for, cheaper, or needed: sums would lose the lightest bin."""
+    check_route(route, kernel)
     num_bins, num_features = bins.features.shape
     if route == "dual" or (route == "auto" and takes_dual(kernel, num_bins, num_features)):
         return True
-    if bins.weights is None or not penalty > 0:
+    assert isinstance(kernel, Polynomial)
+    longest = float(bins.features.square().sum(-1).max()) + kernel.offset
+    lightest, heaviest = (float(x) for x in bins.sample_weight.detach().aminmax())
+    light, heavy = (weight * longest**kernel.degree for weight in (lightest, heaviest))
+    lost = torch.finfo(torch.float64).eps * heavy / (light + 1 / penalty) if penalty > 0 else 0.0
+    if not lost > _LARGEST_LOSS:
         return False
-    longest = float(bins.features.square().sum(-1).max())
-    spread = bins.weights, penalty, (longest + kernel.offset) ** kernel.degree
-    if route == "auto" and num_bins <= _MOST_DUAL and lost_in_sums(*spread) > LARGEST_LOSS:
+    if route == "auto" and num_bins <= _MOST_DUAL:
         return True
-    _check_spread(*spread)
-    return False
-
-
-def _check_spread(weights: Tensor, penalty: float, square: float) -> None:
-    """Refuse weights of which more than ``LARGEST_LOSS`` is lost."""
-    lost = lost_in_sums(weights, penalty, square)
-    if lost > LARGEST_LOSS:
-        raise ValueError(
-            f"weights from {float(weights.min()):.1e} to {float(weights.max()):.1e} are too far "
-            f"apart for X'WX: it loses {lost:.0e} of the lightest bin to rounding, wanted up to "
-            f"{LARGEST_LOSS:.0e}; take the dual, or lower the penalty"
-        )
-
-
-def _solve_linear_primal(
-    bins: TrainingBins, penalty: float, offset: float, progress: Progress | None
-) -> QuadraticForm:
-    """Degree 1: one unknown per feature, and one for the constant."""
-    num_features = bins.features.shape[1]
-    normal = bins.features.new_zeros(num_features + 1, num_features + 1)
-    moment = bins.features.new_zeros(num_features + 1)
-    for chunk in _chunks(bins, progress):
-        z = bins.features[chunk]
-        x = torch.cat([z, torch.full_like(z[:, :1], math.sqrt(offset))], dim=-1)
-        weighted = x if bins.weights is None else x * bins.weights[chunk, None]
-        normal.addmm_(weighted.mT, x)
-        moment.addmv_(weighted.mT, bins.targets[chunk])
-    solved, report = solve_normal_equations_(normal, moment, penalty, restore=from_above)
-    machine = QuadraticForm(solved.new_zeros(0, 0), solved[:-1], math.sqrt(offset) * solved[-1])
-    machine.solved = report
-    return machine
-
-
-def _solve_quadratic_primal(
-    bins: TrainingBins, penalty: float, offset: float, progress: Progress | None
-) -> QuadraticForm:
-    """Degree 2: one unknown per monomial, from sums of fixed size."""
-    num_features = bins.features.shape[1]
-    total = bins.features.new_zeros(ProductSums(num_features).num_held)
-    pull = bins.targets if bins.weights is None else bins.targets * bins.weights
-    for chunk in _chunks(bins, progress):
-        weights = None if bins.weights is None else bins.weights[chunk]
-        add_products_(total, bins.features[chunk], weights)
-    normal = normal_matrix(total, num_features, offset)
-    moment = sum_of_quadratic_features(bins.features, pull, offset)
-    del total
-    weights, report = solve_normal_equations_(normal, moment, penalty, restore=from_above)
-    machine = from_primal(weights, num_features, offset)
-    machine.solved = report
-    return machine
-
-
-def _chunks(bins: TrainingBins, progress: Progress | None) -> Iterator[slice]:
-    starts: Iterable[int] = range(0, len(bins.features), CHUNK_BINS)
-    for start in starts if progress is None else progress(starts, "normal equations"):
-        yield slice(start, start + CHUNK_BINS)
+    raise ValueError(
+        f"weights from {lightest:.1e} to {heaviest:.1e} are too far apart for X'WX: it "
+        f"loses {lost:.0e} of the lightest bin to rounding, wanted up to {_LARGEST_LOSS:.0e}; "
+        "take the dual, or lower the penalty"
+    )

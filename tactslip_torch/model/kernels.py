@@ -1,8 +1,11 @@
-"""Kernels: how alike two bins are. Which of them fold into a quadratic form, and what heads cost.
+"""Kernels, their explicit features, and the heads that a sum over training bins becomes.
 
 The paper's is the polynomial of degree 2 (section IV-E). Polynomials of degree 1 and 2 in K
 features have few monomials, so their sum over the training bins folds into one quadratic form of
-fixed size (``quadratic``); the others keep every training bin (``kernel_sum``).
+fixed size (REFERENCE.md section 5):
+``sum_i beta_i (z_i . z + c)^2 = z' Q z + l' z + a`` with ``Q = Z' diag(beta) Z``,
+``l = 2 c Z' beta`` and ``a = c^2 sum(beta)``. Degree 1 likewise, with ``Q = 0`` (not stored),
+``l = Z' beta``, ``a = c sum(beta)``. Other kernels keep every training bin.
 """
 
 from __future__ import annotations
@@ -10,12 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from tactslip_torch.model.solve import SolveReport
 
 _GRAM_ROWS = 512
+_MOST_QUADRATIC = 1000
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,70 @@ class Polynomial:
         """
         gram: Tensor = (a @ b.mT + self.offset) ** self.degree
         return gram
+
+    def num_monomials(self, num_features: int) -> int:
+        """Number of explicit features, ``P``: of degree 2 and 120 features 7381."""
+        return math.comb(num_features + self.degree, self.degree)
+
+    def scale(self, num_features: int) -> Tensor:
+        """What each monomial is multiplied with, so that the map gives the kernel: ``[P]``."""
+        c = torch.as_tensor(self.offset, dtype=torch.float64)
+        if self.degree == 1:
+            return torch.cat([c.sqrt()[None], torch.ones(num_features, dtype=c.dtype)])
+        first, second = _pairs(num_features)
+        factors = torch.stack([c, (2 * c).sqrt(), torch.full_like(c, math.sqrt(2))])
+        of_each = factors[(first > 0).long() + (second > 0)]
+        return torch.where((first == second) & (first > 0), 1.0, of_each)
+
+    def monomials(self, z: Tensor) -> Tensor:
+        """The explicit feature map of degree 1 or 2: ``phi(a) . phi(b)`` is the kernel.
+
+        Of degree 1 the variables ``(1, z_1, .., z_K)``, of degree 2 the products of pairs of them,
+        row by row: the constant, the features, then ``z_i z_j`` for i <= j. Each times its scale.
+
+        Shape:
+            - z: ``[N, K]``
+            - output: ``[N, P]``, float64
+        """
+        variables = torch.cat([torch.ones_like(z[:, :1]), z], dim=-1)
+        if self.degree == 2:
+            first, second = _pairs(z.shape[-1])
+            variables = variables[:, first] * variables[:, second]
+        return variables * self.scale(z.shape[-1])
+
+    def sum_of_monomials(self, z: Tensor, shares: Tensor) -> Tensor:
+        """``monomials(z).mT @ shares`` without making them.
+
+        Shape:
+            - z: ``[N, K]``; shares: ``[N]``; output: ``[P]``, float64
+        """
+        variables = torch.cat([torch.ones_like(z[:, :1]), z], dim=-1)
+        if self.degree == 1:
+            return (variables.mT @ shares) * self.scale(z.shape[-1])
+        products = variables.mT @ (variables * shares[:, None])
+        return products[*_pairs(z.shape[-1])] * self.scale(z.shape[-1])
+
+    def head(self, weights: Tensor, num_features: int) -> QuadraticForm:
+        """The quadratic form that weights of ``monomials`` stand for.
+
+        Shape:
+            - weights: ``[P]``
+
+        Raises:
+            ValueError: if the number of weights is another.
+        """
+        wanted = self.num_monomials(num_features)
+        if weights.shape != (wanted,):
+            raise ValueError(
+                f"expected {wanted} weights for {num_features} features, got {tuple(weights.shape)}"
+            )
+        scaled = weights * self.scale(num_features)
+        if self.degree == 1:
+            return QuadraticForm(scaled.new_zeros(0, 0), scaled[1:], scaled[0])
+        upper = scaled.new_zeros(num_features + 1, num_features + 1)
+        upper = upper.index_put(_pairs(num_features), scaled)
+        squares = upper[1:, 1:]
+        return QuadraticForm((squares + squares.mT) / 2, upper[0, 1:], upper[0, 0])
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; ``kernel_from_dict`` takes it."""
@@ -103,6 +173,12 @@ class RadialBasis:
         return {"kind": "radial basis", **asdict(self)}
 
 
+def _pairs(num_features: int) -> tuple[Tensor, Tensor]:
+    """The two variables of each monomial of degree 2, of which 0 is the constant."""
+    first, second = torch.triu_indices(num_features + 1, num_features + 1)
+    return first, second
+
+
 Kernel = Polynomial | RadialBasis
 PAPER_KERNEL = Polynomial(degree=2, offset=0.5)
 
@@ -134,37 +210,17 @@ def kernel_from_dict(values: Mapping[str, Any]) -> Kernel:
         raise ValueError(f"{numbers} does not describe a {values['kind']} kernel") from error
 
 
-def lower_gram(kernel: Kernel, z: Tensor, out: Tensor | None = None) -> Tensor:
-    """Kernel matrix of bins with themselves, for a Cholesky: only its lower triangle is filled.
-
-    ``kernel(z, z)`` needs two more matrices of that size on the way; this needs none. Not
-    differentiable.
-
-    Args:
-        kernel: of the machine.
-        z: the bins.
-        out: write it here instead, where it need not be 0.
+def gram_matrix(kernel: Kernel, z: Tensor) -> Tensor:
+    """``kernel(z, z)``, not differentiable, in the memory of the result.
 
     Shape:
-        - z: ``[N, K]``; output: ``[N, N]``, above the diagonal what was there or the kernel
+        - z: ``[N, K]``; output: ``[N, N]``
     """
-    gram = z.new_zeros(len(z), len(z)) if out is None else out
+    gram = z.new_empty(len(z), len(z))
     with torch.no_grad():
-        for start in range(0, len(z), _GRAM_ROWS):
-            end = start + _GRAM_ROWS
-            gram[start:end, :end] = kernel(z[start:end], z[:end])
+        for rows, some in zip(gram.split(_GRAM_ROWS), z.split(_GRAM_ROWS), strict=True):
+            rows.copy_(kernel(some, z))
     return gram
-
-
-class Solved(Protocol):
-    """What a head remembers of the solve it comes from; ``SolveReport`` is one."""
-
-    @property
-    def condition(self) -> float:
-        """Of the system."""
-
-    def facts(self) -> dict[str, Any]:
-        """JSON-able."""
 
 
 class Cost(NamedTuple):
@@ -181,3 +237,190 @@ class Cost(NamedTuple):
             f"{self.multiply_adds / 1000:.1f} k multiply-adds a bin and "
             f"{self.num_bytes / 1000:.1f} kB"
         )
+
+
+class QuadraticForm(nn.Module):
+    """``z' Q z + l' z + a``.
+
+    Args:
+        quadratic: ``[K, K]``, symmetric; of a linear machine empty, ``[0, 0]``.
+        linear: ``[K]``.
+        constant: a scalar tensor.
+
+    Attributes:
+        solved: how its numbers were solved for; ``None`` if read from a file or made by hand.
+
+    Raises:
+        ValueError: if shapes disagree.
+    """
+
+    quadratic: Tensor
+    linear: Tensor
+    constant: Tensor
+
+    def __init__(self, quadratic: Tensor, linear: Tensor, constant: Tensor) -> None:
+        super().__init__()
+        self.solved: SolveReport | None = None
+        num = linear.shape[-1]
+        is_known = quadratic.shape in ((num, num), (0, 0))
+        if not is_known or linear.shape != (num,) or constant.shape != ():
+            raise ValueError(
+                "expected quadratic [K, K] or [0, 0], linear [K] and a scalar constant, got "
+                f"{tuple(quadratic.shape)}, {tuple(linear.shape)} and {tuple(constant.shape)}"
+            )
+        self.register_buffer("quadratic", quadratic.clone())
+        self.register_buffer("linear", linear.clone())
+        self.register_buffer("constant", constant.clone())
+
+    @property
+    def num_features(self) -> int:
+        """How many features it takes."""
+        return self.linear.shape[-1]
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether there is no quadratic part, as of degree 1."""
+        return self.quadratic.numel() == 0
+
+    @property
+    def dense_quadratic(self) -> Tensor:
+        """``Q``, ``[K, K]``, of a linear machine too."""
+        num = self.num_features
+        return self.linear.new_zeros(num, num) if self.is_linear else self.quadratic
+
+    @property
+    def cost(self) -> Cost:
+        """Multiply-adds a bin and bytes, whatever the number of training bins."""
+        num_values = self.num_features + self.quadratic.numel()
+        return Cost(num_values, (num_values + 1) * self.linear.element_size())
+
+    def forward(self, z: Tensor) -> Tensor:
+        """The score.
+
+        Shape:
+            - z: ``[*, K]``
+            - output: ``[*]``
+        """
+        if self.is_linear:
+            linear: Tensor = torch.linalg.vecdot(self.linear, z) + self.constant
+            return linear
+        pull = nn.functional.linear(z, self.quadratic, self.linear)  # as few calls as can be
+        score: Tensor = torch.linalg.vecdot(pull, z) + self.constant
+        return score
+
+
+class KernelSum(nn.Module):
+    """``sum_i beta_i kernel(z, z_i)``: size and latency grow with the number of training bins.
+
+    Args:
+        support: ``[N, K]``, scaled training bins.
+        beta: ``[N]``, their output weights.
+        kernel: of the machine.
+
+    Attributes:
+        solved: how its numbers were solved for; ``None`` if read from a file or made by hand.
+
+    Raises:
+        ValueError: if shapes disagree.
+
+    Example:
+        >>> machine = KernelSum(torch.zeros(1, 2), torch.ones(1), RadialBasis(1.0))
+        >>> machine(torch.tensor([[0.0, 0.0], [1.0, 0.0]]))
+        tensor([1.0000, 0.3679])
+    """
+
+    support: Tensor
+    beta: Tensor
+
+    def __init__(self, support: Tensor, beta: Tensor, kernel: Kernel) -> None:
+        super().__init__()
+        self.solved: SolveReport | None = None
+        if support.ndim != 2 or beta.shape != support.shape[:1]:
+            raise ValueError(
+                "expected support [N, K] and beta [N] with one N, got "
+                f"{tuple(support.shape)} and {tuple(beta.shape)}"
+            )
+        self.register_buffer("support", support.clone())
+        self.register_buffer("beta", beta.clone())
+        self.kernel = kernel
+
+    @property
+    def num_features(self) -> int:
+        """How many features it takes."""
+        return self.support.shape[1]
+
+    @property
+    def cost(self) -> Cost:
+        """Multiply-adds a bin and bytes; both grow with the number of training bins."""
+        num_bins, num_features = self.support.shape
+        num_values = num_bins * (num_features + 1)
+        return Cost(num_values, num_values * self.support.element_size())
+
+    @property
+    def cost_note(self) -> str:
+        """What keeping the sum costs, in a sentence for logs."""
+        return (
+            f"{self.kernel} does not fold into a quadratic form: the machine keeps all "
+            f"{len(self.support)} training bins, {self.cost}"
+        )
+
+    def forward(self, z: Tensor) -> Tensor:
+        """The score; holds a kernel matrix of all bins given by all training bins.
+
+        Shape:
+            - z: ``[*, K]``
+            - output: ``[*]``
+        """
+        across = self.kernel(z[..., None, :], self.support)  # [*, 1, N]
+        return torch.matmul(across, self.beta).squeeze(-1)
+
+
+Head = QuadraticForm | KernelSum
+"""A quadratic form of fixed size, or the sum over training bins of a kernel that does not fold."""
+
+
+def collapse(support: Tensor, beta: Tensor, kernel: Kernel = PAPER_KERNEL) -> QuadraticForm:
+    """Fold a kernel sum of degree 1 or 2 into its quadratic form.
+
+    Sums and result are in float64 whatever comes in: the terms are many and cancel. Differentiable
+    in both tensors.
+
+    Args:
+        support: scaled training bins.
+        beta: their output weights.
+        kernel: a polynomial of degree 1 or 2.
+
+    Shape:
+        - support: ``[N, K]``
+        - beta: ``[N]``
+
+    Raises:
+        ValueError: for a kernel that does not fold.
+    """
+    if not isinstance(kernel, Polynomial) or not kernel.collapses:
+        raise ValueError(
+            f"{kernel} does not fold into a quadratic form, polynomials of degree 1 and 2 do; "
+            "keep the sum as a KernelSum"
+        )
+    support, beta = support.double(), beta.double()
+    pull, total = support.mT @ beta, beta.sum()
+    if kernel.degree == 1:
+        return QuadraticForm(support.new_zeros(0, 0), pull, kernel.offset * total)
+    bend = support.mT @ (support * beta[:, None])
+    return QuadraticForm(bend, 2 * kernel.offset * pull, kernel.offset**2 * total)
+
+
+def machine_of(support: Tensor, beta: Tensor, kernel: Kernel) -> Head:
+    """A kernel sum, folded where its kernel folds and that makes it smaller.
+
+    A quadratic form has a number for each pair of features: of more than 1000 features and fewer
+    bins than that, the sum over bins is the smaller one.
+
+    Shape:
+        - support: ``[N, K]``; beta: ``[N]``
+    """
+    is_wide = support.shape[1] > max(_MOST_QUADRATIC, len(support))
+    is_quadratic = isinstance(kernel, Polynomial) and kernel.degree == 2
+    if kernel.collapses and not (is_wide and is_quadratic):
+        return collapse(support, beta, kernel)
+    return KernelSum(support, beta, kernel)

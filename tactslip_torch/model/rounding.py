@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.model.quadratic import QuadraticForm
+from tactslip_torch.model.kernels import QuadraticForm
 
 _WIDE = 2.0**-52  # twice the unit roundoff of the float64 sums below
 _KEPT, _VARIED, _ROUNDS = 16, 32, 16

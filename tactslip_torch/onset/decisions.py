@@ -19,7 +19,7 @@ from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.conformal import UNSURE, answers
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.judgement import Judgement
-from tactslip_torch.model.widening import widened_llr
+from tactslip_torch.model.missing_channels import widened_llr
 from tactslip_torch.onset.rules import NEUTRAL, Latch, latch, latch_start
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.signals.filtering import ChannelFilter

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing import Dead, dead_names, without
+from tactslip_torch.model.missing_channels import Dead, dead_names, without
 from tactslip_torch.onset.decisions import Decider, Decisions, is_usable, score_filtered
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.signals.stream import FilterStream, SampleClock

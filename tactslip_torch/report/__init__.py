@@ -1,11 +1,12 @@
-"""What a run tells a person: scores per bin, tables, figures, and the paper's numbers beside."""
+"""Reports for people: scores per bin, tables, figures, and the paper's numbers beside."""
 
-from tactslip_torch.report.figures import confusion_figure, pipeline_figure
+from tactslip_torch.report.metrics import bin_metrics, confusion_matrix, split_metrics
+from tactslip_torch.report.pipeline import pipeline_figure
 from tactslip_torch.report.published import PublishedSplit
-from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
-from tactslip_torch.report.selected import selected_features_figure
-from tactslip_torch.report.tables import (
+from tactslip_torch.report.results import (
+    confusion_figure,
     materials_table,
+    selected_features_figure,
     selected_table,
     solve_line,
     splits_table,

@@ -1,4 +1,4 @@
-"""What adding or taking out recordings did: a table, a figure, and the journal of a detector."""
+"""Incremental learning: before and after as a table and a figure, and a detector's journal."""
 
 from __future__ import annotations
 
@@ -6,114 +6,104 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
+from tactslip_torch.report.style import (
+    BLUE,
+    UPPER_LEFT_OUTSIDE,
+    VERMILION,
+    clean,
+    lanes,
+    marked,
+    new_figure,
+    percent,
+    save,
+    table,
+)
 
-from tactslip_torch.report.tables import SIMULATED_LINE, aligned
-from tactslip_torch.runtime import whole_file
-
-_BEFORE, _AFTER, _NEW = "#999999", "#0072B2", "#D55E00"
+_BEFORE = "#999999"
 
 
-def adaptation_table(found: Mapping[str, Any]) -> str:
+def adaptation_table(content: Mapping[str, Any]) -> str:
     """Balanced accuracy of every old material and of the new recordings, before and after.
 
     Args:
-        found: the content of ``adaptation.json``.
+        content: of ``adaptation.json``.
     """
-    rows = [[name, _percent(a), _percent(b), _points(a, b)] for name, a, b in _scores(found)]
-    header = ["balanced accuracy %", "before", "after", "points"]
-    head = [SIMULATED_LINE] if found["simulated"] else []
-    head.append(_what(found))
-    parts = ["\n".join(head), aligned(header, rows)]
-    if len(found["tried"]) > 1:
-        tried = [[f"{factor:g}", f"{100 * fall:.2f}"] for factor, fall in found["tried"]]
-        parts.append(aligned(["weight, in average old materials", "old lose, points"], tried))
-    seconds = ", ".join(f"{name} {value:.1f} s" for name, value in found["seconds"].items())
-    return "\n\n".join([*parts, f"took {seconds}"])
+    rows = [["balanced accuracy %", "before", "after", "points"]]
+    for name, before, after in _scores(content):
+        points = "-" if after is None else f"{100 * (after - before):+.2f}"
+        rows.append([name, percent(before), percent(after), points])
+    blocks = [marked(content["simulated"], _action(content)), table(rows)]
+    if len(content["tried"]) > 1:
+        tried = [[f"{factor:g}", percent(loss)] for factor, loss in content["tried"]]
+        header = ["weight, in average old materials", "old lose, points"]
+        blocks.append(table([header, *tried]))
+    seconds = ", ".join(f"{name} {value:.1f} s" for name, value in content["seconds"].items())
+    return "\n\n".join([*blocks, f"took {seconds}"])
 
 
 def journal_table(steps: Sequence[Mapping[str, Any]]) -> str:
     """Every step of a detector since it was trained, first to last."""
     if not steps:
         return "no step since training"
-    rows = [
-        [
-            str(number),
-            step["when"],
-            step["action"],
-            ", ".join(step["materials"]),
-            str(len(step["recordings"])),
-            "-" if step["weight"] is None else f"{step['weight']:.3g}",
-            "yes" if step["slip_free"] else "no",
-            "yes" if step["forced"] else "no",
-        ]
-        for number, step in enumerate(steps, 1)
-    ]
-    header = ["step", "when (UTC)", "action", "material", "recordings", "weight", "slip-free"]
-    return aligned([*header, "forced"], rows, num_left=4)
+    rows = [["step", "when (UTC)", "action", "material", "recordings", "weight", "slip-free"]]
+    rows[0].append("forced")
+    for number, step in enumerate(steps, 1):
+        weight = "-" if step["weight"] is None else f"{step['weight']:.3g}"
+        row = [str(number), step["when"], step["action"], ", ".join(step["materials"])]
+        row += [str(len(step["recordings"])), weight]
+        rows.append([*row, *("yes" if step[name] else "no" for name in ("slip_free", "forced"))])
+    return table(rows, num_left=4)
 
 
-def adaptation_figure(found: Mapping[str, Any], path: str | Path) -> None:
+def adaptation_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write before and after of every material as a line between two dots.
 
     Args:
-        found: the content of ``adaptation.json``.
+        content: of ``adaptation.json``.
         path: the PNG to write, replaced as a whole if it exists.
     """
-    rows = _scores(found)
-    figure = Figure(figsize=(7.2, 1.7 + 0.36 * len(rows)), layout="constrained")
+    rows = _scores(content)
+    figure = new_figure(7.2, 1.7 + 0.36 * len(rows))
     axes = figure.subplots()
-    num_new = 1 if found["new"] else 0
-    for place, (name, before, after) in enumerate(reversed(rows)):
-        colour = _NEW if place < num_new and name.endswith("(new)") else _AFTER
-        known = [100 * value for value in (before, after) if value is not None]
-        axes.plot(known, [place] * len(known), color=colour, lw=2, alpha=0.5, zorder=1)
-        axes.scatter(100 * before, place, color=_BEFORE, s=42, zorder=2)
+    for place, (name, before, after) in enumerate(rows):
+        is_new = bool(content["new"]) and place == len(rows) - 1 and name.endswith("(new)")
+        colour = VERMILION if is_new else BLUE
         if after is not None:
+            between = [100 * before, 100 * after]
+            axes.plot(between, [place] * 2, color=colour, lw=2, alpha=0.5, zorder=1)
             axes.scatter(100 * after, place, color=colour, s=42, zorder=3)
-    axes.scatter([], [], color=_BEFORE, s=42, label="before")
-    axes.scatter([], [], color=_AFTER, s=42, label="after, old")
-    if found["new"]:
-        axes.scatter([], [], color=_NEW, s=42, label="after, new")
-    axes.set_yticks(range(len(rows)), [name for name, _, _ in reversed(rows)])
-    axes.set_ylim(-0.6, len(rows) - 0.4)
+        axes.scatter(100 * before, place, color=_BEFORE, s=42, zorder=2)
+    labels = {_BEFORE: "before", BLUE: "after, old"}
+    for colour, label in (labels | ({VERMILION: "after, new"} if content["new"] else {})).items():
+        axes.scatter([], [], color=colour, s=42, label=label)
+    clean(axes, "x")
+    lanes(axes, [name for name, _, _ in rows])
     axes.set_xlabel("balanced accuracy by the machine without the recording, %")
-    axes.grid(axis="x", color="#DDDDDD")
-    axes.set_axisbelow(True)
-    for side in ("top", "right", "left"):
-        axes.spines[side].set_visible(False)
-    axes.tick_params(axis="y", length=0)
-    kind = ", simulated data" if found["simulated"] else ""
-    verdict = "accepted" if found["accepted"] else "refused"
-    axes.set_title(f"{_what(found)}: {verdict}{kind}", fontsize=10, loc="left")
-    axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=160, facecolor="white")
+    result = "accepted" if content["accepted"] else "refused"
+    kind = ", SIMULATED data" if content["simulated"] else ""
+    axes.set_title(f"{_action(content)}: {result}{kind}", fontsize=10, loc="left")
+    axes.legend(frameon=False, fontsize=8, **UPPER_LEFT_OUTSIDE)
+    save(figure, path)
 
 
-def _what(found: Mapping[str, Any]) -> str:
-    count, names = len(found["recordings"]), ", ".join(found["materials"])
-    kind = " (non-slip bins alone)" if found["slip_free"] else ""
-    weight = "" if found["weight"] is None else f", each bin with weight {found['weight']:.3g}"
-    recordings = "recording" if count == 1 else "recordings"
-    return f"{found['action']} {count} {recordings} of {names}{kind}{weight}"
+def _action(content: Mapping[str, Any]) -> str:
+    """What was done, in words."""
+    count = len(content["recordings"])
+    recordings = "1 recording" if count == 1 else f"{count} recordings"
+    kind = " (non-slip bins alone)" if content["slip_free"] else ""
+    weight = content["weight"]
+    weighted = "" if weight is None else f", each bin with weight {weight:.3g}"
+    materials = ", ".join(content["materials"])
+    return f"{content['action']} {recordings} of {materials}{kind}{weighted}"
 
 
-def _scores(found: Mapping[str, Any]) -> list[tuple[str, float, float | None]]:
+def _scores(content: Mapping[str, Any]) -> list[tuple[str, float, float | None]]:
     """Name, before and after: old materials, their mean, and the new one."""
-    before, after = found["old"]["before"], found["old"]["after"]
+    before, after = content["old"]["before"], content["old"]["after"]
     rows: list[tuple[str, float, float | None]] = [(n, before[n], after[n]) for n in sorted(before)]
     if len(rows) > 1:
         means = [sum(of.values()) / len(of) for of in (before, after)]
         rows.append(("mean of old materials", means[0], means[1]))
-    if new := found["new"]:
-        rows.append((f"{', '.join(found['materials'])} (new)", new["before"], new["after"]))
+    if new := content["new"]:
+        rows.append((f"{', '.join(content['materials'])} (new)", new["before"], new["after"]))
     return rows
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.2f}"
-
-
-def _points(before: float, after: float | None) -> str:
-    return "-" if after is None else f"{100 * (after - before):+.2f}"

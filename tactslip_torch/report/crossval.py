@@ -1,4 +1,4 @@
-"""What ``crossval`` found over all choices of unseen materials: a table and a figure."""
+"""Scores over all choices of held-out materials: tables and a figure of ``crossval.json``."""
 
 from __future__ import annotations
 
@@ -8,83 +8,83 @@ from statistics import mean, median, stdev
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from tactslip_torch.report.tables import SIMULATED_LINE, aligned
-from tactslip_torch.runtime import whole_file
+from tactslip_torch.report.style import (
+    clean,
+    colours_of,
+    marked,
+    new_figure,
+    percent,
+    save,
+    table,
+)
 
 PAPERS_UNSEEN = frozenset({"iron", "cloth", "copper", "wood"})
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 
-def crossval_table(found: Mapping[str, Any]) -> str:
+def crossval_table(content: Mapping[str, Any]) -> str:
     """Balanced accuracy in percent over all splits, of each recipe; then of each unseen material.
 
     Args:
-        found: the content of ``crossval.json``.
+        content: of ``crossval.json``.
     """
-    head = [SIMULATED_LINE] if found["simulated"] else []
-    head.append(
-        f"balanced accuracy %, every choice of {found['num_unseen']} unseen materials of "
-        f"{len(found['materials'])}; fitted on {found['train_bins']} bins of each material and "
+    line = (
+        f"balanced accuracy %, every choice of {content['num_unseen']} unseen materials of "
+        f"{len(content['materials'])}; fitted on {content['train_bins']} bins of each material and "
         "class"
     )
-    splits, materials = split_rows(found), material_rows(found)
-    parts = [aligned(splits[0], splits[1:], num_left=2), aligned(materials[0], materials[1:])]
-    return "\n".join(head) + "\n\n" + "\n\n".join(parts)
+    tables = (table(split_rows(content), num_left=2), table(material_rows(content)))
+    return marked(content["simulated"], line, "", "\n\n".join(tables))
 
 
-def split_rows(found: Mapping[str, Any]) -> list[list[str]]:
-    """A header and one row per recipe and role: how the scores of all splits lie."""
-    rows = [["recipe", "judged on", "mean", "sd", "least", "5 %", "median", "most"]]
+def split_rows(content: Mapping[str, Any]) -> list[list[str]]:
+    """A header and one row per recipe and role: the distribution of the scores of all splits."""
+    rows = [["recipe", "evaluated on", "mean", "sd", "least", "5 %", "median", "most"]]
     rows[0] += ["the paper's four", "splits"]
-    for name, splits in found["splits"].items():
+    for name, splits in content["splits"].items():
         for role in ("test", "unseen"):
-            scores = sorted(_scores(splits, role))
+            scores = sorted(split[role] for split in splits if split[role] is not None)
             if not scores:
                 rows.append([name, role, *["-"] * 7, "0"])
                 continue
-            of_all = [mean(scores), _spread(scores), scores[0], _quantile(scores, 0.05)]
-            of_all += [median(scores), scores[-1]]
-            cells = _percents(*of_all, _of_paper(splits, role))
-            rows.append([name, role, *cells, str(len(scores))])
+            numbers = [mean(scores), _spread(scores), scores[0], scores[int(0.05 * len(scores))]]
+            numbers += [median(scores), scores[-1]]
+            numbers.append(next((split[role] for split in splits if _is_papers(split)), None))
+            rows.append([name, role, *map(percent, numbers), str(len(scores))])
     return rows
 
 
-def material_rows(found: Mapping[str, Any]) -> list[list[str]]:
+def material_rows(content: Mapping[str, Any]) -> list[list[str]]:
     """A header and one row per material: its scores in the splits where it is unseen."""
     header = ["unseen material"]
-    for name in found["splits"]:
+    for name in content["splits"]:
         header += [f"{name} mean", "sd"]
     rows = [header]
-    for material in found["materials"]:
-        cells = []
-        for splits in found["splits"].values():
+    for material in content["materials"]:
+        row = [material]
+        for splits in content["splits"].values():
             scores = material_scores(splits, material)
-            cells += _percents(mean(scores) if scores else None, _spread(scores))
-        rows.append([material, *cells])
+            row += [percent(mean(scores) if scores else None), percent(_spread(scores))]
+        rows.append(row)
     return rows
 
 
-def crossval_figure(found: Mapping[str, Any], path: str | Path) -> None:
+def crossval_figure(content: Mapping[str, Any], path: str | Path) -> None:
     """Write the distribution over splits, and the scores of each unseen material, as a PNG.
 
     Args:
-        found: the content of ``crossval.json``.
+        content: of ``crossval.json``.
         path: the PNG to write, replaced as a whole if it exists.
     """
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    kind = "SIMULATED hand" if found["simulated"] else "recorded"
-    figure.suptitle(
-        f"Every choice of {found['num_unseen']} unseen materials of {len(found['materials'])} "
-        f"({kind})",
-        fontsize=13,
+    title = (
+        f"Every choice of {content['num_unseen']} unseen materials of {len(content['materials'])}"
     )
+    figure = new_figure(11, 4.6, title, simulated=content["simulated"])
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.25))
-    _distribution(left, found)
-    _by_material(right, found)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    colours = colours_of(content["splits"])
+    _distribution(left, content, colours)
+    _by_material(right, content, colours)
+    save(figure, path)
 
 
 def material_scores(splits: Sequence[Mapping[str, Any]], material: str) -> list[float]:
@@ -93,69 +93,44 @@ def material_scores(splits: Sequence[Mapping[str, Any]], material: str) -> list[
     return [score for score in scores if score is not None]
 
 
-def _distribution(axes: Axes, found: Mapping[str, Any]) -> None:
+def _distribution(axes: Axes, content: Mapping[str, Any], colours: Mapping[str, str]) -> None:
     """Splits in the order of their scores; the paper's own choice is marked."""
-    for number, (name, splits) in enumerate(found["splits"].items()):
-        colour = _COLOURS[number % len(_COLOURS)]
+    for name, splits in content["splits"].items():
         known = [split for split in splits if split["unseen"] is not None]
-        ordered = sorted(known, key=lambda split: float(split["unseen"]))
-        scores = [100 * float(split["unseen"]) for split in ordered]
-        share = [(place + 0.5) / len(scores) for place in range(len(scores))]
+        known.sort(key=lambda split: float(split["unseen"]))
+        scores = [100 * split["unseen"] for split in known]
+        fraction = [(place + 0.5) / len(scores) for place in range(len(scores))]
         label = f"{name}: mean {mean(scores):.1f}"
-        axes.plot(scores, share, color=colour, linewidth=2, label=label)
-        for place, split in enumerate(ordered):
-            if frozenset(split["materials"]) == PAPERS_UNSEEN:
-                axes.plot(scores[place], share[place], "o", color=colour, markersize=8)
+        axes.plot(scores, fraction, color=colours[name], linewidth=2, label=label)
+        for place in (place for place, split in enumerate(known) if _is_papers(split)):
+            axes.plot(scores[place], fraction[place], "o", color=colours[name], markersize=8)
     axes.set_xlabel("balanced accuracy on the unseen materials, %")
-    axes.set_ylabel("share of splits at or below")
+    axes.set_ylabel("fraction of splits at or below")
     axes.set_ylim(0, 1)
-    axes.grid(color="#DDDDDD")
     axes.set_title("over all splits; dot: the paper's four", fontsize=10)
     axes.legend(frameon=False, loc="upper left")
+    clean(axes)
 
 
-def _by_material(axes: Axes, found: Mapping[str, Any]) -> None:
+def _by_material(axes: Axes, content: Mapping[str, Any], colours: Mapping[str, str]) -> None:
     """Mean and spread of each material over the splits where it is unseen."""
-    count = len(found["splits"])
-    for number, splits in enumerate(found["splits"].values()):
-        for place, material in enumerate(found["materials"]):
-            scores = material_scores(splits, material)
-            if not scores:
-                continue
-            x = place + (number - (count - 1) / 2) * 0.25
-            colour = _COLOURS[number % len(_COLOURS)]
-            axes.errorbar(
-                x,
-                100 * mean(scores),
-                yerr=100 * _spread(scores),
-                fmt="o",
-                color=colour,
-                capsize=3,
-            )
-    axes.set_xticks(range(len(found["materials"])), found["materials"], rotation=30)
+    for number, (name, splits) in enumerate(content["splits"].items()):
+        aside = (number - (len(colours) - 1) / 2) * 0.25
+        for place, material in enumerate(content["materials"]):
+            if scores := material_scores(splits, material):
+                style: dict[str, Any] = {"fmt": "o", "color": colours[name], "capsize": 3}
+                spread = 100 * _spread(scores)
+                axes.errorbar(place + aside, 100 * mean(scores), yerr=spread, **style)
+    axes.set_xticks(range(len(content["materials"])), content["materials"], rotation=30)
     axes.set_ylabel("balanced accuracy, %")
-    axes.grid(axis="y", color="#DDDDDD")
     axes.set_title("each material where it is unseen: mean and sd over splits", fontsize=10)
+    clean(axes, "y")
 
 
-def _scores(splits: Sequence[Mapping[str, Any]], role: str) -> list[float]:
-    return [split[role] for split in splits if split[role] is not None]
-
-
-def _of_paper(splits: Sequence[Mapping[str, Any]], role: str) -> float | None:
-    """The split that leaves out the materials that the paper does."""
-    return next(
-        (split[role] for split in splits if frozenset(split["materials"]) == PAPERS_UNSEEN), None
-    )
+def _is_papers(split: Mapping[str, Any]) -> bool:
+    """Whether a split leaves out the materials that the paper does."""
+    return frozenset(split["materials"]) == PAPERS_UNSEEN
 
 
 def _spread(scores: Sequence[float]) -> float:
     return stdev(scores) if len(scores) > 1 else 0.0
-
-
-def _quantile(ordered: Sequence[float], share: float) -> float:
-    return ordered[min(len(ordered) - 1, int(share * len(ordered)))]
-
-
-def _percents(*fractions: float | None) -> list[str]:
-    return ["-" if fraction is None else f"{100 * fraction:.2f}" for fraction in fractions]

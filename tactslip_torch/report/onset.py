@@ -1,14 +1,19 @@
-"""What a detector heard in a recording, as the paper's last figure.
+"""Decisions on streams: what is kept while one passes, its figure, table and files.
 
-The films over time, blue where the status decided is no slip and yellow where it is slip
-(paper section V-D); below them the decided and the true status, and the probability of slip.
-Behind it stand the decisions that are unsure, where the detector may be. Everything stands at the
+The figure follows the paper's last one (section V-D): fast channels over time, blue where no slip
+is decided and yellow where slip is; below them the decided and the true status, and the probability
+of slip, behind which decisions are marked where the detector abstains. Everything stands at the
 time at which it was known, so the delay of a decision can be seen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,165 +22,583 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 
-from tactslip_torch.report.envelope import Array
-from tactslip_torch.report.onset_traces import Heard, Stretches, spans, status_at
+from tactslip_torch.report.style import (
+    ALARM,
+    BLUE,
+    GREY,
+    INK,
+    ORANGE,
+    clean,
+    legend_below,
+    marked,
+    new_figure,
+    save,
+    table,
+)
 from tactslip_torch.runtime import whole_file
 
-REST, SLIP, ALARM = "#0072B2", "#E69F00", "#C6361B"
-_PALE_SLIP = "#FFF0CC"
-_INK, _GREY = "#222222", "#666666"
-_INVALID: dict[str, Any] = {
-    "facecolor": "none",
-    "edgecolor": "#999999",
-    "hatch": "////",
-    "linewidth": 0,
-    "zorder": 0.5,
-}
-_UNSURE: dict[str, Any] = {"facecolor": "#DDD6E8", "edgecolor": "none", "zorder": 0.2}
-_ONSET: dict[str, Any] = {"color": _INK, "linestyle": "-."}
-_ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-"}
-_ESTIMATE: dict[str, Any] = {"color": ALARM, "linestyle": ":"}
+Array = NDArray[np.float64]
+Points = tuple[Array, Array]
+"""Times in seconds and values there."""
+Segments = Sequence[tuple[float, float]]
+"""Start and end of each, in seconds."""
+Write = Callable[[Iterable[Sequence[Any]]], None]
+
+REST, SLIP = BLUE, ORANGE
+COLUMNS = (
+    *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic", "is_valid"),
+    *("outcome", "true_onset_s", "delay_s", "simulated"),
+)
+"""Of ``onsets.csv``."""
+_NUM_SEGMENTS = 1500  # of each line, of which the least and the greatest value are kept
+_MOST_ROWS = 40
+_SAME_S = 1e-8
 _WIDTH, _ROOM = 1.2, 40  # of marks, in points, as long as there are no more of a kind
 _MOST_LINES = 250
+_INVALID: dict[str, Any] = {
+    "facecolor": "none", "edgecolor": "#999999", "hatch": "////", "linewidth": 0, "zorder": 0.5,
+}  # fmt: skip
+_ABSTAINS: dict[str, Any] = {"facecolor": "#DDD6E8", "edgecolor": "none", "zorder": 0.2}
+_ONSET: dict[str, Any] = {"color": INK, "linestyle": "-."}
+_ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-"}
+_ESTIMATE: dict[str, Any] = {"color": ALARM, "linestyle": ":"}
 
 
-def onset_figure(heard: Heard, path: str | Path, *, title: str) -> None:
-    """Write the figure that ``draw_onsets`` draws as PNG, replaced as a whole if it exists."""
-    figure = draw_onsets(heard, title=title)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=120, facecolor="white")
+# Long signals ------------------------------------------------------------------------------------
+def envelope(values: Array, num_segments: int) -> tuple[NDArray[np.int64], Array]:
+    """The least and the greatest sample of each of ``num_segments`` segments, in order of time.
+
+    A line through them looks like the line through all samples, and no burst is lost. Signals of
+    at most twice as many samples come back whole. Samples that are not finite count only where a
+    segment has no others, and are NaN then: a gap.
+
+    Shape:
+        - values: ``[C, T]``
+        - output: indices into ``T`` and values there, both ``[C, M]``
+    """
+    running = _RunningEnvelope(values.shape[0], values.shape[1], num_segments)
+    running.add(values)
+    return running.points()
 
 
-def draw_onsets(heard: Heard, *, title: str) -> Figure:
-    """Draw the films in lanes, the decided and the true status, and the probability of slip.
+class _RunningEnvelope:
+    """``envelope`` of a signal of known length that comes in pieces; keeps what is drawn."""
+
+    def __init__(self, num_channels: int, num_samples: int, num_segments: int) -> None:
+        self._size = max(1, -(-num_samples // num_segments))
+        self._rest: Array = np.empty((num_channels, 0))
+        self._first = 0
+        self._indices: list[NDArray[np.int64]] = [np.empty((num_channels, 0), dtype=np.int64)]
+        self._values: list[Array] = [np.empty((num_channels, 0))]
+
+    def add(self, values: NDArray[np.floating]) -> None:
+        """Take the next samples, ``[C, n]``; ``n`` may be 0."""
+        waiting = np.concatenate([self._rest, values], axis=1)
+        whole = waiting.shape[1] // self._size * self._size
+        self._take(waiting[:, :whole])
+        self._rest = waiting[:, whole:].copy()
+
+    def points(self) -> tuple[NDArray[np.int64], Array]:
+        """Indices and values of all samples so far, the last segment as far as it came."""
+        self._take(self._rest)
+        self._rest = self._rest[:, :0]
+        return np.concatenate(self._indices, axis=1), np.concatenate(self._values, axis=1)
+
+    def _take(self, values: Array) -> None:
+        """Keep the extremes of every segment; of one or two samples they are all."""
+        num_channels, num_samples = values.shape
+        if not num_samples:
+            return  # so that the lists are no longer than there are segments
+        finite = np.where(np.isfinite(values), values, np.nan)
+        if self._size <= 2:
+            indices = np.tile(np.arange(num_samples), (num_channels, 1))
+        else:
+            starts = np.arange(0, num_samples, self._size)
+            missing = ((0, 0), (0, len(starts) * self._size - num_samples))
+            cut = np.pad(finite, missing, constant_values=np.nan)
+            cut = cut.reshape(num_channels, len(starts), self._size)
+            least = np.where(np.isnan(cut), np.inf, cut).argmin(axis=2)
+            greatest = np.where(np.isnan(cut), -np.inf, cut).argmax(axis=2)
+            places = np.sort(np.stack([least, greatest], axis=2), axis=2) + starts[None, :, None]
+            indices = places.reshape(num_channels, -1)
+        self._indices.append(indices + self._first)
+        self._values.append(np.take_along_axis(finite, indices, axis=1))
+        self._first += num_samples
+
+
+# While a stream passes ---------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class StreamSummary:
+    """One recording and what was decided of it, as few points as a figure can show.
 
     Args:
-        heard: what is drawn.
+        view: start and end of what is drawn, in seconds.
+        channels: samples of each drawn channel by its name; NaN is a gap.
+        probability: of slip.
+        is_slip: contact status after each decision, 0 or 1.
+        is_valid: whether the decision can be relied on, 0 or 1.
+        abstains: whether its score is too near the boundary to answer, or not valid, 0 or 1.
+        alarms: of each alarm, when it was raised and when its slip is estimated to have begun.
+        onsets_s: exact onsets, where they are known.
+        sliding_s: start and end of each slide.
+        is_known: whether the truth is.
+        units: of the samples.
+    """
+
+    view: tuple[float, float]
+    channels: Mapping[str, Points]
+    probability: Points
+    is_slip: Points
+    is_valid: Points
+    abstains: Points
+    alarms: Segments = ()
+    onsets_s: Sequence[float] = ()
+    sliding_s: Segments = ()
+    is_known: bool = False
+    units: str = "V"
+
+
+class Traces:
+    """Gathers samples and decisions of a recording; its memory does not grow with the length.
+
+    Args:
+        channels: what is drawn: row in the samples, by name.
+        sample_rate_hz: of the samples.
+        hop_s: distance of two decisions.
+        view: start and end of what is drawn, in seconds.
+        units: of the samples.
+    """
+
+    def __init__(
+        self,
+        channels: Mapping[str, int],
+        sample_rate_hz: float,
+        hop_s: float,
+        view: tuple[float, float],
+        units: str = "V",
+    ) -> None:
+        self._channels, self._view, self._units = channels, view, units
+        self._sample_rate_hz, self._hop_s = sample_rate_hz, hop_s
+        self._first, self._stop = (round(edge * sample_rate_hz) for edge in view)
+        num_decisions = round((view[1] - view[0]) / hop_s)
+        length = self._stop - self._first
+        self._samples = _RunningEnvelope(len(channels), length, _NUM_SEGMENTS)
+        self._decisions = _RunningEnvelope(4, num_decisions, _NUM_SEGMENTS)
+        self._num_samples = 0
+        self._first_s: float | None = None
+
+    def add_samples(self, samples: NDArray[np.floating]) -> None:
+        """Take the next samples, ``[C, n]``."""
+        first, stop = (max(edge - self._num_samples, 0) for edge in (self._first, self._stop))
+        self._num_samples += samples.shape[1]
+        self._samples.add(samples[list(self._channels.values()), first:stop])
+
+    def add_decisions(
+        self,
+        available_s: Array,
+        probability: Array,
+        is_slip: Array,
+        is_valid: Array,
+        abstains: Array,
+    ) -> None:
+        """Take the next decisions, each ``[m]``."""
+        since_s = self._view[0] - self._hop_s  # the one before the view tells the status there
+        is_seen = (available_s > since_s) & (available_s <= self._view[1])
+        if self._first_s is None and is_seen.any():
+            self._first_s = float(available_s[is_seen][0])
+        self._decisions.add(np.stack([probability, is_slip, is_valid, abstains])[:, is_seen])
+
+    def summary(
+        self, alarms: Segments, onsets_s: Sequence[float], sliding_s: Segments, *, is_known: bool
+    ) -> StreamSummary:
+        """What was gathered, with alarms and truth as ``StreamSummary`` has them."""
+        places, samples = self._samples.points()
+        times = (self._first + places) / self._sample_rate_hz
+        numbers, values = self._decisions.points()
+        decided_s = (self._first_s or 0.0) + numbers * self._hop_s
+        probability, is_slip, is_valid, abstains = zip(decided_s, values, strict=True)
+        return StreamSummary(
+            view=self._view,
+            channels={name: (times[row], samples[row]) for row, name in enumerate(self._channels)},
+            probability=probability,
+            is_slip=is_slip,
+            is_valid=is_valid,
+            abstains=abstains,
+            alarms=alarms,
+            onsets_s=onsets_s,
+            sliding_s=sliding_s,
+            is_known=is_known,
+            units=self._units,
+        )
+
+
+class DecisionCounts:
+    """Adds up decisions on a stream: counts, and alarms with their ends.
+
+    Args:
+        onsets_s: true onsets, as far as they are known.
+
+    Attributes:
+        num_decisions: so far.
+        num_invalid: of them, those that cannot be relied on.
+        first_positive_s: of each onset, the first decision from it on that speaks for slip; NaN.
+    """
+
+    def __init__(self, onsets_s: Sequence[float] = ()) -> None:
+        self.num_decisions = self.num_invalid = 0
+        self.first_positive_s = [math.nan] * len(onsets_s)
+        self._onsets_s = tuple(onsets_s)
+        self._alarms: list[dict[str, Any]] = []
+        self._ends_s: list[float] = []
+        self._was_on = False
+
+    def add(
+        self,
+        available_s: Array,
+        llr: NDArray[np.floating],
+        is_valid: NDArray[np.bool_],
+        is_on: NDArray[np.bool_],
+        alarms: Sequence[Mapping[str, Any]],
+    ) -> None:
+        """Take the next decisions, each ``[m]``, and the alarms that they raised."""
+        self.num_decisions += len(available_s)
+        self.num_invalid += int((~is_valid).sum())
+        self._alarms += map(dict, alarms)
+        status = np.concatenate([[self._was_on], is_on])
+        self._ends_s += available_s[status[:-1] & ~status[1:]].tolist()
+        self._was_on = bool(status[-1])
+        positive_s = available_s[llr > 0]
+        for place, onset in enumerate(self._onsets_s):
+            after = positive_s[positive_s >= onset]
+            if math.isnan(self.first_positive_s[place]) and len(after):
+                self.first_positive_s[place] = float(after[0])
+
+    @property
+    def alarms(self) -> list[dict[str, Any]]:
+        """Those so far, each with its ``end_s``; ``None`` while it stands."""
+        ends = [*self._ends_s, *[None] * (len(self._alarms) - len(self._ends_s))]
+        return [alarm | {"end_s": end} for alarm, end in zip(self._alarms, ends, strict=True)]
+
+
+def view_of(given: Any, duration_s: float) -> tuple[float, float]:
+    """What is drawn of a recording: all of it, or ``[start, end]`` as far as it goes.
+
+    Raises:
+        ValueError: if that is no such pair, or begins behind the recording.
+    """
+    if given is None:
+        return 0.0, duration_s
+    edges = list(given) if isinstance(given, Sequence) and not isinstance(given, str) else []
+    if len(edges) != 2 or not all(type(edge) in (int, float) for edge in edges):
+        raise ValueError(f"view must be [start, end] in seconds, got {given!r}")
+    start, end = max(float(edges[0]), 0.0), min(float(edges[1]), duration_s)
+    if not start < end:
+        raise ValueError(f"view={given!r} shows nothing of {duration_s:g} s")
+    return start, end
+
+
+# Tables and files --------------------------------------------------------------------------------
+def alarm_outcome(alarm_s: float, truth: Mapping[str, Any]) -> dict[str, Any]:
+    """What an alarm was: its ``outcome`` as in ``onset_rows``, of which onset, and how late.
+
+    Args:
+        alarm_s: when it was raised.
+        truth: of an entry of ``onsets.json``.
+    """
+    if alarm_s in truth["false_alarms_s"]:
+        return {"outcome": "false", "true_onset_s": None, "delay_s": None}
+    for onset in truth["onsets"]:  # onsets ascend: the last one that has begun stays
+        delay_s = alarm_s - onset["onset_s"]
+        is_found = onset["outcome"] == "found" and abs(delay_s - onset["delay_s"]) < _SAME_S
+        if is_found or delay_s > -truth["early_s"] - _SAME_S:
+            after = "late" if onset["outcome"] == "missed" else "repeated"
+            outcome = "found" if is_found else "early" if delay_s < 0 else after
+            result = {"outcome": outcome, "true_onset_s": onset["onset_s"], "delay_s": delay_s}
+        if is_found:
+            break
+    return result
+
+
+def onset_rows(content: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Every alarm, and every onset that was missed, in order of time; each with all ``COLUMNS``.
+
+    ``outcome`` is that of the alarm: it ``found`` a slip, came ``early``, ``repeated`` the alarm of
+    a slip, came too ``late`` for one that was missed, or is ``false``; or ``missed``, of an onset.
+    ``None`` where the truth is not known.
+
+    Args:
+        content: of ``onsets.json``.
+    """
+    rows: list[dict[str, Any]] = []
+    for entry in content["recordings"]:
+        events = [alarm | {"at": alarm["alarm_s"]} for alarm in entry["alarms"]]
+        events += [
+            {"outcome": "missed", "true_onset_s": onset["onset_s"], "at": onset["onset_s"]}
+            for onset in (entry["truth"] or {}).get("onsets", ())
+            if onset["outcome"] == "missed"
+        ]
+        named = {"file": entry["file"], "simulated": entry["simulated"]}
+        for event in sorted(events, key=lambda event: float(event["at"])):
+            rows.append({column: (named | event).get(column) for column in COLUMNS})
+    return rows
+
+
+def onsets_title(entry: Mapping[str, Any], *, of_simulated: bool) -> str:
+    """A line about one recording, which says what of it is simulated.
+
+    Args:
+        entry: of ``onsets.json``.
+        of_simulated: whether the detector was trained on simulated data.
+    """
+    title = [f"{'SIMULATED recording' if entry['simulated'] else 'Recording'} {entry['file']}"]
+    title += [f"material {entry['material']}"] if entry["material"] else []
+    count = len(entry["alarms"])
+    title += [f"{count} alarm{'s' * (count != 1)}"]
+    if truth := entry["truth"]:
+        num_found = sum(onset["outcome"] == "found" for onset in truth["onsets"])
+        title += [f"{num_found} of {len(truth['onsets'])} slips found"]
+        title += [f"{len(truth['false_alarms_s'])} false"]
+    title += ["detector trained on simulated data"] if of_simulated else []
+    return ", ".join(title)
+
+
+def onsets_table(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
+    """The first rows of ``onset_rows`` as text.
+
+    Args:
+        rows: of ``onset_rows``.
+        simulated: whether any recording is; the first line says so.
+    """
+    cells = [["file", "alarm s", "onset s", "P(slip)", "valid", "true onset s", "delay s"]]
+    cells[0].append("outcome")
+    for place, row in enumerate(rows[:_MOST_ROWS]):
+        is_first = place == 0 or rows[place - 1]["file"] != row["file"]
+        shown = [row["file"] if is_first else "", _seconds(row["alarm_s"])]
+        shown += [_seconds(row["onset_s"]), _seconds(row["probability"], 2)]
+        shown.append({None: "-", True: "yes", False: "NO"}[row["is_valid"]])
+        shown += [_seconds(row["true_onset_s"]), _seconds(row["delay_s"])]
+        cells.append([*shown, row["outcome"] or "-"])
+    rest = len(rows) - _MOST_ROWS
+    lines = [table(cells) if rows else "no alarm, and no slip missed"]
+    return marked(simulated, *lines, *([f"and {rest} more, see onsets.csv"] if rest > 0 else []))
+
+
+def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
+    """What was detected in all, in a few lines.
+
+    Args:
+        content: of ``onsets.json``.
+        seconds: that it took.
+    """
+    entries = content["recordings"]
+    duration_s = sum(entry["duration_s"] for entry in entries)
+    alarms = sum(len(entry["alarms"]) for entry in entries)
+    invalid = sum(entry["decisions"]["invalid"] for entry in entries)
+    number = sum(entry["decisions"]["number"] for entry in entries)
+    lines = [
+        f"{alarms} alarms in {duration_s:.1f} s of {len(entries)} recordings; "
+        f"took {seconds:.1f} s, {duration_s / seconds:.0f} times real time"
+    ]
+    if invalid:
+        lines.append(
+            f"NOTE: {100 * invalid / number:.1f} % of the decisions are not valid: a channel in "
+            "use is missing or dead; they count as long as another is left"
+        )
+    if events := content["events"]:
+        delay = events["delay_ms"]
+        median = f", median delay {delay['median']['value']:.1f} ms" if delay else ""
+        lines.append(
+            f"of {events['num_onsets']} slips {events['num_found']} found{median}, "
+            f"{events['num_early']} early, {events['num_missed']} missed; "
+            f"{events['num_false_alarms']} false alarms in {60 * events['quiet_hours']:.2f} "
+            "minutes without slip"
+        )
+    return "\n".join(lines)
+
+
+def _seconds(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def write_onsets(content: Mapping[str, Any], folder: Path) -> None:
+    """Write ``onsets.json`` and ``onsets.csv``, each whole or not at all.
+
+    Args:
+        content: of ``onsets.json``.
+        folder: where they go.
+    """
+    with whole_file(folder / "onsets.json") as temporary:
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    with decisions_file(folder / "onsets.csv", COLUMNS, wanted=True) as write:
+        write(list(row.values()) for row in onset_rows(content))
+
+
+def plain(value: Any) -> Any:
+    """The same with ``None`` for every number that JSON does not have."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@contextmanager
+def decisions_file(path: Path, columns: Sequence[str], *, wanted: bool) -> Iterator[Write]:
+    """Open a CSV file that is there, whole, when all went well; yields what writes its rows.
+
+    Args:
+        path: of the file.
+        columns: its header.
+        wanted: whether there is to be one.
+    """
+    if not wanted:
+        yield lambda rows: None
+        return
+    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        yield writer.writerows
+
+
+# Figure ------------------------------------------------------------------------------------------
+def onset_figure(stream: StreamSummary, path: str | Path, *, title: str) -> None:
+    """Write the figure that ``draw_onsets`` draws as PNG, replaced as a whole if it exists."""
+    save(draw_onsets(stream, title=title), path, dpi=120)
+
+
+def draw_onsets(stream: StreamSummary, *, title: str) -> Figure:
+    """Draw channels in lanes, the decided and the true status, and the probability of slip.
+
+    Args:
+        stream: what is drawn.
         title: of the figure; says what is simulated.
     """
-    heights = [max(1.2, 0.42 * len(heard.films)), 0.55, 1.3]
-    figure = Figure(figsize=(12.0, sum(heights) + 1.3), layout="constrained")
+    heights = [max(1.2, 0.42 * len(stream.channels)), 0.55, 1.3]
+    figure = new_figure(12.0, sum(heights) + 1.3, title)
     panels = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": heights})
-    slips = spans(heard.is_slip, heard.view[1])
-    invalid = spans((heard.is_valid[0], 1 - heard.is_valid[1]), heard.view[1])
-    _draw_films(panels[0], heard, slips)
-    _draw_status(panels[1], heard, slips)
-    _draw_probability(panels[2], heard)
-    unsure = spans(heard.is_unsure, heard.view[1])
-    _shade(panels[2], unsure, "unsure", **_UNSURE)
+    end_s = stream.view[1]
+    slips = _spans(stream.is_slip, end_s)
+    invalid = _spans((stream.is_valid[0], 1 - stream.is_valid[1]), end_s)
+    abstains = _spans(stream.abstains, end_s)
     for axes in panels:
+        clean(axes, "y")
         _shade(axes, invalid, "invalid", **_INVALID)
-        axes.tick_params(color="#BBBBBB", labelsize=8)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.spines[:].set_color("#BBBBBB")
-    panels[0].set_xlim(*heard.view)
-    panels[2].set_xlabel("time, s", fontsize=9, color=_GREY)
-    figure.suptitle(title, fontsize=11)
-    handles = _legend(heard, bool(invalid), bool(unsure))
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=8
-    )
-    return figure
-
-
-def _draw_films(axes: Axes, heard: Heard, slips: Stretches) -> None:
-    """A lane per film around its median, in the colours of the status; bursts may cross lanes."""
-    known = [v[np.isfinite(v)] for _, v in heard.films.values()]
-    lane_v = _lane_height([v for v in known if v.size])
-    middles = -lane_v * np.arange(len(heard.films))
-    lanes = zip(heard.films.values(), known, middles, strict=True)
-    for place, ((times, volts), v, middle) in enumerate(lanes):
-        shown = volts - (float(np.median(v)) if v.size else 0.0) + middle
-        is_slip = status_at(heard.is_slip, times)
-        for colour, own in ((REST, ~is_slip), (SLIP, is_slip)):
-            reaching = own.copy()
-            reaching[1:] |= own[:-1]  # to the first point of the other colour: no hole
-            line = np.where(reaching, shown, np.nan)
-            axes.plot(times, line, color=colour, linewidth=0.6, gid=f"film {place}")
-    _shade(axes, slips, "slip", facecolor=_PALE_SLIP, edgecolor="none", zorder=0)
-    _mark(axes, heard, heard.onsets_s, "onset", **_ONSET)
-    alarms = [alarm for alarm, _ in heard.alarms]
-    _mark(axes, heard, alarms, "alarm", **_ALARM)
-    if 0 < len(seen := _seen(heard, alarms)) <= _MOST_LINES:
-        above = axes.get_xaxis_transform()
-        axes.plot(seen, [1.0] * len(seen), "v", color=ALARM, transform=above, clip_on=False)
-    axes.set_yticks(middles, list(heard.films), fontsize=7)
-    axes.set_ylim(middles[-1] - 0.8 * lane_v, 0.8 * lane_v)
-    axes.set_ylabel(f"channels, lanes {lane_v:.2g} {heard.units} apart", fontsize=8)
-
-
-def _lane_height(known: Sequence[Array]) -> float:
-    """Volts between lanes: room for what is usual, while a burst may cross its neighbours."""
-    usual = [float(np.subtract(*np.quantile(v, [0.95, 0.05]))) for v in known]
-    bursts = [float(np.ptp(v)) for v in known]
-    height_v = max([0.0, *(1.5 * v for v in usual), *(0.25 * v for v in bursts)])
-    return height_v if height_v > 0 else 1.0
-
-
-def _draw_status(axes: Axes, heard: Heard, slips: Stretches) -> None:
-    """The decided status as a bar, and the true one below it where it is known."""
-    known_s = heard.is_slip[0][0] if len(heard.is_slip[0]) else heard.view[1]
-    bars = [("decided", 1, max(known_s, heard.view[0]), slips)]
-    if heard.is_known:
-        bars.append(("truth", 0, heard.view[0], heard.sliding_s))
-    for name, level, start_s, stretches in bars:
-        whole = [(start_s, heard.view[1])]
-        for colour, own in ((REST, whole), (SLIP, _clipped(heard, stretches))):
-            if beams := [(start, end - start) for start, end in own]:
-                spot: dict[str, Any] = {"facecolor": colour, "gid": f"{name} {colour}"}
-                axes.broken_barh(beams, (level - 0.35, 0.7), **spot)
-    axes.set_yticks([bar[1] for bar in bars], [bar[0] for bar in bars], fontsize=8)
-    axes.set_ylim(0.5 - 0.5 * len(bars) + 0.5 * (len(bars) == 1), 1.5)
-
-
-def _draw_probability(axes: Axes, heard: Heard) -> None:
-    times, probability = heard.probability
-    axes.plot(times, probability, color=_INK, linewidth=0.8, drawstyle="steps-post")
-    _mark(axes, heard, heard.onsets_s, "onset", **_ONSET)
-    _mark(axes, heard, [estimate for _, estimate in heard.alarms], "estimate", **_ESTIMATE)
-    axes.set_ylim(-0.04, 1.04)
-    axes.set_yticks([0, 0.5, 1])
-    axes.grid(axis="y", color="#E4E4E4", linewidth=0.6)
-    axes.set_ylabel("P(slip)", fontsize=8)
-
-
-def _legend(heard: Heard, has_invalid: bool, has_unsure: bool) -> list[Any]:
+    _draw_channels(panels[0], stream, slips)
+    _draw_status(panels[1], stream, slips)
+    _draw_probability(panels[2], stream)
+    _shade(panels[2], abstains, "abstains", **_ABSTAINS)
+    panels[0].set_xlim(*stream.view)
+    panels[2].set_xlabel("time, s", fontsize=9, color=GREY)
     handles: list[Any] = [
         Line2D([], [], color=REST, linewidth=2, label="decided: no slip"),
         Line2D([], [], color=SLIP, linewidth=2, label="decided: slip"),
         Line2D([], [], marker="v", label="alarm", **_ALARM),
         Line2D([], [], label="onset, detected", **_ESTIMATE),
     ]
-    if heard.onsets_s:
-        handles.append(Line2D([], [], label="onset, true", **_ONSET))
-    if has_unsure:
-        handles.append(Patch(label="unsure", **_UNSURE))
-    if has_invalid:
-        handles.append(Patch(label="not to be relied on", **_INVALID))
-    return handles
+    handles += [Line2D([], [], label="onset, true", **_ONSET)] if stream.onsets_s else []
+    handles += [Patch(label="abstains", **_ABSTAINS)] if abstains else []
+    handles += [Patch(label="not to be relied on", **_INVALID)] if invalid else []
+    legend_below(figure, handles, len(handles))
+    return figure
 
 
-def _mark(axes: Axes, heard: Heard, times: Sequence[float], name: str, **style: Any) -> None:
+def _draw_channels(axes: Axes, stream: StreamSummary, slips: Segments) -> None:
+    """A lane per channel around its median, in the colours of the status; bursts may cross."""
+    known = [values[np.isfinite(values)] for _, values in stream.channels.values()]
+    height = lane_height([values for values in known if values.size])
+    middles = -height * np.arange(len(stream.channels))
+    for place, (times, values) in enumerate(stream.channels.values()):
+        centre = float(np.median(known[place])) if known[place].size else 0.0
+        is_slip = _status_at(stream.is_slip, times)
+        for colour, shown in ((REST, ~is_slip), (SLIP, is_slip)):
+            reaching = shown.copy()
+            reaching[1:] |= shown[:-1]  # to the first point of the other colour: no hole
+            line = np.where(reaching, values - centre + middles[place], np.nan)
+            axes.plot(times, line, color=colour, linewidth=0.6, gid=f"channel {place}")
+    _shade(axes, slips, "slip", facecolor="#FFF0CC", edgecolor="none", zorder=0)
+    _mark(axes, stream, stream.onsets_s, "onset", **_ONSET)
+    seen = _mark(axes, stream, [alarm for alarm, _ in stream.alarms], "alarm", **_ALARM)
+    if 0 < len(seen) <= _MOST_LINES:
+        above = axes.get_xaxis_transform()
+        axes.plot(seen, [1.0] * len(seen), "v", color=ALARM, transform=above, clip_on=False)
+    axes.set_yticks(middles, list(stream.channels), fontsize=7)
+    axes.set_ylim(middles[-1] - 0.8 * height, 0.8 * height)
+    axes.grid(visible=False)
+    axes.set_ylabel(f"channels, lanes {height:.2g} {stream.units} apart", fontsize=8)
+
+
+def lane_height(known: Sequence[Array]) -> float:
+    """Distance of lanes: room for what is usual, while a burst may cross its neighbours.
+
+    Args:
+        known: finite samples of each channel, none empty.
+    """
+    usual = [float(np.subtract(*np.quantile(values, [0.95, 0.05]))) for values in known]
+    bursts = [float(np.ptp(values)) for values in known]
+    height = max([0.0, *(1.5 * span for span in usual), *(0.25 * span for span in bursts)])
+    return height if height > 0 else 1.0
+
+
+def _draw_status(axes: Axes, stream: StreamSummary, slips: Segments) -> None:
+    """The decided status as a bar, and the true one below it where it is known."""
+    first, last = stream.view
+    known_s = stream.is_slip[0][0] if len(stream.is_slip[0]) else last
+    bars = [("decided", 1, max(known_s, first), slips)]
+    if stream.is_known:
+        bars.append(("truth", 0, first, stream.sliding_s))
+    for name, level, start_s, segments in bars:
+        in_view = [(max(start, first), min(end, last)) for start, end in segments]
+        in_view = [(start, end) for start, end in in_view if end > start]
+        for colour, drawn in ((REST, [(start_s, last)]), (SLIP, in_view)):
+            if beams := [(start, end - start) for start, end in drawn]:
+                place = (level - 0.35, 0.7)
+                axes.broken_barh(beams, place, facecolor=colour, gid=f"{name} {colour}")
+    axes.set_yticks([bar[1] for bar in bars], [bar[0] for bar in bars], fontsize=8)
+    axes.set_ylim(0.5 if len(bars) == 1 else -0.5, 1.5)
+    axes.grid(visible=False)
+
+
+def _draw_probability(axes: Axes, stream: StreamSummary) -> None:
+    times, probability = stream.probability
+    axes.plot(times, probability, color=INK, linewidth=0.8, drawstyle="steps-post")
+    _mark(axes, stream, stream.onsets_s, "onset", **_ONSET)
+    _mark(axes, stream, [estimate for _, estimate in stream.alarms], "estimate", **_ESTIMATE)
+    axes.set_ylim(-0.04, 1.04)
+    axes.set_yticks([0, 0.5, 1])
+    axes.set_ylabel("P(slip)", fontsize=8)
+
+
+def _mark(
+    axes: Axes, stream: StreamSummary, times: Sequence[float], name: str, **style: Any
+) -> list[float]:
     """Lines from top to bottom, the finer the more there are; of too many their upper ends."""
-    if not (seen := _seen(heard, times)):
-        return  # a collection of nothing has no layout
-    width = _WIDTH * min(1.0, _ROOM / len(seen)) ** 0.5
-    through = axes.get_xaxis_transform()
-    bottom = 0.0 if len(seen) <= _MOST_LINES else 0.97
-    axes.vlines(seen, bottom, 1, transform=through, linewidth=max(width, 0.2), gid=name, **style)
+    seen = [time for time in times if stream.view[0] <= time <= stream.view[1]]
+    if seen:  # a collection of nothing has no layout
+        width = max(0.2, _WIDTH * min(1.0, _ROOM / len(seen)) ** 0.5)
+        bottom = 0.0 if len(seen) <= _MOST_LINES else 0.97
+        through = axes.get_xaxis_transform()
+        axes.vlines(seen, bottom, 1, transform=through, linewidth=width, gid=name, **style)
+    return seen
 
 
-def _shade(axes: Axes, stretches: Stretches, name: str, **style: Any) -> None:
-    if beams := [(start, end - start) for start, end in stretches]:
+def _shade(axes: Axes, segments: Segments, name: str, **style: Any) -> None:
+    if beams := [(start, end - start) for start, end in segments]:
         axes.broken_barh(beams, (0, 1), transform=axes.get_xaxis_transform(), gid=name, **style)
 
 
-def _seen(heard: Heard, times: Sequence[float]) -> list[float]:
-    return [time for time in times if heard.view[0] <= time <= heard.view[1]]
+def _spans(status: Points, end_s: float) -> list[tuple[float, float]]:
+    """Segments in which a status is on; it holds from its time to the next, at last to the end."""
+    times, values = status
+    is_on = np.concatenate([[False], np.asarray(values) >= 0.5, [False]])
+    edges = np.flatnonzero(is_on[1:] != is_on[:-1])
+    bounds = np.append(times, end_s)[edges].reshape(-1, 2)
+    return [(float(start), float(end)) for start, end in bounds if end > start]
 
 
-def _clipped(heard: Heard, stretches: Stretches) -> Stretches:
-    first, last = heard.view
-    cut = [(max(start, first), min(end, last)) for start, end in stretches]
-    return [(start, end) for start, end in cut if end > start]
+def _status_at(status: Points, times: Array) -> NDArray[np.bool_]:
+    """Whether a status is on at other times: off before its first."""
+    known, values = status
+    place = np.searchsorted(known, times, side="right")
+    return np.concatenate([[False], np.asarray(values) >= 0.5])[place]

@@ -1,7 +1,7 @@
 """Thresholds for unsure answers from what the first pass kept of the training recordings.
 
 Calibration recordings are not set aside: each sampled bin is scored in closed form by the machine
-that never met its recording (``model.held_out``). Features, scaling, K, c and C are the plan's,
+that never met its recording (``HeldOut``). Features, scaling, K, c and C are the plan's,
 which saw all of them, and the detector itself is trained on the left-out recording too, so the
 promise of ``model.conformal`` holds as far as one recording of the training set changes little;
 ``benchmarks.abstaining`` looks. A recording stands by its sampled bins, which are drawn by a hash
@@ -21,7 +21,7 @@ from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.conformal import check_coverage, check_number, thresholds
 from tactslip_torch.model.fit import TrainingBins
-from tactslip_torch.model.held_out import HeldOut
+from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.training.recipe import Recipe, stand_for
 from tactslip_torch.training.selection import Plan
 

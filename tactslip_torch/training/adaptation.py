@@ -3,7 +3,7 @@
 Sums with other bins are solved in closed form, and so is what every known bin scores by the machine
 without its recording, from one factor: without the bins of a group ``g`` the residuals are
 ``e_g = (I - H_gg)^-1 (t - f)_g`` with the hat matrix of the machine of all bins
-(``model.held_out``). Here all bins are in the sums, and a group is what is known of a recording: of
+(``HeldOut``). Here all bins are in the sums, and a group is what is known of a recording: of
 one that was added all bins, of one trained on those sampled. The rest of the latter stays in, so a
 score is a little better than that of a machine without the recording; before and after a change
 alike. By these scores a change is accepted only if the old materials are still known.
@@ -30,18 +30,14 @@ from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model import abstention
 from tactslip_torch.model.abstention import abstention_of
 from tactslip_torch.model.calibration import fit_platt
-from tactslip_torch.model.cholesky import forward_solve, from_above
-from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.conformal import check_number, thresholds
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.downdate import residuals_by_block
 from tactslip_torch.model.fit import TrainingBins
-from tactslip_torch.model.held_out import HeldOut
-from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.model.left_out import MOST_CONDITION
-from tactslip_torch.model.quadratic import QuadraticForm, from_primal, quadratic_features
-from tactslip_torch.model.sufficient import SufficientStats
-from tactslip_torch.model.symmetric_solve import solve_symmetric_
+from tactslip_torch.model.kernels import Polynomial, QuadraticForm
+from tactslip_torch.model.leave_one_group_out import MOST_CONDITION, HeldOut, residuals_without
+from tactslip_torch.model.missing_channels import ClassGaussians
+from tactslip_torch.model.moments import SufficientStats
+from tactslip_torch.model.solve import solve_symmetric
 from tactslip_torch.onset.settings import KEY as ALARM
 from tactslip_torch.runtime import bar
 from tactslip_torch.training.datamodule import FeatureMaker
@@ -93,20 +89,18 @@ def solve(statistics: Statistics) -> Solved:
             a recording, or a recording weighs so much that the machine without it cannot be told.
     """
     sums, machine, known = statistics.sums, statistics.machine, statistics.known()
-    normal, moment, noise = sums.normal_equations(
-        machine.penalty, machine.offset, None, machine.balance
-    )
-    weights, report = solve_symmetric_(
+    kernel = Polynomial(2, machine.offset)
+    normal, moment = sums.normal_equations(machine.offset, balance=machine.balance)
+    weights, report, factor = solve_symmetric(
         normal,
         moment,
         machine.penalty,
         name="X'WX",
-        restore=from_above,
-        noise=noise,
         in_span=True,
         most_condition=MOST_CONDITION,
     )
-    head = from_primal(weights, sums.num_features, machine.offset)
+    assert factor is not None  # as most_condition is given
+    head = kernel.head(weights, sums.num_features)
     head.solved = report
     scales = _class_scales(sums, machine)
     roots = (scales[known.is_slip.long()] * known.weight).sqrt()
@@ -115,13 +109,12 @@ def solve(statistics: Statistics) -> Solved:
     residuals = torch.empty_like(right)
     for groups in _chunks(known.recording):
         rows = torch.cat(groups)
-        scaled = quadratic_features(known.z[rows], machine.offset) * roots[rows, None]
-        columns = forward_solve(normal, scaled.mT).mT  # the factor stands in the matrix
-        parts = columns.split([len(group) for group in groups])
-        for number, (group, part) in enumerate(zip(groups, parts, strict=True)):
-            left = (part @ part.mT).neg_()
-            left.diagonal().add_(1)
-            residuals[group] = residuals_by_block(left, right[group], [(number, len(group))])
+        scaled = kernel.monomials(known.z[rows]) * roots[rows, None]
+        columns = torch.linalg.solve_triangular(factor, scaled.mT, upper=False)
+        parts = columns.split([len(group) for group in groups], dim=1)
+        for group, part in zip(groups, parts, strict=True):
+            name = int(known.recording[group[0]])
+            residuals[group] = residuals_without(part.mT @ part, right[group], name)
     return Solved(head, known, targets - residuals / roots)
 
 
@@ -238,7 +231,7 @@ FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 Where every training material in turn was new (simulated, ``benchmarks.adapting``), its own accuracy
 kept rising to about the last of these, and what the others lost rose with it.
 """
-_MOST_WEIGHT = 8000.0  # of a bin; more has no room on the grid of the sums
+_MOST_WEIGHT = 8000.0  # of a bin; more drowns the others
 _OF_MARGIN = 0.5
 """``auto`` spends this part of the margin: how far old materials fall is itself an estimate."""
 

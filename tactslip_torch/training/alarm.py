@@ -43,7 +43,7 @@ from tactslip_torch.onset.rules import Cusum, KOfN, Rule, rule_from_dict
 from tactslip_torch.onset.settings import KEY, AlarmSettings, calibration_of
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.onset.thresholds import Threshold, alarm_counts, alarm_rate, choose_threshold
-from tactslip_torch.report.reliability import weights_at_share
+from tactslip_torch.report.metrics import weights_at_share
 from tactslip_torch.runtime import bar
 from tactslip_torch.training.stream_evaluation import (
     Clock,

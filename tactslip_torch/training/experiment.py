@@ -41,9 +41,8 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.settings import KEY
-from tactslip_torch.report.answers import merged_answers
-from tactslip_torch.report.scores import merged_metrics, summed_metrics
-from tactslip_torch.report.tuning import tuning_figure
+from tactslip_torch.report.metrics import merged_answers, merged_metrics, summed_metrics
+from tactslip_torch.report.results import tuning_figure
 from tactslip_torch.runtime import LEAD, whole_file
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.spectrum import SpectrumMethod

@@ -13,81 +13,10 @@ from torch import Tensor
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.bin_sample import bin_keys
 from tactslip_torch.ledger import Ledger, content_digest
-from tactslip_torch.model.cholesky import from_above
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.kernel_elm import solve_normal_equations_
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.model.quadratic import QuadraticForm
-from tactslip_torch.model.sufficient import SufficientStats
+from tactslip_torch.model.kernels import Head, Polynomial, QuadraticForm
+from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.training.selection import Plan, Progress
-
-Head = QuadraticForm | KernelSum
-GRID_BITS = 38  # of sums that hold 2^24 bins
-
-
-class LinearSums:
-    """Sums of fixed size that a machine of degree 1 is solved from, in either class.
-
-    Whole multiples of ``2 ** -GRID_BITS``, rounded once for each batch of bins: the same bits in
-    any order and on any number of workers.
-
-    Args:
-        num_features: K.
-    """
-
-    def __init__(self, num_features: int) -> None:
-        size = num_features + 1
-        self.sums = torch.zeros(2, size, size, dtype=torch.int64)
-
-    def update(self, z: Tensor, is_slip: Tensor, weights: Tensor) -> None:
-        """Add bins.
-
-        Shape:
-            - z: ``[N, K]``, in ``[-1, 1]``; is_slip: ``[N]``, bool; weights: ``[N]``
-
-        Raises:
-            ValueError: if a number is not finite, or the grid has no room.
-        """
-        x = torch.cat([z, torch.ones_like(z[:, :1])], 1)
-        for kind, mine in enumerate((~is_slip, is_slip)):
-            products = (x[mine] * weights[mine, None]).mT @ x[mine]
-            if not bool((products.abs() + self.count[kind] < 2.0 ** (62 - GRID_BITS)).all()):
-                raise ValueError("sums of degree 1 take finite features of 16 million bins at most")
-            self.sums[kind] += (products * 2.0**GRID_BITS).round().long()
-
-    @property
-    def count(self) -> Tensor:
-        """Weight of the bins of non-slip and of slip, ``[2]``."""
-        return self.sums[:, -1, -1].double() / 2.0**GRID_BITS
-
-    def merge(self, other: LinearSums) -> None:
-        """Add the bins of another."""
-        self.sums += other.sums
-
-    def solve(self, penalty: float, offset: float, balance: str) -> QuadraticForm:
-        """The machine.
-
-        Raises:
-            ValueError: if a class is absent or a number is not finite.
-        """
-        all_products = self.sums.double() / 2.0**GRID_BITS
-        count = self.count
-        if not bool((count > 0).all()):
-            raise ValueError("training needs bins of both classes; add recordings with the other")
-        weight = torch.ones(2, dtype=torch.float64)
-        if balance == "weights":
-            weight = count.sum() / (2 * count)
-        unit = torch.ones(all_products.shape[1], dtype=torch.float64)
-        unit[-1] = math.sqrt(offset)  # of the constant
-        normal = (all_products * weight[:, None, None]).sum(0) * unit * unit[:, None]
-        sums = all_products[:, :, -1] * weight[:, None]
-        solved, report = solve_normal_equations_(
-            normal, (sums[1] - sums[0]) * unit, penalty, restore=from_above
-        )
-        head = QuadraticForm(solved.new_zeros(0, 0), solved[:-1], unit[-1] * solved[-1])
-        head.solved = report
-        return head
 
 
 class TrainingPass:
@@ -104,8 +33,10 @@ class TrainingPass:
         self.plan = plan
         self.ledger = Ledger()
         self.bins: dict[str, tuple[Tensor, ...]] = {}
-        self.linear = LinearSums(plan.frame.size) if plan.is_linear else None
-        self.stats = SufficientStats(plan.frame.size) if plan.adds_up else None
+        self.stats: SufficientStats | None = None
+        if plan.adds_up:
+            assert isinstance(plan.kernel, Polynomial)
+            self.stats = SufficientStats(plan.frame.size, degree=plan.kernel.degree)
 
     def update(
         self, recording: str, features: Tensor, is_slip: Tensor, scene: str = PAPER_SCENE
@@ -124,10 +55,7 @@ class TrainingPass:
             self.stats.update(recording, z, labels, weights)
             return
         self.ledger.add(recording, content_digest(z, labels))
-        if self.linear is None:
-            self.bins[recording] = (z, labels, weights)
-        else:
-            self.linear.update(z, labels, weights)
+        self.bins[recording] = (z, labels, weights)
 
     def merge(self, other: TrainingPass) -> None:
         """Take over what another worker gathered.
@@ -140,27 +68,19 @@ class TrainingPass:
             return
         self.ledger.merge(other.ledger)
         self.bins |= other.bins
-        if self.linear is not None and other.linear is not None:
-            self.linear.merge(other.linear)
 
     def solve(self, progress: Progress | None = None) -> Head:
         """The machine.
 
         Raises:
-            ValueError: if a class is absent, a number is not finite, or the sums are too coarse
-            for this penalty.
+            ValueError: if a class is absent, or the system cannot be told in float64.
         """
         plan = self.plan
         if self.stats is not None:
             return solve_sums(plan, self.stats)
-        is_balanced = plan.balance == "weights" and not plan.scene_weights  # which hold balance
-        if self.linear is not None:
-            assert isinstance(plan.kernel, Polynomial)  # is_linear
-            balance = "weights" if is_balanced else "none"
-            return self.linear.solve(plan.penalty, plan.kernel.offset, balance)
         parts = [self.bins[name] for name in sorted(self.bins)]
         z, is_slip, weights = (torch.cat(part) for part in zip(*parts, strict=True))
-        if is_balanced:
+        if _balance(plan) == "weights":
             counts = torch.bincount(is_slip.long(), minlength=2).clamp(min=1)
             weights = weights * (len(z) / (2 * counts.double()))[is_slip.long()]
         return fit_machine(TrainingBins(z, is_slip, weights), plan.penalty, plan.kernel)
@@ -193,18 +113,25 @@ def solve_sums(plan: Plan, stats: SufficientStats) -> QuadraticForm:
     """The machine of sums.
 
     Raises:
-        ValueError: if the plan's kernel is not of degree 2, a class is absent, a number is
-            not finite, or the sums are too coarse for this penalty.
+        ValueError: if the plan's kernel is of another degree than the sums, a class is absent, or
+            the system cannot be told in float64.
     """
-    if not isinstance(plan.kernel, Polynomial) or plan.kernel.degree != 2:
-        raise ValueError(f"sums need a polynomial kernel of degree 2, the plan has {plan.kernel}")
-    balance: Literal["weights", "none"] = "weights" if plan.balance == "weights" else "none"
-    return stats.solve(plan.penalty, plan.kernel.offset, balance=balance)
+    if not isinstance(plan.kernel, Polynomial) or plan.kernel.degree != stats.degree:
+        raise ValueError(
+            f"these sums need a polynomial kernel of degree {stats.degree}, the plan has "
+            f"{plan.kernel}"
+        )
+    return stats.solve(plan.penalty, plan.kernel.offset, balance=_balance(plan))
 
 
 def solve_facts(head: Head) -> dict[str, Any]:
     """How a machine was solved for, JSON-able: method, condition, error (``SolveReport``)."""
     return {} if head.solved is None else head.solved.facts()
+
+
+def _balance(plan: Plan) -> Literal["weights", "none"]:
+    """How classes are balanced when a machine is solved; weights of scenes hold it already."""
+    return "weights" if plan.balance == "weights" and not plan.scene_weights else "none"
 
 
 def _is_kept(recording: str, is_slip: Tensor, shares: Sequence[float]) -> Tensor:
@@ -259,12 +186,9 @@ def sum_over_ranks(gathered: TrainingPass) -> None:
                 gathered.merge(part)
         return
     stats = gathered.stats
-    shares = of_all_ranks((stats.ledger, stats.count, stats.sums[:, 0].tolist()))
+    parts = of_all_ranks((stats.ledger, stats.count))
     stats.ledger = Ledger()
-    for ledger, _, _ in shares:
+    for ledger, _ in parts:
         stats.ledger.merge(ledger)  # refuses a recording that two of them saw
-    own = torch.distributed.get_rank()
-    others = [brought for rank, (_, _, brought) in enumerate(shares) if rank != own]
-    stats.check_capacity([sum(of_class) for of_class in zip(*others, strict=True)])
-    stats.count = torch.stack([count for _, count, _ in shares]).sum(0)
+    stats.count = torch.stack([count for _, count in parts]).sum(0)
     torch.distributed.all_reduce(stats.sums)

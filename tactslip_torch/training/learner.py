@@ -28,8 +28,8 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.abstention import KEY, abstention_of
-from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.events import (
     EventRules,
@@ -40,8 +40,13 @@ from tactslip_torch.onset.events import (
     recording_events,
 )
 from tactslip_torch.onset.rules import KOfN, latch, latch_start
-from tactslip_torch.report.answers import answer_counts, answer_metrics
-from tactslip_torch.report.scores import bin_metrics, confusion_matrix, split_metrics
+from tactslip_torch.report.metrics import (
+    answer_counts,
+    answer_metrics,
+    bin_metrics,
+    confusion_matrix,
+    split_metrics,
+)
 from tactslip_torch.runtime import bar
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.abstention import Abstaining

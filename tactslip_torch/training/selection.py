@@ -18,11 +18,10 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.calibration import fit_platt
-from tactslip_torch.model.class_gaussians import ClassGaussians
 from tactslip_torch.model.fit import TrainingBins
-from tactslip_torch.model.held_out import HeldOut
 from tactslip_torch.model.kernels import Kernel, Polynomial, kernel_from_dict
-from tactslip_torch.model.quadratic import num_quadratic_features
+from tactslip_torch.model.leave_one_group_out import HeldOut
+from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import best_threshold
 from tactslip_torch.runtime import for_each
@@ -668,14 +667,9 @@ class Plan:
     @property
     def adds_up(self) -> bool:
         """Whether training bins become sums of fixed size; few bins, or other kernels, do not."""
-        fewer = self.num_bins <= num_quadratic_features(self.frame.size)
-        return adds_up(self.kernel) and not fewer
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether a machine of degree 1 is solved from sums, as of more bins than columns."""
-        is_first = isinstance(self.kernel, Polynomial) and self.kernel.degree == 1
-        return is_first and self.num_bins > self.frame.size
+        if not isinstance(self.kernel, Polynomial) or not self.kernel.collapses:
+            return False
+        return self.num_bins > self.kernel.num_monomials(self.frame.size)
 
     @property
     def calibration(self) -> dict[str, Any] | None:
@@ -762,7 +756,7 @@ def plan_detector(
     then held-out scores are wanted for what follows from them, such as a calibration.
 
     A held-out score is that of the machine refitted without the bin's group, from one
-    factorisation per choice (``model.held_out``), with ranking and scaling held. So it chooses,
+    factorisation per choice (``HeldOut``), with ranking and scaling held. So it chooses,
     but it is not what may be reported: for that, ranking and scaling are redone (``crossval``).
 
     Raises:

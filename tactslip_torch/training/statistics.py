@@ -8,7 +8,6 @@ are taken out as they were taken in, so any step can be taken back.
 from __future__ import annotations
 
 import copy
-import math
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from torch import Tensor
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
 from tactslip_torch.ledger import Ledger, content_digest
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.sufficient import SufficientStats
+from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.runtime import load_table, save_table
 from tactslip_torch.training.selection import Plan
 
@@ -272,9 +271,8 @@ class Statistics:
             if weight == before:
                 continue
             for value, change in ((before, sums.remove), (weight, sums.update)):
-                for batch_id, part in _batches(name, len(own.z), value, sums.grid_bits):
-                    z, is_slip = own.z[part], own.is_slip[part]
-                    change(batch_id, z, is_slip, z.new_full((len(z),), value))
+                if value > 0:
+                    change(name, own.z, own.is_slip, own.z.new_full((len(own.z),), value))
         return replace(self, sums=sums, bins=known, weights={**self.weights, **weights})
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -283,7 +281,6 @@ class Statistics:
             "sums": {
                 "num_features": self.sums.num_features,
                 "about": self.sums.about,
-                "grid_bits": self.sums.grid_bits,
             },
             "batches": self.sums.ledger.entries,
             "machine": vars(self.machine),
@@ -366,19 +363,6 @@ def _bins_of_file(
         )
         for number, (name, material, key) in enumerate(facts)
     }
-
-
-def _batches(
-    name: str, num_bins: int, weight: float, grid_bits: int
-) -> Iterator[tuple[str, slice]]:
-    """A recording as batches of which the grid has room for each; the first has its name.
-
-    One batch unless the weight is so large that 256 bins are too much, so as training adds it.
-    """
-    room = 2.0 ** (51 - grid_bits)  # of 256 bins or, if a batch has fewer, of those
-    most = max(num_bins, 1) if 256 * weight < room else max(math.ceil(room / weight) - 1, 1)
-    for number, start in enumerate(range(0, num_bins if weight > 0 else 0, most)):
-        yield f"{name} part {number}" if number else name, slice(start, start + most)
 
 
 def detector_digest(detector: SlipDetector) -> str:

@@ -20,8 +20,8 @@ from tactslip_torch import (
     SufficientStats,
     simulate,
 )
-from tactslip_torch.model.differentiable_fit import fit_quadratic
-from tactslip_torch.model.held_out_gradient import held_out_scores
+from tactslip_torch.model.fit import fit_quadratic
+from tactslip_torch.model.leave_one_group_out import held_out_scores
 
 PACKAGE = "tactslip_torch"
 REPLACED_NEXT = ("features/", "graph/", "model/few_bins")

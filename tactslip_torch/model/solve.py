@@ -1,0 +1,405 @@
+"""``(A + diag(1 / (C w))) x = b`` for a positive semi-definite A, however close to singular.
+
+Cholesky wherever the condition of the system, scaled to a diagonal of ones, allows it. Closer to
+singular, and for an infinite C, ``sqrt(w) A sqrt(w)`` without its ridge is decomposed into
+eigenvectors, and what is rounding noise is dropped: eigenvalues up to ``n eps`` of the largest.
+With a large C they would fill x with rounding. If they are null, as those of duplicates are, they
+add nothing to a score of a training bin; what they could add is part of the stated error. So an
+infinite C gives the minimum-norm (weighted) least-squares solution.
+
+Reference:
+    Higham (2002), Accuracy and Stability of Numerical Algorithms, 2nd ed., sections 10.1 (Demmel's
+    bounds: what counts is the condition of the scaled matrix) and 15.3 (its estimate, LAPACK's
+    ``dpocon``); Golub and Van Loan, Matrix Computations, 4th ed., section 5.5 (rank).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NamedTuple
+
+import torch
+from scipy.linalg.lapack import dpocon
+from torch import Tensor
+
+log = logging.getLogger(__name__)
+
+_EPS = torch.finfo(torch.float64).eps
+_TINY = torch.finfo(torch.float64).tiny
+_MOST_CONDITION = 1e12  # of what Cholesky may solve
+_LARGEST_ERROR = 1e-2  # of a solution that is handed out
+_LARGEST_UNSAID = 1e-3  # that may be left out of a least-squares solution without a word
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """How a system was solved, and how far rounding may reach.
+
+    Attributes:
+        method: by which factorisation.
+        dtype: of the matrix as it was given; the arithmetic is float64's always.
+        size: number of unknowns.
+        penalty: the paper's ``C``.
+        condition: estimate for the system scaled to a diagonal of ones; of the components kept
+            for ``"eigen"``.
+        condition_bound: what it cannot exceed, since no eigenvalue is below the ridge's; ``None``
+            without a ridge.
+        rank: components kept; all but for ``"eigen"``.
+        error: to first order in the rounding of the matrix, of ``"cholesky"`` that of the solution,
+            relative, in the norm scaled like the system. Of ``"eigen"`` that of the scores of
+            training bins, relative to the targets, in the mean square by weight; scores elsewhere
+            may differ by more, where they tell apart what nearly repeats in training.
+        left_out: for ``"eigen"``, what the components left out could add to a score of a training
+            bin, relative to the targets: 0 if they are null, as those of exact duplicates are, but
+            no more than this if they only are too small for float64 to tell.
+    """
+
+    method: Literal["cholesky", "eigen"]
+    dtype: str
+    size: int
+    penalty: float
+    condition: float
+    condition_bound: float | None
+    rank: int
+    error: float
+    left_out: float | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """All of it as JSON holds it; an infinite number is the string ``"inf"``."""
+        return {
+            name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in asdict(self).items()
+        }
+
+    def __str__(self) -> str:
+        text = f"{self.method} of {self.size} unknowns at C={self.penalty:g} in {self.dtype}"
+        if self.rank < self.size:
+            text += f", {self.rank} of them kept"
+        of = "" if self.method == "cholesky" else " of training scores"
+        text += f": condition {self.condition:.1e}, relative error{of} up to {self.error:.0e}"
+        if self.left_out is not None and self.left_out == self.error:
+            text += " unless what is left out is null"
+        return text
+
+
+class Solution(NamedTuple):
+    """Of a system, and how it was come by.
+
+    Attributes:
+        x: ``[n]``, in the dtype of the matrix.
+        report: on the solve.
+        factor: ``[n, n]``, float64, the lower Cholesky factor of ``A + diag(1 / (C w))``; ``None``
+            if the method was another.
+    """
+
+    x: Tensor
+    report: SolveReport
+    factor: Tensor | None
+
+
+def solve_symmetric(
+    matrix: Tensor,
+    right: Tensor,
+    penalty: float,
+    weights: Tensor | None = None,
+    *,
+    name: str = "matrix",
+    in_span: bool = False,
+    most_condition: float | None = None,
+) -> Solution:
+    """``(matrix + diag(1 / (penalty weights)))^-1 right`` in float64, and a report.
+
+    Needs one more matrix of that size, the eigendecomposition four. A float32 matrix carries an
+    error of ``eps32``: refused if that times the condition exceeds 1e-2. Not differentiable.
+
+    Args:
+        matrix: symmetric, positive semi-definite; kept.
+        right: kept.
+        penalty: the paper's ``C``, positive; ``inf`` for minimum-norm (weighted) least squares.
+        weights: positive weight of each unknown; default 1.
+        name: of the matrix, for errors.
+        in_span: the right-hand side lies in the span of the matrix, as that of normal equations.
+        most_condition: raise an error instead of leaving Cholesky, or above this condition.
+
+    Shape:
+        - matrix: ``[n, n]``; right, weights: ``[n]``
+
+    Raises:
+        ValueError: if a number is not finite, the matrix is not positive semi-definite, its
+            rounding drowns the solution, or eigenvectors are needed and not allowed.
+
+    Example:
+        >>> twice = torch.ones(2, 2, dtype=torch.float64)  # one bin, twice
+        >>> x, report, _ = solve_symmetric(twice, twice[0], penalty=1e30)
+        >>> x, report.method, report.rank
+        (tensor([0.5000, 0.5000], dtype=torch.float64), 'eigen', 1)
+    """
+    given, eps = matrix.dtype, torch.finfo(matrix.dtype).eps
+    matrix, right = matrix.detach().double(), right.detach().double()
+    weights = torch.ones_like(right) if weights is None else weights.detach().double()
+    ridge = _ridge(penalty, weights)
+    system = matrix.clone()
+    system.diagonal().add_(ridge)
+    whole = system.diagonal().clone()
+    scale = torch.where(whole > 0, whole, 1.0).sqrt()
+    system.div_(scale).div_(scale[:, None])
+    norm = float(torch.linalg.matrix_norm(system, 1))
+    if not (math.isfinite(norm) and bool(right.isfinite().all())):
+        _check_finite(matrix, right, name)
+        raise ValueError(f"{name} overflows float64; scale the features")
+    least = float((ridge / whole).min())
+    bound = norm / least if least > 0 else math.inf
+    size, dtype = len(right), str(given).removeprefix("torch.")
+    known = bound if math.isfinite(bound) else None
+    is_light = bool(_light_bins(matrix.diagonal(), weights, eps).any())
+    if not math.isinf(penalty) or is_light:
+        factor = system.mT  # column-major, so that LAPACK works within the copy
+        info = torch.empty((), dtype=torch.int32, device=matrix.device)
+        torch.linalg.cholesky_ex(factor, out=(factor, info))
+        condition = math.inf if info else min(bound, _condition(factor, norm))
+        limit = min(_MOST_CONDITION, 1 / (size * _EPS))
+        limit = limit if eps <= _EPS else min(limit, _LARGEST_ERROR / eps)
+        if condition <= (limit if most_condition is None else min(limit, most_condition)):
+            factor.mul_(scale[:, None])
+            x = torch.cholesky_solve(right[:, None], factor)[:, 0]
+            error = math.sqrt(size) * eps * condition
+            report = SolveReport("cholesky", dtype, size, penalty, condition, known, size, error)
+            return Solution(_in_dtype(x, given, name), report, factor)
+        reason = f"{name} + I/C at penalty={penalty:g} has condition {condition:.1e}"
+        if eps > _EPS:
+            wanted = "make it in float64, or lower the penalty"
+            raise ValueError(f"{reason}, too much for a matrix in {dtype}; {wanted}")
+        if most_condition is not None:
+            raise ValueError(f"{reason}, wanted up to {most_condition:.0e}; lower the penalty")
+        log.warning("%s, too much for Cholesky in float64", reason)
+    del system
+    _check_light(matrix.diagonal(), weights, penalty, eps, name)
+    kept = _truncated(matrix, right, penalty, weights.sqrt(), eps, in_span=in_span, name=name)
+    error = max(kept.error, kept.left_out)
+    report = SolveReport(
+        "eigen", dtype, size, penalty, kept.condition, known, kept.rank, error, kept.left_out
+    )
+    if not math.isinf(penalty) or kept.left_out > _LARGEST_UNSAID:
+        log.warning("%s: solved by %s", name, report)
+    return Solution(_in_dtype(kept.x, given, name), report, None)
+
+
+def solve_kernel_elm(
+    gram: Tensor, targets: Tensor, penalty: float, weights: Tensor | None = None
+) -> Tensor:
+    """Output weights of the kernel machine: ``(gram + diag(1 / (penalty * weights)))^-1 targets``.
+
+    ``solve_symmetric`` for any number of systems, differentiable any number of times in ``gram``,
+    ``targets`` and ``weights``. Where components are left out, derivatives are those at constant
+    rank; with ``penalty=inf`` this is the Moore-Penrose pseudo-inverse, the paper's wording. Solved
+    in float64, and handed out in the dtype of ``gram``.
+
+    Args:
+        gram: kernel matrix of the training bins, symmetric, positive semi-definite.
+        targets: +1 for slip and -1 for non-slip.
+        penalty: the paper's ``C``, positive; larger fits the training bins more closely.
+        weights: positive weight of each bin; default 1.
+
+    Shape:
+        - gram: ``[*, N, N]``; targets, weights, output: ``[*, N]``
+
+    Raises:
+        ValueError: if shapes disagree, ``penalty`` is not positive, a number is not finite,
+            ``gram`` is not positive semi-definite, or float32 is not enough.
+
+    Reference:
+        Huang, Zhou, Ding and Zhang (2012), IEEE Trans. SMC-B 42(2), 513-529; with weights Zong,
+        Huang and Chen (2013), Neurocomputing 101, 229-242. Equals ``dual_coef_`` of
+        ``sklearn.kernel_ridge.KernelRidge(alpha=1 / penalty)``.
+
+    Example:
+        >>> solve_kernel_elm(torch.eye(2), torch.tensor([1.0, -1.0]), penalty=1.0)
+        tensor([ 0.5000, -0.5000])
+    """
+    num_bins = gram.shape[-1]
+    if gram.shape[-2] != num_bins or targets.shape[-1] != num_bins:
+        raise ValueError(
+            f"expected gram [*, N, N] and targets [*, N] with one N, got {tuple(gram.shape)} "
+            f"and {tuple(targets.shape)}"
+        )
+    if num_bins == 0 or not gram.is_floating_point():
+        raise ValueError(f"gram must have bins and be floating, got {num_bins} of {gram.dtype}")
+    weights = torch.ones_like(targets) if weights is None else weights
+    if weights.shape != targets.shape:
+        raise ValueError(
+            f"weights must have one entry per bin, {tuple(targets.shape)}, "
+            f"got {tuple(weights.shape)}"
+        )
+    check_weights(weights)
+    if gram.ndim > 2:
+        systems = zip(
+            gram.flatten(0, -3), targets.flatten(0, -2), weights.flatten(0, -2), strict=True
+        )
+        solved = [solve_kernel_elm(own, t, penalty, w) for own, t, w in systems]
+        return torch.stack(solved).view(targets.shape)
+    x, report, _ = solve_symmetric(gram, targets, penalty, weights, name="gram")
+    if not torch.is_grad_enabled() or not any(t.requires_grad for t in (gram, targets, weights)):
+        return x
+    right, weights = targets.double(), weights.double()
+    system = (gram.double() + gram.double().mT) / 2
+    if report.method == "cholesky":
+        ridged = system + (1 / (penalty * weights)).diag()
+        return solve_by_autograd(ridged, right).to(gram.dtype)
+    # (M + I/C)^-1 on the span of M is (I + M^+/C)^-1 M^+: one is well-posed, one has derivatives
+    roots, noise = weights.sqrt(), num_bins * torch.finfo(gram.dtype).eps
+    inverse: Tensor = torch.linalg.pinv(roots[:, None] * system * roots, rtol=noise, hermitian=True)
+    ridged = torch.eye(num_bins).to(inverse) + inverse / penalty
+    return (roots * solve_by_autograd(ridged, inverse @ (roots * right))).to(gram.dtype)
+
+
+def solve_by_autograd(system: Tensor, right: Tensor) -> Tensor:
+    """``system^-1 right``, differentiable any number of times, of a positive definite system.
+
+    Shape:
+        - system: ``[n, n]``; right, output: ``[n]``
+    """
+    return torch.cholesky_solve(right[:, None], torch.linalg.cholesky(system))[:, 0]
+
+
+def check_weights(weights: Tensor) -> None:
+    """Refuse weights of bins that are not positive and finite.
+
+    Raises:
+        ValueError: if there is one.
+    """
+    wrong = weights[~((weights > 0) & weights.isfinite())]
+    if len(wrong):
+        raise ValueError(f"weights must be positive and finite, got {float(wrong[0]):g}")
+
+
+class _Kept(NamedTuple):
+    """Of a system without what is rounding noise; fields as in ``SolveReport``."""
+
+    x: Tensor
+    condition: float
+    error: float
+    left_out: float
+    rank: int
+
+
+def _truncated(
+    matrix: Tensor,
+    right: Tensor,
+    penalty: float,
+    roots: Tensor,
+    eps: float,
+    *,
+    in_span: bool,
+    name: str,
+) -> _Kept:
+    """The solution on what is above rounding; ``roots`` are those of the weights.
+
+    Raises:
+        ValueError: if the matrix is not positive semi-definite, its rounding drowns what is kept,
+            or what is left out is above rounding and adds a hundredth to a score.
+    """
+    values, vectors = torch.linalg.eigh(roots * matrix * roots[:, None])
+    top, low, num = float(values[-1]), float(values[0]), len(values)
+    rounding, cutoff = eps * max(top, -low), num * eps * top
+    if low < -max(10 * cutoff, 0.0):
+        raise ValueError(
+            f"{name} is not positive semi-definite: it has the eigenvalue {low:.3g} beside "
+            f"{top:.3g}; it must be a sum of squares"
+        )
+    kept, ridge = values > cutoff, 1 / penalty
+    rank = int(kept.sum())
+    along = vectors.mT @ (roots * right)
+    solved = torch.where(kept, along / torch.where(kept, values + ridge, 1.0), 0.0)
+    least = float(values[num - rank] + ridge) if rank else math.inf
+    condition, error = (top + ridge) / least, math.sqrt(num) * rounding / least
+    if error > _LARGEST_ERROR:
+        raise ValueError(
+            f"{name} at penalty={penalty:g} has rank {rank} of {num} and a condition of "
+            f"{condition:.1e}, too much for its rounding ({error:.0e} of the solution); lower the "
+            "penalty, or leave out what is nearly duplicate"
+        )
+    dropped, away = values[: num - rank], vectors[:, : num - rank]
+    size = float(torch.linalg.vector_norm(values.clamp(min=0).sqrt() * solved))
+
+    def added(at: Tensor) -> float:
+        """To a score of a training bin, relative, were these the eigenvalues left out."""
+        part = along[: num - rank].abs()
+        if in_span:  # that of the targets is this over the root of the eigenvalue
+            scores = (at.sqrt() / (at + ridge)).nan_to_num(0.0) * part
+            most = torch.linalg.vector_norm(scores) / size
+        else:
+            scores = (at / (at + ridge)).nan_to_num(0.0) * part
+            most = (away.abs() @ scores / roots).max() / right.abs().max()
+        return min(float(most.nan_to_num(0.0)), 1.0)
+
+    seen = added(torch.where(dropped > math.sqrt(num) * rounding, dropped, 0.0))
+    if seen > _LARGEST_ERROR:
+        raise ValueError(
+            f"{name} at penalty={penalty:g} is nearly singular: eigenvalues of "
+            f"{float(dropped[-1]) / top:.0e} of the largest add {seen:.0e} to scores, but drown in "
+            "rounding; leave out what is nearly duplicate, or lower the penalty"
+        )
+    unseen = dropped.clamp(min=0) + rounding
+    if in_span:
+        unseen = unseen.clamp(max=max(ridge, _TINY))  # where it would add most
+    return _Kept(roots * (vectors @ solved), condition, error, added(unseen), rank)
+
+
+def _ridge(penalty: float, weights: Tensor) -> Tensor:
+    """``1 / (C w)``, which must be finite."""
+    ridge = 1 / (penalty * weights)
+    if not (penalty > 0 and bool(ridge.isfinite().all())):
+        raise ValueError(
+            f"penalty (the paper's C) must be positive, and so large that 1 / (C w) is finite, "
+            f"got {penalty}"
+        )
+    return ridge
+
+
+def _condition(factor: Tensor, norm: float) -> float:
+    """Estimate from a lower Cholesky factor, column-major, and the 1-norm of the matrix."""
+    reciprocal, _ = dpocon(factor.cpu().numpy(), norm, uplo="L")
+    return 1 / reciprocal if reciprocal > 0 else math.inf
+
+
+def _light_bins(diagonal: Tensor, weights: Tensor, eps: float) -> Tensor:
+    """Which bins a cut at rounding would lose for their weights: ``[n]``, bool."""
+    own, least = diagonal * weights, len(diagonal) * eps
+    lost, faint = ((x <= least * x.max()) for x in (own, diagonal))
+    return lost & ~faint
+
+
+def _check_light(diagonal: Tensor, weights: Tensor, penalty: float, eps: float, name: str) -> None:
+    """Refuse to lose a bin of which C makes a hundredth of its score."""
+    own = diagonal * weights
+    lost = _light_bins(diagonal, weights, eps) & (own > 1e-2 * (own + 1 / penalty))
+    if bool(lost.any()):
+        raise ValueError(
+            f"{name} at penalty={penalty:g} is singular, with weights from "
+            f"{float(weights.min()):.1e} to {float(weights.max()):.1e} too far apart to leave only "
+            "noise out; bring them closer, or lower the penalty"
+        )
+
+
+def _check_finite(matrix: Tensor, right: Tensor, name: str) -> None:
+    """Name the first number that is not."""
+    for what, values in ((name, matrix), (f"right-hand side of {name}", right)):
+        if not bool(values.isfinite().all()):
+            place = (~values.isfinite()).nonzero()[0].tolist()
+            raise ValueError(
+                f"{what} must be finite, got {float(values[tuple(place)])} at {place}; leave out "
+                "or mask the bin it comes from"
+            )
+
+
+def _in_dtype(x: Tensor, given: torch.dtype, name: str) -> Tensor:
+    """A solution as it is handed out: refused where the dtype has no room for it."""
+    cast = x.to(given)
+    if not bool(cast.isfinite().all()):
+        raise ValueError(
+            f"the solution for {name} leaves {str(given)[6:]}: an entry is "
+            f"{float(x[~cast.isfinite()][0]):.3g}; scale the features or the penalty"
+        )
+    return cast

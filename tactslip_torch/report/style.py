@@ -1,0 +1,137 @@
+"""Shared form of every report: words and numbers in tables, and colours, axes and files of figures.
+
+Colours are those of Okabe and Ito (2008), which colour-blind readers tell apart. Figures are drawn
+on matplotlib's ``Figure`` objects, so that no window opens and no global state changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import Any, Literal
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tactslip_torch.runtime import whole_file
+
+SIMULATED_LINE = "SIMULATED data: numbers of a simulated hand, not of the paper's"
+
+BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
+PALETTE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
+INK, GREY, LIGHT = "#222222", "#666666", "#DDDDDD"
+ALARM = "#C6361B"
+_KIND_COLOURS = {"SG": ORANGE, "PVDF": BLUE}
+
+SMALL, TEXT, TITLE = 8, 9.5, 12  # font sizes in points
+UPPER_LEFT_OUTSIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+
+
+# Tables ------------------------------------------------------------------------------------------
+def table(rows: Sequence[Sequence[str]], num_left: int = 1) -> str:
+    """Columns padded to their widest cell: ``num_left`` flush left, the others flush right.
+
+    Args:
+        rows: cells; the first row is the header.
+        num_left: number of columns that hold words.
+
+    Example:
+        >>> print(table([["stage", "seconds"], ["solve", "9.50"]]))
+        stage  seconds
+        solve     9.50
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(width) if position < num_left else cell.rjust(width)
+            for position, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
+
+
+def marked(simulated: bool, *lines: str) -> str:
+    """The lines, under the one without which no simulated number may be printed."""
+    return "\n".join([*([SIMULATED_LINE] if simulated else []), *lines])
+
+
+def percent(fraction: float | None, digits: int = 2) -> str:
+    """A fraction in percent, ``-`` where there is none.
+
+    Example:
+        >>> percent(0.97531), percent(None)
+        ('97.53', '-')
+    """
+    return "-" if fraction is None else f"{100 * fraction:.{digits}f}"
+
+
+def words(name: str) -> str:
+    """A name of the code as people write it: spaces in place of underscores."""
+    return name.replace("_", " ")
+
+
+def grouped(count: float) -> str:
+    """A whole number with thin spaces between thousands."""
+    return f"{count:,.0f}".replace(",", "\N{THIN SPACE}")
+
+
+# Figures -----------------------------------------------------------------------------------------
+def new_figure(width: float, height: float, title: str = "", *, simulated: bool = False) -> Figure:
+    """An empty figure of some inches, its parts laid out by matplotlib, that says SIMULATED."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    if title:
+        figure.suptitle(f"{title} (SIMULATED data)" if simulated else title, fontsize=TITLE)
+    return figure
+
+
+def save(figure: Figure, path: str | Path, dpi: int = 160) -> None:
+    """Write a figure as PNG, replaced as a whole if it exists."""
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=dpi, facecolor="white")
+
+
+def clean(axes: Axes, grid: Literal["x", "y", "both"] = "both") -> None:
+    """A light grid behind the data, no ticks, no box."""
+    axes.grid(axis=grid, color=LIGHT, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(length=0, labelsize=SMALL + 0.5, labelcolor=INK)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def lanes(axes: Axes, names: Sequence[str], *, least: int = 1) -> None:
+    """Give the y axis a lane for each name, the first on top; room for ``least`` lanes."""
+    axes.set_yticks(range(len(names)), names, fontsize=TEXT)
+    axes.set_ylim(max(least, len(names)) - 0.4, -0.6)
+
+
+def stack(axes: Axes, lane: float, widths: Sequence[float], colours: Iterable[str]) -> None:
+    """One bar in a lane out of parts that follow each other."""
+    left = 0.0
+    for width, colour in zip(widths, colours, strict=True):
+        axes.barh(lane, width, 0.6, left=left, color=colour)
+        left += width
+
+
+def legend_below(figure: Figure, handles: Sequence[Any], ncols: int) -> None:
+    """One legend for all panels, below them."""
+    style: dict[str, Any] = {"loc": "outside lower center", "fontsize": SMALL + 0.5}
+    figure.legend(handles=handles, ncols=ncols, frameon=False, **style)
+
+
+def colours_of(names: Iterable[str]) -> dict[str, str]:
+    """A colour for each name, in the order of ``PALETTE``."""
+    return dict(zip(dict.fromkeys(names), cycle(PALETTE)))
+
+
+def kind_colours(kinds: Iterable[str]) -> dict[str, str]:
+    """A colour for each kind of channel: blue for PVDF, orange for SG, others what is left."""
+    left = cycle(colour for colour in PALETTE if colour not in _KIND_COLOURS.values())
+    return {kind: _KIND_COLOURS.get(kind) or next(left) for kind in dict.fromkeys(kinds)}
+
+
+def series(rows: Iterable[Mapping[str, Any]], key: str, scale: float = 1.0) -> list[float]:
+    """One entry of each row as numbers to plot, NaN where it is None."""
+    return [float("nan") if row[key] is None else scale * row[key] for row in rows]

@@ -1,0 +1,253 @@
+"""Closed-form scores without a group against refits without it, and their gradients."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tactslip_torch.model import leave_one_group_out
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, RadialBasis
+from tactslip_torch.model.leave_one_group_out import HeldOut, held_out_scores
+
+CUBIC, RADIAL, LINE = Polynomial(3), RadialBasis(0.4), Polynomial(1, 0.7)
+GROUPS = ("bins", "cycles", "materials", "mixed")
+
+
+def draw(
+    rng: np.random.Generator, num_bins: int, num_features: int = 3, weighted: bool = False
+) -> TrainingBins:
+    """Noisy labels of both classes everywhere, so that no fold loses one."""
+    z = rng.uniform(-1, 1, (num_bins, num_features))
+    is_slip = (z[:, 0] - z[:, 1] ** 2 + 0.3 * rng.normal(size=num_bins) > -0.2).copy()
+    first = min(8, num_bins)
+    is_slip[:first] = np.arange(first) // 2 % 2 == 0
+    weights = torch.from_numpy(rng.uniform(0.2, 3, num_bins)) if weighted else None
+    return TrainingBins(torch.from_numpy(z), torch.from_numpy(is_slip), weights)
+
+
+def grouped(rng: np.random.Generator, num_bins: int, kind: str) -> Tensor:
+    """Groups in no order, with names that are not 0, 1, 2, ..."""
+    if kind == "bins":
+        groups = np.arange(num_bins)
+    elif kind == "cycles":
+        groups = rng.integers(0, num_bins // 6, num_bins)
+    elif kind == "materials":
+        groups = rng.integers(0, 4, num_bins)
+    else:  # one of half the bins, some of a few, many of one
+        groups = np.where(np.arange(num_bins) % 2 == 0, 0, np.arange(num_bins) // 2)
+        groups[: num_bins // 5] = 5
+    return torch.from_numpy(rng.permutation(7 * groups - 20))
+
+
+def gram(kernel: Kernel, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    if isinstance(kernel, RadialBasis):
+        return np.exp(-kernel.gamma * ((a[:, None] - b[None]) ** 2).sum(-1))
+    return (a @ b.T + kernel.offset) ** kernel.degree
+
+
+def refitted(bins: TrainingBins, groups: Tensor, penalty: float, kernel: Kernel) -> np.ndarray:
+    """Delete the group, solve, predict."""
+    z, t, g = bins.features.numpy(), np.where(bins.is_slip, 1.0, -1.0), groups.numpy()
+    w = np.ones(len(z)) if bins.weights is None else bins.weights.numpy()
+    scores = np.full(len(z), np.nan)
+    for name in np.unique(g):
+        out, own = g != name, g == name
+        system = gram(kernel, z[out], z[out]) + np.diag(1 / (penalty * w[out]))
+        scores[own] = gram(kernel, z[own], z[out]) @ np.linalg.solve(system, t[out])
+    return scores
+
+
+def assert_refits(
+    bins: TrainingBins, groups: Tensor, penalty: float, kernel: Kernel = PAPER_KERNEL
+) -> None:
+    fit = HeldOut(bins, groups, kernel).at(penalty)
+    expected = refitted(bins, groups, penalty, kernel)
+    scale = max(1.0, np.abs(expected).max())
+    np.testing.assert_allclose(fit.scores.numpy(), expected, rtol=0, atol=1e-8 * scale)
+
+
+# Scores ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chunk", [256, 11])
+@pytest.mark.parametrize("penalty", [1e-3, 1e3])
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("kind", GROUPS)
+@pytest.mark.parametrize(
+    ("kernel", "num_bins", "num_features"),
+    [
+        (PAPER_KERNEL, 60, 12),  # the dual: 91 monomials
+        (LINE, 40, 41),
+        (CUBIC, 60, 12),
+        (RADIAL, 60, 12),
+        (Polynomial(2, 1.5), 80, 4),  # the primal: 15 monomials, groups of more and of fewer bins
+        (LINE, 80, 4),
+    ],
+)
+def test_scores_are_those_of_refits(
+    kernel, num_bins, num_features, kind, weighted, penalty, chunk, rng, monkeypatch
+):
+    monkeypatch.setattr(leave_one_group_out, "_CHUNK", chunk)
+    bins = draw(rng, num_bins, num_features, weighted)
+    assert_refits(bins, grouped(rng, num_bins, kind), penalty, kernel)
+
+
+@pytest.mark.parametrize("route", ["primal", "dual"])
+def test_leaving_one_bin_out_is_the_classic_formula(route, rng):
+    """``beta_i / (G^-1)_ii`` (Rasmussen 2006, 5.12)."""
+    bins = draw(rng, 50, 5)
+    z, t = bins.features.numpy(), bins.targets.numpy()
+    inverse = np.linalg.inv(gram(PAPER_KERNEL, z, z) + np.eye(50) / 2.0)
+    scores = HeldOut(bins, torch.arange(50), route=route).at(2.0).scores
+    np.testing.assert_allclose(t - scores.numpy(), (inverse @ t) / np.diag(inverse), rtol=1e-10)
+
+
+@pytest.mark.parametrize("route", ["primal", "dual"])
+@pytest.mark.parametrize("kind", ["bins", "materials"])
+def test_labels_of_a_group_do_not_move_its_scores(kind, route, rng):
+    bins, groups = draw(rng, 60, 3), grouped(rng, 60, kind)
+    own = groups == groups[7]
+    flipped = TrainingBins(bins.features, bins.is_slip ^ own)
+    before = HeldOut(bins, groups, route=route).at(0.7).scores
+    after = HeldOut(flipped, groups, route=route).at(0.7).scores
+    torch.testing.assert_close(after[own], before[own], rtol=0, atol=1e-9)
+    assert float((after - before)[~own].abs().max()) > 1e-3  # they do move the others'
+
+
+@pytest.mark.parametrize("num_bins", [12, 60])
+def test_one_matrix_serves_every_penalty_and_tensors_are_kept(num_bins, rng):
+    bins, groups = draw(rng, num_bins, 4, weighted=True), torch.arange(num_bins) % 3
+    tensors = [bins.features, bins.is_slip, bins.weights, groups]
+    before = [tensor.clone() for tensor in tensors]
+    machine = HeldOut(bins, groups)
+    found = [machine.at(penalty) for penalty in (0.1, 10.0, 0.1)]
+    assert torch.equal(found[0].scores, found[2].scores)
+    assert not torch.equal(found[0].scores, found[1].scores)
+    assert all(map(torch.equal, tensors, before))
+    new = torch.from_numpy(rng.uniform(-1, 1, (30, 4)))
+    head, expected = found[1].head, fit_machine(bins, 10.0)
+    torch.testing.assert_close(head(new), expected(new), rtol=0, atol=1e-9)
+    assert head.solved.size == (12 if num_bins == 12 else 15)
+
+
+# Gradients ------------------------------------------------------------------------------------
+
+
+def inputs_of(rng, num_bins, num_features, kind):
+    """Features, labels, groups, C, c and weights; a gradient is wanted of all that have one."""
+    bins, groups = draw(rng, num_bins, num_features, weighted=True), grouped(rng, num_bins, kind)
+    numbers = [torch.tensor(value, dtype=torch.float64) for value in (0.7, 0.4)]
+    z, weights = bins.features.requires_grad_(), bins.weights.requires_grad_()
+    penalty, offset = [number.requires_grad_() for number in numbers]
+    return z, bins.is_slip, groups, penalty, offset, weights
+
+
+def through_refits(z, is_slip, groups, penalty, offset, weights):
+    """Delete the group, solve, predict: by autograd through every solve."""
+    targets = torch.where(is_slip, 1.0, -1.0).double()
+    scores = torch.zeros_like(targets)
+    for name in groups.unique():
+        own, out = groups == name, groups != name
+        gram = (z[out] @ z[out].mT + offset) ** 2
+        beta = torch.linalg.solve(gram + torch.diag(1 / (penalty * weights[out])), targets[out])
+        scores = scores.index_put((own,), ((z[own] @ z[out].mT + offset) ** 2) @ beta)
+    return scores
+
+
+@pytest.mark.parametrize("kind", GROUPS)
+def test_scores_and_gradients_are_those_through_refits(kind, rng):
+    inputs = inputs_of(rng, 60, 12, kind)
+    wanted = [inputs[0], *inputs[3:]]
+    pull = torch.from_numpy(rng.standard_normal(60))
+    scores = held_out_scores(*inputs)
+    bins = TrainingBins(inputs[0].detach(), inputs[1], inputs[5].detach())
+    closed = HeldOut(bins, inputs[2], Polynomial(2, 0.4), "dual").at(0.7).scores
+    torch.testing.assert_close(scores.detach(), closed, rtol=0, atol=1e-10)
+    expected = torch.autograd.grad(through_refits(*inputs), wanted, pull)
+    for one, other in zip(torch.autograd.grad(scores, wanted, pull), expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("num_features", [2, 6])
+def test_derivatives_are_right_once_and_twice(num_features, rng):
+    """With more bins than monomials, and fewer."""
+    z, is_slip, groups, *numbers = inputs_of(rng, 12, num_features, "materials")
+
+    def scores(z, *numbers):
+        return held_out_scores(z, is_slip, groups, *numbers)
+
+    assert torch.autograd.gradcheck(scores, (z, *numbers))
+    assert torch.autograd.gradgradcheck(scores, (z, *numbers))
+
+
+def test_float32_features_get_their_gradient_in_float32(rng):
+    z, is_slip, groups, *_ = inputs_of(rng, 30, 3, "cycles")
+    single = z.detach().float().requires_grad_()
+    scores = held_out_scores(single, is_slip, groups, 0.7)
+    assert scores.dtype == torch.float64
+    (slope,) = torch.autograd.grad(scores.sum(), single)
+    assert slope.dtype == torch.float32
+
+
+# Refusals -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("penalty", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_penalty_must_be_positive_and_finite(penalty, rng):
+    for num_bins in (12, 60):
+        bins, groups = draw(rng, num_bins, 4), torch.arange(num_bins) % 3
+        with pytest.raises(ValueError, match=r"positive and finite penalty .*, got"):
+            HeldOut(bins, groups).at(penalty)
+        with pytest.raises(ValueError, match=r"positive and finite penalty .*, got"):
+            held_out_scores(bins.features, bins.is_slip, groups, penalty)
+
+
+@pytest.mark.parametrize(
+    ("groups", "message"),
+    [
+        (torch.zeros(19, dtype=torch.int64), r"each of 20 bins, got \(19,\)"),
+        (torch.zeros(20), r"whole number .*, got \(20,\) torch.float32"),
+        (torch.full((20,), 7), r"at least two groups, all 20 bins are in \[7\]"),
+    ],
+)
+def test_groups_must_be_two_or_more_and_one_whole_number_a_bin(groups, message, rng):
+    bins = draw(rng, 20)
+    with pytest.raises(ValueError, match=message):
+        HeldOut(bins, groups)
+    with pytest.raises(ValueError, match=message):
+        held_out_scores(bins.features, bins.is_slip, groups, 1.0)
+
+
+@pytest.mark.parametrize(("value", "kind"), [(True, "slip"), (False, "non-slip")])
+def test_a_group_with_all_of_a_class_is_named(value, kind, rng):
+    bins = draw(rng, 20)
+    groups = torch.where(bins.is_slip == value, 9, torch.arange(20) % 3)
+    with pytest.raises(ValueError, match=f"without group 9 no {kind} bin is left"):
+        HeldOut(bins, groups)
+
+
+def test_other_bad_input_is_refused(rng):
+    bins, groups = draw(rng, 20), torch.arange(20) % 4
+    z, is_slip = bins.features, bins.is_slip
+    with pytest.raises(ValueError, match=r"RadialBasis.* has no primal of fixed size"):
+        HeldOut(bins, groups, RADIAL, route="primal")
+    with pytest.raises(ValueError, match=r"one N, got \(20, 3\), \(19,\)"):
+        held_out_scores(z, is_slip[1:], groups, 1.0)
+    with pytest.raises(ValueError, match=r"offset .* at least 0, got -0.5"):
+        held_out_scores(z, is_slip, groups, 1.0, -0.5)
+    with pytest.raises(ValueError, match="weights must be positive"):
+        held_out_scores(z, is_slip, groups, 1.0, weights=torch.zeros(20))
+    with pytest.raises(ValueError, match=r"condition .*, wanted up to 1e\+10; lower"):
+        held_out_scores(z.repeat(2, 1), is_slip.repeat(2), groups.repeat(2), 1e12)
+
+
+@pytest.mark.parametrize("penalty", [1e7, 1e8])
+def test_a_bin_alone_in_a_feature_is_refused_by_name_where_float64_ends(penalty, rng):
+    """Only bin 25 has the last feature: its leverage is 1 but for about 1 / penalty."""
+    bins, groups = draw(rng, 80, 4), torch.arange(80) + 100
+    bins.features[:, -1] = 0
+    bins.features[25, -1] = 1
+    assert_refits(bins, groups, 1e3)
+    with pytest.raises(ValueError, match="the machine without group 125 is too"):
+        HeldOut(bins, groups).at(penalty)

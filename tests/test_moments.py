@@ -1,0 +1,263 @@
+"""Sums over training bins: what they hold, that they add, and the machines solved from them."""
+
+import numpy as np
+import oracles
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.kernel_ridge import KernelRidge
+
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.moments import FORMAT, ProductSums, SufficientStats
+from tactslip_torch.runtime import load_table, save_table
+
+NUM = 4
+ABOUT = {"hand": {"name": "paper24", "channels": ["SG1", "PVDF1"]}, "scaler": "range"}
+
+
+def make_batches(num=8, seed=0, most=12):
+    """Name, features in [-1, 1], classes and weights; sizes from 0 on."""
+    rng = np.random.default_rng(seed)
+    batches = []
+    for number in range(num):
+        rows = slice(int(rng.integers(0, most)))
+        z = torch.from_numpy(np.clip(rng.standard_normal((most, NUM)), -1, 1))
+        is_slip = torch.from_numpy(rng.uniform(size=most) < 0.6)
+        weights = torch.from_numpy(rng.uniform(0.1, 3, most))
+        batches.append((f"M{number % 3}/{number}", z[rows], is_slip[rows], weights[rows]))
+    return batches
+
+
+def stats_of(batches, about=ABOUT, degree=2):
+    stats = SufficientStats(NUM, about, degree)
+    for batch in batches:
+        stats.update(*batch)
+    return stats
+
+
+def assert_same(one, other):
+    torch.testing.assert_close(one.sums, other.sums, rtol=1e-12, atol=1e-12)
+    assert torch.equal(one.count, other.count)
+    assert (one.ledger.entries, one.about) == (other.ledger.entries, other.about)
+
+
+def joined(batches):
+    parts = [torch.cat([batch[i] for batch in batches]) for i in (1, 2, 3)]
+    return parts[0], parts[1], parts[2]
+
+
+def balanced(is_slip, weights):
+    """Each class with half of the total weight."""
+    out = weights.clone()
+    for of in (is_slip, ~is_slip):
+        out[of] *= weights.sum() / (2 * weights[of].sum())
+    return out
+
+
+# What is summed -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize(("num_features", "used"), [(1, None), (3, 2), (9, None), (36, 23)])
+def test_the_normal_matrix_is_that_of_the_monomials(num_features, used, degree, rng):
+    """Variables in one block and several, bins in two chunks; 36 features are more than a strip."""
+    z = torch.from_numpy(rng.uniform(-1, 1, (600, num_features)))
+    weights = torch.from_numpy(rng.uniform(0, 2, 600))
+    layout = ProductSums(num_features, degree)
+    total = z.new_zeros(layout.num_held)
+    layout.add_(total, z, weights)
+    assert float(total[0]) == pytest.approx(float(weights.sum()))
+    x = Polynomial(degree, 0.7).monomials(z[:, :used])
+    normal = layout.normal_matrix(total, 0.7, used)
+    torch.testing.assert_close(normal, x.mT @ (x * weights[:, None]), rtol=1e-11, atol=1e-10)
+    torch.testing.assert_close(normal, normal.mT, rtol=1e-13, atol=1e-13)
+    moment = layout.moment_vector(total, 0.7, used)
+    torch.testing.assert_close(moment, x.mT @ weights, rtol=1e-11, atol=1e-10)
+    layout.add_(total, z, -weights)
+    assert float(total.abs().max()) < 1e-10
+
+
+@given(
+    seed=st.integers(0, 99),
+    order=st.randoms(use_true_random=False),
+    num_shards=st.integers(1, 5),
+    degree=st.sampled_from([1, 2]),
+)
+def test_any_order_and_sharding_gives_the_same_sums(seed, order, num_shards, degree):
+    batches = make_batches(seed=seed)
+    whole = stats_of(batches, degree=degree)
+    order.shuffle(batches)
+    shards = [stats_of(batches[part::num_shards], degree=degree) for part in range(num_shards)]
+    while len(shards) > 1:  # any tree of merges
+        order.shuffle(shards)
+        other = shards.pop()
+        shards[0].merge(other)
+    assert_same(shards[0], whole)
+    for batch in batches[3:]:
+        whole.remove(*batch)
+    assert_same(whole, stats_of(batches[:3], degree=degree))
+    for batch in batches[:3]:
+        whole.remove(*batch)
+    assert not bool(whole.sums.any())  # nothing is left where no bin is
+
+
+def test_kinds_of_input_do_not_matter():
+    name, z, is_slip, _ = make_batches(1, seed=3, most=40)[0]
+    stats = stats_of([(name, z.float().double(), is_slip)])
+    for features in (z.float(), z.float().requires_grad_(), z.float().mT.contiguous().mT):
+        for labels in (is_slip, is_slip.long(), is_slip.float()):
+            assert_same(stats_of([(name, features, labels, torch.ones(len(z)))]), stats)
+
+
+# Machines -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("balance", ["weights", "none"])
+@pytest.mark.parametrize("used", [None, 1, 3])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize(("penalty", "offset"), [(0.01, 0.5), (10.0, 0.0), (1.0, 2.0)])
+def test_the_machine_is_that_of_scikit_learn(penalty, offset, degree, used, balance, rng):
+    batches = make_batches(6, 1, most=20)
+    stats = stats_of(batches, degree=degree)
+    before = stats.sums.clone()
+    form = stats.solve(penalty, offset, used, balance)
+    assert torch.equal(stats.sums, before)
+    z, is_slip, weights = joined(batches)
+    weights = balanced(is_slip, weights) if balance == "weights" else weights
+    ridge = KernelRidge(alpha=1 / penalty, kernel="poly", degree=degree, gamma=1, coef0=offset)
+    ridge.fit(z[:, :used], np.where(is_slip, 1.0, -1.0), sample_weight=weights.numpy())
+    at = rng.uniform(-1, 1, (9, used or NUM))
+    expected = ridge.predict(at)
+    actual = form(torch.from_numpy(at)).numpy()
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    assert form.num_features == (used or NUM)
+
+
+@pytest.mark.slow
+def test_solve_at_the_papers_size(rng):
+    """7381 monomials, few bins: the dual is small."""
+    z = np.clip(rng.standard_normal((150, 120)), -1, 1)
+    is_slip = rng.uniform(size=150) < 0.7
+    stats = SufficientStats(120)
+    stats.update("one", torch.from_numpy(z), torch.from_numpy(is_slip))
+    form = stats.solve(0.1, num_features=30, balance="none")
+    gram, targets = oracles.kernel(z[:, :30], z[:, :30]), np.where(is_slip, 1.0, -1.0)
+    expected = gram @ oracles.kernel_elm(gram, targets, 0.1)
+    actual = form(torch.from_numpy(z[:, :30])).numpy()
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9)
+
+
+def test_an_infinite_penalty_is_least_squares(rng):
+    z = torch.from_numpy(rng.uniform(-1, 1, (200, NUM)))
+    is_slip = torch.from_numpy(rng.uniform(size=200) < 0.5)
+    form = stats_of([("one", z, is_slip)]).solve(np.inf, balance="none")
+    x = Polynomial(2).monomials(z).numpy()
+    expected = x @ np.linalg.lstsq(x, np.where(is_slip, 1.0, -1.0), rcond=None)[0]
+    np.testing.assert_allclose(form(z).numpy(), expected, rtol=0, atol=1e-9)
+
+
+# Refusals -------------------------------------------------------------------------------------
+
+
+def with_value(z, value):
+    z = z.clone()
+    z[5, 2] = value
+    return z
+
+
+BATCH = ("b", torch.rand(9, NUM).double(), torch.arange(9) % 2 == 0, torch.ones(9).double())
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (1, with_value(BATCH[1], torch.nan), r"z must be within \[-1, 1\], got nan at bin 5, fe"),
+        (1, with_value(BATCH[1], -1.0001), r"got -1.0001 at bin 5, feature 2"),
+        (3, torch.ones(9).index_fill(0, torch.tensor(4), 0.0), "finite, got 0 at bin 4"),
+        (3, torch.ones(9).index_fill(0, torch.tensor(4), torch.inf), "finite, got inf at bin 4"),
+        (1, BATCH[1][:, :3], r"expected z \[N, 4\], .* got \(9, 3\), \(9,\), \(9,\)"),
+        (2, BATCH[2][:8], r"expected z \[N, 4\], .* got \(9, 4\), \(8,\), \(9,\)"),
+        (3, BATCH[3][:, None], r"expected z \[N, 4\], .* got \(9, 4\), \(9,\), \(9, 1\)"),
+    ],
+)
+def test_a_batch_that_is_refused_changes_nothing(place, value, message):
+    stats = stats_of([("a", *BATCH[1:])])
+    batch = list(BATCH)
+    batch[place] = value
+    with pytest.raises(ValueError, match=rf"^batch 'b': .*{message}"):
+        stats.update(*batch)
+    assert_same(stats, stats_of([("a", *BATCH[1:])]))
+
+
+def test_a_batch_is_added_once_and_taken_out_as_it_was():
+    stats = stats_of([BATCH])
+    name, z, is_slip, weights = BATCH
+    with pytest.raises(ValueError, match="batch 'b' is in these statistics already; add it once"):
+        stats.update(name, z / 2, is_slip)
+    with pytest.raises(ValueError, match="batch 'a' was never added"):
+        stats.remove("a", z, is_slip, weights)
+    for other in ((z.flip(0), is_slip, weights), (z, ~is_slip, weights), (z, is_slip, weights * 2)):
+        with pytest.raises(ValueError, match="batch 'b' was added with other content"):
+            stats.remove(name, *other)
+    assert_same(stats, stats_of([BATCH]))
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (SufficientStats(3, ABOUT), "num_features: 4 and 3"),
+        (SufficientStats(NUM, ABOUT, degree=1), "degree: 2 and 1"),
+        (SufficientStats(NUM), "about.hand: .* and nothing"),
+        (SufficientStats(NUM, ABOUT | {"scaler": "x"}), 'about.scaler: "range" and "x"'),
+        (stats_of(make_batches()), "8 batches are in both statistics, such as 'M0/0'"),
+    ],
+)
+def test_sums_that_do_not_merge_stay_as_they_are(other, message):
+    stats = stats_of(make_batches())
+    with pytest.raises(ValueError, match=message):
+        stats.merge(other)
+    assert_same(stats, stats_of(make_batches()))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"penalty": 0.0}, r"penalty \(the paper's C\) must be positive"),
+        ({"penalty": 1.0, "offset": -0.5}, r"offset \(the kernel's c\) must be 0 or more"),
+        ({"penalty": 1.0, "num_features": 5}, "use_features must be in 1..4, got 5"),
+        ({"penalty": 1.0, "balance": "undersample"}, "balance must be 'weights' or 'none', got"),
+    ],
+)
+def test_solve_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        stats_of(make_batches()).solve(**arguments)
+
+
+def test_one_class_is_not_enough_and_neither_is_no_feature():
+    stats = stats_of([("a", BATCH[1], torch.ones(9).bool(), BATCH[3])])
+    with pytest.raises(ValueError, match=r"^there is no non-slip bin in these sums; add .*$"):
+        stats.solve(1.0)
+    with pytest.raises(ValueError, match="1 feature or more and degree 1 or 2, got 0 and 2"):
+        SufficientStats(0)
+    with pytest.raises(ValueError, match="about must be what JSON holds"):
+        SufficientStats(1, {"x": float("nan")})
+
+
+# Files ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_sums_come_back_from_their_file(degree, tmp_path):
+    stats = stats_of(make_batches(), degree=degree)
+    stats.save(tmp_path / "sums.pt")
+    again = SufficientStats.load(tmp_path / "sums.pt")
+    assert_same(again, stats)
+    assert torch.equal(again.sums, stats.sums)
+    again.merge(stats_of([BATCH], degree=degree))
+    assert load_table(tmp_path / "sums.pt", FORMAT)[0]["degree"] == degree
+    save_table(tmp_path / "other.pt", "tactslip_torch sums 1", {}, {})
+    with pytest.raises(ValueError, match="must be of format 'tactslip_torch sums 2'"):
+        SufficientStats.load(tmp_path / "other.pt")
+    with pytest.raises(FileNotFoundError):
+        SufficientStats.load(tmp_path / "nothing.pt")
