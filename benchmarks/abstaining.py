@@ -24,7 +24,7 @@ from benchmarks.harness import COLORS, LIGHT, Benchmark, Job, Report, Table, per
 from benchmarks.subjects import SEEN_ROLE, FittedMachine, composed, small_recipe, surveyed
 from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.conformal import answers, thresholds
-from tactslip_torch.report.answers import CLASSES, answer_counts, answer_metrics
+from tactslip_torch.report.metrics import CLASSES, answer_counts, answer_metrics
 from tactslip_torch.simulation import SEEN_MATERIALS
 from tactslip_torch.training.abstention import held_out_scores
 

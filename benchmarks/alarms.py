@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from benchmarks.commands import result_of, table_of, take_figures
 from benchmarks.harness import Benchmark, Job, Report, Table
 from benchmarks.onset import QUICK_STREAMS, QUICK_TRAINING
-from tactslip_torch.report.alarm import kept_rows, promise_line, scene_rows
+from tactslip_torch.report.results import kept_rows, promise_line, scene_rows
 
 _KEPT = ("simulated", "experiment", "seed", "versions", "events", "alarm")
 

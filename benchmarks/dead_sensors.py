@@ -26,9 +26,8 @@ from tactslip_torch.model.calibration import (
     reliability,
 )
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.held_out import HeldOut
-from tactslip_torch.model.missing import MissingScores, dead_mask
-from tactslip_torch.model.widening import widened_llr
+from tactslip_torch.model.leave_one_group_out import HeldOut
+from tactslip_torch.model.missing_channels import MissingScores, dead_mask, widened_llr
 
 OURS, REFIT = "closed form", "refit"
 _CALIBRATED_ON = 3000  # training bins at most that a refitted machine is calibrated on

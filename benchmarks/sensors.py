@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from benchmarks.commands import result_of, table_of, take_figures
 from benchmarks.harness import Benchmark, Job, Report, Table
 from benchmarks.reproduction.runs import run
-from tactslip_torch.report.sensors import (
-    ANEW_WORDS,
+from tactslip_torch.report.importance import (
+    RESELECT_WORDS,
     best_rows,
     lines_about,
     unit_rows,
@@ -52,17 +52,17 @@ class Sensors(Benchmark[Sizes]):
         detector = job.folder / "detector"
         run("detector for sensors", job.sizes.training, detector, job.folder / "cache")
         found = {}
-        for way in ANEW_WORDS:
+        for way in RESELECT_WORDS:
             overrides = [f"model={detector / 'detector.pt'}", f"anew={way}"]
             overrides += [*job.sizes.overrides, *job.overrides]
             found[way] = result_of("importance", overrides, job.folder / way, "sensors.json")
-        return {"ways": found, "folder": str(job.folder / next(iter(ANEW_WORDS)))}
+        return {"ways": found, "folder": str(job.folder / next(iter(RESELECT_WORDS)))}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """One by one and the best few, by way of selection and by unit."""
         found = {}
         for way, content in numbers["ways"].items():
-            words = ANEW_WORDS[way]
+            words = RESELECT_WORDS[way]
             for unit in content["best"]:
                 is_first = unit == "kind"
                 found[f"Without one {unit}, features {words}"] = table_of(

@@ -31,8 +31,7 @@ from tactslip_torch.features.extractor import EngineName, FeatureExtractor
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.kernel_sum import KernelSum
-from tactslip_torch.model.kernels import Polynomial, kernel_from_dict
+from tactslip_torch.model.kernels import KernelSum, Polynomial, kernel_from_dict
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY

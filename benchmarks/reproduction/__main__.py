@@ -42,7 +42,7 @@ from benchmarks.reproduction.runs import kept, run
 from tactslip_torch.analysis.signal_checks import filtered, judge_facts
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.report import published
-from tactslip_torch.report.figures import pipeline_figure
+from tactslip_torch.report.pipeline import pipeline_figure
 from tactslip_torch.simulation.parameters import CALIBRATED_PATH, SEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings
 

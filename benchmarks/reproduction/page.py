@@ -21,7 +21,7 @@ from benchmarks.reproduction.results import (
 )
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.report import published
-from tactslip_torch.report.tables import BASELINES
+from tactslip_torch.report.results import BASELINES
 
 CALIBRATED, PREDICTED, NOT_COMPARABLE = "*calibrated*", "*predicted*", "*not comparable*"
 _HALF = "the published matrices do not fit half a second on either side"
