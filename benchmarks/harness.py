@@ -36,7 +36,7 @@ from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[imp
 
 from benchmarks import RESULTS, ROOT
 from benchmarks.reproduction.runs import code_digest
-from tactslip_torch.report.style import table as aligned
+from tactslip_torch.report import style
 from tactslip_torch.runtime import whole_file
 
 QUICK_LINE = "QUICK: too few rounds to mean anything, whatever stands under limits"
@@ -242,7 +242,7 @@ class Table(NamedTuple):
 
     def text(self) -> str:
         """Aligned columns."""
-        return "\n".join(filter(None, [aligned([self.header, *self.rows]), self.note]))
+        return "\n".join(filter(None, [style.table([self.header, *self.rows]), self.note]))
 
     def markdown(self) -> str:
         """A table of Markdown, columns of numbers to the right and of words to the left."""

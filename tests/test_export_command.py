@@ -8,11 +8,12 @@ import sys
 import pytest
 from small_detector import alarming_detector, certified, small_detector
 
+from tactslip_torch.commands import export as export_command
 from tactslip_torch.commands.certify import FORMAT as CERTIFICATE_FORMAT
 from tactslip_torch.graph import export
 from tactslip_torch.graph.export import export_detector, sidecar_facts, summary, worst_error
 from tactslip_torch.graph.facts import sidecar_path
-from tactslip_torch.training import experiment as fold_training
+from tactslip_torch.training import experiment
 
 pytestmark = pytest.mark.onnx
 
@@ -82,7 +83,7 @@ def test_no_other_certificate_is_handed_on(kept):
 
 def test_training_tells_of_each_graph_and_loses_nothing(detector, tmp_path, monkeypatch):
     detector.save(tmp_path / "detector.pt")
-    found = fold_training.export_fold(detector, tmp_path)
+    found = experiment.export_fold(detector, tmp_path)
     assert found.keys() == {"bin", "stream"}
     for kind, name in export.FILES.items():
         assert found[kind]["bytes"] == (tmp_path / name).stat().st_size
@@ -94,7 +95,7 @@ def test_training_tells_of_each_graph_and_loses_nothing(detector, tmp_path, monk
         raise ValueError("no such descriptor\nas a graph")
 
     monkeypatch.setattr(export, "_graph", failing)
-    found = fold_training.export_fold(small_detector(), tmp_path)
+    found = experiment.export_fold(small_detector(), tmp_path)
     assert found == {"bin": f"{tmp_path / 'model.onnx'} was not written: no such descriptor"}
 
 
@@ -106,7 +107,7 @@ def command(monkeypatch, capsys, *arguments):
     monkeypatch.setattr(sys, "argv", ["export", *arguments])
     status = 0
     try:
-        export.main()
+        export_command.main()
     except SystemExit as stop:
         status = stop.code
     said = capsys.readouterr()
@@ -121,7 +122,7 @@ def test_the_command_leaves_what_the_detector_can_give(monkeypatch, capsys, tmp_
         made.append((str(folder), graphs, precision, str(source)))
         return ()
 
-    monkeypatch.setattr(export, "export_detector", instead)
+    monkeypatch.setattr(export_command, "export_detector", instead)
     model = f"model={tmp_path / 'detector.pt'}"
     assert command(monkeypatch, capsys, model) == (0, "", "")
     out = tmp_path / "out"

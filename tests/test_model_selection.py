@@ -8,7 +8,7 @@ from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.training import selection as model_selection
+from tactslip_torch.training import selection
 from tactslip_torch.training.recipe import FREE_CONSTANT, Recipe, scene_weights, stand_for
 from tactslip_torch.training.selection import candidates, choose_model, fitted_frame, group_scores
 
@@ -105,7 +105,7 @@ def test_the_left_out_group_teaches_nothing(rng):
     structures = candidates(how, 480)
 
     def scores(features):
-        data = model_selection._Data(
+        data = selection._Data(
             how,
             POOL,
             sample._replace(features=features)
@@ -129,7 +129,7 @@ def test_the_left_out_group_teaches_nothing(rng):
             sample.group,
             None,
         )
-        fold = model_selection._Fold(data, frozenset([0, 1]), structures).at([0.01])
+        fold = selection._Fold(data, frozenset([0, 1]), structures).at([0.01])
         return fold.scores[0]
 
     spoilt = sample.features.clone()

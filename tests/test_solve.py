@@ -171,7 +171,7 @@ def test_the_stated_error_is_true_or_the_system_refused(kind, spread, penalty):
     """Of the scores of training bins, in the mean square by weight, by either route.
 
     Once a weighted system of nearly duplicate features was off by 84 % where 3e-7 was stated. Up
-    to a condition of 1e10 nothing is refused and the error has a cap of its own.
+    to a condition of 1e8 the error has a cap of its own.
     """
     z, targets, weights = case(kind, spread)
     bins = TrainingBins(*tensors(z, targets > 0, weights))
@@ -187,7 +187,7 @@ def test_the_stated_error_is_true_or_the_system_refused(kind, spread, penalty):
         wrong = np.sqrt((weights * (scores - expected) ** 2).sum() / weights.sum())
         assert wrong <= 2 * report.error + 1e-14
         assert report.error <= max(1e-2, report.left_out or 0.0)
-        if report.condition <= 1e8:
+        if report.method == "cholesky" and report.condition <= 1e8:
             assert wrong <= 1e-6
         json.dumps(report.facts(), allow_nan=False)
 

@@ -563,7 +563,7 @@ def export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, flo
             found[kind] = {"error": worst_error(facts), "bytes": facts["onnx_bytes"]}
         except Exception as error:  # of onnxruntime they have no base in common
             log.exception("the %s graph was not written", kind)
-            found[kind] = " ".join(str(error).split()).splitlines()[0]
+            found[kind] = (str(error) or type(error).__name__).splitlines()[0]
     return found
 
 
