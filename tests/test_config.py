@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 from torch.utils.data import DataLoader
 
-from tactslip_torch.commands import entry as config
+import tactslip_torch
 from tactslip_torch.commands.entry import (
     conf_dir,
     errors_in_one_line,
@@ -32,14 +32,14 @@ def test_conf_inside_the_package_comes_first(monkeypatch, tmp_path):
     for folder in (package / "conf", package.parent / "conf"):
         folder.mkdir(parents=True)
         (folder / "train.yaml").write_text("")
-    monkeypatch.setattr(config, "__file__", str(package / "config.py"))
+    monkeypatch.setattr(tactslip_torch, "__file__", str(package / "__init__.py"))
     assert conf_dir() == package / "conf"
     (package / "conf" / "train.yaml").unlink()
     assert conf_dir() == package.parent / "conf"
 
 
 def test_no_conf_is_an_error_that_says_where(monkeypatch, tmp_path):
-    monkeypatch.setattr(config, "__file__", str(tmp_path / "config.py"))
+    monkeypatch.setattr(tactslip_torch, "__file__", str(tmp_path / "__init__.py"))
     with pytest.raises(FileNotFoundError, match=r"no conf folder with train\.yaml.*reinstall"):
         conf_dir()
 
