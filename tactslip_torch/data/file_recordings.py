@@ -1289,7 +1289,7 @@ def _refuse_others(path: Path, found: Found, sample_rate_hz: float, units: str) 
         found.is_measured and abs(rate / sample_rate_hz - 1) <= _RATE_ERR
     ):
         raise ValueError(
-            f"{path} is of {rate} Hz, the detector of {sample_rate_hz:g} Hz; resample it"
+            f"{path} is of {rate:g} Hz, the detector of {sample_rate_hz:g} Hz; resample it"
         )
     if found.units not in (None, units):
         raise ValueError(
