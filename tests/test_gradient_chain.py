@@ -220,15 +220,15 @@ def test_gradients_of_a_stream_are_slopes(rng):
         torch.testing.assert_close((pull * way).sum(), slope, rtol=1e-4, atol=1e-6)
 
 
-def test_what_a_statistic_rests_on():
+def test_what_a_log_likelihood_ratio_rests_on():
     """No gradient to channels that are not in use or missing, nor to later samples."""
-    detector, settings = detector_of("PVDF"), settings_of(RULES[1])
+    detector, settings = detector_of("PVDF"), settings_of(RULES[0])
     samples = signal(600, 4)
     samples[0, 100] = torch.nan  # a gauge: nobody reads it
     samples[3, 50] = torch.inf  # the first film bins
     samples.requires_grad_()
     found = stream_statistic(detector, settings, samples)
-    (pull,) = torch.autograd.grad(found.statistic[0], samples)
+    (pull,) = torch.autograd.grad(found.llr[0], samples)  # CUSUM may stand at 0, without a slope
     assert not pull[[0, 1, 3]].any()
     assert pull[2].any()
     assert not pull[:, 100 + detector.look_ahead :].any()
