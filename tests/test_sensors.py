@@ -225,7 +225,7 @@ def test_fingers_stand_in_order_with_tips_up_and_the_thumb_leaning_out():
     assert [finger.degrees < 0 for finger in fingers] == [False] * 4 + [True]
     names = [[row["name"] for row in segment] for segment in fingers[3].segments]
     assert names == [["SG10", "PVDF7"], ["SG11", "PVDF8"], ["SG12"]]
-    assert len(set(kind_colours(rows).values())) == 2
+    assert len(set(kind_colours(row["kind"] for row in rows).values())) == 2
 
 
 # The command -------------------------------------------------------------------------------------
