@@ -168,8 +168,7 @@ def test_a_simulated_set_is_called_so(tmp_path, capsys):
 def drawn(num_channels=3, **changes):
     example = {
         "title": "wood/0",
-        "samples": samples(0, channels=num_channels).numpy(),
-        "names": [f"E{i}" for i in range(num_channels)],
+        "samples": samples(0, channels=num_channels),
         "sample_rate_hz": RATE_HZ,
         "units": "V",
         "onsets_s": (1.0,),
@@ -177,7 +176,8 @@ def drawn(num_channels=3, **changes):
         "non_slip_s": ((0.0, 0.5),),
     }
     trials = [Trial("wood", "paper", 3.0, 1.0, 0.5, 1), Trial("iron", "paper", 6.0, 0.0, 0.0, 0)]
-    return draw_dataset(trials, DrawnRecording(**(example | changes)), title="a set")
+    names = [f"E{i}" for i in range(num_channels)]
+    return draw_dataset(trials, DrawnRecording(**(example | changes)), names, title="a set")
 
 
 def test_the_figure_shows_seconds_and_labels():
@@ -195,10 +195,10 @@ def test_of_many_channels_so_many_are_drawn_and_said():
     traces = drawn(60).axes[1]
     assert len(traces.get_yticklabels()) == 24
     assert "24 of 60 channels" in traces.get_title()
-    nothing = drawn(samples=np.full((3, 600), np.nan)).axes[1]
+    nothing = drawn(samples=torch.full((3, 600), torch.nan)).axes[1]
     assert len(nothing.get_yticklabels()) == 3
     with pytest.raises(ValueError, match="no recording to draw"):
-        draw_dataset([], None, title="nothing")
+        draw_dataset([], None, [], title="nothing")
 
 
 def test_tables_say_what_is_simulated_and_what_is_not_known():

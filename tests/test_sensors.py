@@ -21,11 +21,11 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.report.importance import (
     _fingers,
     best_table,
-    kind_colours,
     sensors_csv,
     sensors_figure,
     sensors_table,
 )
+from tactslip_torch.report.style import kind_colours
 
 SMALL = ("bins=20", "judged_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
 CHANNELS = ["SG1", "SG2", "PVDF1", "PVDF2"]
@@ -225,7 +225,7 @@ def test_fingers_stand_in_order_with_tips_up_and_the_thumb_leaning_out():
     assert [finger.degrees < 0 for finger in fingers] == [False] * 4 + [True]
     names = [[row["name"] for row in segment] for segment in fingers[3].segments]
     assert names == [["SG10", "PVDF7"], ["SG11", "PVDF8"], ["SG12"]]
-    assert len(set(kind_colours(rows).values())) == 2
+    assert len(set(kind_colours(row["kind"] for row in rows).values())) == 2
 
 
 # The command -------------------------------------------------------------------------------------

@@ -442,9 +442,10 @@ def _stacked(
     totals = np.zeros(len(columns), dtype=int)
     for layer, colour in colours.items():
         lengths = np.array([counts.get((layer, column), 0) for column in columns])
-        has = lengths > 0  # an empty bar would still draw its outline
+        has = np.full(len(columns), True)
         style: dict[str, Any] = {"color": colour, "label": layer}
         if is_hatched:
+            has = lengths > 0  # an empty bar would still draw its outline
             style = {"facecolor": "white", "edgecolor": colour, "hatch": "////"}
             style["label"] = f"{layer}, paper"
         if is_horizontal:
@@ -740,9 +741,17 @@ def _scene_scores(metrics: Mapping[str, Any]) -> Iterator[_SceneScores]:
 def confound_table(metrics: Mapping[str, Any]) -> str:
     """Bins, recalls and balanced accuracy of each detector on each kind of scene, held out.
 
-    One row per split, scene and detector; detectors on the same bins are beside. ``trained on it``
-    says whether other cycles of that scene were trained on, ``-`` where the results do not tell. A
-    class without bins has the recall ``-``.
+    Args:
+        metrics: the content of ``metrics.json``.
+    """
+    return marked(metrics["simulated"], table(confound_rows(metrics), num_left=4))
+
+
+def confound_rows(metrics: Mapping[str, Any]) -> list[list[str]]:
+    """A header and one row per split, scene and detector; detectors on the same bins are beside.
+
+    ``trained on it`` says whether other cycles of that scene were trained on, ``-`` where the
+    results do not tell. A class without bins has the recall ``-``.
 
     Args:
         metrics: the content of ``metrics.json``.
@@ -754,7 +763,7 @@ def confound_table(metrics: Mapping[str, Any]) -> str:
         keys = ("non_slip_recall", "slip_recall", "balanced_accuracy")
         cells = [str(scores["num_bins"]), *(percent(scores[key]) for key in keys)]
         rows.append([role, scene, detector, trained, *cells])
-    return marked(metrics["simulated"], table(rows, num_left=4))
+    return rows
 
 
 def confound_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
