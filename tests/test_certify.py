@@ -167,7 +167,7 @@ def test_nothing_judged_is_told(tmp_path, monkeypatch, capsys):
     model = f"model={saved(tmp_path)}"
     status, out, lines = run(monkeypatch, capsys, model, "judge=[]")
     assert (status, lines) == (0, [])
-    assert "; no held-out bins were judged" in out
+    assert "; no held-out bins were evaluated" in out
 
 
 def test_one_judged_role_may_be_named_alone(tmp_path):

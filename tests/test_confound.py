@@ -154,7 +154,7 @@ def test_results_of_one_scene_have_nothing_to_compare(tmp_path, capsys):
 def test_the_table_has_the_scores_of_the_bins_of_each_detector_and_scene():
     metrics, bins = made()
     header, *rows = confound_rows(metrics)
-    assert header[:5] == ["judged on", "scene", "detector", "trained on it", "bins"]
+    assert header[:5] == ["evaluated on", "scene", "detector", "trained on it", "bins"]
     assert [row[:3] for row in rows] == [
         [role, scene, fold]
         for role in ("test", "unseen")

@@ -685,6 +685,7 @@ def _draw_scales(axes: Axes, scales: Mapping[str, float]) -> None:
     axes.set_xlabel("features, by scale")
     axes.set_ylabel("scale in the kernel")
     axes.set_title("learned scales: soft selection", fontsize=10)
+    clean(axes, "y")
 
 
 # Confounders: scenes that have motion without slip, or slip without motion ------------------------
@@ -1084,10 +1085,11 @@ def events_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
     if not events:
         raise ValueError("metrics has no events to draw")
     rules = dict.fromkeys(rule for by_rule in events.values() for rule in by_rule)
-    styles: dict[str, dict[str, Any]] = {
-        rule: {"color": PALETTE[place % len(PALETTE)], "ls": ("-", "--", ":")[place // 7 % 3]}
-        for place, rule in enumerate(rules)
-    }
+    free = [colour for colour in PALETTE if colour not in _OUTCOMES.values()]
+    styles: dict[str, dict[str, Any]] = {}
+    for place, rule in enumerate(rules):
+        dash = ("-", "--", ":")[place // len(free) % 3]
+        styles[rule] = {"color": free[place % len(free)], "ls": dash}
     heights = [1.3 + 0.3 * max(2, len(by_rule)) for by_rule in events.values()]
     title = "Which slips are found, how late, and how many alarms are false"
     figure = new_figure(11.0, 1.3 + sum(heights), title, simulated=metrics["simulated"])
