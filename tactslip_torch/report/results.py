@@ -778,11 +778,11 @@ def confound_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
         path: the PNG to write, replaced as a whole if it exists.
 
     Raises:
-        ValueError: if there are no several kinds of scenes to compare.
+        ValueError: if there are no several kinds of scenes.
     """
     scored = list(_scene_scores(metrics))
     if not scored:
-        raise ValueError("metrics has no several kinds of scenes to compare")
+        raise ValueError("metrics has no split with several kinds of scenes to draw")
     roles, scenes = (list(dict.fromkeys(column)) for column in list(zip(*scored, strict=True))[:2])
     colours = colours_of(one.detector for one in scored)
     height = 1.7 + len(roles) * (0.8 + 0.28 * len(scenes))
