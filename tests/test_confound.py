@@ -154,7 +154,7 @@ def test_results_of_one_scene_have_nothing_to_compare(tmp_path, capsys):
 def test_the_table_has_the_scores_of_the_bins_of_each_detector_and_scene():
     metrics, bins = made()
     header, *rows = confound_rows(metrics)
-    assert header[:5] == ["judged on", "scene", "detector", "trained on it", "bins"]
+    assert header[:5] == ["evaluated on", "scene", "detector", "trained on it", "bins"]
     assert [row[:3] for row in rows] == [
         [role, scene, fold]
         for role in ("test", "unseen")
@@ -231,7 +231,7 @@ def test_each_dot_of_the_figure_is_a_score(drawn, tmp_path):
     (figure,) = drawn
     for row, role in enumerate(("test", "unseen")):
         names = [label.get_text() for label in figure.axes[2 * row].get_yticklabels()]
-        assert names == ["tapped", "carried", "paper's protocol"]  # from below
+        assert names == ["paper's protocol", "carried", "tapped"]  # from the top
         for column, key in enumerate(("non_slip_recall", "slip_recall")):
             axes = figure.axes[2 * row + column]
             found = {
@@ -241,7 +241,7 @@ def test_each_dot_of_the_figure_is_a_score(drawn, tmp_path):
                 for line in dots_of(axes)
             }
             expected = {}
-            for colour, fold in (("#D55E00", "protocol"), ("#0072B2", "with_scenes")):
+            for colour, fold in (("#0072B2", "protocol"), ("#D55E00", "with_scenes")):
                 scenes = metrics["folds"][fold]["splits"][role]["per_scene"]
                 for scene, scores in scenes.items():
                     if scores[key] is not None:
@@ -262,7 +262,7 @@ def test_the_figure_says_simulated_what_was_trained_on_and_where_no_slip_is(draw
         for line in dots_of(false_slips)
         if line.get_markerfacecolor() == "white"
     ]
-    assert sorted(hollow) == [("#0072B2", 0), ("#D55E00", 0), ("#D55E00", 1)]
+    assert sorted(hollow) == [("#0072B2", 1), ("#0072B2", 2), ("#D55E00", 2)]
     assert [text.get_text() for text in found.texts] == ["no slip in this scene"]
     assert not false_slips.texts
 

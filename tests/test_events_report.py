@@ -96,15 +96,6 @@ def test_one_row_for_each_role_and_rule():
     assert "SIMULATED" not in events_table(metrics_of(events, simulated=False))
 
 
-def test_of_an_hour_or_more_false_alarms_are_by_the_hour():
-    for quiet_s, unit in ((3500.0, "/min"), (7200.0, "/h")):
-        numbers = numbers_of(quiet_s=quiet_s)
-        cells = cells_of(events_table(metrics_of({"r": {"x": numbers}})).splitlines()[-1])
-        name = "false_alarms_per_hour" if unit == "/h" else "false_alarms_per_minute"
-        assert cells[8].startswith(f"{numbers[name]['value']:.1f} {unit} ["), cells
-        assert cells[9].endswith(" h" if unit == "/h" else " min")
-
-
 def test_parts_of_the_delay_are_told_where_compute_was_measured():
     plain = {"test": {"rule": numbers_of()}}
     assert "look-ahead" not in events_table(metrics_of(plain))
@@ -143,19 +134,6 @@ def test_the_figure_is_drawn_and_says_simulated(tmp_path, simulated, monkeypatch
     events_figure(metrics_of(events, simulated), tmp_path / "events.png")
     assert_drawn_atomically(tmp_path / "events.png")
     assert ("SIMULATED" in words[0]) == simulated
-
-
-def test_the_line_of_a_rule_rises_to_what_it_found(tmp_path, monkeypatch):
-    drawn = []
-    plot = "matplotlib.axes.Axes.plot"
-    monkeypatch.setattr(plot, lambda self, x, y, *_, **__: drawn.append((x, y)))
-    numbers = numbers_of()
-    events_figure(metrics_of({"test": {"x": numbers}}), tmp_path / "events.png")
-    (delays, shares), (median, half) = drawn
-    assert delays == numbers["delay_ms"]["quantiles"]
-    found = 100 * numbers["found"]["value"]
-    np.testing.assert_allclose(shares, np.linspace(0, found, 21))
-    assert (median, half) == (numbers["delay_ms"]["median"]["value"], found / 2)
 
 
 def test_a_rule_has_one_line_in_the_legend_however_it_is_written(tmp_path, monkeypatch):

@@ -103,17 +103,6 @@ def test_groups_equal_the_scores_of_their_own_bins_and_add_up() -> None:
     assert set(scores) == SCORE_KEYS | {"per_material", "per_speed"}
 
 
-def test_scenes_are_groups_as_materials_are() -> None:
-    truth, predicted = random_bins(5)
-    scenes = [("taps", "paper")[i % 2] for i in range(len(truth))]
-    scores = bin_metrics(truth, predicted, scenes, [20.0] * len(truth), scenes)
-    alone = bin_metrics(truth, predicted, scenes, [20.0] * len(truth))
-    assert scores["per_scene"] == alone["per_material"]
-    assert list(scores["per_scene"]) == ["taps", "paper"]
-    one = bin_metrics(truth, predicted, scenes, [20.0] * len(truth), ["paper"] * len(truth))
-    assert list(one["per_scene"]) == ["paper"]
-
-
 def test_of_several_scenes_groups_count_the_papers_bins_alone() -> None:
     truth, predicted = random_bins(7)
     num = len(truth)
@@ -174,12 +163,6 @@ def test_recall_by_position_is_the_share_of_right_bins_there(rng: np.random.Gene
     assert json.loads(json.dumps(scores, allow_nan=False)) == scores
 
 
-def test_positions_without_bins_are_left_out() -> None:
-    truth = torch.tensor([False, True, True])
-    scores = bin_metrics(truth, truth, ["a"] * 3, [20.0] * 3, positions=[-1, 19, None])
-    assert list(scores["per_position"]) == ["-1", "19"]
-
-
 def test_merged_scores_equal_those_of_all_bins_together(rng: np.random.Generator) -> None:
     truth, predicted = random_bins(4)
     materials = ["ABS" if i < 200 else "iron" for i in range(len(truth))]  # iron: second part only
@@ -215,12 +198,6 @@ def test_no_bins_give_no_scores() -> None:
     scores = bin_metrics(nothing, nothing, [], [])
     assert scores["confusion"] == [[0, 0], [0, 0]]
     assert [scores[key] for key in ("accuracy", "balanced_accuracy", "num_bins")] == [None, None, 0]
-
-
-def test_scores_are_strict_json() -> None:
-    truth, predicted = torch.ones(3, dtype=torch.bool), torch.tensor([True, False, True])
-    scores = bin_metrics(truth, predicted, ["ABS"] * 3, [20.0] * 3)
-    assert json.loads(json.dumps(scores, allow_nan=False)) == scores
 
 
 def test_wrong_input_is_named() -> None:
@@ -280,11 +257,6 @@ def test_splits_table_has_ours_and_the_papers_numbers() -> None:
     assert len(widths) == 1  # aligned
 
 
-def test_measured_data_is_not_called_simulated() -> None:
-    metrics = metrics_of(simulated=False)
-    assert "simulated" not in (splits_table(metrics) + materials_table(metrics)).lower()
-
-
 def test_a_split_unknown_to_the_paper_stands_alone_and_none_is_a_dash() -> None:
     scores = split_metrics([[0, 0], [1, 3]])
     rows = rows_of(splits_table({"simulated": False, "splits": {"validation": scores}}))
@@ -314,14 +286,6 @@ def test_materials_table_has_scenes_where_there_are_several() -> None:
             "20 mm/s",
             *expected,
         ]
-
-
-def test_bins_of_no_stroke_are_called_so() -> None:
-    truth, predicted = random_bins(8)
-    speeds = [(0.0, 20.0)[i % 2] for i in range(len(truth))]
-    scores = bin_metrics(truth, predicted, ["a"] * len(truth), speeds)
-    table = materials_table({"simulated": False, "splits": {"test": scores}})
-    assert [row[-6] for row in rows_of(table)[1:]] == ["a", "no stroke", "20 mm/s"]
 
 
 def test_timing_table_takes_a_given_total() -> None:

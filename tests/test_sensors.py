@@ -21,11 +21,11 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.report.importance import (
     _fingers,
     best_table,
-    kind_colours,
     sensors_csv,
     sensors_figure,
     sensors_table,
 )
+from tactslip_torch.report.style import kind_colours
 
 SMALL = ("bins=20", "judged_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
 CHANNELS = ["SG1", "SG2", "PVDF1", "PVDF2"]

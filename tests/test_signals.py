@@ -9,9 +9,9 @@ from matplotlib.colors import to_rgba
 from PIL import Image
 
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.report.onset import envelope
+from tactslip_torch.report.onset import envelope, lane_height
 from tactslip_torch.report.recordings import (
-    SignalRow,
+    DrawnRecording,
     channel_colours,
     draw_signals,
     signals_figure,
@@ -28,7 +28,7 @@ def row(title="M1", num_samples=16000, seed=0, **truth):
     rng = np.random.default_rng(seed)
     volts = 0.01 * rng.standard_normal((24, num_samples)) + np.linspace(-1, 2, 24)[:, None]
     volts[np.arange(24), rng.integers(0, num_samples, 24)] += 0.7
-    return SignalRow(title, torch.from_numpy(volts), RATE_HZ, **truth)
+    return DrawnRecording(title, torch.from_numpy(volts), RATE_HZ, **truth)
 
 
 def lines_of(axes):
@@ -81,13 +81,6 @@ def test_an_envelope_is_samples_in_order_with_every_extreme(
                 assert (np.nanmin(drawn), np.nanmax(drawn)) == (np.nanmin(part), np.nanmax(part))
 
 
-def test_a_short_signal_comes_back_whole():
-    values = np.arange(20.0).reshape(2, 10)
-    places, seen = envelope(values, 5)
-    np.testing.assert_array_equal(seen, values)
-    np.testing.assert_array_equal(places, [range(10)] * 2)
-
-
 # What is drawn -------------------------------------------------------------------------------
 
 
@@ -107,7 +100,7 @@ def test_lines_hold_the_samples_and_their_extremes():
     drawn = row()
     figure = draw_signals([drawn], CHANNELS, title="")
     measured, gauges, films = figure.axes
-    volts = drawn.volts.numpy()
+    volts, scales = drawn.samples.numpy(), {}
     for index, name in enumerate(HAND.names):
         own = volts[index]
         if name in GAUGES:
@@ -118,7 +111,8 @@ def test_lines_hold_the_samples_and_their_extremes():
             assert (places[0] < 20, places[-1] > len(own) - 20) == (True, True)
         panel = gauges if name in GAUGES else films
         lane = lines_of(panel)[name].get_ydata()
-        assert np.ptp(lane) == pytest.approx(np.ptp(own), rel=1e-12)  # the burst is there
+        scale = np.ptp(own) / np.ptp(lane)  # the burst is there, all lanes on one scale
+        assert scale == pytest.approx(scales.setdefault(panel, scale), rel=1e-12)
         assert len(lane) < len(own) / 5
 
 
@@ -134,18 +128,19 @@ def test_lanes_have_their_offset_removed_and_one_scale():
     assert steps[0] < 0  # the first lane on top
     for name in FILMS:
         middle = np.median(lines_of(films)[name].get_ydata())
-        assert middle == pytest.approx(ticks[name], abs=0.01)
+        assert middle == pytest.approx(ticks[name], abs=0.05)
     (bar,) = [line for line in films.lines if line.get_linewidth() == 2]
     (words,) = [text.get_text() for text in films.texts]
-    assert words == f"{np.ptp(bar.get_ydata()):g} V"
+    height = lane_height(list(drawn.samples[14:].numpy()))
+    assert words == f"{height * np.ptp(bar.get_ydata()):g} V"
     assert set(words) <= set("0125. V")
 
 
 def test_quiet_and_missing_channels_are_drawn_without_a_warning():
     drawn = row(num_samples=2000)
-    drawn.volts[3] = torch.nan
-    drawn.volts[14:] = 0.25
-    drawn.volts[20, 100:200] = torch.inf
+    drawn.samples[3] = torch.nan
+    drawn.samples[14:] = 0.25
+    drawn.samples[20, 100:200] = torch.inf
     _, gauges, films = draw_signals([drawn], CHANNELS, title="").axes
     assert np.isnan(lines_of(gauges)[HAND.names[3]].get_ydata()).all()
     lanes = lines_of(films)
@@ -156,7 +151,7 @@ def test_quiet_and_missing_channels_are_drawn_without_a_warning():
 def test_onsets_are_marked_and_slides_and_handling_shaded_apart():
     truth = {
         "onsets_s": (2.125, 5.0),
-        "sliding_s": ((2.125, 4.0), (5.0, 6.5)),
+        "slip_s": ((2.125, 4.0), (5.0, 6.5)),
         "non_slip_s": ((6.75, 7.5),),
     }
     figure = draw_signals([row(**truth)], CHANNELS, title="")
@@ -169,20 +164,11 @@ def test_onsets_are_marked_and_slides_and_handling_shaded_apart():
         assert first[2] == second[2] != handled[2]
     words = [text.get_text() for text in figure.legends[0].get_texts()]
     assert words[:5] == ["little", "ring", "middle", "index", "thumb"]
-    assert words[-3:] == ["onset of slip, exact", "the contact slides", "handled, no slip"]
-
-
-def test_without_onset_nothing_is_called_slip():
-    figure = draw_signals([row(non_slip_s=((1.0, 2.0),))], CHANNELS, title="")
-    assert lasting(figure.axes[0]) == []
-    assert "handled, no slip" in [text.get_text() for text in figure.legends[0].get_texts()]
-    assert not {"onset of slip, exact", "the contact slides"} & {
-        text.get_text() for text in figure.legends[0].get_texts()
-    }
+    assert words[-3:] == ["onset of slip", "slip", "non-slip"]
 
 
 def test_a_view_shows_its_stretch_alone():
-    truth = {"onsets_s": (2.0, 5.0), "sliding_s": ((2.0, 4.0), (5.0, 6.5))}
+    truth = {"onsets_s": (2.0, 5.0), "slip_s": ((2.0, 4.0), (5.0, 6.5))}
     drawn = row(**truth)
     axes = draw_signals([drawn], CHANNELS, title="", views=[(3.0, 4.5)]).axes[0]
     assert axes.get_xlim() == (3.0, 4.5)
@@ -208,7 +194,7 @@ def test_a_view_shows_its_stretch_alone():
 )
 def test_five_seconds_around_a_stroke(truth, stroke, view):
     slides = tuple((onset, onset + 0.5) for onset in truth.get("onsets_s", ()))
-    assert row(sliding_s=slides, **truth).around(stroke, 2.0, 3.0) == view
+    assert row(slip_s=slides, **truth).around(stroke, 2.0, 3.0) == view
 
 
 def test_fingers_are_told_apart_by_colour_and_segments_by_paleness():
@@ -221,13 +207,6 @@ def test_fingers_are_told_apart_by_colour_and_segments_by_paleness():
     assert min(apart) > 0.3
 
 
-def test_a_hand_of_films_alone_is_drawn():
-    films = [channel for channel in CHANNELS if channel["kind"] == "PVDF"]
-    drawn = SignalRow("a", torch.randn(10, 200), RATE_HZ)
-    (axes,) = draw_signals([drawn], films, title="").axes
-    assert tuple(lines_of(axes)) == FILMS
-
-
 def test_other_kinds_stand_in_columns_by_how_they_adapt():
     ways = {"electrode": "fast", "force": "slow", "SG": None, "PVDF": None}
     channels = [
@@ -237,7 +216,7 @@ def test_other_kinds_stand_in_columns_by_how_they_adapt():
     ]
     volts = torch.randn(8, 200)
     rows = HandLayout(channels).to_rows()
-    axes = draw_signals([SignalRow("a", volts, RATE_HZ, units="counts")], rows, title="").axes
+    axes = draw_signals([DrawnRecording("a", volts, RATE_HZ, units="counts")], rows, title="").axes
     kinds = ["force", "force", "SG", "SG", "electrode", "PVDF"]
     assert [one.get_title().split(",")[0] for one in axes] == kinds
     for one, kind in zip(axes, kinds, strict=True):
@@ -247,18 +226,11 @@ def test_other_kinds_stand_in_columns_by_how_they_adapt():
     assert {text.get_text().split()[1] for one in axes for text in one.texts} == {"counts"}
 
 
-def test_a_figure_of_many_channels_has_room_for_their_names():
-    channels = [Channel(f"e{i}", "electrode", "index", "distal", "fast") for i in range(40)]
-    drawn = SignalRow("a", torch.randn(40, 200), RATE_HZ)
-    figure = draw_signals([drawn], HandLayout(channels).to_rows(), title="")
-    assert figure.get_figheight() > 40 * 7 / 72  # names are 6.5 points high
-
-
 def test_rows_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="no recording to draw"):
         draw_signals([], CHANNELS, title="")
     with pytest.raises(ValueError, match="M1 has 3 channels, not 24"):
-        draw_signals([SignalRow("M1", torch.zeros(3, 200), RATE_HZ)], CHANNELS, title="")
+        draw_signals([DrawnRecording("M1", torch.zeros(3, 200), RATE_HZ)], CHANNELS, title="")
     with pytest.raises(ValueError, match="views must be one per row, got 0 for 1"):
         draw_signals([row()], CHANNELS, title="", views=[])
 
@@ -266,7 +238,7 @@ def test_rows_that_do_not_fit_are_refused():
 def test_the_file_is_a_small_picture_of_the_figure(tmp_path):
     path = tmp_path / "signals.png"
     path.write_bytes(b"before")
-    rows = [row(f"M{i}", 30000, i, onsets_s=(3.0,), sliding_s=((3.0, 9.0),)) for i in range(1, 7)]
+    rows = [row(f"M{i}", 30000, i, onsets_s=(3.0,), slip_s=((3.0, 9.0),)) for i in range(1, 7)]
     signals_figure(rows, CHANNELS, path, title="SIMULATED")
     assert path.stat().st_size < 1e6
     with Image.open(path) as image:

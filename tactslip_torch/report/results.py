@@ -442,9 +442,10 @@ def _stacked(
     totals = np.zeros(len(columns), dtype=int)
     for layer, colour in colours.items():
         lengths = np.array([counts.get((layer, column), 0) for column in columns])
-        has = lengths > 0  # an empty bar would still draw its outline
+        has = np.full(len(columns), True)
         style: dict[str, Any] = {"color": colour, "label": layer}
         if is_hatched:
+            has = lengths > 0  # an empty bar would still draw its outline
             style = {"facecolor": "white", "edgecolor": colour, "hatch": "////"}
             style["label"] = f"{layer}, paper"
         if is_horizontal:
@@ -684,6 +685,7 @@ def _draw_scales(axes: Axes, scales: Mapping[str, float]) -> None:
     axes.set_xlabel("features, by scale")
     axes.set_ylabel("scale in the kernel")
     axes.set_title("learned scales: soft selection", fontsize=10)
+    clean(axes, "y")
 
 
 # Confounders: scenes that have motion without slip, or slip without motion ------------------------
@@ -740,9 +742,17 @@ def _scene_scores(metrics: Mapping[str, Any]) -> Iterator[_SceneScores]:
 def confound_table(metrics: Mapping[str, Any]) -> str:
     """Bins, recalls and balanced accuracy of each detector on each kind of scene, held out.
 
-    One row per split, scene and detector; detectors on the same bins are beside. ``trained on it``
-    says whether other cycles of that scene were trained on, ``-`` where the results do not tell. A
-    class without bins has the recall ``-``.
+    Args:
+        metrics: the content of ``metrics.json``.
+    """
+    return marked(metrics["simulated"], table(confound_rows(metrics), num_left=4))
+
+
+def confound_rows(metrics: Mapping[str, Any]) -> list[list[str]]:
+    """A header and one row per split, scene and detector; detectors on the same bins are beside.
+
+    ``trained on it`` says whether other cycles of that scene were trained on, ``-`` where the
+    results do not tell. A class without bins has the recall ``-``.
 
     Args:
         metrics: the content of ``metrics.json``.
@@ -754,7 +764,7 @@ def confound_table(metrics: Mapping[str, Any]) -> str:
         keys = ("non_slip_recall", "slip_recall", "balanced_accuracy")
         cells = [str(scores["num_bins"]), *(percent(scores[key]) for key in keys)]
         rows.append([role, scene, detector, trained, *cells])
-    return marked(metrics["simulated"], table(rows, num_left=4))
+    return rows
 
 
 def confound_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
@@ -768,11 +778,11 @@ def confound_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
         path: the PNG to write, replaced as a whole if it exists.
 
     Raises:
-        ValueError: if there are no several kinds of scenes to compare.
+        ValueError: if there are no several kinds of scenes.
     """
     scored = list(_scene_scores(metrics))
     if not scored:
-        raise ValueError("metrics has no several kinds of scenes to compare")
+        raise ValueError("metrics has no split with several kinds of scenes to draw")
     roles, scenes = (list(dict.fromkeys(column)) for column in list(zip(*scored, strict=True))[:2])
     colours = colours_of(one.detector for one in scored)
     height = 1.7 + len(roles) * (0.8 + 0.28 * len(scenes))
@@ -1075,10 +1085,11 @@ def events_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
     if not events:
         raise ValueError("metrics has no events to draw")
     rules = dict.fromkeys(rule for by_rule in events.values() for rule in by_rule)
-    styles: dict[str, dict[str, Any]] = {
-        rule: {"color": PALETTE[place % len(PALETTE)], "ls": ("-", "--", ":")[place // 7 % 3]}
-        for place, rule in enumerate(rules)
-    }
+    free = [colour for colour in PALETTE if colour not in _OUTCOMES.values()]
+    styles: dict[str, dict[str, Any]] = {}
+    for place, rule in enumerate(rules):
+        dash = ("-", "--", ":")[place // len(free) % 3]
+        styles[rule] = {"color": free[place % len(free)], "ls": dash}
     heights = [1.3 + 0.3 * max(2, len(by_rule)) for by_rule in events.values()]
     title = "Which slips are found, how late, and how many alarms are false"
     figure = new_figure(11.0, 1.3 + sum(heights), title, simulated=metrics["simulated"])

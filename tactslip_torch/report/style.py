@@ -6,7 +6,7 @@ on matplotlib's ``Figure`` objects, so that no window opens and no global state 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any, Literal
@@ -130,8 +130,3 @@ def kind_colours(kinds: Iterable[str]) -> dict[str, str]:
     """A colour for each kind of channel: blue for PVDF, orange for SG, others what is left."""
     left = cycle(colour for colour in PALETTE if colour not in _KIND_COLOURS.values())
     return {kind: _KIND_COLOURS.get(kind) or next(left) for kind in dict.fromkeys(kinds)}
-
-
-def series(rows: Iterable[Mapping[str, Any]], key: str, scale: float = 1.0) -> list[float]:
-    """One entry of each row as numbers to plot, NaN where it is None."""
-    return [float("nan") if row[key] is None else scale * row[key] for row in rows]
