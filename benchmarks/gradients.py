@@ -111,8 +111,9 @@ class Gradients(Benchmark[Sizes]):
             peer = _row(numbers, row["problem"], PEER)
             differs = "-"
             if peer is not None and row["way"] == OURS:
-                theirs = torch.tensor(peer["rounds"][0]["gradient"])
-                off = torch.tensor(first["gradient"]) - theirs
+                both = (first["gradient"], peer["rounds"][0]["gradient"])
+                ours, theirs = (torch.tensor(of, dtype=torch.float64) for of in both)
+                off = ours - theirs
                 differs = number(float((off.abs() / theirs.abs()).max()))
             backward = [of["backward_s"] for of in rounds if of["backward_s"] is not None]
             cells.append(
