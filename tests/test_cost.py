@@ -147,7 +147,8 @@ def test_measured_prices_are_of_this_machine():
     assert costs.facts()["groups"].keys() == GROUPS.keys()
     assert costs.rest_us >= 0
     assert costs.rest_of_one_us >= 0
-    assert costs.pooling_us + costs.pooling_of_one_us > 0
+    assert costs.pooling_us >= 0  # a difference of two timings: noise may hide it on a busy machine
+    assert costs.pooling_of_one_us >= 0
     few, many = (set().union(*parts(*names)) for names in (POOL.names[:1], POOL.names))
     assert 0 < costs.features_us(few) <= costs.features_us(many)
     assert costs.tail >= 1

@@ -10,8 +10,7 @@ from test_recipe import make_parts, surveyed, together
 from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.missing_channels import RESOLUTION
-from tactslip_torch.training import selection as planning
-from tactslip_torch.training import selection as validation
+from tactslip_torch.training import selection
 from tactslip_torch.training.fitting import TrainingPass
 from tactslip_torch.training.recipe import Recipe, recalls_mean
 from tactslip_torch.training.selection import Plan, plan_detector
@@ -79,7 +78,7 @@ def test_scores_are_calibrated_by_machines_that_never_met_the_group(rng):
 def test_scores_that_tell_slip_backwards_are_not_calibrated(rng, caplog):
     features, is_slip = together(make_parts(rng))
     bins = TrainingBins(features.double(), is_slip)
-    assert validation._calibration(-is_slip.double(), bins.is_slip, bins.weights) is None
+    assert selection._calibration(-is_slip.double(), bins.is_slip, bins.weights) is None
     assert "slip has the lower scores" in caplog.text
 
 
@@ -169,7 +168,7 @@ def test_thinned_bins_stand_for_all(change, balance, rng, monkeypatch, caplog):
     parts = make_parts(rng, cycles=5, bins=80, share=0.6)
     recipe = Recipe(**FEW | {"penalties": 0.01}, balance=balance, **change)
     whole = planned(recipe, parts)
-    monkeypatch.setattr(planning, "MOST_KEPT_BINS", 300)
+    monkeypatch.setattr(selection, "MOST_KEPT_BINS", 300)
     thinned = planned(recipe, parts)
     assert (whole.stands_for, thinned.num_bins) == (1.0, 300)
     assert thinned.stands_for == pytest.approx(whole.num_bins / 300, rel=1e-3)
@@ -181,7 +180,7 @@ def test_thinned_bins_stand_for_all(change, balance, rng, monkeypatch, caplog):
 
 
 def test_degree_one_takes_every_bin(rng, monkeypatch):
-    monkeypatch.setattr(planning, "MOST_KEPT_BINS", 50)
+    monkeypatch.setattr(selection, "MOST_KEPT_BINS", 50)
     parts = make_parts(rng)
     plan = planned(Recipe(**FEW, degree=1, balance="weights"), parts)
     gathered = passed(plan, parts)

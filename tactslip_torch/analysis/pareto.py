@@ -4,7 +4,7 @@ For each alignment of the filter, over groups of channels and of components, fea
 several ways; heads of several sizes and degrees are scored by closed-form validation, a material
 left out at a time, on a bounded sample of training bins. Ranking and scaling saw that material.
 Beside them, features pooled over channels, all or the best of them, validated by
-``model_selection``: everything is learned without the material left out. These scores choose, so
+``training.selection``: everything is learned without the material left out. These scores choose, so
 that of the one chosen is a little too good. Costs are modelled (``analysis.latency``) until the few
 that are left are timed, fitted and evaluated.
 """
@@ -275,7 +275,7 @@ class Search:
         pooled_components: groups, as above, of what is pooled over channels.
         statistics: over channels, each a list of ``pooling.STATISTICS``; none: nothing is pooled.
         pooled_sizes: numbers of pooled columns; ``None`` takes all: of many training bins
-            with degree 1 alone (``model_selection.candidates``).
+            with degree 1 alone (``training.selection.candidates``).
 
     Raises:
         ValueError: for a name that is none, an empty list, or a number out of range.

@@ -1,4 +1,4 @@
-"""The step of an even clock and the unit of its stamps, before gaps are known."""
+"""The even clock behind time stamps: its step, the unit of the stamps, gaps, and the rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""What a file holds, as one number that stands for it."""
+"""Folders of recordings in files as one source: looked at as a whole, refused with every reason.
+
+Each file is opened once for its channels, clock and unit, on one clock resampled where that is
+asked for, and checked against the others; what was seen is remembered. ``FileRecordings`` then
+loads recordings one by one.
+"""
 
 from __future__ import annotations
 

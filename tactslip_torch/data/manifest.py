@@ -1,6 +1,7 @@
-"""The lines of a manifest as a person wrote it, CSV or YAML, before anything is made of them.
+"""Manifests: which files a set has, of what, and what is known of slip in each.
 
-Nothing in the file is executed: of YAML only its nodes are read, as text and lists of text.
+A manifest is CSV or YAML. Nothing in it is executed: of YAML only its nodes are read, as text and
+lists of text.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files whose names say what they are, as a source: a pattern instead of a manifest.
+"""Sets whose layout is known: file names that say what they are, and the authors' raw files.
 
 Where a set is laid out as ``<class>/<object><trial>.csv``, a regular expression with named groups
 reads material, trial, scene and label from each path.

@@ -1,4 +1,8 @@
-"""Features of one recording: simulated or read, filtered, cut into bins, described, and cached."""
+"""From recordings to features of labelled bins: made by workers, cached, handed to Lightning.
+
+``FeatureMaker`` simulates or reads one recording, filters, cuts, describes and caches it;
+``SlipDataModule`` hands a split's recordings to the learner.
+"""
 
 from __future__ import annotations
 

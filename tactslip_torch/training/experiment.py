@@ -1,4 +1,4 @@
-"""What several folds found, as one result."""
+"""One experiment: features and trainer, and each fold fitted, tested, saved and exported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a second pass to a machine, in any order and on any number of workers."""
+"""From a second pass to a machine, in any order, on any number of workers and processes."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What a test says of a detector: decisions on labelled bins, as scores and as events.
+"""The Lightning module: two passes over training bins make a detector, a test pass evaluates it.
 
-Bins of a stroke in their order are a short stream: a rule makes alarms of the decisions, and these
-find a slip or do not. The detector was not made for these rules; they show what its errors would
-mean in use.
+A test tells of decisions on labelled bins as scores and as events. Bins of a stroke in their order
+are a short stream: a rule makes alarms of the decisions, and these find a slip or do not. The
+detector was not made for these rules; they show what its errors would mean in use.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class Recipe:
             ``group_scores``).
         validation: ``"held"``: features are ranked and scaled once for all validation folds;
             ``"nested"``: anew in each fold, and the choice is evaluated by leaving out two groups
-            (``model_selection``).
+            (``training.selection``).
         tolerance: choices within so much of the best balanced accuracy are as good: of them, the
             simplest machine with the strongest penalty is taken. For ``"nested"``.
         scene_weights: weight of a kind of scene beside the paper's: of all its bins of a class
