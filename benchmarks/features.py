@@ -27,7 +27,7 @@ from benchmarks.harness import (
     number,
     on_threads,
 )
-from benchmarks.peers import arrays, loop, others
+from benchmarks.peers import arrays, loop, others, rockets
 from benchmarks.subjects import FLOAT32, FLOAT64, labelled_bins
 from tactslip_torch import FeatureExtractor, FeaturePool, HandLayout
 
@@ -69,7 +69,7 @@ class Features(Benchmark[Sizes]):
         some, _ = labelled_bins(1)
         bins = some[torch.arange(sizes.bins) % len(some)].clone()
         few = bins[: sizes.slow_bins]
-        rocket = others.mini_rocket(bins[:64].numpy(), sizes.threads, sizes.num_kernels)
+        rocket = rockets.mini_rocket(bins[:64].numpy(), sizes.threads, sizes.num_kernels)
         names = [(n.channel, n.component, n.domain, n.descriptor) for n in FeaturePool(HAND).names]
         windows = bins.float().numpy()
         ways: dict[str, tuple[int, Callable[[], Any]]] = {

@@ -34,7 +34,7 @@ from benchmarks.harness import (
     on_threads,
     say,
 )
-from benchmarks.peers import loop, others
+from benchmarks.peers import loop, others, rockets
 from benchmarks.subjects import (
     FLOAT32,
     FLOAT64,
@@ -204,8 +204,7 @@ def _loop(main: MainJobDetector) -> Score:
 def _rocket(sizes: Sizes) -> Score:
     bins, is_slip = labelled_bins(sizes.recordings)
     say("latency: MiniRocket")
-    targets = np.where(is_slip.numpy(), 1.0, -1.0)
-    scores = others.mini_rocket_ridge(bins.numpy(), targets, 1, sizes.num_kernels)
+    scores = rockets.fit(bins.numpy(), is_slip.numpy(), num_kernels=sizes.num_kernels).score
     filters = ChannelFilter(WINDOW_LENGTHS)
     return lambda samples: scores(filters.valid(samples.double()).float().numpy())
 

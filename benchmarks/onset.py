@@ -34,7 +34,7 @@ from benchmarks.harness import (
     percent,
     say,
 )
-from benchmarks.peers.others import mini_rocket_ridge
+from benchmarks.peers import rockets
 from benchmarks.reproduction.runs import run
 from benchmarks.subjects import Array, Trained, composed
 from tactslip_torch import AlarmSettings, FeaturePool, Judgement, SlipDetector, StreamingDetector
@@ -274,9 +274,9 @@ def _peers(
     some = [trained.recordings("train")[at] for at in order[: sizes.peer_recordings]]
     made = [trained.maker.filtered_bins(recording) for recording in some]
     windows = torch.cat([bins for bins, _ in made]).float().numpy()
-    targets = torch.cat([torch.where(laid.is_slip, 1.0, -1.0) for _, laid in made]).numpy()
+    is_slip = torch.cat([laid.is_slip for _, laid in made]).numpy()
     say(f"onset: MiniRocket and ridge on {len(windows)} bins")
-    scores = mini_rocket_ridge(windows, targets, 1, sizes.num_kernels)
+    scores = rockets.fit(windows, is_slip, num_kernels=sizes.num_kernels).score
     shared = partial(_RocketDetector, detector.pool, detector.channel_filter)
     baselines: dict[str, Scorer] = {
         name: BaselineDetector(key, detector.pool, detector.channel_filter)

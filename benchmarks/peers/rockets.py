@@ -1,7 +1,6 @@
 """MiniRocket, and MultiRocket with Hydra: random convolutions of windows, then ridge.
 
-The strongest general classifiers of time series that fit in seconds. The penalty of the ridge is
-chosen by leaving groups out, such as materials or objects, unless said otherwise.
+The strongest general classifiers of time series that fit in seconds. aeon makes the convolutions.
 """
 
 from __future__ import annotations
@@ -13,16 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from scipy.linalg import eigh
+from sklearn.linear_model import RidgeClassifier, RidgeClassifierCV
+from sklearn.metrics import balanced_accuracy_score
+from sklearn.preprocessing import StandardScaler
 
-from benchmarks.peers.others import Array, mini_rocket, quiet
-from benchmarks.real.inner import best_choice
-from benchmarks.real.ridge import balanced_weights, ridge_scores
+from benchmarks.peers.others import Array, quiet
 
 ALPHAS = np.logspace(-3, 5, 17)
 MINI_ROCKET = "MiniRocket"
 MULTI_ROCKET_HYDRA = "MultiRocketHydra"
 _CONVOLUTIONS = "aeon.transformations.collection.convolution_based"
-Score = Callable[[Array], Array]
+Transform = Callable[[Array], Array]
 
 
 class Predictor(NamedTuple):
@@ -33,134 +33,121 @@ class Predictor(NamedTuple):
         alpha: penalty of the ridge.
     """
 
-    score: Score
+    score: Transform
     alpha: float
-
-
-class Convolved(NamedTuple):
-    """Features of windows.
-
-    Attributes:
-        transform: from windows ``[N, C, T]`` to rows ``[N, F]``.
-        is_scaled: whether rows are scaled already; if not, ridge standardises them.
-    """
-
-    transform: Score
-    is_scaled: bool
 
 
 def fit(
     windows: Array,
     is_slip: Array,
-    groups: Array,
+    groups: Array | None = None,
     *,
     name: str = MINI_ROCKET,
     seed: int = 0,
     num_kernels: int | None = None,
+    num_groups: int = 64,
 ) -> Predictor:
-    """Fit a classifier of windows, its penalty chosen by leaving groups out.
+    """Fit a classifier of windows with balanced classes.
 
     Args:
         windows: in any unit; a window's own scale matters.
         is_slip: bool.
-        groups: what is left out together, such as materials.
+        groups: what is left out together to choose the penalty, such as materials; by default it
+            is chosen by leaving out single windows.
         name: ``MINI_ROCKET`` or ``MULTI_ROCKET_HYDRA``.
         seed: of the kernels.
         num_kernels: of MiniRocket or MultiRocket; their authors' by default.
+        num_groups: of Hydra's kernels, eight each, for every dilation.
 
     Shape:
         - windows: ``[N, C, T]``; is_slip, groups: ``[N]``
     """
-    convolved = convolve(windows, name, seed, num_kernels)
+    if name == MINI_ROCKET:
+        rocket = mini_rocket(windows, 1, num_kernels or 10_000, seed)
+        scaler = StandardScaler().fit(rocket.transform(_single(windows)))
+        transform: Transform = lambda x: scaler.transform(rocket.transform(_single(x)))  # noqa: E731
+    else:
+        transform = _multi_rocket_hydra(windows, seed, num_kernels or 6_250, num_groups)
     with quiet():
-        rows = convolved.transform(windows)
-        ridge, alpha = ridge_by_groups(rows, is_slip, groups, convolved.is_scaled)
-    return predictor(convolved, ridge, alpha)
-
-
-def predictor(convolved: Convolved, ridge: Any, alpha: float) -> Predictor:
-    """From windows to scores by features and a fitted ridge."""
+        rows = transform(windows)
+        if groups is None:
+            ridge = RidgeClassifierCV(ALPHAS, class_weight="balanced").fit(rows, is_slip)
+            alpha = float(ridge.alpha_)
+        else:
+            alpha = _best_alpha((rows @ rows.T).astype(np.float64), is_slip, groups)
+            ridge = RidgeClassifier(alpha, class_weight="balanced").fit(rows, is_slip)
 
     def score(windows: Array) -> Array:
         with quiet():
-            found: Array = ridge.decision_function(convolved.transform(windows))
+            found: Array = ridge.decision_function(transform(windows))
         return found
 
     return Predictor(score, alpha)
 
 
-def convolve(
-    windows: Array, name: str, seed: int = 0, num_kernels: int | None = None, num_groups: int = 64
-) -> Convolved:
-    """Features fitted to training windows ``[N, C, T]``, without labels.
+def mini_rocket(windows: Array, threads: int, num_kernels: int = 10_000, seed: int = 0) -> Any:
+    """MiniRocket's transform, fitted and compiled.
 
     Args:
-        windows: of training.
-        name: ``MINI_ROCKET`` or ``MULTI_ROCKET_HYDRA``.
-        seed: of the kernels.
-        num_kernels: of MiniRocket or MultiRocket; their authors' by default.
-        num_groups: of Hydra's kernels, eight each, for every dilation.
+        windows: ``[N, C, n]``; it takes quantiles of their convolutions.
+        threads: of its transform.
+        num_kernels: about as many features.
+        seed: of what it draws: channels of a kernel, and windows for the quantiles.
     """
-    if name == MINI_ROCKET:
-        made = mini_rocket(windows, 1, num_kernels or 10_000, seed)
-        return Convolved(lambda x: np.asarray(made.transform(_single(x))), False)
-    return Convolved(_multi_rocket_hydra(windows, seed, num_kernels or 6_250, num_groups), True)
+    with quiet():
+        import numba
+
+        numba.config.THREADING_LAYER = "workqueue"  # that by OpenMP sets the threads of torch too
+        transform = import_module(_CONVOLUTIONS).MiniRocket(
+            n_kernels=num_kernels, n_jobs=threads, random_state=seed
+        )
+        transform.fit(_single(windows))
+        transform.transform(_single(windows[:2]))
+    return transform
 
 
-def _multi_rocket_hydra(windows: Array, seed: int, num_kernels: int, num_groups: int) -> Score:
+def _multi_rocket_hydra(windows: Array, seed: int, num_kernels: int, num_groups: int) -> Transform:
     """As aeon's ``MultiRocketHydraClassifier``: both transforms, each with a scaler of its own."""
-    from sklearn.preprocessing import StandardScaler
-
     threads = torch.get_num_threads()
     with quiet(), torch.random.fork_rng([]):
         import numba
 
-        numba.config.THREADING_LAYER = "workqueue"  # that by OpenMP sets the threads of torch too
-        convolutions = import_module(_CONVOLUTIONS)
+        numba.config.THREADING_LAYER = "workqueue"
         hydra = import_module(f"{_CONVOLUTIONS}._hydra").HydraTransformer(
             n_groups=num_groups, random_state=seed
         )
-        rocket = convolutions.MultiRocket(n_kernels=num_kernels, random_state=seed)
-        x = _single(windows)
-        counts = hydra.fit_transform(x)
+        rocket = import_module(_CONVOLUTIONS).MultiRocket(n_kernels=num_kernels, random_state=seed)
+        counts = hydra.fit_transform(_single(windows))
         torch.set_num_threads(threads)  # which Hydra sets
         of_hydra = import_module("aeon.classification.convolution_based._hydra")._SparseScaler()
         of_hydra.fit(counts)
-        of_rocket = StandardScaler().fit(rocket.fit_transform(x))
+        of_rocket = StandardScaler().fit(rocket.fit_transform(_single(windows)))
 
     def transform(others: Array) -> Array:
-        x = _single(others)
         with quiet():
-            counts = of_hydra.transform(hydra.transform(x)).numpy()
-            values = of_rocket.transform(rocket.transform(x))
+            counts = of_hydra.transform(hydra.transform(_single(others))).numpy()
+            values = of_rocket.transform(rocket.transform(_single(others)))
         return np.concatenate([counts, values], 1, dtype=np.float32)
 
     return transform
 
 
-def ridge_by_groups(
-    rows: Array, is_slip: Array, groups: Array, is_scaled: bool = False
-) -> tuple[Any, float]:
-    """Ridge on rows ``[n, F]``, its penalty by leaving each group out, and that penalty."""
-    from sklearn.linear_model import RidgeClassifier
-
-    products = (rows @ rows.T).astype(np.float64) if is_scaled else None
-
-    def trial(train: Array, held: Array) -> list[Array]:
-        if products is None:
-            return list(ridge_scores(rows[train], is_slip[train], rows[held], ALPHAS))
-        parts = products[np.ix_(train, train)], products[np.ix_(held, train)]
-        return list(ridge_scores_of_products(*parts, is_slip[train], ALPHAS))
-
-    best, _ = best_choice(trial, is_slip, groups, len(set(groups.tolist())))
-    made = scaled(RidgeClassifier(ALPHAS[best], class_weight="balanced"), is_scaled)
-    return made.fit(rows, is_slip), float(ALPHAS[best])
+def _best_alpha(products: Array, is_slip: Array, groups: Array) -> float:
+    """The penalty with the best balanced accuracy, each group left out in turn."""
+    scores = np.empty((len(ALPHAS), len(is_slip)))
+    for group in np.unique(groups):
+        held, train = groups == group, groups != group
+        inner, outer = products[np.ix_(train, train)], products[np.ix_(held, train)]
+        scores[:, held] = ridge_scores(inner, outer, is_slip[train], ALPHAS)
+    accuracies = [balanced_accuracy_score(is_slip, of >= 0) for of in scores]
+    return float(ALPHAS[int(np.argmax(accuracies))])
 
 
-def ridge_scores_of_products(products: Array, known: Array, is_slip: Array, alphas: Array) -> Array:
+def ridge_scores(products: Array, known: Array, is_slip: Array, alphas: Array) -> Array:
     """Ridge regression to +-1 with balanced classes, from inner products of rows alone.
 
-    As ``RidgeClassifier(class_weight="balanced")``; rows are centred, not scaled.
+    As ``RidgeClassifier(class_weight="balanced")``. There are fewer rows than features, so one
+    eigendecomposition of their inner products does for all penalties.
 
     Args:
         products: of training rows.
@@ -172,7 +159,8 @@ def ridge_scores_of_products(products: Array, known: Array, is_slip: Array, alph
         - products: ``[n, n]``; known: ``[m, n]``; is_slip: ``[n]``; alphas: ``[A]``
         - output: ``[A, m]``; at least 0 means slip
     """
-    target, weight = np.where(is_slip, 1.0, -1.0), balanced_weights(is_slip)
+    number, target = len(is_slip), np.where(is_slip, 1.0, -1.0)
+    weight = np.where(is_slip, number / is_slip.sum(), number / (~is_slip).sum()) / 2
     middle = products @ (weight / weight.sum())  # with the weighted mean of rows
     level = middle @ (weight / weight.sum())
     away = known @ (weight / weight.sum())
@@ -182,14 +170,6 @@ def ridge_scores_of_products(products: Array, known: Array, is_slip: Array, alph
     wanted = vectors.T @ (root * target)  # balanced: the weighted mean of targets is 0
     others = (known - middle - away[:, None] + level) * root @ vectors
     return np.stack([others @ (wanted / (values.clip(0) + alpha)) for alpha in alphas])
-
-
-def scaled(ridge: Any, is_scaled: bool = False) -> Any:
-    """It, with a ``StandardScaler`` before it unless rows are scaled already."""
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-
-    return make_pipeline(*([] if is_scaled else [StandardScaler()]), ridge)
 
 
 def _single(windows: Array) -> Array:

@@ -1,1 +1,0 @@
-"""The benchmark on real recordings: ours and baselines, each object left out in turn."""
