@@ -11,8 +11,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from benchmarks.commands import result_of, table_of, take_figures
-from benchmarks.harness import Benchmark, Job, Report, Table
+from benchmarks.harness import Benchmark, Job, Report, Table, result_of, take_figures
 from benchmarks.onset import QUICK_STREAMS, QUICK_TRAINING
 from tactslip_torch.report.results import kept_rows, promise_line, scene_rows
 
@@ -51,8 +50,8 @@ class Alarms(Benchmark[Sizes]):
         about = f"Seed {numbers['seed']}, a decision every {hop_ms:g} ms; {promise_line(numbers)}."
         confounders = "By the same threshold; the methods to the right by theirs."
         return {
-            "Alarms": table_of(kept_rows(numbers), about),
-            "Confounders": table_of(scene_rows(numbers), confounders),
+            "Alarms": Table.of(kept_rows(numbers), about),
+            "Confounders": Table.of(scene_rows(numbers), confounders),
         }
 
     def section(self, report: Report) -> str:

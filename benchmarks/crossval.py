@@ -11,8 +11,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from benchmarks.commands import result_of, table_of, take_figures
-from benchmarks.harness import Benchmark, Job, Report, Table
+from benchmarks.harness import Benchmark, Job, Report, Table, result_of, take_figures
 from tactslip_torch.report.crossval import material_rows, split_rows
 
 
@@ -58,8 +57,8 @@ class Crossval(Benchmark[Sizes]):
             f"{numbers['train_bins']} bins of each material and class."
         )
         return {
-            "By choice": table_of(split_rows(numbers), note),
-            "By material": table_of(material_rows(numbers)),
+            "By choice": Table.of(split_rows(numbers), note),
+            "By material": Table.of(material_rows(numbers)),
         }
 
     def section(self, report: Report) -> str:

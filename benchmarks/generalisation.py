@@ -30,8 +30,7 @@ from hydra.utils import instantiate
 from torch import Tensor
 
 from benchmarks import RESULTS, ROOT
-from benchmarks.harness import between_markers
-from benchmarks.reproduction.runs import code_digest, run
+from benchmarks.harness import between_markers, code_digest, trained
 from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split, unseen4
@@ -174,7 +173,9 @@ def seed_run(seed: int, folder: Path, cache: Path, name: str, *, quick: bool) ->
     """All measures of an experiment with one seed."""
     small = ["data.cycles=5"] if quick else []
     place = folder / f"{name}-{seed}"
-    metrics = run(f"{name}, seed {seed}", [f"+exp={name}", f"seed={seed}", *small], place, cache)
+    metrics = trained(
+        f"{name}, seed {seed}", [f"+exp={name}", f"seed={seed}", *small], place, cache
+    )
     detector = SlipDetector.load(place / "detector.pt")
     nested = metrics.get("nested_validation") or {}
     chosen = next(row for row in metrics["validation"] if row.get("chosen"))
@@ -257,7 +258,7 @@ def hard_run(seed: int, folder: Path, cache: Path, *, quick: bool) -> dict[str, 
         over = ["+exp=hard", f"recipe={recipe}", f"seed={seed}", "export=false"]
         over += ["data.cycles=5"] if quick else []
         place = folder / f"hard-{recipe}-{seed}"
-        metrics = run(f"hard, {recipe}, seed {seed}", over, place, cache)
+        metrics = trained(f"hard, {recipe}, seed {seed}", over, place, cache)
         found[f"recipe={recipe}"] = _by_role(metrics["splits"])
         if recipe == HARD_RECIPES[0]:
             nested = metrics.get("nested_validation") or {}

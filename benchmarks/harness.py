@@ -9,11 +9,13 @@ see that it runs, and touches no tracked file; ``--render`` writes the same from
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import platform
 import random
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -35,7 +37,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from threadpoolctl import threadpool_info, threadpool_limits  # type: ignore[import-untyped]
 
 from benchmarks import RESULTS, ROOT
-from benchmarks.reproduction.runs import code_digest
+from tactslip_torch.features.cache import source_digest
 from tactslip_torch.report import style
 from tactslip_torch.runtime import whole_file
 
@@ -199,6 +201,74 @@ def versions(more: Sequence[str] = ()) -> dict[str, str]:
     return found | {"BLAS": " and ".join([*known, *sorted(blas)])}
 
 
+# ------------------------------------------------------------------------------------- trainings
+_MADE_BY = "made_by.txt"
+
+
+def trained(name: str, overrides: Sequence[str], folder: Path, cache: Path) -> dict[str, Any]:
+    """The metrics of a run, from its folder if this code finished it there, else trained now.
+
+    Args:
+        name: for messages.
+        overrides: of ``tactslip_torch.train``.
+        folder: of its results.
+        cache: of features.
+
+    Raises:
+        RuntimeError: if the training fails.
+    """
+    made_by = " ".join([code_digest(), *overrides])
+    note = folder / _MADE_BY
+    if not note.exists() or note.read_text(encoding="utf-8") != made_by:
+        note.unlink(missing_ok=True)
+        command = [sys.executable, "-m", "tactslip_torch.train", *overrides]
+        command += ["export=false", f"cache={cache}", f"hydra.run.dir={folder}"]
+        print(f"{name}: {' '.join(command[1:])}", file=sys.stderr, flush=True)
+        done = subprocess.run(command, check=False, stdout=subprocess.DEVNULL)
+        if done.returncode:
+            raise RuntimeError(f"{name} failed; see above")
+        with whole_file(note) as temporary:
+            temporary.write_text(made_by, encoding="utf-8")
+    metrics: dict[str, Any] = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return metrics
+
+
+def code_digest() -> str:
+    """Of everything that decides a result: sources, calibrated knobs, configuration."""
+    digest = hashlib.sha256(source_digest(ROOT / "tactslip_torch").encode())
+    others = [*(ROOT / "tactslip_torch").rglob("*.json"), *(ROOT / "conf").rglob("*.yaml")]
+    for path in sorted(others):
+        digest.update(path.relative_to(ROOT).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def result_of(command: str, overrides: Sequence[str], folder: Path, name: str) -> dict[str, Any]:
+    """The JSON file ``name`` that ``tactslip COMMAND`` leaves in the folder.
+
+    Raises:
+        RuntimeError: if the command fails, which has said why.
+    """
+    made_by, note = " ".join([code_digest(), *overrides]), folder / "made_by.txt"
+    if not note.exists() or note.read_text(encoding="utf-8") != made_by:
+        given = ["-m", "tactslip_torch", command, *overrides, f"hydra.run.dir='{folder}'"]
+        say(" ".join(given))
+        done = subprocess.run([sys.executable, *given], stdout=subprocess.DEVNULL, check=False)
+        if done.returncode:
+            raise RuntimeError(f"tactslip {command} failed; see above")
+        write_text(note, made_by)
+    found: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
+    return found
+
+
+def take_figures(folder: Path, figures: Mapping[str, Path]) -> None:
+    """Copy figures of a run's folder, by their name there, to where they go."""
+    for name, path in figures.items():
+        if (folder / name).exists():
+            with whole_file(path) as temporary:
+                shutil.copy(folder / name, temporary)
+
+
 # ------------------------------------------------------------------------------------- tables
 class Spread(NamedTuple):
     """The median of some numbers and their quartiles."""
@@ -239,6 +309,11 @@ class Table(NamedTuple):
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[str]], note: str = "") -> Table:
+        """Of rows of which the first is the header."""
+        return cls(rows[0], rows[1:], note)
 
     def text(self) -> str:
         """Aligned columns."""

@@ -33,9 +33,9 @@ from benchmarks.harness import (
     on_threads,
     percent,
     say,
+    trained,
 )
 from benchmarks.peers import rockets
-from benchmarks.reproduction.runs import run
 from benchmarks.subjects import Array, Trained, composed
 from tactslip_torch import AlarmSettings, FeaturePool, Judgement, SlipDetector, StreamingDetector
 from tactslip_torch.data.splits import PAPER_SCENE
@@ -135,7 +135,7 @@ class Onset(Benchmark[Sizes]):
             training = ["+exp=onset", f"features.align={align}", *sizes.training]
             folder = job.folder / align
             with TemporaryDirectory(prefix="tactslip-bench-") as cache:  # some gigabytes
-                run(f"detector, {align}", [*training, "onset=none"], folder, Path(cache))
+                trained(f"detector, {align}", [*training, "onset=none"], folder, Path(cache))
             detector = SlipDetector.load(folder / "detector.pt")
             peers: dict[str, Scorer] = {}
             if (align, hop_ms) == (sizes.aligns[0], sizes.hops_ms[-1]):

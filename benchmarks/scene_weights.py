@@ -25,7 +25,7 @@ from hydra.utils import instantiate
 from torch import Tensor
 
 from benchmarks.generalisation import SCENE_WEIGHTS, config_of, recordings
-from benchmarks.reproduction.runs import code_digest
+from benchmarks.harness import code_digest
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import PAPER_SCENE, Split
 from tactslip_torch.features.bin_sample import BinSample, SampledBins

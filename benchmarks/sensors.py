@@ -12,9 +12,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from benchmarks.commands import result_of, table_of, take_figures
-from benchmarks.harness import Benchmark, Job, Report, Table
-from benchmarks.reproduction.runs import run
+from benchmarks.harness import Benchmark, Job, Report, Table, result_of, take_figures, trained
 from tactslip_torch.report.importance import (
     RESELECT_WORDS,
     best_rows,
@@ -50,7 +48,7 @@ class Sensors(Benchmark[Sizes]):
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
         """What the command leaves, by way of selection."""
         detector = job.folder / "detector"
-        run("detector for sensors", job.sizes.training, detector, job.folder / "cache")
+        trained("detector for sensors", job.sizes.training, detector, job.folder / "cache")
         found = {}
         for way in RESELECT_WORDS:
             overrides = [f"model={detector / 'detector.pt'}", f"anew={way}"]
@@ -65,10 +63,10 @@ class Sensors(Benchmark[Sizes]):
             words = RESELECT_WORDS[way]
             for unit in content["best"]:
                 is_first = unit == "kind"
-                found[f"Without one {unit}, features {words}"] = table_of(
+                found[f"Without one {unit}, features {words}"] = Table.of(
                     unit_rows(content, unit), "; ".join(lines_about(content)) if is_first else ""
                 )
-                found[f"The best few by {unit}, features {words}"] = table_of(
+                found[f"The best few by {unit}, features {words}"] = Table.of(
                     best_rows(content, unit), with_all_line(content) if is_first else ""
                 )
         return found

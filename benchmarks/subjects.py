@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 from torch import Tensor
 
-from benchmarks.harness import say
-from benchmarks.reproduction.runs import run
+from benchmarks.harness import say, trained
 from benchmarks.selection import kept_selection
 from tactslip_torch import AlarmSettings, FeaturePool, HandLayout, SlipDetector
 from tactslip_torch.commands.crossval import Materials
@@ -180,7 +179,7 @@ class Trained:
         Raises:
             RuntimeError: if the training fails.
         """
-        metrics = run(folder.name, overrides, folder, cache_folder)
+        metrics = trained(folder.name, overrides, folder, cache_folder)
         config = composed("train", overrides)
         source, rule = instantiate(config.data, _convert_="all"), instantiate(config.labels)
         (split,) = instantiate(config.split, _convert_="all")(source.ids)

@@ -12,8 +12,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from benchmarks.harness import Benchmark, Job, Report, Table, bars, percent
-from benchmarks.reproduction.runs import run
+from benchmarks.harness import Benchmark, Job, Report, Table, bars, percent, trained
 
 LEARNED = {
     "C and c": "[penalty,offset]",
@@ -53,7 +52,7 @@ class Tuning(Benchmark[Sizes]):
         for place, (name, learn) in enumerate(LEARNED.items()):
             overrides = [*job.sizes.overrides, *job.overrides, f"tuning.learn={learn}"]
             folder = job.folder / str(place)
-            metrics = run(f"tuning {name}", overrides, folder, job.folder / "cache")
+            metrics = trained(f"tuning {name}", overrides, folder, job.folder / "cache")
             found[name] = metrics["tuning"] | {"tuned_splits": metrics["splits"]}
         return {"ways": found}
 

@@ -27,7 +27,7 @@ OTHERS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*SUBJECTS, "reproduction"])
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path) -> None:
     arguments = ["--quick", "--out", str(tmp_path)]
     if name in ("real", "realism"):
@@ -48,9 +48,9 @@ def test_a_benchmark_runs_in_its_smallest_form(name: str, tmp_path: Path) -> Non
     _run(name, *arguments)
 
 
-@pytest.mark.parametrize("name", [*SUBJECTS, "reproduction"])
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_a_section_has_its_place_in_a_page(name: str) -> None:
-    module = import_module(f"benchmarks.{name}" + (".__main__" * (name == "reproduction")))
+    module = import_module(f"benchmarks.{name}")
     (subject,) = (
         of
         for of in vars(module).values()

@@ -1,28 +1,376 @@
-"""Tables of REPRODUCTION.md and of README.md, from stored runs."""
+"""Published numbers beside ours: ``python -m benchmarks.reproduction [key=value ...]``.
+
+Trains every experiment on every seed. Runs that this very code finished are kept, so it resumes.
+Writes the tables of REPRODUCTION.md and of README.md between their markers, and the figures.
+"""
 
 from __future__ import annotations
 
+import json
+import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from benchmarks.harness import Table
-from benchmarks.reproduction.results import (
-    POOLED,
-    SCORES,
-    Runs,
-    by_seed,
-    gains,
-    labels_of,
-    mean_sd,
-    percent,
-    recall_beside_onset,
-    roles_of,
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf
+
+from benchmarks import ROOT
+from benchmarks.harness import (
+    GREY,
+    LIGHT,
+    OURS,
+    PEER,
+    Benchmark,
+    Job,
+    Report,
+    Table,
+    between_markers,
+    finish,
+    trained,
+    write_text,
 )
+from tactslip_torch.analysis.signal_checks import filtered, judge_facts
+from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.report import published
+from tactslip_torch.report.metrics import split_metrics, summed_metrics
+from tactslip_torch.report.pipeline import pipeline_figure
 from tactslip_torch.report.results import BASELINES
+from tactslip_torch.simulation.parameters import CALIBRATED_PATH, SEEN_MATERIALS
+from tactslip_torch.simulation.source import SimulatedRecordings
 
+GROUPS = ("per_material", "per_speed", "per_scene")
+
+_PAPER = "recipe=paper"
+EXPERIMENTS: Mapping[str, tuple[tuple[str, ...], int]] = {
+    # these use the features of one set of recordings ...
+    "unseen4": (("+exp=unseen4", _PAPER), 5),
+    "unseen4 robust": (("+exp=unseen4", "recipe=robust"), 5),
+    "random_bins": (("+exp=random_bins", _PAPER), 5),
+    "shuffled": (("+exp=seen6", _PAPER, "labels.shuffle_seed=1"), 1),
+    "SG means only": (
+        ("+exp=unseen4", _PAPER, "recipe.among={kind:SG,descriptor:mean}"),
+        3,
+    ),
+    "PVDF only": (("+exp=unseen4", _PAPER, "recipe.among={kind:PVDF}"), 2),
+    # ... these of another ...
+    "half_second": (("+exp=unseen4", _PAPER, "labels=half_second"), 5),
+    "half_second random_bins": (("+exp=random_bins", _PAPER, "labels=half_second"), 5),
+    # ... and each of these its own
+    "motor_off": (("+exp=unseen4", _PAPER, "scene=motor_off"), 2),
+    "motor_only": (("+exp=unseen4", _PAPER, "scene=motor_only"), 2),
+    "confound": (("+exp=confound",), 2),
+}
+"""Overrides and seeds of each, in the order that shares most features."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Seeds at most, experiments, and overrides of every run."""
+
+    seeds: int = 5
+    experiments: tuple[str, ...] = tuple(EXPERIMENTS)
+    overrides: tuple[str, ...] = ()
+    cycles: int = 3
+
+
+class Reproduction(Benchmark[Sizes]):
+    """Every experiment on every seed."""
+
+    name = "reproduction"
+    title = "Published numbers beside ours"
+    about = "every number of ours is SIMULATED, the paper's are of a real hand"
+    page, markers = "REPRODUCTION.md", "results"
+    sizes = Sizes()
+    quick = Sizes(
+        1,
+        ("random_bins", "unseen4", "confound"),
+        ("data.cycles=2", "split.train_share=0.5", "recipe.sample_bins=60"),
+        1,
+    )
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Trainings, one after the other, and checks of the signals."""
+        runs: dict[str, list[dict[str, Any]]] = {name: [] for name in job.sizes.experiments}
+        commands = {}
+        for seed in range(job.sizes.seeds):
+            for name in runs:
+                overrides, seeds = EXPERIMENTS[name]
+                given = [*overrides, *job.sizes.overrides, *job.overrides]
+                if job.is_quick and name == "confound":
+                    others = OmegaConf.load(ROOT / "conf" / "others" / "confound.yaml")
+                    given += [f"others.{o}.cycles=2" for o in map(str, others) if o != "defaults"]
+                commands[name] = " ".join(given)
+                if seed < seeds:
+                    folder = job.folder / f"{name.replace(' ', '-')}-{seed}"
+                    cache = job.folder / "cache"
+                    metrics = trained(
+                        f"{name}, seed {seed}", [*given, f"seed={seed}"], folder, cache
+                    )
+                    runs[name].append(kept(metrics, folder))
+        return {
+            "runs": runs,
+            "commands": commands,
+            "calibrated": json.loads(CALIBRATED_PATH.read_text(encoding="utf-8")),
+            "signals": [_signal_checks(seed, job.sizes.cycles) for seed in range(job.sizes.seeds)],
+        }
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """All of REPRODUCTION.md, and what was run."""
+        rows = [
+            [
+                name,
+                f"`train {numbers['commands'][name]}`",
+                str(len(of)),
+                f"{sum(run['seconds'] for run in of) / 60:.1f}",
+            ]
+            for name, of in numbers["runs"].items()
+        ]
+        ran = Table(["experiment", "command", "seeds", "minutes"], rows)
+        return {**all_tables(numbers), "What was run": ran}
+
+    def publish(self, report: Report, folder: Path) -> None:
+        """The page, and the table between the markers of README.md."""
+        super().publish(report, folder)
+        if not report["quick"]:
+            path, table = ROOT / "README.md", short_table(report["numbers"]["runs"]).markdown()
+            text = path.read_text(encoding="utf-8")
+            write_text(path, between_markers(text, "reproduction", table))
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Balanced accuracy of every seed, the paper's as a bar."""
+        runs, axes = numbers["runs"], drawing.subplots()
+        names = [(name, role) for name in runs for role in roles_of(runs, name)]
+        beside = {("random_bins", "test"), ("unseen4", "unseen")}
+        for place, (name, role) in enumerate(names):
+            for baseline, marker, color in ((POOLED, "|", PEER), (None, "o", OURS)):
+                values = percent(runs, name, role, "balanced_accuracy", baseline=baseline)
+                axes.plot(values, [place] * len(values), marker, color=color, alpha=0.7, ms=5)
+            if (name, role) in beside:
+                x = 100 * (published.SPLITS[role].balanced_accuracy or 0)
+                axes.plot([x, x], [place - 0.4, place + 0.4], color="black", lw=2)
+        for marker, color, label in (
+            ("o", OURS, "ours, a dot a seed"),
+            ("|", PEER, "best pooled number"),
+        ):
+            axes.plot([], [], marker, color=color, label=label)
+        axes.plot([], [], color="black", lw=2, label="paper, real hand")
+        axes.set_yticks(range(len(names)), [", ".join(of) for of in names], fontsize=6)
+        axes.set_ylim(len(names) - 0.4, -0.6)
+        axes.set_xlabel("balanced accuracy, %")
+        axes.grid(axis="x", color=LIGHT)
+        drawing.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+
+    def figures(self, report: Report, path: Path) -> None:
+        """Every seed, recall beside the onset, scenes, and the pipeline."""
+        super().figures(report, path)
+        runs = report["numbers"]["runs"]
+        drawing = Figure(figsize=(8.4, 3.6), layout="constrained")
+        axes = drawing.subplots()
+        for name, color in (("unseen4", OURS), ("unseen4 robust", PEER)):
+            for role, style in (("test", "o-"), ("unseen", "s--")):
+                found = {
+                    place: recall_beside_onset(
+                        runs, name, role, [str(place) if place < 20 else "20+"]
+                    )
+                    for place in range(-20, 21)
+                }
+                means = {place: mean(values) for place, values in found.items() if values}
+                label = f"{name}, {role}"
+                axes.plot(list(means), list(means.values()), style, color=color, ms=3, label=label)
+        axes.axvline(-0.5, color=GREY, ls="--", lw=1)
+        axes.set_xlabel("bins of 50 ms beside the labelled onset: non-slip before 0, slip from 0")
+        axes.set_ylabel("recall, %, mean of seeds")
+        axes.legend(frameon=False, fontsize=8)
+        finish(drawing, report, "Recall beside the onset", path.with_stem(f"{path.stem}_places"))
+        if "confound" in runs:
+            drawing = Figure(figsize=(9.2, 4.4), layout="constrained")
+            panels, scenes = drawing.subplots(1, 2, sharey=True), scenes_of(runs)
+            for axes, role in zip(panels, ("test", "unseen"), strict=True):
+                for fold, color in zip(FOLDS, (PEER, OURS), strict=True):
+                    for place, scene in enumerate(scenes):
+                        values = list(scene_recalls(runs, fold, role, scene).values())
+                        words = f"trained on {FOLDS[fold]}" if place == 0 else None
+                        axes.plot(values, [place] * len(values), "o", color=color, label=words)
+                axes.set_xlabel(f"mean recall of the classes there are, %, {role}")
+                axes.grid(axis="x", color=LIGHT)
+            panels[0].set_yticks(range(len(scenes)), scenes, fontsize=8)
+            panels[0].legend(frameon=False, fontsize=8)
+            finish(drawing, report, "Slip or the arm", path.with_stem(f"{path.stem}_confound"))
+        pipeline_figure(path.with_name("pipeline.png"))
+
+
+def _signal_checks(seed: int, cycles: int) -> list[dict[str, Any]]:
+    """What the paper says of its signals, checked on recordings of seen materials of a seed."""
+    source = SimulatedRecordings(seed=seed, cycles=cycles, materials=list(SEEN_MATERIALS))
+    recordings = {
+        material: [
+            filtered(source.load(RecordingId(material, cycle)), source.hand)
+            for cycle in range(cycles)
+        ]
+        for material in SEEN_MATERIALS
+    }
+    return judge_facts(recordings)
+
+
+# --------------------------------------------------------------------- counts and scores of runs
+def kept(metrics: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """What is kept of a run, JSON-able; of several folds, each, with the scenes trained on.
+
+    Args:
+        metrics: as the run left them.
+        folder: where it did, with its resolved configuration.
+    """
+    row: dict[str, Any] = {name: metrics[name] for name in ("simulated", "seed")}
+    row["seconds"] = metrics["timing_s"]["total"]
+    if "folds" in metrics:
+        config = OmegaConf.load(folder / "config.yaml")
+        row["trained_scenes"] = list(OmegaConf.select(config, "split.trained_scenes"))
+        return row | {"folds": {name: _of_fold(of) for name, of in metrics["folds"].items()}}
+    return row | _of_fold(metrics)
+
+
+def _of_fold(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "splits": {role: _counts(scores) for role, scores in metrics["splits"].items()},
+        "baselines": {
+            name: {
+                "feature": found.get("feature"),
+                "splits": {role: _counts(scores) for role, scores in found["splits"].items()},
+            }
+            for name, found in metrics["baselines"].items()
+        },
+        "penalty": metrics["penalty"],
+        "validation": max((row["mean"] for row in metrics.get("validation", [])), default=None),
+        "selected": metrics["selected"],
+        "among": metrics.get("among"),
+    }
+
+
+def _counts(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """Confusions of all bins and of groups; right and all bins of every place beside onsets."""
+    groups = {
+        kind: {label: of["confusion"] for label, of in scores[kind].items()}
+        for kind in GROUPS
+        if scores.get(kind)
+    }
+    places = {
+        label: [of["num_right"], of["num_bins"]]
+        for label, of in scores.get("per_position", {}).items()
+    }
+    return {"confusion": scores["confusion"], **groups, "per_position": places}
+
+
+Runs = Mapping[str, Sequence[Mapping[str, Any]]]
+"""Of each experiment, one a seed, as ``runs.kept`` has them."""
+SCORES = {
+    "accuracy": "accuracy",
+    "balanced_accuracy": "balanced accuracy",
+    "non_slip_recall": "non-slip recall",
+    "slip_recall": "slip recall",
+}
+POOLED = "best_pooled_number"
+
+
+def mean_sd(values: Sequence[float], digits: int = 2, sign: str = "") -> str:
+    """``mean ± sd`` over seeds, the mean alone of one, or ``-`` of nothing.
+
+    Example:
+        >>> mean_sd([1.0, 2.0, 3.0])
+        '2.00 ± 1.00'
+    """
+    if not values:
+        return "-"
+    spread = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
+    return f"{statistics.mean(values):{sign}.{digits}f}{spread}"
+
+
+def runs_of(runs: Runs, experiment: str) -> list[Mapping[str, Any]]:
+    """Of an experiment; ``"confound: protocol"`` is the fold ``protocol`` of ``confound``."""
+    name, _, fold = experiment.partition(": ")
+    found = runs.get(name, [])
+    return [run["folds"][fold] | {"seed": run["seed"]} for run in found] if fold else list(found)
+
+
+def roles_of(runs: Runs, experiment: str) -> list[str]:
+    """Roles that an experiment evaluates."""
+    return [role for run in runs_of(runs, experiment)[:1] for role in run.get("splits", {})]
+
+
+def labels_of(runs: Runs, experiment: str, role: str, kind: str) -> list[str]:
+    """Labels of the groups of a kind, such as speeds."""
+    splits = [run["splits"].get(role, {}) for run in runs_of(runs, experiment)]
+    return list(dict.fromkeys(label for split in splits for label in split.get(kind, {})))
+
+
+def by_seed(
+    runs: Runs,
+    experiment: str,
+    role: str,
+    score: str,
+    *,
+    group: tuple[str, str] | None = None,
+    baseline: str | None = None,
+) -> dict[int, float]:
+    """A score in percent by seed; seeds without any are left out.
+
+    Args:
+        runs: stored.
+        experiment: its name.
+        role: ``"train"``, ``"test"`` or ``"unseen"``.
+        score: a key of ``SCORES``.
+        group: such as ``("per_speed", "20")``: of these bins alone.
+        baseline: of this in the place of the detector.
+    """
+    found = {}
+    for run in runs_of(runs, experiment):
+        judged = run if baseline is None else run.get("baselines", {}).get(baseline, {})
+        split = judged.get("splits", {}).get(role)
+        if split is None:
+            continue
+        if group is None:
+            value = split_metrics(split["confusion"])[score]
+        elif group[1] in split.get(group[0], {}):
+            value = summed_metrics([{"confusion": split[group[0]][group[1]]}])[score]
+        else:
+            continue
+        if value is not None:
+            found[run["seed"]] = 100 * value
+    return found
+
+
+def percent(runs: Runs, experiment: str, role: str, score: str, **of: Any) -> list[float]:
+    """As ``by_seed``, the numbers alone."""
+    return list(by_seed(runs, experiment, role, score, **of).values())
+
+
+def gains(after: Mapping[int, float], before: Mapping[int, float]) -> list[float]:
+    """What each seed that both have gains.
+
+    Example:
+        >>> gains({0: 90.0, 1: 91.0}, {1: 80.0, 2: 70.0})
+        [11.0]
+    """
+    return [value - before[seed] for seed, value in after.items() if seed in before]
+
+
+def recall_beside_onset(
+    runs: Runs, experiment: str, role: str, places: Sequence[str]
+) -> list[float]:
+    """Recall, in percent, of bins at these places beside their onsets; a number a seed."""
+    found = []
+    for run in runs_of(runs, experiment):
+        counts = run["splits"].get(role, {}).get("per_position", {})
+        own = [counts[place] for place in places if place in counts]
+        if own:
+            found.append(100 * sum(right for right, _ in own) / sum(num for _, num in own))
+    return found
+
+
+# ------------------------------------------------------------------------------------- tables
 CALIBRATED, PREDICTED, NOT_COMPARABLE = "*calibrated*", "*predicted*", "*not comparable*"
 _HALF = "the published matrices do not fit half a second on either side"
 SETTINGS = {
@@ -368,3 +716,7 @@ def _short_rows(runs: Runs) -> Iterator[list[str]]:
             values = [getattr(published.SPLITS[role], score) for score in SCORES]
             of_paper = ["" if value is None else f"{100 * value:.2f}" for value in values]
             yield [f"paper, real hand, {role}", *of_paper, ""]
+
+
+if __name__ == "__main__":
+    raise SystemExit(Reproduction().run())
