@@ -27,7 +27,7 @@ from tactslip_torch.model.calibration import (
 )
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.leave_one_group_out import HeldOut
-from tactslip_torch.model.missing_channels import MissingScores, dead_mask, widened_llr
+from tactslip_torch.model.missing_channels import MissingScores, channel_mask, widened_llr
 
 OURS, REFIT = "closed form", "refit"
 _CALIBRATED_ON = 3000  # training bins at most that a refitted machine is calibrated on
@@ -86,7 +86,7 @@ class DeadSensors(Benchmark[Sizes]):
         calibration = calibration_from_dict(detector.info["calibration"])
         rows = []
         for kind, name, channels in _losses(detector.pool.hand, job.sizes.halves):
-            dead = dead_mask(channels, detector.pool.hand.names)
+            dead = channel_mask(channels, detector.pool.hand.names)
             is_lost = dead[detector.channel_index]
             if not is_lost.any() or is_lost.all():
                 continue
@@ -170,16 +170,16 @@ def _losses(hand: HandLayout, halves: int) -> list[tuple[str, str, list[str]]]:
 
 def _ways(trained: Trained) -> dict[str, MissingScores]:
     detector = trained.detector
-    typical, index = detector.typical, detector.channel_index
-    assert typical is not None  # as trained
+    imputation, index = detector.imputation, detector.channel_index
+    assert imputation is not None  # as trained
     silent = torch.zeros(len(detector.pool.hand), detector.pool.bin_samples)
     features = detector.pool(detector.pool.widen(silent))[list(detector.selected)].double()
     fills = {
-        "mean-fill": typical,
-        "zero-fill": torch.zeros_like(typical),
+        "mean-fill": imputation,
+        "zero-fill": torch.zeros_like(imputation),
         "0 V": detector.scaler(features),
     }
-    found = {OURS: MissingScores(detector.head, typical, index, detector.gaussians)}
+    found = {OURS: MissingScores(detector.head, imputation, index, detector.gaussians)}
     for name, fill in fills.items():
         found[name] = MissingScores(detector.head, fill, index, None)
     return found

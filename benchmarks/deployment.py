@@ -260,7 +260,7 @@ def _bins(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str, A
 
 
 def _score(detector: SlipDetector, dtype: torch.dtype, samples: torch.Tensor) -> Any:
-    return detector.judge_raw(samples.to(dtype)).score
+    return detector.predict_raw(samples.to(dtype)).score
 
 
 def _streams(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str, Any]]:

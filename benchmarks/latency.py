@@ -131,7 +131,7 @@ class Latency(Benchmark[Sizes]):
             session = BinSession(Path(folder) / "model.onnx", threads=1)
         return {
             OURS: fast.score_raw,
-            "tactslip_torch, float32, with validity": lambda x: fast.judge_raw(x).score,
+            "tactslip_torch, float32, with validity": lambda x: fast.predict_raw(x).score,
             "tactslip_torch, float64": lambda x: exact.score_raw(x.double()),
             REFERENCE: lambda x: slow.score_raw(x.double()),
             ORT: session.scores,

@@ -37,7 +37,7 @@ from benchmarks.harness import (
 )
 from benchmarks.peers import rockets
 from benchmarks.subjects import Array, Trained, composed
-from tactslip_torch import AlarmSettings, FeaturePool, Judgement, SlipDetector, StreamingDetector
+from tactslip_torch import AlarmSettings, FeaturePool, Prediction, SlipDetector, StreamingDetector
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.onset.baselines import BaselineDetector
 from tactslip_torch.onset.decisions import Scorer
@@ -256,13 +256,13 @@ class _RocketDetector:
         """Samples behind a bin that the longest frame takes in."""
         return self.channel_filter.context_after
 
-    def judge(self, bins: Tensor, *, given: torch.dtype) -> Judgement:
+    def predict(self, bins: Tensor, *, given: torch.dtype) -> Prediction:
         """Score filtered bins ``[N, C, n]``; a channel that is missing counts as silent."""
         is_missing = self.pool.is_missing(bins)
         is_valid = (self.pool.is_alive(bins) & ~is_missing).all(-1)
         windows = torch.where(is_missing[..., None], 0.0, bins).float().contiguous()
         score = torch.from_numpy(np.asarray(self.scores(windows.numpy()))).reshape(-1).to(given)
-        return Judgement(score, is_valid, is_missing, torch.zeros_like(score))
+        return Prediction(score, is_valid, is_missing, torch.zeros_like(score))
 
 
 def _peers(

@@ -336,7 +336,7 @@ def _ours(windows: Windows, recipe: Recipe, train: Array, _: SlipDetector | None
         plan.frame.scaler,
         second.solve(),
         {"penalty": plan.penalty, "calibration": plan.calibration, "kernel": kernel},
-        plan.typical,
+        plan.imputation,
         plan.gaussians,
         plan.frame.pooling,
     )
@@ -349,7 +349,7 @@ def _ours(windows: Windows, recipe: Recipe, train: Array, _: SlipDetector | None
 
     @torch.no_grad()
     def score_samples(samples: Array) -> Array:
-        return detector.judge(torch.from_numpy(samples)).score.numpy()
+        return detector.predict(torch.from_numpy(samples)).score.numpy()
 
     names = detector.selected_names
     chosen = {

@@ -189,7 +189,7 @@ def _naive(detector: SlipDetector, samples: Array, hop: int) -> Callable[[], Any
     length = detector.context_before + detector.pool.bin_samples + detector.context_after
     starts = range(0, whole.shape[-1] - length, hop)
     each = cycle(starts)
-    return lambda: detector.judge_raw(whole[None, :, (at := next(each)) : at + length])
+    return lambda: detector.predict_raw(whole[None, :, (at := next(each)) : at + length])
 
 
 def _next_push(stream: StreamingDetector, samples: Iterator[Array]) -> None:

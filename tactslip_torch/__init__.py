@@ -6,8 +6,8 @@ from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.judgement import Judgement
 from tactslip_torch.model.moments import SufficientStats
+from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.simulation import Scene, simulate
@@ -21,7 +21,7 @@ __all__ = [
     "FeatureName",
     "FeaturePool",
     "HandLayout",
-    "Judgement",
+    "Prediction",
     "Recording",
     "Scene",
     "SlipDetector",

@@ -130,7 +130,7 @@ def test_what_stands_in_for_a_sensor_is_of_old_and_new_bins(run, files, trained)
         ]
     )
     torch.testing.assert_close(new.gaussians.mean, expected)
-    torch.testing.assert_close(new.typical, expected.mean(0))
+    torch.testing.assert_close(new.imputation, expected.mean(0))
     assert not torch.allclose(old.gaussians.mean, expected)
 
 

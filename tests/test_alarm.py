@@ -342,8 +342,8 @@ class Backwards:
         self.needed_index, self.look_ahead = detector.needed_index, detector.look_ahead
         self._detector = detector
 
-    def judge(self, bins, *, given=None):
-        found = self._detector.judge(bins, given=given)
+    def predict(self, bins, *, given=None):
+        found = self._detector.predict(bins, given=given)
         return found._replace(score=-found.score)
 
 

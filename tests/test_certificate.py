@@ -24,7 +24,7 @@ def test_both_scores_are_those_of_the_pipelines(head, arithmetic):
     with torch.no_grad():
         assert torch.equal(compared.exact, detector.score_raw(samples))
         rounded = single.score_raw(samples.float())
-        judged = single.judge_raw(samples.float())
+        judged = single.predict_raw(samples.float())
     assert rounded.dtype == torch.float32
     assert torch.equal(compared.rounded, rounded.double())
     assert torch.equal(compared.error, (rounded.double() - compared.exact).abs())
@@ -159,7 +159,7 @@ def test_extremes_are_judged_by_kind_and_flagged_as_the_pipeline_flags_them():
     for kind, row in found.facts()["extremes"].items():
         drawn = extreme_bins(kind, (6, 4, 150), generator, torch.float32)
         with torch.no_grad():
-            judged = single.judge_raw(drawn)
+            judged = single.predict_raw(drawn)
             error = (judged.score.double() - detector.score_raw(drawn.double())).abs()
         assert row["bins"] == 6
         assert row["invalid"] == int((~judged.is_valid).sum())

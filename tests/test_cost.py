@@ -157,7 +157,7 @@ def test_measured_prices_are_of_this_machine():
 
 def test_a_stand_in_gives_finite_scores():
     detector = _stand_in(POOL, ChannelFilter([51, 51, 11, 11]), [0, 30, 100], "eager")
-    score = detector.judge_raw(torch.randn(7, 4, 150)).score
+    score = detector.predict_raw(torch.randn(7, 4, 150)).score
     assert score.isfinite().all()
 
 

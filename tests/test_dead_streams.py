@@ -33,9 +33,9 @@ def test_a_dead_channel_of_a_stream_is_as_one_of_nan(detector, samples):
     broken = samples.clone()
     broken[2] = torch.nan
     whole = StreamingDetector(detector, dtype=torch.float64).push(broken.T)
-    live = StreamingDetector(detector, dtype=torch.float64, dead=["PVDF1"])
+    live = StreamingDetector(detector, dtype=torch.float64, masked_channels=["PVDF1"])
     found = live.push(samples.T)
-    assert live.dead == ("PVDF1",)
+    assert live.masked_channels == ("PVDF1",)
     assert len(found.score) > 50
     for each, expected in zip(found, whole, strict=True):
         torch.testing.assert_close(each, expected, rtol=1e-9, atol=1e-9)
@@ -47,7 +47,9 @@ def test_a_channel_that_no_feature_needs_may_die(samples):
     detector = alarming_with_gaussians(seed=4)
     assert "SG1" not in {name.channel for name in detector.selected_names}
     whole = StreamingDetector(detector, dtype=torch.float64).push(samples.T)
-    found = StreamingDetector(detector, dtype=torch.float64, dead=["SG1"]).push(samples.T)
+    found = StreamingDetector(detector, dtype=torch.float64, masked_channels=["SG1"]).push(
+        samples.T
+    )
     assert torch.equal(found.score, whole.score)
     assert torch.equal(found.llr, whole.llr)
     assert torch.equal(found.is_valid, whole.is_valid)
@@ -55,7 +57,9 @@ def test_a_channel_that_no_feature_needs_may_die(samples):
 
 
 def test_probability_and_statistic_are_of_the_widened_ratio(detector, samples):
-    found = StreamingDetector(detector, dtype=torch.float64, dead="PVDF1").push(samples.T)
+    found = StreamingDetector(detector, dtype=torch.float64, masked_channels="PVDF1").push(
+        samples.T
+    )
     broken = samples.clone()
     broken[2] = torch.nan
     scores = score_stream(detector, broken, AlarmSettings.of(detector).hop_samples)
@@ -71,7 +75,7 @@ def test_sensors_die_and_come_back_in_the_middle_of_a_stream(detector, samples):
     thirds = samples.T.tensor_split(3)
     parts = []
     for third, dead in zip(thirds, ([], ["SG1", "PVDF2"], []), strict=True):
-        live.dead = dead
+        live.masked_channels = dead
         parts.append(live.push(third))
     assert [bool(part.is_valid.all()) for part in parts] == [True, False, True]
     assert not parts[1].is_valid.any()
@@ -83,18 +87,20 @@ def test_sensors_die_and_come_back_in_the_middle_of_a_stream(detector, samples):
 
 
 def test_a_hand_that_is_wholly_dead_tells_nothing(detector, samples):
-    found = StreamingDetector(detector, dtype=torch.float64, dead=HAND.names).push(samples.T)
+    found = StreamingDetector(detector, dtype=torch.float64, masked_channels=HAND.names).push(
+        samples.T
+    )
     assert torch.equal(found.probability, torch.full_like(found.score, 0.5))
     assert not found.alarms
 
 
 def test_another_hands_channel_is_refused_and_nothing_changes(detector):
-    live = StreamingDetector(detector, dead=["SG1"])
-    with pytest.raises(ValueError, match=r"^dead names the channel 'SG7'"):
-        live.dead = ["SG7"]
-    assert live.dead == ("SG1",)
-    with pytest.raises(ValueError, match=r"^dead names the channel 'SG7'"):
-        StreamingDetector(detector, dead=["SG7"])
+    live = StreamingDetector(detector, masked_channels=["SG1"])
+    with pytest.raises(ValueError, match=r"^masked_channels names the channel 'SG7'"):
+        live.masked_channels = ["SG7"]
+    assert live.masked_channels == ("SG1",)
+    with pytest.raises(ValueError, match=r"^masked_channels names the channel 'SG7'"):
+        StreamingDetector(detector, masked_channels=["SG7"])
 
 
 @pytest.mark.parametrize("calibration", [Platt(2.0, 0.3), Isotonic((-2.0, 2.0), (-5.0, 5.0))])

@@ -272,12 +272,12 @@ def test_another_threshold_can_be_given(model, tmp_path):
 def test_dead_channels_are_not_listened_to(model, tmp_path):
     save(tmp_path / "a.npz", recording())
     place = tmp_path / "a.npz"
-    content = heard(model, place, tmp_path / "out", "dead=[PVDF2,SG1]", "figure=false")
-    assert content["dead"] == ["SG1", "PVDF2"]
+    content = heard(model, place, tmp_path / "out", "masked_channels=[PVDF2,SG1]", "figure=false")
+    assert content["masked_channels"] == ["SG1", "PVDF2"]
     numbers = content["recordings"][0]["decisions"]
     assert numbers["invalid"] == numbers["number"] > 0
     whole = heard(model, place, tmp_path / "whole", "figure=false")
-    assert whole["dead"] == []
+    assert whole["masked_channels"] == []
     assert whole["recordings"][0]["decisions"]["invalid"] == 0
 
 
@@ -559,8 +559,16 @@ REFUSED = {
     "view": (whole, ["view=3"], "view must be [start, end] in seconds, got 3"),
     "view of nothing": (whole, ["view=[9,10]"], "shows nothing of 8 s"),
     "engine": (whole, ["engine=steam"], "steam"),
-    "dead": (whole, ["dead=[SG1,SG9]"], "dead names the channel 'SG9', which this hand does not"),
-    "dead number": (whole, ["dead=3"], "dead must be a list of names of channels, got 3"),
+    "dead": (
+        whole,
+        ["masked_channels=[SG1,SG9]"],
+        "masked_channels names the channel 'SG9', which this hand does not",
+    ),
+    "dead number": (
+        whole,
+        ["masked_channels=3"],
+        "masked_channels must be a list of names of channels, got 3",
+    ),
     "no detector": (whole, ["model=missing.pt"], "no detector at missing.pt"),
     "another file": (whole, ["model=in/a.npz"], "in/a.npz is damaged or no file of ours"),
 }

@@ -458,17 +458,17 @@ def test_a_later_format_is_refused(saved):
         SlipDetector.load(saved)
 
 
-@pytest.mark.parametrize("method", ["__call__", "score_raw", "judge", "judge_raw"])
+@pytest.mark.parametrize("method", ["__call__", "score_raw", "predict", "predict_raw"])
 def test_many_bins_are_judged_as_few_are(method):
     """In parts, on several threads, with leading axes; a broken channel is found in its part."""
     detector = random_detector()
     samples = noise(600)
-    if method.startswith("judge"):
+    if method.startswith("predict"):
         samples[377, 20, 60] = torch.nan
     bins = samples if method.endswith("raw") else samples[..., 25:125]
-    judge = getattr(detector, method)
-    few = [judge(part) for part in bins.split(30)]
-    many = judge(bins.reshape(3, 200, *bins.shape[1:]))
+    predict = getattr(detector, method)
+    few = [predict(part) for part in bins.split(30)]
+    many = predict(bins.reshape(3, 200, *bins.shape[1:]))
     if isinstance(many, torch.Tensor):
         few, many = [(one,) for one in few], (many,)
     for parts, whole in zip(zip(*few, strict=True), many, strict=True):
@@ -495,18 +495,18 @@ def test_a_score_waits_for_its_look_ahead_and_no_longer(kind, align):
     assert detector.look_ahead == ({"SG": 25, "PVDF": 5}[kind] if align == "centred" else 0)
     samples = noise(6)
     first = detector.context_before + 100 + detector.look_ahead
-    expected = detector.judge_raw(samples)
+    expected = detector.predict_raw(samples)
     for garbage in (0.0, 1e3, torch.nan):
         spoilt = samples.clone()
         spoilt[:, [i for i, c in enumerate(whole.pool.hand.channels) if c.kind == kind], first:] = (
             garbage
         )
-        judged = detector.judge_raw(spoilt)
+        judged = detector.predict_raw(spoilt)
         assert torch.equal(judged.score, expected.score)
         assert judged.is_valid.all()
     moved = samples.clone()
     moved[..., first - 1] += 1.0
-    assert (detector.judge_raw(moved).score != expected.score).all()
+    assert (detector.predict_raw(moved).score != expected.score).all()
 
 
 @pytest.mark.parametrize("head", ["quadratic", "watched", "constant feature"])
@@ -521,9 +521,9 @@ def test_one_bin_is_judged_as_many_are(head):
     samples[1, 16, 70], samples[2, 17], samples[3, 18] = torch.nan, 0.5, 1e200 * samples[3, 18]
     for dtype in (torch.float64, torch.float32):
         given = samples.to(dtype)
-        whole = detector.judge_raw(given)
+        whole = detector.predict_raw(given)
         for index, one in enumerate(given):
-            alone = detector.judge_raw(one)
+            alone = detector.predict_raw(one)
             assert alone.score.dtype == dtype
             for found, expected in zip(alone, whole, strict=True):
                 torch.testing.assert_close(found, expected[index], rtol=1e-5, atol=1e-6)

@@ -63,7 +63,7 @@ def test_an_export_leaves_its_files_and_nothing_else(exported):
 @pytest.mark.parametrize("batch", [0, 1, 2, 7, 64])
 def test_the_bin_graph_gives_the_detectors_judgement(detector, exported, batch):
     samples = raw_bins(batch, seed=batch).float()
-    expected = detector.judge_raw(samples.double())
+    expected = detector.predict_raw(samples.double())
     got = run(exported[0], samples=cropped(detector, samples))
     assert got.keys() == {"score", "probability", "valid"}
     spread = float(detector.score_raw(raw_bins(64)).std())

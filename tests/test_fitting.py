@@ -202,7 +202,7 @@ def test_typical_features_lie_midway_between_the_classes(rng):
     z = plan.frame(features)
     assert 0 < is_slip.double().mean() < 0.4
     expected = (z[is_slip].mean(0) + z[~is_slip].mean(0)) / 2  # the sample holds every bin
-    torch.testing.assert_close(torch.tensor(plan.typical, dtype=torch.float64), expected)
+    torch.testing.assert_close(torch.tensor(plan.imputation, dtype=torch.float64), expected)
 
 
 def test_gaussians_are_of_the_selected_features_of_either_class(rng):

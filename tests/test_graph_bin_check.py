@@ -41,9 +41,11 @@ def bin_run(detector, change=lambda samples, out: out):
 
     def run(inputs):
         samples = torch.from_numpy(inputs["samples"])
-        dead = torch.from_numpy(inputs["dead"]) if "dead" in inputs else None
+        dead = torch.from_numpy(inputs["masked_channels"]) if "masked_channels" in inputs else None
         with torch.no_grad():
-            score, is_valid, *_ = single.judge_raw(pad(samples, (before, after)), dead=dead)
+            score, is_valid, *_ = single.predict_raw(
+                pad(samples, (before, after)), masked_channels=dead
+            )
         stated = probability(settings.calibration.llr(score), settings.slip_share)
         out = {"score": score.numpy(), "probability": stated.numpy(), "valid": is_valid.numpy()}
         return change(samples, out)

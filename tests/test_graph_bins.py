@@ -141,21 +141,21 @@ def test_ties_and_steps_are_counted_as_torch_counts_them():
 @pytest.mark.parametrize("form", FORMS, ids=named)
 def test_a_sensor_that_fails_is_left_out_as_in_torch(form):
     detector = small_detector()
-    typical = torch.linspace(-0.9, 0.9, 12, dtype=torch.float64)
+    imputation = torch.linspace(-0.9, 0.9, 12, dtype=torch.float64)
     parts = (detector.pool, detector.channel_filter, detector.selected, detector.scaler)
-    detector = SlipDetector(*parts, detector.head, typical=typical)
+    detector = SlipDetector(*parts, detector.head, imputation=imputation)
     samples = raw_bins(40).to(getattr(torch, form.precision)).double()
     for row, value in enumerate([float("nan"), float("inf"), -float("inf")] * 4):
         samples[row, row % 4, 30 + 7 * row] = value
     samples[20:28, 2] = 1.0  # dead
     samples[28] = float("nan")
-    expected = detector.double().judge_raw(samples)
+    expected = detector.double().predict_raw(samples)
     score, valid = judged(detector, form, samples)
     sd = float(expected.score.std())
     most = 1e-9 if form.precision == "float64" else 1e-4
     assert float((score - expected.score).abs().max()) < most * sd
     given = samples.to(getattr(torch, form.precision))
-    assert torch.equal(valid, detector.judge_raw(given).is_valid)
+    assert torch.equal(valid, detector.predict_raw(given).is_valid)
     assert 0 < int(valid.sum()) < len(valid)
 
 
@@ -166,9 +166,9 @@ def test_extremes_get_the_score_and_the_flag_of_torch(kind, precision):
     dtype = getattr(torch, precision)
     generator = torch.Generator().manual_seed(5)
     samples = extreme_bins(kind, (16, 4, 150), generator, dtype)
-    expected = detector.judge_raw(samples.double())
+    expected = detector.predict_raw(samples.double())
     score, valid = judged(detector, Form(precision), samples)
-    assert torch.equal(valid, detector.judge_raw(samples).is_valid)
+    assert torch.equal(valid, detector.predict_raw(samples).is_valid)
     assert bool(score.isfinite().all())
     if kind in ALL_ROUNDING or (kind, precision) == (OFFSET, "float64"):
         return

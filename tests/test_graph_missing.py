@@ -40,7 +40,7 @@ def run_on(detector, form, samples, dead=None):
     start = detector.context_before - window.before
     feeds = {"samples": samples[..., start : start + window.length].numpy()}
     if dead is not None:
-        feeds["dead"] = dead.numpy()
+        feeds["masked_channels"] = dead.numpy()
     return runner(session_of(bin_graph(detector, form).model({})))(feeds)
 
 
@@ -50,12 +50,14 @@ def test_expected_scores_are_those_of_torch(form, lost):
     detector = with_gaussians()
     samples = broken_bins().to(getattr(torch, form.precision))
     dead = None if lost is None else torch.zeros(4).bool().index_fill(0, torch.tensor(lost), True)
-    expected = detector.judge_raw(samples.double(), dead=dead)
+    expected = detector.predict_raw(samples.double(), masked_channels=dead)
     got = run_on(detector, form, samples, dead)
     most = 1e-9 if form.precision == "float64" else 1e-4
     error = np.abs(got["score"] - expected.score.numpy()).max()
-    assert error < most * float(detector.judge_raw(raw_bins(24)).score.std())
-    assert np.array_equal(got["valid"], detector.judge_raw(samples, dead=dead).is_valid.numpy())
+    assert error < most * float(detector.predict_raw(raw_bins(24)).score.std())
+    assert np.array_equal(
+        got["valid"], detector.predict_raw(samples, masked_channels=dead).is_valid.numpy()
+    )
 
 
 @pytest.mark.parametrize(
@@ -65,7 +67,7 @@ def test_probabilities_are_as_wide_as_the_scores_are_uncertain(calibration):
     detector = with_gaussians()
     detector.info["calibration"] = calibration.to_dict()
     samples = broken_bins()
-    judged = detector.judge_raw(samples)
+    judged = detector.predict_raw(samples)
     wide = torch.sigmoid(widened_llr(calibration, judged.score, judged.variance)).numpy()
     got = run_on(detector, Form("float64"), samples)["probability"]
     np.testing.assert_allclose(got, wide, atol=1e-9)
@@ -78,9 +80,9 @@ def test_dead_may_be_left_out_and_is_no_input_that_a_host_must_know():
     stream = stream_graph(detector, AlarmSettings.of(detector), Form())
     for graph in (bin_graph(detector, Form()), stream):
         session = session_of(graph.model({}))
-        assert [each.name for each in session.get_overridable_initializers()] == ["dead"]
-        assert "dead" not in [each.name for each in session.get_inputs()]
-    named = {"dead": np.zeros(4, bool), "samples": np.ones((2, 4, 150), np.float32)}
+        assert [each.name for each in session.get_overridable_initializers()] == ["masked_channels"]
+        assert "masked_channels" not in [each.name for each in session.get_inputs()]
+    named = {"masked_channels": np.zeros(4, bool), "samples": np.ones((2, 4, 150), np.float32)}
     run = runner(session_of(bin_graph(detector, Form()).model({})))
     whole = run({"samples": named["samples"][..., : Window.of(detector).length]})
     named["samples"] = named["samples"][..., : Window.of(detector).length]

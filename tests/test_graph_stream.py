@@ -16,7 +16,7 @@ from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.stream import Timing, stream_graph
 from tactslip_torch.graph.value import F64
 from tactslip_torch.model.calibration import Isotonic, Platt
-from tactslip_torch.model.judgement import Judgement
+from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.settings import AlarmSettings
@@ -74,9 +74,9 @@ def loud_detector(kind="all", align="centred"):
         loud = bins.var(-1, correction=0).masked_fill(is_missing, 0.0)[:, used].sum(-1)
         score = (loud + FLOOR).log() - detector.usual
         score = score.to(given)
-        return Judgement(score, ~is_missing[:, used].any(-1), is_missing, torch.zeros_like(score))
+        return Prediction(score, ~is_missing[:, used].any(-1), is_missing, torch.zeros_like(score))
 
-    detector.judge = judge
+    detector.predict = judge
     return detector
 
 

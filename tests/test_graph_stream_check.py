@@ -46,8 +46,8 @@ class StreamRun:
             settings = AlarmSettings.of(self.detector)
             if len(inputs["threshold"]):
                 settings = replace(settings, threshold=float(inputs["threshold"][0]))
-            dead = torch.from_numpy(inputs.get("dead", np.zeros(4, bool)))
-            self.stream = StreamingDetector(self.detector, settings, dead=dead)
+            dead = torch.from_numpy(inputs.get("masked_channels", np.zeros(4, bool)))
+            self.stream = StreamingDetector(self.detector, settings, masked_channels=dead)
         made = self.stream.push(samples)
         out = {
             "score": made.score,

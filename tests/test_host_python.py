@@ -125,7 +125,7 @@ def test_bins_are_scored_as_the_package_scores_them(model, tmp_path):
     bins = torch.stack(
         [torch.from_numpy(samples[s - before : s + 100 + after].T.copy()) for s in starts[1:-1]]
     )
-    judged = detector.judge_raw(bins.double())
+    judged = detector.predict_raw(bins.double())
     assert [line["valid"] for line in lines[1:-1]] == judged.is_valid.tolist()
     assert not judged.is_valid.all()
     found = torch.tensor([line["score"] for line in lines[1:-1]], dtype=torch.float64)

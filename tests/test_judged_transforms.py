@@ -1,4 +1,4 @@
-"""Judgements under vmap, func.grad, jvp, a trace, torch.compile and inference mode."""
+"""Predictions under vmap, func.grad, jvp, a trace, torch.compile and inference mode."""
 
 import warnings
 
@@ -12,9 +12,9 @@ from tactslip_torch.model.detector import SlipDetector
 SEED = 4  # of a detector that needs no SG1
 
 
-@pytest.fixture(scope="module", params=["typical", "gaussians"])
+@pytest.fixture(scope="module", params=["imputation", "gaussians"])
 def detector(request):
-    return {"typical": small_detector, "gaussians": with_gaussians}[request.param](seed=SEED)
+    return {"imputation": small_detector, "gaussians": with_gaussians}[request.param](seed=SEED)
 
 
 def healthy_bins(detector):
@@ -41,17 +41,17 @@ def assert_same(found, expected, most=1e-9):
 def gradient_of(detector, bins):
     """Of the sum of the scores; the patterns are looked at here, and bins go by them."""
     bins = bins.clone().requires_grad_()
-    detector.judge(bins).score.sum().backward()
+    detector.predict(bins).score.sum().backward()
     return bins.grad
 
 
 @BINS
 def test_mapped_over_bins(bins_of, detector):
     bins = bins_of(detector)
-    assert_same(torch.vmap(detector.judge)(bins), detector.judge(bins))
+    assert_same(torch.vmap(detector.predict)(bins), detector.predict(bins))
     dead = ["SG2", "PVDF2"]
-    mapped = torch.vmap(lambda part: detector.judge(part, dead=dead))(bins)
-    assert_same(mapped, detector.judge(bins, dead=dead))
+    mapped = torch.vmap(lambda part: detector.predict(part, masked_channels=dead))(bins)
+    assert_same(mapped, detector.predict(bins, masked_channels=dead))
 
 
 @BINS
@@ -62,7 +62,7 @@ def test_gradients_are_those_of_backward(bins_of, detector):
     assert expected[0].abs().max() > 0
 
     def score(part):
-        return detector.judge(part).score.sum()
+        return detector.predict(part).score.sum()
 
     for take in (torch.func.grad(score), torch.vmap(torch.func.grad(score))):
         torch.testing.assert_close(take(bins), expected, rtol=1e-8, atol=1e-8)
@@ -73,8 +73,8 @@ def test_gradients_are_those_of_backward(bins_of, detector):
 def test_tangents_are_those_of_backward(bins_of, detector):
     bins = bins_of(detector)
     direction = torch.randn(bins.shape, generator=torch.Generator().manual_seed(2)).double()
-    score, slope = torch.func.jvp(lambda x: detector.judge(x).score, (bins,), (direction,))
-    torch.testing.assert_close(score, detector.judge(bins).score, rtol=1e-9, atol=1e-9)
+    score, slope = torch.func.jvp(lambda x: detector.predict(x).score, (bins,), (direction,))
+    torch.testing.assert_close(score, detector.predict(bins).score, rtol=1e-9, atol=1e-9)
     expected = (gradient_of(detector, bins) * direction).sum((-2, -1))
     torch.testing.assert_close(slope, expected, rtol=1e-8, atol=1e-8)
 
@@ -84,10 +84,10 @@ def test_a_trace_holds_for_other_bins(bins_of, detector):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # tracing is deprecated, and says so
         given = healthy_bins(detector)
-        traced = torch.jit.trace(lambda x: tuple(detector.judge(x)), given, check_trace=False)
+        traced = torch.jit.trace(lambda x: tuple(detector.predict(x)), given, check_trace=False)
         bins = bins_of(detector).flip(0)
         # a trace keeps the table of entropies in float32
-        assert_same(traced(bins), detector.judge(bins), most=1e-4)
+        assert_same(traced(bins), detector.predict(bins), most=1e-4)
 
 
 def test_compiled_it_holds_for_other_bins(detector, monkeypatch):
@@ -98,9 +98,9 @@ def test_compiled_it_holds_for_other_bins(detector, monkeypatch):
 
     monkeypatch.setattr(detector, "_features", samples)
     torch.compiler.reset()
-    compiled = torch.compile(detector.judge, backend="eager")  # capture alone, without a compiler
+    compiled = torch.compile(detector.predict, backend="eager")  # capture alone, without a compiler
     for bins in (healthy_bins(detector), broken_bins(detector)):
-        assert_same(compiled(bins), detector.judge(bins))
+        assert_same(compiled(bins), detector.predict(bins))
 
 
 # Inference mode ----------------------------------------------------------------------------------
@@ -115,9 +115,9 @@ def test_what_is_made_under_inference_mode_judges_what_is_missing(how, detector,
         made = SlipDetector.load(tmp_path / "detector.pt")
         if how == "moved":
             made = made.float().double()
-        inside = made.judge(bins)
-    for found in (inside, made.judge(bins)):
-        torch.testing.assert_close(found.score, detector.judge(bins).score, rtol=1e-5, atol=1e-5)
+        inside = made.predict(bins)
+    for found in (inside, made.predict(bins)):
+        torch.testing.assert_close(found.score, detector.predict(bins).score, rtol=1e-5, atol=1e-5)
 
 
 def test_a_change_under_inference_mode_is_followed(tmp_path):
@@ -125,13 +125,13 @@ def test_a_change_under_inference_mode_is_followed(tmp_path):
     with torch.inference_mode():
         made = SlipDetector.load(tmp_path / "detector.pt")
         bins = broken_bins(made)
-        before = made.judge(bins).score
+        before = made.predict(bins).score
         made.head.constant += 1.0
-        torch.testing.assert_close(made.judge(bins).score, before + 1, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(made.predict(bins).score, before + 1, rtol=1e-9, atol=1e-9)
 
 
 def test_gradients_are_open_after_a_first_judgement_under_inference_mode():
     detector = with_gaussians(seed=SEED)
     with torch.inference_mode():
-        detector.judge(broken_bins(detector))
+        detector.predict(broken_bins(detector))
     assert gradient_of(detector, broken_bins(detector)).isfinite().all()

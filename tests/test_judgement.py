@@ -9,18 +9,16 @@ from test_detector import noise, random_detector
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.detector_file import FORMAT
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.runtime import load_table, save_table
 from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 
 BAD = [float("nan"), float("inf"), -float("inf"), 1e308]
 
 
-@pytest.fixture(scope="module", params=["typical", "gaussians"])
+@pytest.fixture(scope="module", params=["imputation", "gaussians"])
 def detector(request):
-    """With typical features alone, and with Gaussians of the features."""
+    """With imputation values alone, and with Gaussians of the features."""
     made = random_detector()
     if request.param == "gaussians":
         bins = made.channel_filter.valid(noise(100, seed=5))
@@ -41,26 +39,26 @@ def unused_channel(detector):
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_healthy_bins_are_scored_as_ever(dtype, detector):
     samples = noise(9).to(dtype)
-    judged = detector.judge_raw(samples)
+    judged = detector.predict_raw(samples)
     assert judged.score.dtype == dtype
     assert torch.equal(judged.score, detector.score_raw(samples))
     assert judged.is_valid.tolist() == [True] * 9
     assert not judged.is_missing.any()
     bins = detector.channel_filter.valid(samples)
-    assert torch.equal(detector.judge(bins).score, detector(bins))
+    assert torch.equal(detector.predict(bins).score, detector(bins))
 
 
 @pytest.mark.parametrize("bad", BAD)
 def test_a_missing_channel_gives_its_typical_features(bad, detector):
     """The score is that of features computed by hand, with the channel's own replaced."""
-    typical = torch.linspace(-0.9, 0.9, len(detector.selected), dtype=torch.float64)
+    imputation = torch.linspace(-0.9, 0.9, len(detector.selected), dtype=torch.float64)
     detector = SlipDetector(
         detector.pool,
         detector.channel_filter,
         detector.selected,
         detector.scaler,
         detector.head,
-        typical=typical,
+        imputation=imputation,
     )
     bins = detector.channel_filter.valid(noise(4))
     channel = used_channel(detector)
@@ -68,9 +66,9 @@ def test_a_missing_channel_gives_its_typical_features(bad, detector):
     name = detector.pool.hand.names[channel]
     for place, feature in enumerate(detector.selected_names):
         if feature.channel == name:
-            scaled[place] = typical[place]
+            scaled[place] = imputation[place]
     bins[2, channel, 50] = bad
-    judged = detector.judge(bins)
+    judged = detector.predict(bins)
     assert judged.is_valid.tolist() == [True, True, False, True]
     assert judged.is_missing.nonzero().tolist() == [[2, channel]]
     torch.testing.assert_close(judged.score[2], detector.head(scaled), rtol=1e-14, atol=0)
@@ -82,12 +80,12 @@ def test_a_missing_channel_gives_its_typical_features(bad, detector):
 def test_a_channel_no_feature_needs_changes_nothing(bad, num, detector):
     """Once an error of torch, of every detector with Gaussians: no bin to take the patterns of."""
     samples, unused = noise(num), unused_channel(detector)
-    expected = detector.judge_raw(samples)
+    expected = detector.predict_raw(samples)
     if bad == "dead":
-        judged = detector.judge_raw(samples, dead=[detector.pool.hand.names[unused]])
+        judged = detector.predict_raw(samples, masked_channels=[detector.pool.hand.names[unused]])
     else:
         samples[:, unused] = bad
-        judged = detector.judge_raw(samples)
+        judged = detector.predict_raw(samples)
     assert torch.equal(judged.score, expected.score)
     assert torch.equal(judged.variance, torch.zeros_like(judged.score))
     assert judged.is_valid.all()
@@ -102,20 +100,20 @@ def test_raise_names_bin_channel_and_sample(bad, detector):
         ValueError,
         match=rf"bin 1, 2, channel PVDF1, sample 149 is {bad}; repair .* nonfinite='mask'",
     ):
-        detector.judge_raw(samples, nonfinite="raise")
+        detector.predict_raw(samples, nonfinite="raise")
     healthy = noise(2)
-    judged = detector.judge_raw(healthy, nonfinite="raise")
+    judged = detector.predict_raw(healthy, nonfinite="raise")
     assert torch.equal(judged.score, detector.score_raw(healthy))
 
 
 def test_one_bin_without_batch_axes(detector):
     samples = noise(1)[0]
-    judged = detector.judge_raw(samples)
+    judged = detector.predict_raw(samples)
     assert judged.score.shape == judged.is_valid.shape == ()
     assert judged.is_missing.shape == (24,)
     samples[3, 0] = torch.nan
     with pytest.raises(ValueError, match=r"^channel SG4, sample 0 is nan"):
-        detector.judge_raw(samples, nonfinite="raise")
+        detector.predict_raw(samples, nonfinite="raise")
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -123,7 +121,7 @@ def test_one_bin_without_batch_axes(detector):
 def test_every_extreme_gives_a_finite_score_or_a_flag(kind, dtype, detector):
     generator = torch.Generator().manual_seed(3)
     samples = extreme_bins(kind, (16, 24, 150), generator, dtype)
-    judged = detector.judge_raw(samples)
+    judged = detector.predict_raw(samples)
     assert judged.score.isfinite().all()
     if kind in ("constant", "zero"):
         assert not judged.is_valid.any()
@@ -132,9 +130,9 @@ def test_every_extreme_gives_a_finite_score_or_a_flag(kind, dtype, detector):
 
 
 def test_all_channels_missing_gives_the_score_of_what_is_known_beforehand(detector):
-    """That of typical features, or the mean over both classes, alike in number."""
-    judged = detector.judge(torch.full((2, 24, 100), torch.nan))
-    expected = detector.head(detector.typical)
+    """That of imputation values, or the mean over both classes, alike in number."""
+    judged = detector.predict(torch.full((2, 24, 100), torch.nan))
+    expected = detector.head(detector.imputation)
     if (known := detector.gaussians) is not None:
         lift = (detector.head.quadratic * known.covariance).sum((-2, -1))
         expected = (detector.head(known.mean) + lift).mean()
@@ -146,7 +144,7 @@ def test_gradients_stay_finite_beside_a_missing_channel(detector):
     samples = noise(2)
     samples[0, used_channel(detector), 70] = torch.nan
     samples.requires_grad_(True)
-    detector.judge_raw(samples).score.sum().backward()
+    detector.predict_raw(samples).score.sum().backward()
     gradient = samples.grad
     assert gradient is not None
     kept = torch.ones(24, dtype=torch.bool)
@@ -157,28 +155,22 @@ def test_gradients_stay_finite_beside_a_missing_channel(detector):
 
 def test_an_unknown_policy_is_refused(detector):
     with pytest.raises(ValueError, match="nonfinite must be 'mask' or 'raise', got 'drop'"):
-        detector.judge_raw(noise(1), nonfinite="drop")
+        detector.predict_raw(noise(1), nonfinite="drop")
 
 
-def test_typical_features_are_kept_in_the_file(detector, tmp_path):
-    typical = torch.full((len(detector.selected),), 0.25, dtype=torch.float64)
+def test_imputation_values_are_kept_in_the_file(detector, tmp_path):
+    imputation = torch.full((len(detector.selected),), 0.25, dtype=torch.float64)
     parts = (detector.pool, detector.channel_filter, detector.selected, detector.scaler)
-    SlipDetector(*parts, detector.head, typical=typical).save(tmp_path / "a.pt")
+    SlipDetector(*parts, detector.head, imputation=imputation).save(tmp_path / "a.pt")
     loaded = SlipDetector.load(tmp_path / "a.pt")
-    assert torch.equal(loaded.typical, typical)
-    facts, state = load_table(tmp_path / "a.pt", FORMAT)  # as written before there were any
-    del state["typical"], facts["pool"]["arithmetic"]
-    save_table(tmp_path / "b.pt", FORMAT, facts, state)
-    older = SlipDetector.load(tmp_path / "b.pt")
-    assert not older.typical.any()
-    assert older.pool.arithmetic == "double"
+    assert torch.equal(loaded.imputation, imputation)
 
 
-@pytest.mark.parametrize("typical", [torch.zeros(3), torch.full((12,), 1.5)])
-def test_typical_features_that_are_none_are_refused(typical, detector):
+@pytest.mark.parametrize("imputation", [torch.zeros(3), torch.full((12,), 1.5)])
+def test_imputation_values_that_are_none_are_refused(imputation, detector):
     parts = (detector.pool, detector.channel_filter, detector.selected, detector.scaler)
-    with pytest.raises(ValueError, match="typical must be 12 scaled features in"):
-        SlipDetector(*parts, detector.head, typical=typical)
+    with pytest.raises(ValueError, match="imputation must be 12 scaled features in"):
+        SlipDetector(*parts, detector.head, imputation=imputation)
 
 
 # Arithmetic ------------------------------------------------------------------------------------
@@ -190,7 +182,7 @@ def test_float32_samples_are_scored_as_in_float64_but_for_the_head(kind, detecto
     inside = detector.pool(detector.channel_filter.valid(samples.double()))
     z = detector.scaler(inside[:, list(detector.selected)])
     single = copy.deepcopy(detector).float()
-    assert torch.equal(single.judge_raw(samples).score, single.head(z.float()))
+    assert torch.equal(single.predict_raw(samples).score, single.head(z.float()))
 
 
 def test_a_feature_far_from_zero_keeps_its_digits_in_a_float32_detector():
@@ -236,7 +228,7 @@ def test_filtered_bins_with_a_broken_channel(bad, dtype, arithmetic):
     bins = detector.channel_filter.valid(noise(3)).to(dtype)
     bins[0, used_channel(detector)] = bad
     bins[1, used_channel(detector), 5] = bad
-    judged = detector.judge(bins)
+    judged = detector.predict(bins)
     assert judged.score.isfinite().all()
     assert judged.is_missing[:, used_channel(detector)].tolist() == [True, True, False]
     assert judged.is_valid.tolist() == [False, False, True]
@@ -245,7 +237,7 @@ def test_filtered_bins_with_a_broken_channel(bad, dtype, arithmetic):
 def test_a_head_that_overflows_is_not_valid():
     detector = random_detector()
     detector.head.quadratic *= 1e40
-    judged = detector.float().judge_raw(noise(4).float())
+    judged = detector.float().predict_raw(noise(4).float())
     assert not judged.is_valid[~judged.score.isfinite()].any()
     assert not judged.score.isfinite().all()
 
@@ -261,9 +253,9 @@ def test_a_head_that_overflows_is_not_valid():
 )
 def test_what_are_no_samples_of_this_hand_is_refused_in_words(samples, message, policy, detector):
     with pytest.raises(ValueError, match=message):
-        detector.judge_raw(samples, nonfinite=policy)
+        detector.predict_raw(samples, nonfinite=policy)
     with pytest.raises(ValueError, match=message.replace("150", "100")):
-        detector.judge(samples[..., :100], nonfinite=policy)
+        detector.predict(samples[..., :100], nonfinite=policy)
 
 
 def test_gradients_of_denormal_samples_are_finite(detector):

@@ -242,11 +242,11 @@ def test_a_rival_judges_filtered_bins(name, rng):
     assert detector.needed_index.tolist() == films
     assert detector.look_ahead == 5  # half the films' frame, not the gauges' 25
     bins = ChannelFilter([51, 51, 11, 11]).valid(raw_bins(20))
-    score, is_valid, is_missing, _ = detector.judge(bins)
+    score, is_valid, is_missing, _ = detector.predict(bins)
     assert torch.equal(score, SCORES[name](bins, films))
     assert is_valid.all()
     assert not is_missing.any()
-    in_32 = detector.judge(bins, given=torch.float32)
+    in_32 = detector.predict(bins, given=torch.float32)
     assert in_32.score.dtype == torch.float32
     torch.testing.assert_close(in_32.score.double(), score, rtol=0, atol=1e-4)
 
@@ -255,12 +255,12 @@ def test_a_rival_judges_filtered_bins(name, rng):
 def test_a_missing_film_is_flagged_and_counts_as_silent(name):
     detector = rival(name)
     bins = ChannelFilter([51, 51, 11, 11]).valid(raw_bins(5))
-    whole = detector.judge(bins)
+    whole = detector.predict(bins)
     bins[1, 2, 30] = torch.nan  # a film
     bins[2, 0, 30] = torch.inf  # a gauge, which no score depends on
     bins[3, 3] = 0.1  # a dead film
     bins[4] = torch.nan
-    found = detector.judge(bins)
+    found = detector.predict(bins)
     assert found.score.isfinite().all()
     assert found.is_valid.tolist() == [True, False, True, False, False]
     assert found.is_missing.sum(-1).tolist() == [0, 1, 1, 0, 4]
@@ -280,7 +280,7 @@ def test_a_rival_runs_where_a_detector_does(name, rng):
     starts = range(0, 700 - 100 + 1, 20)
     assert len(found.score) == len(starts)
     bins = torch.stack([filtered[:, s : s + 100] for s in starts])
-    torch.testing.assert_close(found.score, detector.judge(bins).score, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(found.score, detector.predict(bins).score, rtol=1e-12, atol=1e-12)
     reached = [s < 415 and s + 100 > 395 for s in starts]
     assert (~found.is_valid).tolist() == reached
     again = pickle.loads(pickle.dumps(detector))
@@ -294,4 +294,4 @@ def test_a_rival_that_does_not_exist_or_feels_nothing_is_refused():
     with pytest.raises(ValueError, match="needs a film"):
         rival("largest_detail", pool=FeaturePool(gauges), channel_filter=ChannelFilter([51, 51]))
     with pytest.raises(ValueError, match="expected bins"):
-        rival("largest_detail").judge(torch.randn(2, 3, 100))
+        rival("largest_detail").predict(torch.randn(2, 3, 100))

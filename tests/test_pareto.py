@@ -111,7 +111,7 @@ def test_the_detector_is_the_one_described_and_its_test_score_its_own(written):
     for recording in fold.having("test"):
         bins = maker.lay_bins(source.timeline(recording))
         filtered = detector.channel_filter(source.load(recording).samples.double())
-        score = detector.judge(bins_at(filtered, bins.starts, 100).float()).score
+        score = detector.predict(bins_at(filtered, bins.starts, 100).float()).score
         truth += bins.is_slip.tolist()
         says += (score >= 0).tolist()
     truth, says = np.array(truth), np.array(says)
@@ -481,8 +481,8 @@ def test_a_large_quadratic_head_keeps_to_the_sample(shop):
 @pytest.mark.parametrize(("align", "before", "after"), [("centred", 25, 25), ("causal", 50, 0)])
 def test_test_bins_come_with_the_context_of_their_filter(shop, monkeypatch, align, before, after):
     detector = shop.make(candidate(align=align), "double")
-    given, judge_raw = [], detector.judge_raw
-    monkeypatch.setattr(detector, "judge_raw", lambda raw: given.append(raw) or judge_raw(raw))
+    given, predict_raw = [], detector.predict_raw
+    monkeypatch.setattr(detector, "predict_raw", lambda raw: given.append(raw) or predict_raw(raw))
     found = shop.judged(detector)
     expected = []
     for recording in shop.fold.having("test"):
@@ -545,8 +545,8 @@ def test_a_saved_causal_detector_loads_as_causal(shop, tmp_path):
     loaded = SlipDetector.load(tmp_path / "a.pt")
     assert loaded.channel_filter.align == "causal"
     raw = torch.randn(5, 4, 150)
-    assert torch.equal(loaded.judge_raw(raw).score, detector.judge_raw(raw).score)
+    assert torch.equal(loaded.predict_raw(raw).score, detector.predict_raw(raw).score)
     changed = raw.clone()
     changed[..., :50] += 1  # all context lies before the bin
-    moved = loaded.judge_raw(changed).score - loaded.judge_raw(raw).score
+    moved = loaded.predict_raw(changed).score - loaded.predict_raw(raw).score
     assert (moved != 0).any()

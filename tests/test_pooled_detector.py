@@ -140,7 +140,7 @@ def test_decisions_of_a_stream_with_a_stuck_channel_are_those_without_it(detecto
     stuck[place, STUCK_AT:] = 0.2
     streams = [
         StreamingDetector(detector, dtype=torch.float64),
-        StreamingDetector(detector, dtype=torch.float64, dead=["PVDF7"]),
+        StreamingDetector(detector, dtype=torch.float64, masked_channels=["PVDF7"]),
     ]
     found, wanted = (
         stream.push(samples.T) for stream, samples in zip(streams, (stuck, recording), strict=True)
@@ -158,7 +158,7 @@ def test_decisions_of_a_stream_with_a_stuck_channel_are_those_without_it(detecto
 
 def test_dead_channels_are_left_out_of_their_pools(detector, recording):
     bins = recording.unfold(-1, 400, 400).transpose(0, 1)[:, :, : detector.pool.bin_samples]
-    judged = detector.judge(bins, dead=list(DEAD))
+    judged = detector.predict(bins, masked_channels=list(DEAD))
     mask = torch.tensor([name in DEAD for name in detector.pool.hand.names])
     features = detector.extractor(bins.masked_fill(mask[:, None], 0.0), torch.float64)
     columns = detector.columns(features, mask.expand(len(bins), -1))
@@ -168,21 +168,22 @@ def test_dead_channels_are_left_out_of_their_pools(detector, recording):
     assert not judged.is_valid.any()
     holed = bins.clone()
     holed[:, mask, 7] = torch.nan
-    torch.testing.assert_close(detector.judge(holed).score, judged.score, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(detector.predict(holed).score, judged.score, rtol=1e-10, atol=1e-12)
 
 
 def test_few_bins_are_judged_as_many(detector, recording):
     bins = recording.unfold(-1, 400, 400).transpose(0, 1)[:40, :, : detector.pool.bin_samples]
     for dead in ((), DEAD):
-        many = detector.judge(bins, dead=list(dead))
-        few = [detector.judge(part, dead=list(dead)) for part in bins.split(2)]
+        many = detector.predict(bins, masked_channels=list(dead))
+        few = [detector.predict(part, masked_channels=list(dead)) for part in bins.split(2)]
         score = torch.cat([each.score for each in few])
         torch.testing.assert_close(score, many.score, rtol=1e-9, atol=1e-12)
 
 
 def test_without_any_channel_a_score_is_finite_and_not_valid(detector, recording):
-    judged = detector.judge(
-        recording[None, :, : detector.pool.bin_samples], dead=list(detector.pool.hand.names)
+    judged = detector.predict(
+        recording[None, :, : detector.pool.bin_samples],
+        masked_channels=list(detector.pool.hand.names),
     )
     assert judged.score.isfinite().all()
     assert not judged.is_valid.any()
@@ -220,8 +221,10 @@ def test_the_graph_of_a_bin_is_torch(graphs, broken, detector):
         bins[::2, 3, 50] = bins[1::2, 17, 60] = torch.nan
     if broken == "stuck":
         bins[:, [3, 17]] = 0.4 + noise_like(bins[:, [3, 17]])
-    score, valid = graphs[0].run(["score", "valid"], {"samples": bins.numpy(), "dead": dead})
-    judged = detector.judge_raw(bins, dead=torch.from_numpy(dead))
+    score, valid = graphs[0].run(
+        ["score", "valid"], {"samples": bins.numpy(), "masked_channels": dead}
+    )
+    judged = detector.predict_raw(bins, masked_channels=torch.from_numpy(dead))
     atol = 1e-9 * float(judged.score.std())
     np.testing.assert_allclose(score, judged.score.numpy(), rtol=0, atol=atol)
     assert valid.tolist() == judged.is_valid.tolist()

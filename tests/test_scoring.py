@@ -27,7 +27,7 @@ def test_every_bin_of_the_filtered_recording_is_judged():
         [oracles.savgol(x, w) for x, w in zip(samples.numpy(), LENGTHS, strict=True)]
     )
     starts = [s for s in range(333) if s % HOP == 0 and s + 100 <= 333]
-    one_by_one = [detector.judge(torch.from_numpy(filtered[:, s : s + 100])) for s in starts]
+    one_by_one = [detector.predict(torch.from_numpy(filtered[:, s : s + 100])) for s in starts]
     found = score_stream(detector, samples, HOP)
     assert len(found.score) == 12
     assert found.score.std() > 1
@@ -37,7 +37,7 @@ def test_every_bin_of_the_filtered_recording_is_judged():
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("kind", ["all", "PVDF"])
 @pytest.mark.parametrize("align", ["centred", "causal", "trailing"])
-def test_bins_with_context_score_as_judge_raw_says(dtype, kind, align):
+def test_bins_with_context_score_as_predict_raw_says(dtype, kind, align):
     """But for channels that no feature is of: those are looked at unfiltered."""
     detector, samples = detector_of(kind, align), signal(500, 3, dtype)
     samples[3, 220], samples[2, 300:] = torch.nan, 0.25
@@ -45,7 +45,7 @@ def test_bins_with_context_score_as_judge_raw_says(dtype, kind, align):
     assert found.score.dtype == dtype
     before, after = detector.context_before, detector.context_after
     judged = [
-        detector.judge_raw(samples[:, s - before : s + 100 + after])
+        detector.predict_raw(samples[:, s - before : s + 100 + after])
         for s in range(60, 500 - 100 - after, HOP)
     ]
     expected = Scores(*map(torch.stack, zip(*judged, strict=True)))

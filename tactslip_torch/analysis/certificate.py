@@ -212,7 +212,7 @@ def _tapped(detector: SlipDetector, samples: Tensor) -> tuple[Tensor, Tensor, Te
     stages = (detector.scaler, detector.head)
     hooks = [m.register_forward_pre_hook(lambda _, given: taken.extend(given)) for m in stages]
     try:
-        score, is_valid, *_ = detector.judge_raw(samples)
+        score, is_valid, *_ = detector.predict_raw(samples)
     finally:
         for hook in hooks:
             hook.remove()

@@ -323,11 +323,11 @@ def time_calls(
 
 
 def time_detector(detector: SlipDetector, calls: int, runs: int = 3) -> Timing:
-    """Time ``judge_raw`` of one ordinary bin, float32, as a live loop calls it."""
+    """Time ``predict_raw`` of one ordinary bin, float32, as a live loop calls it."""
     pool = detector.pool
     inputs = single_bins(pool, pool.bin_samples + 2 * detector.channel_filter.context)
     with torch.inference_mode():
-        return time_calls(detector.judge_raw, inputs, calls, runs)
+        return time_calls(detector.predict_raw, inputs, calls, runs)
 
 
 def time_in_fresh_process(

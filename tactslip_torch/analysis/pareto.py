@@ -609,7 +609,7 @@ class Timed:
     Args:
         candidate: what it is.
         arithmetic: of its pool.
-        timing: of ``judge_raw``.
+        timing: of ``predict_raw``.
         latency: with the shortest hop that compute at p99 fits into.
         graph_us: median of its ONNX graph in onnxruntime, of samples in float32; of the pool in
             float64.
@@ -758,7 +758,7 @@ class Workshop:
             plan.frame.scaler,
             head,
             info,
-            plan.typical,
+            plan.imputation,
             plan.gaussians,
             plan.frame.pooling,
             engine=data.maker.extractor.engine,
@@ -780,7 +780,7 @@ class Workshop:
             kept = is_inside & self.fold.bin_roles(recording, len(is_inside))["test"]
             raw = bins_at(samples, bins.starts[kept] - before, before + bins.bin_samples + after)
             with torch.inference_mode():
-                says.append(detector.judge_raw(raw.float()).score >= 0)
+                says.append(detector.predict_raw(raw.float()).score >= 0)
             truth.append(bins.is_slip[kept])
         is_slip = torch.cat(truth)
         return {

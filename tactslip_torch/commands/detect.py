@@ -36,7 +36,7 @@ from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import dead_names
+from tactslip_torch.model.missing_channels import masked_names
 from tactslip_torch.onset.decisions import Decisions, answer_of
 from tactslip_torch.onset.events import (
     EventRules,
@@ -152,7 +152,9 @@ def _hear(
     ):
         rate = detector.pool.sample_rate_hz
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
-        stream = StreamingDetector(detector, settings, dtype=samples.dtype, dead=config.dead or ())
+        stream = StreamingDetector(
+            detector, settings, dtype=samples.dtype, masked_channels=config.masked_channels or ()
+        )
         view = view_of(config.view, entry["duration_s"])
         drawn = _drawn(detector.pool.hand)
         traces = Traces(drawn, rate, stream.hop_s, view, units_of(detector))
@@ -279,7 +281,7 @@ def _origin(listener: Listener) -> dict[str, Any]:
             "bin_s": pool.bin_samples / rate,
         },
         "settings": settings.to_dict() | {"is_own_threshold": config.threshold is None},
-        "dead": list(dead_names(config.dead or (), pool.hand.names)),
+        "masked_channels": list(masked_names(config.masked_channels or (), pool.hand.names)),
         "versions": versions(),
     }
     return dict(plain(facts))

@@ -26,8 +26,8 @@ from tactslip_torch.graph.trials import (
 )
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.judgement import Judgement
 from tactslip_torch.model.missing_channels import widened_llr
+from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.onset.settings import calibration_of
 
 BATCHES = (1, 7, 0, 56)
@@ -122,7 +122,7 @@ def check_bins(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]:
     judged.refuse_errors(behind, sd, worst, "simulated bins behind degenerate ones")
     facts["dead"] = {}
     for name, dead in dead_masks(hand, detector.needed_index).items():
-        judged.dead = dead
+        judged.masked_channels = dead
         without = judged.compare([simulated], f"simulated bins without {name}")
         facts["dead"][name] = _set_facts(without, sd)
         judged.refuse_errors(without, sd, loose, f"simulated bins without {name}")
@@ -140,25 +140,29 @@ class Judged:
         self.dtype = torch.float32 if form.precision == "float32" else torch.float64
         self.calibrated = calibration_of(detector)
         self.unstated = WORST_PROBABILITY[form.precision]
-        self.dead: Tensor | None = None
+        self.masked_channels: Tensor | None = None
         self.others: list[SlipDetector] = []
         for engine in ("reference", "eager"):
             other = copy.copy(self.detector)
             other.extractor = FeatureExtractor(other.pool, other.selected, engine)
             self.others.append(other)
 
-    def judge(self, samples: Tensor) -> Judgement:
+    def judge(self, samples: Tensor) -> Prediction:
         """By torch, scores in float64."""
         with torch.no_grad():
             # a sensor is trusted by what its samples resolve in the precision they come in
-            trusted = self.detector.judge_raw(self._padded(samples), dead=self.dead)
+            trusted = self.detector.predict_raw(
+                self._padded(samples), masked_channels=self.masked_channels
+            )
         return self.exact(samples)._replace(is_valid=trusted.is_valid)
 
-    def exact(self, samples: Tensor, detector: SlipDetector | None = None) -> Judgement:
+    def exact(self, samples: Tensor, detector: SlipDetector | None = None) -> Prediction:
         """In float64, by the detector or one of ``others``, whose features other engines make."""
         detector = detector or self.detector
         with torch.no_grad():
-            return detector.judge_raw(self._padded(samples.double()), dead=self.dead)
+            return detector.predict_raw(
+                self._padded(samples.double()), masked_channels=self.masked_channels
+            )
 
     def _padded(self, samples: Tensor) -> Tensor:
         """With the context of all channels: what no filter in use takes in is 0."""
@@ -197,7 +201,11 @@ class Judged:
         """
         expected = [self.judge(samples) for samples in batches]
         try:
-            asked = {} if self.dead is None else {"dead": self.dead.numpy()}
+            asked = (
+                {}
+                if self.masked_channels is None
+                else {"masked_channels": self.masked_channels.numpy()}
+            )
             runs = [self.run({"samples": samples.numpy(), **asked}) for samples in batches]
         except ValueError as error:
             raise ValueError(f"{what}: {error}") from error

@@ -1,4 +1,4 @@
-"""From raw bins to scores, as a graph: what ``SlipDetector.judge_raw`` does, and no more."""
+"""From raw bins to scores, as a graph: what ``SlipDetector.predict_raw`` does, and no more."""
 
 from __future__ import annotations
 
@@ -80,9 +80,9 @@ def judge_bins(
 
 
 def dead_input(graph: Graph, detector: SlipDetector) -> Value:
-    """The input ``dead [C]``, bool: by default no channel is."""
+    """The input ``masked_channels [C]``, bool: by default no channel is."""
     num = len(detector.pool.hand)
-    return graph.input("dead", BOOL, (num,), np.zeros(num, bool))
+    return graph.input("masked_channels", BOOL, (num,), np.zeros(num, bool))
 
 
 def bin_graph(detector: SlipDetector, form: Form) -> Graph:
@@ -94,7 +94,7 @@ def bin_graph(detector: SlipDetector, form: Form) -> Graph:
 
     Shape:
         - in ``samples``: ``[batch, C, Window.length]``, volts, in the precision of the form
-        - in ``dead``: ``[C]``, bool; may be left out: none is
+        - in ``masked_channels``: ``[C]``, bool; may be left out: none is
         - out ``score``, ``valid`` (bool) and, if calibrated, ``probability``: ``[batch]``
     """
     graph, window = Graph(), Window.of(detector)

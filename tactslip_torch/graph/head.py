@@ -94,8 +94,8 @@ def lost_features(is_missing: Value, detector: SlipDetector) -> Value:
 
 
 def with_typical(graph: Graph, z: Value, is_lost: Value, detector: SlipDetector) -> Value:
-    """Scaled features ``[B, K]``, those that are lost replaced by typical ones."""
-    return graph.where(is_lost, matrix(graph, detector.typical), z)
+    """Scaled features ``[B, K]``, those that are lost replaced by imputation values."""
+    return graph.where(is_lost, matrix(graph, detector.imputation), z)
 
 
 def matrix(graph: Nodes, x: Tensor) -> Value:

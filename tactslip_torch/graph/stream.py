@@ -71,8 +71,8 @@ def stream_graph(
 ) -> Graph:
     """The graph of a stream: what comes next, and what was kept, to decisions and what is kept.
 
-    Inputs ``samples [n, C]``, ``tail [r, C]``, ``state [s]``, ``threshold [t]`` and ``dead [C]``,
-    which may be left out; outputs
+    Inputs ``samples [n, C]``, ``tail [r, C]``, ``state [s]``, ``threshold [t]`` and
+    ``masked_channels [C]``, which may be left out; outputs
     ``score``, ``probability``, ``statistic``, ``valid``, ``alarm``, ``on``, ``time_s``,
     ``onset_s``, ``[k]`` each, ``next_tail [Timing.tail, C]`` and ``next_state
     [Timing.state_size]``. A stream begins with an empty tail and state; without a threshold that of

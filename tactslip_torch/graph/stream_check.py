@@ -20,7 +20,7 @@ from tactslip_torch.graph.stream import Timing
 from tactslip_torch.graph.trials import dead_masks, simulated_stream, unit_of
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import Dead
+from tactslip_torch.model.missing_channels import ChannelMask
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 
@@ -80,7 +80,7 @@ def check_stream(run: Run, detector: SlipDetector, form: Form) -> dict[str, Any]
     lost = _compare(got, of_broken, settings, sd, worst, form, "broken sensors")
     dead = dead_masks(hand, detector.needed_index)["every other"]
     of_dead = _columns(double, settings, whole, dead)
-    host.dead = dead.numpy()
+    host.masked_channels = dead.numpy()
     got = host.watch(samples, ways["by hop"])
     without = _compare(got, of_dead, settings, sd, worst, form, "dead sensors")
     return {
@@ -170,7 +170,7 @@ class _Host:
     def __init__(self, run: Run, num_channels: int, form: Form, timing: Timing) -> None:
         self.run, self.form, self.timing = run, form, timing
         self.num_channels = num_channels
-        self.dead: NDArray[np.bool_] | None = None
+        self.masked_channels: NDArray[np.bool_] | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -181,7 +181,7 @@ class _Host:
     def push(self, samples: NDArray[Any], threshold: float | None = None) -> Columns:
         given = np.array([] if threshold is None else [threshold], np.float64)
         feeds = {"samples": samples, "tail": self.tail, "state": self.state, "threshold": given}
-        asked = {} if self.dead is None else {"dead": self.dead}
+        asked = {} if self.masked_channels is None else {"masked_channels": self.masked_channels}
         columns = self.run(feeds | asked)
         wanted = {*FLAGS, *TIMES, *NUMBERS, "next_tail", "next_state"}
         if columns.keys() != wanted:
@@ -221,13 +221,13 @@ def _pieces(samples: NDArray[Any], sizes: Sequence[int]) -> Iterator[NDArray[Any
 
 
 def _columns(
-    detector: SlipDetector, settings: AlarmSettings, samples: Tensor, dead: Dead = ()
+    detector: SlipDetector, settings: AlarmSettings, samples: Tensor, dead: ChannelMask = ()
 ) -> Columns:
     """What the streaming detector says of samples ``[T, C]``, under the graph's names."""
-    double = StreamingDetector(detector, settings, dtype=torch.float64, dead=dead)
+    double = StreamingDetector(detector, settings, dtype=torch.float64, masked_channels=dead)
     decisions = double.push(samples)
     # a sensor is trusted by what its samples resolve in the precision they come in
-    trusted = StreamingDetector(detector, settings, dtype=samples.dtype, dead=dead)
+    trusted = StreamingDetector(detector, settings, dtype=samples.dtype, masked_channels=dead)
     is_valid = trusted.push(samples).is_valid
     named = {
         "score": decisions.score,

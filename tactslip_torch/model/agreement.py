@@ -20,14 +20,14 @@ def check_parts(
     selected: Sequence[int],
     scaler: FeatureScaler,
     head: Head,
-    typical: Tensor,
+    imputation: Tensor,
     gaussians: ClassGaussians | None,
     pooling: ChannelPooling | None = None,
 ) -> None:
     """Refuse parts that disagree; what they are ``SlipDetector`` says.
 
     Raises:
-        ValueError: if they disagree about the number of channels or features, or typical features
+        ValueError: if they disagree about the number of channels or features, or imputation values
             are not scaled.
     """
     num = len(selected)
@@ -49,10 +49,10 @@ def check_parts(
             f"a filter of {len(channel_filter.window_lengths)} channels does not fit a hand "
             f"of {len(pool.hand)}"
         )
-    if typical.shape != (num,) or not bool((typical.abs() <= 1).all()):
+    if imputation.shape != (num,) or not bool((imputation.abs() <= 1).all()):
         raise ValueError(
-            f"typical must be {num} scaled features in [-1, 1], got "
-            f"{tuple(typical.shape)} of at most {float(typical.abs().max()):g}"
+            f"imputation must be {num} scaled features in [-1, 1], got "
+            f"{tuple(imputation.shape)} of at most {float(imputation.abs().max()):g}"
         )
     if gaussians is not None and gaussians.num_features != num:
         raise ValueError(f"Gaussians of {gaussians.num_features} features do not fit {num} of them")

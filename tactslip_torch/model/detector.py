@@ -20,8 +20,13 @@ from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.model.agreement import check_parts
 from tactslip_torch.model.detector_file import Head, damaged, read_detector, write_detector
 from tactslip_torch.model.few_bins import FEW_BINS, FEW_FILTERED, FewBins
-from tactslip_torch.model.judgement import Judgement, Nonfinite, check_nonfinite, judged_in_parts
-from tactslip_torch.model.missing_channels import ClassGaussians, Dead, MissingScores, without
+from tactslip_torch.model.missing_channels import (
+    ChannelMask,
+    ClassGaussians,
+    MissingScores,
+    without,
+)
+from tactslip_torch.model.prediction import Nonfinite, Prediction, check_nonfinite, predict_in_parts
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import is_plain
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -41,9 +46,9 @@ class SlipDetector(nn.Module):
         scaler: of the K columns.
         head: the machine on scaled features.
         info: JSON-able facts about the training, kept in the file.
-        typical: scaled features that stand in for those of a missing channel; default 0.
+        imputation: scaled features in place of those of a missing channel, ``[K]``; default 0.
         gaussians: of the scaled features; with them, what is missing leaves the expected score and
-            its variance (``ExpectedScore``), instead of the score of ``typical`` features.
+            its variance (``ExpectedScore``), instead of the score of ``imputation`` values.
         pooling: from the features that are read to the columns; ``None``: they are the columns.
         engine: what features are made by where no gradient is asked for (``FeatureExtractor``).
 
@@ -51,14 +56,14 @@ class SlipDetector(nn.Module):
         - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
         - score: ``[*]``, dtype of ``bins``; at least 0 means slip
         - inside: ``bins -> features [*, M] -> columns [*, K] -> scaled [*, K] -> score [*]``
-        - raw samples, for ``score_raw`` and ``judge_raw``: ``[*, C, before + n + after]``, with
+        - raw samples, for ``score_raw`` and ``predict_raw``: ``[*, C, before + n + after]``, with
           ``context_before`` and ``context_after`` samples around the bin
 
     Raises:
         ValueError: if the parts disagree about the number of channels or features.
     """
 
-    typical: Tensor
+    imputation: Tensor
     channel_index: Tensor  # of each column; one past the last channel for a pooled one
     needed_index: Tensor  # of the channels in use
 
@@ -70,15 +75,17 @@ class SlipDetector(nn.Module):
         scaler: FeatureScaler,
         head: Head,
         info: Mapping[str, Any] | None = None,
-        typical: Tensor | Sequence[float] | None = None,
+        imputation: Tensor | Sequence[float] | None = None,
         gaussians: ClassGaussians | None = None,
         pooling: ChannelPooling | None = None,
         *,
         engine: EngineName = "auto",
     ) -> None:
         super().__init__()
-        typical = torch.as_tensor([0.0] * len(scaler.minimum) if typical is None else typical)
-        check_parts(pool, channel_filter, selected, scaler, head, typical, gaussians, pooling)
+        imputation = torch.as_tensor(
+            [0.0] * len(scaler.minimum) if imputation is None else imputation
+        )
+        check_parts(pool, channel_filter, selected, scaler, head, imputation, gaussians, pooling)
         self.pool, self.channel_filter = pool, channel_filter
         self.extractor = FeatureExtractor(pool, selected, engine)
         self.selected = self.extractor.selected
@@ -86,7 +93,7 @@ class SlipDetector(nn.Module):
         self.info = dict(info or {})
         self._few: FewBins | None = None
         self._missing: MissingScores | None = None
-        self.register_buffer("typical", typical.to(next(head.buffers()), copy=True))
+        self.register_buffer("imputation", imputation.to(next(head.buffers()), copy=True))
         place = {name: index for index, name in enumerate(pool.hand.names)}
         channels = [place.get(name.channel, len(place)) for name in self.selected_names]
         indices = {"channel": channels, "needed": self.extractor.plan.channels}
@@ -120,7 +127,7 @@ class SlipDetector(nn.Module):
     def forward(self, bins: Tensor) -> Tensor:
         """Score filtered bins; at least 0 means slip, NaN where a needed value is not finite.
 
-        ``judge`` is for programs that must go on when a sensor fails.
+        ``predict`` is for programs that must go on when a sensor fails.
 
         Shape:
             - bins: ``[*, C, n]``
@@ -130,7 +137,7 @@ class SlipDetector(nn.Module):
             ValueError: if the number of channels or samples is another.
         """
         self.pool.check(bins)
-        return judged_in_parts(lambda part: self._score(part, FEW_FILTERED), bins)
+        return predict_in_parts(lambda part: self._score(part, FEW_FILTERED), bins)
 
     def score_raw(self, samples: Tensor) -> Tensor:
         """Filter and score raw bins that come with their context.
@@ -143,15 +150,15 @@ class SlipDetector(nn.Module):
             ValueError: if the number of channels or samples is another.
         """
         self.channel_filter.check(samples)
-        return judged_in_parts(self._score_raw, samples)
+        return predict_in_parts(self._score_raw, samples)
 
-    def judge(
+    def predict(
         self,
         bins: Tensor,
         nonfinite: Nonfinite = "mask",
         given: torch.dtype | None = None,
-        dead: Dead | None = None,
-    ) -> Judgement:
+        masked_channels: ChannelMask | None = None,
+    ) -> Prediction:
         """Score filtered bins of a hand whose sensors may fail: a finite score, and its validity.
 
         Args:
@@ -160,7 +167,7 @@ class SlipDetector(nn.Module):
                 score is the one expected without it, and not valid. ``"raise"``: refuse.
             given: dtype of the samples that the bins were filtered from, by default theirs; that of
                 the score, and what a sensor must resolve to be trusted.
-            dead: channels that count as missing whatever they say.
+            masked_channels: channels that count as missing whatever they say.
 
         Shape:
             - bins: ``[*, C, n]``
@@ -171,28 +178,31 @@ class SlipDetector(nn.Module):
         """
         self.pool.check(bins)
         check_nonfinite(nonfinite, bins, self.pool.hand.names)
-        bins = without(bins, dead, self.pool.hand.names)
+        bins = without(bins, masked_channels, self.pool.hand.names)
         dtype = given or bins.dtype
-        return judged_in_parts(lambda part: self._judge(part, dtype, FEW_FILTERED), bins)
+        return predict_in_parts(lambda part: self._predict(part, dtype, FEW_FILTERED), bins)
 
-    def judge_raw(
-        self, samples: Tensor, nonfinite: Nonfinite = "mask", dead: Dead | None = None
-    ) -> Judgement:
-        """``judge`` for raw bins with their context, where NaN and Inf count as filters reach it.
+    def predict_raw(
+        self,
+        samples: Tensor,
+        nonfinite: Nonfinite = "mask",
+        masked_channels: ChannelMask | None = None,
+    ) -> Prediction:
+        """``predict`` for raw bins with their context, where NaN and Inf count as filters reach it.
 
         Shape:
             - samples: ``[*, C, context_before + n + context_after]``, volts
 
         Raises:
-            ValueError: as ``judge``.
+            ValueError: as ``predict``.
         """
         self.channel_filter.check(samples)
         check_nonfinite(nonfinite, samples, self.pool.hand.names)
-        samples = without(samples, dead, self.pool.hand.names)
-        return judged_in_parts(self._judge_raw, samples)
+        samples = without(samples, masked_channels, self.pool.hand.names)
+        return predict_in_parts(self._predict_raw, samples)
 
     def validity(self, bins: Tensor) -> Tensor:
-        """Whether every channel in use can be trusted (``FeaturePool.validity``), as ``judge``.
+        """Whether every channel in use can be trusted (``FeaturePool.validity``), as ``predict``.
 
         Shape:
             - bins: ``[*, C, n]``, filtered
@@ -227,7 +237,7 @@ class SlipDetector(nn.Module):
         """Scaled columns, which the head takes; shapes as ``columns`` has them."""
         columns = self.columns(saturating(features, self.scaler.minimum.dtype), is_missing)
         scaled: Tensor = self.scaler(columns)
-        return scaled.to(self.typical.dtype)
+        return scaled.to(self.imputation.dtype)
 
     def _score(self, bins: Tensor, most: int = FEW_BINS) -> Tensor:
         if (few := self._few_bins(bins, most)) is not None:
@@ -237,14 +247,14 @@ class SlipDetector(nn.Module):
     def _score_raw(self, samples: Tensor) -> Tensor:
         return saturating(self._score(self._filter(samples)), samples.dtype)
 
-    def _judge_raw(self, samples: Tensor) -> Judgement:
-        return self._judge(self._filter(samples), samples.dtype)
+    def _predict_raw(self, samples: Tensor) -> Prediction:
+        return self._predict(self._filter(samples), samples.dtype)
 
-    def _judge(self, bins: Tensor, given: torch.dtype, most: int = FEW_BINS) -> Judgement:
+    def _predict(self, bins: Tensor, given: torch.dtype, most: int = FEW_BINS) -> Prediction:
         """Scores of filtered bins, valid by the dtype they were given in, which is the score's."""
         if (few := self._few_bins(bins, most)) is not None:
             wide = self.pool.widen(bins.detach())
-            return few.judge(self._features, wide, given, self._without)
+            return few.predict(self._features, wide, given, self._without)
         is_alive = self.pool.is_alive(bins.to(given))  # sensors resolve no more than they give
         bins = self.pool.widen(bins)
         is_missing = self.pool.is_missing(bins)
@@ -257,11 +267,11 @@ class SlipDetector(nn.Module):
         if not is_whole:
             score, variance = self._without(score, scaled, is_missing)
         is_valid = self._needed(is_alive & ~is_missing) & score.isfinite()
-        return Judgement(score, is_valid, is_missing, variance)
+        return Prediction(score, is_valid, is_missing, variance)
 
     def _without(self, score: Tensor, *missing: Tensor) -> tuple[Tensor, Tensor]:
         """Scores and variances where channels are missing (``MissingScores``)."""
-        parts = self.head, self.typical, self.channel_index, self.gaussians
+        parts = self.head, self.imputation, self.channel_index, self.gaussians
         if self._missing is None or not self._missing.is_of(*parts):
             self._missing = MissingScores(*parts)
         return self._missing(score, *missing)

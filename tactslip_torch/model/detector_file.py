@@ -33,7 +33,7 @@ class DetectorParts(NamedTuple):
     scaler: FeatureScaler
     head: Head
     info: Mapping[str, Any]
-    typical: Tensor | None
+    imputation: Tensor
     gaussians: ClassGaussians | None
     pooling: ChannelPooling | None
 
@@ -116,7 +116,7 @@ def _parts(facts: Mapping[str, Any], state: Mapping[str, Tensor]) -> DetectorPar
         FeatureScaler(**part("scaler.")),
         head,
         facts["info"],
-        state.get("typical"),
+        state["imputation"],
         ClassGaussians.among(state),
         pooling and ChannelPooling.from_dict(hand, pooling, part("pooling.")),
     )

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from tactslip_torch.features.pool import LARGEST_SAMPLE, FeaturePool, saturating
 from tactslip_torch.model.detector_file import Head
-from tactslip_torch.model.judgement import Judgement
 from tactslip_torch.model.kernels import QuadraticForm
+from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.model.scaling import FeatureScaler
 
 Array = np.ndarray[Any, Any]
@@ -85,13 +85,13 @@ class FewBins:
         with np.errstate(all="ignore"):
             return self._score(self._scaled(self._columns(features)), dtype)
 
-    def judge(
+    def predict(
         self,
         features_of: Callable[[Tensor], Tensor],
         bins: Tensor,
         given: torch.dtype,
         without: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
-    ) -> Judgement:
+    ) -> Prediction:
         """Scores of filtered bins ``[*, C, n]``, valid by the dtype they were ``given`` in.
 
         What to make of missing channels, ``without`` is asked (``MissingScores``).
@@ -109,7 +109,7 @@ class FewBins:
                 score, variance = without(score, torch.from_numpy(np.asarray(scaled)), lost)
             is_trusted = (is_alive & ~is_missing)[..., self._needed].all(-1)
             is_valid = np.asarray(is_trusted & np.isfinite(score.numpy()))
-        return Judgement(score, torch.from_numpy(is_valid), torch.from_numpy(is_missing), variance)
+        return Prediction(score, torch.from_numpy(is_valid), torch.from_numpy(is_missing), variance)
 
     def _scaled(self, features: Tensor) -> Array:
         """As ``FeatureScaler``, in the dtype of the head."""

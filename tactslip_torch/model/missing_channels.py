@@ -30,7 +30,7 @@ from tactslip_torch.model.calibration import Calibration
 from tactslip_torch.model.kernels import Head, QuadraticForm
 from tactslip_torch.runtime import has_values
 
-Dead = Sequence[str] | Tensor
+ChannelMask = Sequence[str] | Tensor
 """Channels that are not to be listened to: their names, or a mask ``[C]``, bool."""
 
 PREFIX = "gaussians."
@@ -49,49 +49,49 @@ come in afterwards by Bayes (``probability``), and no bound is stated for them.
 """
 
 
-def dead_mask(dead: Dead, names: Sequence[str]) -> Tensor:
-    """The mask ``[C]`` of dead channels.
+def channel_mask(masked: ChannelMask, names: Sequence[str]) -> Tensor:
+    """The mask ``[C]`` of masked channels.
 
     Raises:
         ValueError: for a channel that is none of these names, or a mask of another shape or dtype.
     """
-    if isinstance(dead, Tensor):
-        if dead.shape != (len(names),) or dead.dtype != torch.bool:
+    if isinstance(masked, Tensor):
+        if masked.shape != (len(names),) or masked.dtype != torch.bool:
             raise ValueError(
-                f"dead must be names of channels or a bool mask [{len(names)}], got {dead.dtype} "
-                f"{tuple(dead.shape)}"
+                f"masked_channels must be names of channels or a bool mask [{len(names)}], "
+                f"got {masked.dtype} {tuple(masked.shape)}"
             )
-        return dead
-    listed = [dead] if isinstance(dead, str) else dead
+        return masked
+    listed = [masked] if isinstance(masked, str) else masked
     if not isinstance(listed, Iterable):
-        raise ValueError(f"dead must be a list of names of channels, got {dead!r}")
+        raise ValueError(f"masked_channels must be a list of names of channels, got {masked!r}")
     if unknown := [name for name in listed if name not in names]:
         raise ValueError(
-            f"dead names the channel {unknown[0]!r}, which this hand does not have; take some of "
-            f"{', '.join(names)}"
+            f"masked_channels names the channel {unknown[0]!r}, which this hand does not have; "
+            f"take some of {', '.join(names)}"
         )
     return torch.tensor([name in listed for name in names], dtype=torch.bool)
 
 
-def dead_names(dead: Dead, names: Sequence[str]) -> tuple[str, ...]:
-    """Names of dead channels, in the order of the hand.
+def masked_names(masked: ChannelMask, names: Sequence[str]) -> tuple[str, ...]:
+    """Names of masked channels, in the order of the hand.
 
     Raises:
-        ValueError: as ``dead_mask``.
+        ValueError: as ``channel_mask``.
     """
-    mask = dead_mask(dead, names).tolist()
-    return tuple(name for name, is_dead in zip(names, mask, strict=True) if is_dead)
+    mask = channel_mask(masked, names).tolist()
+    return tuple(name for name, is_masked in zip(names, mask, strict=True) if is_masked)
 
 
-def without(samples: Tensor, dead: Dead | None, names: Sequence[str]) -> Tensor:
-    """Samples ``[*, C, n]`` with NaN in dead channels, which is how a missing one looks.
+def without(samples: Tensor, masked: ChannelMask | None, names: Sequence[str]) -> Tensor:
+    """Samples ``[*, C, n]`` with NaN in masked channels, which is how a missing one looks.
 
     Raises:
-        ValueError: as ``dead_mask``.
+        ValueError: as ``channel_mask``.
     """
-    if dead is None:
+    if masked is None:
         return samples
-    mask = dead_mask(dead, names).to(samples.device)
+    mask = channel_mask(masked, names).to(samples.device)
     return samples.masked_fill(mask[:, None], torch.nan) if bool(mask.any()) else samples
 
 
@@ -99,12 +99,12 @@ class MissingScores:
     """Scores of bins some of whose channels are missing.
 
     Of a quadratic form with Gaussians of its features, the expected score and its variance
-    (``ExpectedScore``). Of any other, the score of typical features in the place of those missing,
+    (``ExpectedScore``). Of any other, the score of imputation values in the place of those missing,
     and no variance.
 
     Args:
         head: the machine.
-        typical: scaled features, ``[K]``.
+        imputation: scaled features, ``[K]``.
         channel_index: of each column, ``[K]``; one past the last channel for a pooled one.
         gaussians: of the features, if they are known.
     """
@@ -112,26 +112,26 @@ class MissingScores:
     def __init__(
         self,
         head: Head,
-        typical: Tensor,
+        imputation: Tensor,
         channel_index: Tensor,
         gaussians: ClassGaussians | None,
     ) -> None:
-        self._head, self._typical, self._channel_index = head, typical, channel_index
+        self._head, self._imputation, self._channel_index = head, imputation, channel_index
         self._expected: ExpectedScore | None = None
         if gaussians is not None and isinstance(head, QuadraticForm):
             self._expected = ExpectedScore(head, gaussians)
-        of = _tensors(head, typical, channel_index, gaussians)
+        of = _tensors(head, imputation, channel_index, gaussians)
         self._stamps = [(each, _state(each)) for each in of]
 
     def is_of(
         self,
         head: Head,
-        typical: Tensor,
+        imputation: Tensor,
         channel_index: Tensor,
         gaussians: ClassGaussians | None,
     ) -> bool:
         """Whether it was made of these, none of them replaced or changed since."""
-        now = _tensors(head, typical, channel_index, gaussians)
+        now = _tensors(head, imputation, channel_index, gaussians)
         return len(now) == len(self._stamps) and all(map(_is_as_stamped, now, self._stamps))
 
     def __call__(self, score: Tensor, scaled: Tensor, is_missing: Tensor) -> tuple[Tensor, Tensor]:
@@ -155,7 +155,7 @@ class MissingScores:
     def _of(self, scaled: Tensor, is_lost: Tensor) -> tuple[Tensor, Tensor]:
         """Of features ``[*, K]``, and which of them are missing."""
         if self._expected is None:
-            score = self._head(torch.where(is_lost, self._typical, scaled))
+            score = self._head(torch.where(is_lost, self._imputation, scaled))
             return score, torch.zeros_like(score)
         return self._expected(scaled, is_lost)
 
@@ -166,10 +166,10 @@ def _put(values: Tensor, where: Tensor, others: Tensor) -> Tensor:
 
 
 def _tensors(
-    head: Head, typical: Tensor, channel_index: Tensor, gaussians: ClassGaussians | None
+    head: Head, imputation: Tensor, channel_index: Tensor, gaussians: ClassGaussians | None
 ) -> list[Tensor]:
     of_features = [] if gaussians is None else gaussians.buffers()
-    return [*head.buffers(), typical, channel_index, *of_features]
+    return [*head.buffers(), imputation, channel_index, *of_features]
 
 
 def _state(x: Tensor) -> int | Tensor:

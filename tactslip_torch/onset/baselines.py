@@ -19,7 +19,7 @@ from torch import Tensor
 
 from tactslip_torch.features.guards import are_ordinary, is_nowhere, stretch
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.judgement import Judgement
+from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names
@@ -151,7 +151,7 @@ class BaselineDetector:
         reaches = self.channel_filter.reaches
         return max(reaches[film][1] for film in self.pool.hand.fast)
 
-    def judge(self, bins: Tensor, *, given: torch.dtype | None = None) -> Judgement:
+    def predict(self, bins: Tensor, *, given: torch.dtype | None = None) -> Prediction:
         """Score filtered bins. A film that is missing counts as silent, and the score as not valid.
 
         Args:
@@ -177,7 +177,7 @@ class BaselineDetector:
         else:
             score = largest_detail(bins, films, self.pool.wavelet, self.pool.level)
         is_valid = is_trusted.index_select(-1, films.to(bins.device)).all(-1)
-        return Judgement(score, is_valid, is_missing, torch.zeros_like(score))
+        return Prediction(score, is_valid, is_missing, torch.zeros_like(score))
 
 
 def _log_of_largest(

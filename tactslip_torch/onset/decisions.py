@@ -18,15 +18,15 @@ from tactslip_torch.model.abstention import abstention_of
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.conformal import UNSURE, answers
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.judgement import Judgement
 from tactslip_torch.model.missing_channels import widened_llr
+from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.onset.rules import NEUTRAL, Latch, latch, latch_start
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.signals.filtering import ChannelFilter
 
 
 class Scores(NamedTuple):
-    """Judgements of N bins of a recording, in order.
+    """Predictions of N bins of a recording, in order.
 
     Attributes:
         score: ``[N]``, dtype of the samples; at least 0 means slip.
@@ -75,7 +75,7 @@ class Scorer(Protocol):
     def look_ahead(self) -> int:
         """Samples behind a bin that its score waits for."""
 
-    def judge(self, bins: Tensor, *, given: torch.dtype) -> Judgement:
+    def predict(self, bins: Tensor, *, given: torch.dtype) -> Prediction:
         """Judge filtered bins ``[N, C, n]``, of samples that were ``given`` in a dtype."""
 
 
@@ -128,7 +128,7 @@ def score_filtered(
         empty = none.new_empty(0, dtype=given)
         return Scores(empty, none.bool()[:, 0], none.bool(), empty)
     bins = filtered.unfold(-1, length, hop_samples).transpose(0, 1)  # [N, C, n], a view
-    judged = [detector.judge(part.contiguous(), given=given) for part in bins.split(chunk)]
+    judged = [detector.predict(part.contiguous(), given=given) for part in bins.split(chunk)]
     return Scores(*judged[0]) if len(judged) == 1 else Scores(*_together(judged))
 
 
@@ -145,7 +145,7 @@ def _check(detector: Scorer, samples: Tensor) -> None:
         )
 
 
-def _together(judged: Sequence[Judgement]) -> list[Tensor]:
+def _together(judged: Sequence[Prediction]) -> list[Tensor]:
     return [torch.cat(parts) for parts in zip(*judged, strict=True)]
 
 
@@ -416,7 +416,7 @@ def stream_statistic(
     is_used = torch.zeros(len(detector.pool.hand), 1, dtype=torch.bool, device=bins.device)
     is_used[used] = True
     bins = torch.where(is_used | bins.isfinite(), bins, 0.0)  # or 0 times NaN comes back
-    score, _, is_missing, variance = detector.judge(bins, given=samples.dtype)
+    score, _, is_missing, variance = detector.predict(bins, given=samples.dtype)
     llr = widened_llr(settings.calibration, score, variance)
     tells = is_usable(score, is_missing, detector.needed_index) & llr.isfinite()
     llr = torch.where(tells, llr, NEUTRAL)

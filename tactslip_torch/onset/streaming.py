@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import Dead, dead_names, without
+from tactslip_torch.model.missing_channels import ChannelMask, masked_names, without
 from tactslip_torch.onset.decisions import Decider, Decisions, is_usable, score_filtered
 from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.signals.stream import FilterStream, SampleClock
@@ -45,13 +45,13 @@ class StreamingDetector:
         detector: fitted on this hand.
         settings: hop, calibration, rule and threshold; by default those in the detector's file.
         dtype: of the samples, float32 or float64, and of the scores; what is pushed is converted.
-        dead: names of channels that are not to be listened to.
+        masked_channels: names of channels that are not to be listened to.
         max_gap_s: longest gap that is filled.
 
     Attributes:
         num_gaps: longer gaps since it was made or reset.
-        dead: channels that count as missing whatever they say, in the order of the hand; may be set
-            at any time, for all decisions that are still to be made.
+        masked_channels: channels that count as missing whatever they say, in the order of the
+            hand; may be set at any time, for all decisions that are still to be made.
 
     Raises:
         ValueError: if the detector has no settings, the gap is negative, the dtype another or the
@@ -70,7 +70,7 @@ class StreamingDetector:
         settings: AlarmSettings | None = None,
         *,
         dtype: torch.dtype = torch.float32,
-        dead: Dead = (),
+        masked_channels: ChannelMask = (),
         max_gap_s: float = 0.05,
     ) -> None:
         if dtype not in _NUMPY:
@@ -82,7 +82,7 @@ class StreamingDetector:
         self.settings = AlarmSettings.of(detector) if settings is None else settings
         self.dtype = dtype
         self.num_gaps = 0
-        self.dead = dead_names(dead, pool.hand.names)
+        self.masked_channels = masked_names(masked_channels, pool.hand.names)
         self._clock = SampleClock(pool.sample_rate_hz)
         self._max_gap = round(max_gap_s * pool.sample_rate_hz)
         wide = pool.widen(torch.empty(0, dtype=dtype)).dtype
@@ -94,13 +94,13 @@ class StreamingDetector:
         self._start()
 
     @property
-    def dead(self) -> tuple[str, ...]:
+    def masked_channels(self) -> tuple[str, ...]:
         """Channels that are not listened to, in the order of the hand."""
-        return self._dead
+        return self._masked_channels
 
-    @dead.setter
-    def dead(self, dead: Dead) -> None:
-        self._dead = dead_names(dead, self.detector.pool.hand.names)
+    @masked_channels.setter
+    def masked_channels(self, masked_channels: ChannelMask) -> None:
+        self._masked_channels = masked_names(masked_channels, self.detector.pool.hand.names)
 
     @property
     def look_ahead_s(self) -> float:
@@ -243,7 +243,7 @@ class StreamingDetector:
         self._drop()
         hop = self.settings.hop_samples
         with torch.no_grad():
-            heard = without(self._filtered, self._dead, self.detector.pool.hand.names)
+            heard = without(self._filtered, self._masked_channels, self.detector.pool.hand.names)
             scores = score_filtered(self.detector, heard, hop, self.dtype)
             tells = is_usable(scores.score, scores.is_missing, self.detector.needed_index)
             judged = (scores.score, scores.is_valid, tells, scores.variance)

@@ -518,7 +518,7 @@ def _training_bins(statistics: Statistics, known: KnownBins) -> TrainingBins:
 def _renew_stand_ins(detector: SlipDetector, bins: TrainingBins) -> None:
     """What is expected of a sensor that is missing."""
     gaussians = ClassGaussians.fit(bins.features, bins.is_slip, bins.weights)
-    detector.typical.copy_(gaussians.mean.mean(0))  # both classes counting alike
+    detector.imputation.copy_(gaussians.mean.mean(0))  # both classes counting alike
     if detector.gaussians is not None:
         detector.gaussians = gaussians
 

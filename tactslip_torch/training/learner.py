@@ -526,7 +526,7 @@ class SlipLearner(L.LightningModule):
             self.facts
             | {"calibration": plan.calibration, KEY: plan.abstain}
             | ({BASELINES: self.baselines.to_dict()} if self.baselines else {}),
-            plan.typical,
+            plan.imputation,
             plan.gaussians,
             plan.frame.pooling,
         )

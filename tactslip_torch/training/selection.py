@@ -87,7 +87,7 @@ class Plan:
         shares: of non-slip and slip bins that are trained on.
         stands_for: how many bins each of those stands for, as in validation.
         num_bins: how many bins are trained on; about, where shares are below 1.
-        typical: mean of the scaled features, both classes counting alike; it stands in where a
+        imputation: mean of the scaled features, both classes counting alike; it stands in where a
             sensor is missing.
         validation: one row per choice: what was chosen from, the balanced accuracy of each
             held-out group, and the calibration of held-out scores.
@@ -110,7 +110,7 @@ class Plan:
     shares: tuple[float, float]
     stands_for: float
     num_bins: int
-    typical: tuple[float, ...]
+    imputation: tuple[float, ...]
     validation: list[dict[str, Any]] = field(default_factory=list)
     among: dict[str, Any] | None = None
     abstain: dict[str, Any] | None = None
@@ -146,7 +146,7 @@ class Plan:
             "shares": list(self.shares),
             "stands_for": self.stands_for,
             "num_bins": self.num_bins,
-            "typical": list(self.typical),
+            "imputation": list(self.imputation),
             "validation": self.validation,
             "among": self.among,
             "abstain": self.abstain,
@@ -177,7 +177,7 @@ class Plan:
             shares=(facts["shares"][0], facts["shares"][1]),
             stands_for=facts["stands_for"],
             num_bins=facts["num_bins"],
-            typical=tuple(facts["typical"]),
+            imputation=tuple(facts["imputation"]),
             validation=list(facts["validation"]),
             among=facts.get("among"),  # older plans know no such restriction
             abstain=facts.get("abstain"),  # nor unsure answers
@@ -272,7 +272,7 @@ def plan_detector(
         shares=(shares[0], shares[1]),
         stands_for=stands_for,
         num_bins=round(num_bins),
-        typical=_typical(z, sample.is_slip, weights),
+        imputation=_imputation(z, sample.is_slip, weights),
         validation=rows,
         among=None if allowed is None else _narrowed(recipe, allowed, sizes),
         gaussians=ClassGaussians.fit(z, sample.is_slip, weights) if has_gaussians else None,
@@ -320,7 +320,7 @@ def _plan_nested(
         shares=(shares[0], shares[1]),
         stands_for=1.0,
         num_bins=num_bins,
-        typical=_typical(z, sample.is_slip, weights),
+        imputation=_imputation(z, sample.is_slip, weights),
         validation=rows,
         among=None if recipe.among is None or allowed is None else _narrowed(recipe, allowed, []),
         gaussians=ClassGaussians.fit(z, sample.is_slip, weights) if has_gaussians else None,
@@ -335,7 +335,7 @@ def _narrowed(recipe: Recipe, allowed: Tensor, sizes: Sequence[int]) -> dict[str
     return {"wanted": recipe.facts()["among"], "matching": matching, "num_features": list(sizes)}
 
 
-def _typical(scaled: Tensor, is_slip: Tensor, weights: Tensor) -> tuple[float, ...]:
+def _imputation(scaled: Tensor, is_slip: Tensor, weights: Tensor) -> tuple[float, ...]:
     """Mean of scaled features ``[N, K]``, both classes counting alike; K numbers."""
     means = [weights[mine] @ scaled[mine] / weights[mine].sum() for mine in (is_slip, ~is_slip)]
     return tuple(((means[0] + means[1]) / 2).tolist())

@@ -32,7 +32,7 @@ ENGINES = ("eager", "compiled")
 
 def predict_raw(detector, samples, **options):
     """Scores and validity of raw bins that come with their context."""
-    return detector.judge_raw(samples, **options)
+    return detector.predict_raw(samples, **options)
 
 
 def score_raw(detector, samples):
@@ -40,7 +40,7 @@ def score_raw(detector, samples):
 
 
 def stream_with_masked_channels(detector, channels, **options):
-    return StreamingDetector(detector, dead=channels, **options)
+    return StreamingDetector(detector, masked_channels=channels, **options)
 
 
 def solve_moments(stats, penalty):
@@ -106,7 +106,7 @@ KEYS = {
     "inputs": "inputs",
     "label": "labels",
     "layout": "labels.layout",
-    "masked_channels": "dead",
+    "masked_channels": "masked_channels",
     "material": "material",
     "materials": "data.materials",
     "generated_materials": "materials",
@@ -197,7 +197,7 @@ TRAINING_RECORDINGS = "train_recordings"  # in the detector's info
 
 # Graphs: inputs and outputs
 BIN_INPUT, BIN_OUTPUTS = "samples", ("score", "probability", "valid")
-MASK_INPUT = "dead"
+MASK_INPUT = "masked_channels"
 STREAM_INPUTS = ("samples", "tail", "state", "threshold")
 STREAM_HANDED_ON = {"tail": "next_tail", "state": "next_state"}
 STREAM_OUTPUTS = {

@@ -16,7 +16,7 @@ _POLICIES = get_args(Nonfinite)
 _PART_BINS = 256
 
 
-class Judgement(NamedTuple):
+class Prediction(NamedTuple):
     """Scores, and whether they can be relied on.
 
     Attributes:
@@ -35,7 +35,7 @@ class Judgement(NamedTuple):
     variance: Tensor
 
 
-Said = TypeVar("Said", Tensor, Judgement)
+Said = TypeVar("Said", Tensor, Prediction)
 
 
 def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
@@ -50,16 +50,16 @@ def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
         refuse_nonfinite(samples, names, "repair the samples, or take nonfinite='mask'")
 
 
-def judged_in_parts(judge: Callable[[Tensor], Said], x: Tensor) -> Said:
-    """What ``judge`` says of bins ``[*, C, n]``: of many in parts that stay in a cache."""
+def predict_in_parts(predict: Callable[[Tensor], Said], x: Tensor) -> Said:
+    """What ``predict`` says of bins ``[*, C, n]``: of many in parts that stay in a cache."""
     if not is_plain(x) or x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS:
-        return judge(x)
+        return predict(x)
 
     def joined(parts: Sequence[Tensor]) -> Tensor:
         whole: Tensor = torch.cat(list(parts)).unflatten(0, x.shape[:-2])
         return whole
 
-    found = in_parts(judge, x.flatten(0, -3).split(_PART_BINS))
-    if isinstance(found[0], Judgement):
-        return Judgement(*map(joined, zip(*found, strict=True)))
+    found = in_parts(predict, x.flatten(0, -3).split(_PART_BINS))
+    if isinstance(found[0], Prediction):
+        return Prediction(*map(joined, zip(*found, strict=True)))
     return joined(found)
