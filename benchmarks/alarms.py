@@ -1,6 +1,6 @@
 """One false alarm an hour, asked for and kept: ``python -m benchmarks.alarms [key=value ...]``.
 
-Runs ``python -m tactslip_torch.train +exp=onset`` and puts its tables into README.md.
+Runs ``python -m tactslip_torch.train +exp=onset`` and puts its tables into docs/onset.md.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Alarms(Benchmark[Sizes]):
     name = "alarms"
     title = "Alarms"
     about = "false alarms an hour, asked for and kept, and how late slips are found"
-    page, markers = "README.md", "onset"
+    page, markers = "docs/onset.md", "onset"
     sizes = Sizes()
     quick = Sizes(
         ("+exp=onset", *QUICK_TRAINING, *QUICK_STREAMS, "onset.hours=0.002", "onset.hop_ms=50")
@@ -55,7 +55,7 @@ class Alarms(Benchmark[Sizes]):
         }
 
     def section(self, report: Report) -> str:
-        """The tables alone: README.md says the rest."""
+        """The tables alone: docs/onset.md says the rest."""
         tables = [table.markdown() for table in self.tables(report["numbers"]).values()]
         kind = "Simulated" if report["numbers"]["simulated"] else "Recorded"
         command = f"`python -m benchmarks.alarms`, code {report['code']}"

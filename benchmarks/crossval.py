@@ -1,6 +1,6 @@
 """Recipes on every choice of held-out materials: ``python -m benchmarks.crossval [key=value ...]``.
 
-Runs ``tactslip crossval`` and puts its tables into README.md.
+Runs ``tactslip crossval`` and puts its tables into docs/recipes.md.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Crossval(Benchmark[Sizes]):
     name = "crossval"
     title = "Every choice of held-out materials"
     about = "balanced accuracy, %, on every choice of held-out materials"
-    page = "README.md"
+    page = "docs/recipes.md"
     sizes = Sizes()
     quick = Sizes(
         (
@@ -62,7 +62,7 @@ class Crossval(Benchmark[Sizes]):
         }
 
     def section(self, report: Report) -> str:
-        """The tables alone: README.md says the rest."""
+        """The tables alone: docs/recipes.md says the rest."""
         shown = [f"'{each}'" for each in report["overrides"]]
         command = f"`{' '.join([f'python -m benchmarks.{self.name}', *shown])}`"
         tables = [table.markdown() for table in self.tables(report["numbers"]).values()]

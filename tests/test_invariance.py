@@ -19,7 +19,7 @@ from tactslip_torch.features.descriptors import (
 from tactslip_torch.features.invariance import INVARIANCES, feature_invariance, invariance_table
 from tactslip_torch.signals.spectrum import amplitude_spectrum, frequency_axis_hz
 
-README = Path(__file__).parents[1] / "README.md"
+PAGE = Path(__file__).parents[1] / "docs" / "numerics.md"
 ROWS = {f"{row.descriptor} of {row.domain}": row for row in INVARIANCES}
 CHANGES = ("gain", "offset", "polarity", "reversal", "permutation")
 NEITHER = [(name, c) for name, row in ROWS.items() for c in CHANGES if getattr(row, c) == "neither"]
@@ -193,7 +193,7 @@ def test_the_markdown_is_aligned_and_complete():
 
 
 def test_the_readme_carries_the_table():
-    text = README.read_text(encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
     begin, end = "<!-- invariances -->", "<!-- /invariances -->"
     assert (text.count(begin), text.count(end)) in ((0, 0), (1, 1))
     if begin in text:  # once it is there, it is this one

@@ -13,11 +13,17 @@ from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.rules import KOfN
 
 ROOT = Path(__file__).parents[1]
-TEXT = (ROOT / "README.md").read_text()
+PAGES = {path.name: path.read_text() for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))}
+TEXT = PAGES["README.md"]
+ALL = "\n".join(PAGES.values())
 
 
 def test_the_programs_run(tmp_path, monkeypatch, capsys):
-    first, live, second, through, third = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    programs = [
+        re.findall(r"```python\n(.*?)```", PAGES[name], re.DOTALL)
+        for name in ("README.md", "kernel_machine.md", "speed.md")
+    ]
+    (first, live), (second, through), (third,) = programs
     monkeypatch.chdir(tmp_path)
     random_detector().save("detector.pt")
     exec(compile(first, "README.md", "exec"), {})
@@ -43,16 +49,21 @@ def test_the_programs_run(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.splitlines() == ["torch.Size([64, 174])"] * 3
 
 
-def test_every_link_and_picture_leads_somewhere():
-    targets = re.findall(r"\]\((?!https?:)([^)#]+)\)", TEXT)
-    assert len(targets) >= 4
+@pytest.mark.parametrize("name", PAGES)
+def test_every_link_and_picture_leads_somewhere(name):
+    folder = ROOT if name == "README.md" else ROOT / "docs"
+    targets = re.findall(r"\]\((?!https?:)([^)#]+)\)", PAGES[name])
     for target in targets:
-        assert (ROOT / target).exists(), target
+        assert (folder / target).exists(), target
+
+
+def test_every_page_is_in_the_table_of_pages():
+    assert {name for name in PAGES if f"docs/{name}" not in TEXT} == {"README.md"}
 
 
 @pytest.mark.parametrize("kind", ["exp", "labels"])
 def test_every_choice_it_names_exists(kind):
-    for name in re.findall(rf"\b{kind}=(\w+)", TEXT):
+    for name in re.findall(rf"\b{kind}=(\w+)", ALL):
         assert (ROOT / "conf" / kind / f"{name}.yaml").exists(), name
 
 
@@ -66,7 +77,7 @@ def test_every_part_of_the_package_is_in_the_table():
 
 def test_hydra_reads_the_sweep_it_shows():
     """Overrides on both sides of -m are refused."""
-    (arguments,) = re.findall(r"`\.\.\. ([^`]*-m [^`]+)`", TEXT)
+    (arguments,) = re.findall(r"`\.\.\. ([^`]*-m [^`]+)`", PAGES["commands.md"])
     read = get_args_parser().parse_args(arguments.split())
     assert read.multirun
     assert read.overrides == ["+exp=unseen4", "seed=0,1,2"]
