@@ -64,6 +64,7 @@ def test_the_certificate_of_this_detector_is_handed_on(kept):
     assert "its certificate does not hold" in line
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_no_other_certificate_is_handed_on(kept):
     source, digest = kept

@@ -95,6 +95,7 @@ def test_another_threshold_raises_other_alarms(host, model, recording):
     assert_same(ran, expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_graph_in_double_precision_is_fed_in_it(host, tmp_path, tmp_path_factory, dtype):
     model = hosts.exported(tmp_path_factory, "float64") / "stream.onnx"

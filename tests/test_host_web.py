@@ -210,6 +210,7 @@ def scale_of(facts):
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_the_slider_goes_by_false_alarms_where_the_model_knows_them():
     curve = [[9.0, 0.0], [8.0, 0.5], [7.0, 0.5], [6.0, 2.0], [3.0, 90.0], [1.0, 700.0]]
     cusum = {"name": "cusum", "ceiling": 10.0}
