@@ -141,9 +141,7 @@ def test_an_export_of_the_same_detector_gives_the_same_bytes(detector, exported,
     assert again.read_bytes() == exported[0].read_bytes()
 
 
-@pytest.mark.parametrize(
-    "precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_head_and_scaler_comes_through(variant, precision, tmp_path):
     """The check sees to the errors; its bound is the one that it states."""

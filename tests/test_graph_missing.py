@@ -90,9 +90,7 @@ def test_dead_may_be_left_out_and_is_no_input_that_a_host_must_know():
 
 
 @pytest.mark.parametrize("kind", ["bin", "stream"])
-@pytest.mark.parametrize(
-    "precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_the_check_of_an_export_tries_masks(kind, precision):
     detector, form = alarming_with_gaussians(), Form(precision)
     graphs = {
