@@ -18,7 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
 from statistics import median
@@ -40,7 +40,6 @@ from tactslip_torch.data.clock import (
 )
 from tactslip_torch.data.folder import refuse_other_channels
 from tactslip_torch.data.formats import (
-    AS_IT_SAYS,
     Archived,
     Opened,
     Reading,
@@ -213,7 +212,7 @@ class Stream:
     """
 
     name: str = ""
-    reading: Reading = AS_IT_SAYS
+    reading: Reading = field(default_factory=Reading)
     channels: HandLayout | None = None
     kind: str = "electrode"
     adapting: Adapting | None = None

@@ -10,7 +10,6 @@ from tactslip_torch.data.formats._door import (
     open_file,
 )
 from tactslip_torch.data.formats._reading import (
-    AS_IT_SAYS,
     Archived,
     Opened,
     Reading,
@@ -21,7 +20,6 @@ from tactslip_torch.data.formats._reading import (
 )
 
 __all__ = [
-    "AS_IT_SAYS",
     "FORMATS",
     "Archived",
     "Format",

@@ -1,8 +1,8 @@
 """Files of recordings: which format they are of, read and written through one door.
 
-Whatever a library raises of a file becomes one line that names it (``guarded``); nothing in a file
-is executed; what it claims is held against its size before anything is allocated; files are written
-to a temporary name and renamed. ``reading.isolate`` reads in a process of its own (``_isolation``).
+Whatever a library raises of a file becomes one line that names it; nothing in a file is executed;
+what it claims is held against its size before anything is allocated; files are written to a
+temporary name and renamed. ``reading.isolate`` reads in a process of its own (``_isolation``).
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ from __future__ import annotations
 import importlib
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from tactslip_torch.data.formats._faults import Refused, check_file, guarded
-from tactslip_torch.data.formats._header import facts_of
+from tactslip_torch.data.formats._header import header_of
 from tactslip_torch.data.formats._isolation import isolated
-from tactslip_torch.data.formats._messages import is_bag, is_only_bag
-from tactslip_torch.data.formats._reading import AS_IT_SAYS, Archived, Opened, Reading
+from tactslip_torch.data.formats._limits import Refused, guarded
+from tactslip_torch.data.formats._reading import Archived, Opened, Reading
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import whole_file
@@ -33,15 +33,13 @@ class Format:
     Args:
         name: of the format.
         endings: of its files, the first that of files that are written.
-        module: beside this one, with its functions ``write``, ``read`` and ``facts``.
-        of: what stands behind the names of these functions, if the module has several formats.
+        module: the adapter, with its functions ``write``, ``read`` and ``header``.
         is_folder: whether a recording is a folder, known by ``metadata.yaml``.
     """
 
     name: str
     endings: tuple[str, ...]
     module: str
-    of: str = ""
     is_folder: bool = False
 
     def save(
@@ -60,12 +58,11 @@ class Format:
                 the samples another dtype, a word holds a NUL, provenance or key is not JSON-able,
                 or the format cannot hold that much.
         """
-        facts = facts_of(recording, hand, key)
+        header = header_of(recording, hand, key)
         samples = recording.samples.detach().cpu().contiguous().numpy()
-        whole = _whole_folder if self.is_folder else whole_file
-        with whole(path) as temporary:
+        with (_whole_folder if self.is_folder else whole_file)(path) as temporary:
             try:
-                self._function("write")(temporary, samples, facts)
+                self._adapter.write(temporary, samples, header)
             except Refused as error:
                 raise Refused(f"{path} {error}".replace(str(temporary), str(path))) from None
 
@@ -85,41 +82,43 @@ class Format:
 
     def key(self, path: Path) -> dict[str, Any]:
         """Read no more of a recording of ours than its key; errors as ``load``."""
-        self._check(path)
         with guarded(path):
-            facts = self._function("facts")(path)
-            if facts is None:
-                raise Refused(f"{path} is no recording of ours")
-            return dict(facts["key"])
+            self._check(path)
+            header = self._adapter.header(path)
+            if header is None:
+                raise Refused("is no recording of ours")
+            return dict(header["key"])
 
     @contextmanager
-    def open(self, path: Path, how: Reading = AS_IT_SAYS) -> Iterator[Opened]:
+    def open(self, path: Path, how: Reading | None = None) -> Iterator[Opened]:
         """Open a file, ours or another's, to read its samples by stretches.
+
+        Args:
+            path: of the file or folder.
+            how: what the file does not say itself.
 
         Raises:
             FileNotFoundError: if there is no such file.
             ValueError: in one line that names the file, if it is damaged, its library is absent, or
                 it does not show which samples are meant.
         """
-        self._check(path)
+        how = how or Reading()
         with ExitStack() as stack:
-            if how.isolate:
-                opened = isolated(path, how, stack)
-            else:
-                with guarded(path):
-                    opened = self._function("read")(path, how, stack)
+            with guarded(path):
+                self._check(path)
+                opened = (isolated if how.isolate else self._adapter.read)(path, how, stack)
             yield opened
 
-    def _check(self, path: Path) -> None:
-        if not self.is_folder:
-            check_file(path)
-        elif not path.is_dir():
-            raise FileNotFoundError(f"no folder at {path}")
+    @property
+    def _adapter(self) -> ModuleType:
+        return importlib.import_module(f"tactslip_torch.data.formats.{self.module}")
 
-    def _function(self, name: str) -> Callable[..., Any]:
-        module = importlib.import_module(f"tactslip_torch.data.formats.{self.module}")
-        function: Callable[..., Any] = getattr(module, f"{name}{self.of}")
-        return function
+    def _check(self, path: Path) -> None:
+        """Refuse what is no plain file or folder: reading a pipe would wait for ever."""
+        if not path.exists():
+            raise FileNotFoundError(path)
+        if not (path.is_dir() if self.is_folder else path.is_file()):
+            raise Refused(f"must be a {'folder' if self.is_folder else 'file'}")
 
 
 FORMATS = {
@@ -129,9 +128,9 @@ FORMATS = {
         Format("text", ("csv", "tsv", "txt", "dat", "lvm"), "_text"),
         Format("hdf5", ("h5", "hdf5", "he5"), "_hdf5"),
         Format("mat", ("mat",), "_mat"),
-        Format("mcap", ("mcap",), "_messages", "_mcap"),
+        Format("mcap", ("mcap",), "_mcap"),
         Format("parquet", ("parquet",), "_parquet"),
-        Format("rosbag2", ("bag2",), "_messages", "_rosbag2", is_folder=True),
+        Format("rosbag2", ("bag2",), "_rosbag2", is_folder=True),
     )
 }
 """By name."""
@@ -145,7 +144,7 @@ def endings() -> tuple[str, ...]:
 def find_format(path: Path) -> Format | None:
     """The format of a file, or of a folder that is a bag; None if there is none."""
     if path.is_dir():
-        return FORMATS["rosbag2"] if is_bag(path) else None
+        return FORMATS["rosbag2"] if (path / "metadata.yaml").is_file() else None
     ending = "" if path.name.startswith(".") else path.suffix[1:].lower()
     return next((f for f in FORMATS.values() if ending in f.endings and not f.is_folder), None)
 
@@ -179,7 +178,7 @@ def named_format(name: str) -> Format:
 
 
 @contextmanager
-def open_file(path: Path, how: Reading = AS_IT_SAYS) -> Iterator[Opened]:
+def open_file(path: Path, how: Reading | None = None) -> Iterator[Opened]:
     """Open a recording of any format; errors as ``format_of`` and ``Format.open``."""
     with format_of(path).open(path, how) as opened:
         yield opened
@@ -190,9 +189,9 @@ def _whole_folder(path: Path) -> Iterator[Path]:
     """A folder to write, put in the place of ``path`` when all went well.
 
     Raises:
-        ValueError: if something other than a bag is there.
+        Refused: if something other than a bag is there.
     """
-    if path.exists() and not is_only_bag(path):
+    if path.exists() and not _is_only_bag(path):
         raise Refused(f"{path} is there and no folder of rosbag2; give another name")
     path.parent.mkdir(parents=True, exist_ok=True)
     around = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
@@ -204,3 +203,12 @@ def _whole_folder(path: Path) -> Iterator[Path]:
         (around / path.name).rename(path)
     finally:
         shutil.rmtree(around)
+
+
+def _is_only_bag(path: Path) -> bool:
+    """Whether a folder holds the files of a bag and nothing else, so that it may be replaced."""
+    if not path.is_dir() or path.is_symlink():
+        return False
+    files = list(path.iterdir())
+    are_of_bags = all(file.suffix in (".db3", ".mcap", ".yaml") for file in files)
+    return not files or (find_format(path) is not None and are_of_bags)

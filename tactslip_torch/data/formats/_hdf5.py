@@ -8,7 +8,7 @@ files, virtual datasets and those stored in other files stay closed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -20,24 +20,24 @@ from tactslip_torch.data.formats._arrays import (
     LABEL_NAMES,
     Array,
     ArraySamples,
-    Contents,
     choose,
+    rate_in,
     why_not_numbers,
 )
-from tactslip_torch.data.formats._faults import (
+from tactslip_torch.data.formats._header import DTYPES, header_in, opened_from, text_of
+from tactslip_torch.data.formats._limits import (
     FREE_BYTES,
     MOST_MEMBERS,
     Refused,
     check_plausible,
     needs,
 )
-from tactslip_torch.data.formats._header import DTYPES, facts_in, ours, text_of
 from tactslip_torch.data.formats._reading import Opened, Reading
 
 _CHUNK_BYTES = 256 * 2**10
 
 
-def write(path: Path, samples: NDArray[Any], facts: Mapping[str, Any]) -> None:
+def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
     """Write ``/samples`` with ``sample_rate_hz``, ``units`` and ``channel_name`` as attributes.
 
     Everything else is JSON in the file's attribute ``header``.
@@ -50,11 +50,11 @@ def write(path: Path, samples: NDArray[Any], facts: Mapping[str, Any]) -> None:
         how = {"chunks": (num_channels, min(instants, num_samples)), "fletcher32": True}
     # HDF5 of 2008 and later: before, more than some 4000 names would not fit
     with h5py.File(path, "w", libver="v108") as file:
-        file.attrs["header"] = _fixed(text_of(facts))[0]
+        file.attrs["header"] = _fixed(text_of(header))[0]
         stored = file.create_dataset("samples", data=samples, **how)
-        stored.attrs["sample_rate_hz"] = facts["sample_rate_hz"]
-        stored.attrs["units"] = _fixed(facts["units"])[0]
-        stored.attrs["channel_name"] = _fixed(*(row["name"] for row in facts["channels"]))
+        stored.attrs["sample_rate_hz"] = header["sample_rate_hz"]
+        stored.attrs["units"] = _fixed(header["units"])[0]
+        stored.attrs["channel_name"] = _fixed(*(row["name"] for row in header["channels"]))
 
 
 def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
@@ -64,48 +64,53 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     name, wherever they stand; times by name; the rate by an attribute or a single number, names of
     channels by words, that are called so.
     """
-    file = opened(path, stack)
-    facts = _facts(file)
-    arrays: list[Array] = []
+    file = opened_hdf5(path, stack)
+    own = _header(file)
+    if own is not None:
+        samples = file["samples"]
+        if why := why_not(samples):
+            raise ValueError(f"/samples {why}")
+        array = Array(path, "/samples", samples)
+        return opened_from(own, ArraySamples(array, 1, dtype=DTYPES[own["dtype"]]))
     refused: dict[str, str] = {}
-    words: list[Any] = []
-    for name, thing in objects(file, refused):
-        if not hasattr(thing, "shape"):
-            continue
-        leaf = name.rpartition("/")[2]
-        why = why_not(thing)
+    numbers: dict[str, Any] = {}
+    words: list[tuple[str, ...]] = []
+    for name, dataset in datasets(file, refused):
+        why = why_not(dataset)
         if why is None:
-            arrays.append(Array(path, name, thing, leaf=leaf))
-        else:
-            refused[name] = why
-            if leaf.lower() in LABEL_NAMES and why_elsewhere(thing) is None:
-                words.append(thing)
-    if facts is not None:
-        (samples,) = (array for array in arrays if array.name == "/samples")
-        return ours(facts, ArraySamples(samples, 1, dtype=DTYPES[facts["dtype"]]))
-
-    def around(name: str) -> Iterator[Any]:
-        parts = name.strip("/").split("/")
-        return (file["/" + "/".join(parts[:depth])] for depth in range(len(parts), -1, -1))
-
-    def labels(name: str) -> Iterator[tuple[str, ...]]:
-        for thing in around(name):
-            yield from (attribute(thing, at) for at in thing.attrs if at.lower() in LABEL_NAMES)
-        yield from (words_in(thing) for thing in words)
-
-    def numbers(name: str) -> Iterator[dict[str, float]]:
-        yield from map(_numbers, around(name))
-
-    return choose(Contents(arrays, refused, labels, numbers), how)
+            numbers[name] = dataset
+            continue
+        refused[name] = why
+        if name.rpartition("/")[2].lower() in LABEL_NAMES and why_elsewhere(dataset) is None:
+            words.append(words_of(dataset))
+    arrays = []
+    for name, dataset in numbers.items():
+        around = [dataset]
+        while around[-1].name != "/":
+            around.append(around[-1].parent)
+        named = [
+            attribute(one, at) for one in around for at in one.attrs if at.lower() in LABEL_NAMES
+        ]
+        rate = next(filter(None, map(_rate_of, around)), None)
+        leaf = name.rpartition("/")[2]
+        arrays.append(
+            Array(path, name, dataset, leaf, labels=[*named, *words], sample_rate_hz=rate)
+        )
+    return choose(arrays, refused, how)
 
 
-def facts(path: Path) -> dict[str, Any] | None:
+def header(path: Path) -> dict[str, Any] | None:
     """All of a file of ours but its samples; ``None`` if it is another's."""
     with ExitStack() as stack:
-        return _facts(opened(path, stack))
+        return _header(opened_hdf5(path, stack))
 
 
-def opened(path: Path, stack: ExitStack) -> Any:
+def _header(file: Any) -> dict[str, Any] | None:
+    words = attribute(file, "header")
+    return header_in(words[0]) if len(words) == 1 else None
+
+
+def opened_hdf5(path: Path, stack: ExitStack) -> Any:
     """An open HDF5 file.
 
     Raises:
@@ -114,20 +119,20 @@ def opened(path: Path, stack: ExitStack) -> Any:
     return stack.enter_context(needs("h5py", f"reading {path.suffix}").File(path, "r"))
 
 
-def objects(file: Any, refused: dict[str, str]) -> Iterator[tuple[str, Any]]:
-    """Every group and dataset that hard links lead to, by name, breadth first.
+def datasets(file: Any, refused: dict[str, str]) -> Iterator[tuple[str, Any]]:
+    """Every dataset that hard links lead to, by name, breadth first.
 
     Args:
         file: open.
         refused: gets the names of what is no such, with the reason.
 
     Raises:
-        Refused: if there are more than ``MOST_MEMBERS``.
+        Refused: if there are more than ``MOST_MEMBERS`` groups and datasets.
     """
     h5py = needs("h5py", "reading HDF5")
-    todo, seen = [("", file)], {h5py.h5o.get_info(file.id).addr}
-    while todo:
-        prefix, group = todo.pop(0)
+    groups, seen = [("", file)], {h5py.h5o.get_info(file.id).addr}
+    while groups:
+        prefix, group = groups.pop(0)
         for leaf in group:
             name = f"{prefix}/{leaf}"
             if not isinstance(group.get(leaf, getlink=True), h5py.HardLink):
@@ -145,8 +150,9 @@ def objects(file: Any, refused: dict[str, str]) -> Iterator[tuple[str, Any]]:
             if len(seen) > MOST_MEMBERS:
                 raise Refused(f"holds more than {MOST_MEMBERS} objects")
             if isinstance(found, h5py.Group):
-                todo.append((name, found))
-            yield name, found
+                groups.append((name, found))
+            elif isinstance(found, h5py.Dataset):
+                yield name, found
 
 
 def why_elsewhere(dataset: Any) -> str | None:
@@ -160,53 +166,50 @@ def why_not(dataset: Any) -> str | None:
     """The reason why a dataset is not read as numbers of up to two dimensions, if there is one."""
     try:
         why = why_elsewhere(dataset) or why_not_numbers(dataset.dtype, dataset.shape)
+        if why is None:
+            stored = min(dataset.id.get_storage_size(), dataset.file.id.get_filesize())
+            claimed = max(math.prod(dataset.shape), math.prod(dataset.chunks or (0,)))
+            check_plausible("", claimed * dataset.dtype.itemsize, stored)
     except TypeError:
         return "holds what NumPy does not know"
-    if why is not None:
-        return why
-    stored = min(dataset.id.get_storage_size(), dataset.file.id.get_filesize())
-    claimed = max(math.prod(dataset.shape), math.prod(dataset.chunks or (0,)))
-    try:
-        check_plausible("", claimed * dataset.dtype.itemsize, stored)
     except Refused as error:
         return str(error).strip()
-    return None
-
-
-def words_in(dataset: Any) -> tuple[str, ...]:
-    """The words of a dataset of no or one dimension; none if it holds others."""
-    return _words(dataset, lambda: dataset[()])
+    return why
 
 
 def attribute(thing: Any, name: str) -> tuple[str, ...]:
     """The words of an attribute; none if it is not there, or holds others."""
-    if name not in thing.attrs:
+    if name not in thing.attrs or not _are_words(thing.attrs.get_id(name)):
         return ()
-    return _words(thing.attrs.get_id(name), lambda: thing.attrs[name])
+    return _decoded(thing.attrs[name])
 
 
-def _words(kept: Any, read: Callable[[], Any]) -> tuple[str, ...]:
+def words_of(dataset: Any) -> tuple[str, ...]:
+    """The words of a dataset of no or one dimension; none if it holds others."""
+    return _decoded(dataset[()]) if _are_words(dataset) else ()
+
+
+def _are_words(kept: Any) -> bool:
+    """Whether there are words of no or one dimension, and no more than may be read."""
     count = math.prod(kept.shape) if kept.shape is not None and len(kept.shape) < 2 else 0
-    is_large = count * kept.dtype.itemsize > FREE_BYTES or count > MOST_MEMBERS
-    if kept.dtype.kind not in "OS" or is_large or not count:
-        return ()
-    words = [w.decode() if isinstance(w, bytes) else w for w in np.atleast_1d(read())]
+    return kept.dtype.kind in "OS" and (
+        0 < count <= MOST_MEMBERS and count * kept.dtype.itemsize <= FREE_BYTES
+    )
+
+
+def _decoded(values: Any) -> tuple[str, ...]:
+    words = [w.decode() if isinstance(w, bytes) else w for w in np.atleast_1d(values)]
     return tuple(words) if all(isinstance(word, str) for word in words) else ()
 
 
-def _numbers(thing: Any) -> dict[str, float]:
-    """Attributes that are one number."""
-    ids = {name: thing.attrs.get_id(name) for name in thing.attrs}
-    return {
-        name: float(np.asarray(thing.attrs[name]).reshape(-1)[0])
-        for name, kept in ids.items()
-        if kept.shape in ((), (1,)) and kept.dtype.kind in "iuf"
-    }
-
-
-def _facts(file: Any) -> dict[str, Any] | None:
-    words = attribute(file, "header")
-    return facts_in(words[0]) if len(words) == 1 else None
+def _rate_of(thing: Any) -> float | None:
+    """The sample rate among the attributes that are one number."""
+    single = [
+        name
+        for name in thing.attrs
+        if (kept := thing.attrs.get_id(name)).shape in ((), (1,)) and kept.dtype.kind in "iuf"
+    ]
+    return rate_in({name: float(np.ravel(thing.attrs[name])[0]) for name in single})
 
 
 def _fixed(*words: str) -> NDArray[np.bytes_]:

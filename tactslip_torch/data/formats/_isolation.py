@@ -24,20 +24,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from tactslip_torch.data.formats._arrays import Array, ArraySamples, ArrayTimes, Vector
-from tactslip_torch.data.formats._faults import MOST_WHOLE, Refused
-from tactslip_torch.data.formats._header import DTYPES, facts_of, ours
+from tactslip_torch.data.formats._arrays import Array, ArraySamples, ArrayTimes
+from tactslip_torch.data.formats._header import DTYPES, header_of, opened_from
+from tactslip_torch.data.formats._limits import MOST_WHOLE, Refused
 from tactslip_torch.data.formats._reading import Opened, Reading
 
-_GIB = 2**30
 _STRETCH = 2**16  # samples at a time
-_LIBRARIES = {
-    ".mat": ("scipy.io", "h5py"),
-    ".parquet": ("pyarrow.parquet",),
-    ".mcap": ("mcap.reader", "rosbags.typesys"),
-    "": ("rosbags.rosbag2", "rosbags.typesys"),
-} | dict.fromkeys((".h5", ".hdf5", ".he5"), ("h5py",))
-"""By ending what is imported before memory is limited."""
+_LIBRARIES = ("scipy.io", "h5py", "pyarrow.parquet", "mcap.reader", "rosbags.rosbag2")
 _PROGRAM = (
     "from tactslip_torch.data.formats import _isolation, open_file; _isolation.child(open_file)"
 )
@@ -67,57 +60,46 @@ def isolated(path: Path, how: Reading, stack: ExitStack) -> Opened:
         )
     except subprocess.TimeoutExpired:
         raise Refused(
-            f"{path} took more than {how.isolate_s:g} s to read; raise reading.isolate_s if it may"
+            f"took more than {how.isolate_s:g} s to read; raise reading.isolate_s if it may"
         ) from None
-    told = folder / "told.json"
-    if done.returncode or not told.exists():
+    answer = folder / "answer.json"
+    if done.returncode or not answer.exists():
         name = signal.Signals(-done.returncode).name if done.returncode < 0 else done.returncode
         raise Refused(
-            f"{path} ended the process that read it ({name}), within {how.isolate_gib:g} GiB of "
+            f"ended the process that read it ({name}), within {how.isolate_gib:g} GiB of "
             "memory; raise reading.isolate_gib if it may take more"
         )
-    return _opened(path, folder, json.loads(told.read_text()))
-
-
-def _opened(path: Path, folder: Path, told: dict[str, Any]) -> Opened:
-    if told.get("missing"):
-        raise FileNotFoundError(told["missing"])
-    if told.get("refused"):
-        raise Refused(told["refused"])
-    values = np.memmap(folder / "samples", told["dtype"], "r") if told["size"] else np.empty(0)
-    samples = ArraySamples(
-        Array(path, "samples", values.reshape(-1, told["num_channels"])),
-        0,
-        dtype=DTYPES[told["dtype"]],
-    )
-    if told["facts"] is not None:
-        return ours(told["facts"], samples)
+    found = json.loads(answer.read_text())
+    if found.get("refused"):
+        raise Refused(found["refused"])
+    dtype = found["dtype"]
+    values = np.memmap(folder / "samples", dtype, "r") if found["size"] else np.empty(0, dtype)
+    table = Array(path, "samples", values.reshape(-1, found["num_channels"]))
+    samples = ArraySamples(table, 0, dtype=DTYPES[dtype])
+    if found["header"] is not None:
+        return opened_from(found["header"], samples)
     times = None
-    if told["has_times"]:
-        times = ArrayTimes(
-            Vector(Array(path, "times", np.memmap(folder / "times", "f8", "r"))), "s"
-        )
-    names = None if told["names"] is None else tuple(told["names"])
-    return Opened(samples, None, names, times, told["sample_rate_hz"])
+    if found["has_times"]:
+        column = Array(path, "times", np.memmap(folder / "times", "f8", "r"))
+        times = ArrayTimes(ArraySamples([column]), "s")
+    names = None if found["names"] is None else tuple(found["names"])
+    return Opened(samples, None, names, times, found["sample_rate_hz"])
 
 
 def child(open_file: Callable[..., AbstractContextManager[Opened]]) -> None:
     """Read the file that standard input names, within the limits it states."""
     folder, asked = Path(sys.argv[1]), json.loads(sys.stdin.read())
     path, how = Path(asked["path"]), Reading(**asked["how"])
-    for name in _LIBRARIES.get(path.suffix.lower(), ()):
+    for name in _LIBRARIES:
         with suppress(ImportError):
             importlib.import_module(name)
     _limit(how)
-    told: dict[str, Any] = {}
     try:
         with open_file(path, how) as opened:
-            told = _written(opened, folder)
-    except FileNotFoundError as error:
-        told = {"missing": str(error)}
-    except (ValueError, MemoryError) as error:
-        told = {"refused": str(error) or f"{path} needs more memory than reading.isolate_gib"}
-    (folder / "told.json").write_text(json.dumps(told))
+            answer = _written(opened, folder)
+    except (OSError, ValueError, MemoryError) as error:
+        answer = {"refused": str(error) or f"{path} needs more memory than reading.isolate_gib"}
+    (folder / "answer.json").write_text(json.dumps(answer))
 
 
 def _limit(how: Reading) -> None:
@@ -127,7 +109,7 @@ def _limit(how: Reading) -> None:
     torch.set_num_threads(1)
     in_use = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     limits = {
-        resource.RLIMIT_AS: in_use + int(how.isolate_gib * _GIB),
+        resource.RLIMIT_AS: in_use + int(how.isolate_gib * 2**30),
         resource.RLIMIT_CPU: int(how.isolate_s) + 1,
         resource.RLIMIT_FSIZE: 16 * MOST_WHOLE,
         resource.RLIMIT_CORE: 0,
@@ -141,14 +123,13 @@ def _written(opened: Opened, folder: Path) -> dict[str, Any]:
     samples, archived = opened.samples, opened.archived
     with (folder / "samples").open("wb") as file, (folder / "times").open("wb") as times:
         for first in range(0, samples.num_samples, _STRETCH):
-            part = samples.read(first, first + _STRETCH)
-            file.write(part.T.contiguous().numpy().data)
+            file.write(samples.read(first, first + _STRETCH).T.contiguous().numpy().data)
             if opened.times is not None:
                 times.write(opened.times.read(first, first + _STRETCH).numpy().data)
-    facts = None
+    header = None
     if archived is not None:
-        facts = facts_of(archived.recording, archived.hand, archived.key)
-        facts |= {"shape": [samples.num_channels, samples.num_samples]}
+        header = header_of(archived.recording, archived.hand, archived.key)
+        header["shape"] = [samples.num_channels, samples.num_samples]
     return {
         "dtype": str(samples.dtype).removeprefix("torch."),
         "size": samples.num_samples,
@@ -156,5 +137,5 @@ def _written(opened: Opened, folder: Path) -> dict[str, Any]:
         "names": opened.names,
         "sample_rate_hz": opened.sample_rate_hz,
         "has_times": opened.times is not None and samples.num_samples > 0,
-        "facts": facts,
+        "header": header,
     }

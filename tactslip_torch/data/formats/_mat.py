@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,19 +22,24 @@ from tactslip_torch.data.formats._arrays import (
     LABEL_NAMES,
     Array,
     ArraySamples,
-    Contents,
     choose,
     why_not_numbers,
 )
-from tactslip_torch.data.formats._faults import (
+from tactslip_torch.data.formats._hdf5 import (
+    attribute,
+    datasets,
+    opened_hdf5,
+    why_elsewhere,
+    why_not,
+)
+from tactslip_torch.data.formats._header import DTYPES, header_in, opened_from, text_of
+from tactslip_torch.data.formats._limits import (
     FREE_BYTES,
     MOST_MEMBERS,
     MOST_WHOLE,
     Refused,
     check_plausible,
 )
-from tactslip_torch.data.formats._hdf5 import attribute, objects, opened, why_elsewhere, why_not
-from tactslip_torch.data.formats._header import DTYPES, facts_in, ours, text_of
 from tactslip_torch.data.formats._reading import Opened, Reading
 
 _TITLE = b"MATLAB 5.0 MAT-file, written by tactslip_torch"
@@ -44,15 +50,34 @@ _MOST_DEPTH = 32  # of structs in structs
 _NUMBERS = {"double", "single"} | {f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)}
 
 
-class _Variables(NamedTuple):
-    """Numbers, words by name, and what is left alone with the reason."""
+@dataclass
+class _Variables:
+    """What a file holds: numbers, words by name, and what is left alone with the reason."""
 
-    arrays: list[Array]
-    words: dict[str, tuple[str, ...]]
-    refused: dict[str, str]
+    path: Path
+    arrays: list[Array] = field(default_factory=list)
+    words: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def header(self) -> dict[str, Any] | None:
+        """That of ours."""
+        return header_in("".join(self.words.get("header", ())))
+
+    def add(self, name: str, values: Any, is_turned: bool) -> None:
+        """Keep numbers."""
+        leaf = name.rpartition(".")[2]
+        self.arrays.append(Array(self.path, name, values, leaf, is_turned))
+
+    def labels(self, array: Array) -> list[tuple[str, ...]]:
+        """The words that may name the channels of an array, those of its own struct first."""
+        struct_name = array.name.rpartition(".")[0]
+        called = [at for at in self.words if at.rpartition(".")[2].lower() in LABEL_NAMES]
+        called.sort(key=lambda at: at.rpartition(".")[0] != struct_name)
+        return [self.words[at] for at in called]
 
 
-def write(path: Path, samples: NDArray[Any], facts: Mapping[str, Any]) -> None:
+def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
     """Write ``samples`` ``[C, T]``, ``sample_rate_hz``, ``units`` and the cells ``channel_name``.
 
     Everything else is JSON text in ``header``.
@@ -65,12 +90,12 @@ def write(path: Path, samples: NDArray[Any], facts: Mapping[str, Any]) -> None:
             f"{_MOST_BYTES}; save as .h5"
         )
     names = np.empty((len(samples), 1), dtype=object)
-    names[:, 0] = [row["name"] for row in facts["channels"]]
+    names[:, 0] = [row["name"] for row in header["channels"]]
     content = {
-        "header": text_of(facts),
+        "header": text_of(header),
         "samples": samples,
-        "sample_rate_hz": facts["sample_rate_hz"],
-        "units": facts["units"],
+        "sample_rate_hz": header["sample_rate_hz"],
+        "units": header["units"],
         "channel_name": names,
     }
     with path.open("w+b") as file:
@@ -91,46 +116,37 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
             read whole or unpacks to more than is plausible.
     """
     found = _variables(path, stack)
-    facts = _facts(found)
-    if facts is not None:
+    own = found.header
+    if own is not None:
         (samples,) = (array for array in found.arrays if array.name == "samples")
-        return ours(facts, ArraySamples(samples, 1, dtype=DTYPES[facts["dtype"]]))
-
-    def labels(name: str) -> Iterator[tuple[str, ...]]:
-        near = name.rpartition(".")[0]
-        called = [at for at in found.words if at.rpartition(".")[2].lower() in LABEL_NAMES]
-        called.sort(key=lambda at: at.rpartition(".")[0] != near)
-        yield from (found.words[at] for at in called)
-
-    return choose(Contents(found.arrays, found.refused, labels), how)
+        return opened_from(own, ArraySamples(samples, 1, dtype=DTYPES[own["dtype"]]))
+    arrays = [replace(array, labels=found.labels(array)) for array in found.arrays]
+    return choose(arrays, found.refused, how)
 
 
-def facts(path: Path) -> dict[str, Any] | None:
+def header(path: Path) -> dict[str, Any] | None:
     """All of a file of ours but its samples; ``None`` if it is another's."""
     with ExitStack() as stack:
-        return _facts(_variables(path, stack, ["header"]))
-
-
-def _facts(found: _Variables) -> dict[str, Any] | None:
-    return facts_in("".join(found.words.get("header", ())))
+        return _variables(path, stack, ["header"]).header
 
 
 def _variables(path: Path, stack: ExitStack, names: list[str] | None = None) -> _Variables:
     """What is in a file; of version 5 only these variables, if any are named."""
+    found = _Variables(path)
     with path.open("rb") as file:
         head = file.read(_HEADER_BYTES)
         if head.startswith((b"MATLAB 7.3", b"\x89HDF")):
-            return _of_73(path, opened(path, stack))
+            _look_73(opened_hdf5(path, stack), found)
+            return found
         if len(head) < _HEADER_BYTES or head[124:128] not in (b"\x00\x01IM", b"\x01\x00MI"):
             raise Refused("must be a MAT file of version 5 or 7.3, and is damaged or none of them")
         _check_size(file, "<" if head[126:] == b"IM" else ">", path.stat().st_size)
     import scipy.io
 
     content = scipy.io.loadmat(path, mat_dtype=True, variable_names=names, spmatrix=False)
-    found = _Variables([], {}, {})
     for name, value in content.items():
         if not name.startswith("__"):
-            _look(path, name, value, found, 0)
+            _look(name, value, found, 0)
     return found
 
 
@@ -159,64 +175,62 @@ def _check_size(file: IO[bytes], order: str, num_bytes: int) -> None:
     check_plausible("its variables", unpacked, num_bytes, MOST_WHOLE)
 
 
-def _look(path: Path, name: str, value: Any, found: _Variables, depth: int) -> None:
+def _look(name: str, value: Any, found: _Variables, depth: int) -> None:
     """Sort a variable of version 5, or the fields of a struct, into what is read and what not."""
-    if not isinstance(value, np.ndarray):
-        found.refused[name] = f"is {'sparse' if hasattr(value, 'tocsc') else 'no array'}"
-    elif type(value) is not np.ndarray:
-        found.refused[name] = "is an object"
+    if type(value) is not np.ndarray:
+        found.refused[name] = "is sparse" if hasattr(value, "tocsc") else "is an object"
     elif value.dtype.names is not None:
         if value.size != 1 or depth > _MOST_DEPTH:
             found.refused[name] = "is a struct array" if value.size != 1 else "is nested too deeply"
             return
-        for field in value.dtype.names:
-            _look(path, f"{name}.{field}", value.reshape(-1)[0][field], found, depth + 1)
+        for inner in value.dtype.names:
+            _look(f"{name}.{inner}", value.reshape(-1)[0][inner], found, depth + 1)
     elif value.dtype.kind == "U":
         found.words[name] = tuple(str(word).rstrip(" \0") for word in value.reshape(-1))
     elif value.dtype.kind == "O":
         cells = value.reshape(-1)
         if len(cells) and all(isinstance(c, np.ndarray) and c.dtype.kind == "U" for c in cells):
-            found.words[name] = tuple(
-                str(cell.reshape(-1)[0]) if cell.size else "" for cell in cells
-            )
+            found.words[name] = tuple(str(c.reshape(-1)[0]) if c.size else "" for c in cells)
         else:
             found.refused[name] = "is a cell array"
     elif (why := why_not_numbers(value.dtype, value.shape)) is not None:
         found.refused[name] = why
     else:
-        found.arrays.append(Array(path, name, value, leaf=name.rpartition(".")[2]))
+        found.add(name, value, is_turned=False)
 
 
 # Version 7.3 -------------------------------------------------------------------------------------
 
 
-def _of_73(path: Path, file: Any) -> _Variables:
-    found = _Variables([], {}, {})
-    for path_in_file, thing in objects(file, found.refused):
+def _look_73(file: Any, found: _Variables) -> None:
+    """Sort what is in an HDF5 file by the classes that MATLAB wrote."""
+    for path_in_file, thing in datasets(file, found.refused):
         name = path_in_file.strip("/").replace("/", ".")
-        if name.startswith("#") or not hasattr(thing, "shape"):
+        if name.startswith("#"):
             continue
         kind = "".join(attribute(thing, "MATLAB_class"))
-        why = why_elsewhere(thing)
-        if why is not None or "MATLAB_empty" in thing.attrs:
-            found.refused[name] = why or "is empty"
-        elif kind == "char":
+        why = why_elsewhere(thing) or ("is empty" if "MATLAB_empty" in thing.attrs else None)
+        if why is None and kind == "char":
             found.words[name] = _characters(thing)
-        elif kind == "cell":
+            continue
+        if why is None and kind == "cell":
             words = _cells(file, thing)
-            found.words.update({name: words} if words else {})
-            found.refused.update({} if words else {name: "is a cell array"})
-        elif (kind and kind not in _NUMBERS) or "MATLAB_object_decode" in thing.attrs:
-            is_flag = kind == "logical"
-            found.refused[name] = "holds true or false" if is_flag else f"is of class {kind[:40]}"
-        elif "MATLAB_sparse" in thing.parent.attrs:
-            found.refused[name] = "is of a sparse matrix"
-        elif (why := why_not(thing)) is not None:
-            found.refused[name] = why
+            if words:
+                found.words[name] = words
+                continue
+            why = "is a cell array"
+        if why is None and kind == "logical":
+            why = "holds true or false"
+        is_other = "MATLAB_object_decode" in thing.attrs or kind not in (*_NUMBERS, "")
+        if why is None and is_other:
+            why = f"is of class {kind[:40]}"
+        if why is None and "MATLAB_sparse" in thing.parent.attrs:
+            why = "is of a sparse matrix"
+        why = why or why_not(thing)
+        if why is None:
+            found.add(name, thing, is_turned=True)
         else:
-            leaf = name.rpartition(".")[2]
-            found.arrays.append(Array(path, name, thing, is_turned=True, leaf=leaf))
-    return found
+            found.refused[name] = why
 
 
 def _characters(thing: Any) -> tuple[str, ...]:

@@ -1,8 +1,8 @@
 """Recordings as ``.npz`` files that anything with NumPy can read, and ``.npy`` arrays.
 
 Of ours numbers are arrays, words are text arrays, what has no fixed form is JSON text. Nothing is
-pickled, and nothing in a file is executed. Arrays are read by stretches; compressed ones are
-unpacked to a temporary file (``TMPDIR``) first.
+pickled, and nothing in a file is executed. Arrays are mapped into memory, so no more is read than
+is asked for; compressed ones are unpacked to a temporary file (``TMPDIR``) first.
 """
 
 from __future__ import annotations
@@ -16,35 +16,26 @@ import tempfile
 import zipfile
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal, cast
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._arrays import (
-    Array,
-    ArraySamples,
-    Contents,
-    choose,
-    why_not_numbers,
-)
-from tactslip_torch.data.formats._faults import MOST_CHANNELS, Refused, check_plausible
-from tactslip_torch.data.formats._header import DTYPES, FORM, ours
+from tactslip_torch.data.formats._arrays import Array, ArraySamples, choose, why_not_numbers
+from tactslip_torch.data.formats._header import DTYPES, FORM, MOMENTS, STRETCHES, opened_from
+from tactslip_torch.data.formats._limits import MOST_CHANNELS, Refused, check_plausible
 from tactslip_torch.data.formats._reading import Opened, Reading
 
 _LOCAL_HEADER = struct.Struct("<26xHH")  # of a ZIP member: lengths of its name and extra field
-_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _MOST_BESIDE = 16 * 2**20  # bytes of a member of ours that is read whole: names, numbers, JSON
 _COLUMNS = ("name", "kind", "finger", "segment", "adapting")
 _WORDS = ("units", "material")
-_NUMBERS = ("speeds_mm_s", "onsets_s", "annotated_onsets_s")
-_PAIRS = ("sliding_s", "non_slip_s", "slip_s")
 
 
-def write(path: Path, samples: NDArray[Any], facts: Mapping[str, Any]) -> None:
+def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
     """Write ``samples`` ``[C, T]`` and everything else as arrays of their own.
 
     Beside them: ``sample_rate_hz``, ``units``, ``material``, ``speeds_mm_s``, ``onsets_s``,
@@ -53,15 +44,15 @@ def write(path: Path, samples: NDArray[Any], facts: Mapping[str, Any]) -> None:
     say it, ``_adapting`` (one per row of samples); ``provenance`` and ``key`` as JSON text.
     """
     content: dict[str, Any] = {"format": np.array(FORM), "samples": samples}
-    content |= {name: np.array([facts[name]], np.str_)[0] for name in _WORDS}
-    content["sample_rate_hz"] = np.float64(facts["sample_rate_hz"])
-    content |= {name: np.array(facts[name], np.float64) for name in _NUMBERS}
-    for name in _PAIRS:
-        if facts[name] or name != "slip_s":
-            content[name] = np.array(facts[name], np.float64).reshape(-1, 2)
+    content |= {name: np.array([header[name]], np.str_)[0] for name in _WORDS}
+    content["sample_rate_hz"] = np.float64(header["sample_rate_hz"])
+    content |= {name: np.array(header[name], np.float64) for name in MOMENTS}
+    for name in STRETCHES:
+        if header[name] or name != "slip_s":
+            content[name] = np.array(header[name], np.float64).reshape(-1, 2)
     for name in ("provenance", "key"):
-        content[name] = np.array(json.dumps(facts[name], sort_keys=True))
-    rows = facts["channels"]
+        content[name] = np.array(json.dumps(header[name], sort_keys=True))
+    rows = header["channels"]
     for column in _COLUMNS:
         if any(column in row for row in rows):
             words = [row.get(column, "") for row in rows]
@@ -77,26 +68,29 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     """
     file = stack.enter_context(path.open("rb"))
     if file.read(len(npy.MAGIC_PREFIX)) == npy.MAGIC_PREFIX:
-        arrays, refused = _sorted(path, {"samples": _stored(file, 0, path.stat().st_size)})
+        stored = {"samples": _mapped(file, 0, path.stat().st_size)}
         first = True if how.time_first is None else how.time_first
-        return choose(Contents(arrays, refused), replace(how, samples=None, time_first=first))
-    with zipfile.ZipFile(file) as archive:
-        stored = {
-            member.filename.removesuffix(".npy"): _member(file, archive, member, stack)
-            for member in _checked(archive)
-            if member.filename.endswith(".npy")
-        }
-    arrays, refused = _sorted(path, stored)
-    if "format" in stored and how.samples in (None, "samples"):
-        facts = _facts(path, stored["samples"].shape, stored["samples"].dtype)
-        (samples,) = (array for array in arrays if array.name == "samples")
-        return ours(facts, ArraySamples(samples, 1, dtype=DTYPES[facts["dtype"]]))
-    if how.samples is None and "samples" in stored:
-        how = replace(how, samples="samples", time_first=how.time_first is True)
-    return choose(Contents(arrays, refused), how)
+        how = replace(how, samples=None, time_first=first)
+    else:
+        with zipfile.ZipFile(file) as archive:
+            stored = {
+                member.filename.removesuffix(".npy"): _member(file, archive, member, stack)
+                for member in _checked(archive)
+                if member.filename.endswith(".npy")
+            }
+        if "format" in stored and how.samples in (None, "samples"):
+            values = stored["samples"]
+            header = _header(path, values.shape, values.dtype)
+            samples = Array(path, "samples", values)
+            return opened_from(header, ArraySamples(samples, 1, dtype=DTYPES[header["dtype"]]))
+        if how.samples is None and "samples" in stored:
+            how = replace(how, samples="samples", time_first=how.time_first is True)
+    whys = {name: why_not_numbers(kept.dtype, kept.shape) for name, kept in stored.items()}
+    arrays = [Array(path, name, kept) for name, kept in stored.items() if whys[name] is None]
+    return choose(arrays, {name: why for name, why in whys.items() if why is not None}, how)
 
 
-def facts(path: Path) -> dict[str, Any] | None:
+def header(path: Path) -> dict[str, Any] | None:
     """All of a file of ours but its samples; ``None`` if it is another's."""
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         members = {member.filename: member for member in _checked(archive)}
@@ -104,10 +98,10 @@ def facts(path: Path) -> dict[str, Any] | None:
             return None
         with archive.open(members["samples.npy"]) as content:
             shape, _, dtype = _head(content)
-    return _facts(path, shape, dtype)
+    return _header(path, shape, dtype)
 
 
-def _facts(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
+def _header(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
     with np.load(path, allow_pickle=False) as content:
         if (form := str(content["format"])) != FORM:
             raise Refused(f"must be of format {FORM!r}, got {form[:80]!r}")
@@ -115,15 +109,15 @@ def _facts(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str
         words = [content[f"channel_{column}"].tolist() for column in columns]
         if len(shape) != 2 or shape[0] > MOST_CHANNELS or any(len(w) != shape[0] for w in words):
             raise ValueError("a name for every row of samples")
-        rows = (dict(zip(columns, row, strict=True)) for row in zip(*words, strict=True))
+        rows = [dict(zip(columns, row, strict=True)) for row in zip(*words, strict=True)]
         return {
             "format": form,
             "dtype": str(dtype),
             "shape": list(shape),
             "sample_rate_hz": float(content["sample_rate_hz"]),
             **{name: str(content[name]) for name in _WORDS},
-            **{name: content[name].tolist() for name in _NUMBERS},
-            **{name: content[name].tolist() if name in content else [] for name in _PAIRS},
+            **{name: content[name].tolist() for name in MOMENTS},
+            **{name: content[name].tolist() if name in content else [] for name in STRETCHES},
             **{name: json.loads(str(content[name])) for name in ("provenance", "key")},
             "channels": [
                 {name: word for name, word in row.items() if word or name != "adapting"}
@@ -150,66 +144,28 @@ def _checked(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
 
 def _member(
     file: IO[bytes], archive: zipfile.ZipFile, member: zipfile.ZipInfo, stack: ExitStack
-) -> _Stored:
+) -> NDArray[Any]:
     """An array of an archive; all of it is read once, for its check sum."""
     is_packed = member.compress_type != zipfile.ZIP_STORED
     copied = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115  # by the stack
     with archive.open(member) as content, Path(os.devnull).open("wb") as nowhere:
         shutil.copyfileobj(content, copied if is_packed else nowhere)
     if is_packed:
-        return _stored(copied, 0, member.file_size)
+        return _mapped(copied, 0, member.file_size)
     file.seek(member.header_offset)
     name, extra = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
-    return _stored(file, file.tell() + name + extra, member.file_size)
-
-
-def _sorted(path: Path, stored: Mapping[str, _Stored]) -> tuple[list[Array], dict[str, str]]:
-    whys = {name: why_not_numbers(kept.dtype, kept.shape) for name, kept in stored.items()}
-    arrays = [Array(path, name, kept) for name, kept in stored.items() if whys[name] is None]
-    return arrays, {name: why for name, why in whys.items() if why is not None}
-
-
-@dataclass(frozen=True)
-class _Stored:
-    """A NumPy array in an open file that is read by slices."""
-
-    file: IO[bytes]
-    start: int
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    is_fortran: bool
-
-    def __getitem__(self, index: tuple[slice, ...]) -> NDArray[Any]:
-        if not self.shape:
-            return self._run(0, 1).reshape(())
-        index = (*index, *[slice(None)] * (len(self.shape) - len(index)))
-        if self.is_fortran:
-            turned = _Stored(self.file, self.start, self.shape[::-1], self.dtype, False)
-            return turned[index[::-1]].T
-        ranges = [range(*part.indices(size)) for part, size in zip(index, self.shape, strict=True)]
-        rows, width = ranges[0], math.prod(self.shape[1:])
-        if len(ranges) == 1 or len(ranges[1]) == width:
-            found = self._run(rows.start * width, len(rows) * width)
-        else:
-            parts = [self._run(row * width + ranges[1].start, len(ranges[1])) for row in rows]
-            found = np.concatenate([np.empty(0, self.dtype), *parts])
-        return found.reshape([len(part) for part in ranges])
-
-    def _run(self, first: int, count: int) -> NDArray[Any]:
-        self.file.seek(self.start + first * self.dtype.itemsize)
-        content = self.file.read(count * self.dtype.itemsize)
-        if len(content) < count * self.dtype.itemsize:
-            raise Refused("was cut while it was read; make it again")
-        return np.frombuffer(content, self.dtype)
+    return _mapped(file, file.tell() + name + extra, member.file_size)
 
 
 def _head(content: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether columns stand together, and dtype, as the head of an array states them."""
     version = npy.read_magic(content)  # type: ignore[no-untyped-call]
-    head: tuple[tuple[int, ...], bool, np.dtype[Any]] = _HEADERS[version](content)  # type: ignore[no-untyped-call]
+    read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
+    head: tuple[tuple[int, ...], bool, np.dtype[Any]] = read(content)  # type: ignore[no-untyped-call]
     return head
 
 
-def _stored(file: IO[bytes], start: int, num_bytes: int) -> _Stored:
+def _mapped(file: IO[bytes], start: int, num_bytes: int) -> NDArray[Any]:
     """The array that begins there and must end within so many bytes."""
     file.seek(start)
     shape, is_fortran, dtype = _head(file)
@@ -217,4 +173,7 @@ def _stored(file: IO[bytes], start: int, num_bytes: int) -> _Stored:
     is_whole = end <= start + num_bytes and min(shape, default=0) >= 0
     if not is_whole or max(shape, default=0) > 2**40:  # an array without channels claims anything
         raise ValueError("samples must be all there")
-    return _Stored(file, file.tell(), shape, dtype, is_fortran)
+    if dtype.hasobject or not math.prod(shape) * dtype.itemsize:
+        return np.empty(shape if not dtype.hasobject else (), dtype)
+    order: Literal["F", "C"] = "F" if is_fortran else "C"
+    return np.memmap(cast("Any", file), dtype, "r", file.tell(), shape, order)

@@ -13,35 +13,41 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._arrays import Array, ArraySamples, Contents, choose
-from tactslip_torch.data.formats._faults import (
+from tactslip_torch.data.formats._arrays import Array, ArraySamples, choose, rate_in
+from tactslip_torch.data.formats._header import (
+    DTYPES,
+    MOST_HEADER,
+    header_in,
+    opened_from,
+    text_of,
+)
+from tactslip_torch.data.formats._limits import (
     MOST_CHANNELS,
     MOST_WHOLE,
     Refused,
     check_plausible,
     needs,
 )
-from tactslip_torch.data.formats._header import DTYPES, MOST_HEADER, facts_in, ours, text_of
 from tactslip_torch.data.formats._reading import Opened, Reading
 
 _TIME = "time_s"
 _GROUP_BYTES = 4 * 2**20
 
 
-def write(path: Path, samples: NDArray[Any], facts: Mapping[str, Any]) -> None:
+def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
     """Write the column ``time_s`` and a column a channel.
 
     Metadata: ``header``, which is everything else as JSON, ``sample_rate_hz`` and ``units``.
     """
     pa, pq = needs("pyarrow", "writing .parquet"), needs("pyarrow.parquet", "writing .parquet")
-    names = [row["name"] for row in facts["channels"]]
+    names = [row["name"] for row in header["channels"]]
     if _TIME in names:
         raise Refused(f"cannot hold a channel called {_TIME!r}; rename it")
-    times = np.arange(samples.shape[1]) / facts["sample_rate_hz"]
+    times = np.arange(samples.shape[1]) / header["sample_rate_hz"]
     metadata = {
-        "header": text_of(facts),
-        "sample_rate_hz": repr(facts["sample_rate_hz"]),
-        "units": facts["units"],
+        "header": text_of(header),
+        "sample_rate_hz": repr(header["sample_rate_hz"]),
+        "units": header["units"],
     }
     columns = [pa.array(values) for values in (times, *samples)]
     pq.write_table(
@@ -79,27 +85,29 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
             units[name] = None
         else:
             refused[name] = f"holds {str(kind)[:40]!r}"
-    table = file.read(columns=list(units), use_threads=False)
-    arrays = [
-        Array(path, name, _values(table.column(table.schema.names.index(name)), unit), False, unit)
-        for name, unit in units.items()
-    ]
-    facts = facts_in(metadata.get("header"))
-    if facts is not None:
-        if names[:1] != [_TIME] or len(arrays) < 2 or refused:
-            raise ValueError("times must stand first, then channels")
-        return ours(facts, ArraySamples(arrays[1:], dtype=DTYPES[facts["dtype"]]))
     said: dict[str, float] = {}
     for name, text in metadata.items():
         with suppress(ValueError):
             said[name] = float(text)
-    return choose(Contents(arrays, refused, numbers=lambda name: (said,), columns=names), how)
+    rate = rate_in(said)
+    table = file.read(columns=list(units), use_threads=False)
+    arrays = []
+    for name, unit in units.items():
+        column = table.column(table.schema.names.index(name))  # nulls are NaN, stamps whole numbers
+        values = (column if unit is None else column.cast("int64")).to_numpy()
+        arrays.append(Array(path, name, values, time_unit=unit, sample_rate_hz=rate))
+    own = header_in(metadata.get("header"))
+    if own is not None:
+        if names[:1] != [_TIME] or len(arrays) < 2 or refused:
+            raise ValueError("times must stand first, then channels")
+        return opened_from(own, ArraySamples(arrays[1:], dtype=DTYPES[own["dtype"]]))
+    return choose(arrays, refused, how, columns=names)
 
 
-def facts(path: Path) -> dict[str, Any] | None:
+def header(path: Path) -> dict[str, Any] | None:
     """All of a file of ours but its samples; ``None`` if it is another's."""
     with ExitStack() as stack:
-        return facts_in(_opened(path, stack)[1].get("header"))
+        return header_in(_opened(path, stack)[1].get("header"))
 
 
 def _opened(path: Path, stack: ExitStack) -> tuple[Any, dict[str, str]]:
@@ -118,9 +126,3 @@ def _opened(path: Path, stack: ExitStack) -> tuple[Any, dict[str, str]]:
         for name, value in said.items()
     }
     return file, metadata
-
-
-def _values(column: Any, unit: str | None) -> NDArray[Any]:
-    """A column's numbers; nulls are NaN, time stamps whole numbers."""
-    found: NDArray[Any] = (column if unit is None else column.cast("int64")).to_numpy()
-    return found

@@ -62,14 +62,14 @@ class Archived(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """A file that is open.
+    """A recording in a file that is open.
 
     Args:
-        samples: in the file's order of channels.
-        archived: all else around a recording of no samples, if the file is one of ours.
+        samples: all of them.
+        archived: all else of a file of ours, around no samples; ``None`` for other files.
         names: of the channels, if the file says.
-        times: if the file has any.
-        sample_rate_hz: if the file states it; what times say is not here.
+        times: of the samples, if the file has any.
+        sample_rate_hz: if the file says; what a person says is not here.
     """
 
     samples: Samples
@@ -86,8 +86,9 @@ def pieces(samples: Samples, num_samples: int) -> Iterator[Tensor]:
 
 
 def is_number(value: object) -> bool:
-    """Whether a setting is a number; ``True`` is none."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    """Whether a setting is a finite number; ``True`` is none."""
+    is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return is_real and math.isfinite(value)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -125,46 +126,50 @@ class Reading:
     isolate_s: float = 120.0
 
     def __post_init__(self) -> None:
-        for name, is_right, wanted in self._checks():
+        units, columns = get_args(TimeUnit), self.channels
+        is_list = isinstance(columns, Sequence) and not isinstance(columns, str) and bool(columns)
+        mark = self.delimiter
+        rate = self.sample_rate_hz
+        for name, is_right, wanted in (
+            ("sample_rate_hz", rate is None or _is_positive(rate), "positive"),
+            ("isolate_gib", _is_positive(self.isolate_gib), "positive"),
+            ("isolate_s", _is_positive(self.isolate_s), "positive"),
+            ("time_unit", self.time_unit in units, f"one of {', '.join(units)}"),
+            (
+                "channels",
+                columns is None or (is_list and all(map(_is_column, columns))),
+                "a list of columns, by name or number",
+            ),
+            (
+                "samples",
+                isinstance(self.samples, str | None),
+                "the name of a dataset, variable or topic, or null",
+            ),
+            ("time_first", self.time_first in (True, False, None), "true, false or null"),
+            ("isolate", isinstance(self.isolate, bool), "true or false"),
+            ("time", self.time is None or _is_column(self.time), "a name, a number or null"),
+            (
+                "delimiter",
+                mark is None or (isinstance(mark, str) and len(mark) == 1),
+                "one character",
+            ),
+        ):
             if not is_right:
                 raise ValueError(f"reading.{name} must be {wanted}, got {getattr(self, name)!r}")
-        if self.channels is not None:
-            object.__setattr__(self, "channels", tuple(self.channels))
-            if len(set(self.channels)) < len(self.channels):
-                raise ValueError(f"reading.channels names a column twice: {list(self.channels)}")
-
-    def _checks(self) -> Iterator[tuple[str, bool, str]]:
-        for name in ("sample_rate_hz", "isolate_gib", "isolate_s"):
-            value = getattr(self, name)
-            is_right = is_number(value) and 0 < value < math.inf
-            yield name, is_right or (value is None and name == "sample_rate_hz"), "positive"
-        units = get_args(TimeUnit)
-        yield "time_unit", self.time_unit in units, f"one of {', '.join(units)}"
-        listed = self.channels
-        is_list = isinstance(listed, Sequence) and not isinstance(listed, str)
-        is_right = listed is None or (is_list and bool(listed) and all(map(_is_column, listed)))
-        yield "channels", is_right, "a list of columns, by name or number"
-        is_name = self.samples is None or isinstance(self.samples, str)
-        yield "samples", is_name, "the name of a dataset, variable or topic, or null"
-        yield "time_first", self.time_first in (True, False, None), "true, false or null"
-        yield "isolate", isinstance(self.isolate, bool), "true or false"
-        yield "time", self.time is None or _is_column(self.time), "a name, a number or null"
-        mark = self.delimiter
-        yield (
-            "delimiter",
-            mark is None or (isinstance(mark, str) and len(mark) == 1),
-            ("one character"),
-        )
+        if columns is not None:
+            object.__setattr__(self, "channels", tuple(columns))
+            if len(set(columns)) < len(columns):
+                raise ValueError(f"reading.channels names a column twice: {list(columns)}")
 
     def key(self) -> dict[str, Any]:
         """What decides the samples that are read, as plain values; ``isolate`` does not."""
         return {n: value for n, value in asdict(self).items() if not n.startswith("isolate")}
 
 
+def _is_positive(value: object) -> bool:
+    return is_number(value) and value > 0  # type: ignore[operator]
+
+
 def _is_column(value: object) -> bool:
     """Whether a setting says a column, by name or number."""
     return isinstance(value, (str, int)) and not isinstance(value, bool)
-
-
-AS_IT_SAYS = Reading()
-"""What is asked of a file that says all itself."""

@@ -4,15 +4,17 @@ A file of ours is a comment with the header, a line of column names, and a row a
 and a column a channel, separated by commas in ``.csv`` and by tabs elsewhere. Of others most is
 found out from the first lines: delimiter, names, comments, a preamble, decimal commas, LabVIEW's
 headings. UTF-8, Latin-1 and UTF-16 with its mark are read. Every row is looked at when a file is
-opened; what is larger than 64 MiB is kept in a temporary file (``TMPDIR``).
+opened; the numbers are kept in a temporary file (``TMPDIR``).
 """
 
 from __future__ import annotations
 
+import codecs
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -24,20 +26,19 @@ from tactslip_torch.data.formats._arrays import (
     ArraySamples,
     ArrayTimes,
     Spool,
-    Vector,
     chosen_columns,
     unit_of_time,
 )
-from tactslip_torch.data.formats._faults import Refused
 from tactslip_torch.data.formats._header import (
     DTYPES,
     FORM,
     MOST_HEADER,
-    facts_in,
-    ours,
+    header_in,
+    opened_from,
     shape_of,
     text_of,
 )
+from tactslip_torch.data.formats._limits import Refused
 from tactslip_torch.data.formats._reading import Opened, Reading
 
 _HEAD = 2**20  # characters in which the first row must be found, and the most of a line
@@ -76,16 +77,16 @@ class _Layout(NamedTuple):
     sample_rate_hz: float | None = None
 
 
-def write(path: Path, samples: NDArray[Any], facts: Mapping[str, Any]) -> None:
+def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
     """Write numbers with as few digits as give the same bits; of a NaN only that it is one."""
     mark = "," if path.suffix.lower() == ".csv" else "\t"
-    names = [" ".join(row["name"].split()) for row in facts["channels"]]  # whole in the header
+    names = [" ".join(row["name"].split()) for row in header["channels"]]  # whole in the header
     with path.open("w", encoding="utf-8", errors="replace", newline="\n") as file:
-        file.write(f"# {FORM} {text_of(facts)}\n")
+        file.write(f"# {FORM} {text_of(header)}\n")
         csv.writer(file, delimiter=mark, lineterminator="\n").writerow(["time_s", *names])
         for first in range(0, samples.shape[1], _TO_WRITE):
             rows = samples[:, first : first + _TO_WRITE]
-            times = np.arange(first, first + rows.shape[1]) / facts["sample_rate_hz"]
+            times = np.arange(first, first + rows.shape[1]) / header["sample_rate_hz"]
             texts = [map(repr, times.tolist()), *(_texts(row) for row in rows)]
             file.writelines(mark.join(row) + "\n" for row in zip(*texts, strict=True))
 
@@ -97,97 +98,72 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         Refused: if it is no table of numbers, naming the line; or lacks a column of ``how``.
     """
     with _text_of(path) as file:
-        facts = _facts(file)
-        if facts is None:
-            file.seek(0)
-            head = _first_lines(file)
-            layout = _layout_of(head, how)
-            file.seek(0)
-            _skip_lines(file, layout.first_line - 1)
-        else:
-            header = file.readline(MOST_HEADER)
-            mark = "\t" if header.startswith("time_s\t") else ","
-            if not header.startswith(f"time_s{mark}"):
+        own = _header(file)
+        if own is not None:
+            line_of_names = file.readline(MOST_HEADER)
+            mark = "\t" if line_of_names.startswith("time_s\t") else ","
+            if not line_of_names.startswith(f"time_s{mark}"):
                 raise ValueError("no names of columns behind its header")
-            layout = _Layout(3, mark, shape_of(facts)[0] + 1)
+            layout = _Layout(3, mark, shape_of(own)[0] + 1)
+        else:
+            file.seek(0)
+            layout = _layout_of(file.read(_HEAD), how)
+            file.seek(0)
+            for _ in range(layout.first_line - 1):
+                file.readline(_HEAD)
         spool = Spool(layout.num_columns, np.float64, stack)
         for line, lines in _blocks(file, layout.first_line):
             spool.add(_rows_of(lines, layout, line))
     table = Array(path, "table", spool.array())
-    if facts is not None:
-        columns = range(1, layout.num_columns)
-        return ours(facts, ArraySamples(table, 0, columns, DTYPES[facts["dtype"]]))
-    return _chosen(table, layout, how)
-
-
-def facts(path: Path) -> dict[str, Any] | None:
-    """All of a file of ours but its samples; ``None`` if it is another's."""
-    with _text_of(path) as file:
-        return _facts(file)
-
-
-def _chosen(table: Array, layout: _Layout, how: Reading) -> Opened:
-    names = layout.names
-
-    def is_count(column: int) -> bool:
-        values = table.values[:_TO_COUNT, column]
-        return len(values) > 2 and bool((np.diff(values) == 1).all())
-
-    time, columns = chosen_columns(names, layout.num_columns, how, is_count, is_time_first=True)
+    if own is not None:
+        rows = range(1, layout.num_columns)
+        return opened_from(own, ArraySamples(table, 0, rows, DTYPES[own["dtype"]]))
+    names, first_rows = layout.names, table.values[:_TO_COUNT]
+    if names is None and how.time == "auto" and how.sample_rate_hz is None:
+        how = replace(how, time=0 if layout.num_columns > 1 else None)
+    is_count = (first_rows[1:] == first_rows[:-1] + 1).all(0) & (len(first_rows) > 2)
+    counts = np.flatnonzero(is_count).tolist()
+    time, columns = chosen_columns(names, layout.num_columns, how, counts)
     times = None
     if time is not None and not (layout.is_time_empty and time == 0):
-        times = ArrayTimes(Vector(table, time), unit_of_time(names[time] if names else None, how))
-    samples = ArraySamples(table, 0, columns)
+        unit = unit_of_time(names[time] if names else None, how)
+        times = ArrayTimes(ArraySamples(table, 0, [time]), unit)
     chosen = tuple(names[column] for column in columns) if names is not None else None
-    return Opened(samples, None, chosen, times, layout.sample_rate_hz)
+    return Opened(ArraySamples(table, 0, columns), None, chosen, times, layout.sample_rate_hz)
 
 
-# Lines -------------------------------------------------------------------------------------------
+def header(path: Path) -> dict[str, Any] | None:
+    """All of a file of ours but its samples; ``None`` if it is another's."""
+    with _text_of(path) as file:
+        return _header(file)
 
 
-def _text_of(path: Path) -> IO[str]:
-    """An open text; bytes that are no UTF-8 are Latin-1 (``_plain``)."""
-    with path.open("rb") as file:
-        is_utf16 = file.read(2) in (b"\xff\xfe", b"\xfe\xff")
-    encoding = "utf-16" if is_utf16 else "utf-8-sig"
-    return path.open(encoding=encoding, errors="strict" if is_utf16 else "surrogateescape")
-
-
-def _facts(file: IO[str]) -> dict[str, Any] | None:
+def _header(file: IO[str]) -> dict[str, Any] | None:
     start = file.read(len(FORM) + 2)
     if not start.startswith(f"# {FORM[:-1]}"):  # without its version
         return None
     rest = file.readline(MOST_HEADER)
     if start != f"# {FORM}":
         raise Refused(f"must be of format {FORM!r}, got {start[2:]!r}")
-    facts = facts_in(rest.strip())
-    if facts is None or not rest.endswith("\n"):
+    header = header_in(rest.strip())
+    if header is None or not rest.endswith("\n"):
         raise ValueError("no header behind its name")
-    return facts
+    return header
 
 
-def _plain(line: str) -> str:
-    if line.isascii():
-        return line
-    content = line.encode("utf-8", "surrogateescape")
+# Lines -------------------------------------------------------------------------------------------
+
+
+def _text_of(path: Path) -> IO[str]:
+    """An open text in the encoding that its first bytes show."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     try:
-        return content.decode()
+        codecs.getincrementaldecoder(encoding)().decode(head)
     except UnicodeDecodeError:
-        return content.decode("latin-1")
-
-
-def _first_lines(file: IO[str]) -> list[str]:
-    """The lines of the first stretch of a file; one that is cut off there is left out."""
-    head = file.read(_HEAD)
-    if "\0" in head:
-        raise Refused("holds NUL bytes, so it is no text; save it as UTF-8")
-    lines = head.split("\n")
-    return [_plain(line) for line in (lines[:-1] if len(head) == _HEAD else lines)]
-
-
-def _skip_lines(file: IO[str], count: int) -> None:
-    for _ in range(count):
-        file.readline(_HEAD)
+        encoding = "latin-1"
+    return path.open(encoding=encoding, errors="replace")
 
 
 def _blocks(file: IO[str], line: int) -> Iterator[tuple[int, list[str]]]:
@@ -204,8 +180,7 @@ def _blocks(file: IO[str], line: int) -> Iterator[tuple[int, list[str]]]:
             raise _wrong(line + len(lines), what)
         yield line, lines
         line += len(lines)
-    if rest:
-        yield line, [rest]
+    yield line, [rest]
 
 
 def _rows_of(lines: list[str], layout: _Layout, line: int) -> NDArray[np.float64]:
@@ -216,8 +191,7 @@ def _rows_of(lines: list[str], layout: _Layout, line: int) -> NDArray[np.float64
     Raises:
         Refused: naming the first line that is no such row.
     """
-    lines = [_bare(one) for one in lines]
-    plain = lines
+    lines = plain = [one.partition("#")[0] for one in lines]
     if not any(map(str.strip, lines)):
         return np.empty((0, layout.num_columns))
     if layout.has_tail:
@@ -229,14 +203,13 @@ def _rows_of(lines: list[str], layout: _Layout, line: int) -> NDArray[np.float64
         rows: NDArray[Any] = np.loadtxt(plain, delimiter=delimiter, comments=None, ndmin=2)
         if rows.shape[1] == layout.num_columns:
             return rows
-    except ValueError:
+    except ValueError:  # cell by cell, so that what is empty is NaN and what is wrong has a line
         pass
     found = [_row_of(one, layout, number) for number, one in enumerate(lines, line) if one.strip()]
     return np.array(found, dtype=np.float64).reshape(-1, layout.num_columns)
 
 
 def _row_of(line: str, layout: _Layout, number: int) -> list[float]:
-    """One row cell by cell, so that what is wrong has a line."""
     cells = _cells(line, layout.delimiter)
     if layout.has_tail and not cells[-1]:
         cells.pop()
@@ -246,7 +219,7 @@ def _row_of(line: str, layout: _Layout, number: int) -> list[float]:
     row = []
     for cell in cells:
         plain = cell.replace(".", "?").replace(",", ".", 1) if layout.has_commas else cell
-        if plain and not _is_number(plain):
+        if plain and not _NUMBER.fullmatch(plain):
             raise _wrong(number, f"{_quoted(cell)} is no number; leave empty what is missing")
         row.append(float(plain or "nan"))
     return row
@@ -260,58 +233,46 @@ def _quoted(cell: str) -> str:
     return repr(cell if len(cell) <= 40 else cell[:37] + "...")
 
 
-def _bare(line: str) -> str:
-    """A line without its comment."""
-    return line.partition("#")[0]
-
-
 def _cells(line: str, delimiter: str) -> list[str]:
     """The cells of one line, quotes and blanks around them taken off."""
     if delimiter == _BLANKS:
         line = " ".join(line.split())
-    if '"' not in line:
-        return [cell.strip() for cell in line.split(delimiter)]
     try:
-        found = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [""])
+        rows = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
+        return [cell.strip() for cell in next(rows, [""])] or [""]
     except csv.Error:  # a cell of more than 128 KiB
         return [line]
-    return [cell.strip() for cell in found]
-
-
-def _is_number(cell: str) -> bool:
-    return _NUMBER.fullmatch(cell) is not None
 
 
 # Layout ------------------------------------------------------------------------------------------
 
 
-def _layout_of(lines: Sequence[str], how: Reading) -> _Layout:
-    """The layout of a table, from its first lines.
+def _layout_of(head: str, how: Reading) -> _Layout:
+    """The layout of a table, from its first characters.
 
     Raises:
         Refused: if it has no row of numbers, or a header of other columns.
     """
+    if "\0" in head:
+        raise Refused("holds NUL bytes, so it is no text; save it as UTF-8")
+    lines = head.split("\n")
+    if len(head) == _HEAD:
+        lines.pop()  # cut
     headings: list[tuple[int, str]] = []
+    is_lvm = head.startswith("LabVIEW Measurement")
     for number, line in enumerate(lines, 1):
-        if not line.strip():
-            continue
-        is_lvm = bool(headings) and headings[0][1].startswith("LabVIEW Measurement")
-        delimiter = _delimiter_of(_bare(line), how, is_lvm)
-        if delimiter is None:
+        bare = line.partition("#")[0]
+        marks = how.delimiter or [mark for mark in "\t;," if mark in bare] + [_BLANKS]
+        delimiter = next((m for m in marks if _is_row(_cells(bare, m), m, is_lvm)), None)
+        if delimiter is not None:
+            rows = [one.partition("#")[0] for one in lines[number - 1 :]]
+            return _named(_of_rows(rows, number, delimiter), headings, is_lvm)
+        if line.strip():
             headings.append((number, line))
-            continue
-        layout = _of_rows([_bare(one) for one in lines[number - 1 :]], number, delimiter)
-        return _named(layout, headings, is_lvm)
     raise Refused(
         f"holds no row of numbers in its first {_HEAD >> 20} MiB; "
         "it must be a table of numbers, with a decimal point"
     )
-
-
-def _delimiter_of(line: str, how: Reading, is_lvm: bool) -> str | None:
-    """What makes a line a row of numbers; None if nothing does."""
-    marks = how.delimiter or [mark for mark in "\t;," if mark in line] + [_BLANKS]
-    return next((mark for mark in marks if _is_row(_cells(line, mark), mark, is_lvm)), None)
 
 
 def _is_row(cells: Sequence[str], delimiter: str, is_lvm: bool) -> bool:
@@ -320,18 +281,15 @@ def _is_row(cells: Sequence[str], delimiter: str, is_lvm: bool) -> bool:
         cells = [cell.replace(",", ".", 1) for cell in cells]
     if not cells[0] and not is_lvm:
         return False
-    return any(cells) and all(not cell or _is_number(cell) for cell in cells)
+    return any(cells) and all(not cell or _NUMBER.fullmatch(cell) for cell in cells)
 
 
 def _of_rows(lines: Sequence[str], number: int, delimiter: str) -> _Layout:
     """The layout without names, from the first row and those behind it."""
     first = _cells(lines[0], delimiter)
     rows = [line.rstrip(" ") for line in lines if line.strip()]
-    has_tail = (
-        delimiter != _BLANKS
-        and len(first) > 1
-        and all(row.endswith(delimiter) for row in rows[:100])
-    )
+    is_ended = all(row.endswith(delimiter) for row in rows[:100])
+    has_tail = delimiter != _BLANKS and len(first) > 1 and is_ended
     text = "\n".join(rows) if delimiter in _WITH_COMMAS else ""
     has_commas = "," in text and "." not in text
     if has_commas and not _NO_THOUSANDS.search(text):
@@ -384,9 +342,10 @@ def _names_line(words: Sequence[tuple[int, str]], layout: _Layout) -> tuple[int,
         cells = _cells(line, layout.delimiter)
         if len(cells) >= layout.num_columns and all(map(_UNIT.fullmatch, cells)):
             continue
-        is_broken = _is_number(cells[0]) or any(_is_number(c) and not c.isdigit() for c in cells)
+        numbers = [cell for cell in cells if _NUMBER.fullmatch(cell)]
+        is_broken = cells[0] in numbers or not all(map(str.isdigit, numbers))
         if is_broken and len(cells) > 1:
-            wrong = next(cell for cell in cells if not _is_number(cell))
+            wrong = next(cell for cell in cells if cell not in numbers)
             raise _wrong(number, f"{_quoted(wrong)} is no number")
         return number, cells if len(cells) > 1 or layout.num_columns == 1 else []
     return 0, []
@@ -398,7 +357,7 @@ def _from_comment(headings: Sequence[tuple[int, str]], layout: _Layout) -> tuple
         return 0, []
     number, line = headings[-1]
     cells = _cells(line.lstrip("# "), layout.delimiter)
-    is_header = len(cells) == layout.num_columns > 1 and not any(map(_is_number, cells))
+    is_header = len(cells) == layout.num_columns > 1 and not any(map(_NUMBER.fullmatch, cells))
     return number, cells if is_header and all(cells) else []
 
 
@@ -415,7 +374,7 @@ def _rate_of(words: Sequence[tuple[int, str]], delimiter: str) -> float | None:
             raise _wrong(number, "times for each column; write X_Columns One or No")
         steps = {cell.replace(",", ".") for cell in rest if cell} if first == "Delta_X" else set()
         step = steps.pop() if len(steps) == 1 else ""
-        if _is_number(step) and float(step) > 0:
+        if _NUMBER.fullmatch(step) and float(step) > 0:
             rate = 1 / float(step)
     return rate
 

@@ -6,14 +6,13 @@ import importlib.util
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import ModuleType
 
 MOST_WHOLE = 4 * 2**30
 """Bytes of numbers in a file of a format that is read whole: MAT of version 5 and Parquet."""
 MOST_CHANNELS = 2**16
 MOST_MEMBERS = 10_000
-"""Arrays, groups or columns of one file that are looked at."""
+"""Arrays, groups, columns or topics of one file that are looked at."""
 MOST_RATIO, FREE_BYTES = 100, 64 * 2**20
 """A file may hold so many times its size, and so many bytes in any case."""
 _MOST_SAID = 200
@@ -46,19 +45,6 @@ def guarded(path: str | os.PathLike[str]) -> Iterator[None]:
     except Exception as error:  # HDF5, Arrow, zlib, struct, SQLite and YAML raise many kinds
         said = " ".join(str(error).split())[:_MOST_SAID] or type(error).__name__
         raise Refused(f"{name} is damaged or no recording of ours ({said})") from error
-
-
-def check_file(path: Path) -> None:
-    """Refuse what is no plain file: reading a pipe would wait for ever.
-
-    Raises:
-        FileNotFoundError: if there is nothing.
-        Refused: if it is a folder, pipe or device.
-    """
-    if not path.exists():
-        raise FileNotFoundError(f"no file at {path}")
-    if not path.is_file():
-        raise Refused(f"{path} must be a file")
 
 
 def check_plausible(what: str, claimed: int, stored: int, most: int | None = None) -> None:
