@@ -11,6 +11,9 @@ from tactslip_torch.data import clock as module
 from tactslip_torch.data.clock import EvenSamples, Gap, even_clock, nominal_rate, refuse_gaps
 
 RATE = 2000.0
+RATES = (92.31, 98.0, 101.0, 700.0, 900.0, 1000.0, 1024.0, 1300.0, 2000.0)
+UNITS = (0.0, 1e-6, 1e-3, 1e-2)
+ROUNDED = [(r, u) for r in RATES for u in UNITS if u * r <= (2.2 if u < 1e-2 else 1.2)]
 
 
 class KeptTimes(NamedTuple):
@@ -26,13 +29,16 @@ class Kept:
     """Samples in memory."""
 
     def __init__(self, values):
-        self.values = values
+        self.values, self.dtype = values, values.dtype
         self.num_channels, self.num_samples = values.shape
-        self.dtype = values.dtype
 
     def read(self, first, stop):
         assert 0 <= first <= stop <= self.num_samples
         return self.values[:, first:stop].clone()
+
+
+def clock_of(seconds, stated_hz=None, name="a.csv"):
+    return even_clock(KeptTimes(seconds), len(seconds), stated_hz, name)
 
 
 def ticks(num, dropped=(), rate=RATE):
@@ -41,33 +47,41 @@ def ticks(num, dropped=(), rate=RATE):
     return (left - left[0]).double() / rate, left
 
 
+def rounded(rate, unit, left, seed=0):
+    """Times of ticks, from any moment on, rounded down to a unit."""
+    start = torch.rand(1, generator=torch.Generator().manual_seed(seed)).double() / 100
+    seconds = left.double() / rate + start
+    return (seconds / unit).floor() * unit if unit else seconds
+
+
+def missing_ticks(clock):
+    return [tick for gap in clock.gaps for tick in range(gap.start, gap.start + gap.missing)]
+
+
 drops = st.lists(
     st.tuples(st.integers(20, 900), st.integers(1, 30)), max_size=4, unique_by=lambda gap: gap[0]
 )
 
 
-@settings(max_examples=60)
-@given(drops, st.sampled_from([0.0, 0.05, 0.2]), st.integers(0, 99), st.sampled_from([64, 10**6]))
-def test_what_was_dropped_is_found_and_filled(gaps, jitter, seed, piece):
+@settings(max_examples=40)
+@given(drops, st.sampled_from([0.0, 0.05, 0.2]), st.integers(0, 99), st.sampled_from([700, 10**6]))
+def test_what_was_dropped_is_found_and_filled(gaps, jitter, seed, block):
     dropped = {tick for start, count in gaps for tick in range(start, start + count)}
     seconds, left = ticks(1000, dropped)
     generator = torch.Generator().manual_seed(seed)
     late = torch.rand(len(seconds), generator=generator).double() * jitter / RATE
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_PIECE", max(piece, 700))
-        found = even_clock(KeptTimes(seconds + late - late[0]), len(seconds), RATE)
-    assert found.num_samples == 1000
-    missing = [tick for gap in found.gaps for tick in range(gap.start, gap.start + gap.missing)]
-    assert missing == sorted(dropped)
+        patch.setattr(module, "_BLOCK", block)
+        found = clock_of(seconds + late - late[0], RATE)
+    assert (found.num_samples, missing_ticks(found)) == (1000, sorted(dropped))
     assert found.jitter_s <= jitter / RATE + 1e-12
     values = torch.stack([left.double(), -left.double()])
-    even = EvenSamples(Kept(values), found, most_bridged=0)
-    whole = even.read(0, 1000)
-    expected = torch.arange(1000).double()
-    expected[sorted(dropped)] = torch.nan
-    torch.testing.assert_close(whole, torch.stack([expected, -expected]), equal_nan=True)
-    bridged = EvenSamples(Kept(values), found, most_bridged=1000)  # a ramp is its own bridge
     ramp = torch.arange(1000).double()
+    holed = ramp.clone()
+    holed[sorted(dropped)] = torch.nan
+    whole = EvenSamples(Kept(values), found).read(0, 1000)
+    torch.testing.assert_close(whole, torch.stack([holed, -holed]), equal_nan=True)
+    bridged = EvenSamples(Kept(values), found, most_bridged=1000)  # a ramp is its own bridge
     for first, stop in ((0, 1000), (17, 333), (500, 501), (990, 2000), (40, 40)):
         part = bridged.read(first, stop)
         torch.testing.assert_close(part, torch.stack([ramp, -ramp])[:, first:stop])
@@ -75,95 +89,51 @@ def test_what_was_dropped_is_found_and_filled(gaps, jitter, seed, piece):
 
 def test_long_gaps_are_not_bridged():
     seconds, left = ticks(100, {30, 31, 60})
-    found = even_clock(KeptTimes(seconds), len(seconds))
+    found = clock_of(seconds)
     assert found.gaps == (Gap(30, 2, 30), Gap(60, 1, 58))
-    assert found.missing_s == ((0.015, 0.016), (0.03, 0.0305))
     read = EvenSamples(Kept(left.double()[None]), found, most_bridged=1).read(0, 100)[0]
     assert read[60] == 60
     assert read[30:32].isnan().all()
     with pytest.raises(
-        ValueError, match=r"a\.csv: 3 samples are missing in 2 gaps, first 2 at 0\.0"
+        ValueError, match=r"a\.csv: 3 samples are missing in 2 gaps, first 2 at 0\."
     ):
         refuse_gaps(found, "a.csv")
-    refuse_gaps(even_clock(KeptTimes(ticks(100)[0]), 100), "a.csv")
+    refuse_gaps(clock_of(ticks(100)[0]), "a.csv")
 
 
-@pytest.mark.parametrize("rate", [92.3, 1000.0, 2000.0, 12345.6])
-def test_the_rate_is_measured(rate):
-    seconds, _ = ticks(3000, {500, 501, 1500}, rate)
-    found = even_clock(KeptTimes(seconds), len(seconds))
+@pytest.mark.parametrize(("rate", "unit"), ROUNDED)
+def test_stamps_neither_round_the_rate_nor_lose_or_invent_samples(rate, unit):
+    num = int(12 * rate)
+    stamps = rounded(rate, unit, torch.arange(num))
+    for stated in (None, rate):
+        found = clock_of(stamps, stated)
+        assert (found.num_samples, found.gaps) == (num, ())
+        # least squares of evenly spread rounding: 3 sigma of the slope
+        error = max(3 * unit * (num**-0.5) / 12, 1e-9)
+        assert found.sample_rate_hz == pytest.approx(rate, rel=error)
+
+
+@pytest.mark.parametrize("rate", [92.3, 1000.0, 12345.6])
+def test_the_rate_is_measured_across_gaps(rate):
+    found = clock_of(ticks(3000, {500, 501, 1500}, rate)[0])
     assert found.sample_rate_hz == pytest.approx(rate, rel=1e-9)
 
 
-def test_stamps_rounded_to_milliseconds_are_no_gaps_and_do_not_round_the_rate():
-    seconds, _ = ticks(20_000, set(range(7000, 7040)))
-    stamps = (seconds * 1000).floor() / 1000
-    found = even_clock(KeptTimes(stamps), len(stamps))
+def test_stamps_that_slip_slowly_against_the_samples_lose_none():
+    found = clock_of(rounded(1000.1, 1e-3, torch.arange(12_000)))
+    assert (found.num_samples, found.gaps) == (12_000, ())
+    assert found.sample_rate_hz == pytest.approx(1000.1, rel=3e-5)
+
+
+def test_a_pause_between_coarse_stamps():
+    stamps = (ticks(20_000, set(range(7000, 7040)))[0] * 1000).floor() / 1000
+    found = clock_of(stamps)
     assert found.sample_rate_hz == pytest.approx(RATE, rel=1e-4)
     assert (len(found.gaps), found.num_samples) == (1, 20_000)
     assert abs(found.gaps[0].start - 7000) <= 1
 
 
-def test_a_clock_that_runs_a_little_otherwise_loses_nothing_in_an_hour():
-    num = 400_000
-    seconds = torch.arange(num).double() / 2000.7
-    assert even_clock(KeptTimes(seconds), num, stated_hz=RATE).num_samples == num
-
-
-def test_a_sample_that_comes_late_is_no_gap():
-    seconds, _ = ticks(200)
-    seconds[50] += 0.9 / RATE
-    seconds[90:94] += torch.tensor([3.2, 2.2, 1.2, 0.3]).double() / RATE
-    found = even_clock(KeptTimes(seconds), 200)
-    assert found.gaps == ()
-    assert found.jitter_s == pytest.approx(3.2 / RATE, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("change", "stated", "said"),
-    [
-        (lambda t: t.flip(0), None, "time goes back at sample 1"),
-        (lambda t: t.index_fill(0, torch.tensor([7]), torch.nan), None, "time of sample 7 is nan"),
-        (lambda t: t, 1000.0, r"its times are 2000 Hz, but 1000 Hz is stated"),
-        (lambda t: (t * RATE / 32).floor() * 32 / RATE, None, "32 samples share a time"),
-        (lambda t: torch.zeros_like(t), None, "200 samples share a time"),
-        (lambda t: t[:2], None, "has 2 times, too few"),
-        (lambda t: torch.cat([t[:100], t[60:]]), None, "time goes back at sample 100"),
-        (lambda t: torch.cat([t[:100], t[99:]]), None, "samples 100 and before come 1 steps clos"),
-    ],
-)
-def test_times_that_tell_no_clock_are_refused(change, stated, said):
-    seconds = change(ticks(200)[0])
-    with pytest.raises(ValueError, match=said) as caught:
-        even_clock(KeptTimes(seconds), len(seconds), stated, "a.csv")
-    assert "\n" not in str(caught.value)
-
-
-RATES = (92.31, 98.0, 101.0, 700.0, 900.0, 1000.0, 1024.0, 1300.0, 2000.0)
-UNITS = (0.0, 1e-6, 1e-3, 1e-2)
-ROUNDED = [(r, u) for r in RATES for u in UNITS if u * r <= (2.2 if u < 1e-2 else 1.2)]
-
-
-def rounded(rate, unit, left, seed):
-    """Times of ticks, from any moment on, rounded down to a unit."""
-    start = torch.rand(1, generator=torch.Generator().manual_seed(seed)).double() / 100
-    seconds = left.double() / rate + start
-    return (seconds / unit).floor() * unit if unit else seconds
-
-
-@pytest.mark.parametrize(("rate", "unit"), ROUNDED)
-@pytest.mark.parametrize("stated", [True, False])
-def test_rounded_stamps_neither_round_the_rate_nor_lose_or_invent_samples(rate, unit, stated):
-    num = int(12 * rate)
-    stamps = rounded(rate, unit, torch.arange(num), 0)
-    found = even_clock(KeptTimes(stamps), num, rate if stated else None)
-    assert (found.num_samples, found.gaps) == (num, ())
-    # least squares of evenly spread rounding: 3 sigma of the slope
-    error = 3 * unit * (num**-0.5) / 12 if unit else 1e-9
-    assert found.sample_rate_hz == pytest.approx(rate, rel=max(error, 1e-9))
-
-
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=60)
 @given(
     st.sampled_from([(r, u) for r, u in ROUNDED if u * r < 0.45]),
     st.sampled_from([0.005, 0.02, 0.05]),
@@ -179,71 +149,74 @@ def test_random_losses_are_all_found(kind, share, longest, stated, seed):
         length = int(torch.randint(1, longest + 1, (1,), generator=generator))
         is_left[place : place + length] = False
     is_left[0] = is_left[-1] = True
-    left = is_left.nonzero().flatten()
-    stamps = rounded(rate, unit, left, seed)
-    found = even_clock(KeptTimes(stamps), len(stamps), rate if stated else None)
-    missing = [tick for gap in found.gaps for tick in range(gap.start, gap.start + gap.missing)]
-    assert missing == (~is_left).nonzero().flatten().tolist()
+    stamps = rounded(rate, unit, is_left.nonzero().flatten(), seed)
+    found = clock_of(stamps, rate if stated else None)
+    assert missing_ticks(found) == (~is_left).nonzero().flatten().tolist()
     assert found.sample_rate_hz == pytest.approx(rate, rel=1e-5)
 
 
-@pytest.mark.parametrize("after", [1, 2, 5, 7, 8, 9, 500, 992, 995, 998, 999])
+@pytest.mark.parametrize("rate", [700.0, 1024.0, 2000.0])
+def test_coarse_stamps_that_do_not_tell_what_is_missing_are_refused(rate):
+    is_left = torch.rand(12_288, generator=torch.Generator().manual_seed(1)) > 0.01
+    stamps = rounded(rate, 1e-3, is_left.nonzero().flatten())
+    with pytest.raises(ValueError, match=r"rounded so coarsely .* reading\.sample_rate_hz=\.\.\."):
+        clock_of(stamps, rate)
+
+
+@pytest.mark.parametrize("after", [1, 2, 8, 500, 992, 998, 999])
 def test_a_pause_is_found_at_any_place(after):
     seconds, _ = ticks(1000)
     seconds[after:] += 1.0
-    found = even_clock(KeptTimes(seconds), 1000)
+    found = clock_of(seconds)
     assert found.gaps == (Gap(after, 2000, after),)
     assert found.jitter_s < 1e-9
 
 
-def test_many_short_gaps_between_coarse_stamps_add_up():
-    dropped = {tick + n for tick in range(200, 39_800, 390) for n in range(3)}
-    seconds, _ = ticks(40_000, dropped)
-    stamps = ((seconds + 1e-7) * 1000).floor() / 1000
-    found = even_clock(KeptTimes(stamps), len(stamps))
-    assert found.num_samples == 40_000
-    assert found.num_samples / found.sample_rate_hz == pytest.approx(20.0, abs=5e-4)
+def test_a_sample_that_comes_late_is_no_gap():
+    seconds, _ = ticks(200)
+    seconds[50] += 0.9 / RATE
+    seconds[90:94] += torch.tensor([3.2, 2.2, 1.2, 0.3]).double() / RATE
+    found = clock_of(seconds)
+    assert found.gaps == ()
+    assert found.jitter_s == pytest.approx(3.2 / RATE, rel=0.02)
 
 
-@pytest.mark.parametrize("rate", [700.0, 900.0, 1300.0, 2000.0])
-@pytest.mark.parametrize("share", [0.005, 0.02, 0.05])
-def test_losses_between_stamps_as_coarse_as_steps_shift_the_end_by_a_stamp_at_most(rate, share):
-    num = int(12 * rate)
-    is_left = torch.rand(num, generator=torch.Generator().manual_seed(1)) > share
-    is_left[0] = is_left[-1] = True
-    stamps = rounded(rate, 1e-3, is_left.nonzero().flatten(), 1)
-    found = even_clock(KeptTimes(stamps), len(stamps))
-    assert abs(found.num_samples - num) <= max(1, 1e-3 * rate)
-    assert found.sample_rate_hz == pytest.approx(rate, rel=1e-5)
-
-
-def test_coarse_stamps_and_losses_that_leave_the_rate_open_are_refused():
-    is_left = torch.rand(12_288, generator=torch.Generator().manual_seed(1)) > 0.005
-    stamps = rounded(1024.0, 1e-3, is_left.nonzero().flatten(), 1)
-    with pytest.raises(ValueError, match=r"they tell no rate; state it: reading\.sample_rate_hz"):
-        even_clock(KeptTimes(stamps), len(stamps))
-
-
-def test_a_clock_that_drifts_loses_nothing_and_says_how_far_it_is_off():
-    num, most = 300_000, 20.0  # steps off a straight line, at the middle
+def test_a_clock_that_runs_otherwise_or_drifts_loses_nothing_and_says_how_far_it_is_off():
+    num, most = 400_000, 20.0  # steps off a straight line, at the middle
+    assert clock_of(torch.arange(num).double() / 2000.7, RATE).num_samples == num
     place = torch.linspace(0, 1, num).double()
     seconds = (torch.arange(num) + 4 * most * place * (1 - place)).double() / RATE
-    found = even_clock(KeptTimes(seconds - seconds[0]), num)
+    found = clock_of(seconds - seconds[0])
     assert (found.num_samples, found.gaps) == (num, ())
     assert 0.3 * most / RATE < found.jitter_s < most / RATE
 
 
-def test_times_that_come_at_random_tell_no_gaps():
+def at_random(times):
     late = torch.rand(4000, generator=torch.Generator().manual_seed(0)).double() * 4
-    seconds = (torch.arange(4000) + late).sort().values / RATE
-    with pytest.raises(ValueError, match=r"come so unevenly|steps closer than"):
-        even_clock(KeptTimes(seconds), 4000)
+    return (torch.arange(4000) + late).sort().values / RATE
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e3, "ms"), (1e6, "us"), (1e9, "ns")])
-def test_times_of_another_unit_are_hinted_at(factor, unit):
-    with pytest.raises(ValueError, match=f"reading.time_unit={unit}"):
-        even_clock(KeptTimes(ticks(200)[0] * factor), 200, RATE)
+@pytest.mark.parametrize(
+    ("change", "stated", "said"),
+    [
+        (lambda t: t.flip(0), None, "time goes back at sample 1"),
+        (lambda t: t.index_fill(0, torch.tensor([7]), torch.nan), None, "time of sample 7 is nan"),
+        (lambda t: t, 1000.0, r"its times are 2000 Hz, but 1000 Hz is stated"),
+        (lambda t: (t * RATE / 32).floor() * 32 / RATE, None, "32 samples share a time"),
+        (lambda t: torch.zeros_like(t), None, "200 samples share a time"),
+        (lambda t: t[:2], None, "has 2 times, too few"),
+        (lambda t: torch.cat([t[:100], t[60:]]), None, "time goes back at sample 100"),
+        (lambda t: torch.cat([t[:100], t[99:]]), None, "samples 100 and before come 1 steps clos"),
+        (lambda t: t * 1e3, RATE, r"reading\.time_unit=ms"),
+        (lambda t: t * 1e6, RATE, r"reading\.time_unit=us"),
+        (lambda t: t * 1e9, RATE, r"reading\.time_unit=ns"),
+        (at_random, None, "come so unevenly|steps closer than"),
+    ],
+)
+def test_times_that_tell_no_clock_are_refused(change, stated, said):
+    with pytest.raises(ValueError, match=said) as caught:
+        clock_of(change(ticks(200)[0]), stated)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_rate_is_called_by_its_round_number_only_if_it_may_be_that():
