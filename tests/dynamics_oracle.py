@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.integrate import solve_ivp
 
-from tactslip_torch.simulation.bristles import (
+from tactslip_torch.simulation._bristles import (
     EngineName,
     Lanes,
     LaneState,

@@ -14,7 +14,7 @@ from dynamics_oracle import SMOOTH, TACKY, Drive, Element, carry, driven, ramped
 
 from tactslip_torch import runtime as engines
 from tactslip_torch.simulation import bristles
-from tactslip_torch.simulation.bristles import (
+from tactslip_torch.simulation._bristles import (
     EngineName,
     Lanes,
     LaneState,

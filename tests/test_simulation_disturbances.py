@@ -32,7 +32,7 @@ from tactslip_torch.simulation import (
     simulate,
     timeline,
 )
-from tactslip_torch.simulation.disturbances import (
+from tactslip_torch.simulation._disturbances import (
     MARGIN_S,
     _motor_level_mv,
     _quiet,
@@ -43,7 +43,7 @@ from tactslip_torch.simulation.disturbances import (
     partial_intervals,
     rotation_hz,
 )
-from tactslip_torch.simulation.sensors import draw_front
+from tactslip_torch.simulation._sensors import draw_front
 
 TWO = ("M3", "M6")
 

@@ -1,4 +1,4 @@
-"""The scheme of ``bristles`` as a kernel that numba compiles: float64, on the CPU.
+"""The scheme of ``_bristles`` as a kernel that numba compiles: float64, on the CPU.
 
 Lanes are carried in blocks of 16, each with the steps of Newton that the eager engine takes; those
 that are done wait for the slowest. What belongs to a block lies in one array, 16 numbers for each
@@ -69,7 +69,7 @@ def _friction(at: Array) -> None:
 
 @_inner
 def _pull(at: Array, bent: Array, weight: float, i: int, a: float) -> None:
-    """Add a bristle's force and slope: ``bristles._Stage.pull``."""
+    """Add a bristle's force and slope: ``_bristles._Stage.pull``."""
     for b in range(_SIDE):
         x, s, d0, load = at[_X + b], at[_S + b], at[_D0 + b], at[_LOAD + b] * weight
         base, lag = bent[i, b], a * s
@@ -92,7 +92,7 @@ def _pull(at: Array, bent: Array, weight: float, i: int, a: float) -> None:
 
 @_inner
 def _newton(at: Array, a: float, halve: bool, may_try: bool) -> float:
-    """One step for each speed, as in ``bristles._Stage.root``; how many lanes are not done."""
+    """One step for each speed, as in ``_bristles._Stage.root``; how many lanes are not done."""
     still = 0.0
     for b in range(_SIDE):
         x, low, high, done = at[_X + b], at[_LOW + b], at[_HIGH + b], at[_DONE + b]
@@ -190,17 +190,14 @@ def carry_blocks(
     step_s: float,
     gamma: float,
     patience: int,
-    gross: float,
     every: int,
     out: Array,
-    incipient: Array,
 ) -> None:
     """Carry lanes through some steps; ``states [3, L]`` and ``bristles [L, n]`` in place.
 
     ``table [12, L]`` holds mass, k, k1, tau, c, mu_s, mu_k, vs, s and d0 of a bristle,
-    ``1 / (1 + a / tau)`` and ``A``; ``patience`` and ``gross`` are ``bristles``';
-    ``arm`` and ``normal [2 K, L]`` have two rows a step;
-    ``out [4, t, L]`` takes friction, inertia, speed and slip, ``incipient [t, L]`` the rest.
+    ``1 / (1 + a / tau)`` and ``A``; ``arm`` and ``normal [2 K, L]`` have two rows a step;
+    ``out [3, t, L]`` takes friction, inertia and slip.
     """
     num_lanes, n = bristles.shape
     at, z = np.zeros(_END), np.empty((n, _SIDE))
@@ -228,7 +225,7 @@ def carry_blocks(
                     at[_U0 + b] = at[_U + b]
                 _begin(at, z, bent, pressure, a)
                 number, still = 0, 1.0
-                while still > 0.0:  # it ends: see bristles.PATIENCE
+                while still > 0.0:  # it ends: see _bristles._PATIENCE
                     _friction(at)
                     for i in range(n):
                         _pull(at, bent, pressure[i], i, a)
@@ -243,16 +240,12 @@ def carry_blocks(
             if number % every == 0:
                 for b in range(num):
                     row, lane = number // every - 1, first + b
-                    slip, some = 0.0, False
+                    slip = at[_V + b]
                     for i in range(n):
-                        each = at[_V + b] - rates[i, b]
-                        slip += pressure[i] * each
-                        some = some or abs(each) > gross * abs(at[_ARM + b])
+                        slip -= pressure[i] * rates[i, b]
                     out[0, row, lane] = at[_K + b] * at[_U + b] + at[_Q + b]
                     out[1, row, lane] = at[_M + b] * at[_RATE_V + b]
-                    out[2, row, lane] = at[_V + b]
-                    out[3, row, lane] = slip
-                    incipient[row, lane] = some and at[_ARM + b] != 0.0
+                    out[2, row, lane] = slip
         for b in range(num):
             for row in range(3):
                 states[row, first + b] = at[_U + row * _SIDE + b]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -58,19 +59,6 @@ PRIORS: Mapping[str, Prior] = {
 }
 """The calibrated parameters by name."""
 
-
-def parameters_at(difficulty: float) -> dict[str, Value]:
-    """All three calibrated parameters at a place on the line of difficulty.
-
-    Example:
-        >>> parameters_at(0.0)
-        {'friction_noise_mv': 8.0, 'presliding_mm': (0.3, 3.0), 'burst_rate_hz': 0.3}
-        >>> parameters_at(1.0)["friction_noise_mv"]
-        5.333
-    """
-    return {name: prior.at(difficulty) for name, prior in PRIORS.items()}
-
-
 CALIBRATED_PATH = Path(__file__).parent / "calibrated.json"
 """The frozen values, part of the package."""
 
@@ -86,9 +74,9 @@ def read_calibrated(path: Path = CALIBRATED_PATH) -> dict[str, Any]:
         values = json.loads(path.read_text(encoding="utf-8"))["values"]
         return {
             name: tuple(map(float, values[name]))
-            if isinstance(PRIORS[name].start, tuple)
+            if isinstance(prior.start, tuple)
             else float(values[name])
-            for name in PRIORS
+            for name, prior in PRIORS.items()
         }
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise ValueError(
@@ -97,49 +85,39 @@ def read_calibrated(path: Path = CALIBRATED_PATH) -> dict[str, Any]:
         ) from None
 
 
-CALIBRATED = read_calibrated()
-"""What scenes take by default, by the name of the parameter."""
+_CALIBRATED = read_calibrated()
 
 # --- groups of parameters -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Parameters:
-    """A group of parameters: lists become tuples, and every number is checked."""
+    """A group of parameters: lists become tuples, numbers are checked, ranges are in order."""
 
     def __post_init__(self) -> None:
-        where = type(self).__name__
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, list):
                 value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
                 object.__setattr__(self, field.name, value)
-            if isinstance(value, bool | str) or value is None:
-                continue
             if isinstance(value, int | float):
-                if not (math.isfinite(value) and value >= 0):
-                    raise ValueError(
-                        f"{where}.{field.name} must be finite and not negative, got {value}"
-                    )
-            elif "tuple[float, float]" in str(field.type) and not (
-                len(value) == 2 and 0 < value[0] <= value[1] < math.inf
-            ):
-                raise ValueError(
-                    f"{where}.{field.name} must be (low, high), 0 < low <= high, got {value}"
-                )
+                fine = math.isfinite(value) and value >= 0
+                self._require(field.name, fine, "finite and not negative")
+            elif isinstance(value, tuple) and "tuple[float, float]" in str(field.type):
+                fine = len(value) == 2 and 0 < value[0] <= value[1] < math.inf
+                self._require(field.name, fine, "(low, high), 0 < low <= high")
 
     def _require(self, name: str, holds: bool, wanted: str) -> None:
-        """One line if a value of the group cannot be."""
         if not holds:
-            where = type(self).__name__
-            raise ValueError(f"{where}.{name} must be {wanted}, got {getattr(self, name)!r}")
+            where, value = type(self).__name__, getattr(self, name)
+            raise ValueError(f"{where}.{name} must be {wanted}, got {value!r}")
 
 
 Moves = Literal["hand", "object", "both"]
 
 
 @dataclass(frozen=True)
-class Stroke:
+class Stroke(_Parameters):
     """One straight movement after a pause.
 
     Args:
@@ -160,16 +138,11 @@ class Stroke:
     moves: Moves = "hand"
 
     def __post_init__(self) -> None:
-        for name in ("speed_mm_s", "distance_mm"):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise ValueError(f"Stroke.{name} must be positive and finite, got {value}")
-        if not 0 <= self.pause_s < math.inf:
-            raise ValueError(f"Stroke.pause_s must be finite and not negative, got {self.pause_s}")
-        if self.moves not in get_args(Moves):
-            raise ValueError(
-                f"Stroke.moves must be one of {', '.join(get_args(Moves))}, got {self.moves!r}"
-            )
+        super().__post_init__()
+        self._require("speed_mm_s", self.speed_mm_s > 0, "positive")
+        self._require("distance_mm", self.distance_mm > 0, "positive")
+        known = get_args(Moves)
+        self._require("moves", self.moves in known, f"one of {', '.join(known)}")
 
     @property
     def slides(self) -> bool:
@@ -237,12 +210,12 @@ class Contact(_Parameters):
     mu_s: float | None = None
     mu_k: float | None = None
     friction_spread: float = 0.2
-    presliding_mm: tuple[float, float] = CALIBRATED["presliding_mm"]
+    presliding_mm: tuple[float, float] = _CALIBRATED["presliding_mm"]
     presliding_spread: float = 0.2
     relaxation: tuple[float, float] = (0.1, 0.3)
     relaxation_time_s: tuple[float, float] = (0.2, 2.0)
     recoil_s: float = 0.008
-    friction_noise_mv: float = CALIBRATED["friction_noise_mv"]
+    friction_noise_mv: float = _CALIBRATED["friction_noise_mv"]
     friction_noise_exponent: float = 0.75
     friction_noise_low_share: float = 0.3
     texture_scale: float = 1.0
@@ -253,26 +226,22 @@ class Contact(_Parameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require("mu_s", self.mu_s is None or self.mu_s > 0, "positive")
-        if self.mu_s is not None and self.mu_k is not None and self.mu_k > self.mu_s:
+        static, kinetic = self.mu_s, self.mu_k
+        self._require("mu_s", static is None or static > 0, "positive")
+        if static is not None and kinetic is not None and kinetic > static:
             raise ValueError(
-                f"Contact.mu_k must not exceed mu_s, got mu_k={self.mu_k} and mu_s={self.mu_s}"
+                f"Contact.mu_k must not exceed mu_s, got mu_k={kinetic} and mu_s={static}"
             )
+        loads = all(0 <= load < math.inf for _, load in self.finger_loads)
+        self._require("finger_loads", loads, "finite and not negative")
         self._require("recoil_s", self.recoil_s > 0, "positive")
         self._require("friction_noise_low_share", self.friction_noise_low_share <= 1, "at most 1")
         self._require("runout", self.runout <= 1, "at most 1")
         self._require("relaxation", self.relaxation[1] <= 1, "at most 1")
-        loads = all(0 <= load < math.inf for _, load in self.finger_loads)
-        self._require("finger_loads", loads, "finite and not negative")
-        for name, holds, wanted in (
-            ("lifted_fraction", self.lifted_fraction < 1, "below 1"),
-            ("touching", self.touching is None or bool(self.touching), "null or some channels"),
-            ("load_n", self.load_n > 0, "positive"),
-        ):
-            if not holds:
-                raise ValueError(
-                    f"no element in contact: {name} must be {wanted}, got {getattr(self, name)!r}"
-                )
+        none = "or no element is in contact"
+        self._require("load_n", self.load_n > 0, f"positive, {none}")
+        self._require("lifted_fraction", self.lifted_fraction < 1, f"below 1, {none}")
+        self._require("touching", self.touching != (), f"null or some channels, {none}")
 
 
 @dataclass(frozen=True)
@@ -293,8 +262,8 @@ class Sensors(_Parameters):
             manual), at least 2 Hz.
         pvdf_offset_mv: largest offset behind the high-pass; keep it at or below 2 mV.
         pvdf_drift_mv: size of the film's slow (pyroelectric) drift.
-        warming_mv: how far a strain gauge's zero moves over the recording as the hand warms up,
-            with a sign and size of its own in every channel; a film feels a fiftieth of it.
+        warming_mv: how far an SG channel's zero moves over the recording as the hand warms up,
+            with a sign and size of its own in every channel; a PVDF channel moves a fiftieth of it.
         num_bits: of the converter.
         rail_v: the converter's range is plus and minus this.
 
@@ -362,7 +331,7 @@ class Disturbances(_Parameters):
     mains_burst_mv: float = 50.0
     machine_mv: float = 0.0
     machine_hz: tuple[float, float] = (12.0, 60.0)
-    burst_rate_hz: float = CALIBRATED["burst_rate_hz"]
+    burst_rate_hz: float = _CALIBRATED["burst_rate_hz"]
     burst_mv: float = 30.0
     label_jitter_ms: float = 15.0
 
@@ -422,11 +391,9 @@ class Faults(_Parameters):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("drop_ms", self.drop_ms[1] <= 200, "at most 200")
-        for pair in self.swapped:
-            if len(pair) != 2 or pair[0] == pair[1]:
-                raise ValueError(f"Faults.swapped takes pairs of channels, got {pair}")
-        named = self.names
-        twice = sorted({name for name in named if named.count(name) > 1})
+        pairs = all(len(pair) == 2 and pair[0] != pair[1] for pair in self.swapped)
+        self._require("swapped", pairs, "pairs of channels")
+        twice = [name for name, count in Counter(self.names).items() if count > 1]
         if twice:
             raise ValueError(f"Faults names {', '.join(twice)} twice; a channel has one fault")
 
@@ -574,14 +541,11 @@ class Material:
     fast_ratio: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not self.mu_s > 0:
-            raise ValueError(f"{self.title}: mu_s must be positive, got {self.mu_s}")
         low, high = self.mu_ratio
-        if not 0 < low <= high:
-            raise ValueError(f"{self.title}: mu_ratio must be 0 < low <= high, got {self.mu_ratio}")
-        if high > 1:
+        if not (self.mu_s > 0 and 0 < low <= high <= 1):
             raise ValueError(
-                f"{self.title}: mu_k must not exceed mu_s, got a ratio mu_k/mu_s of up to {high}"
+                f"{self.title}: expected mu_s > 0 and mu_ratio (mu_k / mu_s) with "
+                f"0 < low <= high <= 1, got {self.mu_s} and {self.mu_ratio}"
             )
 
 
@@ -612,7 +576,7 @@ def _prior(
 
 # Friction, Ra and wavelengths: PHYSICS.md's table, as priors: none was measured on this hand.
 # Each session draws its own from the ranges. Texture levels: rough 150 mV and smooth 10 mV
-# (its starting knobs), the materials between by roughness and softness (prior, ours). The tacky
+# (its starting values), the materials between by roughness and softness (prior, ours). The tacky
 # fast_ratio: with it the force oscillates by about a quarter (prior, ours).
 MATERIALS: dict[str, Material] = {
     "M1": _prior("ABS", 0.8, (5.0, 12.0), 150.0, "rough", (0.18, 0.22), 0.05),

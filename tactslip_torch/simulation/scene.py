@@ -6,16 +6,17 @@ then.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.simulation.blocks import Array, Grid, Key
+from tactslip_torch.simulation._blocks import Array, Grid, Key
 from tactslip_torch.simulation.parameters import (
     MATERIALS,
     SEEN_MATERIALS,
@@ -34,10 +35,11 @@ from tactslip_torch.simulation.parameters import (
 FIDELITIES = ("kinematic", "bristles")
 """How contacts are modelled: by closed forms, or by skin and bristles integrated in time."""
 
-_FORMER_FIDELITIES = {"lugre": "num_bristles=1", "patch": "its 24 bristles"}
-
 SIMULATION_VERSION = 2
 """Raised whenever the samples of some scene change; part of ``Scene.to_dict``, so of cache keys."""
+
+MAX_PRESLIDING_FACTOR = 1.5
+"""Largest factor of an element's presliding travel on the recording's (ours)."""
 
 PAPER_STROKES = (Stroke(20.0), Stroke(40.0), Stroke(60.0))
 """100 mm at 20, 40 and 60 mm/s after 2 s of rest each; the strokes run on without return."""
@@ -117,74 +119,60 @@ class Scene:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "strokes", tuple(self.strokes))
-        if self.material not in MATERIALS:
-            raise ValueError(
-                f"unknown material {self.material!r}; known are {', '.join(MATERIALS)}"
-            )
         if self.session is None:
             object.__setattr__(self, "session", self.material)
-        if self.fidelity not in FIDELITIES:
-            former = _FORMER_FIDELITIES.get(str(self.fidelity))
-            remedy = f"; instead of it take bristles with {former}" if former else ""
-            raise ValueError(
-                f"unknown fidelity {self.fidelity!r}; there is {', '.join(FIDELITIES)}{remedy}"
-            )
+        for what, value, known in (
+            ("material", self.material, tuple(MATERIALS)),
+            ("fidelity", self.fidelity, FIDELITIES),
+        ):
+            if value not in known:
+                raise ValueError(f"{what} must be one of {', '.join(known)}, got {value!r}")
         for name in ("sample_rate_hz", "acceleration_m_s2"):
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value}")
         if not 0 <= self.tail_s < math.inf:
             raise ValueError(f"tail_s must be finite and not negative, got {self.tail_s}")
-        self._require_strokes()
-        self._require_contact()
-
-    def key(self, purpose: str) -> Key:
-        """The key of a draw that belongs to the recording alone."""
-        kind = () if self.name == PAPER else (self.name,)
-        session = self._session
-        return (self.seed, "recording", session, self.material, self.cycle, *kind, purpose)
-
-    def session_key(self, purpose: str) -> Key:
-        """The key of a draw that all recordings of the session share."""
-        return (self.seed, "session", self._session, purpose)
-
-    @property
-    def _session(self) -> str | int:
-        """The session's name; a scene always has one."""
-        return self.material if self.session is None else self.session
-
-    def _require_strokes(self) -> None:
-        """Refuse strokes that may end before they slip: each that slides has an onset."""
         if not self.strokes and self.tail_s == 0:
             raise ValueError("a scene needs a stroke, or a tail_s to rest for; it has neither")
-        longest_mm = 1.5 * self.contact.presliding_mm[1]
+        longest_mm = MAX_PRESLIDING_FACTOR * self.contact.presliding_mm[1]
         for number, stroke in enumerate(self.strokes, 1):
             if stroke.slides and stroke.distance_mm <= 1.5 * longest_mm:
                 raise ValueError(
                     f"stroke {number} of {stroke.distance_mm:g} mm is too short to slip surely: "
                     f"presliding may take {longest_mm:g} mm; it needs {1.5 * longest_mm:g} mm"
                 )
+        self._require_contact()
 
     def _require_contact(self) -> None:
-        """Refuse contacts that this hand or this material contradicts."""
-        contact, known = self.contact, set(self.hand.names)
+        """Refuse contacts and faults that do not fit this hand or this material."""
+        contact, names = self.contact, self.hand.names
         for what, named in (
             ("contact.touching", contact.touching or ()),
             ("faults", self.faults.names),
         ):
-            strangers = sorted(set(named) - known)
-            if strangers:
-                raise ValueError(f"{what} names {strangers}, which this hand does not have")
+            if unknown := sorted(set(named) - set(names)):
+                raise ValueError(f"{what} names {unknown}, which this hand does not have")
         loads = dict(contact.finger_loads)
-        touching = known if contact.touching is None else set(contact.touching)
-        if not any(c.name in touching and loads.get(c.finger, 1.0) > 0 for c in self.hand.channels):
+        touching = names if contact.touching is None else contact.touching
+        if not any(loads.get(self.hand.channel(name).finger, 1.0) > 0 for name in touching):
             raise ValueError("no element in contact: every element that may touch has zero load")
-        material = MATERIALS[self.material]
-        if contact.mu_s is None and contact.mu_k is not None and contact.mu_k > material.mu_s:
+        mu_s = MATERIALS[self.material].mu_s
+        if contact.mu_s is None and contact.mu_k is not None and contact.mu_k > mu_s:
             raise ValueError(
                 f"contact.mu_k must not exceed mu_s, got {contact.mu_k} above {self.material}'s "
-                f"{material.mu_s}; set contact.mu_s too"
+                f"{mu_s}; set contact.mu_s too"
             )
+
+    def key(self, purpose: str) -> Key:
+        """The key of a draw that belongs to the recording alone."""
+        kind = () if self.name == PAPER else (self.name,)
+        session = cast("str | int", self.session)
+        return (self.seed, "recording", session, self.material, self.cycle, *kind, purpose)
+
+    def session_key(self, purpose: str) -> Key:
+        """The key of a draw that all recordings of the session share."""
+        return (self.seed, "session", cast("str | int", self.session), purpose)
 
     @cached_property
     def arm(self) -> tuple[ArmStroke, ...]:
@@ -193,18 +181,18 @@ class Scene:
         A stroke at speed v over the distance d lasts ``d/v + v/a``, so the paper's nominal onsets
         of 2, 9 and 13.5 s become arm starts at 2, 9.04 and 13.62 s.
         """
-        plan, now_s, here_mm = [], 0.0, 0.0
+        arm, now_s, here_mm = [], 0.0, 0.0
         a = 1000.0 * self.acceleration_m_s2
         for stroke in self.strokes:
             distance_mm = stroke.distance_mm
             peak = min(stroke.speed_mm_s, math.sqrt(a * distance_mm))
             start_s = now_s + stroke.pause_s
             now_s = start_s + distance_mm / peak + peak / a
-            plan.append(
+            arm.append(
                 ArmStroke(start_s, here_mm, a, peak, peak / a, now_s, distance_mm, stroke.moves)
             )
             here_mm += distance_mm if stroke.slides else 0.0
-        return tuple(plan)
+        return tuple(arm)
 
     @property
     def slides(self) -> tuple[ArmStroke, ...]:
@@ -221,15 +209,11 @@ class Scene:
 
         Imperfections are left out where there are none, as before there were any.
         """
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "hand"}
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         plain["hand"] = self.hand.to_rows()
-        plain["strokes"] = [asdict(stroke) for stroke in self.strokes]
-        for name in _GROUPS:
-            plain[name] = {k: _listed(v) for k, v in asdict(plain[name]).items()}
         if self.imperfections == Imperfections():
             del plain["imperfections"]
-        plain["simulation_version"] = SIMULATION_VERSION
-        return plain
+        return {**plain, "simulation_version": SIMULATION_VERSION}
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Scene:
@@ -244,11 +228,15 @@ class Scene:
         if "hand" in values:
             values["hand"] = HandLayout.from_rows(values["hand"])
         if "strokes" in values:
-            values["strokes"] = tuple(Stroke(**stroke) for stroke in values["strokes"])
+            values["strokes"] = _strokes(values["strokes"])
         for name, group in _GROUPS.items():
             if name in values:
                 values[name] = group(**values[name])
         return cls(**values)
+
+
+def _strokes(given: Iterable[Stroke | Mapping[str, Any]]) -> tuple[Stroke, ...]:
+    return tuple(one if isinstance(one, Stroke) else Stroke(**one) for one in given)
 
 
 def paper_scenes(
@@ -290,27 +278,18 @@ def paper_scenes(
     ]
 
 
-def _listed(value: Any) -> Any:
-    """Tuples as lists, all the way down."""
-    return [_listed(v) for v in value] if isinstance(value, tuple) else value
-
-
 def _grouped(overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Overrides as fields of ``Scene``, the groups' own fields sorted into their groups."""
     values = dict(overrides)
     if "strokes" in values:
-        values["strokes"] = tuple(
-            stroke if isinstance(stroke, Stroke) else Stroke(**stroke)
-            for stroke in values["strokes"]
-        )
+        values["strokes"] = _strokes(values["strokes"])
     for name, group in _GROUPS.items():
-        given = values.pop(name, None)
+        given = values.pop(name, {})
         base = given if isinstance(given, group) else group(**(given or {}))
         inner = {f.name: values.pop(f.name) for f in fields(group) if f.name in values}
         values[name] = replace(base, **inner)
     known = {f.name for f in fields(Scene)} - {"material", "hand", "seed", "cycle"}
-    unknown = sorted(set(values) - known)
-    if unknown:
+    if unknown := sorted(set(values) - known):
         raise ValueError(
             f"unknown override {', '.join(unknown)}; a scene has {', '.join(sorted(known))} "
             f"and the fields of {', '.join(group.__name__ for group in _GROUPS.values())}"
@@ -376,31 +355,31 @@ class ArmStroke:
         return np.where(self.distance_mm - travel_mm < ramp_mm, late, time)
 
 
-def next_starts_s(plan: tuple[ArmStroke, ...]) -> list[float]:
-    """Of each stroke of a plan, when the one behind it starts; infinite for the last."""
-    return [*(stroke.start_s for stroke in plan), math.inf][1:]
-
-
+@dataclass(frozen=True, eq=False)
 class Motion:
     """A motion on a grid, computed once for all elements.
 
     Args:
-        plan: the strokes that count: those that slide for the contact's motion, those that the
-            arm drives for its own.
+        strokes: those that count: all that slide for the contact's motion, all that the arm
+            drives for its own.
         grid: where.
-
-    Attributes:
-        travel_mm: of every stroke from its own origin, ``[K, B]`` each.
-        position_mm: over all strokes, ``[K, B]``.
     """
 
-    def __init__(self, plan: tuple[ArmStroke, ...], grid: Grid) -> None:
-        self.plan, self.grid = plan, grid
-        self.travel_mm = tuple(stroke.travel_mm(grid.time_s) for stroke in plan)
-        self.position_mm: Array = sum(self.travel_mm, np.zeros(grid.time_s.shape))
+    strokes: tuple[ArmStroke, ...]
+    grid: Grid
+
+    @cached_property
+    def travel_mm(self) -> list[Array]:
+        """Of every stroke from its own origin, ``[K, B]`` each."""
+        return [stroke.travel_mm(self.grid.time_s) for stroke in self.strokes]
+
+    @cached_property
+    def position_mm(self) -> Array:
+        """Over all strokes, ``[K, B]``."""
+        return sum(self.travel_mm, self.grid.zeros())
 
     @cached_property
     def speed_mm_s(self) -> Array:
-        """Speed over all strokes, ``[K, B]``."""
-        speeds = (stroke.speed_mm_s(self.grid.time_s) for stroke in self.plan)
-        return sum(speeds, np.zeros(self.grid.time_s.shape))
+        """Over all strokes, ``[K, B]``."""
+        speeds = (stroke.speed_mm_s(self.grid.time_s) for stroke in self.strokes)
+        return sum(speeds, self.grid.zeros())

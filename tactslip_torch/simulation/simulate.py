@@ -16,32 +16,32 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from tactslip_torch.data.recording import Recording
-from tactslip_torch.simulation.blocks import Array, Grid, block_samples_for, generator
-from tactslip_torch.simulation.bristles import EngineName
-from tactslip_torch.simulation.contact import Contacts, StrokeTrace, scene_contact, traces_of
-from tactslip_torch.simulation.disturbances import (
+from tactslip_torch.simulation._blocks import Array, Grid, generator
+from tactslip_torch.simulation._bristles import EngineName
+from tactslip_torch.simulation._contact import Contacts, StrokeTrace, scene_contact, traces_of
+from tactslip_torch.simulation._disturbances import (
     Handled,
-    common_waves,
-    disturb,
+    add_imperfections,
+    common_volts,
     gain_factor,
     held_samples,
     load_factor,
-    pickup,
     recorded_channels,
     stuck_volts,
 )
-from tactslip_torch.simulation.grasp import Grasp, Slips, draw_grasp
-from tactslip_torch.simulation.scene import SIMULATION_VERSION, Motion, Scene
-from tactslip_torch.simulation.sensors import (
+from tactslip_torch.simulation._grasp import Grasp, Slips, draw_grasp
+from tactslip_torch.simulation._sensors import (
+    SharedVibration,
+    converted,
     draw_front,
     element_vibration,
-    film_volts,
-    front_end,
-    gauge_volts,
-    shared_field,
+    fast_volts,
+    slow_volts,
 )
+from tactslip_torch.simulation.scene import SIMULATION_VERSION, Motion, Scene
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def simulate(
     """
     if not dtype.is_floating_point:
         raise ValueError(f"dtype must be floating, got {dtype}")
-    return recording_of(scene, None, windows, channels, dtype)
+    return _recording(scene, None, windows, channels, dtype)
 
 
 def simulate_many(
@@ -179,12 +179,12 @@ def simulate_many(
             found = traces_of(distinct, device=device, dtype=dtype, engine=engine)
             traces = dict(zip(distinct, found, strict=True))
             for scene, own in zip(some, wanted[start : start + at_once], strict=True):
-                yield recording_of(scene, traces.get(scene), own, channels)
+                yield _recording(scene, traces.get(scene), own, channels)
 
     return made()
 
 
-def recording_of(
+def _recording(
     scene: Scene,
     traces: tuple[StrokeTrace, ...] | None,
     windows: Sequence[tuple[float, float]] | None = None,
@@ -195,25 +195,22 @@ def recording_of(
     grasp = draw_grasp(scene)
     contact = scene_contact(scene, grasp, traces)
     truth = _timeline(scene, grasp, contact.slips)
-    wanted = _wanted_samples(scene, truth, windows)
-    indices = _channel_indices(scene, channels)
     volts = np.full((len(scene.hand), truth.num_samples), np.nan)
+    wanted, indices = _wanted_samples(scene, truth, windows), _channel_indices(scene, channels)
     recorded, stuck = recorded_channels(scene), stuck_volts(scene)
-    if wanted and indices:
-        held = held_samples(scene, truth.num_samples)  # by every sample, the one that stands there
-        size = block_samples_for(scene.sample_rate_hz)
-        blocks = np.unique(np.concatenate([held[first:last] // size for first, last in wanted]))
-        grid = Grid(blocks, size, scene.sample_rate_hz)
+    if len(wanted) and indices:
+        held = held_samples(scene, truth.num_samples)[wanted]  # the sample that stands there
+        size = Grid(held, scene.sample_rate_hz).block_samples
+        blocks = np.unique(held // size)
+        places = np.searchsorted(blocks, held // size) * size + held % size
         sensed = sorted({recorded[index] for index in indices if index not in stuck})
-        rows = _volts(scene, grasp, contact, grid, sensed)
-        for first, last in wanted:
-            block, offset = np.divmod(held[first:last], size)
-            source = np.searchsorted(blocks, block) * size + offset
-            for index in indices:
-                if index in stuck:
-                    volts[index, first:last] = stuck[index]
-                else:
-                    volts[index, first:last] = rows[recorded[index]].reshape(-1)[source]
+        grid = Grid(blocks, scene.sample_rate_hz)
+        rows = dict(zip(sensed, _volts(scene, grasp, contact, grid, sensed), strict=True))
+        for index in indices:
+            if index in stuck:
+                volts[index, wanted] = stuck[index]
+            else:
+                volts[index, wanted] = rows[recorded[index]].reshape(-1)[places]
     return Recording(
         samples=torch.from_numpy(volts).to(dtype),
         sample_rate_hz=scene.sample_rate_hz,
@@ -229,30 +226,26 @@ def recording_of(
 
 def _timeline(scene: Scene, grasp: Grasp, slips: Slips) -> Timeline:
     """The timeline of a scene whose contact is known."""
-    down = grasp.touching
-    onsets = [_weighted_median(row[down], grasp.load_n[down]) for row in slips.start_s]
-    sticking = [np.nan_to_num(row[down], nan=-np.inf) for row in slips.end_s]  # never slid
-    ends = [_weighted_median(row, grasp.load_n[down]) for row in sticking]
+    touching = grasp.touching
+    load_n = grasp.load_n[touching]
+    onsets_s = [_weighted_median(row[touching], load_n) for row in slips.start_s]
+    never = -np.inf  # for elements that did not slide
+    ends_s = [_weighted_median(np.nan_to_num(r[touching], nan=never), load_n) for r in slips.end_s]
+    jitter_s = 1e-3 * scene.disturbances.label_jitter_ms
+    draws = generator(*scene.key("annotation")).standard_normal(len(onsets_s))
+    marks_s = np.asarray(onsets_s) + jitter_s * np.clip(draws, -3.0, 3.0)
     num_samples = math.ceil(scene.end_s * scene.sample_rate_hz - 1e-6)
     duration_s = num_samples / scene.sample_rate_hz
     return Timeline(
         duration_s=duration_s,
         num_samples=num_samples,
         speeds_mm_s=tuple(stroke.speed_mm_s for stroke in scene.strokes if stroke.slides),
-        onsets_s=tuple(onsets),
-        annotated_onsets_s=tuple(_annotated(scene, onsets, ends)),
-        sliding_s=tuple(zip(onsets, ends, strict=True)),
+        onsets_s=tuple(onsets_s),
+        annotated_onsets_s=tuple(np.maximum(np.minimum(marks_s, ends_s), 0.0).tolist()),
+        sliding_s=tuple(zip(onsets_s, ends_s, strict=True)),
         arm_s=tuple((stroke.start_s, stroke.stop_s) for stroke in scene.arm if stroke.drives),
         non_slip_s=Handled(scene, grasp).intervals_s(duration_s),
     )
-
-
-def _annotated(scene: Scene, onsets: list[float], ends: list[float]) -> list[float]:
-    """Onsets with a person's jitter, kept inside the recording and before the slide's end."""
-    jitter_s = 1e-3 * scene.disturbances.label_jitter_ms
-    draws = generator(*scene.key("annotation")).standard_normal(len(onsets))
-    marks = np.asarray(onsets) + jitter_s * np.clip(draws, -3.0, 3.0)
-    return [max(0.0, min(m, e)) for m, e in zip(marks.tolist(), ends, strict=True)]
 
 
 def _weighted_median(values: Array, weights: Array) -> float:
@@ -264,51 +257,44 @@ def _weighted_median(values: Array, weights: Array) -> float:
 
 def _volts(
     scene: Scene, grasp: Grasp, contact: Contacts, grid: Grid, indices: list[int]
-) -> dict[int, Array]:
+) -> list[Array]:
     """Volts of the channels asked for on the grid, ``[K, B]`` each."""
     history, _, now = grid.history
-    driven = Motion(tuple(stroke for stroke in scene.arm if stroke.drives), grid)
-    front, common = draw_front(scene), common_waves(scene, driven) + pickup(scene, grid)
-    field = shared_field(scene, grasp, Motion(scene.slides, grid))
+    front, shared = draw_front(scene), SharedVibration.of(scene, grasp, Motion(scene.slides, grid))
     motion, handled = Motion(scene.slides, history), Handled(scene, grasp)
-    volts = {index: grid.zeros() for index in indices}
-    for wave in common:
-        for index in indices:
-            volts[index][wave.rows] += wave.volts[index] * wave.wave
-    elements = {int(grasp.element_of_channel[index]) for index in indices}
-    for element in sorted(elements & set(grasp.touching.tolist())):
+    volts = dict(zip(indices, common_volts(scene, grid, indices), strict=True))
+    elements = set(grasp.element_of_channel[indices].tolist()) & set(grasp.touching.tolist())
+    for element in sorted(elements):
         state = contact.element(element, grid, motion)
-        vibration = element_vibration(scene, grasp, state, field, element)
-        disturb(scene, grasp, state, element, grid, vibration)
-        normal_n, shear_n, press_n = state.normal_n, state.friction_n, None
-        if (factor := load_factor(scene, element, history)) is not None:
+        vibration = element_vibration(scene, grasp, state, shared, element, grid)
+        add_imperfections(scene, grasp, state, element, grid, vibration)
+        normal_n, shear_n, press_n = state.normal_n, state.friction_n, history.zeros()
+        if scene.imperfections.share_wander > 0:
+            factor = load_factor(scene, element, history)
             normal_n, shear_n = normal_n * factor, shear_n * factor
             for band in (vibration.high, vibration.low):
                 band *= np.sqrt(factor[now])
         if not handled.is_idle:
             press_n = handled.press_n(element, normal_n, history)
-            normal_n = normal_n + press_n
             shear_n = shear_n + handled.shear_n(element, history.time_s)
             vibration.high[:] += handled.knock_v(element, grid)
         for index in indices:
             if grasp.element_of_channel[index] != element:
                 continue
-            if scene.hand.channels[index].adapting == "slow":
-                sensed = gauge_volts(scene, normal_n[now], shear_n[now], vibration)
-            else:
-                sensed = film_volts(scene, grid, shear_n, vibration, press_n)
+            if index in scene.hand.slow:
+                sensed = slow_volts(scene, (normal_n + press_n)[now], shear_n[now], vibration)
+            else:  # what presses is felt like friction (prior, ours)
+                sensed = fast_volts(scene, grid, shear_n + press_n, vibration)
             volts[index] += front.gain[index] * gain_factor(scene, index, grid) * sensed
-    return {index: front_end(scene, front, index, grid, volts[index]) for index in indices}
+    return [converted(scene, front, index, grid, volts[index]) for index in indices]
 
 
 def _wanted_samples(
     scene: Scene, truth: Timeline, windows: Sequence[tuple[float, float]] | None
-) -> list[tuple[int, int]]:
-    """The windows in samples."""
-    if windows is None:
-        return [(0, truth.num_samples)]
-    wanted = []
-    for start_s, end_s in windows:
+) -> NDArray[np.int64]:
+    """The samples in any of the windows, ascending."""
+    is_wanted = np.full(truth.num_samples, windows is None)
+    for start_s, end_s in windows or ():
         if not (math.isfinite(start_s) and math.isfinite(end_s)):
             raise ValueError(f"a window must be finite, got ({start_s}, {end_s})")
         first, last = (round(t * scene.sample_rate_hz) for t in (start_s, end_s))
@@ -317,8 +303,8 @@ def _wanted_samples(
                 f"a window must lie within the recording, 0 <= start < end <= "
                 f"{truth.duration_s:g} s, got ({start_s:g}, {end_s:g})"
             )
-        wanted.append((first, last))
-    return wanted
+        is_wanted[first:last] = True
+    return np.flatnonzero(is_wanted)
 
 
 def _channel_indices(scene: Scene, channels: Iterable[str] | None) -> list[int]:
@@ -327,8 +313,7 @@ def _channel_indices(scene: Scene, channels: Iterable[str] | None) -> list[int]:
     if channels is None:
         return list(range(len(names)))
     asked = {channels} if isinstance(channels, str) else set(channels)
-    unknown = sorted(asked - set(names))
-    if unknown:
+    if unknown := sorted(asked - set(names)):
         raise ValueError(f"unknown channels {', '.join(unknown)}; this hand has {', '.join(names)}")
     return [index for index, name in enumerate(names) if name in asked]
 

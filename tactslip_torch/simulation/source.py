@@ -8,7 +8,7 @@ from typing import Any
 
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.simulation.bristles import integrator
+from tactslip_torch.simulation._bristles import integrator
 from tactslip_torch.simulation.parameters import SEEN_MATERIALS, UNSEEN_MATERIALS
 from tactslip_torch.simulation.scene import PAPER, Scene, paper_scenes
 from tactslip_torch.simulation.simulate import Timeline, simulate, timeline

@@ -23,10 +23,9 @@ for float64 on the CPU.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
 from importlib.metadata import version
 from itertools import count
-from typing import Literal, NamedTuple, Self, cast, get_args
+from typing import Literal, NamedTuple, cast, get_args
 
 import numpy as np
 import torch
@@ -36,26 +35,18 @@ from tactslip_torch.runtime import usable_engine
 
 EngineName = Literal["auto", "compiled", "eager"]
 
-GROSS_SHARE = 0.5
-"""Of the arm's speed, above which an element slides grossly, and a bristle at all."""
+_GAMMA = 1.0 - 1.0 / math.sqrt(2.0)  # length of a stage in steps
 
-GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
-"""Length of a stage in steps."""
-
-PATIENCE = 10
-"""Evaluations after which every other step halves the bracket, whatever Newton says.
-
-So the search ends: by then or, at the latest, when no number lies within the bracket, which in
-float64 takes 1074 + 1024 + 53 halvings of the widest there is.
-"""
+# Evaluations after which every other step halves the bracket, whatever Newton says. So the search
+# ends: by then or, at the latest, when no number lies within the bracket, which in float64 takes
+# 1074 + 1024 + 53 halvings of the widest there is.
+_PATIENCE = 10
 
 _FADED = 6.5  # Stribeck speeds, beyond which exp(-(v/vs)^2) is no part of 1 in float64
-_ROUNDINGS = 64.0  # how many roundings the sum of the pressure may be off
 
 
-@dataclass(frozen=True, eq=False)
-class Lanes:
-    """Skin and friction of every lane; tensors that broadcast to the lanes' shape.
+class Lanes(NamedTuple):
+    """Skin and friction of every lane, ``[*]`` each, all positive or zero.
 
     Args:
         mass_kg: of the skin that moves with the contact; 0 is a pure balance of forces.
@@ -64,20 +55,12 @@ class Lanes:
         relaxation_time_s: with which it does; may be infinite.
         damping_n_s_m: the damper beside both springs.
         mu_s: friction coefficient at rest.
-        mu_k: friction coefficient in sliding.
+        mu_k: friction coefficient in sliding, at most ``mu_s``.
         stribeck_m_s: speed over which the one becomes the other.
         bristle_stiffness_n_m: of all bristles together.
         bristle_damping_n_s_m: of all bristles together, at rest.
         viscous_n_s_m: friction in proportion to speed.
-        pressure: share of the load that each bristle carries; its length is their number.
-
-    Shape:
-        - pressure: ``[n]``; all others broadcast to ``shape``, ``[*]``
-
-    Raises:
-        ValueError: for a value that is negative, not finite or not a number, a stiffness,
-            Stribeck speed, relaxation time or friction that is not positive, ``mu_k > mu_s``, or a
-            pressure that does not sum to 1.
+        pressure: fraction of the load that each bristle carries, ``[n]``; sums to 1.
     """
 
     mass_kg: Tensor
@@ -93,76 +76,9 @@ class Lanes:
     viscous_n_s_m: Tensor
     pressure: Tensor
 
-    def __post_init__(self) -> None:
-        dampers = ("damping_n_s_m", "bristle_damping_n_s_m", "viscous_n_s_m")
-        may_be_zero = ("mass_kg", "relaxing_n_m", *dampers)
-        for field in fields(self):
-            name, values = field.name, getattr(self, field.name)
-            fine = values >= 0 if name in may_be_zero else values > 0
-            if name != "relaxation_time_s":
-                fine = fine & values.isfinite()
-            if not fine.all():
-                sign = "not negative" if name in may_be_zero else "positive"
-                raise ValueError(
-                    f"expected {name} finite and {sign}, got {float(values[~fine][0]):g}"
-                )
-        weights = self.pressure
-        slack = _ROUNDINGS * torch.finfo(weights.dtype).eps
-        if weights.dim() != 1 or not abs(float(weights.sum()) - 1.0) <= slack:
-            raise ValueError(
-                f"expected pressure [n] that sums to 1, got {tuple(weights.shape)} with sum "
-                f"{float(weights.sum()):g}; hertz_pressure(n) gives one"
-            )
-        if (self.mu_k > self.mu_s).any():
-            raise ValueError(
-                f"expected mu_k <= mu_s, got mu_k up to {float(self.mu_k.max()):g} over mu_s down "
-                f"to {float(self.mu_s.min()):g}; friction in sliding is not above that at rest"
-            )
 
-    @classmethod
-    def together(cls, each: list[Lanes], device: torch.device, dtype: torch.dtype) -> Lanes:
-        """Lanes ``[L]`` of several, one after the other; they share one pressure."""
-        names = [field.name for field in fields(cls) if field.name != "pressure"]
-        tensors = {name: torch.cat([getattr(own, name) for own in each]) for name in names}
-        tensors["pressure"] = each[0].pressure
-        return cls(**{name: values.to(device, dtype) for name, values in tensors.items()})
-
-    @property
-    def shape(self) -> torch.Size:
-        """The lanes' shape."""
-        tensors: list[Tensor] = [getattr(self, field.name) for field in fields(self)]
-        return torch.Size(torch.broadcast_shapes(*(values.shape for values in tensors[:-1])))
-
-    @property
-    def num_bristles(self) -> int:
-        """How many bristles share the load."""
-        return len(self.pressure)
-
-
-def hertz_pressure(
-    num_bristles: int, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
-) -> Tensor:
-    """Shares of the load under a Hertz pressure, in proportion to ``sqrt(1 - r^2)``.
-
-    Bristle ``i`` stands at ``r = (2 i + 1) / n - 1`` across the contact.
-
-    Shape:
-        - output: ``[n]``, positive, sums to 1
-
-    Raises:
-        ValueError: for no bristle.
-    """
-    if num_bristles < 1:
-        raise ValueError(f"expected one bristle or more, got {num_bristles}")
-    steps = torch.arange(num_bristles, dtype=torch.float64, device=device)
-    place = (2.0 * steps + 1.0) / num_bristles - 1.0
-    weights = (1.0 - place * place).sqrt()
-    return (weights / weights.sum()).to(dtype)
-
-
-@dataclass(frozen=True, eq=False)
-class LaneState:
-    """Where every lane is between two steps.
+class LaneState(NamedTuple):
+    """Where every lane is between two steps, or how fast it changes.
 
     Args:
         stretch_m: of the skin, arm less patch.
@@ -180,62 +96,44 @@ class LaneState:
     bristle_m: Tensor
 
     @classmethod
-    def sticking(
-        cls, lanes: Lanes, force_n: Tensor | float = 0.0, relaxing_share: Tensor | float = 0.0
-    ) -> Self:
-        """At rest, with a shear force that spring and bristles agree on.
+    def sticking(cls, lanes: Lanes, force_n: Tensor) -> LaneState:
+        """At rest, the Maxwell arm relaxed, with a shear force that spring and bristles agree on.
 
-        Each bristle carries the share of the force that it carries of the load, as after sliding.
-        What goes beyond ``mu_s N`` is lost in the first step.
-
-        Args:
-            lanes: whose state it is.
-            force_n: with which the skin pulls the patch.
-            relaxing_share: part of it that the Maxwell arm holds, from 0 (long at rest) to 1.
-
-        Shape:
-            - force_n, relaxing_share: broadcast to the lanes' shape
-
-        Raises:
-            ValueError: if ``relaxing_share`` is outside 0 to 1.
+        Each bristle carries the fraction of the force that it carries of the load, as after
+        sliding. What goes beyond ``mu_s N`` is lost in the first step.
         """
-        like = lanes.pressure
-        force = torch.as_tensor(force_n, dtype=like.dtype, device=like.device)
-        share = torch.as_tensor(relaxing_share, dtype=like.dtype, device=like.device)
-        if not ((share >= 0) & (share <= 1)).all():
-            raise ValueError(
-                f"expected relaxing_share within 0 to 1, got {float(share.min()):g} to "
-                f"{float(share.max()):g}"
-            )
-        force, share = force.expand(lanes.shape), share.expand(lanes.shape)
-        each = lanes.bristle_stiffness_n_m / lanes.num_bristles
-        return cls(
-            stretch_m=(1.0 - share) * force / lanes.stiffness_n_m,
-            speed_m_s=torch.zeros_like(force),
-            relaxing_n=share * force,
-            bristle_m=(force / each)[..., None] * like,
-        )
+        still = torch.zeros_like(force_n)
+        each = lanes.bristle_stiffness_n_m / len(lanes.pressure)
+        bristle = (force_n / each)[..., None] * lanes.pressure
+        return cls(force_n / lanes.stiffness_n_m, still, still, bristle)
 
 
-@dataclass(frozen=True, eq=False)
-class Trace:
+class Trace(NamedTuple):
     """Lanes at every so many steps; all ``[T, *]``.
 
     Args:
         friction_n: what the skin's springs transmit, ``k u + q``.
         inertia_n: mass times acceleration of the patch.
-        speed_m_s: of the patch over the surface.
-        slip_m_s: that speed less the bristles' rates, each by its share of the load. More than
-            half of the arm's speed is gross sliding.
-        incipient: whether a bristle slips at more than half of the speed of an arm that moves; so
-            does any without load, which the patch drags along.
+        slip_m_s: speed of the patch over the surface less the bristles' rates, each by its
+            fraction of the load. More than half of the arm's speed is gross sliding.
     """
 
     friction_n: Tensor
     inertia_n: Tensor
-    speed_m_s: Tensor
     slip_m_s: Tensor
-    incipient: Tensor
+
+
+def hertz_pressure(num_bristles: int) -> Tensor:
+    """Fractions of the load under a Hertz pressure, in proportion to ``sqrt(1 - r^2)``.
+
+    Bristle ``i`` stands at ``r = (2 i + 1) / n - 1`` across the contact.
+
+    Shape:
+        - output: ``[n]`` float64, positive, sums to 1
+    """
+    place = (2.0 * torch.arange(num_bristles, dtype=torch.float64) + 1.0) / num_bristles - 1.0
+    weights = (1.0 - place * place).sqrt()
+    return weights / weights.sum()
 
 
 def stage_times_s(num_steps: int, step_s: float, first_step: int = 0) -> Tensor:
@@ -245,7 +143,7 @@ def stage_times_s(num_steps: int, step_s: float, first_step: int = 0) -> Tensor:
         - output: ``[2 num_steps]`` float64, two stages a step
     """
     steps = torch.arange(first_step, first_step + num_steps, dtype=torch.float64)
-    return torch.stack((steps + GAMMA, steps + 1.0), -1).flatten() * step_s
+    return torch.stack((steps + _GAMMA, steps + 1.0), -1).flatten() * step_s
 
 
 def integrate(
@@ -268,7 +166,7 @@ def integrate(
         arm_m_s: the arm's speed over the surface at the stages, ``stage_times_s``.
         load_n: newtons at the same times.
         step_s: length of a step; 125 to 250 us are accurate, any is stable.
-        every: of how many steps the last is kept.
+        every: of how many steps the last is kept; it divides their number.
         engine: ``"compiled"`` is for float64 on the CPU and has no gradient; ``"auto"`` takes it
             where it can, else ``"eager"``. They agree to rounding.
 
@@ -276,45 +174,19 @@ def integrate(
         The trace, its entry ``i`` after ``(i + 1) every`` steps, and the last state.
 
     Shape:
-        - arm_m_s, load_n: ``[2 num_steps, *]``, or what expands to the lanes' shape ``*``
+        - arm_m_s, load_n: ``[2 num_steps, *]``
         - output: ``[num_steps / every, *]``, in the lanes' kind of number and on their device
 
     Raises:
-        ValueError: for a number of steps that is not a multiple of ``every``, a step that is not
-            positive, shapes that do not fit the lanes, an unknown engine, or one that cannot do
-            this.
+        ValueError: for an unknown engine, or one that cannot do this.
     """
-    num_steps, shape = len(arm_m_s) // 2, lanes.shape
-    if every < 1 or len(arm_m_s) != 2 * num_steps or num_steps % every:
-        raise ValueError(
-            f"expected two stages a step and num_steps as a multiple of every, got {len(arm_m_s)} "
-            f"stages and {every}"
-        )
-    if not 0 < step_s < math.inf:
-        raise ValueError(f"expected step_s positive and finite, got {step_s:g}")
-    wanted = (shape, shape, shape, (*shape, lanes.num_bristles))
-    came = [tuple(values.shape) for values in vars(state).values()]
-    if came != [tuple(each) for each in wanted]:
-        raise ValueError(
-            f"expected a state of lanes {tuple(shape)} with {lanes.num_bristles} bristles, got "
-            f"{', '.join(map(str, came))}"
-        )
-    try:
-        arm, load = (
-            values.to(lanes.pressure).expand(2 * num_steps, *shape) for values in (arm_m_s, load_n)
-        )
-    except RuntimeError:
-        raise ValueError(
-            f"expected arm_m_s and load_n that expand to {(2 * num_steps, *shape)}, got "
-            f"{tuple(arm_m_s.shape)} and {tuple(load_n.shape)}"
-        ) from None
     chosen = _usable(engine)
-    if chosen == "compiled" and (lack := _compiled_lacks(lanes, state, arm, load)):
+    if chosen == "compiled" and (lack := _compiled_lacks(lanes, state, arm_m_s, load_n)):
         if engine == "compiled":
             raise ValueError(f'engine "compiled" {lack}; use engine "eager"')
         chosen = "eager"
     carry = _carry_compiled if chosen == "compiled" else _carry_eager
-    return carry(lanes, state, arm, load, step_s, every)
+    return carry(lanes, state, arm_m_s, load_n, step_s, every)
 
 
 def integrator(
@@ -332,9 +204,7 @@ def integrator(
         'eager'
     """
     kind = torch.device(device).type
-    chosen = _usable(engine)
-    if (dtype, kind) != (torch.float64, "cpu"):
-        chosen = "eager"
+    chosen = _usable(engine) if (dtype, kind) == (torch.float64, "cpu") else "eager"
     runs_on = "numba" if chosen == "compiled" else "torch"
     return {
         "engine": chosen,
@@ -351,48 +221,20 @@ def _carry_eager(
     lanes: Lanes, state: LaneState, arm: Tensor, load: Tensor, step_s: float, every: int
 ) -> tuple[Trace, LaneState]:
     """All lanes at once, step by step, in torch."""
-    stage, rows = _Stage(lanes, GAMMA * step_s), []
-    rest_s = (1.0 - 2.0 * GAMMA) * step_s
+    stage, rows = _Stage(lanes, _GAMMA * step_s), []
+    rest_s = (1.0 - 2.0 * _GAMMA) * step_s
     for number in range(len(arm) // 2):
         start_m_s, (first, second) = state.speed_m_s, (2 * number, 2 * number + 1)
-        middle = stage.end(state, arm[first], load[first], start_m_s)
+        middle, rates = stage.end(state, arm[first], load[first], start_m_s)
         # The second stage starts 1 - gamma of the first's rates ahead, gamma of them behind its end
-        ahead = LaneState(
-            *(
-                value + rest_s * rate
-                for value, rate in zip(
-                    vars(middle.state).values(), vars(middle.rates).values(), strict=True
-                )
-            )
-        )
-        guess = start_m_s + (middle.state.speed_m_s - start_m_s) / GAMMA
-        last = stage.end(ahead, arm[second], load[second], guess)
-        state = last.state
+        ahead = LaneState(*(x + rest_s * rate for x, rate in zip(middle, rates, strict=True)))
+        guess = start_m_s + (middle.speed_m_s - start_m_s) / _GAMMA
+        state, rates = stage.end(ahead, arm[second], load[second], guess)
         if (number + 1) % every == 0:
-            moves = arm[second] != 0
-            slipping = last.slip_m_s.abs() > GROSS_SHARE * arm[second].abs()[..., None]
-            rows.append(
-                (
-                    lanes.stiffness_n_m * state.stretch_m + state.relaxing_n,
-                    last.inertia_n,
-                    state.speed_m_s,
-                    (last.slip_m_s * lanes.pressure).sum(-1),
-                    slipping.any(-1) & moves,
-                )
-            )
-    if not rows:
-        nothing = lanes.pressure.new_empty((0, *lanes.shape))
-        return Trace(nothing, nothing, nothing, nothing, nothing.bool()), state
+            friction = lanes.stiffness_n_m * state.stretch_m + state.relaxing_n
+            slip = state.speed_m_s - (rates.bristle_m * lanes.pressure).sum(-1)
+            rows.append(Trace(friction, lanes.mass_kg * rates.speed_m_s, slip))
     return Trace(*(torch.stack(column) for column in zip(*rows, strict=True))), state
-
-
-class _StageEnd(NamedTuple):
-    """A lane at the end of a stage and how fast it changes there."""
-
-    state: LaneState
-    rates: LaneState
-    inertia_n: Tensor  # m v'
-    slip_m_s: Tensor  # of each bristle, [*, n]
 
 
 class _Pull(NamedTuple):
@@ -405,7 +247,7 @@ class _Pull(NamedTuple):
 
 
 class _Stage:
-    """Implicit stages of one length ``a``: what they share, and how one ends."""
+    """Implicit stages of one length ``a``: what they have in common, and how one ends."""
 
     def __init__(self, lanes: Lanes, stage_s: float) -> None:
         self.lanes, self.stage_s = lanes, stage_s
@@ -413,29 +255,31 @@ class _Stage:
         springs = lanes.stiffness_n_m + lanes.relaxing_n_m * self.relaxed
         dampers = lanes.damping_n_s_m + lanes.viscous_n_s_m
         self.inertia = lanes.mass_kg + stage_s * (stage_s * springs + dampers)  # A, kg
-        n = lanes.num_bristles
+        n = len(lanes.pressure)
         self.stiffness = (lanes.bristle_stiffness_n_m / n)[..., None]  # of one bristle
         self.damping = (lanes.bristle_damping_n_s_m / n)[..., None]  # of one bristle at rest
         self.mu_s, self.mu_k = lanes.mu_s[..., None], lanes.mu_k[..., None]
         self.stribeck = lanes.stribeck_m_s[..., None]
 
-    def end(self, base: LaneState, arm: Tensor, normal_n: Tensor, guess: Tensor) -> _StageEnd:
-        """The end of a stage from ``base``; differentiable.
+    def end(
+        self, base: LaneState, arm: Tensor, normal_n: Tensor, guess: Tensor
+    ) -> tuple[LaneState, LaneState]:
+        """The end of a stage from ``base`` and the rates there; differentiable.
 
         Args:
             base: values that the stage starts from.
             arm: speed at the stage's time, ``[*]``.
-            normal_n: load at that time, ``[*]``.
+            normal_n: load at that time, ``[*]``; below 0, or no more than rounding, it is none.
             guess: speed to start the search from.
         """
         lanes, a = self.lanes, self.stage_s
-        load = self.carried(normal_n)
+        floor = torch.finfo(normal_n.dtype).tiny ** 0.25
+        load = torch.where(normal_n > floor, normal_n, 0.0)[..., None] * lanes.pressure
         most = load * (self.mu_s / self.stiffness)  # deflection that the load holds
         bristle = torch.minimum(torch.maximum(base.bristle_m, -most), most)
-        ahead = base.relaxing_n + a * lanes.relaxing_n_m * arm
         drive = (
             lanes.stiffness_n_m * (base.stretch_m + a * arm)
-            + self.relaxed * ahead
+            + self.relaxed * (base.relaxing_n + a * lanes.relaxing_n_m * arm)
             + lanes.damping_n_s_m * arm
         )
         offset = -lanes.mass_kg * base.speed_m_s - a * drive
@@ -450,27 +294,13 @@ class _Stage:
             left, slope, _ = self.left(load, turned, offset, speed)
             speed = speed - (left - left.detach()) / slope.detach()
         at = self.pull(load, turned, speed)
-        v = side * speed
+        v, back = side * speed, side[..., None]
         stretching = arm - v
         relaxing = self.relaxed * (base.relaxing_n + a * lanes.relaxing_n_m * stretching)
+        state = LaneState(base.stretch_m + a * stretching, v, relaxing, back * at.bristle)
+        relaxing_rate = lanes.relaxing_n_m * stretching - relaxing / lanes.relaxation_time_s
         accelerating = (v - base.speed_m_s) / a
-        back = side[..., None]
-        return _StageEnd(
-            LaneState(base.stretch_m + a * stretching, v, relaxing, back * at.bristle),
-            LaneState(
-                stretching,
-                accelerating,
-                lanes.relaxing_n_m * stretching - relaxing / lanes.relaxation_time_s,
-                back * at.rate,
-            ),
-            lanes.mass_kg * accelerating,
-            back * (speed[..., None] - at.rate),
-        )
-
-    def carried(self, normal_n: Tensor) -> Tensor:
-        """Load of each bristle ``[*, n]``; one that is no more than rounding, or below, is none."""
-        floor = torch.finfo(normal_n.dtype).tiny ** 0.25
-        return torch.where(normal_n > floor, normal_n, 0.0)[..., None] * self.lanes.pressure
+        return state, LaneState(stretching, accelerating, relaxing_rate, back * at.rate)
 
     def pull(self, load: Tensor, base: Tensor, speed: Tensor) -> _Pull:
         r"""Friction of the bristles, less the viscous part, at the end of a stage.
@@ -497,7 +327,7 @@ class _Stage:
         A bristle without load has no friction, ``Z = Z' = 0``, and all of ``V`` is its slip.
 
         Args:
-            load: of each bristle, from ``carried``.
+            load: of each bristle.
             base: deflections that the stage starts from, cut to what the load holds.
             speed: not negative; for a patch that moves back turn the signs of ``base`` and of the
                 result.
@@ -560,11 +390,11 @@ class _Stage:
             high = torch.where(below, high, speed)
             wanted = speed - left / slope
             outside = ~((wanted >= low) & (wanted <= high))  # so is NaN
-            if number >= PATIENCE and number % 2:
+            if number >= _PATIENCE and number % 2:
                 outside = torch.ones_like(outside)
             half = low + 0.5 * (high - low)
             empty = ~((half > low) & (half < high))  # also where it is NaN
-            to_low = outside & ~was_low & (number < PATIENCE)
+            to_low = outside & ~was_low & (number < _PATIENCE)
             wanted = torch.where(outside, torch.where(to_low, low, half), wanted)
             was_low = was_low | to_low
             close = (wanted - speed).abs() <= eps**0.5 * speed
@@ -593,8 +423,7 @@ def _compiled_lacks(lanes: Lanes, state: LaneState, arm: Tensor, load: Tensor) -
     """Why kernels cannot do this; empty if they can."""
     if lanes.pressure.dtype != torch.float64 or lanes.pressure.device.type != "cpu":
         return f"needs float64 on the CPU, got {lanes.pressure.dtype} on {lanes.pressure.device}"
-    tensors = (*vars(lanes).values(), *vars(state).values(), arm, load)
-    if torch.is_grad_enabled() and any(values.requires_grad for values in tensors):
+    if torch.is_grad_enabled() and any(x.requires_grad for x in (*lanes, *state, arm, load)):
         return "has no gradient, which is asked for"
     return ""
 
@@ -605,43 +434,32 @@ def _carry_compiled(
     """``_carry_eager`` of float64 on the CPU, without gradient."""
     from tactslip_torch.simulation.compiled import carry_blocks
 
-    n, shape, stage = lanes.num_bristles, lanes.shape, _Stage(lanes, GAMMA * step_s)
-    rows = (
-        lanes.mass_kg,
-        lanes.stiffness_n_m,
-        lanes.relaxing_n_m,
-        lanes.relaxation_time_s,
-        lanes.damping_n_s_m,
-        lanes.mu_s,
-        lanes.mu_k,
-        lanes.stribeck_m_s,
-        stage.stiffness[..., 0],
-        stage.damping[..., 0],
-        stage.relaxed,
-        stage.inertia,
-    )
+    *flat, bristle = (values.detach() for values in state)
+    shape, n, stage = flat[0].shape, len(lanes.pressure), _Stage(lanes, _GAMMA * step_s)
+    of_bristle = (stage.stiffness[..., 0], stage.damping[..., 0])
+    rows = (*lanes[:8], *of_bristle, stage.relaxed, stage.inertia)
     table = torch.stack([row.detach().expand(shape).reshape(-1) for row in rows]).numpy()
-    *flat, bristle = (values.detach() for values in vars(state).values())
     states = torch.stack([values.reshape(-1) for values in flat]).numpy()
     bristles = bristle.reshape(-1, n).numpy().copy()
-    num_rows = len(arm) // (2 * every)
-    out = np.empty((4, num_rows, shape.numel()))
-    incipient = np.empty((num_rows, shape.numel()), dtype=np.bool_)
+    out = np.empty((3, len(arm) // (2 * every), shape.numel()))
+    arm, load = (
+        values.detach().expand(len(arm), *shape).reshape(len(arm), -1).contiguous()
+        for values in (arm, load)
+    )
+    pressure = lanes.pressure.detach().contiguous().numpy()
     carry_blocks(
         table,
         states,
         bristles,
-        np.ascontiguousarray(lanes.pressure.detach().numpy()),
-        arm.detach().reshape(len(arm), shape.numel()).contiguous().numpy(),
-        load.detach().reshape(len(load), shape.numel()).contiguous().numpy(),
+        pressure,
+        arm.numpy(),
+        load.numpy(),
         step_s,
-        GAMMA,
-        PATIENCE,
-        GROSS_SHARE,
+        _GAMMA,
+        _PATIENCE,
         every,
         out,
-        incipient,
     )
-    kept = [torch.from_numpy(values).reshape(num_rows, *shape) for values in (*out, incipient)]
+    trace = Trace(*(torch.from_numpy(values).reshape(-1, *shape) for values in out))
     u, v, q = torch.from_numpy(states).reshape(3, *shape)
-    return Trace(*kept), LaneState(u, v, q, torch.from_numpy(bristles).reshape(*shape, n))
+    return trace, LaneState(u, v, q, torch.from_numpy(bristles).reshape(*shape, n))

@@ -20,18 +20,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.simulation.blocks import Array, generator, log_uniform, lognormal
+from tactslip_torch.simulation._blocks import Array, generator, log_uniform, lognormal
 from tactslip_torch.simulation.parameters import MATERIALS, Material
-from tactslip_torch.simulation.scene import ArmStroke, Scene
+from tactslip_torch.simulation.scene import MAX_PRESLIDING_FACTOR, ArmStroke, Scene
 
-MAX_PRESLIDING_FACTOR = 1.5
-"""Largest factor of an element's presliding travel on the recording's (``Scene`` relies on it)."""
-
-RESTICK_SHARE = 0.5
-"""Share of the shear lost at letting go that the skin takes up again as the arm stops (ours)."""
-
-RUNOUT_PERIOD_MM = 180.0
-"""Travel over which the normal load rises and falls (prior, ours)."""
+_RESTICK_FRACTION = 0.5  # of the shear lost at letting go, taken up as the arm stops (ours)
+_RUNOUT_PERIOD_MM = 180.0  # travel over which the load rises and falls (prior, ours)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,34 +51,6 @@ class Surface:
     wavelength_mm: float | None
 
 
-def _surface(scene: Scene) -> Surface:
-    """The material's parameters: per session, friction a little per recording too."""
-    material, contact = MATERIALS[scene.material], scene.contact
-    rng = generator(*scene.session_key("surface"), scene.material)
-    session_mu, again = rng.standard_normal(), generator(*scene.key("mu"))
-    mu_s = material.mu_s * float(
-        np.exp(contact.friction_spread * (session_mu + 0.2 * again.standard_normal()))
-    )
-    ratio = float(rng.uniform(*material.mu_ratio))
-    roughness = log_uniform(rng, material.ra_um) / float(np.sqrt(np.prod(material.ra_um)))
-    texture_exponent, spectral_exponent = rng.uniform(0.5, 1.0), rng.uniform(1.5, 3.0)
-    wavelength = material.wavelength_mm and log_uniform(rng, material.wavelength_mm)
-    if contact.mu_s is not None:
-        mu_s = contact.mu_s
-    if contact.mu_k is not None:
-        mu_s = max(mu_s, contact.mu_k)  # one drawn below it would lower what was asked for
-        ratio = contact.mu_k / mu_s
-    return Surface(
-        material=material,
-        mu_s=mu_s,
-        mu_ratio=ratio,
-        texture_mv=material.texture_mv * contact.texture_scale * roughness**0.5,
-        texture_exponent=float(texture_exponent),
-        spectral_exponent=float(spectral_exponent),
-        wavelength_mm=wavelength,
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Grasp:
     """How the hand touches in one recording; arrays over its E elements.
@@ -93,7 +59,7 @@ class Grasp:
         element_of_channel: element of every channel, ``[C]``.
         load_n: normal force, 0 where an element does not touch, ``[E]``.
         presliding_mm: travel that stretches the fresh skin until it lets go, ``[E]``.
-        relaxation: share of shear that a long pause relaxes, ``[E]``.
+        relaxation: fraction of shear that a long pause relaxes, ``[E]``.
         relaxation_time_s: its time constant, ``[E]``.
         resonance_hz: the skin's resonance, ``[E]``.
         damping: its damping ratio, ``[E]``.
@@ -125,9 +91,9 @@ class Grasp:
 
     @property
     def shear_after(self) -> float:
-        """Shear when the arm has stopped after a slide, as a share of ``mu_s N``."""
+        """Shear when the arm has stopped after a slide, as a fraction of ``mu_s N``."""
         ratio = self.surface.mu_ratio
-        return ratio + RESTICK_SHARE * (1.0 - ratio)
+        return ratio + _RESTICK_FRACTION * (1.0 - ratio)
 
     def normal_n(
         self, element: int | NDArray[np.int64], position_mm: Array, time_s: Array
@@ -138,40 +104,43 @@ class Grasp:
             - position_mm, time_s, output: any one shape; with several elements ``[E]`` the times
               are ``[*, 1]`` and the output is ``[*, E]``
         """
-        angle = 2 * np.pi / RUNOUT_PERIOD_MM * position_mm
-        runout = self.runout * np.sin(angle + self.runout_phase[element])
+        angle = 2 * np.pi / _RUNOUT_PERIOD_MM * position_mm + self.runout_phase[element]
         since_grasp_s = np.maximum(time_s, 0.0) + 1.0
         creep = np.exp(-since_grasp_s / (5.0 * self.relaxation_time_s[element]))
-        normal_n: Array = (
-            self.load_n[element] * (1.0 + runout) * (1.0 + 0.3 * self.relaxation[element] * creep)
-        )
-        return normal_n
+        creep *= 0.3 * self.relaxation[element]
+        load_n = self.load_n[element] * (1.0 + self.runout * np.sin(angle)) * (1.0 + creep)
+        return np.asarray(load_n)
 
-    def relaxed(self, rest_s: Array, element: int | slice = slice(None)) -> Array:
-        """Share of the shear left after a rest."""
+    def relaxed(self, rest_s: Array | float, element: int | slice = slice(None)) -> Array:
+        """Fraction of the shear left after a rest."""
         decay = -np.expm1(-rest_s / self.relaxation_time_s[element])
-        return np.asarray(1.0 - self.relaxation[element] * decay, dtype=np.float64)
+        return np.asarray(1.0 - self.relaxation[element] * decay)
 
 
 def draw_grasp(scene: Scene) -> Grasp:
     """The recording's contact. At least one element touches: the one nearest to touching."""
-    contact, element_of_channel, loads = scene.contact, *_elements(scene)
-    num = len(loads)
-    session, rng = generator(*scene.session_key("contact")), generator(*scene.key("g"))
-    loads = loads * lognormal(session, contact.session_share_spread, num)
-    loads = loads * lognormal(rng, contact.recording_share_spread, num)
-    chance = np.where(loads > 0, rng.random(num), -1.0)
-    down = (chance >= contact.lifted_fraction) | (chance == chance.max())
-    factor = np.clip(
-        lognormal(rng, contact.presliding_spread, num),
-        1 / MAX_PRESLIDING_FACTOR,
-        MAX_PRESLIDING_FACTOR,
+    contact, channels = scene.contact, scene.hand.channels
+    places = [(channel.finger, channel.segment) for channel in channels]
+    elements = list(dict.fromkeys(places))
+    num = len(elements)
+    names = scene.hand.names if contact.touching is None else contact.touching
+    allowed = {place for place, c in zip(places, channels, strict=True) if c.name in names}
+    finger_loads = dict(contact.finger_loads)
+    load_n = contact.load_n * np.array(
+        [finger_loads.get(place[0], 1.0) * (place in allowed) for place in elements]
     )
+    session, rng = generator(*scene.session_key("contact")), generator(*scene.key("g"))
+    load_n = load_n * lognormal(session, contact.session_share_spread, num)
+    load_n = load_n * lognormal(rng, contact.recording_share_spread, num)
+    chance = np.where(load_n > 0, rng.random(num), -1.0)
+    is_down = (chance >= contact.lifted_fraction) | (chance == chance.max())
+    most = MAX_PRESLIDING_FACTOR
+    factor = np.clip(lognormal(rng, contact.presliding_spread, num), 1 / most, most)
     low, high = contact.relaxation
     middle_hz = log_uniform(session, contact.skin_resonance_hz)
     return Grasp(
-        element_of_channel=element_of_channel,
-        load_n=np.where(down & (loads > 0), loads, 0.0),
+        element_of_channel=np.array([elements.index(place) for place in places]),
+        load_n=np.where(is_down & (load_n > 0), load_n, 0.0),
         presliding_mm=log_uniform(rng, contact.presliding_mm) * factor,
         relaxation=low + (high - low) * rng.random(num),
         relaxation_time_s=np.full(num, log_uniform(rng, contact.relaxation_time_s)),
@@ -183,37 +152,43 @@ def draw_grasp(scene: Scene) -> Grasp:
     )
 
 
-def _elements(scene: Scene) -> tuple[NDArray[np.int64], Array]:
-    """Every channel's element, and every element's nominal load (0 where it may not touch)."""
-    contact = scene.contact
-    finger_loads = dict(contact.finger_loads)
-    places = [(channel.finger, channel.segment) for channel in scene.hand.channels]
-    order = list(dict.fromkeys(places))
-    allowed = set(
-        places
-        if contact.touching is None
-        else [
-            place
-            for place, name in zip(places, scene.hand.names, strict=True)
-            if name in contact.touching
-        ]
+def _surface(scene: Scene) -> Surface:
+    """The material as this session has it; its friction varies a little per recording too."""
+    material, contact = MATERIALS[scene.material], scene.contact
+    rng = generator(*scene.session_key("surface"), scene.material)
+    deviation = rng.standard_normal() + 0.2 * generator(*scene.key("mu")).standard_normal()
+    mu_s = material.mu_s * float(np.exp(contact.friction_spread * deviation))
+    mu_ratio = float(rng.uniform(*material.mu_ratio))
+    roughness = log_uniform(rng, material.ra_um) / np.sqrt(np.prod(material.ra_um))
+    texture_exponent, spectral_exponent = rng.uniform(0.5, 1.0), rng.uniform(1.5, 3.0)
+    wavelength_mm = material.wavelength_mm and log_uniform(rng, material.wavelength_mm)
+    if contact.mu_s is not None:
+        mu_s = contact.mu_s
+    if contact.mu_k is not None:
+        mu_s = max(mu_s, contact.mu_k)  # one drawn below it would lower what was asked for
+        mu_ratio = contact.mu_k / mu_s
+    return Surface(
+        material=material,
+        mu_s=mu_s,
+        mu_ratio=mu_ratio,
+        texture_mv=material.texture_mv * contact.texture_scale * float(roughness) ** 0.5,
+        texture_exponent=texture_exponent,
+        spectral_exponent=spectral_exponent,
+        wavelength_mm=wavelength_mm,
     )
-    loads = [contact.load_n * finger_loads.get(p[0], 1.0) * (p in allowed) for p in order]
-    return np.array([order.index(place) for place in places]), np.array(loads)
 
 
 @dataclass(frozen=True, eq=False)
 class Slips:
-    """Every slip of every element; arrays over S strokes that slide and E elements.
+    """Every slip of every element; arrays ``[S, E]`` over S strokes that slide and E elements.
 
     One slip a stroke: where an element sticks and slips, from the first letting go to the last
     sticking, the stick phases between included.
 
     Args:
-        start_s: when the element lets go, ``[S, E]``; NaN for elements that do not touch.
-        end_s: when it sticks again for good, ``[S, E]``.
-        shear_before: quasi-static shear at the start of each stroke, as a share of ``mu_s N``,
-            ``[S, E]``.
+        start_s: when the element lets go; NaN for elements that do not touch.
+        end_s: when it sticks again for good.
+        shear_before: quasi-static shear at the start of each stroke, as a fraction of ``mu_s N``.
     """
 
     start_s: Array
@@ -221,15 +196,15 @@ class Slips:
     shear_before: Array
 
 
-def quasi_static_slips(grasp: Grasp, plan: tuple[ArmStroke, ...]) -> Slips:
-    """When each element lets go and sticks again, over a plan of strokes that slide."""
-    shape = (len(plan), len(grasp.load_n))
+def quasi_static_slips(grasp: Grasp, strokes: tuple[ArmStroke, ...]) -> Slips:
+    """When each element lets go and sticks again, over the strokes that slide."""
+    shape = (len(strokes), len(grasp.load_n))
     start_s, end_s, before = np.empty(shape), np.empty(shape), np.zeros(shape)
     restick_mm = (grasp.shear_after - grasp.surface.mu_ratio) * grasp.presliding_mm
-    for number, stroke in enumerate(plan):
+    for number, stroke in enumerate(strokes):
         if number:
-            pause_s = stroke.start_s - plan[number - 1].stop_s
-            before[number] = grasp.shear_after * grasp.relaxed(np.asarray(pause_s))
+            pause_s = stroke.start_s - strokes[number - 1].stop_s
+            before[number] = grasp.shear_after * grasp.relaxed(pause_s)
         travel_mm = (1.0 - before[number]) * grasp.presliding_mm
         start_s[number] = stroke.time_of_travel_s(travel_mm)
         end_s[number] = stroke.time_of_travel_s(stroke.distance_mm - restick_mm)

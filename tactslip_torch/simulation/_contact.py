@@ -1,0 +1,503 @@
+"""How elements stick, let go and slide, by closed forms or by integrated bristles.
+
+Truth, vibration and sensors are made from what a contact says, whichever it is.
+
+*Kinematic*: every sample is a formula; bursts are drawn where skin lets go.
+
+*Bristles*: each stroke that slides is integrated alone (``_bristles.py``), element by element: from
+the shear that the quasi-static contact has at its start, spring and bristles at rest and in
+balance, the Maxwell arm relaxed, through the stroke and a quarter second of settling. In the pause
+the shear relaxes in closed form; the two are blended over the settling by a raised cosine. So a
+stroke does not need the strokes before it. What that approximates: the shear with which a stroke
+ends is replaced by the quasi-static one, and creep of bristles over a pause is left out. An
+element slides grossly from the first to the last time at which its slip speed exceeds half of the
+speed of an arm that moves. It takes every stroke of every touching element, whatever windows and
+channels are asked for.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from importlib.util import find_spec
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tactslip_torch.simulation._blocks import Array, Grid, generator, lognormal, smooth_step
+from tactslip_torch.simulation._bristles import (
+    EngineName,
+    Lanes,
+    LaneState,
+    hertz_pressure,
+    integrate,
+    integrator,
+    stage_times_s,
+)
+from tactslip_torch.simulation._grasp import Grasp, draw_grasp, quasi_static_slips
+from tactslip_torch.simulation.scene import ArmStroke, Motion, Scene
+
+GROSS_FRACTION = 0.5
+"""Of the arm's speed, above which an element of bristles slides grossly."""
+
+_SLIDE_RISE_S = 0.004  # with which an element that let go reaches the arm's speed (ours)
+_BURSTS = (1.0, -0.2)  # of letting go and of sticking again, over that of letting go (ours)
+_SETTLING_S = 0.25  # how long a stroke is integrated on behind its end, at most its pause (ours)
+_MOVING_FRACTION = 0.02  # of its highest speed, below which the arm counts as at rest (ours)
+_LEAST_STIFFNESS = 0.01  # of the skin's, what stays however much relaxes (ours)
+_RECORDINGS_KEPT = 4  # whose traces are kept, about 4 MB each
+_SAMPLES_AT_ONCE = 1024  # that are driven and integrated in one call
+
+
+@dataclass(frozen=True, eq=False)
+class ElementContact:
+    """One touching element's contact on a grid of blocks and on its history.
+
+    Args:
+        normal_n: newtons, on ``grid.history``.
+        friction_n: newtons, on ``grid.history``; never above static friction.
+        slide: slip speed over the speed between hand and object, on the grid: 0 sticking, or
+            where nothing drives it; 1 sliding steadily; above 1 where the skin springs back, by
+            much where the arm is slow.
+        release_v: what a film of unit gain hears of letting go and sticking again, on the grid.
+    """
+
+    normal_n: Array
+    friction_n: Array
+    slide: Array
+    release_v: Array
+
+
+def _with_next_starts(strokes: Sequence[ArmStroke]) -> Iterator[tuple[ArmStroke, float]]:
+    """Strokes, each with the start of the one behind it; infinite for the last."""
+    yield from zip(strokes, [*(s.start_s for s in strokes[1:]), math.inf], strict=False)
+
+
+class KinematicContact:
+    """Contact by closed forms.
+
+    Args:
+        scene: whose contact.
+        grasp: how the hand touches.
+
+    Attributes:
+        slips: when each element slides, over all strokes that do.
+        integrator: nothing.
+    """
+
+    integrator: Mapping[str, str] = {}
+
+    def __init__(self, scene: Scene, grasp: Grasp) -> None:
+        self.slips = quasi_static_slips(grasp, scene.slides)
+        self._scene, self._grasp = scene, grasp
+
+    def element(self, element: int, grid: Grid, motion: Motion) -> ElementContact:
+        """A touching element's contact.
+
+        Args:
+            element: which.
+            grid: where.
+            motion: of the strokes that slide, on the grid's history.
+        """
+        grasp, slide = self._grasp, grid.zeros()
+        for start_s, end_s in self._slips_of(element):
+            rows = grid.overlapping(start_s, end_s)
+            time_s = grid.time_s[rows]
+            since = np.where((time_s >= start_s) & (time_s < end_s), time_s - start_s, 0.0)
+            slide[rows] -= np.expm1(-since / _SLIDE_RISE_S)
+        normal_n = grasp.normal_n(element, motion.position_mm, motion.grid.time_s)
+        friction_n = grasp.surface.mu_s * normal_n * self._shear(element, motion)
+        return ElementContact(normal_n, friction_n, slide, self._release_v(element, grid))
+
+    def _slips_of(self, element: int) -> Array:
+        """Start and end in seconds of every slip of an element, ``[S, 2]``."""
+        return np.stack([self.slips.start_s[:, element], self.slips.end_s[:, element]], axis=1)
+
+    def _shear(self, element: int, motion: Motion) -> Array:
+        """Friction over ``mu_s N`` on the motion's grid; zero before the first stroke, ``[K, B]``.
+
+        It grows as the skin stretches, falls as it lets go, grows back as it sticks, relaxes.
+        """
+        grasp, slips, shear = self._grasp, self.slips, motion.grid.zeros()
+        presliding_mm = grasp.presliding_mm[element]
+        ratio, after = grasp.surface.mu_ratio, grasp.shear_after
+        for number, (stroke, next_s) in enumerate(_with_next_starts(motion.strokes)):
+            rows = motion.grid.overlapping(stroke.start_s, next_s)
+            t, travel_mm = motion.grid.time_s[rows], motion.travel_mm[number][rows]
+            let_go_s, stick_s = self._slips_of(element)[number]
+            fall = np.exp(-np.maximum(t - let_go_s, 0.0) / self._scene.contact.recoil_s)
+            stretching = slips.shear_before[number, element] + travel_mm / presliding_mm
+            value = np.where(
+                t > let_go_s, ratio + (1.0 - ratio) * fall, np.minimum(stretching, 1.0)
+            )
+            sticking = after - (stroke.distance_mm - travel_mm) / presliding_mm
+            value = np.where(t >= stick_s, sticking, value)
+            rest = after * grasp.relaxed(np.maximum(t - stroke.stop_s, 0.0), element)
+            value = np.where(t >= stroke.stop_s, rest, value)
+            np.copyto(shear[rows], value, where=(t >= stroke.start_s) & (t <= next_s))
+        return shear
+
+    def _release_v(self, element: int, grid: Grid) -> Array:
+        """The ringing of the skin at each letting go and, weaker, at each sticking again."""
+        scene, grasp, volts = self._scene, self._grasp, grid.zeros()
+        omega = 2 * np.pi * grasp.resonance_hz[element]
+        decay = grasp.damping[element] * omega
+        times_s = self._slips_of(element)
+        sizes = lognormal(generator(*scene.key("onset pulse"), element), 0.3, times_s.shape)
+        sizes = sizes * np.array(_BURSTS) * scene.contact.onset_pulse_v * grasp.friction_n[element]
+        for start_s, size in zip(times_s.flat, sizes.flat, strict=True):
+            rows, wave = grid.ringing(start_s, 12.0 / decay, omega, decay)
+            volts[rows] += size * wave
+        return volts
+
+
+@dataclass(frozen=True, eq=False)
+class StrokeTrace:
+    """One stroke of the touching elements of a recording, integrated, at its samples.
+
+    Args:
+        first: the sample at which or before which the stroke starts; row 0.
+        settling_s: how long it is integrated on behind its end.
+        friction_n: what the skin transmits, ``[num + 1, E]`` float32.
+        inertia_n: of the skin, ``[num + 1, E]`` float32.
+        slide: slip speed over the arm's, 0 where it slips back or the arm rests,
+            ``[num + 1, E]`` float32.
+        start_s: when gross sliding begins, NaN where it never does, ``[E]``.
+        end_s: when it ends for good, ``[E]``.
+        integrator: what integrated it: see ``_bristles.integrator``.
+    """
+
+    first: int
+    settling_s: float
+    friction_n: NDArray[np.float32]
+    inertia_n: NDArray[np.float32]
+    slide: NDArray[np.float32]
+    start_s: Array
+    end_s: Array
+    integrator: Mapping[str, str]
+
+
+class BristleContact:
+    """Contact read from integrated skin and bristles.
+
+    Args:
+        scene: whose contact; its fidelity is ``"bristles"``.
+        grasp: how the hand touches.
+        traces: of its strokes; ``None`` to integrate them now, or take those of the last few
+            scenes again.
+
+    Attributes:
+        slips: when each element slides grossly, over all strokes that do.
+        integrator: what integrated it; empty if there is no stroke.
+
+    Raises:
+        ValueError: if no whole number of steps makes a sample, or the hand never slides.
+    """
+
+    def __init__(
+        self, scene: Scene, grasp: Grasp, traces: tuple[StrokeTrace, ...] | None = None
+    ) -> None:
+        self._scene, self._grasp = scene, grasp
+        self._traces = scene_traces(scene) if traces is None else traces
+        self.integrator = self._traces[0].integrator if self._traces else {}
+        rest = quasi_static_slips(grasp, scene.slides)
+        start_s, end_s = np.full_like(rest.start_s, np.nan), np.full_like(rest.end_s, np.nan)
+        load = grasp.load_n[grasp.touching]
+        for number, trace in enumerate(self._traces):
+            start_s[number, grasp.touching] = trace.start_s
+            end_s[number, grasp.touching] = trace.end_s
+            sliding = load[np.isfinite(trace.start_s)].sum() / load.sum()
+            if sliding < 0.5:  # its onset would not exist
+                raise ValueError(
+                    f"stroke {number + 1} never slides: elements that carry {100 * sliding:.0f} % "
+                    "of the load let go, 50 % must; give it more travel or less friction"
+                )
+        self.slips = replace(rest, start_s=start_s, end_s=end_s)
+
+    def element(self, element: int, grid: Grid, motion: Motion) -> ElementContact:
+        """A touching element's contact: see ``KinematicContact.element``."""
+        grasp, history = self._grasp, motion.grid
+        lane = int(np.searchsorted(grasp.touching, element))
+        normal_n = grasp.normal_n(element, motion.position_mm, history.time_s)
+        friction_n, slide, inertia_n = history.zeros(), grid.zeros(), grid.zeros()
+        for trace, (stroke, next_s) in zip(
+            self._traces, _with_next_starts(motion.strokes), strict=True
+        ):
+            rows = history.overlapping(stroke.stop_s, next_s)
+            t = history.time_s[rows]
+            rest_n = grasp.surface.mu_s * normal_n[rows] * grasp.shear_after
+            rest_n *= grasp.relaxed(np.maximum(t - stroke.stop_s, 0.0), element)
+            paused = (t >= stroke.stop_s) & (t <= next_s)
+            np.copyto(friction_n[rows], rest_n, where=paused)
+            _blend(friction_n, history, trace, trace.friction_n[:, lane], stroke.stop_s)
+            _blend(slide, grid, trace, trace.slide[:, lane], stroke.stop_s)
+            _blend(inertia_n, grid, trace, trace.inertia_n[:, lane], stroke.stop_s)
+        release_v = self._scene.dynamics.release_v_per_n * inertia_n
+        return ElementContact(normal_n, friction_n, slide, release_v)
+
+
+Contacts = KinematicContact | BristleContact
+"""Either model of a recording's contact."""
+
+
+def scene_contact(
+    scene: Scene, grasp: Grasp, traces: tuple[StrokeTrace, ...] | None = None
+) -> Contacts:
+    """The contact of a scene by its fidelity; ``traces`` where they are integrated already."""
+    if scene.fidelity == "kinematic":
+        return KinematicContact(scene, grasp)
+    return BristleContact(scene, grasp, traces)
+
+
+def _blend(
+    out: Array, grid: Grid, trace: StrokeTrace, values: NDArray[np.float32], stop_s: float
+) -> None:
+    """Put a stroke's samples in their places, fading into what is there over the settling."""
+    num, rate_hz = len(values) - 1, grid.sample_rate_hz
+    rows = grid.overlapping(trace.first / rate_hz, (trace.first + num) / rate_hz)
+    sample = grid.blocks[rows, None] * grid.block_samples + np.arange(grid.block_samples)
+    place = sample - trace.first
+    settled = (grid.time_s[rows] - stop_s) / max(trace.settling_s, 1e-9)
+    weight = np.where((place >= 0) & (place <= num), 1.0 - smooth_step(settled), 0.0)
+    out[rows] += weight * (values[np.clip(place, 0, num)] - out[rows])
+
+
+# --- strokes, integrated ------------------------------------------------------------------------
+
+
+def _lanes_of(scene: Scene, grasp: Grasp) -> Lanes:
+    """Skin and bristles of every touching element, ``[E]``.
+
+    ``mu_s N0`` over the presliding travel is the stiffness of skin and bristles in series; the
+    bristles take ``bristle_share`` of the travel, a single one what its stiffness leaves it.
+    Resonance and damping ratio say how heavy and how damped the skin is, its relaxation which part
+    of it is a Maxwell arm. Part of the damping goes with friction, as what feeds stick-slip does:
+    a damping ratio alone is too little for some skins or too much for others. PHYSICS.md, *Chain
+    per sensing element*.
+    """
+    dynamics, surface, material = scene.dynamics, grasp.surface, grasp.surface.material
+    touching = grasp.touching
+    static_n = grasp.friction_n[touching]
+    series_n_m = static_n / (1e-3 * grasp.presliding_mm[touching])
+    fraction = np.full(len(touching), dynamics.bristle_share)
+    if dynamics.num_bristles == 1:
+        fraction = np.minimum(series_n_m / dynamics.bristle_stiffness_n_m, fraction)
+    bristles, skin = series_n_m / fraction, series_n_m / (1.0 - fraction)
+    omega = 2 * np.pi * grasp.resonance_hz[touching]
+    mass = skin / omega**2
+    relaxing = np.minimum(grasp.relaxation[touching], 1.0 - _LEAST_STIFFNESS)
+    damping = 2.0 * (dynamics.sliding_damping + grasp.damping[touching]) * mass * omega
+    fast_ratio = surface.mu_ratio  # far above the Stribeck speed
+    if material.fast_ratio is not None and scene.contact.mu_k is None:
+        fast_ratio = np.interp(surface.mu_ratio, material.mu_ratio, material.fast_ratio)
+    same = np.ones(len(touching))
+    columns = {
+        "mass_kg": mass,
+        "stiffness_n_m": (1.0 - relaxing) * skin,
+        "relaxing_n_m": relaxing * skin,
+        "relaxation_time_s": grasp.relaxation_time_s[touching],
+        "damping_n_s_m": damping + dynamics.sliding_damping_s_m * static_n,
+        "mu_s": surface.mu_s * same,
+        "mu_k": fast_ratio * surface.mu_s * same,
+        "stribeck_m_s": 1e-3 * material.stribeck_mm_s * same,
+        "bristle_stiffness_n_m": bristles,
+        "bristle_damping_n_s_m": 2.0 * dynamics.bristle_damping * np.sqrt(bristles * mass),
+        "viscous_n_s_m": dynamics.viscous_n_s_m * same,
+        "pressure": hertz_pressure(int(dynamics.num_bristles)).numpy(),
+    }
+    return Lanes(**{name: torch.from_numpy(column) for name, column in columns.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class _Slide:
+    """One stroke of one recording, to be integrated.
+
+    Args:
+        scene: of the recording.
+        grasp: how the hand touches.
+        stroke: as the arm runs it.
+        first: the sample at which or before which it starts.
+        num: samples behind the first.
+        settling_s: how long it is integrated on behind its end.
+        shear: of the touching elements as the stroke starts, as a fraction of ``mu_s N``, ``[E]``.
+    """
+
+    scene: Scene
+    grasp: Grasp
+    stroke: ArmStroke
+    first: int
+    num: int
+    settling_s: float
+    shear: Array
+
+    def drive(self, since_s: Array) -> tuple[Array, Array]:
+        """The arm's speed in m/s and the elements' loads in N, at times from the first sample.
+
+        Shape:
+            - since_s: ``[n]``
+            - output: ``[n, E]`` each
+        """
+        time_s = self.first / self.scene.sample_rate_hz + since_s[:, None]
+        position_mm = self.stroke.origin_mm + self.stroke.travel_mm(time_s)
+        load_n = self.grasp.normal_n(self.grasp.touching, position_mm, time_s)
+        return np.broadcast_to(1e-3 * self.stroke.speed_mm_s(time_s), load_n.shape), load_n
+
+
+def _slides_of(scene: Scene) -> list[_Slide]:
+    """The strokes of a scene that slide, ready to be integrated."""
+    grasp, rate_hz = draw_grasp(scene), scene.sample_rate_hz
+    rest, slides = quasi_static_slips(grasp, scene.slides), []
+    for number, (stroke, next_s) in enumerate(_with_next_starts(scene.slides)):
+        settling_s = min(_SETTLING_S, next_s - stroke.stop_s)
+        first = math.floor(stroke.start_s * rate_hz)
+        num = math.ceil((stroke.stop_s + settling_s) * rate_hz) - first
+        shear = rest.shear_before[number, grasp.touching]
+        slides.append(_Slide(scene, grasp, stroke, first, num, settling_s, shear))
+    return slides
+
+
+def _steps_per_sample(scene: Scene) -> int:
+    """How many steps of the integration make a sample.
+
+    Raises:
+        ValueError: if that is not a whole number.
+    """
+    sample_us = 1e6 / scene.sample_rate_hz
+    steps = round(sample_us / scene.dynamics.step_us)
+    if steps < 1 or abs(steps * scene.dynamics.step_us - sample_us) > 1e-6 * sample_us:
+        raise ValueError(
+            f"a whole number of steps must make a sample, got dynamics.step_us="
+            f"{scene.dynamics.step_us:g} at sample_rate_hz={scene.sample_rate_hz:g} "
+            f"({sample_us:g} us); take {sample_us / max(steps, 1):g}"
+        )
+    return steps
+
+
+@lru_cache(maxsize=_RECORDINGS_KEPT)
+def scene_traces(scene: Scene) -> tuple[StrokeTrace, ...]:
+    """The traces of a scene; of the last few they are kept, as a timeline and samples need them."""
+    return traces_of([scene])[0]
+
+
+def traces_of(
+    scenes: Sequence[Scene],
+    *,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float64,
+    engine: EngineName = "auto",
+) -> list[tuple[StrokeTrace, ...]]:
+    """Every stroke that slides of every recording; those that last equally long run side by side.
+
+    However many run beside it, each is the same: bitwise by the compiled engine, to rounding by
+    the eager one.
+
+    Args:
+        scenes: of fidelity ``"bristles"``.
+        device: where lanes are integrated.
+        dtype: in which they are.
+        engine: see ``integrate``.
+
+    Raises:
+        ValueError: if no whole number of steps makes a sample.
+    """
+    if find_spec("numba") is None and engine == "auto":
+        _say_slow()
+    slides = [_slides_of(scene) for scene in scenes]
+    alike: dict[tuple[float, ...], list[_Slide]] = {}
+    for slide in (slide for own in slides for slide in own):
+        scene = slide.scene
+        every, num_bristles = _steps_per_sample(scene), scene.dynamics.num_bristles
+        alike.setdefault((slide.num, every, scene.sample_rate_hz, num_bristles), []).append(slide)
+    traces: dict[_Slide, StrokeTrace] = {}
+    for together in alike.values():
+        made = _integrated(together, torch.device(device), dtype, engine)
+        traces.update(zip(together, made, strict=True))
+    return [tuple(traces[slide] for slide in own) for own in slides]
+
+
+@cache
+def _say_slow() -> None:
+    logging.getLogger(__name__).warning(
+        "numba is not installed: bristles are integrated by engine eager, which is slow; "
+        'pip install "tactslip_torch[fast]"'
+    )
+
+
+def _integrated(
+    slides: list[_Slide], device: torch.device, dtype: torch.dtype, engine: EngineName
+) -> list[StrokeTrace]:
+    """Strokes of one length, side by side."""
+
+    def drive(since_s: Array) -> list[torch.Tensor]:
+        """Arm and load of all lanes, ``[n, L]``."""
+        columns = zip(*(slide.drive(since_s) for slide in slides), strict=True)
+        return [torch.from_numpy(np.concatenate(c, axis=1)).to(device, dtype) for c in columns]
+
+    every, num = _steps_per_sample(slides[0].scene), slides[0].num
+    step_s = 1.0 / (slides[0].scene.sample_rate_hz * every)
+    *columns, pressures = zip(*(_lanes_of(s.scene, s.grasp) for s in slides), strict=True)
+    lanes = Lanes(*(torch.cat(c).to(device, dtype) for c in (*columns, pressures[:1])))
+    shear = torch.from_numpy(np.concatenate([slide.shear for slide in slides]))
+    _, load_n = drive(np.zeros(1))
+    shear_n = shear.to(lanes.mu_s) * lanes.mu_s * load_n[0]
+    state, pieces = LaneState.sticking(lanes, shear_n), []
+    for first in range(0, num, _SAMPLES_AT_ONCE):
+        num_steps = every * (min(first + _SAMPLES_AT_ONCE, num) - first)
+        arm, load = drive(stage_times_s(num_steps, step_s, first * every).numpy())
+        with torch.no_grad():
+            trace, state = integrate(lanes, state, arm, load, step_s, every, engine)
+        pieces.append(torch.stack(trace).double().cpu().numpy())
+    whole = np.concatenate(pieces, axis=1)  # friction, inertia, slip: [3, num, L]
+    start = np.stack([shear_n.double().cpu().numpy(), *np.zeros((2, len(shear_n)))])
+    whole = np.concatenate([start[:, None], whole], axis=1)
+    ends = np.cumsum([len(slide.shear) for slide in slides])[:-1]
+    by = integrator(engine, dtype, device)
+    own = np.split(whole, ends, axis=2)
+    return [_trace(slide, values, by) for slide, values in zip(slides, own, strict=True)]
+
+
+def _trace(slide: _Slide, values: Array, by: Mapping[str, str]) -> StrokeTrace:
+    """What is kept of a stroke's friction, inertia and slip speed, ``[3, num + 1, E]``."""
+    friction, inertia, slip = values
+    rate_hz = slide.scene.sample_rate_hz
+    arm, _ = slide.drive(np.arange(slide.num + 1) / rate_hz)
+    least_m_s = _MOVING_FRACTION * 1e-3 * slide.stroke.peak_mm_s
+    moves = arm > least_m_s
+    excess = np.where(moves, slip - GROSS_FRACTION * arm, -np.abs(slip))
+    start_s, end_s = (t + slide.first / rate_hz for t in _gross(excess, rate_hz))
+    relative = np.where(moves, np.maximum(slip / np.maximum(arm, least_m_s), 0.0), 0.0)
+    return StrokeTrace(
+        slide.first,
+        slide.settling_s,
+        friction.astype(np.float32),
+        inertia.astype(np.float32),
+        relative.astype(np.float32),
+        start_s,
+        end_s,
+        by,
+    )
+
+
+def _gross(excess: Array, rate_hz: float) -> tuple[Array, Array]:
+    """First and last time at which elements slide grossly, between samples by straight lines.
+
+    Args:
+        excess: of the slip speed over the threshold, ``[num + 1, E]``.
+        rate_hz: of the samples.
+    """
+    lanes, is_gross = np.arange(excess.shape[1]), excess > 0
+    padded = np.concatenate([excess, np.zeros((1, len(lanes)))])
+
+    def crossing(inside: NDArray[np.int64], outside: NDArray[np.int64]) -> Array:
+        """From the sample inside towards that outside, in seconds."""
+        high, low = padded[inside, lanes], padded[outside, lanes]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            place = inside + (outside - inside) * high / (high - low)
+        return np.where(is_gross.any(0), place / rate_hz, np.nan)
+
+    begins, ends = is_gross.argmax(0), len(excess) - 1 - is_gross[::-1].argmax(0)
+    return crossing(begins, begins - 1), crossing(ends, ends + 1)
