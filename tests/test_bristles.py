@@ -1,19 +1,18 @@
 """Skin and bristles against Radau and in themselves, up to where a scheme breaks."""
 
-from __future__ import annotations
-
 import math
-from dataclasses import replace
-from functools import lru_cache
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 
 import numpy as np
 import pytest
 import torch
-from dynamics_oracle import SMOOTH, TACKY, Drive, Element, carry, driven, ramped
+from scipy.integrate import solve_ivp
 
-from tactslip_torch import runtime as engines
-from tactslip_torch.simulation import bristles
+from tactslip_torch import runtime
+from tactslip_torch.simulation import _bristles
 from tactslip_torch.simulation._bristles import (
     EngineName,
     Lanes,
@@ -21,133 +20,226 @@ from tactslip_torch.simulation._bristles import (
     Trace,
     hertz_pressure,
     integrate,
+    stage_times_s,
 )
 
-FINE_S = 50e-6
-
-UNTIL_S = 0.08
-
-CASES = {
-    "smooth 20 mm/s": (SMOOTH, 0.02),
-    "smooth 60 mm/s": (SMOOTH, 0.06),
-    "tacky 40 mm/s": (TACKY, 0.04),
-    "patch 20 mm/s": (replace(TACKY, pressure=tuple(hertz_pressure(6).tolist())), 0.02),
-}
-
 ENGINES = ("eager", "compiled")
+Course = Callable[[float], float]
 
 
-@pytest.fixture(params=ENGINES)
-def engine(request: pytest.FixtureRequest) -> str:
-    if request.param == "compiled":
-        pytest.importorskip("numba")
-    return request.param
+@dataclass(frozen=True)
+class Element:
+    """PHYSICS.md's skin on a smooth surface, and its equations in plain NumPy; SI units."""
+
+    m: float = 5e-3
+    k: float = 1e3
+    k1: float = 200.0
+    tau: float = 0.5
+    c: float = 1.0
+    mu_s: float = 0.8
+    mu_k: float = 0.7
+    vs: float = 0.01
+    sigma: float = 1e5
+    d0: float = (1e5 * 5e-3) ** 0.5
+    sigma2: float = 0.0
+    pressure: tuple[float, ...] = (1.0,)
+
+    def lanes(self, dtype: torch.dtype = torch.float64, **other: object) -> Lanes:
+        """As one lane ``[1]``, or as many as the values in ``other`` have."""
+        values = vars(self) | {"m": [self.m]} | other  # in the order of Lanes
+        return Lanes(*(torch.as_tensor(value, dtype=dtype) for value in values.values()))
+
+    def rates(self, v: float, z: np.ndarray, load: float) -> tuple[np.ndarray, float]:
+        """How fast bristles bend, and with what force they pull."""
+        w = np.array(self.pressure)
+        s, d0 = self.sigma / len(w), self.d0 / len(w)
+        mu = self.mu_k + (self.mu_s - self.mu_k) * np.exp(-((v / self.vs) ** 2))
+        z_rate = v - s * abs(v) * z / (w * load * mu)
+        d = d0 / (1.0 + d0 * abs(v) / (w * self.mu_k * load))
+        return z_rate, float((s * z + d * z_rate).sum() + self.sigma2 * v)
+
+    def radau(
+        self, arm: Course, load: Course, times_s: np.ndarray, force_n: float = 0.0
+    ) -> dict[str, np.ndarray]:
+        """SciPy's solution at some times, from rest under a shear force."""
+
+        def right(t: float, y: np.ndarray) -> np.ndarray:
+            (u, v, q), w = y[:3], arm(t)
+            z_rate, pull = self.rates(v, y[3:], load(t))
+            v_rate = (self.k * u + q + self.c * (w - v) - pull) / self.m
+            return np.r_[w - v, v_rate, self.k1 * (w - v) - q / self.tau, z_rate]
+
+        bent = force_n / self.sigma * len(self.pressure) * np.array(self.pressure)
+        start = np.r_[force_n / self.k, 0.0, 0.0, bent]
+        options = {"method": "Radau", "rtol": 1e-8, "atol": 1e-12, "max_step": 1e-3}
+        found = solve_ivp(right, (0.0, times_s[-1]), start, t_eval=times_s, **options)
+        assert found.success
+        u, v, q = found.y[:3]
+        z, loads = found.y[3:], map(load, times_s)
+        z_rates = [self.rates(a, b, c)[0] for a, b, c in zip(v, z.T, loads, strict=True)]
+        slip = v - np.array(z_rates) @ np.array(self.pressure)
+        return {"u": u, "v": v, "q": q, "z": z, "friction": self.k * u + q, "slip": slip}
+
+
+SMOOTH = Element()
+TACKY = replace(SMOOTH, mu_s=1.1, mu_k=0.85, vs=0.05)
+PATCH = replace(TACKY, pressure=tuple(hertz_pressure(6).tolist()))
+
+
+def ramped(arm_m_s: float) -> Course:
+    """An arm that starts at 2 ms and is at speed at 22 ms."""
+    return lambda t: arm_m_s * min(max((t - 0.002) / 0.02, 0.0), 1.0)
 
 
 def one(time_s: float) -> float:
     return 1.0
 
 
-@lru_cache
-def solution(case: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def driven(arm: Course, load: Course = one) -> Callable[[torch.Tensor], tuple[torch.Tensor, ...]]:
+    """The same drive for lanes ``[L]``, all alike: arm and load from times."""
+
+    def drive(times: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        values = torch.tensor([[arm(t), load(t)] for t in times.tolist()], dtype=torch.float64)
+        return values[:, :1], values[:, 1:]
+
+    return drive
+
+
+def at_rest(lanes: Lanes, force: torch.Tensor | float = 0.0) -> LaneState:
+    shape = torch.broadcast_shapes(*(values.shape for values in lanes[:-1]))
+    return LaneState.sticking(lanes, torch.as_tensor(force).to(lanes.pressure).expand(shape))
+
+
+def carry(lanes, state, drive, num_steps, step_s, every=1, first_step=0, engine="auto"):
+    """``integrate`` under a drive that is a function of time."""
+    arm, load = drive(stage_times_s(num_steps, step_s, first_step))
+    arm, load = arm.to(lanes.pressure), load.to(lanes.pressure)
+    return integrate(lanes, state, arm, load, step_s, every, engine)
+
+
+def assert_close(one: tuple, other: tuple, tolerance: float = 0.0) -> None:
+    for mine, its in zip(one, other, strict=True):
+        assert mine.shape == its.shape
+        scale = float(mine.abs().max())
+        assert (mine.double() - its.double()).abs().max() <= tolerance * scale
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> EngineName:
+    if request.param == "compiled":
+        pytest.importorskip("numba")
+    return request.param
+
+
+# --- against Radau ------------------------------------------------------------------------------
+
+CASES = {
+    "smooth 20 mm/s": (SMOOTH, 0.02),
+    "smooth 60 mm/s": (SMOOTH, 0.06),
+    "tacky 40 mm/s": (TACKY, 0.04),
+    "patch 20 mm/s": (PATCH, 0.02),
+}
+TIMES = np.arange(1, 1601) * 50e-6
+
+
+@cache
+def solution(case: str) -> dict[str, np.ndarray]:
     element, arm_m_s = CASES[case]
-    times = np.arange(1, round(UNTIL_S / FINE_S) + 1) * FINE_S
-    return times, element.radau(ramped(arm_m_s), one, times)
+    return element.radau(ramped(arm_m_s), one, TIMES)
 
 
 def crossing_s(times: np.ndarray, speed: np.ndarray, level: float) -> float:
     after = int(np.argmax(speed > level))
-    part = (level - speed[after - 1]) / (speed[after] - speed[after - 1])
-    return times[after - 1] + part * (times[after] - times[after - 1])
-
-
-def assert_same(one: Trace, other: Trace, tolerance: float = 0.0) -> None:
-    for name, values in vars(one).items():
-        scale = 1.0 if name == "incipient" else float(values.abs().max())
-        difference = (values.double() - vars(other)[name].double()).abs()
-        assert values.shape == vars(other)[name].shape, name
-        assert difference.max() <= tolerance * scale, name
+    return np.interp(level, speed[after - 1 : after + 1], times[after - 1 : after + 1])
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize(("step_us", "most", "late_s"), [(125, 0.004, 10e-6), (250, 0.03, 40e-6)])
-def test_friction_and_breakaway_are_radaus(case: str, step_us: int, most: float, late_s: float):
-    element, arm_m_s = CASES[case]
-    times, found = solution(case)
-    lanes, num = element.lanes(m=[element.m]), round(UNTIL_S * 1e6) // step_us
-    trace, _ = carry(
-        lanes, LaneState.sticking(lanes), driven(ramped(arm_m_s), one), num, step_us * 1e-6
-    )
-    ours = np.arange(1, num + 1) * step_us * 1e-6
-    friction = trace.friction_n[:, 0].numpy()
-    peak = found["friction"].max()
-    assert np.abs(friction - np.interp(ours, times, found["friction"])).max() <= most * peak
-    let_go = crossing_s(ours, trace.speed_m_s[:, 0].numpy(), arm_m_s / 2)
-    assert abs(let_go - crossing_s(times, found["v"], arm_m_s / 2)) <= late_s
+def test_friction_and_breakaway_are_radaus(case, step_us, most, late_s):
+    (element, arm_m_s), found = CASES[case], solution(case)
+    lanes, num = element.lanes(), 80_000 // step_us
+    trace, _ = carry(lanes, at_rest(lanes), driven(ramped(arm_m_s)), num, step_us * 1e-6)
+    times = np.arange(1, num + 1) * step_us * 1e-6
+    error = trace.friction_n[:, 0].numpy() - np.interp(times, TIMES, found["friction"])
+    assert np.abs(error).max() <= most * found["friction"].max()
+    let_go_s = crossing_s(times, trace.slip_m_s[:, 0].numpy(), arm_m_s / 2)
+    assert abs(let_go_s - crossing_s(TIMES, found["slip"], arm_m_s / 2)) <= late_s
 
 
-def test_state_and_slip_are_radaus() -> None:
-    element, arm_m_s = CASES["patch 20 mm/s"]
-    _, found = solution("patch 20 mm/s")
-    lanes, step_s = element.lanes(m=[element.m]), 62.5e-6
-    drive = driven(ramped(arm_m_s), one)
+def test_state_and_slip_are_radaus():
+    found, step_s = solution("patch 20 mm/s"), 62.5e-6
+    lanes = PATCH.lanes()
     for until_s in (0.03, 0.06):  # sticking, and in the first slip
         trace, state = carry(
-            lanes, LaneState.sticking(lanes), drive, round(until_s / step_s), step_s
+            lanes, at_rest(lanes), driven(ramped(0.02)), round(until_s / step_s), step_s
         )
-        at = round(until_s / FINE_S) - 1
-        u, v, q, z = (found[name][..., at] for name in "uvqz")
-        z_rate, _ = element.rates(v, z, 1.0)
-        torch.testing.assert_close(
-            torch.cat([state.stretch_m, state.relaxing_n, state.bristle_m[0]]).numpy(),
-            np.r_[u, q, z],
-            rtol=3e-3,
-            atol=1e-9,
-        )
-        slip = v - np.dot(element.pressure, z_rate)
-        np.testing.assert_allclose(trace.slip_m_s[-1, 0], slip, rtol=0.02, atol=1e-6)
-        v_rate = (element.k * u + q + element.c * (arm_m_s - v) - element.rates(v, z, 1.0)[1]) / (
-            element.m
-        )
-        np.testing.assert_allclose(trace.inertia_n[-1, 0], element.m * v_rate, atol=5e-3)
+        at = round(until_s / 50e-6) - 1
+        exact = np.r_[found["u"][at], found["q"][at], found["z"][:, at]]
+        ours = torch.cat([state.stretch_m, state.relaxing_n, state.bristle_m[0]])
+        np.testing.assert_allclose(ours, exact, rtol=3e-3, atol=1e-9)
+        np.testing.assert_allclose(trace.slip_m_s[-1, 0], found["slip"][at], rtol=0.02, atol=1e-6)
 
 
-def test_order_is_two_where_nothing_lets_go() -> None:
-    def arm(t: float) -> float:
+def test_order_is_two_where_nothing_lets_go():
+    def arm(t):
         return 0.06 + 0.01 * math.sin(60.0 * t)
 
-    def load(t: float) -> float:
+    def load(t):
         return 1.0 + 0.3 * math.sin(90.0 * t)
 
-    element = replace(SMOOTH, sigma2=0.5)
-    times = np.arange(1, 11) * 0.02
-    found = element.radau(arm, load, times)
-    lanes, errors = element.lanes(m=[element.m]), []
+    element, times = replace(SMOOTH, sigma2=0.5), np.arange(1, 11) * 0.02
+    exact = element.radau(arm, load, times)["friction"]
+    lanes, errors = element.lanes(), []
     for step_s in (1e-3, 5e-4, 2.5e-4, 1.25e-4):
         every = round(0.02 / step_s)
-        trace, _ = carry(
-            lanes, LaneState.sticking(lanes), driven(arm, load), 10 * every, step_s, every
-        )
-        errors.append(np.abs(trace.friction_n[:, 0].numpy() - found["friction"])[5:].max())
+        trace, _ = carry(lanes, at_rest(lanes), driven(arm, load), 10 * every, step_s, every)
+        errors.append(np.abs(trace.friction_n[:, 0].numpy() - exact)[5:].max())
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert ((orders > 1.8) & (orders < 2.3)).all(), orders
 
 
-def test_balance_of_forces_holds_in_the_trace() -> None:
+@pytest.mark.parametrize("swing", [0.0, 0.2])
+def test_drift_under_vibration_is_radaus(swing):
+    """Pulled with half of what holds at rest, trembling: the model creeps, and we as it does."""
+    force, until_s, turn = 0.4, 0.12, 2.0 * math.pi * 50.0
+    element = replace(SMOOTH, k1=0.0, k=50.0, c=0.1)  # soft: pulls on as the patch creeps
+
+    def arm(t):
+        return 4e-3 * turn * math.cos(turn * t)
+
+    def load(t):
+        return 1.0 + swing * math.sin(turn * t + 1.0)
+
+    found = element.radau(arm, load, np.array([until_s]), force)
+    drift = force / element.k - found["u"][0]  # the arm is back where it was
+    assert drift > 1e-5
+    lanes = element.lanes()
+    for step_s, most in ((125e-6, 1e-3), (250e-6, 4e-3)):
+        start = at_rest(lanes, force)
+        _, state = carry(lanes, start, driven(arm, load), round(until_s / step_s), step_s)
+        assert abs(float(start.stretch_m - state.stretch_m) - drift) <= most * drift
+
+
+# --- what the model does ------------------------------------------------------------------------
+
+
+def test_balance_of_forces_holds_in_the_trace(engine):
     element = replace(TACKY, sigma2=0.7, pressure=tuple(hertz_pressure(3).tolist()))
-    lanes, step_s = element.lanes(m=[element.m]), 250e-6
-    state, drive = LaneState.sticking(lanes), driven(ramped(0.04), one)
-    for number in range(400):
-        trace, state = carry(lanes, state, drive, 1, step_s, first_step=number)
-        arm = ramped(0.04)((number + 1) * step_s)
-        v = float(state.speed_m_s)
+    lanes, step_s = element.lanes(), 250e-6
+    state, drive = at_rest(lanes), driven(ramped(0.04))
+    for number in range(200):
+        trace, state = carry(lanes, state, drive, 1, step_s, first_step=number, engine=engine)
+        arm, v = ramped(0.04)((number + 1) * step_s), float(state.speed_m_s)
         _, friction = element.rates(v, state.bristle_m[0].numpy(), 1.0)
         pulled = float(trace.friction_n) + element.c * (arm - v) - friction
         assert abs(float(trace.inertia_n) - pulled) < 1e-8
 
 
-def drawn_patches(rng: np.random.Generator, num: int) -> tuple[Lanes, torch.Tensor, torch.Tensor]:
-    def spread(low: float, high: float) -> torch.Tensor:
+@pytest.mark.parametrize("stage_s", [1e-7, 1e-4, 1e-2])
+def test_friction_is_passive_bounded_and_has_the_slope_it_states(stage_s, rng):
+    num = 300
+
+    def spread(low, high):
         return torch.tensor(10 ** rng.uniform(low, high, num))
 
     mu_s = spread(-1, 1)
@@ -159,71 +251,58 @@ def drawn_patches(rng: np.random.Generator, num: int) -> tuple[Lanes, torch.Tens
         d0=spread(-2, 6),
         pressure=hertz_pressure(5),
     )
-    stage = bristles._Stage(lanes, 1e-4)
-    load = stage.carried(spread(-3, 3))
+    stage = _bristles._Stage(lanes, stage_s)
+    load = spread(-3, 3)[:, None] * lanes.pressure
     bent = load * stage.mu_s / stage.stiffness * torch.tensor(rng.uniform(-1, 1, (num, 5)))
-    return lanes, load, bent
-
-
-def test_no_bristle_gives_back_more_than_it_holds(rng: np.random.Generator) -> None:
-    lanes, load, bent = drawn_patches(rng, 500)
-    speed = torch.tensor(10 ** rng.uniform(-7, 1, 500))
-    for stage_s in (1e-7, 1e-4, 1e-2):
-        patch = bristles._Stage(lanes, stage_s)
-        at = patch.pull(load, bent, speed)
-        stored = (patch.stiffness * at.bristle * at.rate).sum(-1)
-        work = at.force * speed
-        scale = (patch.stiffness * at.bristle * at.rate).abs().sum(-1) + work.abs()
-        assert (work - stored >= -1e-12 * scale).all()
-        most = load * patch.mu_s
-        assert ((patch.stiffness * at.bristle).abs() <= most * (1 + 1e-12)).all()
-        torch.testing.assert_close(at.bristle, bent + stage_s * at.rate, rtol=1e-9, atol=1e-20)
-
-
-def test_slope_of_the_force_is_its_derivative(rng: np.random.Generator) -> None:
-    lanes, load, bent = drawn_patches(rng, 200)
-    speed = torch.tensor(10 ** rng.uniform(-5, 0, 200), requires_grad=True)
-    at = bristles._Stage(lanes, 1e-4).pull(load, bent, speed)
-    (slope,) = torch.autograd.grad(at.force.sum(), speed)
-    scale = at.slope.abs() + (at.force / speed).abs()
-    assert ((slope - at.slope).abs() <= 1e-9 * scale.detach()).all()
-
-
-@pytest.mark.parametrize("arm_m_s", [0.02, 0.06])
-def test_the_edge_lets_go_before_the_whole(arm_m_s: float) -> None:
-    lanes = replace(SMOOTH, sigma=3e3, d0=1.0).lanes(m=[5e-3], pressure=hertz_pressure(32))
-    trace, _ = carry(lanes, LaneState.sticking(lanes), driven(ramped(arm_m_s), one), 800, 250e-6)
-    sliding = trace.slip_m_s[:, 0] > arm_m_s / 2
-    incipient, gross = (int(flags.int().argmax()) for flags in (trace.incipient[:, 0], sliding))
-    assert 0 < incipient * 1.1 < gross
-    assert trace.incipient[:, 0][sliding].all()
-    held = trace.friction_n[incipient, 0], trace.friction_n[:gross, 0].max()
-    assert held[0] < 0.9 * held[1]
+    speed = spread(-5, 0).requires_grad_()
+    at = stage.pull(load, bent, speed)
+    (slope,) = torch.autograd.grad(at.force.sum(), speed, retain_graph=True)
+    assert ((slope - at.slope).abs() <= 1e-9 * (at.slope.abs() + (at.force / speed).abs())).all()
+    stored = (stage.stiffness * at.bristle * at.rate).sum(-1)  # no more comes back than is held
+    work = at.force * speed
+    scale = (stage.stiffness * at.bristle * at.rate).abs().sum(-1) + work.abs()
+    assert (work - stored >= -1e-12 * scale).all()
+    assert ((stage.stiffness * at.bristle).abs() <= load * stage.mu_s * (1 + 1e-12)).all()
+    torch.testing.assert_close(at.bristle, bent + stage_s * at.rate, rtol=1e-9, atol=1e-20)
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 64])
-def test_hertz_pressure(n: int) -> None:
+def test_hertz_pressure(n):
     place = np.linspace(-1 + 1 / n, 1 - 1 / n, n)
     wanted = np.sqrt(1 - place**2) / np.sqrt(1 - place**2).sum()
     np.testing.assert_allclose(hertz_pressure(n), wanted, rtol=1e-12)
-    assert hertz_pressure(n, dtype=torch.float32).dtype == torch.float32
 
 
 @pytest.mark.parametrize("arm_m_s", [0.02, 0.04, 0.06])
-def test_stick_slip_is_the_tacky_materials(arm_m_s: float) -> None:
-    masses = [2e-3, 5e-3, 1e-2]
-    swing = []
+def test_stick_slip_is_the_tacky_materials(arm_m_s):
     for element in (SMOOTH, TACKY):
-        lanes = replace(element, c=2.0).lanes(m=masses)
-        start = LaneState.sticking(lanes)
-        trace, _ = carry(lanes, start, driven(ramped(arm_m_s), one), 4000, 250e-6)
+        lanes = replace(element, c=2.0).lanes(m=[2e-3, 5e-3, 1e-2])
+        trace, _ = carry(lanes, at_rest(lanes), driven(ramped(arm_m_s)), 4000, 250e-6)
         late = trace.friction_n[2000:]
-        swing.append((late.amax(0) - late.amin(0)) / late.mean(0))
+        swing = (late.amax(0) - late.amin(0)) / late.mean(0)
         sticks = (trace.slip_m_s[2000:] < 0.1 * arm_m_s).any(0)
-        assert (sticks == (element is TACKY)).all()
-    smooth, tacky = swing
-    assert (smooth < 1e-3).all()
-    assert ((tacky > 0.1) & (tacky < 0.7)).all()
+        if element is TACKY:
+            assert (sticks & (swing > 0.1) & (swing < 0.7)).all()
+        else:
+            assert (~sticks & (swing < 1e-3)).all()
+
+
+def test_the_edge_of_a_patch_lets_go_before_the_whole():
+    lanes = replace(SMOOTH, sigma=3e3, d0=1.0).lanes(pressure=hertz_pressure(32))
+    state, num_bent = at_rest(lanes), []
+    for number in range(60):
+        trace, state = carry(lanes, state, driven(ramped(0.02)), 10, 250e-6, 1, 10 * number)
+        held = (
+            SMOOTH.mu_s * lanes.pressure / (3e3 / 32)
+        )  # deflection that each bristle's load holds
+        num_bent.append(int((state.bristle_m[0] > 0.85 * held).sum()))
+        if trace.slip_m_s.max() > 0.01:
+            break
+    assert 0 < num_bent[-4] < 32
+    assert num_bent == sorted(num_bent)
+
+
+# --- engines ------------------------------------------------------------------------------------
 
 
 def varied(n: int = 1, dtype: torch.dtype = torch.float64) -> Lanes:
@@ -239,173 +318,108 @@ def varied(n: int = 1, dtype: torch.dtype = torch.float64) -> Lanes:
     )
 
 
-def shaken(times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def shaken(times: torch.Tensor, least: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
     """Back and forth under a load that goes away and comes back, other ones for each lane."""
     t = times[:, None, None]
     arm = torch.tensor([[0.05, 0.06, 0.04], [0.02, 0.05, 0.07]]) * torch.sin(70.0 * t)
-    load = torch.tensor([[1.0, 0.5, 2.0], [1.5, 1.0, 0.1]]) * (0.7 + torch.sin(90.0 * t)).clamp(0)
-    return arm, load
+    load = torch.tensor([[1.0, 0.5, 2.0], [1.5, 1.0, 0.1]]) * (0.7 + torch.sin(90.0 * t))
+    return arm, load.clamp(least)
 
 
 @pytest.mark.parametrize("n", [1, 16])
-def test_engines_agree(n: int) -> None:
+def test_engines_agree(n):
     pytest.importorskip("numba")
     lanes = varied(n)
-    start = LaneState.sticking(lanes, 0.2, 0.3)
-    eager, end = carry(lanes, start, shaken, 600, 250e-6, engine="eager")
-    compiled, last = carry(lanes, start, shaken, 600, 250e-6, engine="compiled")
-    assert_same(eager, compiled, 1e-9)
-    assert eager.incipient.any()
-    assert not eager.incipient.all()
-    for mine, other in zip(vars(end).values(), vars(last).values(), strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-8, atol=1e-15)
+    results = [carry(lanes, at_rest(lanes, 0.2), shaken, 300, 250e-6, engine=e) for e in ENGINES]
+    for one, other in zip(*results, strict=True):
+        assert_close(one, other, 1e-8)
 
 
-def test_a_load_below_nothing_is_none(engine: str) -> None:
+def test_a_load_below_nothing_is_none_and_nothing_is_changed(engine):
     lanes = varied(2)
-    start = LaneState.sticking(lanes)
-
-    def pulled(times: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:
-        arm, _ = shaken(times)
-        return arm, torch.sin(90.0 * times)[:, None, None].clamp(least)
-
-    below, _ = carry(lanes, start, lambda t: pulled(t, -1.0), 300, 250e-6, engine=engine)
-    none, _ = carry(lanes, start, lambda t: pulled(t, 0.0), 300, 250e-6, engine=engine)
-    assert_same(none, below)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_manners(dtype: torch.dtype, engine: str) -> None:
-    if (dtype, engine) == (torch.float32, "compiled"):
-        pytest.skip("for float64 alone")
-    lanes = varied(3, dtype)
-    start = LaneState.sticking(lanes)
-    strided = LaneState(*(torch.stack([v, v], -1)[..., 0] for v in vars(start).values()))
-    kept = [values.clone() for values in (*vars(lanes).values(), *vars(start).values())]
-    first, state = carry(lanes, start, shaken, 20, 250e-6, engine=engine)
-    second, _ = carry(lanes, strided, shaken, 20, 250e-6, engine=engine)
-    assert_same(first, second)
-    tensors = (*vars(lanes).values(), *vars(start).values())
-    assert all(torch.equal(values, old) for values, old in zip(tensors, kept, strict=True))
-    assert first.friction_n.dtype == state.bristle_m.dtype == dtype
-    assert first.friction_n.shape == (20, 2, 3)
-    assert state.bristle_m.shape == (2, 3, 3)
-    nothing, same = carry(lanes, start, shaken, 0, 250e-6, engine=engine)
-    assert nothing.slip_m_s.shape == (0, 2, 3)
-    assert torch.equal(same.bristle_m, start.bristle_m)
+    start = at_rest(lanes, 0.1)
+    before = [values.clone() for values in (*lanes, *start)]
+    strided = LaneState(*(torch.stack([v, v], -1)[..., 0] for v in start))
+    none, state = carry(lanes, start, shaken, 100, 250e-6, engine=engine)
+    below, _ = carry(lanes, strided, lambda t: shaken(t, -1.0), 100, 250e-6, engine=engine)
+    assert_close(none, below)
+    assert all(torch.equal(x, old) for x, old in zip((*lanes, *start), before, strict=True))
+    assert none.friction_n.shape == (100, 2, 3)
+    assert state.bristle_m.shape == (2, 3, 2)
 
 
-def test_on_any_device(device: torch.device) -> None:
-    lanes = varied(3)
-    there = Lanes(*(values.to(device) for values in vars(lanes).values()))
-    start = LaneState.sticking(there, 0.1, 0.5)
+def test_pieces_make_the_whole(engine):
+    lanes, step_s = varied(4), 2.0**-12
+    whole, end = carry(lanes, at_rest(lanes), shaken, 120, step_s, engine=engine)
+    third, same = carry(lanes, at_rest(lanes), shaken, 120, step_s, every=3, engine=engine)
+    assert_close(tuple(values[2::3] for values in whole), third)
+    state, pieces = at_rest(lanes), []
+    for first, num in ((0, 48), (48, 12), (60, 60)):
+        piece, state = carry(lanes, state, shaken, num, step_s, first_step=first, engine=engine)
+        pieces.append(piece)
+    assert_close(whole, Trace(*map(torch.cat, zip(*pieces, strict=True))))
+    assert_close(end, same)
+    assert_close(end, state)
 
-    trace, state = carry(there, start, shaken, 60, 250e-6, engine="eager")
-    here = LaneState.sticking(lanes, 0.1, 0.5)
-    same, _ = carry(lanes, here, shaken, 60, 250e-6, engine="eager")
-    assert state.bristle_m.device == start.stretch_m.device
-    assert_same(same, Trace(*(values.cpu() for values in vars(trace).values())), 1e-9)
+
+def test_float32_and_any_device_do(device):
+    """In the relative coordinate float32 is enough, through many slips of a tacky surface."""
+    traces = []
+    for dtype in (torch.float32, torch.float64):
+        lanes = TACKY.lanes(dtype, c=2.0, m=[2e-3, 5e-3, 1e-2], pressure=hertz_pressure(4))
+        there = Lanes(*(values.to(device) for values in lanes))
+        trace, _ = carry(there, at_rest(there), driven(ramped(0.04)), 280, 250e-6, engine="eager")
+        assert trace.slip_m_s.device == there.mu_s.device
+        assert trace.slip_m_s.dtype == dtype
+        traces.append(Trace(*(values.cpu().double() for values in trace)))
+    single, double = traces
+    assert (double.slip_m_s[140:] < 4e-3).any(0).all()
+    error = (single.friction_n - double.friction_n).abs().amax(0) / double.friction_n.amax(0)
+    assert (error <= 2e-4).all()
 
 
-def test_auto_takes_what_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_takes_what_it_can(monkeypatch):
     pytest.importorskip("numba")
-    taken, compiled = [], bristles._carry_compiled
-    monkeypatch.setattr(bristles, "_carry_compiled", lambda *a: taken.append(1) or compiled(*a))
-    lanes = varied()
-    carry(lanes, LaneState.sticking(lanes), shaken, 2, 250e-6)
+    taken, compiled = [], _bristles._carry_compiled
+    monkeypatch.setattr(_bristles, "_carry_compiled", lambda *a: taken.append(1) or compiled(*a))
+    lanes, single = varied(), varied(dtype=torch.float32)
+    carry(lanes, at_rest(lanes), shaken, 2, 250e-6)
     assert taken
     taken.clear()
-    single = varied(dtype=torch.float32)
-    carry(single, LaneState.sticking(single), shaken, 2, 250e-6)
-    load = torch.ones((), dtype=torch.float64, requires_grad=True)
-    lane = TACKY.lanes()
-    trace, _ = carry(
-        lane,
-        LaneState.sticking(lane, 0.5),
-        lambda t: (0.02 + 0.0 * t, load.expand(len(t))),
-        9,
-        1e-3,
-    )
-    assert not taken
+    carry(single, at_rest(single), shaken, 2, 250e-6)
+    wanting = lanes._replace(mu_s=lanes.mu_s.clone().requires_grad_())
+    trace, _ = carry(wanting, at_rest(lanes), shaken, 2, 250e-6)
     assert trace.friction_n.requires_grad
     with pytest.raises(ValueError, match=r'"compiled" needs float64 on the CPU, got torch.float32'):
-        carry(single, LaneState.sticking(single), shaken, 2, 250e-6, engine="compiled")
-    monkeypatch.setattr(engines, "find_spec", lambda name: None)
-    carry(lanes, LaneState.sticking(lanes), shaken, 2, 250e-6)
+        carry(single, at_rest(single), shaken, 2, 250e-6, engine="compiled")
+    with pytest.raises(ValueError, match="engine must be one of auto, compiled, eager, got 'fast'"):
+        carry(lanes, at_rest(lanes), shaken, 2, 250e-6, engine="fast")
+    monkeypatch.setattr(runtime, "find_spec", lambda name: None)
+    carry(lanes, at_rest(lanes), shaken, 2, 250e-6)
     assert not taken
     with pytest.raises(ValueError, match='"compiled" needs numba, which is not installed'):
-        carry(lanes, LaneState.sticking(lanes), shaken, 2, 250e-6, engine="compiled")
+        carry(lanes, at_rest(lanes), shaken, 2, 250e-6, engine="compiled")
 
 
-def test_gradients_are_those_of_the_scheme() -> None:
-    def last(mu_s: torch.Tensor, k: torch.Tensor, load: torch.Tensor) -> torch.Tensor:
-        element = Element(vs=0.05)
-        tensors = vars(element.lanes()) | {"mu_s": mu_s, "stiffness_n_m": k}
-        lanes = Lanes(**tensors)
-        trace, state = carry(
-            lanes,
-            LaneState.sticking(lanes, 0.6),
-            lambda t: (0.04 + 0.0 * t, load.expand(len(t))),
-            12,
-            1e-3,
-        )
-        return torch.stack([trace.friction_n[-1], trace.slip_m_s[-1] * 10, state.speed_m_s * 10])
+def test_gradients_are_those_of_the_scheme():
+    def last(mu_s, stiffness, load):
+        lanes = Element(vs=0.05).lanes()._replace(mu_s=mu_s, stiffness_n_m=stiffness)
+        drive = (torch.full((24, 1), 0.04, dtype=torch.float64), load.expand(24, 1))
+        trace, state = integrate(lanes, at_rest(lanes, 0.6), *drive, 1e-3)
+        return torch.cat([trace.friction_n[-1], trace.slip_m_s[-1] * 10, state.speed_m_s * 10])
 
     values = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (0.8, 1e3, 1.0)]
     assert torch.autograd.gradcheck(last, values, eps=1e-6, rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"mu_k": 0.9}, "expected mu_k <= mu_s, got mu_k up to 0.9 over mu_s down to 0.8"),
-        ({"mu_s": -0.5}, "expected mu_s finite and positive, got -0.5"),
-        ({"m": [1e-3, -1e-3]}, "expected mass_kg finite and not negative, got -0.001"),
-        ({"tau": 0.0}, "expected relaxation_time_s finite and positive, got 0"),
-        ({"k": math.nan}, "expected stiffness_n_m finite and positive, got nan"),
-        ({"sigma": math.inf}, "expected bristle_stiffness_n_m finite and positive, got inf"),
-        ({"pressure": [0.5, 0.4]}, r"expected pressure \[n\] that sums to 1, got \(2,\) with sum"),
-        ({"pressure": [[1.0]]}, r"expected pressure \[n\] that sums to 1"),
-    ],
-)
-def test_lanes_that_cannot_be(values: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message) as caught:
-        SMOOTH.lanes(**values)
-    assert "\n" not in str(caught.value)
-
-
-def test_sticking_is_where_nothing_moves(engine: str) -> None:
-    lanes = varied(5)
-    force = torch.tensor([[0.3, 0.0, -0.3], [0.1, 0.2, -0.05]], dtype=torch.float64)
-    start = LaneState.sticking(lanes, force, 0.25)
-    torch.testing.assert_close(lanes.stiffness_n_m * start.stretch_m + start.relaxing_n, force)
-    still = torch.zeros(1, 1, 1, dtype=torch.float64)
-    trace, _ = carry(
-        replace(lanes, relaxing_n_m=torch.zeros_like(lanes.relaxing_n_m)),
-        LaneState.sticking(lanes, force),
-        lambda t: (still.expand(len(t), 1, 1), (still + 1.0).expand(len(t), 1, 1)),
-        40,
-        250e-6,
-        engine=engine,
-    )
-    torch.testing.assert_close(trace.friction_n, force.expand(40, 2, 3), rtol=1e-12, atol=1e-15)
-    assert not trace.incipient.any()
-
-
-SPEEDS_M_S = (1e-6, 1e-3, 0.04, 2.0)
-
-STIFFNESSES_N_M = (1.0, 1e3, 1e6)
-
-BRISTLES_N_M = (1e2, 1e5, 1e8)
-
-MASSES_KG = (0.0, 1e-12, 5e-3, 1.0)
-
-LOADS_N = (0.0, 1e-9, 1.0, 1e6)
+# --- extremes -----------------------------------------------------------------------------------
 
 
 def extreme(n: int, dtype: torch.dtype) -> tuple[Lanes, torch.Tensor, torch.Tensor]:
-    """A lane for each choice of the above, half of them tacky; its arm's speed and its load."""
-    grid = np.array(list(product(SPEEDS_M_S, STIFFNESSES_N_M, BRISTLES_N_M, MASSES_KG, LOADS_N)))
+    """Lanes of all speeds, stiffnesses, masses and loads, half of them tacky; speeds and loads."""
+    speeds, stiffnesses, bristles = (1e-6, 1e-3, 0.04, 2.0), (1.0, 1e3, 1e6), (1e2, 1e5, 1e8)
+    masses, loads = (0.0, 1e-12, 5e-3, 1.0), (0.0, 1e-9, 1.0, 1e6)
+    grid = np.array(list(product(speeds, stiffnesses, bristles, masses, loads)))
     speed, k, sigma, m, load = torch.tensor(grid).T
     tacky = torch.arange(len(grid)) % 2 == 0
     lanes = SMOOTH.lanes(
@@ -423,7 +437,7 @@ def extreme(n: int, dtype: torch.dtype) -> tuple[Lanes, torch.Tensor, torch.Tens
     return lanes, speed, load
 
 
-def turning(speed: torch.Tensor, load: torch.Tensor, until_s: float) -> Drive:
+def turning(speed: torch.Tensor, load: torch.Tensor, until_s: float):
     """The load goes at a third and is back at half, the arm turns round near the end."""
 
     def drive(times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -435,53 +449,47 @@ def turning(speed: torch.Tensor, load: torch.Tensor, until_s: float) -> Drive:
     return drive
 
 
-def needing(engine: EngineName) -> EngineName:
-    if engine == "compiled":
-        pytest.importorskip("numba")
-    return engine
+def largest_force(lanes: Lanes, speed: torch.Tensor, load: torch.Tensor) -> torch.Tensor:
+    springs = lanes.stiffness_n_m + lanes.relaxing_n_m
+    drag = lanes.damping_n_s_m + (springs * lanes.mass_kg).sqrt()
+    return 1.5 * (1.5 * lanes.mu_s * load + 2.0 * drag * speed)  # 1.5 N, and turning round
 
 
 @pytest.mark.parametrize("step_s", [1e-6, 250e-6, 5e-3])
 @pytest.mark.parametrize(
     ("n", "dtype", "engine", "num"),
     [
-        (1, torch.float64, "compiled", 120),
-        (4, torch.float64, "compiled", 120),
-        (2, torch.float64, "eager", 24),
-        (2, torch.float32, "eager", 24),
+        (1, torch.float64, "compiled", 60),
+        (4, torch.float64, "compiled", 60),
+        (2, torch.float32, "eager", 15),
     ],
 )
-def test_bounded_and_within_the_cone(
-    step_s: float, n: int, dtype: torch.dtype, engine: EngineName, num: int
-) -> None:
-    engine = needing(engine)
+def test_bounded_and_within_the_cone(step_s, n, dtype, engine, num):
+    if engine == "compiled":
+        pytest.importorskip("numba")
     lanes, speed, load = extreme(n, dtype)
-    drive = turning(speed, load, num * step_s)
+    drive, slack = turning(speed, load, num * step_s), 1.0 + 64 * torch.finfo(dtype).eps
     load_n, moving = load.to(dtype), speed.to(dtype)
-    state = LaneState.sticking(lanes, 0.5 * lanes.mu_k * load_n, 0.2)
-    each, slack = lanes.bristle_stiffness_n_m[:, None] / n, 64 * torch.finfo(dtype).eps
-    springs = lanes.stiffness_n_m + lanes.relaxing_n_m
-    drag = lanes.damping_n_s_m + (springs * lanes.mass_kg).sqrt()
-    most = 1.5 * (1.5 * lanes.mu_s * load_n + 2.0 * drag * moving)  # 1.5 N, and turning round
+    state = at_rest(lanes, 0.5 * lanes.mu_k * load_n)
+    each, most = lanes.bristle_stiffness_n_m[:, None] / n, largest_force(lanes, moving, load_n)
     for number in range(num):
         trace, state = carry(lanes, state, drive, 1, step_s, first_step=number, engine=engine)
-        for name, values in (vars(trace) | vars(state)).items():
-            assert values.isfinite().all(), (number, name)
+        assert all(values.isfinite().all() for values in (*trace, *state)), number
         now = drive(torch.tensor([(number + 1) * step_s], dtype=torch.float64))[1][0].to(dtype)
         cone = lanes.pressure * (lanes.mu_s * now)[:, None]
-        assert ((each * state.bristle_m).abs() <= cone * (1.0 + slack)).all(), number
+        assert ((each * state.bristle_m).abs() <= cone * slack).all(), number
         assert (trace.friction_n[0].abs() <= most).all(), number
         assert (trace.inertia_n[0].abs() <= most).all(), number
         free = (now == 0.0) & (moving > 0)
-        torch.testing.assert_close(trace.slip_m_s[0][free], trace.speed_m_s[0][free])
+        torch.testing.assert_close(trace.slip_m_s[0][free], state.speed_m_s[free])
 
 
 @pytest.mark.parametrize("step_s", [1e-6, 250e-6, 5e-3])
-def test_no_stage_is_left_unsolved(step_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_stage_is_left_unsolved_and_engines_agree(step_s, monkeypatch):
     """Every lane's equation holds to rounding, or turns its sign within 3e-8 of the speed."""
-    root, eps, num, solved = bristles._Stage.root, torch.finfo(torch.float64).eps, 24, []
+    root, eps, num, solved = _bristles._Stage.root, torch.finfo(torch.float64).eps, 12, []
 
-    def watched(stage, load, base, offset, guess, high):  # type: ignore[no-untyped-def]
+    def watched(stage, load, base, offset, guess, high):
         speed = root(stage, load, base, offset, guess, high)
         left, _, at = stage.left(load, base, offset, speed)
         below, above = (
@@ -491,121 +499,21 @@ def test_no_stage_is_left_unsolved(step_s: float, monkeypatch: pytest.MonkeyPatc
         solved.append((left.abs() <= 16.0 * eps * scale) | (below <= 0) & (above >= 0))
         return speed
 
-    monkeypatch.setattr(bristles._Stage, "root", watched)
-    lanes, speed, load = extreme(4, torch.float64)
-    state = LaneState.sticking(lanes, 0.5 * lanes.mu_k * load, 0.2)
-    carry(lanes, state, turning(speed, load, num * step_s), num, step_s, engine="eager")
+    monkeypatch.setattr(_bristles._Stage, "root", watched)
+    lanes, speed, load = extreme(2, torch.float64)
+    state, drive = at_rest(lanes, 0.5 * lanes.mu_k * load), turning(speed, load, num * step_s)
+    eager, _ = carry(lanes, state, drive, num, step_s, engine="eager")
     assert len(solved) == 2 * num
     assert torch.stack(solved).all()
-
-
-@pytest.mark.parametrize("step_s", [1e-6, 250e-6, 5e-3])
-def test_engines_agree_where_it_is_extreme(step_s: float) -> None:
     pytest.importorskip("numba")
-    lanes, speed, load = extreme(2, torch.float64)
-    start = LaneState.sticking(lanes, 0.5 * lanes.mu_k * load, 0.2)
-    drive = turning(speed, load, 4 * step_s)
-    (one, _), (other, _) = (
-        carry(lanes, start, drive, 4, step_s, engine=engine) for engine in ENGINES
-    )
-    springs = lanes.stiffness_n_m + lanes.relaxing_n_m
-    drag = lanes.damping_n_s_m + (springs * lanes.mass_kg).sqrt()
-    scale = lanes.mu_s * load + drag * speed
+    compiled, _ = carry(lanes, state, drive, 4, step_s, engine="compiled")
+    scale = 1e-6 * largest_force(lanes, speed, load)
     for name in ("friction_n", "inertia_n"):
-        assert ((vars(one)[name] - vars(other)[name]).abs() <= 1e-6 * scale).all(), name
+        assert ((getattr(eager, name)[:4] - getattr(compiled, name)).abs() <= scale).all(), name
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_search_ends_though_nothing_can_be_found(engine: EngineName, wrong: float) -> None:
+def test_a_search_ends_though_nothing_can_be_found(engine, wrong):
     lanes = SMOOTH.lanes(m=[0.0, 5e-3], pressure=hertz_pressure(2))
-    start = LaneState.sticking(lanes, 0.3)
-    drive = driven(lambda t: wrong, lambda t: 1.0)
-    trace, _ = carry(lanes, start, drive, 3, 250e-6, engine=needing(engine))
+    trace, _ = carry(lanes, at_rest(lanes, 0.3), driven(lambda t: wrong), 3, 250e-6, engine=engine)
     assert not trace.friction_n.isfinite().any()
-
-
-@pytest.mark.parametrize("trembling", ["pull", "pull and load"])
-def test_drift_under_vibration_is_radaus(trembling: str) -> None:
-    """Pulled with half of what holds at rest, trembling: the model creeps, and we as it does."""
-    force, until_s, turn = 0.4, 0.12, 2.0 * math.pi * 50.0
-
-    def arm(t: float) -> float:
-        return 4e-3 * turn * math.cos(turn * t)
-
-    def load(t: float) -> float:
-        return 1.0 + (0.2 * math.sin(turn * t + 1.0) if trembling != "pull" else 0.0)
-
-    element = replace(SMOOTH, k1=0.0, k=50.0, c=0.1)  # soft: pulls on as the patch creeps
-    lanes = element.lanes(m=[5e-3])
-    start = LaneState.sticking(lanes, force)
-    begun = np.array([force / element.k, 0.0, 0.0, force / element.sigma])
-    found = element.radau(arm, load, np.array([until_s]), begun)
-    drift = force / element.k - found["u"][0]  # the arm is back where it was
-    assert drift > 1e-5
-    for step_s, most in ((125e-6, 1e-3), (250e-6, 4e-3)):
-        _, state = carry(lanes, start, driven(arm, load), round(until_s / step_s), step_s)
-        ours = float(start.stretch_m - state.stretch_m)
-        assert abs(ours - drift) <= most * drift
-
-
-def test_float32_is_enough() -> None:
-    """In the relative coordinate, through many slips of a tacky surface."""
-    traces = []
-    for dtype in (torch.float32, torch.float64):
-        lanes = SMOOTH.lanes(
-            dtype,
-            c=2.0,
-            m=[2e-3, 5e-3, 1e-2, 5e-3],
-            mu_s=[1.1, 1.1, 1.1, 0.8],
-            mu_k=[0.85, 0.85, 0.85, 0.7],
-            vs=[0.05, 0.05, 0.05, 0.01],
-            pressure=hertz_pressure(4),
-        )
-        drive = driven(ramped(0.04), lambda t: 1.0)
-        traces.append(carry(lanes, LaneState.sticking(lanes), drive, 800, 250e-6)[0])
-    single, double = (trace.friction_n.double() for trace in traces)
-    off = (single - double).abs().amax(0) / double.amax(0)
-    sticks = (traces[1].slip_m_s[400:] < 4e-3).any(0)
-    assert sticks.tolist() == [True, True, True, False]
-    assert (off <= 2e-4).all()
-    assert off[3] <= 1e-5
-
-
-def test_pieces_make_the_whole(engine: str) -> None:
-    lanes, step_s = varied(4), 2.0**-12
-    start = LaneState.sticking(lanes)
-    whole, end = carry(lanes, start, shaken, 120, step_s, engine=engine)
-    third, same = carry(lanes, start, shaken, 120, step_s, every=3, engine=engine)
-    assert_same(Trace(*(values[2::3] for values in vars(whole).values())), third)
-    state, pieces = start, []
-    for first, num in ((0, 48), (48, 12), (60, 60)):
-        piece, state = carry(lanes, state, shaken, num, step_s, first_step=first, engine=engine)
-        pieces.append(vars(piece).values())
-    assert_same(whole, Trace(*map(torch.cat, zip(*pieces, strict=True))))
-    for other in (same, state):
-        for mine, its in zip(vars(end).values(), vars(other).values(), strict=True):
-            assert torch.equal(mine, its)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"every": 3}, "num_steps as a multiple of every, got 8 stages and 3"),
-        ({"every": 0}, "num_steps as a multiple of every, got 8 stages and 0"),
-        ({"step_s": 0.0}, "expected step_s positive and finite, got 0"),
-        ({"engine": "fast"}, "engine must be one of auto, compiled, eager, got 'fast'"),
-        ({"state": LaneState(*[torch.zeros(2)] * 4)}, r"a state of lanes \(3,\) with 1 bristles"),
-        ({"load_n": torch.ones(8, 2)}, r"that expand to \(8, 3\), got \(8, 1\) and \(8, 2\)"),
-    ],
-)
-def test_requests_that_cannot_be(values: dict[str, object], message: str) -> None:
-    lanes = SMOOTH.lanes(m=[1e-3] * 3)
-    whole = {
-        "state": LaneState.sticking(lanes),
-        "arm_m_s": torch.full((8, 1), 0.02),
-        "load_n": torch.ones(8, 1),
-        "step_s": 1e-4,
-    }
-    with pytest.raises(ValueError, match=message):
-        integrate(lanes, **whole | values)
