@@ -234,7 +234,7 @@ def trained(name: str, overrides: Sequence[str], folder: Path, cache: Path) -> d
 
 
 def code_digest() -> str:
-    """Of everything that decides a result: sources, calibrated knobs, configuration."""
+    """Of everything that decides a result: sources, calibrated parameters, configuration."""
     digest = hashlib.sha256(source_digest(ROOT / "tactslip_torch").encode())
     others = [*(ROOT / "tactslip_torch").rglob("*.json"), *(ROOT / "conf").rglob("*.yaml")]
     for path in sorted(others):

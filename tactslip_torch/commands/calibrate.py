@@ -1,14 +1,17 @@
-"""Where on the line of difficulty to try next: a bracketed search that stays where facts hold.
+"""Calibrate the simulated hand: ``python -m tactslip_torch calibrate``.
 
-What is searched for costs a minute a point, so the search is a function of the points tried.
+Three parameters move together along one line of difficulty (``simulation.parameters``) until the
+test accuracy on seen materials is the published one, but no further than the signal checks hold.
+Every point that was tried is written down; with ``write=true`` the values are frozen into the
+package. Unseen materials are not simulated here.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +35,6 @@ from tactslip_torch.simulation.parameters import (
     CALIBRATED_PATH,
     PRIORS,
     SEEN_MATERIALS,
-    parameters_at,
 )
 from tactslip_torch.simulation.scene import SIMULATION_VERSION
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
@@ -41,97 +43,94 @@ from tactslip_torch.training.fitting import TrainingPass
 from tactslip_torch.training.recipe import Recipe
 from tactslip_torch.training.selection import plan_detector
 
-RESOLUTION = 0.02
-"""How closely a target is bracketed on the line of difficulty."""
+_RESOLUTION = 0.02  # of difficulty, to which a target is bracketed
+_CHECKS_RESOLUTION = 0.1  # of difficulty, to which the place is where the checks begin to fail
+_FIRST_SEED = 1000  # seeds below are for results that are reported
 
-FACTS_RESOLUTION = 0.1
-"""How closely the place is bracketed where the facts begin to fail."""
-
-
-@dataclass(frozen=True)
-class Point:
-    """One place on the line of difficulty that was tried.
-
-    Args:
-        difficulty: prior standard deviations from the starting values.
-        accuracy: seen-material test accuracy, the mean over seeds.
-        holds: whether all qualitative facts hold.
-    """
-
-    difficulty: float
-    accuracy: float
-    holds: bool
+Point = Mapping[str, Any]
+"""A place on the line that was tried: its difficulty, its accuracy, whether all checks hold."""
 
 
-def next_difficulty(
-    points: Sequence[Point],
-    target: float,
-    tolerance: float,
-    bounds: tuple[float, float],
-    step: float = 1.0,
-) -> float | None:
-    """Where to try next, or ``None`` when there is nothing left to try.
-
-    Begins at 0 and steps towards the target until it is crossed, the facts fail or the bound is
-    reached; then narrows the bracket, by a secant kept off its ends if it crosses the target, by
-    halves if facts alone fail at its far end. Of points where the facts fail none is returned to.
-    Places are whole hundredths, except a bound that is none; a step is ``RESOLUTION`` or more.
+def parameters_at(difficulty: float) -> dict[str, float | list[float]]:
+    """The calibrated parameters at a place on the line of difficulty, JSON-able.
 
     Example:
-        >>> next_difficulty([Point(0.0, 0.99, True)], 0.96, 0.001, (-3, 3))
-        1.0
-        >>> tried = [Point(0.0, 0.99, True), Point(1.0, 0.95, True)]
-        >>> next_difficulty(tried, 0.96, 0.001, (-3, 3))
-        0.75
+        >>> parameters_at(0.0)
+        {'friction_noise_mv': 8.0, 'presliding_mm': [0.3, 3.0], 'burst_rate_hz': 0.3}
     """
-    if not points:
-        return 0.0
-    start = min(points, key=lambda point: abs(point.difficulty))
-    if not start.holds or any(_is_met(point, target, tolerance) for point in points):
-        return None
-    way = 1 if start.accuracy > target else -1
-    bound = abs(bounds[1] if way > 0 else bounds[0])
-    ahead = sorted((point for point in points), key=lambda point: way * point.difficulty)
-    near = start
-    for point in ahead:
-        if way * point.difficulty <= way * near.difficulty:
-            continue
-        if not (point.holds and way * (point.accuracy - target) > 0):
-            return _between(near, point, target, way)
-        near = point
-    reached = way * near.difficulty
-    if reached >= bound:
-        return None
-    return way * min(round(reached + max(step, RESOLUTION), 2), bound)
+    values = {name: prior.at(difficulty) for name, prior in PRIORS.items()}
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
 
 
-def _is_met(point: Point, target: float, tolerance: float) -> bool:
-    return point.holds and abs(point.accuracy - target) <= tolerance
+def search(
+    evaluate: Callable[[float], Point],
+    target: float,
+    tolerance: float,
+    bounds: Sequence[float],
+    step: float = 1.0,
+    most_points: int = 10,
+) -> list[Point]:
+    """Points on the line of difficulty, each closer to a target accuracy.
+
+    Begins at 0 and steps towards the target until it is crossed, a check fails or the bound is
+    reached; then narrows the bracket, by a secant kept off its ends if it crosses the target, by
+    halves if checks alone fail at its far end. Places are whole hundredths, except a bound that is
+    none; a step is ``.02`` or more.
+
+    Args:
+        evaluate: a difficulty; accuracy falls with it, roughly.
+        target: accuracy.
+        tolerance: of it, within which the search ends.
+        bounds: of the difficulty, about 0.
+        step: until the bracket is there.
+        most_points: at most.
+
+    Returns:
+        All points in the order in which they were tried. Where the checks fail at 0, that one.
+    """
+    near = evaluate(0.0)
+    points, far = [near], None
+    sign = 1 if near["accuracy"] > target else -1
+    bound = abs(bounds[1] if sign > 0 else bounds[0])
+
+    def is_met(point: Point) -> bool:
+        return bool(point["holds"]) and abs(point["accuracy"] - target) <= tolerance
+
+    while near["holds"] and len(points) < most_points and not is_met(points[-1]):
+        at = sign * near["difficulty"]
+        if far is None:
+            place: float | None = min(round(at + max(step, _RESOLUTION), 2), bound)
+        else:
+            place = _between(at, sign * far["difficulty"], near, far, sign * target, sign)
+        if place is None or place <= at:
+            break
+        points.append(evaluate(sign * place))
+        if points[-1]["holds"] and sign * (points[-1]["accuracy"] - target) > 0:
+            near = points[-1]
+        else:
+            far = points[-1]
+    return points
 
 
-def _between(near: Point, far: Point, target: float, way: int) -> float | None:
+def _between(
+    low: float, high: float, near: Point, far: Point, target: float, sign: int
+) -> float | None:
     """A place within the bracket, or ``None`` if it is too narrow."""
-    low, high = way * near.difficulty, way * far.difficulty
-    crosses = way * (far.accuracy - target) <= 0
-    if high - low <= (RESOLUTION if crosses else FACTS_RESOLUTION):
+    above, below = sign * near["accuracy"] - target, sign * far["accuracy"] - target
+    crosses = below <= 0
+    if high - low <= (_RESOLUTION if crosses else _CHECKS_RESOLUTION):
         return None
-    share = 0.5
-    if crosses:
-        share = (near.accuracy - target) / (near.accuracy - far.accuracy)
-    place = low + min(max(share, 0.1), 0.9) * (high - low)
-    return way * round(min(max(place, low + RESOLUTION / 2), high - RESOLUTION / 2), 2)
+    fraction = min(max(above / (above - below), 0.1), 0.9) if crosses else 0.5
+    place = low + fraction * (high - low)
+    return round(min(max(place, low + _RESOLUTION / 2), high - _RESOLUTION / 2), 2)
 
 
-def chosen_point(points: Sequence[Point], target: float) -> int | None:
-    """Index of the point to keep: the closest to the target of those where the facts hold."""
-    holding = [index for index, point in enumerate(points) if point.holds]
-    if not holding:
-        return None
-    return min(holding, key=lambda i: (abs(points[i].accuracy - target), abs(points[i].difficulty)))
-
-
-FIRST_SEED = 1000
-"""Seeds below are for results that are reported, those from here on for calibration."""
+def best_point(points: Sequence[Point], target: float) -> Point | None:
+    """The closest to the target of the points where the checks hold, or ``None``."""
+    holding = [point for point in points if point["holds"]]
+    return min(
+        holding, key=lambda p: (abs(p["accuracy"] - target), abs(p["difficulty"])), default=None
+    )
 
 
 def seen_accuracy(maker: FeatureMaker, data: SlipDataModule, recipe: Recipe, what: str) -> float:
@@ -166,20 +165,18 @@ def seen_accuracy(maker: FeatureMaker, data: SlipDataModule, recipe: Recipe, wha
 
 
 def evaluate_point(config: DictConfig, difficulty: float) -> dict[str, Any]:
-    """Accuracy and facts at a place on the line of difficulty, JSON-able."""
-    knobs = parameters_at(difficulty)
+    """Accuracy and signal checks at a place on the line of difficulty, JSON-able."""
+    parameters = parameters_at(difficulty)
     accuracies = []
     recordings: dict[str, list[Signals]] = {}
     for seed in config.seeds:
-        plain = OmegaConf.to_container(config)
-        overrides = {"seed": seed, "scene": {name: _listed(knobs[name]) for name in knobs}}
-        of_seed = OmegaConf.merge(OmegaConf.create(plain), overrides)
+        overrides = {"seed": seed, "scene": parameters}
+        of_seed = OmegaConf.merge(OmegaConf.create(OmegaConf.to_container(config)), overrides)
         source: RecordingSource = instantiate(of_seed.data, _convert_="all")
         rule: LabelRule = instantiate(of_seed.labels)
         recipe: Recipe = instantiate(of_seed.recipe, _convert_="all")
         (split,) = instantiate(of_seed.split, _convert_="all")(source.ids)
-        parts = feature_parts(source, rule.bin_ms, **of_seed.features)
-        pool, channel_filter, dtype, engine = parts
+        pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **of_seed.features)
         recipe.check_pool(len(pool.names))
         maker = FeatureMaker(source, pool, channel_filter, rule, None, dtype, engine)
         data = SlipDataModule(maker, split, of_seed.num_workers)
@@ -188,19 +185,19 @@ def evaluate_point(config: DictConfig, difficulty: float) -> dict[str, Any]:
             if recording.cycle < config.fact_cycles:
                 signals = filtered(source.load(recording), source.hand)
                 recordings.setdefault(recording.material, []).append(signals)
-    facts = judge_facts(recordings)
+    checks = judge_facts(recordings)
     return {
         "difficulty": difficulty,
-        "knobs": {name: _listed(value) for name, value in knobs.items()},
+        "parameters": parameters,
         "accuracy": sum(accuracies) / len(accuracies),
         "accuracy_by_seed": accuracies,
-        "holds": all(fact["holds"] for fact in facts),
-        "facts": facts,
+        "holds": all(check["holds"] for check in checks),
+        "facts": checks,
     }
 
 
 def calibrate(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Search the line of difficulty and write what was found.
+    """Search the line of difficulty; write every point that was tried and the one that is kept.
 
     Args:
         config: composed from ``conf/calibrate.yaml``.
@@ -210,54 +207,51 @@ def calibrate(config: DictConfig, folder: Path) -> dict[str, Any]:
         The content of ``calibration.json``.
 
     Raises:
-        ValueError: for bad input, or if the facts fail at the starting values, in one line.
+        ValueError: for bad input, or if the checks fail at the starting values, in one line.
     """
     _check(config)
     target = published.SPLITS["test"].accuracy
     save_config(config, folder)
-    tried: list[dict[str, Any]] = []
-    points: list[Point] = []
-    for _ in range(config.most_points):
-        low, high = config.bounds
-        place = next_difficulty(points, target, config.tolerance, (low, high), config.step)
-        if place is None:
-            break
-        tried.append(evaluate_point(config, place))
-        points.append(Point(place, tried[-1]["accuracy"], tried[-1]["holds"]))
-        print(point_line(tried[-1]), flush=True)
-    index = chosen_point(points, target)
-    if index is None:
-        failed = [fact["name"] for fact in tried[0]["facts"] if not fact["holds"]]
+
+    def evaluate(difficulty: float) -> Point:
+        point = evaluate_point(config, difficulty)
+        print(point_line(point), flush=True)
+        return point
+
+    points = search(
+        evaluate, target, config.tolerance, config.bounds, config.step, config.most_points
+    )
+    kept = best_point(points, target)
+    if kept is None:
+        failed = [check["name"] for check in points[0]["facts"] if not check["holds"]]
         raise ValueError(
-            f"the facts {', '.join(failed)} do not hold at the starting values, so there is no "
-            "point to calibrate from; raise fact_cycles, or mend the simulation"
+            f"the signal checks {', '.join(failed)} do not hold at the starting values, so there "
+            "is no point to calibrate from; raise fact_cycles, or mend the simulation"
         )
-    found = _found(config, tried, index, target)
-    text = json.dumps(found, indent=1, allow_nan=False) + "\n"
-    paths = [folder / "calibration.json"] + ([CALIBRATED_PATH] if config.write else [])
-    for path in paths:
+    text = json.dumps(_content(config, points, kept, target), indent=1, allow_nan=False) + "\n"
+    content: dict[str, Any] = json.loads(text)
+    for path in [folder / "calibration.json"] + ([CALIBRATED_PATH] if config.write else []):
         with whole_file(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    calibration_figure(found, folder / "calibration.png")
-    print("\n" + calibration_table(found))
+    calibration_figure(content, folder / "calibration.png")
+    print("\n" + calibration_table(content))
     print(f"\nresults in {folder}" + (f", frozen in {CALIBRATED_PATH}" if config.write else ""))
-    return found
+    return content
 
 
 def _check(config: DictConfig) -> None:
     """Refuse what would not be a calibration."""
-    strangers = [m for m in config.data.materials if m not in SEEN_MATERIALS]
-    if strangers:
+    if unseen := [m for m in config.data.materials if m not in SEEN_MATERIALS]:
         raise ValueError(
             f"calibration simulates seen materials only, {', '.join(SEEN_MATERIALS)}; "
-            f"got {', '.join(strangers)}"
+            f"got {', '.join(unseen)}"
         )
     seeds = config.seeds
     if not isinstance(seeds, ListConfig) or any(type(seed) is not int for seed in seeds):
         raise ValueError(f"seeds must be a list of whole numbers, such as [1000,1001], got {seeds}")
-    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < FIRST_SEED:
+    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < _FIRST_SEED:
         raise ValueError(
-            f"seeds must differ and be {FIRST_SEED} or more, those below are for reported "
+            f"seeds must differ and be {_FIRST_SEED} or more, those below are for reported "
             f"results; got {seeds}"
         )
     bounds = config.bounds
@@ -289,22 +283,20 @@ def _changed_sections(config: DictConfig) -> list[str]:
     return [group for group in groups if given[group] != whole[group]]
 
 
-def _found(
-    config: DictConfig, tried: list[dict[str, Any]], index: int, target: float
+def _content(
+    config: DictConfig, points: Sequence[Point], kept: Point, target: float
 ) -> dict[str, Any]:
     """The content of ``calibration.json``: no time and no path, so that its bytes repeat."""
-    kept = tried[index]
-    protocol = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(protocol, dict)
+    protocol: Any = OmegaConf.to_container(config, resolve=True)
     groups = ("data", "labels", "split", "features", "recipe")
     numbers = ("tolerance", "bounds", "step", "most_points", "fact_cycles")
     return {
         "simulated": True,
         "provenance": (
             "python -m tactslip_torch calibrate: test accuracy on simulated seen materials held "
-            "against the published one, and the qualitative facts; nothing else"
+            "against the published one, and the signal checks; nothing else"
         ),
-        "values": kept["knobs"],
+        "values": kept["parameters"],
         "difficulty": kept["difficulty"],
         "accuracy": kept["accuracy"],
         "target": {
@@ -312,13 +304,11 @@ def _found(
             "row": "test, six seen materials",
             "source": published.PAPER,
         },
-        "verdict": _verdict(tried, kept, target, config),
+        "verdict": _outcome(config, points, kept, target),
         "seeds": list(config.seeds),
-        "priors": {
-            name: asdict(prior) | {"start": _listed(prior.start)} for name, prior in PRIORS.items()
-        },
+        "priors": {name: asdict(prior) for name, prior in PRIORS.items()},
         "facts": kept["facts"],
-        "points": tried,
+        "points": points,
         "protocol": {name: protocol[name] for name in groups + numbers},
         "versions": {
             "tactslip_torch": tactslip_torch.__version__,
@@ -329,22 +319,21 @@ def _found(
     }
 
 
-def _verdict(
-    tried: Sequence[Mapping[str, Any]], kept: Mapping[str, Any], target: float, config: DictConfig
-) -> str:
+def _outcome(config: DictConfig, points: Sequence[Point], kept: Point, target: float) -> str:
     """Whether the target was met, and else why not and by how much."""
     missing = kept["accuracy"] - target
     if abs(missing) <= config.tolerance:
         return f"met within {100 * config.tolerance:g} points"
-    way = 1 if missing > 0 else -1
-    beyond = [row for row in tried if way * (row["difficulty"] - kept["difficulty"]) > 0]
-    if any(not row["holds"] for row in beyond):
-        nearest = min(
-            (row for row in beyond if not row["holds"]),
-            key=lambda row: abs(row["difficulty"] - kept["difficulty"]),
-        )
-        failed = ", ".join(fact["name"] for fact in nearest["facts"] if not fact["holds"])
-        why = f"cut back: at d {nearest['difficulty']:+.2f} the facts {failed} do not hold"
+    sign = 1 if missing > 0 else -1
+    failing = [
+        point
+        for point in points
+        if not point["holds"] and sign * (point["difficulty"] - kept["difficulty"]) > 0
+    ]
+    if failing:
+        nearest = min(failing, key=lambda point: abs(point["difficulty"] - kept["difficulty"]))
+        failed = ", ".join(check["name"] for check in nearest["facts"] if not check["holds"])
+        why = f"cut back: at d {nearest['difficulty']:+.2f} the checks {failed} do not hold"
     elif kept["difficulty"] in tuple(config.bounds):
         why = "the bound of d is reached"
     else:
@@ -354,10 +343,6 @@ def _verdict(
 
 def _quietly(items: Iterable[Any], what: str) -> Iterable[Any]:
     return items
-
-
-def _listed(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="calibrate")

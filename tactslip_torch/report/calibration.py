@@ -30,7 +30,7 @@ def calibration_table(content: Mapping[str, Any]) -> str:
     header = ["d", *(name.rsplit("_", 1)[0] for name in content["values"]), "accuracy %"]
     rows = [[*header, *(f"seed {seed}" for seed in content["seeds"]), "signal checks"]]
     for point in _by_difficulty(content):
-        row = [f"{point['difficulty']:+.2f}", *map(_value, point["knobs"].values())]
+        row = [f"{point['difficulty']:+.2f}", *map(_value, point["parameters"].values())]
         row += map(percent, [point["accuracy"], *point["accuracy_by_seed"]])
         rows.append([*row, "hold" if point["holds"] else f"fail: {_failing(point)}"])
     blocks = [
