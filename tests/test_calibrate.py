@@ -180,7 +180,7 @@ def test_unseen_materials_and_their_results_are_used_nowhere(tmp_path, found, mo
     monkeypatch.setattr(parameters, "UNSEEN_MATERIALS", ())
     for name in ("wood", "copper", "cloth", "iron"):  # they come back in the table's order
         monkeypatch.delitem(parameters.MATERIALS, name)
-    with pytest.raises(ValueError, match="got 'iron'"):
+    with pytest.raises(ValueError, match="unknown material 'iron'"):
         paper_scenes(cycles=1, materials=["iron"])  # they are gone indeed
     calibrate(tiny(), tmp_path)
     written = (tmp_path / "calibration.json").read_bytes()

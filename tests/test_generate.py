@@ -254,7 +254,7 @@ def test_a_file_that_is_not_ours_is_never_replaced(tmp_path, content):
         (["materials=M1", "scene=paper"], r"materials must be a list such as \[M1,M6\], got 'M1'"),
         (["materials=[]", "scene=paper"], "no recording to write; give at least one"),
         (["cycles=0", "scene=paper"], "data: cycles must be at least 1, got 0"),
-        (["data.fidelity=real", "scene=paper"], "data: unknown fidelity 'real'; there is kinem"),
+        (["data.fidelity=real", "scene=paper"], "data: unknown fidelity 'real'; known are kinem"),
         (["+data.scene.mu_k=2.0", "scene=paper"], "data: contact.mu_k must not exceed mu_s"),
         (
             ["scene=paper", "scene.name=a/b", "materials=[M1]"],

@@ -343,8 +343,8 @@ def surface(mu_s, mu_ratio):
 
 
 REFUSED = [
-    (lambda: Scene("M7"), r"material must be one of M1, .*wood, got 'M7'"),
-    (scene(fidelity="lugre"), r"fidelity must be one of kinematic, bristles, got 'lugre'"),
+    (lambda: Scene("M7"), r"unknown material 'M7'; known are M1, .*wood"),
+    (scene(fidelity="lugre"), r"unknown fidelity 'lugre'; known are kinematic, bristles$"),
     (scene(sample_rate_hz=0), r"sample_rate_hz must be positive and finite, got 0"),
     (scene(acceleration_m_s2=-1.0), r"acceleration_m_s2 must be positive"),
     (scene(tail_s=-1), r"tail_s must be finite and not negative, got -1"),

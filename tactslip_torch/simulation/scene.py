@@ -126,7 +126,7 @@ class Scene:
             ("fidelity", self.fidelity, FIDELITIES),
         ):
             if value not in known:
-                raise ValueError(f"{what} must be one of {', '.join(known)}, got {value!r}")
+                raise ValueError(f"unknown {what} {value!r}; known are {', '.join(known)}")
         for name in ("sample_rate_hz", "acceleration_m_s2"):
             value = getattr(self, name)
             if not 0 < value < math.inf:
