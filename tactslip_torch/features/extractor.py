@@ -19,11 +19,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.bank import Bank
 from tactslip_torch.features.eager.engine import EagerEngine
 from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.plan import make_plan
-from tactslip_torch.features.pool import FeaturePool, saturating
+from tactslip_torch.features.ops import saturating
+from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.runtime import for_each, is_plain, usable_engine
 
 EngineName = Literal["auto", "compiled", "eager", "reference"]
@@ -105,7 +107,6 @@ class FeatureExtractor:
         self.selected = tuple(chosen)
         self.engine: EngineName = resolved(engine)
         self.plan = make_plan(pool.hand, pool.level, self.names)
-        self._index = None if selected is None else torch.tensor(self.selected)
         self._start()
 
     @property
@@ -194,10 +195,10 @@ class FeatureExtractor:
             out[index] = self._reference(bins[index], out.dtype)
 
     def _reference(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
-        features: Tensor = self.pool(self.pool.widen(bins))
-        if self._index is not None:
-            features = features.index_select(-1, self._index.to(features.device))
-        return saturating(features, dtype)
+        x = self.pool.widen(bins)
+        if x.dtype not in self._banks:
+            self._banks[x.dtype] = self.pool.bank(self.plan, x.dtype)
+        return saturating(self._banks[x.dtype].of_bins(x), dtype)
 
     def _engine_for(self, bins: torch.dtype) -> Engine:
         dtype = bins if self.pool.arithmetic == "native" else torch.float64
@@ -219,6 +220,7 @@ class FeatureExtractor:
 
     def _start(self) -> None:
         self._engines: dict[torch.dtype, Engine] = {}
+        self._banks: dict[torch.dtype, Bank] = {}
         plan = self.plan
         owner = [(plan.rows[w.row].channel, w.place) for w in plan.wanted]
         owner += [(share.channel, share.place) for share in plan.shares]
@@ -226,7 +228,7 @@ class FeatureExtractor:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without engines, which hold workspaces of threads."""
-        return {name: value for name, value in self.__dict__.items() if name != "_engines"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_engines", "_banks")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)

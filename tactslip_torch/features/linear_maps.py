@@ -8,18 +8,68 @@ ptwt and torch.fft evaluated on an identity.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names
 
+if TYPE_CHECKING:
+    from tactslip_torch.features.pool import FeaturePool
+
 RANK_TOLERANCE = 1e-12
 """Singular values below this part of the largest are rounding."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """The coordinates of one branch, or of a slow channel's bin, and what is made of them.
+
+    There are ``r`` of the branch less its mean, and one of its mean. Their length is that of the
+    branch, less its mean and in full.
+
+    Args:
+        into: from a bin to all coordinates, ``[n, r + 1]``.
+        out: from the first r to the branch less its mean, ``[r, n]``; None if they are that.
+        lines: from all to the spectrum before its modulus, ``[r + 1, 2 L]``: L real parts, then L
+            imaginary ones.
+        is_detail: whether its mean vanishes with the rest.
+    """
+
+    into: Tensor
+    out: Tensor | None
+    lines: Tensor
+    is_detail: bool
+
+    @property
+    def rank(self) -> int:
+        """Number of coordinates but the mean."""
+        return self.into.shape[1] - 1
+
+    def of_window(self, smooth: Tensor | None) -> Tensor:
+        """From ``[x - first, first]`` to all coordinates, ``[W + 1, r + 1]``.
+
+        ``first`` is the first sample of the bin: a small vibration keeps its digits on any offset,
+        and details of a constant are exactly 0.
+
+        Args:
+            smooth: the filter, ``[n, W]``; None: ``x`` is filtered.
+        """
+        into = self.into if smooth is None else smooth.T @ self.into
+        of_first = into.new_zeros(1, into.shape[1])
+        of_first[0, -1] = 0.0 if self.is_detail else math.sqrt(len(self.into))
+        return torch.cat([into, of_first])
+
+    @cached_property
+    def energy_root(self) -> Tensor:
+        """From coordinates to numbers whose squares add up to the spectrum's energy, ``[r+1, r+1]``."""
+        triangle: Tensor = torch.linalg.qr(self.lines.T, mode="r").R
+        return triangle.T
 
 
 @dataclass(frozen=True)
@@ -66,6 +116,32 @@ class LinearMaps:
         return len(self.frequency_hz)
 
 
+    def block(self, branch: int) -> Block:
+        """The coordinates of a branch by its index; of a slow channel's bin for -1."""
+        return self._blocks[branch]
+
+    @cached_property
+    def _blocks(self) -> dict[int, Block]:
+        num = self.num_samples
+        identity = torch.eye(num, dtype=torch.float64)
+        blocks = {}
+        for branch, dense in enumerate((identity, *self.dense), -1):
+            mean = dense.mean(0, keepdim=True)
+            if branch < 0:
+                into, out = dense - mean, identity
+            else:
+                into, out = _low_rank(dense - mean, is_out_orthonormal=True)
+            root = math.sqrt(num)
+            lines = self.dense_lines @ torch.cat([out, out.new_full((num, 1), 1 / root)], dim=-1)
+            blocks[branch] = Block(
+                into=torch.cat([into, root * mean]).T.contiguous(),
+                out=None if branch < 0 else out.T.contiguous(),
+                lines=lines.T.contiguous(),
+                is_detail=branch >= 0 and not self.is_approximation[branch],
+            )
+        return blocks
+
+
 @lru_cache(maxsize=16)
 def _made(
     num: int, sample_rate_hz: float, wavelet: Wavelet, level: int, method: SpectrumMethod
@@ -88,8 +164,11 @@ def _made(
     )
 
 
-def _low_rank(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """``into [r, n]`` with orthonormal rows and ``out [n, r]``, whose product is ``matrix``."""
+def _low_rank(matrix: Tensor, is_out_orthonormal: bool = False) -> tuple[Tensor, Tensor]:
+    """``into [r, n]`` and ``out [n, r]``, whose product is ``matrix``; one of them orthonormal."""
     left, sizes, right = torch.linalg.svd(matrix)
     rank = max(1, int((sizes > RANK_TOLERANCE * sizes[0]).sum()))
-    return right[:rank].contiguous(), (left[:, :rank] * sizes[:rank]).contiguous()
+    left, sizes, right = left[:, :rank], sizes[:rank], right[:rank]
+    if is_out_orthonormal:
+        return (sizes[:, None] * right).contiguous(), left.contiguous()
+    return right.contiguous(), (left * sizes).contiguous()

@@ -13,31 +13,17 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.descriptors import (
-    COMMON_DESCRIPTORS,
-    SPECTRUM_DESCRIPTORS,
-    TIME_DESCRIPTORS,
-    band_energy_ratio,
-    describe,
-)
-from tactslip_torch.features.guards import bounded_gradient, settle
-from tactslip_torch.features.guards import saturating as saturating
+from tactslip_torch.features.bank import Bank, Frame
+from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.names import pool_names
-from tactslip_torch.features.transforms import amplitudes_by, branches_by
+from tactslip_torch.features.ops import bounded_gradient, saturating
+from tactslip_torch.features.plan import Plan, make_plan
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import is_recorded
-from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
-from tactslip_torch.signals.wavelet import (
-    WaveletFilters,
-    as_wavelet,
-    branch_matrix,
-    branch_names,
-    wavelet_fact,
-)
+from tactslip_torch.signals.spectrum import SpectrumMethod
+from tactslip_torch.signals.wavelet import WaveletFilters, as_wavelet, wavelet_fact
 
 Arithmetic = Literal["double", "native"]
-GAIN = 2.0**20
-"""More than wavelet branches and spectra multiply a gradient by on its way back."""
 NATIVE_SPAN = 2.0**-10
 """Part of a film's magnitude; in float32 throughout, less may be lost in a branch."""
 VALIDITY = (
@@ -52,13 +38,13 @@ LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
 class FeaturePool(nn.Module):
     """All features of filtered bins, in the paper's order.
 
-    Holds two constant matrices, the wavelet branches and the spectrum, evaluated on an identity
-    in float64 through ptwt and torch.fft. Follows the dtype and the device of its input. Gradients
-    flow wherever the descriptor is differentiable; they are finite up to 1e288 V.
+    Follows the dtype and the device of its input. Gradients flow wherever the descriptor is
+    differentiable; they are finite up to 1e288 V. The linear maps (wavelet branches and spectrum)
+    are evaluated on an identity in float64 through ptwt and torch.fft.
 
-    float32 bins are computed in float64 and rounded once at the end, unless ``arithmetic`` is
-    ``"native"``. In float32 throughout, entropy and mode step in other places than in float64, and
-    a branch much smaller than its bin drowns in rounding.
+    float32 bins are computed in float64 and rounded once at the end. If ``arithmetic`` is
+    ``"native"``, their branches and order statistics are still float64, all other statistics
+    float32.
 
     Args:
         hand: the channels, in the order in which bins hold them.
@@ -104,17 +90,10 @@ class FeaturePool(nn.Module):
         self.level = level
         self.spectrum: SpectrumMethod = spectrum
         self.arithmetic: Arithmetic = arithmetic
-        self._gauges, self._films = list(hand.slow), list(hand.fast)
         self._inverses: dict[torch.dtype, Tensor] = {}
+        self._banks: dict[torch.dtype, Bank] = {}
         self.names = pool_names(hand, level)
-        lines = spectrum_matrix(bin_samples, spectrum)
-        self._constants = {  # float64; cast to the bins' dtype on use, so they never lose digits
-            "branches": branch_matrix(bin_samples, self.wavelet, level),
-            "cosine": lines.real.contiguous(),
-            "sine": lines.imag.contiguous(),
-            "frequency_hz": frequency_axis_hz(bin_samples, sample_rate_hz, spectrum),
-            "is_approximation": torch.tensor([n[0] == "A" for n in branch_names(level)]),
-        }
+        LinearMaps.of(self)  # refuses a bin that is too short for the levels
 
     def facts(self) -> dict[str, Any]:
         """All arguments but the hand, as JSON-able values; ``FeaturePool(hand, **facts)``."""
@@ -141,7 +120,19 @@ class FeaturePool(nn.Module):
                 nor float64.
         """
         self.check(bins)
-        return saturating(self._describe(self.widen(bins)), bins.dtype)
+        x = self.widen(bins)
+        if x.dtype not in self._banks:
+            self._banks[x.dtype] = self.bank(make_plan(self.hand, self.level, self.names), x.dtype)
+        return saturating(self._banks[x.dtype].of_bins(x), bins.dtype)
+
+    def bank(self, plan: Plan, dtype: torch.dtype) -> Bank:
+        """What makes a part of the features of bins that ``widen`` has brought to this dtype."""
+        frames = [
+            Frame(tuple(sorted(own)), is_film)
+            for is_film, kind in ((False, self.hand.slow), (True, self.hand.fast))
+            if (own := set(kind).intersection(plan.channels))
+        ]
+        return Bank(LinearMaps.of(self), plan, frames, dtype)
 
     def widen(self, x: Tensor) -> Tensor:
         """Samples in the dtype that features are computed in; filter after it, not before.
@@ -153,53 +144,6 @@ class FeaturePool(nn.Module):
             raise ValueError(f"expected float32 or float64 samples in volts, got {x.dtype}")
         x = bounded_gradient(x)
         return x if self.arithmetic == "native" else x.double()
-
-    def _describe(self, bins: Tensor) -> Tensor:
-        films = bins[..., self._films, :]
-        scale = films.detach().abs().amax(-1)  # [*, films]
-        films = bounded_gradient(films)
-        branches = bounded_gradient(self.branches(films), GAIN)  # [*, films, branches, n]
-        spectra = bounded_gradient(self.amplitudes(branches), GAIN)  # [*, films, branches, lines]
-        branch_scale = scale[..., None].expand(branches.shape[:-1])
-        in_time = describe(
-            branches,
-            TIME_DESCRIPTORS,
-            scale=branch_scale,
-            reference=settle(films, scale)[..., None, :],
-        )
-        in_frequency = describe(
-            spectra,
-            SPECTRUM_DESCRIPTORS,
-            scale=branch_scale,
-            frequency_hz=self._constant("frequency_hz", bins),
-        )
-        ratios = band_energy_ratio(spectra).unflatten(-1, (self.level, 2))  # [*, films, level, 2]
-        by_level = torch.cat(
-            [part.unflatten(-2, (self.level, 2)).flatten(-2) for part in (in_time, in_frequency)],
-            dim=-1,
-        )  # [*, films, level, 2 * (14 + 15)]
-        of_films = torch.cat([by_level.flatten(-2), ratios.transpose(-1, -2).flatten(-2)], dim=-1)
-        return torch.cat([self._of_gauges(bins), of_films.flatten(-2)], dim=-1)
-
-    def branches(self, films: Tensor) -> Tensor:
-        """Wavelet branches, those that are constant replaced (D by 0, A by their mean).
-
-        Shape:
-            - films: ``[*, n]``
-            - output: ``[*, 2 * level, n]`` in the order of ``branch_names``
-        """
-        matrix = self._constant("branches", films)
-        return branches_by(films, matrix, self._constant("is_approximation", films))
-
-    def amplitudes(self, branches: Tensor) -> Tensor:
-        """Amplitude spectrum of each branch; the gradient of a line that is zero is 0.
-
-        Shape:
-            - branches: ``[*, n]``
-            - output: ``[*, lines]``
-        """
-        cosine, sine = (self._constant(name, branches) for name in ("cosine", "sine"))
-        return amplitudes_by(branches, cosine, sine)
 
     def validity(self, bins: Tensor) -> Tensor:
         """Which channels can be trusted.
@@ -233,7 +177,7 @@ class FeaturePool(nn.Module):
         if like.dtype not in self._inverses:
             least = [64 * torch.finfo(like.dtype).eps] * len(self.hand)
             if self.arithmetic == "native" and like.dtype == torch.float32:
-                for film in self._films:
+                for film in self.hand.fast:
                     least[film] = NATIVE_SPAN
             with torch.inference_mode(False):  # it may be needed for a gradient later
                 self._inverses[like.dtype] = torch.tensor(least, dtype=like.dtype).reciprocal()
@@ -250,18 +194,6 @@ class FeaturePool(nn.Module):
         if is_recorded():  # onnxruntime's maxima pass over NaN
             return (~(bins.abs() <= largest)).any(-1)
         return ~(torch.maximum(bins.amax(-1), -bins.amin(-1)) <= largest)
-
-    def _of_gauges(self, bins: Tensor) -> Tensor:
-        gauges = bins[..., self._gauges, :]
-        scale = gauges.detach().abs().amax(-1)
-        values = describe(settle(gauges, scale), COMMON_DESCRIPTORS, scale=scale)
-        return values.flatten(-2)
-
-    def _constant(self, name: str, like: Tensor) -> Tensor:
-        constant = self._constants[name]
-        if constant.dtype == torch.bool:
-            return constant.to(like.device)
-        return constant.to(like)
 
     def check(self, bins: Tensor) -> None:
         """Refuse what are no bins of this hand.

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.pool import LARGEST_SAMPLE, FeaturePool, saturating
+from tactslip_torch.features.ops import saturating
+from tactslip_torch.features.pool import LARGEST_SAMPLE, FeaturePool
 from tactslip_torch.model.detector_file import Head
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.prediction import Prediction

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.pool import saturating
+from tactslip_torch.features.ops import saturating
 from tactslip_torch.model.calibration import Calibration
 from tactslip_torch.model.kernels import Head, QuadraticForm
 from tactslip_torch.runtime import has_values

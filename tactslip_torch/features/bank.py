@@ -1,0 +1,411 @@
+"""The features of a plan: rows are formed by linear maps, brought to order one, and described.
+
+A channel's samples go to a few coordinates of each row (51, 27, 15 or 9 of a branch of 100 samples)
+and to its mean, in float64; filter and wavelet are one matrix by then. Here what is rounding beside
+its bin becomes exactly constant, and every row gets the length one. From these coordinates rows go
+on to branches and spectra, which are then good to rounding in any precision, and which
+``descriptors.py`` describes without a thought of extremes.
+
+Everything is written in operations that tensors and values of an ONNX graph share: on tensors it is
+the reference, on values it writes the graph.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tactslip_torch.features.descriptors import DESCRIPTORS, ORDERED, Rows, band_energy_ratios
+from tactslip_torch.features.linear_maps import LinearMaps
+from tactslip_torch.features.ops import bounded_gradient, like, root, taken
+from tactslip_torch.features.plan import Plan, Row
+
+TINY = 1e-300
+"""Instead of 0 in a divisor, where a quotient of 0 is to be 0."""
+_LEAST_LENGTH = 16 * torch.finfo(torch.float64).eps / 0.35
+"""Of a row less its mean, as a part of its bin's magnitude; below it is rounding. A span of 16 eps:
+that of 100 centred values of length 1 lies between .2 (two levels) and 1.41."""
+_OWN_ROWS = ("mode", "entropy", "correlation", "spectral_spread")
+"""Descriptors of so much work that they are taken of the rows that want them alone."""
+
+
+class Frame(NamedTuple):
+    """Channels of one kind whose samples are filtered alike.
+
+    Attributes:
+        channels: positions in the hand.
+        is_film: whether they adapt fast, so have branches.
+        smooth: from their ``W`` samples to the ``n`` of a filtered bin, ``[n, W]``, float64; None:
+            they are filtered.
+    """
+
+    channels: tuple[int, ...]
+    is_film: bool
+    smooth: Tensor | None = None
+
+
+class Samples(NamedTuple):
+    """Samples of the channels of a frame, on the way to rows.
+
+    Attributes:
+        shifted: less the first sample of the bin, then that first sample alone, ``[*, c, W + 1]``,
+            float64: so a small vibration keeps its digits on any offset.
+        moving: the filtered bin but for a constant, ``[*, c, n]``.
+        scale: largest magnitude of the filtered bin, ``[*, c]``, float64; no gradient.
+        unit: in which all these are given, volts, ``[*, c]``; None: they are volts. No gradient.
+    """
+
+    shifted: Tensor
+    moving: Tensor
+    scale: Tensor
+    unit: Tensor | None
+
+
+class Bank:
+    """Makes the features of a plan.
+
+    Args:
+        maps: branches and spectra.
+        plan: the features.
+        frames: which hold every channel of the plan.
+        dtype: of all that there is one of per sample, but for ``ORDERED`` descriptors, which step.
+            Samples, coordinates and what there is one of per row are float64.
+    """
+
+    def __init__(
+        self,
+        maps: LinearMaps,
+        plan: Plan,
+        frames: Sequence[Frame],
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        self.dtype = dtype
+        self.frames = tuple(frames)
+        self._plan = plan
+        wanted: dict[Row, set[str]] = {row: set() for row in plan.rows}
+        for each in plan.wanted:
+            wanted[plan.rows[each.row]].add(each.descriptor)
+        self._families = [
+            _Family(maps, wanted, [i for i, frame in enumerate(frames) if frame.is_film == is_film])
+            for is_film in (False, True)
+        ]
+        for family in self._families:
+            family.lay_out(frames)
+        self._families = [family for family in self._families if family.blocks]
+        self._forms: list[_Form] = []
+        for is_freq in (False, True):
+            own = {row: names for row, names in wanted.items() if (row.kind == "freq") == is_freq}
+            steps = {row: names.intersection(ORDERED) for row, names in own.items()}
+            rest = {row: names.difference(ORDERED) for row, names in own.items()}
+            sets = [(own, dtype)]
+            if dtype != torch.float64:
+                sets = [(steps, torch.float64), (rest, dtype)]
+            for names_of, of_rows in sets:
+                names_of = {row: names for row, names in names_of.items() if names}
+                if names_of:
+                    self._forms.append(_Form(self._families, maps, names_of, is_freq, of_rows))
+        self._ratios = [_Ratios(maps, plan, frame) for frame in frames]
+        made = [place for form in self._forms for place in form.made]
+        made += [place for ratios in self._ratios for place in ratios.made]
+        column = {place: index for index, place in enumerate(made)}
+        order = [0] * plan.num_features
+        channel = [0] * plan.num_features
+        for each in plan.wanted:
+            order[each.place] = column[plan.rows[each.row], each.descriptor]
+            channel[each.place] = plan.rows[each.row].channel
+        for share in plan.shares:
+            order[share.place] = column[Row("freq", share.channel, share.branch), "ratio"]
+            channel[share.place] = share.channel
+        self._order = torch.tensor(order)
+        self._channel = torch.tensor(channel)
+
+    def __call__(self, samples: Sequence[Samples]) -> Tensor:
+        """Features in the order of the plan, ``[*, K]``, float64.
+
+        Args:
+            samples: of each frame.
+        """
+        families = [_Coordinates(family, samples) for family in self._families]
+        made = [value for form in self._forms for value in form(families)]
+        made += [
+            ratios(own, self.dtype)
+            for ratios, own in zip(self._ratios, samples, strict=True)
+            if ratios.made
+        ]
+        return taken(torch.cat(made, dim=-1), self._order, -1)
+
+    def of_bins(self, bins: Tensor) -> Tensor:
+        """Features of filtered bins, float64; NaN of a channel that holds a NaN or Inf.
+
+        Here extremes end: what is not finite becomes 0 (and its features NaN at the end), and each
+        channel is divided by the power of two below its magnitude, which rounds nothing.
+
+        Shape:
+            - bins: ``[*, C, n]``, float32 or float64, volts
+            - output: ``[*, K]``; what is beyond float64 saturates
+        """
+        bins = bounded_gradient(bins).double()
+        magnitude = bins.detach().abs().amax(-1)
+        is_broken = ~magnitude.isfinite()
+        magnitude = torch.where(is_broken, 0.0, magnitude)
+        unit = magnitude.clamp(min=TINY).log2().floor().exp2()
+        x = torch.where(is_broken[..., None], 0.0, bins) / unit[..., None]
+        scale = magnitude / unit
+        samples = []
+        for frame in self.frames:
+            index = torch.tensor(frame.channels, device=x.device)
+            own = x.index_select(-2, index)
+            first = own[..., :1].detach()
+            shifted = own - first
+            samples.append(
+                Samples(
+                    torch.cat([shifted, first], dim=-1),
+                    shifted,
+                    scale.index_select(-1, index),
+                    unit.index_select(-1, index),
+                )
+            )
+        largest = torch.finfo(torch.float64).max
+        features = self(samples).clamp(-largest, largest)
+        return torch.where(taken(is_broken, self._channel, -1), torch.nan, features)
+
+
+class _Family:
+    """Channels of one kind, and the coordinates that the rows of any of them are made of.
+
+    The coordinates of all blocks (branches; of slow channels the bin) lie side by side, those of
+    one block followed by its mean; ``c`` channels, ``K`` coordinates in ``b`` blocks.
+    """
+
+    def __init__(self, maps: LinearMaps, wanted: Iterable[Row], frames: Sequence[int]) -> None:
+        self.frames = frames
+        self._maps = maps
+        self._rows = tuple(wanted)
+
+    def lay_out(self, frames: Sequence[Frame]) -> None:
+        own = [frames[i] for i in self.frames]
+        self.channels = tuple(channel for frame in own for channel in frame.channels)
+        self.blocks = sorted({row.branch for row in self._rows if row.channel in self.channels})
+        if not self.blocks:
+            return
+        blocks = [self._maps.block(branch) for branch in self.blocks]
+        self.into = [torch.cat([each.of_window(f.smooth) for each in blocks], -1) for f in own]
+        widths = [each.rank + 1 for each in blocks]
+        self.ends = list(itertools.accumulate(widths))
+        self.starts = [0, *self.ends[:-1]]
+        identity = torch.eye(len(blocks), dtype=torch.float64)
+        self.of_block = identity.repeat_interleave(torch.tensor(widths), dim=0)  # [K, b]
+        self.of_mean = torch.tensor(self.ends) - 1
+        self.without_mean = self.of_block.index_fill(0, self.of_mean, 0.0)
+        self.stays = torch.tensor([float(not each.is_detail) for each in blocks]).double()
+
+
+class _Coordinates:
+    """The coordinates of a family's channels, and what is made of them."""
+
+    def __init__(self, family: _Family, samples: Sequence[Samples]) -> None:
+        own = [samples[i] for i in family.frames]
+        x = torch.cat(
+            [each.shifted @ like(m, each.shifted) for each, m in zip(own, family.into, strict=True)],
+            dim=-2,
+        )
+        self.family = family
+        self.scale = torch.cat([each.scale for each in own], dim=-1)  # [*, c]
+        units = [each.unit for each in own if each.unit is not None]
+        self.unit = torch.cat(units, dim=-1) if units else None
+        self._moving = [each.moving for each in own]
+        squares = x.detach() * x.detach()
+        length = (squares @ like(family.without_mean, x)).sqrt()  # [*, c, b]
+        least = (self.scale * _LEAST_LENGTH).clamp(min=TINY)[..., None]
+        is_kept = (length >= least).double()
+        self._x, self._is_kept = x, is_kept
+        self._made: dict[tuple[bool, torch.dtype], Tensor] = {}
+        self._lengths = {False: torch.maximum(length, least)}
+        self._scaled = {False: x * ((is_kept / self._lengths[False]) @ like(family.of_block.T, x))}
+
+    def length(self, is_freq: bool) -> Tensor:
+        """Length of each block, of spectra with its mean, ``[*, c, b]``; positive."""
+        self.scaled(is_freq, torch.float64)
+        return self._lengths[is_freq]
+
+    def scaled(self, is_freq: bool, dtype: torch.dtype) -> Tensor:
+        """Coordinates of length one, exactly 0 but for the mean where a block is constant."""
+        if is_freq not in self._scaled:
+            x, family = self._x, self.family
+            kept = self._is_kept @ like(family.without_mean.T, x)
+            kept = kept + self._mean_kept() @ like((family.of_block - family.without_mean).T, x)
+            x = x * kept
+            length = ((x.detach() * x.detach()) @ like(family.of_block, x)).sqrt().clamp(min=TINY)
+            self._lengths[True] = length
+            self._scaled[True] = x * ((1.0 / length) @ like(family.of_block.T, x))
+        if (is_freq, dtype) not in self._made:
+            self._made[is_freq, dtype] = self._scaled[is_freq].to(dtype)
+        return self._made[is_freq, dtype]
+
+    def mean(self) -> Tensor:
+        """Mean of the samples of each block, in its length, ``[*, c, b]``."""
+        family, num = self.family, self.family._maps.num_samples
+        mean = taken(self._x, family.of_mean, -1) * num**-0.5
+        return mean / self._lengths[False] * self._mean_kept()
+
+    def films(self, dtype: torch.dtype) -> Tensor:
+        """Filtered bins less their mean, of order one, ``[*, c, n]``; 0 where that is rounding."""
+        x = torch.cat(self._moving, dim=-2).double()
+        x = x - x.mean(-1, keepdim=True)
+        size = x.detach().abs().amax(-1, keepdim=True)
+        least = (self.scale * (8 * torch.finfo(torch.float64).eps)).clamp(min=TINY)[..., None]
+        return (x * ((size >= least).double() / torch.maximum(size, least))).to(dtype)
+
+    def _mean_kept(self) -> Tensor:
+        """1, and 0 for constant details, ``[*, c, b]``."""
+        return torch.maximum(self._is_kept, like(self.family.stays, self._is_kept))
+
+
+class _Form:
+    """Rows of one length and dtype, and the descriptors that are wanted of them."""
+
+    def __init__(
+        self,
+        families: Sequence[_Family],
+        maps: LinearMaps,
+        wanted: Mapping[Row, set[str]],
+        is_freq: bool,
+        dtype: torch.dtype,
+    ) -> None:
+        self._is_freq = is_freq
+        self._dtype = dtype
+        self._maps = maps
+        self._pieces: list[tuple[int, slice, Tensor | None, Tensor | None]] = []
+        rows, cells, owners = list[Row](), list[int](), list[int]()
+        num_cells = num_owners = 0
+        self._families = []
+        for number, family in enumerate(families):
+            num_blocks = len(family.blocks)
+            for place, branch in enumerate(family.blocks):
+                kind = "freq" if is_freq else "gauge" if branch < 0 else "time"
+                own = [Row(kind, channel, branch) for channel in family.channels]
+                chosen = [i for i, row in enumerate(own) if row in wanted]
+                if not chosen:
+                    continue
+                if number not in self._families:
+                    self._families.append(number)
+                block = maps.block(branch)
+                stop = family.ends[place] - (not is_freq)
+                matrix = block.lines if is_freq else block.out
+                self._pieces.append(
+                    (number, slice(family.starts[place], stop), _index(chosen, len(own)), matrix)
+                )
+                rows += [own[i] for i in chosen]
+                cells += [num_cells + i * num_blocks + place for i in chosen]
+                owners += [num_owners + i for i in chosen]
+            if number in self._families:
+                num_cells += len(family.channels) * num_blocks
+                num_owners += len(family.channels)
+        self._cells, self._owners = torch.tensor(cells), torch.tensor(owners)
+        names = {name for own in wanted.values() for name in own}
+        self._plain, self._ordered = [], []
+        ordered = [i for i, row in enumerate(rows) if wanted[row].intersection(ORDERED)]
+        self._steps = _index(ordered, len(rows))
+        self.made: list[tuple[Row, str]] = []
+        for name in (n for n in DESCRIPTORS if n in names and n not in ORDERED):
+            self._plain.append((name, self._chosen(name, rows, wanted)))
+        for name in (n for n in ORDERED if n in names):
+            self._ordered.append((name, self._chosen(name, [rows[i] for i in ordered], wanted)))
+        of_film = families[-1].channels
+        self._film = [of_film.index(row.channel) for row in rows if "correlation" in wanted[row]]
+
+    def _chosen(
+        self, name: str, rows: Sequence[Row], wanted: Mapping[Row, set[str]]
+    ) -> Tensor | None:
+        """Of which rows a descriptor is made."""
+        chosen = [i for i, row in enumerate(rows) if name not in _OWN_ROWS or name in wanted[row]]
+        self.made += [(rows[i], name) for i in chosen]
+        return _index(chosen, len(rows))
+
+    def __call__(self, families: Sequence[_Coordinates]) -> list[Tensor]:
+        rows = self._rows(families)
+        made = []
+        for name, index in self._plain:
+            own = rows.take(index)
+            if name == "correlation":
+                film = taken(families[-1].films(self._dtype), torch.tensor(self._film), -2)
+                own = replace(own, film=film)
+            made.append(DESCRIPTORS[name](own))
+        if self._ordered:
+            ordered = rows.take(self._steps).ordered()
+            made += [DESCRIPTORS[name](ordered.take(index)) for name, index in self._ordered]
+        return made
+
+    def _rows(self, families: Sequence[_Coordinates]) -> Rows:
+        is_freq, own = self._is_freq, [families[i] for i in self._families]
+        parts = []
+        for number, columns, index, matrix in self._pieces:
+            x = families[number].scaled(is_freq, self._dtype)
+            x = taken(x[..., columns.start : columns.stop], index, -2)
+            parts.append(x if matrix is None else x @ like(matrix, x))
+        values = torch.cat(parts, dim=-2)
+        amplitude = None
+        if is_freq:
+            num = self._maps.num_lines
+            real, imaginary = values[..., :num], values[..., num:]
+            amplitude = root(real * real + imaginary * imaginary)
+            middle = amplitude.mean(-1, keepdim=True)
+            values, mean = amplitude - middle, middle.squeeze(-1).double()
+        else:
+            num = self._maps.num_samples
+            mean = self._of_cells([each.mean() for each in own])
+        length = self._of_cells([each.length(is_freq) for each in own])
+        scale = taken(torch.cat([each.scale for each in own], dim=-1), self._owners, -1)
+        unit = length
+        units = [each.unit for each in own if each.unit is not None]
+        if units:
+            unit = length * taken(torch.cat(units, dim=-1), self._owners, -1)
+        return Rows(
+            values,
+            mean,
+            unit,
+            num,
+            scale / length,
+            amplitude=amplitude,
+            frequency_hz=self._maps.frequency_hz if is_freq else None,
+        )
+
+    def _of_cells(self, tables: Sequence[Tensor]) -> Tensor:
+        """What there is one of per channel and block, of each row, ``[*, R]``."""
+        return taken(torch.cat([each.flatten(-2) for each in tables], dim=-1), self._cells, -1)
+
+
+class _Ratios:
+    """Band energy ratios of the films of a frame."""
+
+    def __init__(self, maps: LinearMaps, plan: Plan, frame: Frame) -> None:
+        own = [i for i, channel in enumerate(frame.channels) if channel in plan.share_channels]
+        branches = range(len(maps.branches))
+        self.made = [
+            (Row("freq", frame.channels[i], branch), "ratio") for i in own for branch in branches
+        ]
+        if not own:
+            return
+        blocks = [maps.block(branch) for branch in branches]
+        self._index = _index(own, len(frame.channels))
+        self._into = torch.cat([b.of_window(frame.smooth) @ b.energy_root for b in blocks], dim=-1)
+        widths = torch.tensor([each.rank + 1 for each in blocks])
+        identity = torch.eye(len(blocks), dtype=torch.float64)
+        self._of_branch = identity.repeat_interleave(widths, dim=0)
+
+    def __call__(self, samples: Samples, dtype: torch.dtype) -> Tensor:
+        """``[*, films of the frame * branches]``, float64."""
+        x = taken(samples.shifted, self._index, -2).to(dtype)
+        parts = (x @ like(self._into, x)).double()  # whose squares may leave float32
+        ratios = band_energy_ratios((parts * parts) @ like(self._of_branch, parts))
+        return ratios.flatten(-2)
+
+
+def _index(chosen: Sequence[int], num: int) -> Tensor | None:
+    """Places to be taken of ``num``; None if that is all of them in order."""
+    return None if list(chosen) == list(range(num)) else torch.tensor(chosen)

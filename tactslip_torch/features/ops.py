@@ -1,0 +1,74 @@
+"""Operations of the definitions that ``torch`` has not under one name, or not as they need them.
+
+All else that ``descriptors.py`` and ``bank.py`` are written in are functions and methods of torch
+that ``graph.value.Value`` takes part in (``__torch_function__``). So each function here asks once
+whether it has a tensor before it, or a value of a graph.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tactslip_torch.runtime import is_plain, is_recorded
+
+
+def root(square: Tensor) -> Tensor:
+    """Square root, whose derivative at 0 is 0."""
+    if not isinstance(square, Tensor):
+        return square.sqrt()
+    is_positive = square.detach() > 0
+    return torch.where(is_positive, torch.where(is_positive, square, 1.0).sqrt(), 0.0)
+
+
+def ascending(x: Tensor, num: int) -> Tensor:
+    """Sorted along the last axis, which has ``num`` values.
+
+    By NumPy where only values are asked for: it sorts short rows several times as fast.
+    """
+    if not isinstance(x, Tensor):
+        return x.ascending(num)
+    if is_plain(x):
+        return torch.from_numpy(np.sort(x.detach().numpy(), axis=-1))
+    return x.sort(-1).values
+
+
+def taken(x: Tensor, index: Tensor | None, axis: int) -> Tensor:
+    """Entries at constant places along an axis; ``None`` is all of them."""
+    if index is None:
+        return x
+    if not isinstance(x, Tensor):
+        return x.take(index.tolist(), axis)
+    return x.index_select(axis, index.to(x.device))
+
+
+def like(constant: Tensor, x: Tensor) -> Tensor:
+    """A constant with the dtype and the device of what it meets; a value of a graph asks itself."""
+    return constant.to(x) if isinstance(x, Tensor) else constant
+
+
+def bounded_gradient(x: Tensor) -> Tensor:
+    """``x``, whose gradient saturates at the largest finite number of the dtype.
+
+    The derivative of a shape is of order 1/span, which for denormals no float can hold. Backward
+    only: derivatives taken forwards become Inf there.
+
+    Shape:
+        - x, output: ``[*]``
+    """
+    if not (x.requires_grad and torch.is_grad_enabled()) or is_recorded():
+        return x
+    x = x.view_as(x)
+    largest = torch.finfo(x.dtype).max
+    # autograd hands on None for a gradient that is undefined
+    x.register_hook(lambda g: None if g is None else g.clamp(-largest, largest))
+    return x
+
+
+def saturating(x: Tensor, dtype: torch.dtype) -> Tensor:
+    """``x`` in another dtype; what is beyond its range becomes its largest finite number."""
+    most = torch.finfo(dtype).max
+    if torch.finfo(x.dtype).max <= most:
+        return x.to(dtype)
+    return x.clamp(-most, most).to(dtype)
