@@ -7,9 +7,8 @@ import torch
 from small_detector import HAND, raw_bins, small_detector
 
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.graph.bins import bin_graph, selected_features
+from tactslip_torch.graph.bins import bin_graph, described
 from tactslip_torch.graph.form import Form, Window
-from tactslip_torch.graph.rows import Front
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import KernelSum, QuadraticForm, RadialBasis
@@ -75,8 +74,7 @@ def whole_pool(
 def features_by_graph(detector, form, samples):
     graph, window = Graph(), Window.of(detector)
     shape = ("batch", len(HAND), window.length)
-    front = Front(graph, detector, graph.input("samples", form.dtype, shape), form)
-    made = selected_features(graph, detector, front, form)
+    made = described(graph, detector, graph.input("samples", form.dtype, shape), form).features
     graph.output("features", made, ("batch", len(detector.selected)))
     given = cut(detector, samples).to(getattr(torch, form.precision))
     return session(graph).run(None, {"samples": given.numpy()})[0]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -121,7 +121,7 @@ class Bank:
         for share in plan.shares:
             order[share.place] = column[Row("freq", share.channel, share.branch), "ratio"]
             channel[share.place] = share.channel
-        self._order = torch.tensor(order)
+        self._order = _index(order, len(made))
         self._channel = torch.tensor(channel)
 
     def __call__(self, samples: Sequence[Samples]) -> Tensor:
@@ -179,7 +179,7 @@ class _Family:
     """Channels of one kind, and the coordinates that the rows of any of them are made of.
 
     The coordinates of all blocks (branches; of slow channels the bin) lie side by side, those of
-    one block followed by its mean; ``c`` channels, ``K`` coordinates in ``b`` blocks.
+    one block followed by its sum; ``c`` channels, ``K`` coordinates in ``b`` blocks.
     """
 
     def __init__(self, maps: LinearMaps, wanted: Iterable[Row], frames: Sequence[int]) -> None:
@@ -200,8 +200,11 @@ class _Family:
         self.starts = [0, *self.ends[:-1]]
         identity = torch.eye(len(blocks), dtype=torch.float64)
         self.of_block = identity.repeat_interleave(torch.tensor(widths), dim=0)  # [K, b]
-        self.of_mean = torch.tensor(self.ends) - 1
-        self.without_mean = self.of_block.index_fill(0, self.of_mean, 0.0)
+        self.sums = torch.tensor(self.ends) - 1
+        self.without_sum = self.of_block.index_fill(0, self.sums, 0.0)
+        self.with_mean = (
+            self.without_sum + (self.of_block - self.without_sum) / self._maps.num_samples
+        )
         self.stays = torch.tensor([float(not each.is_detail) for each in blocks]).double()
 
 
@@ -211,7 +214,10 @@ class _Coordinates:
     def __init__(self, family: _Family, samples: Sequence[Samples]) -> None:
         own = [samples[i] for i in family.frames]
         x = torch.cat(
-            [each.shifted @ like(m, each.shifted) for each, m in zip(own, family.into, strict=True)],
+            [
+                each.shifted @ like(m, each.shifted)
+                for each, m in zip(own, family.into, strict=True)
+            ],
             dim=-2,
         )
         self.family = family
@@ -220,7 +226,7 @@ class _Coordinates:
         self.unit = torch.cat(units, dim=-1) if units else None
         self._moving = [each.moving for each in own]
         squares = x.detach() * x.detach()
-        length = (squares @ like(family.without_mean, x)).sqrt()  # [*, c, b]
+        length = (squares @ like(family.without_sum, x)).sqrt()  # [*, c, b]
         least = (self.scale * _LEAST_LENGTH).clamp(min=TINY)[..., None]
         is_kept = (length >= least).double()
         self._x, self._is_kept = x, is_kept
@@ -237,10 +243,10 @@ class _Coordinates:
         """Coordinates of length one, exactly 0 but for the mean where a block is constant."""
         if is_freq not in self._scaled:
             x, family = self._x, self.family
-            kept = self._is_kept @ like(family.without_mean.T, x)
-            kept = kept + self._mean_kept() @ like((family.of_block - family.without_mean).T, x)
+            kept = self._is_kept @ like(family.without_sum.T, x)
+            kept = kept + self._mean_kept() @ like((family.of_block - family.without_sum).T, x)
             x = x * kept
-            length = ((x.detach() * x.detach()) @ like(family.of_block, x)).sqrt().clamp(min=TINY)
+            length = ((x.detach() * x.detach()) @ like(family.with_mean, x)).sqrt().clamp(min=TINY)
             self._lengths[True] = length
             self._scaled[True] = x * ((1.0 / length) @ like(family.of_block.T, x))
         if (is_freq, dtype) not in self._made:
@@ -250,7 +256,7 @@ class _Coordinates:
     def mean(self) -> Tensor:
         """Mean of the samples of each block, in its length, ``[*, c, b]``."""
         family, num = self.family, self.family._maps.num_samples
-        mean = taken(self._x, family.of_mean, -1) * num**-0.5
+        mean = taken(self._x, family.sums, -1) / num
         return mean / self._lengths[False] * self._mean_kept()
 
     def films(self, dtype: torch.dtype) -> Tensor:

@@ -17,7 +17,6 @@ the same row may have different ones. ``entropy`` is a step function: no gradien
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -25,7 +24,7 @@ from functools import cached_property, lru_cache
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.ops import ascending, root, taken
+from tactslip_torch.features.ops import ascending, like, looked_up, root, taken
 
 ENTROPY_LEVELS = 255
 RUN_TOLERANCE = {torch.float64: 1e-12, torch.float32: 2.0**-20}
@@ -205,7 +204,8 @@ def entropy(x: Rows) -> Tensor:
     level = ((values - least) * levels + (0.5 + HALF_SLACK[torch.float64])).floor()
     # the maximum always has the top level, so the second highest level joins it
     is_new = (level > _before(level)) & (level < float(ENTROPY_LEVELS))
-    return torch.take(_entropy_terms(x.num).to(values.device), _counts(_run_numbers(is_new))).sum(-1)
+    bits = looked_up(_entropy_terms(x.num), _counts(_run_numbers(is_new))).sum(-1)
+    return bits * (span.squeeze(-1) > 0.0).double()
 
 
 def peak_factor(x: Rows) -> Tensor:
@@ -235,7 +235,7 @@ def spectral_spread(x: Rows) -> Tensor:
     0, without gradient, for a zero spectrum and for a single line.
     """
     amplitude, frequency_hz = _spectrum(x)
-    distance = frequency_hz - spectral_centroid(x).type_as(amplitude)[..., None]
+    distance = spectral_centroid(x).type_as(amplitude)[..., None] - frequency_hz
     total = (x.mean * float(x.num)).clamp(min=_NEXT_TO_NOTHING)
     return root((amplitude * distance * distance).sum(-1).double() / total)
 
@@ -252,7 +252,7 @@ def band_energy_ratios(energies: Tensor) -> Tensor:
 def _spectrum(x: Rows) -> tuple[Tensor, Tensor]:
     if x.amplitude is None or x.frequency_hz is None:
         raise ValueError("spectral_centroid and spectral_spread need frequency_hz=")
-    return x.amplitude, x.frequency_hz.type_as(x.amplitude)
+    return x.amplitude, like(x.frequency_hz, x.amplitude)
 
 
 def _before(x: Tensor) -> Tensor:

@@ -23,8 +23,8 @@ from tactslip_torch.features.bank import Bank
 from tactslip_torch.features.eager.engine import EagerEngine
 from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.ops import saturating
+from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.runtime import for_each, is_plain, usable_engine
 
@@ -228,7 +228,11 @@ class FeatureExtractor:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without engines, which hold workspaces of threads."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("_engines", "_banks")}
+        return {
+            name: value
+            for name, value in self.__dict__.items()
+            if name not in ("_engines", "_banks")
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)

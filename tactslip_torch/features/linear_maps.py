@@ -8,7 +8,6 @@ ptwt and torch.fft evaluated on an identity.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
@@ -30,8 +29,8 @@ RANK_TOLERANCE = 1e-12
 class Block:
     """The coordinates of one branch, or of a slow channel's bin, and what is made of them.
 
-    There are ``r`` of the branch less its mean, and one of its mean. Their length is that of the
-    branch, less its mean and in full.
+    There are ``r`` of the branch less its mean, of the same length as it, and then its sum: the sum
+    of whole numbers is exact.
 
     Args:
         into: from a bin to all coordinates, ``[n, r + 1]``.
@@ -62,12 +61,12 @@ class Block:
         """
         into = self.into if smooth is None else smooth.T @ self.into
         of_first = into.new_zeros(1, into.shape[1])
-        of_first[0, -1] = 0.0 if self.is_detail else math.sqrt(len(self.into))
+        of_first[0, -1] = 0.0 if self.is_detail else len(self.into)
         return torch.cat([into, of_first])
 
     @cached_property
     def energy_root(self) -> Tensor:
-        """From coordinates to numbers whose squares add up to the spectrum's energy, ``[r+1, r+1]``."""
+        """From coordinates to numbers whose squares add up to the energy of the spectrum."""
         triangle: Tensor = torch.linalg.qr(self.lines.T, mode="r").R
         return triangle.T
 
@@ -115,7 +114,6 @@ class LinearMaps:
         """Lines of a spectrum."""
         return len(self.frequency_hz)
 
-
     def block(self, branch: int) -> Block:
         """The coordinates of a branch by its index; of a slow channel's bin for -1."""
         return self._blocks[branch]
@@ -126,15 +124,14 @@ class LinearMaps:
         identity = torch.eye(num, dtype=torch.float64)
         blocks = {}
         for branch, dense in enumerate((identity, *self.dense), -1):
-            mean = dense.mean(0, keepdim=True)
+            centred = dense - dense.mean(0)
             if branch < 0:
-                into, out = dense - mean, identity
+                into, out = centred, identity
             else:
-                into, out = _low_rank(dense - mean, is_out_orthonormal=True)
-            root = math.sqrt(num)
-            lines = self.dense_lines @ torch.cat([out, out.new_full((num, 1), 1 / root)], dim=-1)
+                into, out = _low_rank(centred, is_out_orthonormal=True)
+            lines = self.dense_lines @ torch.cat([out, out.new_full((num, 1), 1 / num)], dim=-1)
             blocks[branch] = Block(
-                into=torch.cat([into, root * mean]).T.contiguous(),
+                into=torch.cat([into, dense.sum(0, keepdim=True)]).T.contiguous(),
                 out=None if branch < 0 else out.T.contiguous(),
                 lines=lines.T.contiguous(),
                 is_detail=branch >= 0 and not self.is_approximation[branch],

@@ -18,8 +18,8 @@ def root(square: Tensor) -> Tensor:
     """Square root, whose derivative at 0 is 0."""
     if not isinstance(square, Tensor):
         return square.sqrt()
-    is_positive = square.detach() > 0
-    return torch.where(is_positive, torch.where(is_positive, square, 1.0).sqrt(), 0.0)
+    is_zero = square.detach() <= 0  # not so for NaN
+    return torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
 
 
 def ascending(x: Tensor, num: int) -> Tensor:
@@ -41,6 +41,11 @@ def taken(x: Tensor, index: Tensor | None, axis: int) -> Tensor:
     if not isinstance(x, Tensor):
         return x.take(index.tolist(), axis)
     return x.index_select(axis, index.to(x.device))
+
+
+def looked_up(table: Tensor, index: Tensor) -> Tensor:
+    """Entries of a constant table ``[n]`` at places that were computed, in the shape of these."""
+    return table.to(index.device)[index] if isinstance(index, Tensor) else index.entries_of(table)
 
 
 def like(constant: Tensor, x: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -23,6 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from tactslip_torch.features.names import FeatureName
+from tactslip_torch.features.ops import ascending, like, root
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.runtime import is_plain
 
@@ -68,26 +69,9 @@ def signed_log(features: Tensor, knee: Tensor) -> Tensor:
     return torch.where(is_negative, -bent, bent)
 
 
-@dataclass(frozen=True)
-class Ops:
-    """What tensors and the values of an ONNX graph do not call alike.
-
-    Args:
-        one: the number 1, in the dtype of the values.
-        places: ``0 .. m-1``, ``[m]``, in that dtype.
-        where: chooses by a mask.
-        ascending: sorts along the last axis.
-    """
-
-    one: Any
-    places: Any
-    where: Callable[..., Any]
-    ascending: Callable[[Any], Any]
-
-
 def over_channels(
-    values: Any, in_use: Any, statistics: Sequence[str], num_channels: int, ops: Ops
-) -> list[Any]:
+    values: Tensor, in_use: Tensor, statistics: Sequence[str], num_channels: int
+) -> list[Tensor]:
     """Statistics over the last axis, of the entries in use; 0 where none is.
 
     Written in operations that tensors and the values of an ONNX graph share.
@@ -98,36 +82,34 @@ def over_channels(
         statistics: of ``STATISTICS``, or ranks, ``rank1`` being the smallest. With channels left
             out, ranks are spread evenly over those that remain.
         num_channels: length of the last axis.
-        ops: of the kind of value.
 
     Shape:
         - values: ``[*, R, m]``; in_use: ``[*, 1, m]``
         - output: one ``[*, R]`` for each statistic
     """
-    where, one = ops.where, ops.one
-    present = where(in_use, one, 0.0)
-    num = present.sum(-1, True)  # [*, 1, 1]
-    known = where(in_use, values, 0.0)
-    mean = known.sum(-1, True) / where(num > 0.0, num, one)
+    present = in_use.type_as(values)
+    num = present.sum(-1, keepdim=True)  # [*, 1, 1]
+    known = torch.where(in_use, values, 0.0)
+    mean = known.sum(-1, keepdim=True) / num.clamp(min=1.0)
     away = (known - mean) * present  # a channel that is not in use stands at the mean
+    places = like(torch.arange(num_channels).double(), values)
     ordered = None
     found = []
     for statistic in statistics:
         if statistic == "mean":
             found.append(mean.sum(-1))
         elif statistic == "std":
-            variance = (away * away).sum(-1) / where(num > 1.5, num - one, one).sum(-1)
-            is_none = variance <= 0.0  # at 0 the root has no derivative
-            found.append(where(is_none, 0.0, where(is_none, one, variance).sqrt()))
+            found.append(root((away * away).sum(-1) / (num - 1.0).clamp(min=1.0).sum(-1)))
         elif statistic == "min":
             found.append(away.amin(-1) + mean.sum(-1))
         elif statistic == "max":
             found.append(away.amax(-1) + mean.sum(-1))
         else:
             if ordered is None:  # those not in use come last
-                ordered = ops.ascending(where(in_use, values, known.amax(-1, True)))
-            position = (num - one) * _fraction(statistic, num_channels)
-            weight = (one - (ops.places - position).abs()).clip(0.0, 1.0)  # linear interpolation
+                ordered = torch.where(in_use, values, known.amax(-1, keepdim=True))
+                ordered = ascending(ordered, num_channels)
+            position = (num - 1.0) * _fraction(statistic, num_channels)
+            weight = (1.0 - (position - places).abs()).clamp(min=0.0)  # linear interpolation
             found.append((ordered * weight).sum(-1))
     return found
 
@@ -353,15 +335,9 @@ class ChannelPooling(nn.Module):
             values = features.index_select(-1, group.index.to(features.device))
             values = values.unflatten(-1, (-1, num_channels))
             knee = self.knee[list(group.families), None].to(features)
-            ops = Ops(
-                one=features.new_ones(()),
-                places=torch.arange(num_channels).to(features),
-                where=torch.where,
-                ascending=lambda x: x.sort(-1).values,
-            )
             in_rows = in_use[..., None, :]
             values = signed_log(values, knee)
-            parts += over_channels(values, in_rows, group.statistics, num_channels, ops)
+            parts += over_channels(values, in_rows, group.statistics, num_channels)
         order, kind_of = (self._index[n].to(features.device) for n in ("order", "kind_of"))
         columns = torch.cat(parts, dim=-1).index_select(-1, order)
         known = torch.stack([*is_some, torch.ones_like(is_some[0])], -1).index_select(-1, kind_of)

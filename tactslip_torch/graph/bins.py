@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from tactslip_torch.features.bank import TINY, Bank, Frame, Samples
 from tactslip_torch.features.linear_maps import LinearMaps
-from tactslip_torch.features.plan import Plan, Wanted
-from tactslip_torch.graph.descriptors import DESCRIPTORS
+from tactslip_torch.features.pool import LARGEST_SAMPLE
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.head import lost_features, machine, pooled, scaled, with_typical
 from tactslip_torch.graph.missing import expected_scores, widened_llr_of
-from tactslip_torch.graph.rows import EXACT, Front
 from tactslip_torch.graph.sequence import llr_of, probability_of
-from tactslip_torch.graph.shared import Shared
 from tactslip_torch.graph.value import BOOL, F64, I64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.calibration import Calibration
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.onset.settings import calibration_of
+from tactslip_torch.signals.filtering import overlap_matrix
 
 
 class Judged(NamedTuple):
@@ -64,18 +65,17 @@ def judge_bins(
         - windows: ``[B, channels, Window.length]``
 
     """
-    front = Front(graph, detector, windows, form)
-    features = selected_features(graph, detector, front, form)
-    is_dead = dead.take(front.window.channels, 0)
-    is_missing = front.is_missing | is_dead
+    features, is_missing, is_trusted = described(graph, detector, windows, form)
+    is_dead = dead.take(detector.extractor.plan.channels, 0)
+    is_missing = is_missing | is_dead
     z = scaled(graph, pooled(graph, features, is_missing, detector), detector.scaler)
     is_lost = lost_features(is_missing, detector)
     head, gaussians, variance = detector.head, detector.gaussians, None
     score = machine(graph, with_typical(graph, z, is_lost, detector), head, form)
     if gaussians is not None and isinstance(head, QuadraticForm):
         score, variance = expected_scores(graph, score, z, is_lost, head, gaussians)
-    is_finite = score.is_finite()
-    is_valid = _all(front.is_trusted & ~is_dead) & is_finite
+    is_finite = score.isfinite()
+    is_valid = _all(is_trusted & ~is_dead) & is_finite
     return Judged(score, is_valid, is_finite & ~_all(is_missing), variance)
 
 
@@ -122,64 +122,81 @@ def bin_graph(detector: SlipDetector, form: Form) -> Graph:
     return graph
 
 
-def selected_features(graph: Graph, detector: SlipDetector, front: Front, form: Form) -> Value:
-    """Selected features in their order, ``[B, K]``, float64."""
-    plan, axis_hz = detector.extractor.plan, LinearMaps.of(detector.pool).frequency_hz
-    pieces, column_of, width = list[Value](), dict[int, int](), 0
-    for wanted, exact in _batches(plan, form):
-        names = {w.descriptor for w in wanted}
-        rows = sorted({plan.rows[w.row] for w in wanted})
-        made = front.of(
-            rows,
-            exact=exact,
-            with_scale="mode" in names,
-            with_film="correlation" in names,
-        )
-        place = {row: index for index, row in enumerate(made.rows)}
-        places = {
-            name: sorted({place[plan.rows[w.row]] for w in wanted if w.descriptor == name})
-            for name in sorted(names)
-        }
-        axis = axis_hz if rows[0].kind == "freq" else axis_hz.new_zeros(front.window.bin)
-        shared = Shared(
-            graph,
-            made,
-            places,
-            dtype=form.dtype,
-            frequency_hz=axis,
-        )
-        for name in places:
-            part = DESCRIPTORS[name](shared)
-            for w in wanted:
-                if w.descriptor == name:
-                    column_of[w.place] = width + part.places.index(place[plan.rows[w.row]])
-            pieces.append(part.value)
-            width += len(part.places)
-    for channel in plan.share_channels:
-        branches = sorted({share.branch for share in plan.shares if share.channel == channel})
-        pieces.append(front.shares(channel, branches))
-        for share in plan.shares:
-            if share.channel == channel:
-                column_of[share.place] = width + branches.index(share.branch)
-        width += len(branches)
-    columns = [column_of[place] for place in range(plan.num_features)]
-    return graph.concat(*pieces, axis=1).take(columns, 1)
+class Described(NamedTuple):
+    """Features of ``B`` bins, and what can be said of their channels in use.
+
+    Attributes:
+        features: selected ones in their order, ``[B, K]``, float64.
+        is_missing: ``[B, channels]``, bool: a NaN or Inf is within the frame of the filter.
+        is_trusted: ``[B, channels]``, bool: neither missing nor dead (``FeaturePool.validity``).
+    """
+
+    features: Value
+    is_missing: Value
+    is_trusted: Value
 
 
-def _batches(plan: Plan, form: Form) -> list[tuple[list[Wanted], bool]]:
-    """Descriptors of rows that are made together, and whether in float64 whatever the form."""
-    batches = []
-    for is_freq in (False, True):
-        for exact in (False, True):
-            own = [
-                wanted
-                for wanted in plan.wanted
-                if (plan.rows[wanted.row].kind == "freq") == is_freq
-                and (wanted.descriptor in EXACT and form.dtype != F64) == exact
-            ]
-            if own:
-                batches.append((own, exact))
-    return batches
+def described(graph: Graph, detector: SlipDetector, windows: Value, form: Form) -> Described:
+    """Nodes that filter and describe raw bins; arguments as ``judge_bins`` has them."""
+    used = Window.of(detector).channels
+    films, lengths = set(detector.pool.hand.fast), detector.channel_filter.window_lengths
+    by_frame: dict[tuple[int, bool], list[int]] = {}
+    for channel in used:
+        by_frame.setdefault((lengths[channel], channel in films), []).append(channel)
+    frames = [
+        Frame(tuple(channels), is_film, _filter_matrix(detector, channels[0]))
+        for (_, is_film), channels in by_frame.items()
+    ]
+    read = [_samples(graph, detector, windows, frame, form) for frame in frames]
+    dtype = torch.float64 if form.dtype == F64 else torch.float32
+    bank = Bank(LinearMaps.of(detector.pool), detector.extractor.plan, frames, dtype)
+    order = [channel for frame in frames for channel in frame.channels]
+    places = [order.index(channel) for channel in used]
+    is_missing, is_trusted = (
+        graph.concat(*parts, axis=1).take(places, 1)
+        for parts in zip(*(flags for _, flags in read), strict=True)
+    )
+    features: Any = bank([samples for samples, _ in read])
+    return Described(features, is_missing, is_trusted)
+
+
+def _filter_matrix(detector: SlipDetector, channel: int) -> Tensor:
+    """A channel's filter from its window to the samples of the bin, ``[n, W]``, float64."""
+    kernel = detector.channel_filter.kernel(channel)
+    return overlap_matrix(kernel, detector.pool.bin_samples).T.contiguous()
+
+
+def _samples(
+    graph: Graph, detector: SlipDetector, windows: Value, frame: Frame, form: Form
+) -> tuple[Samples, tuple[Value, Value]]:
+    """What rows are made of; and which channels of the frame are missing, and can be trusted."""
+    window, smooth = Window.of(detector), frame.smooth
+    assert smooth is not None  # frames of raw samples have a filter
+    before, after = detector.channel_filter.reaches[frame.channels[0]]
+    x: Any = windows.take([window.channels.index(channel) for channel in frame.channels], 1)
+    start = window.before - before
+    x = x.slice(start, start + before + window.bin + after, 2)
+    first = x.slice(before, before + 1, 2)
+    moving, unit = x - first, None
+    if form.dtype == F64:  # whose squares float64 does not hold
+        unit = x.abs().amax(2, keepdim=True).maximum(TINY)
+        moving, first = moving / unit, first / unit
+        shifted = graph.concat(moving, first, axis=2)
+    else:
+        shifted = graph.concat(x.double() - first.double(), first.double(), axis=2)
+    moving = moving @ smooth.T
+    filtered = moving + first
+    high, low = filtered.amax(2), filtered.amin(2)
+    scale = high.maximum(-low)
+    probe = filtered[..., 0]  # NaN if anything in the window is no number
+    probe = scale + (probe - probe)
+    largest = min(LARGEST_SAMPLE, float(np.finfo(form.dtype).max))
+    is_known = (probe if unit is None else probe * unit.squeeze(2)) <= largest
+    of_dtype = torch.empty(0, dtype=torch.float64 if form.dtype == F64 else torch.float32)
+    inverse = detector.pool.inverse_span(of_dtype)[list(frame.channels)]
+    is_alive = (high - low) * graph.constant(inverse, form.dtype) > scale
+    samples = Samples(shifted, moving, scale.double(), None if unit is None else unit.squeeze(2))
+    return samples, (~is_known, is_alive & is_known)
 
 
 def _all(mask: Value) -> Value:

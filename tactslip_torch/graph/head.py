@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.pooling import Ops, over_channels
+from tactslip_torch.features.pooling import over_channels
 from tactslip_torch.graph.form import Form
-from tactslip_torch.graph.order import ascending
 from tactslip_torch.graph.value import BOOL, F32, F64, I64, Nodes, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
@@ -47,13 +46,8 @@ def pooled(graph: Graph, features: Value, is_missing: Value, detector: SlipDetec
         knee = layer.knee[list(group.families), None]
         size = (values.abs() * graph.constant(_of(1 / knee), F64) + 1.0).log()
         bent = size * graph.op("Sign", values) * graph.constant(_of(knee), F64)
-        ops = Ops(
-            one=graph.constant(1.0, F64),
-            places=graph.constant(np.arange(num), F64),
-            where=graph.where,
-            ascending=partial(ascending, num=num),
-        )
-        parts += over_channels(bent, in_use.expand(1), group.statistics, num, ops)
+        own: Any = over_channels(bent, in_use.unsqueeze(1), group.statistics, num)  # type: ignore
+        parts += own
     columns = graph.concat(*parts, axis=1).take(layer.order, 1)
     always = is_some[0] | ~is_some[0]
     known = graph.concat(*is_some, always, axis=1).cast(F32).take(layer.kind_of, 1) > 0.0
@@ -70,14 +64,14 @@ def scaled(graph: Graph, features: Value, scaler: FeatureScaler) -> Value:
     slope = torch.where(is_point, 0.0, 2 / width.masked_fill(is_point, 1.0))
     offset = torch.where(is_point, 0.0, -1 - slope * least)
     if bool(is_point.any()):  # 0 times Inf
-        features = features.clip(-_LARGEST, _LARGEST)
+        features = features.clamp(-_LARGEST, _LARGEST)
     if scaler.knee is not None:
         knee = scaler.knee.double()
         slope = slope * knee
         bent = (features.abs() * graph.constant(_of(1 / knee), F64) + 1.0).log()
         features = bent * graph.op("Sign", features)
     z = features * graph.constant(_of(slope), F64) + graph.constant(_of(offset), F64)
-    return z.clip(-1.0, 1.0)
+    return z.clamp(-1.0, 1.0)
 
 
 def lost_features(is_missing: Value, detector: SlipDetector) -> Value:
@@ -118,7 +112,7 @@ def machine(graph: Graph, z: Value, head: Head, form: Form) -> Value:
             pull = z @ _of(head.quadratic) + pull
         score = (pull * z).sum(1) + float(head.constant)
     largest = float(np.finfo(form.dtype).max)
-    return score.clip(-largest, largest).cast(form.dtype)
+    return score.clamp(-largest, largest).cast(form.dtype)
 
 
 def _kernel_sum(graph: Graph, z: Value, head: KernelSum) -> Value:
@@ -132,8 +126,8 @@ def _kernel_sum(graph: Graph, z: Value, head: KernelSum) -> Value:
             values = values * base
     else:
         norms = graph.constant(_of(support.square().sum(-1)), F64)
-        squares = (z * z).sum(1, keep=True) + norms - gram * 2.0
-        values = (squares.max(0.0) * -kernel.gamma).exp()
+        squares = (z * z).sum(1, keepdim=True) + norms - gram * 2.0
+        values = (squares.clamp(min=0.0) * -kernel.gamma).exp()
     return (values @ _of(head.beta[:, None])).squeeze(1)
 
 

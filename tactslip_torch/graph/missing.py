@@ -64,7 +64,7 @@ def expected_scores(
         step = _Bin(head, gaussians)
         _, (mean, variance) = body.scan(step, start, rows, shapes)
         largest = float(np.finfo(score.dtype).max)
-        return [mean.clip(-largest, largest).cast(score.dtype), variance]
+        return [mean.clamp(-largest, largest).cast(score.dtype), variance]
 
     def nothing(body: Graph) -> list[Value]:
         own = score.at(body)
@@ -116,18 +116,18 @@ class _Bin:
             body: Graph, state: Sequence[Value], rows: Sequence[Value]
         ) -> tuple[list[Value], list[Value]]:
             swept, log_det = state
-            unit = body.constant(count, I64).equals(rows[0]).cast(F64)  # [K]
+            unit = body.constant(count, I64).eq(rows[0]).cast(F64)  # [K]
             column = body.op("Gather", swept, rows[0], axis=2)  # [2, K]
-            pivot = (column * unit).sum(1, keep=True)
+            pivot = (column * unit).sum(1, keepdim=True)
             away = column - unit
-            corner = unit.expand(1) * unit.expand(0) * 2.0
-            after = swept - (away / pivot).expand(2) * away.expand(1) - corner
+            corner = unit.unsqueeze(1) * unit.unsqueeze(0) * 2.0
+            after = swept - (away / pivot).unsqueeze(2) * away.unsqueeze(1) - corner
             return [after, log_det + pivot.log().squeeze(1)], []
 
         shapes = [(2, len(count), len(count)), (2,), ()]
         start = [matrix(graph, precision.matrix), matrix(graph, -precision.log_det)]
         (swept, log_det), _ = graph.scan(step, start, [places], shapes)
-        bend = matrix(graph, self._head.dense_quadratic) * is_lost.expand(1) * is_lost
+        bend = matrix(graph, self._head.dense_quadratic) * is_lost.unsqueeze(1) * is_lost
         bent = bend @ swept
         spread = (bent * bent.transpose(0, 2, 1)).sum(2).sum(1) * 2.0
         return _Mask(is_lost, swept, log_det, -(bend * swept).sum(2).sum(1), spread)
@@ -139,13 +139,13 @@ class _Bin:
         middle = matrix(graph, self._gaussians.mean)
         quadratic, linear = matrix(graph, head.dense_quadratic), matrix(graph, head.linear)
         away = (z - middle) * is_seen  # [2, K]
-        turned = (mask.swept @ away.expand(2)).squeeze(2)
+        turned = (mask.swept @ away.unsqueeze(2)).squeeze(2)
         filled = z * is_seen + (middle - turned) * mask.is_lost
         evidence = ((turned * away).sum(1) + mask.log_det) * -0.5
         pull = filled @ quadratic
         mean = ((pull + linear) * filled).sum(1) + float(head.constant) + mask.lift
         slope = (pull * 2.0 + linear) * mask.is_lost
-        variance = mask.spread - ((mask.swept @ slope.expand(2)).squeeze(2) * slope).sum(1)
+        variance = mask.spread - ((mask.swept @ slope.unsqueeze(2)).squeeze(2) * slope).sum(1)
         weight = graph.op("Softmax", evidence, axis=0)
         total = (weight * mean).sum(0)
         apart = mean - total

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tactslip_torch.graph.value import F64, I64, Value
+from tactslip_torch.graph.value import END, F64, I64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.calibration import (
     LARGEST_LLR,
@@ -26,9 +26,6 @@ from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN, Rule
 
 LATCH_START = (0.0, 0.0, 2.0**52)
 """Armed, with no alarm before; the last number counts on exactly in float64."""
-
-END = int(np.iinfo(np.int64).max)
-"""Of an axis, in a slice."""
 
 Walk = tuple[Value, Value]
 """What is made of ``k`` decisions, ``[k]``, and what is remembered of them, float64."""
@@ -46,8 +43,8 @@ def llr_of(score: Value, calibration: Calibration) -> Value:
     wide = score.cast(F64)
     match calibration:
         case Platt(slope, offset):
-            line = wide.clip(-LARGEST_SCORE, LARGEST_SCORE) * slope + offset
-            return line.clip(-LARGEST_LLR, LARGEST_LLR).cast(score.dtype)
+            line = wide.clamp(-LARGEST_SCORE, LARGEST_SCORE) * slope + offset
+            return line.clamp(-LARGEST_LLR, LARGEST_LLR).cast(score.dtype)
         case Isotonic(scores, llrs):
             return _between_knots(wide, scores, llrs).cast(score.dtype)
     raise ValueError(f"expected a calibration Platt or Isotonic, got {calibration!r}")
@@ -144,7 +141,7 @@ def latched(
         - level: ``[1]``
         - memory: ``[3]``
     """
-    is_awake = (statistic.amax(0, keep=True) >= level) | (memory.slice(0, 1, 0) > 0.0)
+    is_awake = (statistic.amax(0, keepdim=True) >= level) | (memory.slice(0, 1, 0) > 0.0)
 
     def watch(body: Graph) -> Latched:
         given = (x.at(body) for x in (statistic, level, number, memory))
@@ -178,13 +175,13 @@ def _watched(
     last = before - since
     high = latest(statistic >= level, before - below, number)  # the last one that was not low
     rearmed = latest(number - high >= float(max(rearm, 1)), last - on, number)
-    allowed = rearmed.min(number - float(refractory))
+    allowed = rearmed.minimum(number - float(refractory))
     allowed = graph.where(statistic >= level, allowed, -math.inf)
     (end,), (alarms,) = graph.scan(_raise, [last.squeeze(0)], [allowed, number])
     is_on = alarms > rearmed
     now = _last(number)
     after = _last(is_on).cast(F64), now - _last(high), now - end
-    return Latched(alarms.equals(number), is_on, graph.concat(*after, axis=0))
+    return Latched(alarms.eq(number), is_on, graph.concat(*after, axis=0))
 
 
 def _raise(body: Graph, state: Sequence[Value], rows: Sequence[Value]) -> Steps:
@@ -198,7 +195,7 @@ def _k_th_largest(rule: KOfN, llr: Value, memory: Value) -> Walk:
         return llr, memory
     graph = llr.graph
     known = graph.concat(memory.cast(llr.dtype), llr, axis=0)  # [n - 1 + k]
-    places = count_up(llr.length(0)).expand(1) + graph.axes(*range(rule.n))
+    places = count_up(llr.length(0)).unsqueeze(1) + graph.axes(*range(rule.n))
     window = graph.op("Gather", known, places, axis=0)  # [k, n]
     largest, _ = graph.ops("TopK", window, graph.axes(rule.k), dtypes=(llr.dtype, I64))
     kept = known.slice(1 - rule.n, END, 0).cast(F64)
@@ -212,24 +209,24 @@ def _sum(graph: Graph, rule: Cusum, llr: Value, memory: Value) -> Walk:
 
     def add(body: Graph, state: Sequence[Value], rows: Sequence[Value]) -> Steps:
         total = state[0] + rows[0]
-        return [total.clip(0.0, rule.ceiling)], [total]
+        return [total.clamp(0.0, rule.ceiling)], [total]
 
     def walk(body: Graph) -> list[Value]:
         return body.scan(add, [start.at(body).squeeze(0)], [step.at(body)])[1]
 
     # Where every step takes away at least what is there, the sum is 0 without a walk.
-    is_quiet = start + step.amax(0, keep=True) <= 0.0
-    total = graph.if_(is_quiet, lambda body: [step.at(body)], walk)[0].clip(0.0, rule.ceiling)
+    is_quiet = start + step.amax(0, keepdim=True) <= 0.0
+    total = graph.if_(is_quiet, lambda body: [step.at(body)], walk)[0].clamp(0.0, rule.ceiling)
     return total, _last(total).cast(F64)
 
 
 def _between_knots(score: Value, scores: Sequence[float], llrs: Sequence[float]) -> Value:
     graph, num = score.graph, len(scores)
-    inside = score.clip(scores[0], scores[-1])
+    inside = score.clamp(scores[0], scores[-1])
     if num == 1:
         return inside * 0.0 + llrs[0]
-    is_right = inside.expand(-1) > graph.constant(scores, F64)  # [k, knots]
-    place = (is_right.cast(I64).sum(-1) - 1).clip(0, num - 2)  # of the knot to the left
+    is_right = inside.unsqueeze(-1) > graph.constant(scores, F64)  # [k, knots]
+    place = (is_right.cast(I64).sum(-1) - 1).clamp(0, num - 2)  # of the knot to the left
     tables = scores[:-1], np.diff(scores), llrs[:-1], llrs[1:]
     x, width, left, right = (
         graph.op("Gather", graph.constant(table, F64), place, axis=0) for table in tables

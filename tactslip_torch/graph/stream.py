@@ -13,7 +13,6 @@ from torch import Tensor
 from tactslip_torch.graph.bins import Judged, dead_input, judge_bins
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.sequence import (
-    END,
     LATCH_START,
     count_up,
     latched,
@@ -22,7 +21,7 @@ from tactslip_torch.graph.sequence import (
     rule_start,
     statistic_of,
 )
-from tactslip_torch.graph.value import BOOL, F64, I64, Value
+from tactslip_torch.graph.value import BOOL, END, F64, I64, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.rules import NEUTRAL
@@ -104,7 +103,7 @@ def stream_graph(
     start = graph.constant([0, 0, 0, *LATCH_START, *rule_start(settings.rule)], F64)
     state = graph.concat(state, start, axis=0).slice(0, timing.state_size, 0)
     seen = state.slice(0, 1, 0) + samples.length(0).cast(F64)
-    decided = ((seen + float(timing.hop - timing.first)) / float(timing.hop)).floor().max(0.0)
+    decided = ((seen + float(timing.hop - timing.first)) / float(timing.hop)).floor().clamp(min=0.0)
     if timing.frame > timing.first:
         decided = graph.where(seen >= float(timing.frame), decided, 0.0)
     deciding = _Deciding(detector, settings, form, judge, timing, dead)
@@ -211,7 +210,7 @@ class _Deciding:
                 lambda body: [self._with_past(whole.at(body), of_stream.at(body))],
                 lambda body: [whole.at(body)],
             )[0]
-        index = (places * timing.hop).expand(1) + graph.axes(*range(window.length))
+        index = (places * timing.hop).unsqueeze(1) + graph.axes(*range(window.length))
         windows = graph.op("Gather", x, index, axis=0).transpose(0, 2, 1)
         if len(columns) == len(window.channels):
             return windows
@@ -259,9 +258,9 @@ class _Deciding:
         timing, rate = self.timing, self.detector.pool.sample_rate_hz
         samples = number * float(timing.hop) + float(timing.first)
         time_s = samples / rate
-        began_s = (run.min(number) * float(timing.hop) + float(timing.first)) / rate
-        onset_s = (began_s - self.settings.lead_s).min(time_s)
+        began_s = (run.minimum(number) * float(timing.hop) + float(timing.first)) / rate
+        onset_s = (began_s - self.settings.lead_s).minimum(time_s)
         if timing.frame <= timing.first:
             return time_s, onset_s
-        waited_s = samples.max(float(timing.frame)) / rate
+        waited_s = samples.maximum(float(timing.frame)) / rate
         return waited_s, waited_s - (time_s - onset_s)

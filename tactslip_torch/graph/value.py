@@ -1,22 +1,27 @@
 """Values of an ONNX graph, and ordinary arithmetic on them.
 
-A ``Value`` is the output of a node; operators and methods on it add nodes to its graph. Numbers
-take the dtype of the value they meet, so nothing is widened or narrowed unasked.
+A ``Value`` is the output of a node; operators and methods on it add nodes to its graph. They have
+the names and the meaning that they have on a ``torch.Tensor``, and torch's own functions take
+values too (``torch.where``), so ``features.descriptors`` and ``features.bank`` write graphs.
+Numbers and tensors are constants, of the dtype of the value they meet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import onnx
+import torch
 from numpy.typing import ArrayLike, NDArray
 from onnx import helper, numpy_helper
 
 F32, F64, I64, BOOL = (np.dtype(name) for name in ("float32", "float64", "int64", "bool"))
 TINY = 1e-300
 """Instead of 0, where a quotient of 0 is to be 0."""
+END = int(np.iinfo(np.int64).max)
+"""Of an axis, in a slice."""
 _FEW = 64  # as many ones and zeros are not worth a node
 
 
@@ -41,6 +46,9 @@ class Nodes:
         """
         array = np.ascontiguousarray(np.asarray(value, dtype)).reshape(np.shape(value))
         key = (array.dtype.name, array.shape, array.tobytes())
+        wide = np.ascontiguousarray(np.asarray(value, F64)).tobytes() if dtype == F32 else b""
+        if (kept := self._constants.get((F64.name, array.shape, wide))) and array.size > _FEW:
+            return self._constants.setdefault(key, kept.cast(dtype))  # one copy in the file
         if key not in self._constants:
             name = self._name("c")
             bits = array.astype(BOOL)
@@ -170,21 +178,25 @@ class Value:
     def __ge__(self, other: Value | float) -> Value:
         return self._with("GreaterOrEqual", other, BOOL)
 
-    def equals(self, other: Value | float) -> Value:
+    def eq(self, other: Value | float) -> Value:
         """Where both are the same, bool."""
         return self._with("Equal", other, BOOL)
 
-    def min(self, other: Value | float) -> Value:
+    def minimum(self, other: Value | float) -> Value:
         """The smaller of two."""
         return self._with("Min", other)
 
-    def max(self, other: Value | float) -> Value:
+    def maximum(self, other: Value | float) -> Value:
         """The larger of two."""
         return self._with("Max", other)
 
-    def clip(self, low: float, high: float) -> Value:
+    def clamp(self, min: float | None = None, max: float | None = None) -> Value:
         """Within bounds."""
-        return self.graph.op("Clip", self, self._operand(low), self._operand(high))
+        if max is None:
+            assert min is not None
+            return self.maximum(min)
+        low = None if min is None else self._operand(min)
+        return self.graph.op("Clip", self, low, self._operand(max))
 
     def abs(self) -> Value:
         """Magnitudes."""
@@ -210,21 +222,21 @@ class Value:
         """Logistic function."""
         return self.graph.op("Sigmoid", self)
 
-    def sum(self, axis: int = -1, keep: bool = False) -> Value:
+    def sum(self, axis: int = -1, keepdim: bool = False) -> Value:
         """Sums along an axis."""
-        return self._reduced("ReduceSum", axis, keep)
+        return self._reduced("ReduceSum", axis, keepdim)
 
-    def mean(self, axis: int = -1, keep: bool = False) -> Value:
+    def mean(self, axis: int = -1, keepdim: bool = False) -> Value:
         """Means along an axis."""
-        return self._reduced("ReduceMean", axis, keep)
+        return self._reduced("ReduceMean", axis, keepdim)
 
-    def amax(self, axis: int = -1, keep: bool = False) -> Value:
+    def amax(self, axis: int = -1, keepdim: bool = False) -> Value:
         """Largest along an axis; in onnxruntime a NaN may be passed over."""
-        return self._reduced("ReduceMax", axis, keep)
+        return self._reduced("ReduceMax", axis, keepdim)
 
-    def amin(self, axis: int = -1, keep: bool = False) -> Value:
+    def amin(self, axis: int = -1, keepdim: bool = False) -> Value:
         """Smallest along an axis; in onnxruntime a NaN may be passed over."""
-        return self._reduced("ReduceMin", axis, keep)
+        return self._reduced("ReduceMin", axis, keepdim)
 
     def cast(self, dtype: np.dtype[Any]) -> Value:
         """In another dtype; itself if it has it."""
@@ -232,6 +244,84 @@ class Value:
             return self
         to = helper.np_dtype_to_tensor_dtype(dtype)
         return self.graph.op("Cast", self, dtype=dtype, to=to)
+
+    def double(self) -> Value:
+        """In float64."""
+        return self.cast(F64)
+
+    def long(self) -> Value:
+        """In int64."""
+        return self.cast(I64)
+
+    def to(self, dtype: torch.dtype) -> Value:
+        """In another dtype, by torch's name."""
+        return self.cast(np.dtype(str(dtype).removeprefix("torch.")))
+
+    def type_as(self, other: Value) -> Value:
+        """In the dtype of another."""
+        return self.cast(other.dtype)
+
+    def detach(self) -> Value:
+        """Itself: a graph has no gradients."""
+        return self
+
+    def __getitem__(self, place: tuple[Any, slice | int | None]) -> Value:
+        """Of the last axis (``x[..., place]``) a slice or an entry; or one more, of length 1."""
+        _, key = place
+        if key is None:
+            return self.unsqueeze(-1)
+        if isinstance(key, int):
+            return self.slice(key, END if key == -1 else key + 1, -1).squeeze(-1)
+        return self.slice(key.start or 0, END if key.stop is None else key.stop, -1)
+
+    def flatten(self, start: int) -> Value:
+        """Of three axes the last two as one."""
+        if start != -2:
+            raise TypeError(f"values are flattened from axis -2 on, got {start}")
+        return self.reshape(0, -1)
+
+    def cumsum(self, axis: int) -> Value:
+        """Sums of all entries up to each."""
+        return self.graph.op("CumSum", self, self.graph.constant(axis, I64))
+
+    def argmax(self, axis: int, keepdim: bool = False) -> Value:
+        """Place of the first of the largest."""
+        return self.graph.op("ArgMax", self, dtype=I64, axis=axis, keepdims=int(keepdim))
+
+    def gather(self, axis: int, index: Value) -> Value:
+        """Entries along an axis, at places that were computed."""
+        return self.graph.op("GatherElements", self, index, axis=axis)
+
+    def scatter_add(self, axis: int, index: Value, values: Value) -> Value:
+        """With values added to the entries at these places."""
+        return self.graph.op("ScatterElements", self, index, values, axis=axis, reduction="add")
+
+    def ascending(self, num: int) -> Value:
+        """Sorted along the last axis, which has ``num`` entries."""
+        return self.graph.ops("TopK", self, self.graph.axes(num), dtypes=(None, I64), largest=0)[0]
+
+    def entries_of(self, table: torch.Tensor) -> Value:
+        """Of a constant table of float64, at the places that are these values."""
+        return self.graph.op("Gather", self.graph.constant(table, F64), self)
+
+    def filled(self, number: int) -> Value:
+        """That number in the shape and dtype of these values."""
+        like = numpy_helper.from_array(np.array([number], self.dtype))
+        shape = self.graph.op("Shape", self, dtype=I64)
+        return self.graph.op("ConstantOfShape", shape, dtype=self.dtype, value=like)
+
+    @classmethod
+    def __torch_function__(
+        cls,
+        function: Callable[..., Any],
+        types: Sequence[type],
+        args: Sequence[Any] = (),
+        kwargs: Mapping[str, Any] | None = None,
+    ) -> Any:
+        """What torch's own functions do with values."""
+        if function not in _FUNCTIONS:
+            raise TypeError(f"{function.__name__} of torch is not known to values of a graph")
+        return _FUNCTIONS[function](*args, **(kwargs or {}))
 
     def take(self, places: Sequence[int], axis: int) -> Value:
         """Entries at constant places along an axis, in that order; a slice where that will do."""
@@ -245,7 +335,7 @@ class Value:
         ends = (self.graph.axes(x) if isinstance(x, int) else x for x in (start, stop))
         return self.graph.op("Slice", self, *ends, self.graph.axes(axis))
 
-    def expand(self, axis: int) -> Value:
+    def unsqueeze(self, axis: int) -> Value:
         """With another axis of length 1."""
         return self.graph.op("Unsqueeze", self, self.graph.axes(axis))
 
@@ -265,9 +355,9 @@ class Value:
         """Length of an axis, ``[1]``, int64."""
         return self.graph.op("Shape", self, dtype=I64, start=axis, end=axis + 1)
 
-    def is_finite(self) -> Value:
+    def isfinite(self) -> Value:
         """Neither NaN nor Inf, bool: a difference with itself is 0."""
-        return (self - self).equals(0.0)
+        return (self - self).eq(0.0)
 
     def _operand(self, other: Value | ArrayLike) -> Value:
         if not isinstance(other, Value):
@@ -281,10 +371,29 @@ class Value:
     ) -> Value:
         return self.graph.op(kind, self, self._operand(other), dtype=dtype)
 
-    def _reduced(self, kind: str, axis: int, keep: bool) -> Value:
-        return self.graph.op(kind, self, self.graph.axes(axis), keepdims=int(keep))
+    def _reduced(self, kind: str, axis: int, keepdim: bool) -> Value:
+        return self.graph.op(kind, self, self.graph.axes(axis), keepdims=int(keepdim))
 
 
 def _is_taken_for_one(number: Value | float) -> bool:
     """Whether onnxruntime, which looks at it in float32, would drop a factor of it as 1."""
-    return not isinstance(number, Value) and number != 1 and np.float32(number) == 1
+    return isinstance(number, int | float) and number != 1 and np.float32(number) == 1
+
+
+def _where(mask: Value, yes: Value | float, no: Value | float) -> Value:
+    return mask.graph.where(mask, yes, no)
+
+
+def _cat(values: Sequence[Value], dim: int) -> Value:
+    return values[0].graph.concat(*values, axis=dim)
+
+
+_FUNCTIONS: dict[Callable[..., Any], Callable[..., Value]] = {
+    torch.where: _where,
+    torch.cat: _cat,
+    torch.minimum: Value.minimum,
+    torch.maximum: Value.maximum,
+    torch.zeros_like: lambda x: x.filled(0),
+    torch.ones_like: lambda x: x.filled(1),
+}
+"""Functions of torch that take values, and what they do."""
