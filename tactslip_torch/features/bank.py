@@ -22,11 +22,16 @@ from torch import Tensor
 
 from tactslip_torch.features.descriptors import DESCRIPTORS, ORDERED, Rows, band_energy_ratios
 from tactslip_torch.features.linear_maps import LinearMaps
-from tactslip_torch.features.ops import bounded_gradient, like, root, taken
-from tactslip_torch.features.plan import Plan, Row
+from tactslip_torch.features.ops import (
+    TINY,
+    bounded_gradient,
+    like,
+    power_of_two_below,
+    root,
+    taken,
+)
+from tactslip_torch.features.plan import Plan, Row, RowKind
 
-TINY = 1e-300
-"""Instead of 0 in a divisor, where a quotient of 0 is to be 0."""
 _LEAST_LENGTH = 16 * torch.finfo(torch.float64).eps / 0.35
 """Of a row less its mean, as a part of its bin's magnitude; below it is rounding. A span of 16 eps:
 that of 100 centred values of length 1 lies between .2 (two levels) and 1.41."""
@@ -90,13 +95,8 @@ class Bank:
         wanted: dict[Row, set[str]] = {row: set() for row in plan.rows}
         for each in plan.wanted:
             wanted[plan.rows[each.row]].add(each.descriptor)
-        self._families = [
-            _Family(maps, wanted, [i for i, frame in enumerate(frames) if frame.is_film == is_film])
-            for is_film in (False, True)
-        ]
-        for family in self._families:
-            family.lay_out(frames)
-        self._families = [family for family in self._families if family.blocks]
+        families = (_Family(maps, wanted, frames, is_film) for is_film in (False, True))
+        self._families = [family for family in families if family.blocks]
         self._forms: list[_Form] = []
         for is_freq in (False, True):
             own = {row: names for row, names in wanted.items() if (row.kind == "freq") == is_freq}
@@ -153,7 +153,7 @@ class Bank:
         magnitude = bins.detach().abs().amax(-1)
         is_broken = ~magnitude.isfinite()
         magnitude = torch.where(is_broken, 0.0, magnitude)
-        unit = magnitude.clamp(min=TINY).log2().floor().exp2()
+        unit = power_of_two_below(magnitude)
         x = torch.where(is_broken[..., None], 0.0, bins) / unit[..., None]
         scale = magnitude / unit
         samples = []
@@ -182,29 +182,26 @@ class _Family:
     one block followed by its sum; ``c`` channels, ``K`` coordinates in ``b`` blocks.
     """
 
-    def __init__(self, maps: LinearMaps, wanted: Iterable[Row], frames: Sequence[int]) -> None:
-        self.frames = frames
-        self._maps = maps
-        self._rows = tuple(wanted)
-
-    def lay_out(self, frames: Sequence[Frame]) -> None:
+    def __init__(
+        self, maps: LinearMaps, wanted: Iterable[Row], frames: Sequence[Frame], is_film: bool
+    ) -> None:
+        self.num = maps.num_samples
+        self.frames = [i for i, frame in enumerate(frames) if frame.is_film == is_film]
         own = [frames[i] for i in self.frames]
         self.channels = tuple(channel for frame in own for channel in frame.channels)
-        self.blocks = sorted({row.branch for row in self._rows if row.channel in self.channels})
-        if not self.blocks:
+        self.blocks = sorted({row.branch for row in wanted if row.channel in self.channels})
+        blocks = [maps.block(branch) for branch in self.blocks]
+        if not blocks:
             return
-        blocks = [self._maps.block(branch) for branch in self.blocks]
         self.into = [torch.cat([each.of_window(f.smooth) for each in blocks], -1) for f in own]
         widths = [each.rank + 1 for each in blocks]
         self.ends = list(itertools.accumulate(widths))
         self.starts = [0, *self.ends[:-1]]
-        identity = torch.eye(len(blocks), dtype=torch.float64)
-        self.of_block = identity.repeat_interleave(torch.tensor(widths), dim=0)  # [K, b]
+        self.of_block = _ones_of(widths)  # [K, b]
         self.sums = torch.tensor(self.ends) - 1
         self.without_sum = self.of_block.index_fill(0, self.sums, 0.0)
-        self.with_mean = (
-            self.without_sum + (self.of_block - self.without_sum) / self._maps.num_samples
-        )
+        of_sum = self.of_block - self.without_sum
+        self.with_mean = self.without_sum + of_sum / self.num
         self.stays = torch.tensor([float(not each.is_detail) for each in blocks]).double()
 
 
@@ -255,8 +252,7 @@ class _Coordinates:
 
     def mean(self) -> Tensor:
         """Mean of the samples of each block, in its length, ``[*, c, b]``."""
-        family, num = self.family, self.family._maps.num_samples
-        mean = taken(self._x, family.sums, -1) / num
+        mean = taken(self._x, self.family.sums, -1) / self.family.num
         return mean / self._lengths[False] * self._mean_kept()
 
     def films(self, dtype: torch.dtype) -> Tensor:
@@ -289,11 +285,11 @@ class _Form:
         self._pieces: list[tuple[int, slice, Tensor | None, Tensor | None]] = []
         rows, cells, owners = list[Row](), list[int](), list[int]()
         num_cells = num_owners = 0
-        self._families = []
+        self._families: list[int] = []
         for number, family in enumerate(families):
             num_blocks = len(family.blocks)
             for place, branch in enumerate(family.blocks):
-                kind = "freq" if is_freq else "gauge" if branch < 0 else "time"
+                kind: RowKind = "freq" if is_freq else "gauge" if branch < 0 else "time"
                 own = [Row(kind, channel, branch) for channel in family.channels]
                 chosen = [i for i, row in enumerate(own) if row in wanted]
                 if not chosen:
@@ -323,7 +319,8 @@ class _Form:
         for name in (n for n in ORDERED if n in names):
             self._ordered.append((name, self._chosen(name, [rows[i] for i in ordered], wanted)))
         of_film = families[-1].channels
-        self._film = [of_film.index(row.channel) for row in rows if "correlation" in wanted[row]]
+        correlated = [row.channel for row in rows if "correlation" in wanted[row]]
+        self._film = torch.tensor([of_film.index(channel) for channel in correlated])
 
     def _chosen(
         self, name: str, rows: Sequence[Row], wanted: Mapping[Row, set[str]]
@@ -339,8 +336,7 @@ class _Form:
         for name, index in self._plain:
             own = rows.take(index)
             if name == "correlation":
-                film = taken(families[-1].films(self._dtype), torch.tensor(self._film), -2)
-                own = replace(own, film=film)
+                own = replace(own, film=taken(families[-1].films(self._dtype), self._film, -2))
             made.append(DESCRIPTORS[name](own))
         if self._ordered:
             ordered = rows.take(self._steps).ordered()
@@ -400,9 +396,7 @@ class _Ratios:
         blocks = [maps.block(branch) for branch in branches]
         self._index = _index(own, len(frame.channels))
         self._into = torch.cat([b.of_window(frame.smooth) @ b.energy_root for b in blocks], dim=-1)
-        widths = torch.tensor([each.rank + 1 for each in blocks])
-        identity = torch.eye(len(blocks), dtype=torch.float64)
-        self._of_branch = identity.repeat_interleave(widths, dim=0)
+        self._of_branch = _ones_of([each.rank + 1 for each in blocks])
 
     def __call__(self, samples: Samples, dtype: torch.dtype) -> Tensor:
         """``[*, films of the frame * branches]``, float64."""
@@ -415,3 +409,9 @@ class _Ratios:
 def _index(chosen: Sequence[int], num: int) -> Tensor | None:
     """Places to be taken of ``num``; None if that is all of them in order."""
     return None if list(chosen) == list(range(num)) else torch.tensor(chosen)
+
+
+def _ones_of(widths: Sequence[int]) -> Tensor:
+    """Which entry is of which block, 1 or 0, ``[sum of widths, blocks]``, float64."""
+    blocks = torch.eye(len(widths), dtype=torch.float64)
+    return blocks.repeat_interleave(torch.tensor(widths), dim=0)

@@ -68,12 +68,15 @@ class Rows:
         """Some of the rows, by their places; all of them for ``None``."""
         if index is None:
             return self
-        one = {name: taken(getattr(self, name), index, -1) for name in ("mean", "unit", "scale")}
-        whole = {
-            name: None if (x := getattr(self, name)) is None else taken(x, index, -2)
-            for name in ("values", "film", "amplitude")
-        }
-        return replace(self, **one, **whole)
+        return replace(
+            self,
+            values=taken(self.values, index, -2),
+            mean=taken(self.mean, index, -1),
+            unit=taken(self.unit, index, -1),
+            scale=taken(self.scale, index, -1),
+            film=None if self.film is None else taken(self.film, index, -2),
+            amplitude=None if self.amplitude is None else taken(self.amplitude, index, -2),
+        )
 
     def ordered(self) -> Rows:
         """The same rows, values in ascending order."""

@@ -11,7 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.runtime import is_plain, is_recorded
+from tactslip_torch.runtime import has_values, is_plain, is_recorded
+
+TINY = 1e-300
+"""Instead of 0 in a divisor, where a quotient of 0 is to be 0."""
 
 
 def root(square: Tensor) -> Tensor:
@@ -51,6 +54,20 @@ def looked_up(table: Tensor, index: Tensor) -> Tensor:
 def like(constant: Tensor, x: Tensor) -> Tensor:
     """A constant with the dtype and the device of what it meets; a value of a graph asks itself."""
     return constant.to(x) if isinstance(x, Tensor) else constant
+
+
+def power_of_two_below(magnitude: Tensor) -> Tensor:
+    """The largest power of two that is no larger, by which to divide rounds nothing; no gradient.
+
+    Of magnitudes below 1e-300, 0 among them, that of 1e-300 (the dtype's smallest normal number).
+    """
+    tiny = max(TINY, torch.finfo(magnitude.dtype).tiny)
+    return magnitude.detach().clamp(min=tiny).log2().floor().exp2()
+
+
+def is_nowhere(mask: Tensor) -> bool:
+    """Whether a mask is known to hold nowhere, so that what depends on it can be passed over."""
+    return mask.device.type == "cpu" and has_values(mask) and not bool(mask.any())
 
 
 def bounded_gradient(x: Tensor) -> Tensor:

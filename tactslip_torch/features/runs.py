@@ -1,4 +1,4 @@
-"""Runs of values that count as one among sorted values: what mode and entropy are made of."""
+"""What entropy is made of, for the fast engines."""
 
 from __future__ import annotations
 
@@ -8,30 +8,8 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 EPS64 = torch.finfo(torch.float64).eps
-
-
-def rank_in_run(is_boundary: Tensor) -> Tensor:
-    """Position of each sorted value within its run, from 0.
-
-    The running maximum of where runs start, by doubling: log2(n) plain maxima of windows, which
-    export to ONNX as ``cummax`` does not.
-
-    Shape:
-        - is_boundary: ``[*, n - 1]``, bool: a new run starts behind this value
-        - output: ``[*, n]``, int32
-    """
-    num = is_boundary.shape[-1] + 1
-    position = torch.arange(num, dtype=torch.int32, device=is_boundary.device)
-    start = pad(torch.where(is_boundary, position[1:], 0), (num, 0))  # the window before the first
-    left, width = num - 1, 1
-    while left:
-        step = min(width, left)
-        start = torch.maximum(start[..., step:], start[..., :-step])
-        left, width = left - step, 2 * width
-    return position - start
 
 
 def entropy_growth(num: int) -> Tensor:

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.bank import TINY, Bank, Frame, Samples
+from tactslip_torch.features.bank import Bank, Frame, Samples
 from tactslip_torch.features.linear_maps import LinearMaps
+from tactslip_torch.features.ops import TINY
 from tactslip_torch.features.pool import LARGEST_SAMPLE
 from tactslip_torch.graph.form import Form, Window
 from tactslip_torch.graph.head import lost_features, machine, pooled, scaled, with_typical
@@ -195,8 +196,8 @@ def _samples(
     of_dtype = torch.empty(0, dtype=torch.float64 if form.dtype == F64 else torch.float32)
     inverse = detector.pool.inverse_span(of_dtype)[list(frame.channels)]
     is_alive = (high - low) * graph.constant(inverse, form.dtype) > scale
-    samples = Samples(shifted, moving, scale.double(), None if unit is None else unit.squeeze(2))
-    return samples, (~is_known, is_alive & is_known)
+    values: tuple[Any, ...] = shifted, moving, scale.double(), unit and unit.squeeze(2)
+    return Samples(*values), (~is_known, is_alive & is_known)
 
 
 def _all(mask: Value) -> Value:

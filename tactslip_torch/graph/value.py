@@ -18,8 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from onnx import helper, numpy_helper
 
 F32, F64, I64, BOOL = (np.dtype(name) for name in ("float32", "float64", "int64", "bool"))
-TINY = 1e-300
-"""Instead of 0, where a quotient of 0 is to be 0."""
 END = int(np.iinfo(np.int64).max)
 """Of an axis, in a slice."""
 _FEW = 64  # as many ones and zeros are not worth a node

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from tactslip_torch.features.extractor import EngineName, FeatureExtractor, resolved
-from tactslip_torch.features.guards import is_nowhere
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import saturating
+from tactslip_torch.features.ops import is_nowhere, saturating
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.model.agreement import check_parts

@@ -17,7 +17,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.guards import are_ordinary, is_nowhere, stretch
+from tactslip_torch.features.ops import is_nowhere, power_of_two_below
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -193,13 +193,10 @@ def _log_of_largest(
     def of_chunk(chunk: Tensor) -> Tensor:
         x = _taken(chunk, places)
         magnitude = torch.maximum(x.amax(-1), -x.amin(-1)).detach()
-        if are_ordinary(magnitude):
-            largest = amplitude(x - x[..., :1].detach())  # exact on a large constant
-        else:
-            factor = stretch(magnitude)
-            x = x * factor[..., None]
-            largest = amplitude(x - x[..., :1].detach()) / factor
-            largest = torch.where(magnitude.isfinite(), largest, torch.nan)
+        unit = power_of_two_below(magnitude)
+        x = x / unit[..., None]
+        largest = amplitude(x - x[..., :1].detach()) * unit  # exact on a large constant
+        largest = torch.where(magnitude.isfinite(), largest, torch.nan)
         return largest.amax(-1).clamp(min=FLOOR_V).log()
 
     flat = bins.reshape(-1, *bins.shape[-2:])
