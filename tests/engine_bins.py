@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from tactslip_torch import FeaturePool, HandLayout
+from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.signals.wavelet import branch_names
 
 PLAIN_KINDS = ("random", "tied", "near_constant")
 DEGENERATE_KINDS = (
@@ -132,17 +132,20 @@ def assert_equals_reference(
 
 def rows_of(pool: FeaturePool, bins: Tensor) -> dict[tuple[str, str, str], Tensor]:
     """The reference's gauges, branches and spectra, ``[N, n or L]``, by the parts of a name."""
-    rows = {}
+    rows, maps = {}, LinearMaps.of(pool)
     for channel in pool.hand.channels:
         x = bins[:, pool.hand.names.index(channel.name)]
         if channel.adapting == "slow":
             rows[channel.name, "raw", "time"] = x
             continue
-        for branch, values in zip(
-            branch_names(pool.level), pool.branches(x).unbind(1), strict=True
+        first = x[:, :1]
+        for branch, dense, is_detail in zip(
+            maps.branches, maps.dense, (not a for a in maps.is_approximation), strict=True
         ):
+            values = (x - first) @ dense.T + (0.0 if is_detail else first)
             rows[channel.name, branch, "time"] = values
-            rows[channel.name, branch, "freq"] = pool.amplitudes(values)
+            lines = (values @ maps.dense_lines.T).unflatten(-1, (2, -1))
+            rows[channel.name, branch, "freq"] = lines.square().sum(1).sqrt()
     return rows
 
 
