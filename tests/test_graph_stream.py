@@ -50,13 +50,13 @@ def judge_loudness(graph, detector, windows, form, dead):
             matrix[i : i + len(kernel), i] = kernel
         parts.append(own.cast(F64) @ matrix.numpy())
     filtered = graph.concat(*parts, axis=1)
-    moved = filtered - filtered.mean(2, keep=True)
+    moved = filtered - filtered.mean(2, keepdim=True)
     loud = (moved * moved).mean(2)
-    is_there = loud.is_finite() & ~dead.take(window.channels, 0)
+    is_there = loud.isfinite() & ~dead.take(window.channels, 0)
     total = graph.where(is_there, loud, 0.0).sum(1)
     total = (total + FLOOR).log() - detector.usual
     num_there = is_there.cast(F64).sum(1)
-    is_valid = num_there.equals(float(len(window.channels)))
+    is_valid = num_there.eq(float(len(window.channels)))
     return Judged(total.cast(form.dtype), is_valid, num_there > 0.0)
 
 

@@ -25,8 +25,8 @@ def guarded(eps=1e-12, double=True):
     graph = Graph()
     dtype = F64 if double else F32
     x = graph.input("samples", dtype, ("batch", 8))
-    largest = x.amax(1, keep=True).max(1.0)
-    y = (x.max(1e-30) + eps).log() / largest
+    largest = x.amax(1, keepdim=True).clamp(min=1.0)
+    y = (x.maximum(1e-30) + eps).log() / largest
     graph.output("score", graph.where(x > 0.0, y, 0.0).sum(), ("batch",))
     return graph.model({})
 
@@ -41,8 +41,8 @@ def test_guards_are_counted_once_however_often_they_are_written():
     }
     graph = Graph()
     x = graph.input("samples", F64, ("batch",))
-    twice = x.max(1.0) + x.max(1.0)
-    x.max(3.0)  # goes nowhere
+    twice = x.maximum(1.0) + x.maximum(1.0)
+    x.maximum(3.0)  # goes nowhere
     graph.output("score", twice, ("batch",))
     assert guards_of(graph.model({}).graph) == {("Max", (1.0,)): 1}
 
@@ -51,7 +51,7 @@ def test_guards_in_bodies_are_seen():
     graph = Graph()
     x = graph.input("samples", F64, ("batch",))
     is_large = x.amax(0) > 1.0
-    (y,) = graph.if_(is_large, lambda g: [x.at(g).max(2.0)], lambda g: [x.at(g).min(3.0)])
+    (y,) = graph.if_(is_large, lambda g: [x.at(g).maximum(2.0)], lambda g: [x.at(g).minimum(3.0)])
     graph.output("score", y, ("batch",))
     assert guards_of(graph.model({}).graph) == {
         ("Greater", (1.0,)): 1,
@@ -133,9 +133,9 @@ def test_what_onnxruntime_fuses_to_a_forbidden_operator_is_seen():
     """A deviation with an epsilon under the root becomes a LayerNormalization."""
     graph = Graph()
     x = graph.input("samples", F32, ("batch", 8))
-    centred = x - x.mean(1, keep=True)
+    centred = x - x.mean(1, keepdim=True)
     two = graph.constant(2.0, F32)
-    spread = (graph.op("Pow", centred, two).mean(1, keep=True) + 1e-5).sqrt()
+    spread = (graph.op("Pow", centred, two).mean(1, keepdim=True) + 1e-5).sqrt()
     weight, bias = (graph.constant(np.full(8, v), F32) for v in (2.0, 1.0))
     graph.output("score", centred / spread * weight + bias, ("batch", 8))
     with pytest.raises(ValueError, match="onnxruntime makes LayerNormalization of it"):
