@@ -265,7 +265,7 @@ def test_a_run_without_a_cache_gives_the_same_and_leaves_none(tiny, tmp_path, mo
 def test_the_users_cache_folder_is_the_default(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     run_train(tmp_path / "run", *TINY, "data.cycles=2")
-    assert list((tmp_path / "home" / "tactslip_torch").rglob("*.features"))
+    assert list((tmp_path / "home" / "tactslip_torch").rglob("*.npz"))
 
 
 def test_damaged_features_are_made_again(tiny, tmp_path, caplog):

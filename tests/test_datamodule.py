@@ -43,9 +43,9 @@ def test_a_damaged_cache_entry_is_made_anew(tmp_path, caplog):
     source = SmallSet()
     maker = small_maker(source, FeatureCache(tmp_path))
     first = maker(RecordingId("a", 0), split_of(source))
-    (path,) = tmp_path.glob("*/*.features")
+    (path,) = tmp_path.glob("*/*.npz")
     content = bytearray(path.read_bytes())
-    content[-1] ^= 1
+    content[len(content) // 2] ^= 1
     path.write_bytes(content)
     again = maker(RecordingId("a", 0), split_of(source))
     assert source.loads == 2

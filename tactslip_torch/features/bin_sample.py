@@ -54,32 +54,11 @@ class SampledBins:
 
 @dataclass
 class _Stratum:
-    """Bins of one group and class: how many there were, and those of smallest key."""
+    """Bins of one group and class: how many there were, and those of smallest key, ascending."""
 
     num_seen: int
-    kept: list[tuple[_Place, int]]  # ascending, each with its row of ``rows``
-    rows: Tensor  # [at least len(kept), F]
-
-    def features(self) -> Tensor:
-        """Of the kept bins, in their order."""
-        return self.rows[[row for _, row in self.kept]]
-
-    def add(self, num_seen: int, others: list[tuple[_Place, int]], rows: Tensor, most: int) -> None:
-        """Let bins in that have rows of their own; only rows of newcomers are copied."""
-        self.num_seen += num_seen
-        merged = sorted(self.kept + [(place, ~row) for place, row in others])[:most]
-        newcomers = [~row for _, row in merged if row < 0]
-        if not newcomers:
-            return
-        if len(merged) > len(self.rows):
-            grown = self.rows.new_empty(min(2 * len(merged), most), self.rows.shape[1])
-            grown[: len(self.rows)] = self.rows
-            self.rows = grown
-        stay = {row for _, row in merged if row >= 0}
-        free = [row for row in range(len(merged)) if row not in stay]
-        self.rows[free] = rows[newcomers]
-        places = iter(free)
-        self.kept = [(place, row if row >= 0 else next(places)) for place, row in merged]
+    places: list[_Place]
+    features: Tensor  # [len(places), F]
 
 
 class BinSample:
@@ -125,8 +104,8 @@ class BinSample:
         for label in (False, True):
             rows = (is_slip == label).nonzero().squeeze(-1).tolist()
             if rows:
-                others = [((_key(recording, row), recording, row), row) for row in rows]
-                self._add((group, label), len(rows), others, features)
+                places = [(_key(recording, row), recording, row) for row in rows]
+                self._add((group, label), _Stratum(len(rows), places, features[rows]))
 
     def merge(self, other: BinSample) -> None:
         """Add the bins of another sample; they must be of other recordings (not checked).
@@ -139,30 +118,27 @@ class BinSample:
         if (width := other._width()) is not None:
             self._check_width(width)
         for name, part in other._strata.items():
-            self._add(name, part.num_seen, part.kept, part.rows)
+            self._add(name, part)
 
     def bins(self) -> SampledBins:
         """The sample, in an order that depends on the bins alone."""
-        state = self.state_dict()
-        strata, recordings = state["facts"]["strata"], state["facts"]["recordings"]
-        tensors = state["tensors"]
-        kept = torch.tensor([num_kept for *_, num_kept in strata], dtype=torch.int64)
-        seen = torch.tensor([num_seen for *_, num_seen, _ in strata], dtype=torch.float64)
-        groups = sorted({group for group, *_ in strata})
-        group = torch.tensor([groups.index(group) for group, *_ in strata], dtype=torch.int64)
-        is_slip = torch.tensor([label for _, label, *_ in strata], dtype=torch.bool)
-        places = list(
-            zip(tensors["recording"].tolist(), tensors["bin_index"].tolist(), strict=True)
-        )
-        order = sorted(range(len(places)), key=places.__getitem__)
-        stratum = torch.arange(len(strata)).repeat_interleave(kept)[order]
+        facts, tensors = self.state_dict().values()
+        kept = torch.tensor([num_kept for *_, num_kept in facts["strata"]], dtype=torch.int64)
+        seen = torch.tensor([num for *_, num, _ in facts["strata"]], dtype=torch.float64)
+        groups = sorted({group for group, *_ in facts["strata"]})
+        group = torch.tensor([groups.index(g) for g, *_ in facts["strata"]], dtype=torch.int64)
+        is_slip = torch.tensor([label for _, label, *_ in facts["strata"]], dtype=torch.bool)
+        # by recording, then by number
+        order = tensors["bin_index"].argsort(stable=True)
+        order = order[tensors["recording"][order].argsort(stable=True)]
+        stratum = torch.arange(len(kept)).repeat_interleave(kept)[order]
         return SampledBins(
             features=tensors["features"][order],
             is_slip=is_slip[stratum],
             group=group[stratum],
             group_names=tuple(groups),
             recording=tensors["recording"][order],
-            recording_names=tuple(recordings),
+            recording_names=tuple(facts["recordings"]),
             bin_index=tensors["bin_index"][order],
             represents=(seen / kept)[stratum],
         )
@@ -170,14 +146,14 @@ class BinSample:
     def state_dict(self) -> dict[str, Any]:
         """``facts`` that JSON holds and ``tensors`` by name, the same for the same bins."""
         strata = sorted(self._strata.items())
-        places = [place for _, part in strata for place, _ in part.kept]
+        places = [place for _, part in strata for place in part.places]
         recordings = sorted({recording for _, recording, _ in places})
         number = {recording: i for i, recording in enumerate(recordings)}
-        features = [part.features() for _, part in strata]
+        features = [part.features for _, part in strata]
         return {
             "facts": {
                 "most": self.most,
-                "strata": [[*name, part.num_seen, len(part.kept)] for name, part in strata],
+                "strata": [[*name, part.num_seen, len(part.places)] for name, part in strata],
                 "recordings": recordings,
             },
             "tensors": {
@@ -193,28 +169,30 @@ class BinSample:
         facts, tensors = state["facts"], state["tensors"]
         sample = cls(facts["most"])
         recordings = [facts["recordings"][i] for i in tensors["recording"].tolist()]
-        places = list(zip(recordings, tensors["bin_index"].tolist(), strict=True))
-        start = 0
+        bins = zip(recordings, tensors["bin_index"].tolist(), strict=True)
+        places = [(_key(*place), *place) for place in bins]
+        stop = 0
         for group, label, num_seen, num_kept in facts["strata"]:
-            own = places[start : start + num_kept]
-            others = [((_key(*place), *place), start + i) for i, place in enumerate(own)]
-            sample._add((group, label), num_seen, others, tensors["features"])
-            start += num_kept
+            own = slice(stop, stop := stop + num_kept)
+            part = _Stratum(num_seen, places[own], tensors["features"][own])
+            sample._add((group, label), part)
         return sample
 
-    def _add(
-        self,
-        name: tuple[str, bool],
-        num_seen: int,
-        others: list[tuple[_Place, int]],
-        rows: Tensor,
-    ) -> None:
-        empty = _Stratum(0, [], rows.new_empty(0, rows.shape[1]))
-        self._strata.setdefault(name, empty).add(num_seen, others, rows, self.most)
+    def _add(self, name: tuple[str, bool], part: _Stratum) -> None:
+        if name in self._strata:
+            own = self._strata[name]
+            part = _Stratum(
+                own.num_seen + part.num_seen,
+                own.places + part.places,
+                torch.cat([own.features, part.features]),
+            )
+        order = sorted(range(len(part.places)), key=part.places.__getitem__)[: self.most]
+        places = [part.places[i] for i in order]
+        self._strata[name] = _Stratum(part.num_seen, places, part.features[order])
 
     def _width(self) -> int | None:
         """How many features the bins have; None before the first."""
-        return next((part.rows.shape[1] for part in self._strata.values()), None)
+        return next((part.features.shape[1] for part in self._strata.values()), None)
 
     def _check_width(self, width: int) -> None:
         if self._width() not in (None, width):

@@ -7,7 +7,7 @@ import hashlib
 import json
 import logging
 import os
-import struct
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,6 @@ from torch import Tensor
 from tactslip_torch.runtime import whole_file
 
 log = logging.getLogger(__name__)
-
-_MAGIC = b"TSFEAT01"
-_SHAPE = struct.Struct("<qq")
-_DIGEST_SIZE = 16
 
 
 def default_cache_folder() -> Path:
@@ -52,7 +48,9 @@ def source_digest(package: Path) -> str:
 
 
 class FeatureCache:
-    """Float32 features by key. A damaged file counts as absent, and is written anew.
+    """Float32 features by key, in NPZ files, which have a checksum.
+
+    A damaged file counts as absent, and is written again.
 
     Args:
         folder: made when first written to.
@@ -67,30 +65,25 @@ class FeatureCache:
         """The features ``[N, F]``, or ``None`` if there are none or their file is damaged."""
         path = self._path(key)
         try:
-            content = path.read_bytes()
+            with path.open("rb") as file, np.load(file) as content:
+                features = torch.from_numpy(content["features"])
+            os.utime(path)  # prune drops what was used longest ago
         except FileNotFoundError:
             return None
-        start = len(_MAGIC) + _DIGEST_SIZE
-        body = memoryview(content)[start:]
-        if content[: len(_MAGIC)] != _MAGIC or content[len(_MAGIC) : start] != _digest(body):
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
             log.warning("cached features %s are damaged; computing them again", path)
             return None
-        shape = _SHAPE.unpack(body[: _SHAPE.size])
-        os.utime(path)  # prune drops what was used longest ago
-        values = np.frombuffer(body[_SHAPE.size :], dtype="<f4").reshape(shape)
-        return torch.from_numpy(values.copy())
+        return features
 
     def store(self, key: str, features: Tensor) -> None:
         """Write features ``[N, F]``, whole or not at all."""
-        values = np.ascontiguousarray(features.numpy(), dtype="<f4")
-        body = _SHAPE.pack(*values.shape) + values.tobytes()
-        with whole_file(self._path(key)) as temporary:
-            temporary.write_bytes(_MAGIC + _digest(body) + body)
+        with whole_file(self._path(key)) as temporary, temporary.open("wb") as file:
+            np.savez(file, features=features.numpy().astype("<f4", order="C"))
 
     def prune(self) -> None:
         """Delete the least recently used files until the folder holds at most ``most_bytes``."""
         found = []
-        for path in self.folder.glob("*/[!.]*.features"):  # a dot begins one being written
+        for path in self.folder.glob("*/[!.]*.npz"):  # a dot begins one being written
             with contextlib.suppress(FileNotFoundError):  # another run may prune as well
                 status = path.stat()
                 found.append((status.st_mtime, status.st_size, path))
@@ -102,8 +95,4 @@ class FeatureCache:
             total -= size
 
     def _path(self, key: str) -> Path:
-        return self.folder / key[:2] / f"{key}.features"
-
-
-def _digest(body: bytes | memoryview) -> bytes:
-    return hashlib.blake2b(body, digest_size=_DIGEST_SIZE).digest()
+        return self.folder / key[:2] / f"{key}.npz"

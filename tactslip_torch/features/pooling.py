@@ -25,7 +25,6 @@ from torch import Tensor, nn
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import ascending, like, root
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.runtime import is_plain
 
 STATISTICS = ("mean", "std", "min", "max", "median")
 SORTED = "sorted"
@@ -49,23 +48,13 @@ def signed_log(features: Tensor, knee: Tensor) -> Tensor:
         - features, output: ``[*, K]``
         - knee: broadcasts with ``features``, positive
     """
-    if is_plain(features) and is_plain(knee):
-        size = features.abs()
-        ratio = size / knee
-        if ratio.numel() and ratio.numpy().max() < torch.inf:
-            bent = torch.where(ratio < torch.finfo(ratio.dtype).tiny, size, knee * ratio.log1p())
-            return bent.copysign_(features)  # the same bits as below in half as many calls
     is_negative = features < 0
     size = torch.where(is_negative, -features, features)  # abs() has derivative 0 at 0
-    ratio = size / knee
-    is_far = ratio.isinf()
-    near = ratio.log1p()
-    far = torch.where(is_far, size, 1.0).log() - knee.log()
-    largest = torch.tensor(torch.finfo(far.dtype).max, dtype=torch.float64).log().item()
-    far = far.clamp(min=largest)  # no step back where near ends
-    bent = knee * torch.where(is_far, far, near)
-    is_linear = ratio < torch.finfo(ratio.dtype).tiny  # a denormal ratio has lost its digits
-    bent = torch.where(is_linear, size, bent)
+    ratio, facts = size / knee, torch.finfo(features.dtype)
+    far = torch.maximum(size, knee).log() - knee.log()
+    far = far.clamp(min=math.log(facts.max))  # no step back where log1p ends
+    bent = knee * torch.where(ratio.isinf(), far, ratio.log1p())
+    bent = torch.where(ratio < facts.tiny, size, bent)  # a denormal ratio has lost its digits
     return torch.where(is_negative, -bent, bent)
 
 
