@@ -185,8 +185,8 @@ def _samples(
         shifted = graph.concat(moving, first, axis=2)
     else:
         shifted = graph.concat(x.double() - first.double(), first.double(), axis=2)
-    moving = moving @ smooth.T
-    filtered = moving + first
+    moving = moving.cast(form.dtype) @ smooth.T
+    filtered = moving + first.cast(form.dtype)
     high, low = filtered.amax(2), filtered.amin(2)
     scale = high.maximum(-low)
     probe = filtered[..., 0]  # NaN if anything in the window is no number
