@@ -369,14 +369,13 @@ def test_what_leaves_the_recording_is_named_and_what_is_off_by_a_sample_is_cut()
     times, wrong = on_time(truth, 11.4995, slack_s=0.0005, missing_s=[(4.0, 4.1)])
     assert not wrong
     assert times == FileTimeline(
-        11.4995,
         (2.0, 9.0),
         (2.0, 9.0),
-        ((2.0, 7.0), (9.0, 11.4995)),
         (0.0, 0.0),
-        ((0.0, 1.0),),
-        (),
-        ((4.0, 4.1),),
+        ((2.0, 7.0), (9.0, 11.4995)),
+        non_slip_s=((0.0, 1.0),),
+        missing_s=((4.0, 4.1),),
+        duration_s=11.4995,
     )
 
 

@@ -18,7 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from statistics import median
@@ -49,6 +49,7 @@ from tactslip_torch.data.formats import (
     pieces,
 )
 from tactslip_torch.data.manifest import (
+    MOMENTS,
     STRETCHES,
     Entry,
     Listing,
@@ -92,17 +93,10 @@ def _read(path: str, changed_ns: int, size: int) -> str:
 
 
 @dataclass(frozen=True)
-class FileTimeline:
+class FileTimeline(Truth):
     """A truth on the time of its recording: all is known and lies inside; a ``Timeline``."""
 
-    duration_s: float
-    onsets_s: tuple[float, ...] = ()
-    annotated_onsets_s: tuple[float, ...] = ()
-    sliding_s: tuple[Stretch, ...] = ()
-    speeds_mm_s: tuple[float, ...] = ()
-    non_slip_s: tuple[Stretch, ...] = ()
-    slip_s: tuple[Stretch, ...] = ()
-    missing_s: tuple[Stretch, ...] = ()
+    duration_s: float = 0.0
 
 
 def on_time(
@@ -126,13 +120,11 @@ def on_time(
         missing_s: further stretches without samples, of the file.
     """
     problems = []
-    named: list[tuple[str, Stretch]] = [
-        (name, stretch) for name in STRETCHES for stretch in getattr(truth, name)
-    ]
-    for name, (start, end) in named:
-        if start >= duration_s or (end > duration_s + slack_s and end != math.inf):
-            span = f"{start:g}-{'end' if end == math.inf else format(end, 'g')} s"
-            problems.append(f"{name}: {span} leaves the recording of {duration_s:.4g} s")
+    for name in STRETCHES:
+        for start, end in getattr(truth, name):
+            if start >= duration_s or (end > duration_s + slack_s and end != math.inf):
+                span = f"{start:g}-{'end' if end == math.inf else format(end, 'g')} s"
+                problems.append(f"{name}: {span} leaves the recording of {duration_s:.4g} s")
     for name in ("onsets_s", "annotated_onsets_s"):
         for onset in getattr(truth, name):
             if onset >= duration_s:
@@ -143,57 +135,41 @@ def on_time(
             "lower skip_s"
         )
     if problems:
-        return FileTimeline(duration_s), problems
-
-    def cut(stretches: Iterable[Stretch]) -> tuple[Stretch, ...]:
-        return tuple((start, min(end, duration_s)) for start, end in stretches)
-
+        return FileTimeline(duration_s=duration_s), problems
     onsets = truth.onsets_s
-    sliding = truth.sliding_s
-    if not sliding:
+    cut: dict[str, Any] = {
+        name: tuple((start, min(end, duration_s)) for start, end in getattr(truth, name))
+        for name in STRETCHES
+    }
+    if not cut["sliding_s"]:
         stops = [*onsets, duration_s, *(start for start, _ in truth.non_slip_s)]
-        sliding = tuple((t, min([t + slide_s, *(s for s in stops if s > t)])) for t in onsets)
-    all_of_it = ((skip_s, duration_s),)
-    return (
-        FileTimeline(
-            duration_s,
-            onsets,
-            truth.annotated_onsets_s or onsets,
-            cut(sliding),
-            truth.speeds_mm_s if len(truth.speeds_mm_s) == len(onsets) else (0.0,) * len(onsets),
-            all_of_it if truth.label == "non-slip" else cut(truth.non_slip_s),
-            all_of_it if truth.label == "slip" else cut(truth.slip_s),
-            tuple(sorted({*cut(truth.missing_s), *missing_s})),
-        ),
-        [],
-    )
+        ends = [min([onset + slide_s, *(s for s in stops if s > onset)]) for onset in onsets]
+        cut["sliding_s"] = tuple(zip(onsets, ends, strict=True))
+    if truth.label is not None:
+        cut["slip_s" if truth.label == "slip" else "non_slip_s"] = ((skip_s, duration_s),)
+    cut["missing_s"] = tuple(sorted({*cut["missing_s"], *missing_s}))
+    speeds = truth.speeds_mm_s if len(truth.speeds_mm_s) == len(onsets) else (0.0,) * len(onsets)
+    annotated = truth.annotated_onsets_s or onsets
+    return FileTimeline(onsets, annotated, speeds, **cut, duration_s=duration_s), []
 
 
 def scaled(truth: Truth, factor: float) -> Truth:
     """A truth told by a clock that runs ``factor`` times as fast as the one wanted."""
-
-    def moments(own: Iterable[float]) -> tuple[float, ...]:
-        return tuple(moment * factor for moment in own)
-
-    def stretches(own: Iterable[Stretch]) -> tuple[Stretch, ...]:
-        return tuple((start * factor, end * factor) for start, end in own)
-
-    return Truth(
-        moments(truth.onsets_s),
-        moments(truth.annotated_onsets_s),
-        truth.speeds_mm_s,
-        stretches(truth.sliding_s),
-        stretches(truth.slip_s),
-        stretches(truth.non_slip_s),
-        stretches(truth.missing_s),
-        truth.label,
-    )
+    changes: dict[str, Any] = {
+        name: tuple(moment * factor for moment in getattr(truth, name))
+        for name in ("onsets_s", "annotated_onsets_s")
+    }
+    for name in STRETCHES:
+        spans = getattr(truth, name)
+        changes[name] = tuple((start * factor, end * factor) for start, end in spans)
+    return replace(truth, **changes)
 
 
 NOWHERE = "unknown"
 """The finger and segment of a channel of which nobody said them."""
 LABEL_NAMES = ("label", "labels", "slip", "is_slip", "contact", "trial", "material", "class")
 """Names of columns, in small letters, that are no channel unless a person says so."""
+_TRUTH = (*MOMENTS, "sliding_s", "slip_s", "non_slip_s")
 _UNIT = re.compile(r"\s*(?:\([^()]*\)|\[[^\[\]]*\])$")
 _NAME_THEM = "name its columns so, or list them in the order of the hand as reading.channels"
 
@@ -226,25 +202,32 @@ class Found(NamedTuple):
         clock: of its samples; one that is missing is a gap.
         is_measured: whether the rate is what its timestamps say, not stated.
         num_channels: in the file.
-        dtype: of its samples.
         names: of its channels, if it says.
-        hand: of its channels, if it is one of ours.
-        units: if it is one of ours.
-        truth: if it is one of ours and has any.
-        material: if it is one of ours.
-        provenance: if it is one of ours.
+        own: of a file of ours its ``channels``, ``units``, ``material``, ``provenance`` and truth,
+            as plain values.
     """
 
     clock: Clock
     is_measured: bool
     num_channels: int
-    dtype: torch.dtype
     names: tuple[str, ...] | None = None
-    hand: HandLayout | None = None
-    units: str | None = None
-    truth: Truth | None = None
-    material: str | None = None
-    provenance: Mapping[str, Any] | None = None
+    own: dict[str, Any] | None = None
+
+    @property
+    def hand(self) -> HandLayout | None:
+        """The channels of a file of ours."""
+        return HandLayout.from_rows(self.own["channels"]) if self.own else None
+
+    @property
+    def truth(self) -> Truth | None:
+        """What a file of ours says, if it says anything."""
+        truth = Truth(**{name: _tuples(self.own[name]) for name in _TRUTH}) if self.own else None
+        return truth if truth is not None and truth.is_labelled else None
+
+
+def _tuples(value: Any) -> Any:
+    """Lists, and those in them, as tuples."""
+    return tuple(map(_tuples, value)) if isinstance(value, (list, tuple)) else value
 
 
 def stream_of(own: Mapping[str, Any], name: str = "") -> Stream:
@@ -254,12 +237,12 @@ def stream_of(own: Mapping[str, Any], name: str = "") -> Stream:
         ValueError: for a key or value that is none.
     """
     given = dict(own)
-    known = [field.name for field in fields(Reading)]
+    known = [one.name for one in fields(Reading)]
     reading = given.pop("reading", None) or {}
     if not isinstance(reading, Mapping) or set(reading) - set(known):
         raise ValueError(f"reading must be of {', '.join(known)}, got {reading!r}")
     rows = given.pop("channels", None)
-    options = [field.name for field in fields(Stream) if field.name != "name"]
+    options = [one.name for one in fields(Stream) if one.name != "name"]
     if unknown := set(given) - set(options):
         raise ValueError(f"a stream has {', '.join(options)}, got {', '.join(sorted(unknown))}")
     return Stream(name, Reading(**reading), _hand_from(rows), **given)
@@ -292,33 +275,20 @@ def look(path: Path, stream: Stream, stated_hz: float | None = None) -> Found:
             its rate.
     """
     with open_file(path, stream.reading) as opened:
-        return look_at(opened, path, stream, stated_hz)
+        return _look_at(opened, path, stream, stated_hz)
 
 
-def look_at(opened: Opened, path: Path, stream: Stream, stated_hz: float | None = None) -> Found:
-    """``look`` at a file that is open.
-
-    Raises:
-        ValueError: as ``look``.
-    """
+def _look_at(opened: Opened, path: Path, stream: Stream, stated_hz: float | None = None) -> Found:
     samples, archived = opened.samples, opened.archived
     num = samples.num_samples
     if not num:
         raise ValueError(f"{path} holds no samples")
     if archived:
         recording = archived.recording
-        return Found(
-            Clock(snapped_rate(recording.sample_rate_hz), num),
-            False,
-            samples.num_channels,
-            samples.dtype,
-            archived.hand.names,
-            archived.hand,
-            recording.units,
-            _truth(recording),
-            recording.material,
-            recording.provenance,
-        )
+        own = {name: getattr(recording, name) for name in (*_TRUTH, "units", "material")}
+        own |= {"channels": archived.hand.to_rows(), "provenance": dict(recording.provenance)}
+        clock = Clock(snapped_rate(recording.sample_rate_hz), num)
+        return Found(clock, False, samples.num_channels, archived.hand.names, own)
     stated = stated_hz or opened.sample_rate_hz or stream.reading.sample_rate_hz
     stated = stated and snapped_rate(stated)
     if opened.times is not None:
@@ -330,7 +300,7 @@ def look_at(opened: Opened, path: Path, stream: Stream, stated_hz: float | None 
             f"{path} says no rate and has no times; give reading.sample_rate_hz=..., or name "
             "the column of times as reading.time=..."
         )
-    return Found(clock, stated is None, samples.num_channels, samples.dtype, opened.names)
+    return Found(clock, stated is None, samples.num_channels, opened.names)
 
 
 def hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
@@ -393,19 +363,6 @@ def _place_of(name: str, own: Sequence[str]) -> int | None:
 def _bare(name: str) -> str:
     """A name without its case and the unit behind it: ``"G1 (mV)"`` is ``"g1"``."""
     return _UNIT.sub("", name.strip()).casefold()
-
-
-def _truth(recording: Recording) -> Truth | None:
-    """What a recording of ours says; ``None`` if nobody said anything."""
-    truth = Truth(
-        recording.onsets_s,
-        recording.annotated_onsets_s,
-        recording.speeds_mm_s,
-        recording.sliding_s,
-        recording.slip_s,
-        recording.non_slip_s,
-    )
-    return truth if truth.is_labelled else None
 
 
 def _some(names: Sequence[str]) -> str:
@@ -474,7 +431,8 @@ def _part(found: Found, stream: Stream, rate_hz: float) -> Part | str:
         hand, rows = hand_of(found, stream)
     except ValueError as error:
         return str(error)
-    return Part(found, hand, tuple(rows), rate_hz, found.units or stream.units)
+    units = found.own["units"] if found.own else stream.units
+    return Part(found, hand, tuple(rows), rate_hz, units)
 
 
 def _rates(founds: Sequence[Found]) -> list[float]:
@@ -516,93 +474,71 @@ def _difference(own: HandLayout, others: HandLayout | None) -> str:
     return f"has {one.name} of another kind or place, {one.to_row()}, not {other.to_row()}"
 
 
-Looks = dict[str, tuple[Found, ...]]
-"""Of each file, relative to the root of its set, what every stream of it said."""
+# What was seen of files is remembered -------------------------------------------------------------
 
 
-def memory_of(root: Path, streams: Iterable[Stream]) -> Path:
-    """Where looks at a set are kept, for one way of reading it."""
-    readings = [stream.reading.key() for stream in streams]
-    code = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        code.update(path.read_bytes())
-    facts = json.dumps([str(root.resolve()), readings, code.hexdigest()], sort_keys=True)
-    cache = os.environ.get("XDG_CACHE_HOME")
-    folder = (Path(cache) if cache else Path.home() / ".cache") / "tactslip_torch" / "looks"
-    return folder / f"{hashlib.sha256(facts.encode()).hexdigest()[:32]}.json"
-
-
-def recall(memory: Path, root: Path, stated_hz: Mapping[str, float | None]) -> Looks:
-    """What is known of files that are as they were; nothing if the memory is damaged.
+class _Memory:
+    """What files of a set said, for one way of reading it; in a file of the user's cache.
 
     Args:
-        memory: where looks are kept.
         root: of the set.
+        streams: how files are read.
         stated_hz: the rate that is said of each file, if one is.
     """
-    known: Looks = {}
-    with contextlib.suppress(
-        OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError
-    ):
-        for file, (stamp, founds) in json.loads(memory.read_text()).items():
-            if file in stated_hz and stamp == _stamp(root / file, stated_hz[file]):
-                known[file] = tuple(_found(plain) for plain in founds)
-    return known
+
+    def __init__(
+        self, root: Path, streams: Iterable[Stream], stated_hz: Mapping[str, float | None]
+    ) -> None:
+        self._root, self._stated_hz = root, stated_hz
+        code = hashlib.sha256()
+        for path in sorted(Path(__file__).parent.rglob("*.py")):
+            code.update(path.read_bytes())
+        facts = [str(root.resolve()), [one.reading.key() for one in streams], code.hexdigest()]
+        name = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:32]
+        cache = os.environ.get("XDG_CACHE_HOME")
+        folder = (Path(cache) if cache else Path.home() / ".cache") / "tactslip_torch" / "looks"
+        self.path = folder / f"{name}.json"
+
+    def recall(self) -> dict[str, tuple[Found, ...]]:
+        """What is known of files that are as they were; nothing if the memory is damaged."""
+        known = {}
+        for file, (stamp, founds) in self._kept().items():
+            with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+                if file in self._stated_hz and stamp == self._stamp(file):
+                    known[file] = tuple(map(_remembered, founds))
+        return known
+
+    def keep(self, seen: Mapping[str, tuple[Found, ...]]) -> None:
+        """Remember these files beside others; where nothing can be written, none."""
+        kept = self._kept()
+        with contextlib.suppress(OSError):
+            for file, founds in seen.items():
+                if (self._root / file).is_file():  # of a folder the time of change says little
+                    kept[file] = [self._stamp(file), founds]
+            with whole_file(self.path) as temporary:
+                temporary.write_text(json.dumps(kept))
+
+    def _kept(self) -> dict[str, Any]:
+        with contextlib.suppress(OSError, ValueError, RecursionError):
+            kept = json.loads(self.path.read_text())
+            if isinstance(kept, dict) and all(
+                isinstance(one, list) and len(one) == 2 for one in kept.values()
+            ):
+                return kept
+        return {}
+
+    def _stamp(self, file: str) -> list[Any]:
+        found = (self._root / file).stat()
+        return [found.st_size, found.st_mtime_ns, self._stated_hz[file]]
 
 
-def keep(memory: Path, root: Path, stated_hz: Mapping[str, float | None], looks: Looks) -> None:
-    """Keep looks beside those that are kept of other files; where nothing can be written, none."""
-    kept: dict[str, Any] = {}
-    with contextlib.suppress(OSError, ValueError, TypeError, RecursionError):
-        kept = dict(json.loads(memory.read_text()))
-    with contextlib.suppress(OSError):
-        for file, founds in looks.items():
-            if (root / file).is_file():  # of a folder the time of change says little
-                kept[file] = [_stamp(root / file, stated_hz[file]), [_plain(f) for f in founds]]
-        with whole_file(memory) as temporary:
-            temporary.write_text(json.dumps(kept))
+def _remembered(plain: list[Any]) -> Found:
+    (rate_hz, num_samples, gaps, jitter_s), is_measured, num_channels, names, own = plain
+    clock = Clock(rate_hz, num_samples, tuple(Gap(*gap) for gap in gaps), jitter_s)
+    return Found(clock, is_measured, num_channels, _tuples(names), own)
 
 
-def _stamp(path: Path, stated_hz: float | None) -> list[Any]:
-    found = path.stat()
-    return [found.st_size, found.st_mtime_ns, stated_hz]
-
-
-def _plain(found: Found) -> dict[str, Any]:
-    return {
-        **found._asdict(),
-        "dtype": str(found.dtype).removeprefix("torch."),
-        "hand": found.hand and found.hand.to_rows(),
-        "truth": found.truth and asdict(found.truth),
-        "provenance": found.provenance and dict(found.provenance),
-    }
-
-
-def _found(plain: dict[str, Any]) -> Found:
-    rate_hz, num_samples, gaps, jitter_s = plain["clock"]
-    truth = plain["truth"] and {
-        name: _tuples(value) if name in STRETCHES else _tuple(value)
-        for name, value in plain["truth"].items()
-    }
-    return Found(
-        **plain
-        | {
-            "clock": Clock(rate_hz, num_samples, tuple(Gap(*gap) for gap in gaps), jitter_s),
-            "dtype": torch.float32 if plain["dtype"] == "float32" else torch.float64,
-            "names": _tuple(plain["names"]),
-            "hand": plain["hand"] and HandLayout.from_rows(plain["hand"]),
-            "truth": truth and Truth(**truth),
-        }
-    )
-
-
-def _tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _tuples(value: list[list[float]]) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(inner) for inner in value)
-
+# Samples as they are wanted ----------------------------------------------------------------------
 
 REACH = 11
 """Samples of the lower rate on either side that a resampled one may hang on."""
@@ -639,6 +575,23 @@ class Treatment:
             raise ValueError(f"data.resample_hz must be a positive number or null, got {rate!r}")
         object.__setattr__(self, "tare_s", tare_of(self.tare_s, "data.tare_s"))
 
+    def num_recorded(self, part: Part) -> int:
+        """How many samples of a stream the recording has."""
+        num = part.found.clock.num_samples
+        if self.resample_hz is None:
+            return num
+        return int(num * self.resample_hz / part.rate_hz + 1e-6)
+
+    def missing_s(self, part: Part) -> list[Stretch]:
+        """The stretches without samples, wider by what resampling draws from them."""
+        rate_hz, most = part.rate_hz, self.most_bridged(part.rate_hz)
+        reach_s = REACH / min(rate_hz, self.resample_hz) if self.resample_hz else 0.0
+        return [
+            (max(gap.start / rate_hz - reach_s, 0.0), (gap.start + gap.missing) / rate_hz + reach_s)
+            for gap in part.found.clock.gaps
+            if gap.missing > most
+        ]
+
     def most_bridged(self, rate_hz: float) -> int:
         """The most samples of a gap that is bridged."""
         return int(self.bridge_ms * rate_hz / 1000 + 1e-6) if self.gaps == "bridge" else 0
@@ -659,58 +612,67 @@ def tare_of(value: object, name: str) -> Stretch | None:
     return float(parts[0]), float(parts[1])
 
 
-def num_recorded(found: Found, rate_hz: float, how: Treatment) -> int:
-    """How many samples of a stream the recording has."""
-    if how.resample_hz is None:
-        return found.clock.num_samples
-    return int(found.clock.num_samples * how.resample_hz / rate_hz + 1e-6)
+class _HandSamples:
+    """Some rows of samples in the order of a hand, on their clock, a level taken off each."""
+
+    def __init__(self, samples: Samples, rows: Sequence[int], level: Tensor | None) -> None:
+        self.num_channels, self.num_samples = len(rows), samples.num_samples
+        self.dtype = samples.dtype
+        self._samples, self._rows, self._level = samples, list(rows), level
+
+    def read(self, first: int, stop: int) -> Tensor:
+        """Samples from ``first`` to before ``stop``, ``[C, n]``."""
+        return self.exact(first, stop).to(self.dtype)
+
+    def exact(self, first: int, stop: int) -> Tensor:
+        """The same, in float64 if a level is taken off."""
+        read = self._samples.read(first, stop)[self._rows]
+        return read if self._level is None else read - self._level
 
 
-def refuse_ratio(rate_hz: float, how: Treatment) -> None:
-    """Raise if samples of that rate cannot be resampled as it was asked for.
-
-    Raises:
-        ValueError: as ``resample``.
-    """
-    if how.resample_hz is not None:
-        resample(torch.zeros(1, 1), rate_hz, how.resample_hz)
-
-
-def missing_of(found: Found, rate_hz: float, how: Treatment) -> tuple[Stretch, ...]:
-    """The stretches of a recording without samples, wider by what resampling draws from them."""
-    most, to_hz = how.most_bridged(rate_hz), how.resample_hz
-    reach_s = REACH / min(rate_hz, to_hz) if to_hz else 0.0
-    return tuple(
-        (max(gap.start / rate_hz - reach_s, 0.0), (gap.start + gap.missing) / rate_hz + reach_s)
-        for gap in found.clock.gaps
-        if gap.missing > most
-    )
-
-
-@contextmanager
-def even_samples(
-    path: Path, stream: Stream, found: Found, most_bridged: int = 0
-) -> Iterator[Samples]:
-    """All channels of a file on their clock, to be read by stretches; NaN in gaps.
+def _of_hand(
+    samples: Samples,
+    found: Found,
+    rows: Sequence[int],
+    rate_hz: float,
+    path: Path,
+    tare_s: Sequence[float] | None = None,
+    most_bridged: int = 0,
+) -> _HandSamples:
+    """Samples of an open file as a hand has them; NaN in gaps that are not bridged.
 
     Raises:
-        ValueError: if the file is damaged, or is not what it was when it was looked at.
+        ValueError: if the file is not what it was when it was looked at, ends before the stretch
+            that is tared on, or has nothing finite there.
     """
-    with open_file(path, stream.reading) as opened:
-        samples: Samples = opened.samples
-        missing = sum(gap.missing for gap in found.clock.gaps)
-        shape = (samples.num_channels, samples.num_samples + missing)
-        if shape != (found.num_channels, found.clock.num_samples):
-            raise ValueError(f"{path} has changed since it was looked at; start again")
-        yield EvenSamples(samples, found.clock, most_bridged) if missing else samples
+    missing = sum(gap.missing for gap in found.clock.gaps)
+    shape = (samples.num_channels, samples.num_samples + missing)
+    if shape != (found.num_channels, found.clock.num_samples):
+        raise ValueError(f"{path} has changed since it was looked at; start again")
+    if missing:
+        samples = EvenSamples(samples, found.clock, most_bridged)
+    if tare_s is None:
+        return _HandSamples(samples, rows, None)
+    first, stop = (round(moment * rate_hz) for moment in tare_s)
+    if not first < stop <= samples.num_samples:
+        raise ValueError(
+            f"{path} has {samples.num_samples} samples, too few for tare_s={list(tare_s)}"
+        )
+    read = samples.read(first, stop)[list(rows)].double()
+    level = read.where(read.isfinite(), torch.nan).nanmean(-1, keepdim=True)
+    broken = level.isnan().flatten().nonzero().flatten().tolist()
+    if broken:
+        raise ValueError(
+            f"{path} has nothing finite in its column {rows[broken[0]] + 1} to tare on from "
+            f"{tare_s[0]:g} to {tare_s[1]:g} s; give another tare_s"
+        )
+    return _HandSamples(samples, rows, level)
 
 
 def recorded(
     path: Path,
     stream: Stream,
-    found: Found,
-    rows: Sequence[int],
-    rate_hz: float,
+    part: Part,
     how: Treatment,
     windows: Sequence[Stretch] | None = None,
 ) -> Tensor:
@@ -721,9 +683,7 @@ def recorded(
     Args:
         path: of the file.
         stream: how it is read.
-        found: what the file said when it was looked at.
-        rows: of the file, in the order of the hand.
-        rate_hz: of the file.
+        part: what the file said when it was looked at.
         how: samples are treated.
         windows: start and end of what is wanted, seconds; ``None`` for all.
 
@@ -733,61 +693,18 @@ def recorded(
     Raises:
         ValueError: if the file is damaged, or is not what it was when it was looked at.
     """
-    with even_samples(path, stream, found, how.most_bridged(rate_hz)) as samples:
-        chosen = list(rows)
+    rate_hz, most = part.rate_hz, how.most_bridged(part.rate_hz)
+    with open_file(path, stream.reading) as opened:
+        samples = _of_hand(opened.samples, part.found, part.rows, rate_hz, path, how.tare_s, most)
         num = samples.num_samples
-        level = tare_level(samples, chosen, rate_hz, how.tare_s, path)
         if how.resample_hz is not None and how.resample_hz != rate_hz:
-            whole = samples.read(0, num)[chosen] - level
-            even = resample(whole, rate_hz, how.resample_hz)
-            return even[:, : num_recorded(found, rate_hz, how)].to(samples.dtype)
-        kept = torch.full((len(chosen), num), torch.nan, dtype=samples.dtype)
+            even = resample(samples.exact(0, num).double(), rate_hz, how.resample_hz)
+            return even[:, : how.num_recorded(part)].to(samples.dtype)
+        kept = torch.full((samples.num_channels, num), torch.nan, dtype=samples.dtype)
         for start, end in windows if windows is not None else [(0.0, num / rate_hz)]:
-            first, stop = math.floor(start * rate_hz), math.ceil(end * rate_hz)
-            first, stop = max(first, 0), min(stop, num)
-            read = samples.read(first, stop)[chosen]
-            kept[:, first:stop] = read if how.tare_s is None else (read - level).to(samples.dtype)
+            first, stop = max(math.floor(start * rate_hz), 0), min(math.ceil(end * rate_hz), num)
+            kept[:, first:stop] = samples.read(first, stop)
         return kept
-
-
-def tare_level(
-    samples: Samples,
-    rows: Sequence[int],
-    rate_hz: float,
-    tare_s: Sequence[float] | None,
-    path: Path,
-) -> Tensor:
-    """What is taken off each channel: the mean of what is finite in a stretch.
-
-    Args:
-        samples: of the file.
-        rows: of the channels.
-        rate_hz: of the samples.
-        tare_s: start and end of the stretch; ``None`` for nothing to take off.
-        path: of the file, for messages.
-
-    Shape:
-        - output: ``[C, 1]``, float64
-
-    Raises:
-        ValueError: if the file ends before the stretch, or a channel has nothing finite in it.
-    """
-    if tare_s is None:
-        return torch.zeros(len(rows), 1, dtype=torch.float64)
-    first, stop = (round(moment * rate_hz) for moment in tare_s)
-    if not first < stop <= samples.num_samples:
-        raise ValueError(
-            f"{path} has {samples.num_samples} samples, too few for tare_s={list(tare_s)}"
-        )
-    read = samples.read(first, stop)[list(rows)].double()
-    level = read.where(read.isfinite(), torch.nan).nanmean(-1, keepdim=True)
-    dead = level.isnan().flatten().nonzero().flatten().tolist()
-    if dead:
-        raise ValueError(
-            f"{path} has nothing finite in its column {rows[dead[0]] + 1} to tare on from "
-            f"{tare_s[0]:g} to {tare_s[1]:g} s; give another tare_s"
-        )
-    return level
 
 
 BEFORE_ONSET_S = 1.01
@@ -881,9 +798,9 @@ def _look_at_all(plan: Plan, entries: Sequence[Entry]) -> Iterable[tuple[Found, 
         except (ValueError, OSError) as error:
             return str(error).replace(f"{plan.root}{os.sep}", "")
 
-    memory = memory_of(plan.root, plan.streams)
     stated_hz = {entry.file: entry.sample_rate_hz for entry in entries}
-    known = recall(memory, plan.root, stated_hz)
+    memory = _Memory(plan.root, plan.streams, stated_hz)
+    known = memory.recall()
     unknown = [entry for entry in entries if entry.file not in known]
     looked, seconds = [], 0.0
     for entry in unknown[:2]:  # the first waits for libraries that are not yet loaded
@@ -897,8 +814,7 @@ def _look_at_all(plan: Plan, entries: Sequence[Entry]) -> Iterable[tuple[Found, 
         looked += map(look_at, unknown[2:])
     seen = {entry.file: found for entry, found in zip(unknown, looked, strict=True)}
     if is_slow:
-        whole = {file: found for file, found in seen.items() if not isinstance(found, str)}
-        keep(memory, plan.root, stated_hz, whole)
+        memory.keep({file: one for file, one in seen.items() if not isinstance(one, str)})
     return [(seen | known)[entry.file] for entry in entries]
 
 
@@ -908,21 +824,19 @@ def _timed(plan: Plan, entry: Entry, parts: tuple[Part, ...]) -> tuple[Surveyed,
     wrong = []
     for part in parts:
         try:
-            refuse_ratio(part.rate_hz, how)
+            if how.resample_hz is not None:  # refuses ratios that cannot be
+                resample(torch.zeros(1, 1), part.rate_hz, how.resample_hz)
             if how.gaps == "refuse":
                 refuse_gaps(part.found.clock, "it")
         except ValueError as error:
             wrong.append(str(error).removeprefix("it: "))
-    ends_s = [
-        num_recorded(part.found, part.rate_hz, how) / (how.resample_hz or part.rate_hz)
-        for part in parts
-    ]
+    ends_s = [how.num_recorded(part) / (how.resample_hz or part.rate_hz) for part in parts]
     duration_s = min(ends_s)
     if max(ends_s) - duration_s > MOST_CUT_S:
         wrong.append(
             f"its streams last {duration_s:.4g} to {max(ends_s):.4g} s; cut the longer one"
         )
-    missing_s = [gap for part in parts for gap in missing_of(part.found, part.rate_hz, how)]
+    missing_s = [gap for part in parts for gap in how.missing_s(part)]
     if how.tare_s is not None:
         first_s, last_s = how.tare_s
         if last_s > duration_s:
@@ -969,8 +883,8 @@ def _doubts(recording: Surveyed) -> list[str]:
                 f"has times that are early or late by {1000 * clock.jitter_s:.3g} ms; "
                 "samples are taken as even"
             )
-        material = part.found.material
-        if number == 0 and material not in (None, entry.recording.material):
+        material = part.found.own["material"] if part.found.own else entry.recording.material
+        if number == 0 and material != entry.recording.material:
             doubts.append(f"itself says {material!r}, not {entry.recording.material!r}")
     return doubts
 
@@ -1150,11 +1064,11 @@ class FileRecordings:
         one = self._recordings[recording]
         path, how, times = self.root / one.entry.file, self._plan.treatment, one.times
         parts = [
-            recorded(path, stream, part.found, part.rows, part.rate_hz, how, windows)
+            recorded(path, stream, part, how, windows)
             for stream, part in zip(self._plan.streams, one.parts, strict=True)
         ]
         num_samples = round(times.duration_s * self.sample_rate_hz)
-        origin = one.parts[0].found.provenance
+        own = one.parts[0].found.own
         return Recording(
             torch.cat([part[:, :num_samples] for part in parts]),
             self.sample_rate_hz,
@@ -1164,7 +1078,7 @@ class FileRecordings:
             times.sliding_s,
             times.annotated_onsets_s,
             times.non_slip_s,
-            {"simulated": False, "file": one.entry.file} if origin is None else origin,
+            own["provenance"] if own else {"simulated": False, "file": one.entry.file},
             slip_s=times.slip_s,
             units=self.units,
         )
@@ -1224,7 +1138,8 @@ def _is_of_mappings(value: object) -> bool:
 
 
 def _is_simulated(one: Surveyed) -> bool:
-    return any((part.found.provenance or {}).get("simulated") for part in one.parts)
+    owns = [part.found.own for part in one.parts]
+    return any(own["provenance"].get("simulated") for own in owns if own)
 
 
 _RATE_ERR = 0.001  # of a measured rate, as what is told in seconds errs; a stated one has none
@@ -1271,18 +1186,13 @@ def hand_file(
     with open_file(path, reading) as opened:
         if opened.archived is not None or (opened.names is None and reading.channels is None):
             refuse_other_channels(path, opened, hand.to_rows())
-        found = look_at(opened, path, stream)
+        found = _look_at(opened, path, stream)
         _refuse_others(path, found, sample_rate_hz, units)
         try:
             _, rows = hand_of(found, stream)
         except ValueError as error:
             raise ValueError(f"{path} {error}") from None
-        samples: Samples = opened.samples
-        if found.clock.gaps:
-            samples = EvenSamples(samples, found.clock)
-        if rows != list(range(samples.num_channels)) or tare is not None:
-            level = tare_level(samples, rows, sample_rate_hz, tare, path)
-            samples = _Chosen(samples, rows, level)
+        samples = _of_hand(opened.samples, found, rows, sample_rate_hz, path, tare)
         yield HandFile(samples, opened.archived)
 
 
@@ -1295,24 +1205,12 @@ def _refuse_others(path: Path, found: Found, sample_rate_hz: float, units: str) 
         raise ValueError(
             f"{path} is of {rate:g} Hz, the detector of {sample_rate_hz:g} Hz; resample it"
         )
-    if found.units not in (None, units):
+    own = found.own["units"] if found.own else units
+    if own != units:
         raise ValueError(
-            f"{path} is in {found.units}, the detector was trained on {units}; give it recordings "
-            f"in {units}, or train one on {found.units}"
+            f"{path} is in {own}, the detector was trained on {units}; give it recordings "
+            f"in {units}, or train one on {own}"
         )
-
-
-class _Chosen:
-    """Some rows of samples, a level taken off each."""
-
-    def __init__(self, samples: Samples, rows: list[int], level: Tensor) -> None:
-        self.num_channels, self.num_samples = len(rows), samples.num_samples
-        self.dtype = samples.dtype
-        self._samples, self._rows, self._level = samples, rows, level
-
-    def read(self, first: int, stop: int) -> Tensor:
-        """Samples from ``first`` to before ``stop``, ``[C, n]``."""
-        return (self._samples.read(first, stop)[self._rows] - self._level).to(self.dtype)
 
 
 PIECE = 1 << 16
@@ -1378,14 +1276,15 @@ def _inspected(path: Path, stream: Stream, part: Part, missing_s: Sequence[Stret
     """One stream of a file."""
     missing = [(gap.start, gap.start + gap.missing) for gap in part.found.clock.gaps]
     missing += [(round(a * part.rate_hz), round(b * part.rate_hz)) for a, b in missing_s]
-    num, rows = len(part.rows), list(part.rows)
+    num = len(part.rows)
     low = torch.full((num,), torch.inf, dtype=torch.float64)
     high, count = -low, torch.zeros(num, dtype=torch.int64)
     first = torch.full((num,), -1, dtype=torch.int64)
     seen = 0
-    with even_samples(path, stream, part.found) as samples:
+    with open_file(path, stream.reading) as opened:
+        samples = _of_hand(opened.samples, part.found, part.rows, part.rate_hz, path)
         for piece in pieces(samples, PIECE):
-            values = piece[rows].double()
+            values = piece.double()
             is_fine = values.isfinite()
             low = torch.minimum(low, values.where(is_fine, torch.inf).amin(-1))
             high = torch.maximum(high, values.where(is_fine, -torch.inf).amax(-1))
