@@ -1,6 +1,5 @@
 """Manifests that people write: what they may look like, and that every mistake is named."""
 
-import csv
 import json
 import os
 
@@ -9,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactslip_torch.data.file_recordings import FileTimeline, on_time, scaled
-from tactslip_torch.data.folder import manifest_line
 from tactslip_torch.data.manifest import (
     COLUMNS,
     Truth,
@@ -18,7 +16,7 @@ from tactslip_torch.data.manifest import (
     read_manifest,
     truth_of,
 )
-from tactslip_torch.data.recording import Recording, RecordingId
+from tactslip_torch.data.recording import RecordingId
 
 FILES = ("a.csv", "b.csv", "c.csv")
 
@@ -90,33 +88,6 @@ def test_columns_are_separated_as_spreadsheets_do_it(root, separator):
     found = listed(root, b"\xef\xbb\xbf" + text.encode())
     assert found.problems == ()
     assert found.entries[0].truth.onsets_s == (2.0, 9.0)
-
-
-def test_what_generate_writes_is_read(root):
-    import torch
-
-    content = Recording(
-        torch.zeros(2, 10),
-        2000.0,
-        "wood",
-        (20.0,),
-        (2.25,),
-        ((2.25, 7.5),),
-        (2.2,),
-        ((0.0, 1.0), (8.0, 9.0)),
-        {"simulated": True, "fidelity": "kinematic", "seed": 0},
-    )
-    line = manifest_line("a.csv", RecordingId("wood", 5, "taps", "2"), content)
-    with (root / "manifest.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, list(line))
-        table.writeheader()
-        table.writerow(line)
-    found = read_manifest(root / "manifest.csv", root)
-    assert found.problems == found.warnings == ()
-    (entry,) = found.entries
-    assert entry.recording == RecordingId("wood", 5, "taps", "2")
-    for name in ("onsets_s", "annotated_onsets_s", "sliding_s", "non_slip_s", "speeds_mm_s"):
-        assert getattr(entry.truth, name) == getattr(content, name)
 
 
 def test_trials_that_nobody_numbered_are_numbered_in_order(root):

@@ -25,9 +25,8 @@ from tactslip_torch.commands.entry import (
     one_line,
     run_entry_point,
 )
-from tactslip_torch.data.conversion import Conversion
 from tactslip_torch.data.file_recordings import FileRecordings, Inspected, inspected, oddities
-from tactslip_torch.data.folder import Written, write_manifest
+from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest
 from tactslip_torch.data.manifest import Problem, write_template
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.report.recordings import (
@@ -111,13 +110,13 @@ def convert(config: DictConfig) -> list[Written]:
         if config[name] is None:
             raise ValueError(f"no value for {name}; give to=FORMAT and output=FOLDER")
     source = _source(config, skip_failed=bool(config.skip_failed or config.data.skip_failed))
-    version = tactslip_torch.__version__
-    job = Conversion(source, Path(str(config.output)), str(config.to), version)
+    made_by = {"made_by": tactslip_torch.__version__}
+    job = RecordingFolder(source, Path(str(config.output)), str(config.to), made_by, "output")
     job.check()
 
     def one(recording: RecordingId) -> Written | str:
         try:
-            return job.convert(recording)
+            return job.write(recording)
         except (ValueError, OSError) as error:
             entry = source.entry(recording)
             what = str(Problem(entry.place, f"{entry.file}: {one_line(error)}"))

@@ -38,7 +38,6 @@ from tactslip_torch.data.clock import (
     refuse_gaps,
     snapped_rate,
 )
-from tactslip_torch.data.folder import refuse_other_channels
 from tactslip_torch.data.formats import (
     Archived,
     Opened,
@@ -287,7 +286,7 @@ def _look_at(opened: Opened, path: Path, stream: Stream, stated_hz: float | None
         recording = archived.recording
         own = {name: getattr(recording, name) for name in (*_TRUTH, "units", "material")}
         own |= {"channels": archived.hand.to_rows(), "provenance": dict(recording.provenance)}
-        clock = Clock(snapped_rate(recording.sample_rate_hz), num)
+        clock, own = Clock(snapped_rate(recording.sample_rate_hz), num), json.loads(json.dumps(own))
         return Found(clock, False, samples.num_channels, archived.hand.names, own)
     stated = stated_hz or opened.sample_rate_hz or stream.reading.sample_rate_hz
     stated = stated and snapped_rate(stated)
@@ -1185,7 +1184,7 @@ def hand_file(
     stream = Stream(reading=reading, channels=hand)
     with open_file(path, reading) as opened:
         if opened.archived is not None or (opened.names is None and reading.channels is None):
-            refuse_other_channels(path, opened, hand.to_rows())
+            _refuse_other_channels(path, opened, hand.to_rows())
         found = _look_at(opened, path, stream)
         _refuse_others(path, found, sample_rate_hz, units)
         try:
@@ -1194,6 +1193,25 @@ def hand_file(
             raise ValueError(f"{path} {error}") from None
         samples = _of_hand(opened.samples, found, rows, sample_rate_hz, path, tare)
         yield HandFile(samples, opened.archived)
+
+
+def _refuse_other_channels(path: Path, opened: Opened, rows: Sequence[Mapping[str, str]]) -> None:
+    """Raise if a recording is not of the hand with these channels, in this order.
+
+    Of samples alone only the number of channels is known.
+
+    Raises:
+        ValueError: if there are others, naming the first.
+    """
+    theirs = opened.archived.hand.to_rows() if opened.archived else rows
+    if opened.samples.num_channels != len(rows):
+        raise ValueError(f"{path} has {opened.samples.num_channels} channels, not {len(rows)}")
+    for place, (found, wanted) in enumerate(zip(theirs, rows, strict=True), 1):
+        if any(found[what] != wanted[what] for what in ("name", "kind")):
+            raise ValueError(
+                f"channel {place} of {path} is {found['name']} ({found['kind']}), not "
+                f"{wanted['name']} ({wanted['kind']}); give recordings of the detector's hand"
+            )
 
 
 def _refuse_others(path: Path, found: Found, sample_rate_hz: float, units: str) -> None:

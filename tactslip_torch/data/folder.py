@@ -1,8 +1,7 @@
-"""A folder of recordings: one file each, found again by what determined it, and a manifest."""
+"""Folders of recordings that are written: one file each, found again by its key, and a manifest."""
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -10,17 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.formats import (
     Archived,
     Format,
-    Opened,
     endings,
     find_format,
     format_of,
     named_format,
 )
+from tactslip_torch.data.manifest import MOMENTS, STRETCHES, write_table
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
-from tactslip_torch.runtime import whole_file
 
 MANIFEST = "manifest.csv"
 
@@ -40,25 +39,6 @@ def recording_files(place: Path) -> list[Path]:
         return found
     format_of(place)
     return [place]
-
-
-def refuse_other_channels(path: Path, opened: Opened, rows: Sequence[Mapping[str, str]]) -> None:
-    """Raise if a recording is not of the hand with these channels, in this order.
-
-    Of samples alone only the number of channels is known.
-
-    Raises:
-        ValueError: if there are others, naming the first.
-    """
-    theirs = opened.archived.hand.to_rows() if opened.archived else rows
-    if opened.samples.num_channels != len(rows):
-        raise ValueError(f"{path} has {opened.samples.num_channels} channels, not {len(rows)}")
-    for place, (found, wanted) in enumerate(zip(theirs, rows, strict=True), 1):
-        if any(found[what] != wanted[what] for what in ("name", "kind")):
-            raise ValueError(
-                f"channel {place} of {path} is {found['name']} ({found['kind']}), not "
-                f"{wanted['name']} ({wanted['kind']}); give recordings of the detector's hand"
-            )
 
 
 def file_facts(path: Path, archived: Archived | None) -> dict[str, Any]:
@@ -96,50 +76,19 @@ class Written(NamedTuple):
     num_bytes: int
 
 
-def as_kept(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Facts as JSON gives them back, to be held against the key in a file."""
-    plain: dict[str, Any] = json.loads(json.dumps(facts, allow_nan=False))
-    return plain
-
-
-def refuse_to_replace(path: Path, form: Format, given: str) -> None:
-    """Raise if there is a file that is not ours.
-
-    Args:
-        path: of the file that is to be written.
-        form: its format.
-        given: what else could be given, such as ``"folder"``.
-
-    Raises:
-        ValueError: naming it.
-    """
-    if path.exists():
-        try:
-            form.key(path)
-        except ValueError as error:
-            raise ValueError(f"{error}; move it away, or give another {given}") from error
-
-
-def write_manifest(folder: Path, written: Sequence[Written]) -> None:
-    """Write the lines of recordings to ``manifest.csv``, whole or not at all."""
-    with (
-        whole_file(folder / MANIFEST) as temporary,
-        temporary.open("w", newline="", encoding="utf-8") as file,
-    ):
-        table = csv.DictWriter(file, list(written[0].line), lineterminator="\n")
-        table.writeheader()
-        table.writerows(one.line for one in written)
-
-
 @dataclass(frozen=True)
 class RecordingFolder:
     """Recordings of a source as files in a folder, made where they are not there yet.
 
+    A file that is there is kept if it is whole and what it was made of is the same: what the
+    source says of its samples, when things happen in it, and ``made_by``.
+
     Args:
         source: the recordings.
         folder: where the files are.
-        ending: of the files, one that a format has.
+        ending: of the files, or the name of a format.
         made_by: what determines the samples beside the source's keys: code and libraries.
+        given: what could be given in place of the folder, for messages.
 
     Raises:
         ValueError: if there is no such format.
@@ -149,6 +98,7 @@ class RecordingFolder:
     folder: Path
     ending: str
     made_by: Mapping[str, Any]
+    given: str = "folder"
 
     def __post_init__(self) -> None:
         _ = self.format  # refuses an unknown one
@@ -159,14 +109,27 @@ class RecordingFolder:
         return named_format(self.ending)
 
     def path(self, recording: RecordingId) -> Path:
-        """The recording's file."""
+        """The recording's file: beside the others as the one it was read from, if there is one."""
+        ending = self.ending if self.ending in self.format.endings else self.format.endings[0]
+        if isinstance(self.source, FileRecordings):
+            return (self.folder / self.source.entry(recording).file).with_suffix(f".{ending}")
         session = f"_session{recording.session}" if recording.session else ""
         name = f"{recording.material}_{recording.scene}_{recording.cycle:02d}{session}"
-        return self.folder / f"{name}.{self.ending}"
+        return self.folder / f"{name}.{ending}"
 
     def key(self, recording: RecordingId) -> dict[str, Any]:
         """What determines the recording's file, as JSON gives it back."""
-        return as_kept({"recording": dict(self.source.key(recording)), **self.made_by})
+        facts: dict[str, Any] = {
+            "recording": {"name": recording.scene, **self.source.key(recording)},
+            "material": recording.material,
+            **self.made_by,
+        }
+        times = self.source.timeline(recording)
+        facts["truth"] = {name: getattr(times, name) for name in (*MOMENTS, *STRETCHES)}
+        if isinstance(self.source, FileRecordings):
+            facts["units"] = self.source.units
+        plain: dict[str, Any] = json.loads(json.dumps(facts, allow_nan=False))
+        return plain
 
     def check(self) -> None:
         """Refuse names that files cannot have, and to replace a file that is not ours.
@@ -174,16 +137,28 @@ class RecordingFolder:
         Raises:
             ValueError: if there is such a name or file.
         """
-        paths = [self.path(recording) for recording in self.source.ids]
-        if not paths:
+        if not self.source.ids:
             raise ValueError("no recording to write; give at least one of materials=[M1,...]")
-        for path in paths:
-            if path.parent != self.folder or not re.fullmatch(r"[\w.+-]+", path.name):
+        root = self.source.root if isinstance(self.source, FileRecordings) else None
+        if root is not None and self.folder.resolve() == root.resolve():
+            raise ValueError("output must be another folder than root, which stays as it is")
+        first: dict[Path, RecordingId] = {}
+        for recording in self.source.ids:
+            path = self.path(recording)
+            is_name = path.parent == self.folder and re.fullmatch(r"[\w.+-]+", path.name)
+            if root is None and not is_name:
                 raise ValueError(f"{path.name!r} cannot name a file; give the scene another name")
-        if len(set(paths)) < len(paths):
-            raise ValueError("two recordings would have one file; give a scene another name")
-        for path in paths:
-            refuse_to_replace(path, self.format, "folder")
+            if path in first:
+                raise ValueError(
+                    f"{first[path]} and {recording} would both become {path.name}; rename one"
+                )
+            first[path] = recording
+            if path.exists():
+                try:
+                    self.format.key(path)
+                except ValueError as error:
+                    what = f"move it away, or give another {self.given}"
+                    raise ValueError(f"{error}; {what}") from error
 
     def load(self, recording: RecordingId) -> Archived:
         """What the recording's file holds.
@@ -195,41 +170,40 @@ class RecordingFolder:
         return self.format.load(self.path(recording))
 
     def write(self, recording: RecordingId) -> Written:
-        """Make the recording's file, unless it is there, whole, and of the same key."""
+        """Make the recording's file, unless it is there, whole, and of the same key.
+
+        Raises:
+            ValueError: if the recording cannot be read.
+        """
         path, key = self.path(recording), self.key(recording)
-        content = self._found(recording, key)
+        try:
+            archived = self.load(recording)
+            content = archived.recording if archived.key == key else None
+        except (FileNotFoundError, ValueError):  # not there, or ours but damaged: see check
+            content = None
         made = content is None
         if content is None:
             content = self.source.load(recording)
+            path.parent.mkdir(parents=True, exist_ok=True)
             self.format.save(path, content, self.source.hand, key)
-        line = manifest_line(path.name, recording, content)
-        return Written(line, made, content.duration_s, path.stat().st_size)
+        inner = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
+        times, origin = self.source.timeline(recording), content.provenance
+        line = {
+            "file": path.relative_to(self.folder).as_posix(),
+            "material": recording.material,
+            "trial": recording.cycle,
+            "scene": recording.scene,
+            "session": recording.session,
+            **{name: json.dumps(getattr(times, name)) for name in (*MOMENTS, *STRETCHES)},
+            "sample_rate_hz": content.sample_rate_hz,
+            "simulated": str(bool(origin.get("simulated"))).lower(),
+            "fidelity": origin.get("fidelity", ""),
+            "seed": origin.get("seed", ""),
+        }
+        num_bytes = sum(file.stat().st_size for file in inner)
+        return Written(line, made, content.duration_s, num_bytes)
 
-    def _found(self, recording: RecordingId, key: Mapping[str, Any]) -> Recording | None:
-        try:
-            archived = self.load(recording)
-        except (FileNotFoundError, ValueError):  # not there, or ours but damaged: see check
-            return None
-        return archived.recording if archived.key == key else None
 
-
-def manifest_line(file: str, recording: RecordingId, content: Recording) -> dict[str, Any]:
-    """A recording's line of the manifest; of what there may be several it holds a JSON list."""
-    origin = content.provenance
-    return {
-        "file": file,
-        "material": recording.material,
-        "cycle": recording.cycle,
-        "scene": recording.scene,
-        "session": recording.session,
-        "onsets_s": json.dumps(content.onsets_s),
-        "annotated_onsets_s": json.dumps(content.annotated_onsets_s),
-        "sliding_s": json.dumps(content.sliding_s),
-        "non_slip_s": json.dumps(content.non_slip_s),
-        "slip_s": json.dumps(content.slip_s),
-        "speeds_mm_s": json.dumps(content.speeds_mm_s),
-        "sample_rate_hz": content.sample_rate_hz,
-        "simulated": str(bool(origin.get("simulated"))).lower(),
-        "fidelity": origin.get("fidelity", ""),
-        "seed": origin.get("seed", ""),
-    }
+def write_manifest(folder: Path, written: Sequence[Written]) -> None:
+    """Write the lines of recordings to ``manifest.csv``, whole or not at all."""
+    write_table(folder / MANIFEST, list(written[0].line), [one.line for one in written])

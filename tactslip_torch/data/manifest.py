@@ -12,7 +12,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -745,11 +745,17 @@ def write_template(root: Path, pattern: str, path: Path | None = None) -> Templa
             raise ValueError(f"{other} is there already; move it away, or give output=FILE")
     path = root / NAMES[0] if path is None else path
     guesses = {file: guessed(file, pattern) for file in found_files(root)}
+    rows = [dict.fromkeys(TEMPLATE_COLUMNS, "") | {"file": f, **own} for f, own in guesses.items()]
+    write_table(path, TEMPLATE_COLUMNS, rows)
+    return Template(path, len(guesses), sum(map(bool, guesses.values())))
+
+
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> None:
+    """Write rows of these columns as CSV, whole or not at all."""
     with (
         whole_file(path) as temporary,
-        temporary.open("w", newline="", encoding="utf-8") as stream,
+        temporary.open("w", newline="", encoding="utf-8") as file,
     ):
-        table = csv.DictWriter(stream, TEMPLATE_COLUMNS, restval="", lineterminator="\n")
+        table = csv.DictWriter(file, columns, lineterminator="\n")
         table.writeheader()
-        table.writerows({"file": file, **guess} for file, guess in guesses.items())
-    return Template(path, len(guesses), sum(map(bool, guesses.values())))
+        table.writerows(rows)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from tactslip_torch.data.manifest import (
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.hand import HandLayout
 
+_Match = tuple[str, re.Match[str]]
 GROUPS = ("material", "trial", "scene", "label")
 _LABELS: Mapping[str, Label] = {"slip": "slip", "non-slip": "non-slip"}
 
@@ -57,15 +58,39 @@ def named_recordings(
         FileNotFoundError: if there is no such folder or manifest.
         ValueError: if the pattern is none or no path matches it, or as ``FileRecordings``.
     """
-    folder = Path(root)
-    if not folder.is_dir():
-        raise FileNotFoundError(f"no folder at {folder}")
-    listing = listed(folder, _checked(pattern), _known(labels), rename or {})
+    listing = listed(Path(root), _checked(pattern), _known(labels), rename or {})
     if not listing.entries and not listing.problems:
-        raise ValueError(f"no file in {folder} has a path that matches data.pattern={pattern!r}")
+        raise ValueError(f"no file in {root} has a path that matches data.pattern={pattern!r}")
+    return _set_of(listing, root, manifest, options)
+
+
+def _set_of(
+    listing: Listing, root: str | Path, manifest: str | None, options: Mapping[str, Any]
+) -> FileRecordings:
+    """The recordings of a listing, better told by a manifest if there is one."""
     if manifest is not None:
-        listing = better_told(listing, read_manifest(manifest_of(folder, manifest), folder))
-    return FileRecordings(folder, manifest=listing, **options)
+        told = read_manifest(manifest_of(Path(root), manifest), Path(root))
+        listing = better_told(listing, told)
+    return FileRecordings(root, manifest=listing, **options)
+
+
+def _matching(root: Path, pattern: re.Pattern[str], problems: list[Problem]) -> Iterator[_Match]:
+    """The files below a folder whose paths match as a whole, sorted; none that is hidden.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+    """
+    if not root.is_dir():
+        raise FileNotFoundError(f"no folder at {root}")
+    for path in sorted(root.rglob("*")):
+        file = path.relative_to(root).as_posix()
+        found = pattern.fullmatch(file)
+        if found is None or any(part.startswith(".") for part in file.split("/")):
+            continue
+        if path.resolve().is_relative_to(root.resolve()):
+            yield file, found
+        else:
+            problems.append(Problem(file, "is a link out of the folder; copy it there"))
 
 
 def listed(
@@ -80,15 +105,7 @@ def listed(
     problems: list[Problem] = []
     taken: dict[RecordingId, str] = {}
     counts: dict[tuple[str, str], int] = {}
-    for path in sorted(root.rglob("*")):
-        parts = path.relative_to(root).parts
-        file = "/".join(parts)
-        found = pattern.fullmatch(file)
-        if found is None or any(part.startswith(".") for part in parts):
-            continue
-        if not path.resolve().is_relative_to(root.resolve()):
-            problems.append(Problem(file, "is a link out of the folder; copy it there"))
-            continue
+    for file, found in _matching(root, pattern, problems):
         groups = found.groupdict()
         material = rename.get(groups["material"], groups["material"])
         scene = groups.get("scene") or RecordingId.scene
@@ -148,7 +165,7 @@ STEMS: Mapping[str, str] = {
     "wood": "wood",
 }
 """What stands in names for each material; small and capital letters are alike."""
-_NAME = re.compile(r"(.+)-slip(\d{1,9})\.txt", re.IGNORECASE)
+_NAME = re.compile(r"(?:.*/)?([^/]+)-slip(\d{1,9})\.txt", re.IGNORECASE)
 
 
 def authors_raw(
@@ -179,19 +196,14 @@ def authors_raw(
         FileNotFoundError: if there is no such folder or manifest.
         ValueError: if no file is named so, or as ``FileRecordings``.
     """
-    folder = Path(root)
-    if not folder.is_dir():
-        raise FileNotFoundError(f"no folder at {folder}")
-    listing = named_files(folder, stems, nominal(speeds_mm_s, distance_mm, pause_s))
+    listing = named_files(Path(root), stems, nominal(speeds_mm_s, distance_mm, pause_s))
     if not listing.entries and not listing.problems:
         raise ValueError(
-            f"no file in {folder} is named as the authors' are, such as {next(iter(stems))}-slip1"
+            f"no file in {root} is named as the authors' are, such as {next(iter(stems))}-slip1"
             ".txt; for other names use data=files"
         )
-    if manifest is not None:
-        listing = better_told(listing, read_manifest(manifest_of(folder, manifest), folder))
     rows = HandLayout.paper24().to_rows() if channels is None else channels
-    return FileRecordings(folder, manifest=listing, channels=rows, **options)
+    return _set_of(listing, root, manifest, {"channels": rows, **options})
 
 
 def nominal(speeds_mm_s: Sequence[float], distance_mm: float, pause_s: float) -> Truth:
@@ -223,14 +235,7 @@ def named_files(root: Path, stems: Mapping[str, str], truth: Truth) -> Listing:
     entries: list[Entry] = []
     problems: list[Problem] = []
     first: dict[RecordingId, str] = {}
-    for path in sorted(root.rglob("*.[tT][xX][tT]")):
-        file = path.relative_to(root).as_posix()
-        found = _NAME.fullmatch(path.name)
-        if found is None or any(part.startswith(".") for part in path.relative_to(root).parts):
-            continue
-        if not path.resolve().is_relative_to(root.resolve()):
-            problems.append(Problem(file, "is a link out of the folder; copy it there"))
-            continue
+    for file, found in _matching(root, _NAME, problems):
         material = materials.get(found[1].lower())
         if material is None:
             close = difflib.get_close_matches(found[1], stems, 1)
