@@ -3,7 +3,6 @@
 import os
 import zlib
 
-import fuzzing
 import generated
 import numpy as np
 import pytest
@@ -63,7 +62,6 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     """A worker of pytest-xdist tells what it made."""
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["generated"] = generated.told()
-        session.config.workeroutput["fuzzed"] = fuzzing.told()
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -71,7 +69,6 @@ def pytest_testnodedown(node: object) -> None:
     """A worker has ended; one that broke down tells nothing."""
     output = getattr(node, "workeroutput", {})
     generated.hear(output.get("generated", []))
-    fuzzing.hear(output.get("fuzzed", {}))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
@@ -80,8 +77,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
             f"property tests: {num} generated bins, seed {generated.SEED} "
             f"(TACTSLIP_SEED={generated.SEED} and the same tests make them again)"
         )
-    if told := fuzzing.summary():
-        terminalreporter.write_line(told)
 
 
 @pytest.fixture
