@@ -22,11 +22,11 @@ from torch import Tensor
 
 from benchmarks.harness import COLORS, LIGHT, Benchmark, Job, Report, Table, percent, say
 from benchmarks.subjects import SEEN_ROLE, FittedMachine, composed, small_recipe, surveyed
+from tactslip_torch.model.abstention import answers, thresholds
 from tactslip_torch.model.calibration import fit_platt
-from tactslip_torch.model.conformal import answers, thresholds
+from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.report.metrics import CLASSES, answer_counts, answer_metrics
 from tactslip_torch.simulation import SEEN_MATERIALS
-from tactslip_torch.training.abstention import held_out_scores
 
 OURS = "recordings as units, ours"
 MEASURES = {
@@ -177,8 +177,9 @@ def _thresholds(
     sample = machine.survey.sample.bins()
     every = torch.arange(len(sample.is_slip))
     groups = {"bin": every, "recording": sample.recording, "material": sample.group}
+    bins = machine.plan.training_bins(sample)
     held = {
-        name: held_out_scores(machine.plan, machine.recipe, machine.survey, group)
+        name: HeldOut(bins, group, machine.plan.kernel).at(machine.plan.penalty).scores
         for name, group in groups.items()
     }
     platt = fit_platt(held["material"], sample.is_slip, machine.weights)

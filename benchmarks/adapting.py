@@ -33,7 +33,7 @@ from benchmarks.harness import (
 from benchmarks.subjects import FittedMachine, Trained
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.model.detector_file import Head
+from tactslip_torch.model.kernels import Head
 from tactslip_torch.training.adaptation import (
     FACTORS,
     Solved,
@@ -281,7 +281,7 @@ def _weights(subject: _Subject, sizes: Sizes) -> Iterator[dict[str, Any]]:
             solved = solve(without.reweighed(dict.fromkeys(bins, factor * unit), bins))
             old = [
                 mean_recall((solved.scores >= 0)[of], solved.known.is_slip[of])
-                for place, name in enumerate(solved.known.materials)
+                for place, name in enumerate(solved.known.material_names)
                 if name != material and bool((of := solved.known.material == place).any())
             ]
             new = _score(solved.head, others or bins, 0.0)

@@ -321,25 +321,13 @@ def _ours(windows: Windows, recipe: Recipe, train: Array, _: SlipDetector | None
     survey = Survey(len(pool.names), recipe.sample_bins)
     for recording, features, is_slip in windows.by_recording(train):
         survey.update(str(recording), recipe.group(recording), features, is_slip)
-    allowed = recipe.allowed(pool)
-    plan = plan_detector(
-        recipe, survey, lambda items, _: items, allowed=allowed, pool=pool, is_nested=False
-    )
+    plan = plan_detector(recipe, survey, pool, is_nested=False)
     second = TrainingPass(plan)
     for recording, features, is_slip in windows.by_recording(train):
         second.update(str(recording), features, is_slip)
     kernel = plan.kernel.to_dict()
-    detector = SlipDetector(
-        pool,
-        windows.maker.channel_filter,
-        plan.frame.selected,
-        plan.frame.scaler,
-        second.solve(),
-        {"penalty": plan.penalty, "calibration": plan.calibration, "kernel": kernel},
-        plan.imputation,
-        plan.gaussians,
-        plan.frame.pooling,
-    )
+    info = {"penalty": plan.penalty, "calibration": plan.calibration, "kernel": kernel}
+    detector = plan.detector(pool, windows.maker.channel_filter, second.solve(), info)
     selected = list(detector.selected)
 
     @torch.no_grad()

@@ -52,10 +52,10 @@ EXPERIMENTS: Mapping[str, tuple[tuple[str, ...], int]] = {
     "random_bins": (("+exp=random_bins", _PAPER), 5),
     "shuffled": (("+exp=seen6", _PAPER, "labels.shuffle_seed=1"), 1),
     "SG means only": (
-        ("+exp=unseen4", _PAPER, "recipe.among={kind:SG,descriptor:mean}"),
+        ("+exp=unseen4", _PAPER, "recipe.feature_filter={kind:SG,descriptor:mean}"),
         3,
     ),
-    "PVDF only": (("+exp=unseen4", _PAPER, "recipe.among={kind:PVDF}"), 2),
+    "PVDF only": (("+exp=unseen4", _PAPER, "recipe.feature_filter={kind:PVDF}"), 2),
     # ... these of another ...
     "half_second": (("+exp=unseen4", _PAPER, "labels=half_second"), 5),
     "half_second random_bins": (("+exp=random_bins", _PAPER, "labels=half_second"), 5),
@@ -246,7 +246,7 @@ def _of_fold(metrics: Mapping[str, Any]) -> dict[str, Any]:
         "penalty": metrics["penalty"],
         "validation": max((row["mean"] for row in metrics.get("validation", [])), default=None),
         "selected": metrics["selected"],
-        "among": metrics.get("among"),
+        "feature_filter": metrics.get("feature_filter"),
     }
 
 

@@ -33,8 +33,8 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.runtime import whole_file
 from tactslip_torch.training.experiment import feature_parts
-from tactslip_torch.training.recipe import Recipe, sample_groups, stand_for
-from tactslip_torch.training.selection import candidates, fitted_frame
+from tactslip_torch.training.recipe import Recipe, sample_groups, sample_weight
+from tactslip_torch.training.selection import candidates, fitted_selection
 
 WEIGHTS = {
     "arm_motion": (0.3, 1.0, 3.0, 10.0),
@@ -80,17 +80,16 @@ def error_rows(
     scene = [name.split("|")[-1] for name in sample.group_names]
     is_of = {one: torch.tensor([s == one for s in scene])[sample.group] for one in set(scene)}
     slip = sample.is_slip
-    counts = [float(sample.represents[slip == kind].sum()) for kind in (False, True)]
     for place in range(len(names)):
         is_out = groups == place
         training = without(sample, is_out)
-        frame = fitted_frame(recipe, pool, training, structure, recipe.allowed(pool))
-        z, others = frame(training.features), frame(sample.features[is_out])
+        selection = fitted_selection(recipe, pool, training, structure)
+        z, others = selection(training.features), selection(sample.features[is_out])
         for weights in itertools.product(*WEIGHTS.values()):
             by_scene = dict.fromkeys(recipe.scene_weights, weights[-1])
             by_scene |= dict(zip(WEIGHTS, weights[:-1], strict=False))
-            each = stand_for(training, replace(recipe, scene_weights=by_scene), counts)
-            sums = SufficientStats(frame.size, degree=1)
+            each = sample_weight(replace(recipe, scene_weights=by_scene), training)
+            sums = SufficientStats(selection.size, degree=1)
             sums.update("training", z, training.is_slip, each)
             says = torch.zeros_like(slip)
             says[is_out] = sums.solve(PENALTY, 1.0, balance="none")(others) >= 0

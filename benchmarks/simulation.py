@@ -37,7 +37,7 @@ from tactslip_torch.simulation import (
     timeline,
 )
 from tactslip_torch.simulation.source import SimulatedRecordings
-from tactslip_torch.training.recipe import recalls_mean
+from tactslip_torch.training.recipe import balanced_accuracy
 
 LEVELS: dict[str, tuple[str, dict[str, int]]] = {
     "kinematic": ("kinematic", {}),
@@ -194,7 +194,7 @@ def _accuracies(job: Job[Sizes]) -> dict[str, dict[str, float]]:
         for other, of in kept.items():
             bins = of.bins_of(sizes.materials, ("test",))
             is_right = machine.scores(bins.features) >= 0
-            found[level][other] = recalls_mean(is_right, bins.is_slip, bins.represents) or 0.0
+            found[level][other] = balanced_accuracy(is_right, bins.is_slip, bins.represents) or 0.0
     return found
 
 

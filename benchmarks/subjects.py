@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -38,7 +38,7 @@ from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.source import SimulatedRecordings
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.experiment import feature_parts
-from tactslip_torch.training.recipe import Recipe, stand_for
+from tactslip_torch.training.recipe import Recipe
 from tactslip_torch.training.selection import plan_detector
 
 Array = NDArray[Any]
@@ -235,16 +235,15 @@ class FittedMachine:
     @torch.no_grad()
     def of(cls, survey: Survey, recipe: Recipe) -> FittedMachine:
         """Rank, scale, choose K and C, and fit."""
-        plan = plan_detector(recipe, survey, _quietly)
-        sample = survey.sample.bins()
-        weights = stand_for(sample, recipe, survey.moments.count.tolist())
-        training = TrainingBins(plan.frame(sample.features), sample.is_slip, weights)
+        plan = plan_detector(recipe, survey)
+        training = plan.training_bins(survey.sample.bins())
+        weights = training.sample_weight
         return cls(plan, survey, recipe, weights, fit_machine(training, plan.penalty, plan.kernel))
 
     @torch.no_grad()
     def scores(self, features: Tensor) -> Tensor:
         """Of bins by their whole pool, ``[N, F]`` to ``[N]``."""
-        scores: Tensor = self.head(self.plan.frame(features))
+        scores: Tensor = self.head(self.plan.selection(features))
         return scores
 
 
@@ -255,7 +254,3 @@ def small_recipe(
     whole: Recipe = instantiate(config.recipes.robust, _convert_="all")
     recipe = replace(whole, sample_bins=train_bins, num_features=num_features)
     return replace(recipe, penalties=tuple(penalties)) if penalties else recipe
-
-
-def _quietly(items: Iterable[Any], what: str) -> Iterable[Any]:
-    return items

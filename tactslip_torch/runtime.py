@@ -317,9 +317,16 @@ LEAD = 31
 
 
 def bar(
-    items: Iterable[Any], what: str, unit: str = "step", total: int | None = None
+    items: Iterable[Any],
+    what: str,
+    unit: str = "step",
+    total: int | None = None,
+    *,
+    show: bool = True,
 ) -> Iterable[Any]:
     """``items`` with a progress bar on standard error that shows rate and time left."""
+    if not show:
+        return items
     if total is None and isinstance(items, Sized):
         total = len(items)
     shown: Iterable[Any] = tqdm(
@@ -335,11 +342,17 @@ class Ticker:
         what: is done.
         unit: of a step.
         total: number of steps, at most.
+        show: whether to draw it.
     """
 
-    def __init__(self, what: str, unit: str, total: int) -> None:
+    def __init__(self, what: str, unit: str, total: int, *, show: bool = True) -> None:
         self._bar = tqdm(
-            desc=f"{what:{LEAD}}", total=total, unit=f" {unit}", dynamic_ncols=True, smoothing=0
+            desc=f"{what:{LEAD}}",
+            total=total,
+            unit=f" {unit}",
+            dynamic_ncols=True,
+            smoothing=0,
+            disable=not show,
         )
 
     def __enter__(self) -> Ticker:

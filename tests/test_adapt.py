@@ -19,13 +19,13 @@ from tactslip_torch.commands.adapt import adapt
 from tactslip_torch.commands.entry import conf_dir, one_line
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
+from tactslip_torch.model.abstention import answers, thresholds
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.model.conformal import answers, thresholds
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.onset.rules import KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
-from tactslip_torch.training.adaptation import Verdict, _class_scales, add
+from tactslip_torch.training.adaptation import AccuracyChange, _class_scales, add
 from tactslip_torch.training.statistics import Statistics, detector_digest, locked
 
 TRAINING = (*TINY, "recipe=robust", "data.seed=0", "statistics=true", "coverage=0.5", "cache=off")
@@ -111,7 +111,7 @@ def test_a_material_comes_in_and_all_is_said(run, files, trained, capsys):
     assert entry["recordings"] == [f"C/{i}" for i in range(4)]
     alarm = AlarmSettings.of(new)
     assert (alarm.threshold, alarm.target_per_hour) == (SETTINGS.threshold, None)
-    assert "no rate is promised; the calibration is made anew" in alarm.facts["adapted"]
+    assert "it stands for no rate; the calibration is made anew" in alarm.facts["adapted"]
     assert alarm.calibration.to_dict() == new.info["calibration"] != SETTINGS.calibration.to_dict()
     assert new.info["calibration"] != old.info["calibration"]
     assert new.info["abstain"]["adapted"]
@@ -122,11 +122,11 @@ def test_what_stands_in_for_a_sensor_is_of_old_and_new_bins(run, files, trained)
     add_c(run, files, "weight=2")
     old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
     known = Statistics.load(run / "statistics.pt").known()
-    assert {2.0} < set(known.represents.tolist())  # a bin of C weighs as two
+    assert {2.0} < set(known.sample_weight.tolist())  # a bin of C weighs as two
     expected = torch.stack(
         [
             (known.z * w).sum(0) / w.sum()
-            for w in (known.represents[:, None] * (known.is_slip == c)[:, None] for c in (0, 1))
+            for w in (known.sample_weight[:, None] * (known.is_slip == c)[:, None] for c in (0, 1))
         ]
     )
     torch.testing.assert_close(new.gaussians.mean, expected)
@@ -143,7 +143,7 @@ def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files,
     kept = SlipDetector.load(run / "detector.pt").info["abstain"]
     statistics = Statistics.load(run / "statistics.pt")
     known, machine = statistics.known(), statistics.machine
-    weights = _class_scales(statistics.sums, machine)[known.is_slip.long()] * known.represents
+    weights = _class_scales(statistics.sums, machine)[known.is_slip.long()] * known.sample_weight
     scores = torch.empty_like(weights)
     groups = known.recording if left_out == "recording" else known.material
     for group in groups.unique():
@@ -154,7 +154,7 @@ def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files,
     expected = thresholds(scores, known.is_slip, known.recording, 0.5)
     assert (kept["low"], kept["high"]) == pytest.approx((expected.low, expected.high), rel=1e-6)
     assert kept["left_out"] == left_out
-    assert f"never met its {left_out}" in kept["adapted"]
+    assert f"without its {left_out}" in kept["adapted"]
 
 
 def test_undo_restores_the_detector_to_the_bit_and_its_sums(run, files):
@@ -207,8 +207,8 @@ def only(files, recordings):
 
 
 def test_what_old_materials_do_not_allow_changes_nothing(run, files, monkeypatch):
-    falling = Verdict({"A": 0.9, "B": 0.9}, {"A": 0.6, "B": 0.6})
-    monkeypatch.setattr(module, "add", lambda *given: replace(add(*given), verdict=falling))
+    falling = AccuracyChange({"A": 0.9, "B": 0.9}, {"A": 0.6, "B": 0.6})
+    monkeypatch.setattr(module, "add", lambda *given: replace(add(*given), old=falling))
     state = content(run)
     with pytest.raises(ValueError, match="refused, nothing is changed: old materials fall"):
         add_c(run, files, "weight=1")

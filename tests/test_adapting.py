@@ -19,26 +19,25 @@ from tactslip_torch.training.adaptation import (
     _OF_MARGIN,
     _OF_ONE,
     FACTORS,
-    Verdict,
+    AccuracyChange,
     _class_scales,
+    accepted,
     accuracies,
     add,
-    compared,
+    compare,
     forget,
     mean_recall,
     solve,
-    taken,
     undo,
 )
-from tactslip_torch.training.fitting import training_part
-from tactslip_torch.training.recipe import Frame
+from tactslip_torch.training.fitting import is_kept
+from tactslip_torch.training.recipe import FeatureSelection, Recipe
 from tactslip_torch.training.selection import Plan
 from tactslip_torch.training.statistics import (
+    KnownBins,
     Machine,
     RecordingBins,
-    Rehearsal,
     Statistics,
-    _known_bins,
 )
 
 K, NUM_BINS = 3, 24
@@ -66,10 +65,12 @@ def statistics(trained):
     for name, own in trained.items():
         sums.update(name, own.z, own.is_slip)
     sizes = torch.tensor([len(own.z) for own in trained.values()])
-    rehearsal = Rehearsal(
+    ones = torch.ones(int(sizes.sum()), dtype=torch.float64)
+    rehearsal = KnownBins(
         torch.cat([own.z for own in trained.values()]),
         torch.cat([own.is_slip for own in trained.values()]),
-        torch.ones(int(sizes.sum()), dtype=torch.float64),
+        ones,
+        ones,
         torch.arange(len(trained)).repeat_interleave(sizes),
         tuple(trained),
         tuple(own.material for own in trained.values()),
@@ -110,7 +111,7 @@ def test_a_known_bin_scores_as_by_the_machine_refitted_without_its_recording(old
         others = [own for other, own in everyone.items() if other != name]
         weights = [2.5 if other in new else 1.0 for other in everyone if other != name]
         expected = fitted(others, weights, scales)(everyone[name].z)
-        found = solved.scores[solved.known.of([name])]
+        found = solved.scores[solved.known.of_recordings([name])]
         torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-9)
 
 
@@ -155,9 +156,11 @@ def assert_same_statistics(one, other):
 def test_an_undone_step_leaves_no_trace(old, trained, new, tmp_path):
     file = torch.arange(5, dtype=torch.uint8)
     change = add(old, solve(old), new, 2.0, margin=1.0)
-    first = taken(old, change, {"action": "add"}, file, "one")
+    first = accepted(old, change, {"action": "add"}, file, "one")
     gone = {"b/1": trained["b/1"], "new/0": new["new/0"]}
-    second = taken(first, forget(first, solve(first), gone), {"action": "forget"}, file + 1, "two")
+    second = accepted(
+        first, forget(first, solve(first), gone), {"action": "forget"}, file + 1, "two"
+    )
     second.save(tmp_path / "second")
     back, found = undo(Statistics.load(tmp_path / "second"))
     assert torch.equal(found, file + 1)
@@ -178,7 +181,7 @@ def test_undo_finds_what_was_there_before_a_recording_came_back_with_other_bins(
         lambda at: forget(at, solve(at), {"wood/0": wood}),
         lambda at: add(at, solve(at), {"wood/0": quiet}, 3.0, margin=1.0),
     ):
-        states.append(taken(states[-1], step(states[-1]), {}, file, f"{len(states)}"))
+        states.append(accepted(states[-1], step(states[-1]), {}, file, f"{len(states)}"))
     states[-1].save(tmp_path / "last")
     at = Statistics.load(tmp_path / "last")
     for state in reversed(states[:-1]):
@@ -197,12 +200,12 @@ def test_a_lone_bin_and_a_heavy_one_come_in_and_go_out(old, num_bins, weight):
     assert_same_sums(back, old, weight)
 
 
-def test_forgetting_is_never_having_met(old, trained):
+def test_forgetting_is_as_if_it_was_never_in(old, trained):
     others = {name: own for name, own in trained.items() if own.material != "c"}
     mine = {name: own for name, own in trained.items() if own.material == "c"}
     found = forget(old, solve(old), mine)
     assert_same_sums(found.statistics, statistics(others))
-    assert sorted(found.verdict.after) == ["a", "b"]
+    assert sorted(found.old.after) == ["a", "b"]
 
 
 def test_only_what_was_put_in_can_be_taken_out(old, trained):
@@ -217,11 +220,11 @@ def test_auto_takes_the_largest_weight_that_old_materials_allow(old, new):
     before = solve(old)
     found = add(old, before, new, None, margin=0.1)
     chosen = found.factor
-    assert found.tried[chosen] == found.verdict.mean_fall
-    assert found.verdict.problem(_OF_MARGIN * 0.1) is None
+    assert found.tried[chosen] == found.old.mean_fall
+    assert found.old.problem(_OF_MARGIN * 0.1) is None
     (next_larger,) = [f for f in FACTORS if f > chosen][:1]
     by_hand = add(old, before, new, found.weight * next_larger / chosen, margin=0.1)
-    assert by_hand.verdict.problem(_OF_MARGIN * 0.1) is not None
+    assert by_hand.old.problem(_OF_MARGIN * 0.1) is not None
     assert found.weight * 3 * NUM_BINS == pytest.approx(chosen * 4 * NUM_BINS)
 
 
@@ -254,18 +257,18 @@ def test_small_steps_together_keep_the_margin(old):
     for number in range(6):
         more = recordings(f"new{number}", 2, 200 + 10 * number, turn=1.0)
         change = add(at, before, more, 1.0, margin=1.0)
-        assert change.drift.before == {
+        assert change.since_training.before == {
             n: accuracies(first, first.known.recordings)[n] for n in "abc"
         }
-        assert change.drift.after == {n: change.verdict.after[n] for n in "abc"}
-        falls.append((change.verdict.mean_fall, change.drift.mean_fall))
-        entry = {"old": change.verdict.to_dict()}
-        at = taken(at, change, entry, torch.zeros(1, dtype=torch.uint8), f"{number}")
+        assert change.since_training.after == {n: change.old.after[n] for n in "abc"}
+        falls.append((change.old.mean_fall, change.since_training.mean_fall))
+        entry = {"old": change.old.to_dict()}
+        at = accepted(at, change, entry, torch.zeros(1, dtype=torch.uint8), f"{number}")
         before = change.solved
     step, together = falls[-1]
     assert together > 2 * step
     margin = (step + together) / 2
-    assert change.verdict.problem(margin) is None
+    assert change.old.problem(margin) is None
     assert change.problem(margin).startswith("since before the first step, ")
 
 
@@ -277,7 +280,7 @@ def test_a_new_material_is_learned_and_later_ones_share_its_weight(old, new):
     later = add(found.statistics, found.solved, more, 2.0, margin=1.0)
     assert dict(later.statistics.weights) == dict.fromkeys([*new, *more], 2.0)
     assert later.new["after"] is None  # nothing else of this recording tells
-    assert "new" in later.verdict.before
+    assert "new" in later.old.before
 
 
 def test_bins_without_slip_alone_weigh_as_those_of_an_average_material(old, trained):
@@ -304,23 +307,25 @@ def test_what_cannot_be_added_is_refused(old, bins, weight, message):
         add(old, solve(old), bins, weight, margin=0.1)
 
 
-def test_a_verdict_names_what_falls():
+def test_a_change_of_accuracy_names_what_falls():
     same = {"a": 0.9, "b": 0.8}
-    assert Verdict(same, same).problem(0.0) is None
-    mean = Verdict(same, {"a": 0.88, "b": 0.8}).problem(0.005)
+    assert AccuracyChange(same, same).problem(0.0) is None
+    mean = AccuracyChange(same, {"a": 0.88, "b": 0.8}).problem(0.005)
     assert mean.startswith("old materials fall from 85.00 to 84.00 %")
-    one = Verdict(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7}).problem(0.04 / _OF_ONE)
+    one = AccuracyChange(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7}).problem(
+        0.04 / _OF_ONE
+    )
     assert one.startswith("b falls from 80.00 to 75.00 %")
-    assert Verdict(same, {"a": 0.88, "b": 0.8}).problem(0.0101) is None
-    assert Verdict({}, {}).problem(0.0) is None
+    assert AccuracyChange(same, {"a": 0.88, "b": 0.8}).problem(0.0101) is None
+    assert AccuracyChange({}, {}).problem(0.0) is None
 
 
 def test_both_machines_are_compared_on_the_bins_that_both_know(old, new):
     before = solve(old)
-    found = compared(before, add(old, before, new, 1.0, margin=1.0).solved)
+    found = compare(before, add(old, before, new, 1.0, margin=1.0).solved)
     assert sorted(found.before) == sorted(found.after) == ["a", "b", "c"]
     known = before.known
-    mine = known.material == known.materials.index("b")
+    mine = known.material == known.material_names.index("b")
     assert found.before["b"] == mean_recall(before.scores[mine] >= 0, known.is_slip[mine])
 
 
@@ -330,38 +335,35 @@ def test_mean_recall_is_balanced_accuracy_or_that_of_the_one_class():
     assert mean_recall(truth, ~torch.zeros(4, dtype=torch.bool)) == pytest.approx(3 / 4)
 
 
-def test_witnesses_give_way_to_all_bins_of_a_recording_that_is_taken_out(old, trained, new):
-    known = _known_bins(
-        old.rehearsal, {"a/0": trained["a/0"]} | new, {"a/0": 0.0} | dict.fromkeys(new, 3.0)
-    )
-    assert not bool(known.of(["a/0"]).any())
-    assert set(known.weight[known.of(new)].tolist()) == {3.0}
+def test_known_bins_give_way_to_all_bins_of_a_recording_that_is_taken_out(old, trained, new):
+    weights = {"a/0": 0.0} | dict.fromkeys(new, 3.0)
+    known = old.rehearsal.with_others({"a/0": trained["a/0"]} | new, weights)
+    assert not bool(known.of_recordings(["a/0"]).any())
+    assert set(known.weight[known.of_recordings(new)].tolist()) == {3.0}
     assert len(known.z) == (len(trained) - 1 + len(new)) * NUM_BINS
-    assert known.materials == ("a", "b", "c", "new")
+    assert known.material_names == ["a", "b", "c", "new"]
     names = [known.recordings[i] for i in known.recording.tolist()]
-    materials = [known.materials[i] for i in known.material.tolist()]
+    materials = [known.material_names[i] for i in known.material.tolist()]
     assert all(name.startswith(f"{of}/") for name, of in zip(names, materials, strict=True))
 
 
-def test_witnesses_are_bins_that_were_trained_on_under_undersampling(rng):
-    frame = Frame((0, 2), FeatureScaler(torch.zeros(2).double(), torch.ones(2).double()))
-    plan = Plan(
-        frame, Polynomial(2, 0.5), 1.0, "undersample", (1.0, 0.4), 1.0, 60,
-        (0.0, 0.0),
-    )  # fmt: skip
+def test_known_bins_are_bins_that_were_trained_on_under_undersampling(rng):
+    ends = torch.zeros(2).double(), torch.ones(2).double()
+    selection, zeros = FeatureSelection((0, 2), FeatureScaler(*ends)), torch.zeros(2)
+    plan = Plan(Recipe(), selection, Polynomial(2, 0.5), 1.0, (1.0, 0.4), 1.0, 60, zeros)
     sample, kept = BinSample(30), {}
     for name in ("m/0", "m/1"):
         features = torch.from_numpy(rng.uniform(0, 1, (40, 4))).float()
         is_slip = torch.arange(40) % 2 == 0
         sample.update(name, "m", features, is_slip)
-        kept[name] = training_part(plan, name, features, is_slip)[0]
-    found = Rehearsal.of(plan, sample.bins(), {"m/0": "m", "m/1": "m"})
+        kept[name] = selection(features[is_kept(name, is_slip, plan.fractions)])
+    found = KnownBins.of(plan, sample.bins(), {"m/0": "m", "m/1": "m"})
     for number, name in enumerate(found.recordings):
         rows = found.z[found.recording == number]
         in_training = (rows[:, None] == kept[name]).all(-1).any(-1)
         assert len(rows) > 0
         assert bool(in_training.all())
-    num_slip = float(found.represents[found.is_slip].sum())
+    num_slip = float(found.sample_weight[found.is_slip].sum())
     assert 0.5 < num_slip / sum(float(len(z) - 20) for z in kept.values()) < 2.0
 
 

@@ -35,7 +35,6 @@ from tactslip_torch.training.alarm import (
     MOST,
     OURS,
     CalibratedAlarm,
-    FalseAlarmBudget,
     labelled,
 )
 from tactslip_torch.training.stream_evaluation import (
@@ -280,8 +279,8 @@ def knocked(number: int) -> Stream:
 def test_the_rule_of_the_file_keeps_the_rate_not_one_like_it(seed):
     """A sum that gets its ceiling after its threshold was set re-arms sooner, and alarms more."""
     streams = [knocked(20 * seed + number) for number in range(20)]
-    budget = FalseAlarmBudget(100.0, "held", 0.5, 0.05, 0.0, 0.95)
-    method = budget.calibrated(OURS, Cusum(1.0, 0.2), Platt(2.0, 0.0), streams, CLOCK)
+    made = stage(false_alarms_per_hour=100.0, rearm_s=0.05, refractory_s=0.0)
+    method = made.calibrated(OURS, Cusum(1.0, 0.2), Platt(2.0, 0.0), streams, CLOCK)
     made = [made for _, made in decide(streams, OURS, method.settings, CLOCK)]
     alarms = sum(int(one.is_alarm.sum()) for one in made)
     allowed = math.floor(100.0 * sum(len(one.number) for one in made) * 0.01 / 3600)
@@ -294,8 +293,8 @@ def test_the_rule_of_the_file_keeps_the_rate_not_one_like_it(seed):
 def test_a_calibration_that_ends_bounds_the_threshold():
     streams = [knocked(number) for number in range(10)]
     flat = Isotonic((-1.0, 0.4), (-3.0, 2.0))  # every knock is beyond its last knot
-    budget = FalseAlarmBudget(1.0, "held", 0.5, 0.05, 0.0, 0.95)
-    method = budget.calibrated(OURS, KOfN(2, 3), flat, streams, CLOCK)
+    made = stage(false_alarms_per_hour=1.0, rearm_s=0.05, refractory_s=0.0)
+    method = made.calibrated(OURS, KOfN(2, 3), flat, streams, CLOCK)
     assert method.settings.threshold <= 2.0  # slips can still be found,
     assert method.threshold.reached is False  # and it is said that the rate is not kept
     assert method.threshold.rate.alarms > 0
@@ -440,10 +439,10 @@ def test_alarms_ends_and_first_words_by_a_plain_loop():
 
 def test_the_papers_rule_alarms_at_every_change_to_slip():
     score = np.random.default_rng(3).standard_normal(100)
-    budget = FalseAlarmBudget(1.0, "held", 0.5, 0.1, 0.2, 0.95)
     clock = Clock(RATE_HZ, 100, 100, 25)
-    method = budget.first_transition(OURS, clock)
-    ((_, made),) = decide([stream_of(score)], OURS, method.settings, clock)
+    changes = {"calibration": Platt(1.0, 0.0), "rearm_s": 0, "refractory_s": 0}
+    settings = replace(settings_of(KOfN(1, 1), 100, threshold=1e-30), **changes)
+    ((_, made),) = decide([stream_of(score)], OURS, settings, clock)
     expected = first_transition(torch.from_numpy(score.astype(np.float32)) >= 0)
     assert made.is_alarm.tolist() == expected.tolist()
 

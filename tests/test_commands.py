@@ -406,8 +406,8 @@ def test_a_run_sets_thresholds_and_says_what_answers_cover(tiny, tmp_path, capsy
     assert list(metrics["answers"]) == ["train", "test", "unseen"]
     detector = SlipDetector.load(tmp_path / "run" / "detector.pt")
     kept = Abstention.of(detector)
-    assert (kept.coverage, kept.facts["left_out"]) == (0.6, "recording")
-    assert kept.facts["num_recordings"] == {"slip": 4, "non_slip": 4}
+    assert (kept.coverage, kept.metadata["left_out"]) == (0.6, "recording")
+    assert kept.metadata["num_recordings"] == {"slip": 4, "non_slip": 4}
     for role, found in metrics["answers"].items():
         assert len(found["recordings"]) == 4
         (quiet, loud), confusion = found["counts"], metrics["splits"][role]["confusion"]

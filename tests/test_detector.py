@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tactslip_torch import FeaturePool, HandLayout, SlipDetector
-from tactslip_torch.model.detector_file import FORMAT
+from tactslip_torch.model.detector import FORMAT
 from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm, RadialBasis
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import load_table, save_table

@@ -30,7 +30,13 @@ from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import SlipDataModule
-from tactslip_torch.training.recipe import FREE_CONSTANT, Frame, fit_frame, recalls_mean, stand_for
+from tactslip_torch.training.recipe import (
+    FREE_CONSTANT,
+    FeatureSelection,
+    balanced_accuracy,
+    sample_weight,
+    scaled_selection,
+)
 
 SMALL = {
     "sizes": [3, 6],
@@ -53,7 +59,8 @@ HAND = HandLayout.paper24()
 def described(candidates):
     """What can be compared of candidates."""
     return [
-        (c._replace(frame=None), c.detector, c.frame.scaler.minimum.tolist()) for c in candidates
+        (c._replace(selection=None), c.detector, c.selection.scaler.minimum.tolist())
+        for c in candidates
     ]
 
 
@@ -181,7 +188,7 @@ def test_every_group_ranking_head_and_size_is_there_once(searched):
     assert sorted(met) == sorted((*group, *rest) for group, *rest in expected)
     names = FeaturePool(SMALL_HAND).names
     for each in candidates:
-        assert each.frame.pooling is None
+        assert each.selection.pooling is None
         chosen = [names[index] for index in each.selected]
         if each.channels == "films":
             assert {name.channel for name in chosen} == {"PVDF1"}
@@ -212,8 +219,8 @@ def test_a_score_is_that_of_machines_that_never_met_the_material(searched, degre
     ]
     survey = made.surveys["centred"]
     sample = survey.sample.bins()
-    z = fit_frame(RECIPE, survey, found.selected)(sample.features)
-    weights = stand_for(sample, RECIPE, survey.moments.count.tolist())
+    z = scaled_selection(RECIPE, survey, found.selected)(sample.features)
+    weights = sample_weight(RECIPE, sample)
     by_penalty = {}
     for penalty in SMALL["penalties"]:
         scores = []
@@ -221,7 +228,7 @@ def test_a_score_is_that_of_machines_that_never_met_the_material(searched, degre
             out = sample.group == index
             training = TrainingBins(z[~out], sample.is_slip[~out], weights[~out])
             head = fit_machine(training, penalty, Polynomial(degree, 0.5))
-            scores.append(recalls_mean(head(z[out]) >= 0, sample.is_slip[out]))
+            scores.append(balanced_accuracy(head(z[out]) >= 0, sample.is_slip[out]))
         by_penalty[penalty] = scores
     best = max(by_penalty, key=lambda penalty: sum(by_penalty[penalty]))
     assert found.balanced_accuracy == pytest.approx(sum(by_penalty[best]) / 3)
@@ -256,12 +263,12 @@ def test_pooled_candidates_of_every_group_size_and_degree(searched):
     assert sorted(met) == sorted(expected)
     for each in pooled:
         assert (each.columns, each.components) == ("pooled mean", "moments")
-        names = each.frame.pooling.names
-        assert len(names) == each.frame.size == each.frame.pooling.knee.numel()
+        names = each.selection.pooling.names
+        assert len(names) == each.selection.size == each.selection.pooling.knee.numel()
         kinds = {name.channel for name in names}
         assert kinds <= {"all": {"SG", "PVDF"}, "films": {"PVDF"}, "gauges": {"SG"}}[each.channels]
         assert not {name.descriptor for name in names} & {"mode", "cv", "entropy", "median", "iqr"}
-        assert each.frame.size == 4 or each.ranking == "none"
+        assert each.selection.size == 4 or each.ranking == "none"
 
 
 def test_a_pooled_score_is_that_of_everything_learned_without_the_material(searched):
@@ -272,7 +279,7 @@ def test_a_pooled_score_is_that_of_everything_learned_without_the_material(searc
         if (c.channels, c.ranking, c.degree) == ("films", "none", 1) and c.columns != "channel"
     ]
     sample = made.surveys["centred"].sample.bins()
-    weights = stand_for(sample, RECIPE, made.surveys["centred"].moments.count.tolist())
+    weights = sample_weight(RECIPE, sample)
     place = {name: index for index, name in enumerate(made.pool.names)}
     names = [
         name
@@ -291,7 +298,7 @@ def test_a_pooled_score_is_that_of_everything_learned_without_the_material(searc
         z = scaler(columns)
         training = TrainingBins(z[~out], sample.is_slip[~out], weights[~out])
         head = fit_machine(training, found.penalty, Polynomial(1, FREE_CONSTANT))
-        expected.append(recalls_mean(head(z[out]) >= 0, sample.is_slip[out]))
+        expected.append(balanced_accuracy(head(z[out]) >= 0, sample.is_slip[out]))
     assert list(found.by_group.values()) == pytest.approx(expected)
     assert found.balanced_accuracy == pytest.approx(sum(expected) / 3)
 
@@ -306,7 +313,7 @@ def test_pooled_compute_is_of_all_channels_and_of_pooling():
         assert after.latency.compute_us - before.latency.compute_us == pytest.approx(more)
         if num_pooled:
             assert set(after.selected) == {
-                made.pool.names.index(name) for name in after.frame.pooling.inputs
+                made.pool.names.index(name) for name in after.selection.pooling.inputs
             }
 
 
@@ -316,13 +323,13 @@ def test_fingers_are_dropped_from_the_best_on():
     made.pool = FeaturePool(HandLayout((gauge, replace(film, finger="thumb"))))
     candidates = made.candidates()
     best = next(c for c in candidates if c.channels == "all" and c.degree == 2)
-    best = best._replace(frame=frame_of((0, 100)))
+    best = best._replace(selection=frame_of((0, 100)))
     found = made.without_fingers(best)
     assert {c.channels for c in found} == {"all without index", "all without thumb"}
     of_film = next(c for c in candidates if c.channels == "films" and len(c.selected) == 6)
     without = [c for c in found if c.channels == "all without index" and len(c.selected) == 6]
     assert without[0].selected == of_film.selected
-    alone = best._replace(frame=frame_of((0,)))
+    alone = best._replace(selection=frame_of((0,)))
     assert made.without_fingers(alone) == []
 
 
@@ -343,7 +350,7 @@ def test_each_finger_goes_that_is_missed_least(monkeypatch):
 
     monkeypatch.setattr(made, "_scored", played)
     one_of_each = [made._channel_of.index(channel) for channel in (0, 3, 6, 9, 12)]
-    best = candidate(60.0, 100.0, 0.9)._replace(frame=frame_of(one_of_each))
+    best = candidate(60.0, 100.0, 0.9)._replace(selection=frame_of(one_of_each))
     found = made.without_fingers(best)
     assert len(found) == 5 + 4 + 3 + 2
     kept = [max(c.balanced_accuracy for c in part) for part in (found[:5], found[5:9], found[9:12])]
@@ -371,7 +378,7 @@ def test_the_front_is_what_nothing_beats(rng):
 
 def frame_of(selected):
     ends = torch.ones(len(selected))
-    return Frame(tuple(selected), FeatureScaler(-ends, ends))
+    return FeatureSelection(tuple(selected), FeatureScaler(-ends, ends))
 
 
 def candidate(worst_ms, compute_us, accuracy, size=50):

@@ -52,7 +52,7 @@ def learned_state(learner):
     detector = learner.detector
     return {
         "selected": detector.selected,
-        "facts": learner.facts,
+        "facts": learner.metadata,
         **detector.state_dict(),
     }
 
@@ -238,10 +238,10 @@ def test_the_solve_is_reported_with_its_condition():
     source = SmallSet()
     learned = learn(source, unseen_c(source))
     solve = learned.detector.info["solve"]
-    assert solve == learned.facts["solve"]
+    assert solve == learned.metadata["solve"]
     assert solve["method"] == "cholesky"
     assert 1 < solve["condition"] <= solve["condition_bound"]
-    assert solve["rank"] == solve["size"] <= learned.facts["num_bins"]
+    assert solve["rank"] == solve["size"] <= learned.metadata["num_bins"]
 
 
 def test_a_finished_pass_survives_a_checkpoint(tmp_path):

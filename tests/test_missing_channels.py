@@ -204,15 +204,6 @@ def test_shrinkage_vanishes_with_bins_and_is_whole_of_one():
     assert shrinkage(torch.eye(2, dtype=torch.float64), 1e6) == 1.0
 
 
-def test_gaussians_come_back_from_a_table_of_tensors(rng):
-    found = gaussians_of(rng)
-    again = ClassGaussians.among(found.tensors() | {"minimum": torch.zeros(3)})
-    assert ClassGaussians.among({"minimum": torch.zeros(3)}) is None
-    assert again is not None
-    assert torch.equal(again.mean, found.mean)
-    assert torch.equal(again.covariance, found.covariance)
-
-
 @pytest.mark.parametrize(
     ("mean", "covariance", "said"),
     [

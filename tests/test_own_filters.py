@@ -11,8 +11,7 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import unseen4
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.detector_file import FORMAT
+from tactslip_torch.model.detector import FORMAT, SlipDetector
 from tactslip_torch.runtime import load_table, save_table
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker

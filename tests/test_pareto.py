@@ -26,8 +26,8 @@ from tactslip_torch.report.pareto import _plain_ticks, none_meets, pareto_table
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.recipe import FREE_CONSTANT, Frame, fit_frame
-from tactslip_torch.training.selection import Structure, fitted_frame
+from tactslip_torch.training.recipe import FREE_CONSTANT, FeatureSelection, scaled_selection
+from tactslip_torch.training.selection import Structure, fitted_selection
 
 TINY = (
     "data._target_=test_commands.TinyRecordings",
@@ -404,7 +404,9 @@ def candidate(**changes):
     parts |= changes
     selected = parts.pop("selected")
     ends = torch.ones(len(selected), dtype=torch.float64)
-    return Candidate(**({"frame": Frame(selected, FeatureScaler(-ends, ends))} | parts))
+    return Candidate(
+        **({"selection": FeatureSelection(selected, FeatureScaler(-ends, ends))} | parts)
+    )
 
 
 def test_a_detector_found_twice_is_one_candidate():
@@ -422,7 +424,9 @@ def test_a_detector_found_twice_is_one_candidate():
 
 def scaled(shop, found):
     """The candidate with its features scaled as the search does."""
-    return found._replace(frame=fit_frame(shop.recipe, shop.surveys[found.align], found.selected))
+    return found._replace(
+        selection=scaled_selection(shop.recipe, shop.surveys[found.align], found.selected)
+    )
 
 
 @pytest.mark.parametrize("degree", [1, 2])
@@ -431,8 +435,8 @@ def test_a_pooled_detector_is_made_timed_and_judged(shop, degree):
     recipe = replace(shop.recipe, pooling=["mean", "std"], use="pooled")
     everything = Structure("pooled", 10**6, Polynomial(1))
     mask = allowed(shop.pool.hand, shop.pool.names, "all", "time_moments")
-    frame = fitted_frame(recipe, shop.pool, survey.sample.bins(), everything, mask).first(18)
-    chosen = candidate(frame=frame, columns="pooled mean, std", degree=degree)
+    frame = fitted_selection(recipe, shop.pool, survey.sample.bins(), everything, mask).first(18)
+    chosen = candidate(selection=frame, columns="pooled mean, std", degree=degree)
     detector = shop.make(chosen, "double", from_all=True)
     assert detector.info["fitted_to"] == "all training bins"
     assert detector.pooling.names == frame.pooling.names

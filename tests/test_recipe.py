@@ -1,12 +1,12 @@
-"""The recipe's choices, on what a first pass learned of random bins."""
+"""Recipes, plans and passes: what is chosen, and that neither order nor workers matter."""
 
-import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.stats import ttest_ind
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
-from test_learning import learn, unseen_c
 
 from tactslip_torch.analysis.pareto import Workshop
 from tactslip_torch.data.recording import RecordingId
@@ -14,18 +14,24 @@ from tactslip_torch.features.groups import matching
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.missing_channels import RESOLUTION
+from tactslip_torch.training import selection
+from tactslip_torch.training.fitting import TrainingPass
 from tactslip_torch.training.learner import SlipLearner
 from tactslip_torch.training.recipe import (
     Recipe,
-    bin_weights,
-    choose_frame,
-    kept_shares,
-    recalls_mean,
-    stand_for,
+    balanced_accuracy,
+    class_fractions,
+    sample_weight,
+    select_features,
 )
 from tactslip_torch.training.selection import Plan, plan_detector
 
 NUM = 30
+FEW = {"num_features": 4, "penalties": (0.1, 3.0), "sample_bins": 500}
+POOL, SMALL_POOL = FeaturePool(HandLayout.paper24()), FeaturePool(SMALL_HAND)
 
 
 def make_parts(rng, materials="abc", cycles=2, bins=40, share=0.5):
@@ -47,113 +53,89 @@ def surveyed(recipe, parts):
     return survey
 
 
+def selected(recipe, parts):
+    return select_features(recipe, surveyed(recipe, parts))
+
+
+def planned(recipe, parts):
+    return plan_detector(recipe, surveyed(recipe, parts))
+
+
+def passed(plan, parts):
+    gathered = TrainingPass(plan)
+    for recording, features, is_slip in parts:
+        gathered.update(str(recording), features, is_slip)
+    return gathered
+
+
 def together(parts):
     return torch.cat([p[1] for p in parts]).double(), torch.cat([p[2] for p in parts])
 
 
-def test_ranking_is_by_the_t_statistic_of_all_bins_together(rng):
-    from scipy.stats import ttest_ind
+def balanced(plan, parts):
+    """All bins as training bins, both classes weighing the same."""
+    features, is_slip = together(parts)
+    weights = (len(is_slip) / (2 * torch.bincount(is_slip.long()).double()))[is_slip.long()]
+    return TrainingBins(plan.selection(features), is_slip, weights)
 
+
+# Ranking, scaling, weights ---------------------------------------------------------------------
+
+
+def test_ranking_is_by_the_t_statistic_and_the_scaler_has_the_range_of_all_bins(rng):
     parts = make_parts(rng)
     features, is_slip = together(parts)
     scores = np.abs(ttest_ind(features[is_slip], features[~is_slip]).statistic)
-    frame = choose_frame(Recipe(num_features=4), surveyed(Recipe(), parts))
-    assert list(frame.selected) == np.argsort(-scores)[:4].tolist()
-
-
-def test_the_papers_scaler_has_the_exact_range_of_every_training_bin(rng):
-    parts = make_parts(rng)
-    recipe = Recipe(num_features=3, sample_bins=2)  # far fewer than there are
-    frame = choose_frame(recipe, surveyed(recipe, parts))
-    features = together(parts)[0][:, list(frame.selected)]
-    assert torch.equal(frame.scaler.maximum, features.amax(0))
-    assert torch.equal(frame.scaler.minimum, features.amin(0))
-    scaled = frame(together(parts)[0])
-    assert scaled.amax(0).tolist() == [1, 1, 1]
-    assert scaled.amin(0).tolist() == [-1, -1, -1]
+    found = selected(Recipe(num_features=4, sample_bins=2), parts)  # far fewer than there are
+    assert list(found.selected) == np.argsort(-scores)[:4].tolist()
+    scaled = found(features)
+    assert scaled.amax(0).tolist() == [1] * 4
+    assert scaled.amin(0).tolist() == [-1] * 4
+    torch.testing.assert_close(found.first(2)(features), scaled[:, :2])
 
 
 def test_tails_are_compressed_and_clipped_on_request(rng):
     parts = make_parts(rng)
     parts[0][1][0, :5] = 1e6  # an outlier in one bin
-    recipe = Recipe(num_features=3, compress=True, tail=0.05)
-    frame = choose_frame(recipe, surveyed(recipe, parts))
-    features = together(parts)[0][:, list(frame.selected)]
-    bent = features.sign() * (features.abs() / frame.scaler.knee).log1p() * frame.scaler.knee
-    share = (bent > frame.scaler.maximum).double().mean(0)
+    found = selected(Recipe(num_features=3, compress=True, tail=0.05), parts)
+    features, scaler = together(parts)[0], found.scaler
+    chosen = features[:, list(found.selected)]
+    bent = chosen.sign() * (chosen.abs() / scaler.knee).log1p() * scaler.knee
+    share = (bent > scaler.maximum).double().mean(0)
     assert ((share > 0.02) & (share <= 0.05)).all()
-    assert frame(together(parts)[0]).abs().amax() == 1
-    assert (frame.scaler.maximum < 10).all()
+    assert found(features).abs().amax() == 1
+    assert (scaler.maximum < 10).all()
 
 
 def test_near_duplicates_are_passed_over(rng):
     parts = make_parts(rng)
     for _, features, _ in parts:  # feature 10 says what feature 4 says
         features[:, 10] = features[:, 4] + 1e-3 * torch.from_numpy(rng.standard_normal(40)).float()
-    with_both = choose_frame(Recipe(num_features=3), surveyed(Recipe(), parts)).selected
-    recipe = Recipe(num_features=3, most_correlation=0.9)
-    without = choose_frame(recipe, surveyed(recipe, parts)).selected
-    assert {4, 10} <= set(with_both)
-    assert len({4, 10} & set(without)) == 1
-    assert {3, 2} <= set(without)
-
-
-def test_the_first_features_of_a_frame(rng):
-    recipe = Recipe(num_features=[2, 5], compress=True)
-    parts = make_parts(rng)
-    frame = choose_frame(recipe, surveyed(recipe, parts))
-    assert len(frame.selected) == 5
-    features = together(parts)[0]
-    assert torch.equal(frame.first(2)(features), frame(features)[:, :2])
+    assert {4, 10} <= set(selected(Recipe(num_features=3), parts).selected)
+    without = set(selected(Recipe(num_features=3, most_correlation=0.9), parts).selected)
+    assert len({4, 10} & without) == 1
+    assert {3, 2} <= without
 
 
 @pytest.mark.parametrize("balance", ["undersample", "weights"])
-def test_both_balances_give_the_classes_one_weight(balance, rng):
-    recipe = Recipe(balance=balance)
-    _, is_slip = together(make_parts(rng, share=0.8))
-    counts = [int((~is_slip).sum()), int(is_slip.sum())]
-    weights = bin_weights(recipe, counts, is_slip)
-    totals = [float(weights[is_slip == value].sum()) for value in (False, True)]
-    assert totals[0] == pytest.approx(totals[1], rel=1e-12)
-    expected = 2 * min(counts) if balance == "undersample" else sum(counts)
-    assert sum(totals) == pytest.approx(expected)
-    assert kept_shares(recipe, counts)[0] == 1.0  # non-slip is the smaller class
-
-
-def test_a_sample_stands_for_all_bins(rng):
-    recipe = Recipe(sample_bins=7, balance="weights")
-    survey = surveyed(recipe, make_parts(rng, share=0.8))
-    sample = survey.sample.bins()
+def test_a_sample_stands_for_all_bins_with_both_classes_of_one_weight(balance, rng):
+    recipe, parts = Recipe(sample_bins=7, balance=balance), make_parts(rng, share=0.8)
+    sample = surveyed(recipe, parts).sample.bins()
     assert len(sample.is_slip) == 3 * 2 * 7
-    weights = stand_for(sample, recipe, survey.moments.count.tolist())
-    assert float(weights.sum()) == pytest.approx(240)
+    weights, num_rest = sample_weight(recipe, sample), int((~together(parts)[1]).sum())
+    totals = [float(weights[mine].sum()) for mine in (sample.is_slip, ~sample.is_slip)]
+    wanted = num_rest if balance == "undersample" else 120
+    assert totals == pytest.approx([wanted, wanted], rel=1e-12)
+    assert class_fractions(recipe, sample)[0] == 1.0  # non-slip is the smaller class
 
 
-def test_an_absent_class_is_named(rng):
-    parts = [(r, f, torch.ones_like(s)) for r, f, s in make_parts(rng)]
-    with pytest.raises(ValueError, match="no non-slip bin"):
-        choose_frame(Recipe(num_features=3), surveyed(Recipe(), parts))
-    with pytest.raises(ValueError, match="no non-slip bin"):
-        bin_weights(Recipe(), [0, 5], torch.ones(5, dtype=torch.bool))
-
-
-def test_recalls_mean_by_hand():
+def test_balanced_accuracy_by_hand():
     truth = torch.tensor([False, False, True, True, True, True])
     says = torch.tensor([False, True, True, True, True, False])
-    assert recalls_mean(says, truth) == pytest.approx((1 / 2 + 3 / 4) / 2)
+    assert balanced_accuracy(says, truth) == pytest.approx((1 / 2 + 3 / 4) / 2)
     weights = torch.tensor([3.0, 1.0, 1.0, 1.0, 1.0, 3.0], dtype=torch.float64)
-    assert recalls_mean(says, truth, weights) == pytest.approx((3 / 4 + 3 / 6) / 2)
-    assert recalls_mean(says[:2], truth[:2]) is None
-
-
-def test_facts_are_json_even_of_an_infinite_penalty():
-    among = {"kind": "SG", "descriptor": ["mean", "std"]}
-    recipes = [Recipe(), Recipe(penalties=float("inf")), Recipe(num_features=[3, 5])]
-    for recipe in [*recipes, Recipe(among=among)]:
-        again = Recipe(**json.loads(json.dumps(recipe.facts(), allow_nan=False)))
-        assert again.among == recipe.among
-        assert again.penalties_ascending == recipe.penalties_ascending
-        assert again.sizes == recipe.sizes
+    assert balanced_accuracy(says, truth, weights) == pytest.approx((3 / 4 + 3 / 6) / 2)
+    assert balanced_accuracy(says[:2], truth[:2]) is None
 
 
 def test_groups_are_materials_or_fifths_of_the_cycles():
@@ -165,9 +147,6 @@ def test_groups_are_materials_or_fifths_of_the_cycles():
     ("change", "message"),
     [
         ({"balance": "none"}, r"recipe.balance must be one of undersample, weights, got 'none'"),
-        ({"score_variance": "x"}, r"recipe.score_variance must be one of pooled, welch"),
-        ({"group_by": "x"}, r"recipe.group_by must be one of material, cycle"),
-        ({"kernel": "x"}, r"recipe.kernel must be one of polynomial, rbf"),
         ({"kernel": "rbf"}, r"recipe.kernel=rbf needs recipe.gamma"),
         ({"penalties": ()}, r"recipe.penalties must be positive, got \[\]"),
         ({"penalties": (0.1, 0.0)}, r"recipe.penalties must be positive"),
@@ -180,11 +159,15 @@ def test_groups_are_materials_or_fifths_of_the_cycles():
         ({"most_correlation": 0.0}, r"recipe.most_correlation must lie in \(0, 1\]"),
         ({"sample_bins": 1}, r"recipe.sample_bins must be at least 2"),
         ({"degree": 0}, r"degree of the kernel must be a whole number"),
-        ({"among": {"kinds": "SG"}}, r"recipe.among: unknown 'kinds', expected some of kind, f"),
-        ({"among": {"kind": []}}, r"recipe.among.kind must be a name or several, got \[\]"),
-        ({"among": {"kind": 3}}, r"recipe.among.kind must be a name or several, got 3"),
-        ({"among": {}}, r"recipe.among must be like .*, got {}"),
-        ({"among": "SG"}, r"recipe.among must be like .*, got 'SG'"),
+        ({"use": "pooled", "pooling": None}, "needs statistics over channels"),
+        ({"num_features": None}, "num_features=null needs recipe.validation=nested"),
+        ({"validation": "nested", "kernel": "rbf", "gamma": 1}, "needs recipe.kernel=polynomial"),
+        ({"validation": "nested", "degree": 3}, "of degree 1 or 2"),
+        ({"tolerance": 1.0}, r"recipe.tolerance must lie in \[0, 1\), got 1.0"),
+        ({"scene_weights": {"taps": 0.0}}, "recipe.scene_weights.taps must be positive"),
+        ({"feature_filter": {"kinds": "SG"}}, r"recipe.feature_filter: unknown 'kinds', expected"),
+        ({"feature_filter": {"kind": 3}}, r"feature_filter.kind must be a name or several, got 3"),
+        ({"feature_filter": "SG"}, r"recipe.feature_filter must be like .*, got 'SG'"),
     ],
     ids=str,
 )
@@ -193,12 +176,146 @@ def test_bad_recipes_are_refused(change, message):
         Recipe(**change)
 
 
-# ------------------------------------------------------------------------- recipes with among
-POOL = FeaturePool(HandLayout.paper24())
+# Plans -----------------------------------------------------------------------------------------
+
+
+def test_validation_and_calibration_equal_refits_without_the_group(rng):
+    parts = make_parts(rng)
+    plan = planned(Recipe(**FEW, balance="weights"), parts)
+    bins = balanced(plan, parts)
+    material = [r.material for r, _, is_slip in parts for _ in is_slip]
+    assert [row["penalty"] for row in plan.validation] == [0.1, 3.0]
+    for row in plan.validation:
+        scores = torch.zeros(len(material), dtype=torch.float64)
+        for name, found in row["balanced_accuracy"].items():
+            mine = torch.tensor([each == name for each in material])
+            others = (x[~mine] for x in (bins.features, bins.is_slip, bins.weights))
+            scores[mine] = fit_machine(TrainingBins(*others), row["penalty"])(bins.features[mine])
+            assert found == balanced_accuracy(scores[mine] >= 0, bins.is_slip[mine])
+        assert row["mean"] == pytest.approx(sum(row["balanced_accuracy"].values()) / 3)
+        expected, found = fit_platt(scores, bins.is_slip, bins.weights), row["calibration"]
+        assert calibration_from_dict(found).slope == pytest.approx(expected.slope, rel=1e-6)
+        assert calibration_from_dict(found).offset == pytest.approx(expected.offset, rel=1e-6)
+    best = max(row["mean"] for row in plan.validation)
+    chosen = next(row for row in plan.validation if row["mean"] == best)
+    assert (plan.penalty, plan.calibration) == (chosen["penalty"], chosen["calibration"])
+
+
+def test_size_offset_and_penalty_are_chosen_together(rng):
+    recipe = Recipe(num_features=[5, 2], offsets=[0.5, 2.0], penalties=(0.1, 1.0))
+    plan = planned(recipe, make_parts(rng))
+    assert len(plan.validation) == 8
+    best = max(plan.validation, key=lambda row: row["mean"])
+    assert plan.selection.size == best["num_features"]
+    assert (plan.kernel.to_dict(), plan.penalty) == (best["kernel"], best["penalty"])
+
+
+def test_what_cannot_be_validated_is_taken_from_the_middle(rng, caplog):
+    recipe = Recipe(num_features=[2, 3], offsets=[0.5, 2.0], penalties=(3.0, 0.1, 0.2))
+    plan = planned(recipe, make_parts(rng, "a"))  # one group
+    assert (plan.selection.size, plan.penalty, plan.validation) == (3, 0.2, [])
+    assert "K=3" in caplog.text
+    assert "unvalidated" in caplog.text
+    plan = planned(Recipe(num_features=3, penalties=float("inf")), make_parts(rng))
+    assert (plan.penalty, plan.metadata["penalty"], plan.validation) == (float("inf"), "inf", [])
+
+
+def test_an_absent_class_is_named(rng):
+    parts = [(r, f, torch.ones_like(s)) for r, f, s in make_parts(rng)]
+    with pytest.raises(ValueError, match="no non-slip bin"):
+        planned(Recipe(num_features=3), parts)
+    parts = [(r, f, torch.full_like(s, r.material in "ab")) for r, f, s in make_parts(rng, "abcd")]
+    with pytest.raises(ValueError, match="no validation group has bins of both classes"):
+        planned(Recipe(**FEW), parts)
+
+
+def test_what_stands_for_missing_channels_is_of_the_selected_features(rng):
+    parts = make_parts(rng, share=0.2)
+    plan = planned(Recipe(**FEW), parts)
+    features, is_slip = together(parts)
+    z = plan.selection(features)
+    torch.testing.assert_close(plan.imputation, (z[is_slip].mean(0) + z[~is_slip].mean(0)) / 2)
+    for place, mine in enumerate((~is_slip, is_slip)):
+        torch.testing.assert_close(plan.gaussians.mean[place], z[mine].mean(0))
+        spread = z[mine].var(0, correction=0) + RESOLUTION
+        torch.testing.assert_close(plan.gaussians.covariance[place].diagonal(), spread)
+    assert planned(Recipe(**FEW, degree=3), parts).gaussians is None
+
+
+def test_a_plan_survives_a_checkpoint(rng, tmp_path):
+    recipe, parts = Recipe(**FEW, compress=True), make_parts(rng)
+    plan = planned(recipe, parts)
+    torch.save(plan.to_dict(), tmp_path / "plan.pt")
+    again = Plan.from_dict(torch.load(tmp_path / "plan.pt", weights_only=True), recipe, POOL)
+    assert again.validation == plan.validation
+    z = together(parts)[0]
+    torch.testing.assert_close(again.selection(z), plan.selection(z), rtol=0, atol=0)
+    torch.testing.assert_close(again.gaussians.mean, plan.gaussians.mean, rtol=0, atol=0)
+    heads = [passed(each, parts).solve() for each in (plan, again)]
+    torch.testing.assert_close(heads[0].state_dict(), heads[1].state_dict(), rtol=0, atol=0)
+
+
+# Passes ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bins", [10, 60], ids=["bins kept", "sums"])
+@pytest.mark.parametrize("balance", ["undersample", "weights"])
+def test_neither_order_nor_sums_change_the_machine(bins, balance, rng):
+    parts = make_parts(rng, bins=bins, share=0.7)
+    recipe = Recipe(**FEW | {"num_features": 12}, balance=balance)
+    plan, other = planned(recipe, parts), planned(recipe, parts[::-1])
+    assert plan.validation == other.validation
+    assert plan.adds_up == (bins == 60)  # 91 monomials of 12 features
+    gathered, turned = passed(plan, parts), passed(other, parts[::-1])
+    heads = [each.solve().state_dict() for each in (gathered, turned)]
+    torch.testing.assert_close(heads[0], heads[1], rtol=1e-9, atol=1e-11)
+    if balance == "weights":
+        whole = balanced(plan, parts)
+        expected = fit_machine(whole, plan.penalty, plan.kernel)(whole.features)
+        found = gathered.solve()(whole.features)
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="already"):
+        gathered.update(str(parts[0][0]), parts[0][1], parts[0][2])
+
+
+def test_undersampling_keeps_about_as_many_slips_as_non_slips(rng):
+    parts = make_parts(rng, cycles=8, share=0.8)
+    plan = planned(Recipe(**FEW), parts)
+    num_rest = int((~together(parts)[1]).sum())
+    kept = passed(plan, parts).stats.count.tolist()
+    assert kept[0] == num_rest
+    assert abs(kept[1] - num_rest) < 5 * num_rest**0.5
+    assert plan.num_bins == 2 * num_rest
+
+
+@pytest.mark.parametrize("change", [{"degree": 3}, {"kernel": "rbf", "gamma": 0.3}], ids=str)
+@pytest.mark.parametrize("balance", ["undersample", "weights"])
+def test_a_kernel_that_does_not_fold_keeps_some_bins_that_stand_for_all(
+    change, balance, rng, monkeypatch, caplog
+):
+    parts = make_parts(rng, cycles=5, bins=80, share=0.6)
+    recipe = Recipe(**FEW | {"penalties": 0.01}, balance=balance, **change)
+    whole = planned(recipe, parts)
+    assert not whole.adds_up
+    monkeypatch.setattr(selection, "MOST_KEPT_BINS", 300)
+    thinned = planned(recipe, parts)
+    assert (whole.bin_weight, thinned.num_bins) == (1.0, 300)
+    assert thinned.bin_weight == pytest.approx(whole.num_bins / 300, rel=1e-3)
+    assert "takes 300 of" in caplog.text
+    z = whole.selection(together(parts)[0])
+    full, few = (passed(plan, parts).solve()(z) for plan in (whole, thinned))
+    assert balanced_accuracy(full >= 0, together(parts)[1]) > 0.8
+    lighter = passed(replace(thinned, bin_weight=1.0), parts).solve()(z)
+    assert (few - full).square().mean() < 0.5 * (lighter - full).square().mean()
+    linear = planned(Recipe(**FEW, degree=1, balance="weights"), parts)  # folds: takes every bin
+    assert int(passed(linear, parts).stats.count.sum()) == linear.num_bins == 1200
+
+
+# A recipe that restricts the ranking -------------------------------------------------------------
 
 
 def told_apart(rng, pool):
-    """A survey of bins of a pool's features, some of which tell the classes apart."""
+    """Statistics of bins of a pool's features, some of which tell the classes apart."""
     survey = Survey(len(pool.names), 50)
     for group in "ab":
         is_slip = torch.arange(60) % 2 == 0
@@ -212,87 +329,56 @@ def told_apart(rng, pool):
     ("wanted", "does", "num"),
     [
         ({"kind": "SG"}, lambda n: n.channel.startswith("SG"), 14 * 13),
-        ({"kind": "PVDF"}, lambda n: n.channel.startswith("PVDF"), 10 * 240),
         ({"kind": "SG", "descriptor": "mean"}, lambda n: str(n).endswith("raw time mean"), 14),
         ({"finger": "thumb"}, lambda n: n.channel in ("SG13", "SG14", "PVDF9", "PVDF10"), 26 + 480),
         ({"channel": ["SG2", "PVDF3"]}, lambda n: n.channel in ("SG2", "PVDF3"), 13 + 240),
         ({"component": "D1", "domain": "time"}, lambda n: " D1 time " in str(n), 10 * 14),
-        ({"descriptor": ["mean", "std"], "component": ["A1", "A2"]}, None, 10 * 2 * 2 * 2),
     ],
     ids=lambda value: "rule" if callable(value) else str(value),  # no address: as in any process
 )
 def test_what_matches_has_every_attribute_that_is_asked_for(wanted, does, num):
     mask = matching(POOL.hand, POOL.names, wanted)
     assert int(mask.sum()) == num
-    if does is not None:
-        assert mask.tolist() == [does(name) for name in POOL.names]
-
-
-def test_a_recipe_without_among_allows_everything():
+    assert mask.tolist() == [does(name) for name in POOL.names]
     assert Recipe().allowed(POOL) is None
 
 
 @pytest.mark.parametrize("most_correlation", [1.0, 0.995])
 def test_only_what_matches_is_ranked_and_in_the_order_of_the_whole_ranking(most_correlation, rng):
-    pool = FeaturePool(SMALL_HAND)
-    survey = told_apart(rng, pool)
-    recipe = Recipe(
-        num_features=9, among={"domain": "freq"}, most_correlation=most_correlation, penalties=0.1
-    )
-    plan = plan_detector(recipe, survey, lambda items, what: items, allowed=recipe.allowed(pool))
-    every = choose_frame(Recipe(num_features=len(pool.names)), survey).selected
-    of_spectra = [index for index in every if pool.names[index].domain == "freq"]
-    assert list(plan.frame.selected) == of_spectra[:9]
-    expected = {"wanted": {"domain": ["freq"]}, "matching": len(of_spectra), "num_features": [9]}
-    assert plan.among == expected
-    assert Plan.of(json.loads(json.dumps(plan.facts())), plan.frame.scaler).among == expected
+    survey, wanted = told_apart(rng, SMALL_POOL), {"domain": "freq"}
+    options = {"most_correlation": most_correlation, "penalties": 0.1}
+    recipe = Recipe(num_features=9, feature_filter=wanted, **options)
+    plan = plan_detector(recipe, survey, SMALL_POOL)
+    every = select_features(Recipe(num_features=len(SMALL_POOL.names)), survey).selected
+    of_spectra = [index for index in every if SMALL_POOL.names[index].domain == "freq"]
+    assert list(plan.selection.selected) == of_spectra[:9]
+    numbers = {"matching": len(of_spectra), "num_features": [9]}
+    assert plan.feature_filter == {"wanted": {"domain": ["freq"]}, **numbers}
 
 
-def test_more_features_than_match_are_cut_and_the_facts_say_so(rng, caplog):
-    pool = FeaturePool(SMALL_HAND)
-    recipe = Recipe(num_features=[2, 60, 120], among={"kind": "SG"}, penalties=(0.1, 1.0))
-    plan = plan_detector(
-        recipe, told_apart(rng, pool), lambda items, what: items, allowed=recipe.allowed(pool)
-    )
-    assert plan.among == {"wanted": {"kind": ["SG"]}, "matching": 13, "num_features": [2, 13]}
+def test_more_features_than_match_are_cut_and_that_is_said(rng, caplog):
+    options = {"feature_filter": {"kind": "SG"}, "penalties": (0.1, 1.0)}
+    recipe, survey = Recipe(num_features=[2, 60, 120], **options), told_apart(rng, SMALL_POOL)
+    plan = plan_detector(recipe, survey, SMALL_POOL)
+    numbers = {"matching": 13, "num_features": [2, 13]}
+    assert plan.feature_filter == {"wanted": {"kind": ["SG"]}, **numbers}
     assert [row["num_features"] for row in plan.validation] == [2, 2, 13, 13]
-    assert {pool.names[index].channel for index in plan.frame.selected} == {"SG1"}
+    assert {SMALL_POOL.names[index].channel for index in plan.selection.selected} == {"SG1"}
     assert "recipe.num_features=120 is cut to 13" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("among", "message"),
-    [
+def test_a_filter_is_never_silently_ignored(rng):
+    recipe = Recipe(num_features=3, feature_filter={"kind": "SG"})
+    with pytest.raises(ValueError, match=r"needs the names of features; hand over the pool"):
+        plan_detector(recipe, told_apart(rng, SMALL_POOL))
+    with pytest.raises(ValueError, match=r"recipe.feature_filter is not for a search"):
+        Workshop({}, None, None, recipe)
+    maker = small_maker(SmallSet())
+    for wanted, message in (
         ({"descriptor": "meen"}, "no feature has descriptor='meen', expected some of mean, median"),
         ({"kind": "SG", "domain": "freq"}, "no feature has kind=SG, domain=freq together"),
-        ({"finger": ["thumb", "toe"]}, "no feature has finger='toe', expected some of little, r"),
-    ],
-    ids=str,
-)
-def test_what_nothing_matches_is_refused_in_one_line(among, message):
-    with pytest.raises(ValueError, match=f"^recipe.among: {message}") as caught:
-        Recipe(among=among).allowed(POOL)
-    assert "\n" not in str(caught.value)
-
-
-def test_among_is_never_silently_ignored(rng):
-    recipe = Recipe(num_features=3, among={"kind": "SG"})
-    with pytest.raises(ValueError, match=r"hand over recipe.allowed\(pool\)"):
-        plan_detector(recipe, told_apart(rng, FeaturePool(SMALL_HAND)), lambda items, what: items)
-    with pytest.raises(ValueError, match=r"recipe.among is not for a search"):
-        Workshop({}, None, None, recipe)
-
-
-@pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec.*")
-def test_a_learner_takes_features_that_match_and_refuses_early_what_none_matches():
-    source = SmallSet()
-    wanted = {"kind": "SG", "descriptor": ["mean", "std"]}
-    learner = learn(source, unseen_c(source), recipe=small_recipe(among=wanted))
-    assert {str(name) for name in learner.detector.selected_names} == {
-        "SG1 raw time mean",
-        "SG1 raw time std",
-    }
-    assert learner.facts["among"]["matching"] == 2
-    maker = small_maker(SmallSet())
-    with pytest.raises(ValueError, match=r"^recipe.among: no feature has finger='toe'"):
-        SlipLearner(maker.pool, maker.channel_filter, small_recipe(among={"finger": "toe"}))
+        ({"finger": ["index", "toe"]}, "no feature has finger='toe', expected some of index"),
+    ):
+        with pytest.raises(ValueError, match=f"^recipe.feature_filter: {message}") as caught:
+            SlipLearner(maker.pool, maker.channel_filter, small_recipe(feature_filter=wanted))
+        assert "\n" not in str(caught.value)

@@ -32,10 +32,6 @@ RECIPE = Recipe(
 )
 
 
-def quiet(items, what):
-    return items
-
-
 @pytest.fixture(scope="module")
 def small():
     """A maker, the sample and the plan of its training recordings, and these."""
@@ -45,17 +41,17 @@ def small():
     for recording in split.having("train"):
         made = maker(recording, split)
         survey.update(str(recording), recording.material, made.features, made.is_slip)
-    plan = plan_detector(RECIPE, survey, quiet)
+    plan = plan_detector(RECIPE, survey)
     return maker, survey.sample.bins(), plan, split
 
 
 def settings_of(small, learn=SETTINGS, penalty=0.1, offset=0.5):
-    return LearnedSettings(learn, penalty, offset, small[2].frame.scaler)
+    return LearnedSettings(learn, penalty, offset, small[2].selection.scaler)
 
 
 def bins_of(small, most=12):
     _, sample, plan, _ = small
-    return tuning_bins(sample, plan.frame.selected, weights_of(sample), most)
+    return tuning_bins(sample, plan.selection.selected, weights_of(sample), most)
 
 
 def weights_of(sample):
@@ -102,7 +98,7 @@ def test_tuning_bins_are_sampled_training_bins(small):
         [torch.bincount(bins.group[bins.is_slip == kind]) for kind in (True, False)]
     )
     assert (counts == 12).all()
-    sampled = sample.features[:, list(plan.frame.selected)].double()
+    sampled = sample.features[:, list(plan.selection.selected)].double()
     assert set(map(tuple, bins.features.tolist())) <= set(map(tuple, sampled.tolist()))
     assert bins.of(1).group.unique().tolist() == [1]
     assert bins.without(1).group.unique().tolist() == [0, 2]
@@ -115,11 +111,13 @@ def test_settings_start_where_the_plan_is(small):
     _, _, plan, _ = small
     settings, bins = settings_of(small).requires_grad_(False), bins_of(small)
     z = settings.scaled(bins.features)
-    torch.testing.assert_close(z, plan.frame.scaler(bins.features), rtol=0, atol=1e-12)
+    torch.testing.assert_close(z, plan.selection.scaler(bins.features), rtol=0, atol=1e-12)
     assert float(settings.penalty) == pytest.approx(0.1, rel=1e-12)
     assert float(settings.offset) == pytest.approx(0.5, rel=1e-12)
     scaler = settings.scaler()
-    torch.testing.assert_close(scaler.minimum, plan.frame.scaler.minimum, rtol=1e-12, atol=1e-300)
+    torch.testing.assert_close(
+        scaler.minimum, plan.selection.scaler.minimum, rtol=1e-12, atol=1e-300
+    )
 
 
 def test_a_scaler_holds_what_scales_do(small):
@@ -165,7 +163,7 @@ def test_gradients_of_every_setting_are_those_of_differences(small):
 
 
 def test_grid_is_of_refits_without_the_group(small):
-    bins, scaler = bins_of(small), small[2].frame.scaler
+    bins, scaler = bins_of(small), small[2].selection.scaler
     points = grid_points(scaler, bins, (0.1, 1.0), (0.5, 2.0))
     z = scaler(bins.features)
     assert [(point.penalty, point.offset) for point in points] == [
@@ -226,10 +224,10 @@ def test_second_fit_is_of_what_was_learned(small, tuned):
     class First:
         recipe, abstaining, with_baselines = RECIPE, None, False
 
-    learner = settled_learner(First(), maker, tuned.frame, tuned.penalty, tuned.offset)
+    learner = settled_learner(First(), maker, tuned.selection, tuned.penalty, tuned.offset)
     assert learner.recipe.penalties_ascending == (tuned.penalty,)
     assert learner.recipe.kernels == (Polynomial(2, tuned.offset),)
-    assert learner.recipe.sizes == (len(plan.frame.selected),)
+    assert learner.recipe.sizes == (len(plan.selection.selected),)
 
 
 @pytest.mark.parametrize(
@@ -281,4 +279,4 @@ def test_a_grid_that_tells_slip_backwards_everywhere_is_no_start(small):
     two = bins_of(small).without(2)
     flipped = replace(two, is_slip=two.is_slip ^ (two.group == 1))  # wrong of the other group
     with pytest.raises(ValueError, match="tuning has no place to start: at every C and c"):
-        grid_points(small[2].frame.scaler, flipped, (0.1, 1.0), (0.5,))
+        grid_points(small[2].selection.scaler, flipped, (0.1, 1.0), (0.5,))

@@ -57,13 +57,18 @@ from tactslip_torch.runtime import Ticker, bar, for_each
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
-from tactslip_torch.training.fitting import TrainingPass, solve_facts
-from tactslip_torch.training.recipe import Frame, Recipe, fit_frame, recalls_mean, stand_for
+from tactslip_torch.training.fitting import TrainingPass, solve_metadata
+from tactslip_torch.training.recipe import (
+    FeatureSelection,
+    Recipe,
+    balanced_accuracy,
+    sample_weight,
+    scaled_selection,
+)
 from tactslip_torch.training.selection import (
     Structure,
-    adds_up,
     choose_model,
-    fitted_frame,
+    fitted_selection,
     plan_detector,
     validate,
 )
@@ -88,7 +93,7 @@ class Candidate(NamedTuple):
         ranking: how they were ranked; ``"none"`` if all are taken.
         degree: of the head.
         penalty: its C, the best of those tried.
-        frame: which features are read, and how its numbers are made of them, best first.
+        selection: which features are read, and how its numbers are made of them, best first.
         balanced_accuracy: on held-out groups, mean over them. A little too good: it chose. Of
             pooled columns everything is learned without the held-out group; ranking and scaling of
             channel features saw it too, and only the machine is refitted.
@@ -103,7 +108,7 @@ class Candidate(NamedTuple):
     ranking: str
     degree: int
     penalty: float
-    frame: Frame
+    selection: FeatureSelection
     balanced_accuracy: float
     by_group: Mapping[str, float | None]
     latency: Latency
@@ -116,12 +121,12 @@ class Candidate(NamedTuple):
     @property
     def selected(self) -> tuple[int, ...]:
         """Pool indices of the features that are read."""
-        return self.frame.selected
+        return self.selection.selected
 
     @property
     def detector(self) -> tuple[Align, int, float, frozenset[int | FeatureName]]:
         """What its detector is made of, however its features were found."""
-        layer = self.frame.pooling
+        layer = self.selection.pooling
         columns = self.selected if layer is None else layer.names
         return self.align, self.degree, self.penalty, frozenset(columns)
 
@@ -188,7 +193,7 @@ def worth_naming(candidates: Sequence[Candidate]) -> list[Candidate]:
     best: dict[object, Candidate] = {}
     for each in candidates:
         groups: list[object] = [(each.columns == "channel", each.components)]
-        if each.frame.size <= _FEW_NUMBERS:
+        if each.selection.size <= _FEW_NUMBERS:
             groups.append(_FEW_NUMBERS)
         for group in groups:
             other = best.setdefault(group, each)
@@ -473,14 +478,14 @@ class Searcher:
             return []
         sample, survey = self._samples[align], self.surveys[align]
         order = places[self._ranked(ranking, survey, sample, places, sizes[-1])].tolist()
-        weights = stand_for(sample, self.recipe, survey.moments.count.tolist())
-        frame = fit_frame(self.recipe, survey, order)
-        bins = TrainingBins(frame(sample.features), sample.is_slip, weights)
+        weights = sample_weight(self.recipe, sample)
+        selection = scaled_selection(self.recipe, survey, order)
+        bins = TrainingBins(selection(sample.features), sample.is_slip, weights)
         found = []
         for degree, size in itertools.product(degrees, sizes):
             kernel = Polynomial(degree, _offset_of(self.recipe))
             choices = [(size, kernel, penalty) for penalty in self.search.penalties]
-            rows = validate(bins, sample.group, sample.group_names, choices, _quietly)
+            rows = validate(bins, sample.group, sample.group_names, choices)
             best = max(rows, key=lambda row: float(row["mean"]))
             found.append(
                 Candidate(
@@ -491,10 +496,10 @@ class Searcher:
                     ranking,
                     degree,
                     best["penalty"],
-                    frame.first(size),
+                    selection.first(size),
                     best["mean"],
                     best["balanced_accuracy"],
-                    self._latency(align, frame.first(size)),
+                    self._latency(align, selection.first(size)),
                 )
             )
         return found
@@ -522,19 +527,10 @@ class Searcher:
             offsets=_offset_of(self.recipe),
             penalties=tuple(self.search.penalties),
         )
-        sample, counts = self._samples[align], self.surveys[align].moments.count.tolist()
-        rows = choose_model(
-            recipe,
-            self.pool,
-            sample,
-            stand_for(sample, recipe, counts),
-            _quietly,
-            num_bins=round(sum(counts)),
-            allowed=mask,
-            is_nested=False,
-        ).rows
+        sample = self._samples[align]
+        rows = choose_model(recipe, self.pool, sample, mask, is_nested=False).rows
         everything = Structure("pooled", len(self.pool.names) * len(STATISTICS), Polynomial(1))
-        frame = fitted_frame(recipe, self.pool, sample, everything, mask)  # ranked
+        selection = fitted_selection(recipe, self.pool, sample, everything, mask)  # ranked
         found = []
         for (size, _), own in itertools.groupby(
             rows, lambda row: (row["num_features"], row["kernel"]["degree"])
@@ -544,7 +540,7 @@ class Searcher:
             best = min(
                 (row for row in alike if row["mean"] >= least), key=lambda row: row["penalty"]
             )
-            first = frame if size is None else frame.first(min(size, frame.size))
+            first = selection if size is None else selection.first(min(size, selection.size))
             found.append(
                 Candidate(
                     align,
@@ -579,11 +575,11 @@ class Searcher:
             return rank_distinct(scores, features, sample.is_slip, num, most)
         return rank_features(scores, num)
 
-    def _latency(self, align: Align, frame: Frame) -> Latency:
-        selected = frame.selected
+    def _latency(self, align: Align, selection: FeatureSelection) -> Latency:
+        selected = selection.selected
         parts = set().union(*(self._needed[index] for index in selected))
-        num_pooled = 0 if frame.pooling is None else len(selected)
-        compute_us = self.costs.compute_us(parts, frame.size, num_pooled)
+        num_pooled = 0 if selection.pooling is None else len(selected)
+        compute_us = self.costs.compute_us(parts, selection.size, num_pooled)
         used = {self._channel_of[index] for index in selected}
         ahead = look_ahead_samples(self.filters[align], used)
         rate = self.pool.sample_rate_hz / 1000
@@ -596,10 +592,6 @@ def _offset_of(recipe: Recipe) -> float:
     """The polynomial's c: the first of the recipe's."""
     offsets = recipe.offsets
     return float(offsets[0] if isinstance(offsets, Sequence) else offsets)
-
-
-def _quietly(items: Iterable[Any], what: str) -> Iterable[Any]:
-    return items
 
 
 @dataclass(frozen=True)
@@ -654,9 +646,10 @@ class Workshop:
         most_summed: int = 120,
         num_workers: int | None = None,
     ) -> None:
-        if recipe.among is not None:
+        if recipe.feature_filter is not None:
             raise ValueError(
-                "recipe.among is not for a search; use search.channels and search.components"
+                "recipe.feature_filter is not for a search; use search.channels and "
+                "search.components"
             )
         self.makers, self.fold, self.search = makers, fold, search
         self.recipe = replace(recipe, sample_bins=search.bins)
@@ -716,14 +709,14 @@ class Workshop:
         survey, data = self.surveys[candidate.align], self._data[candidate.align]
         recipe = replace(
             self.recipe,
-            num_features=candidate.frame.size,
+            num_features=candidate.selection.size,
             kernel="polynomial",
             degree=candidate.degree,
             offsets=_offset_of(self.recipe),
             penalties=candidate.penalty,
         )
-        plan = plan_detector(recipe, survey, _quietly, candidate.frame)
-        is_bounded = adds_up(plan.kernel) and plan.frame.size > self.most_summed
+        plan = plan_detector(recipe, survey, self.pool, candidate.selection)
+        is_bounded = candidate.degree == 2 and plan.selection.size > self.most_summed
         if from_all and not is_bounded:
             gathered = TrainingPass(plan)
             with one_thread():
@@ -732,18 +725,13 @@ class Workshop:
                     gathered.update(name, batch.features[mask], batch.is_slip[mask])
             head, bins = gathered.solve(), "all training bins"
         else:
-            sample = survey.sample.bins()
-            weights = stand_for(sample, recipe, survey.moments.count.tolist())
-            training = TrainingBins(plan.frame(sample.features), sample.is_slip, weights)
+            training = plan.training_bins(survey.sample.bins())
             head = fit_machine(training, plan.penalty, plan.kernel)
             bins = f"{self.search.bins} training bins of each material and class"
-        facts = plan.facts()
-        info = {name: facts[name] for name in ("kernel", "penalty", "balance", "num_bins")}
         trained, source = self.fold.having("train"), data.maker.source
-        info |= {
-            "recipe": recipe.name,
+        info = plan.metadata | {
             "fitted_to": bins,
-            "solve": solve_facts(head),
+            "solve": solve_metadata(head),
             "simulated": source.is_simulated,
             "split": self.fold.name,
             "features_dtype": "float32" if arithmetic == "native" else "float64",
@@ -751,18 +739,8 @@ class Workshop:
             "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
         }
         pool = FeaturePool(self.pool.hand, **self.pool.facts() | {"arithmetic": arithmetic})
-        return SlipDetector(
-            pool,
-            data.maker.channel_filter,
-            plan.frame.selected,
-            plan.frame.scaler,
-            head,
-            info,
-            plan.imputation,
-            plan.gaussians,
-            plan.frame.pooling,
-            engine=data.maker.extractor.engine,
-        )
+        engine = data.maker.extractor.engine
+        return plan.detector(pool, data.maker.channel_filter, head, info, engine)
 
     def judged(self, detector: SlipDetector) -> dict[str, Any]:
         """Balanced accuracy on raw bins of the test cycles, as a live loop would judge them."""
@@ -784,7 +762,7 @@ class Workshop:
             truth.append(bins.is_slip[kept])
         is_slip = torch.cat(truth)
         return {
-            "balanced_accuracy": recalls_mean(torch.cat(says), is_slip),
+            "balanced_accuracy": balanced_accuracy(torch.cat(says), is_slip),
             "num_bins": len(is_slip),
         }
 

@@ -32,16 +32,15 @@ from tactslip_torch.report.adaptation import adaptation_figure, adaptation_table
 from tactslip_torch.runtime import whole_file
 from tactslip_torch.training.adaptation import (
     Change,
+    accepted,
     add,
     check_once,
     check_weight,
     forget,
     known_names,
-    materials_of,
     recording_bins,
-    renewed,
+    refitted,
     solve,
-    taken,
     undo,
 )
 from tactslip_torch.training.datamodule import FeatureMaker
@@ -115,7 +114,7 @@ def _stepped(
     is_accepted = problem is None or bool(config.force)
     solved = time.perf_counter()
     if is_accepted:
-        new = renewed(detector, change.statistics, change.solved, entry)
+        new = refitted(detector, change.statistics, change.solved, entry)
         _write(Path(config.model), new, statistics, change, entry, export=bool(config.export))
     content = {
         "format": FORMAT,
@@ -177,7 +176,7 @@ def _write(
 ) -> None:
     """Detector, statistics and, if wanted, graphs: all of them or none."""
     file = torch.frombuffer(bytearray(model.read_bytes()), dtype=torch.uint8)
-    after = taken(before, change, entry, file, detector_digest(new))
+    after = accepted(before, change, entry, file, detector_digest(new))
     with ExitStack() as files:  # the last takes its place first: it holds the detector before
         at_model = files.enter_context(whole_file(model))
         at_statistics = files.enter_context(whole_file(model.with_name(FILE)))
@@ -214,7 +213,7 @@ def _bins(
         if is_new:  # one that was forgotten gets its name again, others what they are to be called
             ever = known_names(statistics, keys, is_in=False)
             names = {key: name for key, name in ever.items() if name[1] == material}
-            taken_names = set(materials_of(statistics))
+            taken_names = set(statistics.materials)
         found = recording_bins(
             detector,
             maker,
@@ -256,8 +255,8 @@ def _entry(config: DictConfig, bins: Mapping[str, RecordingBins], change: Change
         "weight": change.weight,
         "factor": change.factor,
         "tried": [[factor, fall] for factor, fall in change.tried.items()],
-        "old": change.verdict.to_dict(),
-        "since_training": change.drift.to_dict(),
+        "old": change.old.to_dict(),
+        "since_training": change.since_training.to_dict(),
         "new": dict(change.new),
     }
 

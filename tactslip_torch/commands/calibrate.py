@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -151,14 +151,13 @@ def seen_accuracy(maker: FeatureMaker, data: SlipDataModule, recipe: Recipe, wha
     ]
     for recording, features, is_slip in training:
         survey.update(str(recording), recipe.group(recording), features, is_slip)
-    allowed = recipe.allowed(maker.pool)
-    plan = plan_detector(recipe, survey, _quietly, allowed=allowed)
+    plan = plan_detector(recipe, survey, maker.pool)
     gathered = TrainingPass(plan)
     for recording, features, is_slip in training:
         gathered.update(str(recording), features, is_slip)
     head = gathered.solve()
     right = [
-        (head(plan.frame(features[roles["test"]])) >= 0) == is_slip[roles["test"]]
+        (head(plan.selection(features[roles["test"]])) >= 0) == is_slip[roles["test"]]
         for _, features, is_slip, roles in kept
     ]
     return float(torch.cat(right).double().mean())
@@ -339,10 +338,6 @@ def _outcome(config: DictConfig, points: Sequence[Point], kept: Point, target: f
     else:
         why = "no point tried is closer"
     return f"{100 * missing:+.2f} points from the target: {why}"
-
-
-def _quietly(items: Iterable[Any], what: str) -> Iterable[Any]:
-    return items
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="calibrate")

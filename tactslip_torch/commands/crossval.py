@@ -35,12 +35,12 @@ from tactslip_torch.data.splits import Split, seen6
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.fit import fit_machine
 from tactslip_torch.report.crossval import crossval_figure, crossval_table
 from tactslip_torch.runtime import bar, whole_file
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_parts, save_config
-from tactslip_torch.training.recipe import Recipe, recalls_mean, stand_for
+from tactslip_torch.training.recipe import Recipe, balanced_accuracy
 from tactslip_torch.training.selection import plan_detector
 
 
@@ -101,23 +101,19 @@ def judge(materials: Materials, recipe: Recipe, unseen: Sequence[str]) -> dict[s
     """
     seen = sorted(set(materials.surveys) - set(unseen))
     survey = materials.survey_of(seen)
-    allowed = recipe.allowed(materials.pool)
-    options: dict[str, Any] = {"allowed": allowed, "pool": materials.pool, "is_nested": False}
-    plan = plan_detector(recipe, survey, _quietly, **options)
-    sample = survey.sample.bins()
-    weights = stand_for(sample, recipe, survey.moments.count.tolist())
-    training = TrainingBins(plan.frame(sample.features), sample.is_slip, weights)
+    plan = plan_detector(recipe, survey, materials.pool, is_nested=False)
+    training = plan.training_bins(survey.sample.bins())
     head = fit_machine(training, plan.penalty, plan.kernel)
 
     def score(names: Sequence[str], roles: Sequence[str]) -> tuple[float | None, dict[str, Any]]:
         bins = materials.bins_of(names, roles)
-        says_slip = head(plan.frame(bins.features)) >= 0
+        says_slip = head(plan.selection(bins.features)) >= 0
         by_material = {
-            name: recalls_mean(says_slip[mine], bins.is_slip[mine], bins.represents[mine])
+            name: balanced_accuracy(says_slip[mine], bins.is_slip[mine], bins.represents[mine])
             for index, name in enumerate(bins.group_names)
             for mine in [bins.group == index]
         }
-        return recalls_mean(says_slip, bins.is_slip, bins.represents), by_material
+        return balanced_accuracy(says_slip, bins.is_slip, bins.represents), by_material
 
     of_unseen, by_material = score(unseen, ("train", "test"))
     return {
@@ -125,7 +121,7 @@ def judge(materials: Materials, recipe: Recipe, unseen: Sequence[str]) -> dict[s
         "unseen": of_unseen,
         "test": score(seen, ("test",))[0],
         "per_material": by_material,
-        "num_features": plan.frame.size,
+        "num_features": plan.selection.size,
         "penalty": plan.penalty,
     }
 
@@ -222,10 +218,6 @@ def _each(
 def _job(job: tuple[Recipe, Sequence[str]]) -> dict[str, Any]:
     assert _shared is not None  # _each
     return judge(_shared, *job)
-
-
-def _quietly(items: Iterable[Any], what: str) -> Iterable[Any]:
-    return items
 
 
 @hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="crossval")

@@ -45,7 +45,7 @@ from tactslip_torch.report.importance import best_table, sensors_csv, sensors_fi
 from tactslip_torch.runtime import bar, whole_file
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import DTYPES, feature_cache, save_config, versions
-from tactslip_torch.training.recipe import Recipe, fit_frame, sample_groups, stand_for
+from tactslip_torch.training.recipe import Recipe, sample_groups, sample_weight, scaled_selection
 
 FORMAT = "tactslip_torch sensors 1"
 _WHOLE_NUMBERS = {
@@ -174,7 +174,7 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
             other.update(name, recording.material, batch.features[mask], batch.is_slip[mask])
     torch.set_num_threads(num_threads)
     sample, detector = survey.sample.bins(), trained.detector
-    weights = stand_for(sample, recipe, survey.moments.count.tolist())
+    weights = sample_weight(recipe, sample)
     group, group_names = sample_groups(sample)
     sample = replace(sample, group=group, group_names=group_names)
     selected, is_pooled = list(detector.selected), detector.pooling is not None
@@ -189,7 +189,7 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
         scaler=(
             detector.scaler
             if is_pooled
-            else fit_frame(recipe, survey, range(len(pool.names))).scaler
+            else scaled_selection(recipe, survey, range(len(pool.names))).scaler
         ),
         kernel=kernel_from_dict(detector.info["kernel"]),
         penalties=sorted({*recipe.penalties_ascending, float(detector.info["penalty"])}),

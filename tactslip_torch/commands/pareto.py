@@ -142,7 +142,7 @@ def _facts(
         sorted(timed, key=_preferred),
         lambda each: each.candidate.balanced_accuracy,
         lambda each: each.graph_us,
-        lambda each: each.candidate.frame.size,
+        lambda each: each.candidate.selection.size,
     )
     scale = median(each.timing.p99_us / each.candidate.latency.compute_us for each in timed)
     source = next(iter(shop.makers.values())).source
@@ -266,9 +266,9 @@ def row_of(
 ) -> dict[str, Any]:
     """A detector as JSON-able facts."""
     candidate, names = timed.candidate, shop.pool.names
-    read, layer = [names[index] for index in candidate.selected], candidate.frame.pooling
+    read, layer = [names[index] for index in candidate.selected], candidate.selection.pooling
     return {
-        "num_features": candidate.frame.size,
+        "num_features": candidate.selection.size,
         "features_read": len(read),
         "align": candidate.align,
         "channels": candidate.channels,

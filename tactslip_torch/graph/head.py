@@ -13,8 +13,7 @@ from tactslip_torch.graph.form import Form
 from tactslip_torch.graph.value import BOOL, F32, F64, I64, Nodes, Value
 from tactslip_torch.graph.writer import Graph
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.detector_file import Head
-from tactslip_torch.model.kernels import KernelSum, Polynomial
+from tactslip_torch.model.kernels import Head, KernelSum, Polynomial
 from tactslip_torch.model.scaling import FeatureScaler
 
 _LARGEST = float(np.finfo(np.float64).max)

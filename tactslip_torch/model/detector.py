@@ -17,9 +17,9 @@ from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import is_nowhere, saturating
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.model.agreement import check_parts
-from tactslip_torch.model.detector_file import Head, damaged, read_detector, write_detector
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.few_bins import FEW_BINS, FEW_FILTERED, FewBins
+from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.missing_channels import (
     ChannelMask,
     ClassGaussians,
@@ -28,8 +28,11 @@ from tactslip_torch.model.missing_channels import (
 )
 from tactslip_torch.model.prediction import Nonfinite, Prediction, check_nonfinite, predict_in_parts
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.runtime import is_plain
+from tactslip_torch.runtime import is_plain, load_table, save_table, table_form
 from tactslip_torch.signals.filtering import ChannelFilter
+
+FORMAT = "tactslip_torch detector 3"
+_EARLIER_FORMATS = ("tactslip_torch detector 1", "tactslip_torch detector 2")
 
 
 class SlipDetector(nn.Module):
@@ -75,17 +78,15 @@ class SlipDetector(nn.Module):
         scaler: FeatureScaler,
         head: Head,
         info: Mapping[str, Any] | None = None,
-        imputation: Tensor | Sequence[float] | None = None,
+        imputation: Tensor | None = None,
         gaussians: ClassGaussians | None = None,
         pooling: ChannelPooling | None = None,
         *,
         engine: EngineName = "auto",
     ) -> None:
         super().__init__()
-        imputation = torch.as_tensor(
-            [0.0] * len(scaler.minimum) if imputation is None else imputation
-        )
-        check_parts(pool, channel_filter, selected, scaler, head, imputation, gaussians, pooling)
+        if imputation is None:
+            imputation = torch.zeros(len(scaler.minimum))
         self.pool, self.channel_filter = pool, channel_filter
         self.extractor = FeatureExtractor(pool, selected, engine)
         self.selected = self.extractor.selected
@@ -93,6 +94,7 @@ class SlipDetector(nn.Module):
         self.info = dict(info or {})
         self._few: FewBins | None = None
         self._missing: MissingScores | None = None
+        self._check_parts(imputation)
         self.register_buffer("imputation", imputation.to(next(head.buffers()), copy=True))
         place = {name: index for index, name in enumerate(pool.hand.names)}
         channels = [place.get(name.channel, len(place)) for name in self.selected_names]
@@ -308,10 +310,49 @@ class SlipDetector(nn.Module):
         """Whether all channels in use are trusted, ``[*, C] -> [*]``."""
         return is_trusted.index_select(-1, self.needed_index).all(-1)
 
+    def _check_parts(self, imputation: Tensor) -> None:
+        """Refuse parts that disagree about the number of channels or features."""
+        pool, pooling, num = self.pool, self.pooling, len(self.selected)
+        if pooling is not None:
+            given = tuple(pool.names[index] for index in self.selected)
+            if given != pooling.inputs or pooling.hand != pool.hand:
+                raise ValueError(
+                    f"{num} selected features do not fit a pooling of {len(pooling.inputs)}: they "
+                    "must be its inputs, in their order"
+                )
+            num = len(pooling.names)
+        if not num == len(self.scaler.minimum) == self.head.num_features:
+            raise ValueError(
+                f"{num} columns, a scaler of {len(self.scaler.minimum)} and a head of "
+                f"{self.head.num_features}: the three must agree"
+            )
+        if (num_frames := len(self.channel_filter.window_lengths)) != len(pool.hand):
+            raise ValueError(
+                f"a filter of {num_frames} channels does not fit a hand of {len(pool.hand)}"
+            )
+        if imputation.shape != (num,) or not bool((imputation.abs() <= 1).all()):
+            raise ValueError(
+                f"imputation must be {num} scaled features in [-1, 1], got "
+                f"{tuple(imputation.shape)} of at most {float(imputation.abs().max()):g}"
+            )
+        if self.gaussians is not None and self.gaussians.num_features != num:
+            raise ValueError(
+                f"Gaussians of {self.gaussians.num_features} features do not fit {num} of them"
+            )
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the detector to one file, whole or not at all."""
-        parts = (self.pool, self.channel_filter, self.selected, self.head, self.info, self.pooling)
-        write_detector(path, *parts, self.state_dict())
+        metadata = {
+            "channels": self.pool.hand.to_rows(),
+            "pool": self.pool.facts(),
+            **self.channel_filter.facts(),
+            "selected": list(self.selected),
+            "pooling": None if self.pooling is None else self.pooling.to_dict(),
+            "kernel": self.head.kernel.to_dict() if isinstance(self.head, KernelSum) else None,
+            "info": dict(self.info),
+        }
+        tensors = {name: value.cpu() for name, value in self.state_dict().items()}
+        save_table(path, FORMAT, metadata, tensors)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], engine: EngineName = "auto") -> SlipDetector:
@@ -322,8 +363,54 @@ class SlipDetector(nn.Module):
             ValueError: if it is not a detector file, a damaged one, or of an earlier version.
         """
         resolved(engine)
-        parts = read_detector(path)
+        name = os.fspath(path)
         try:
-            return cls(*parts, engine=engine)
+            if table_form(path) in _EARLIER_FORMATS:
+                raise ValueError(
+                    f"{name} was made by version 0.1.0 or earlier; train again, or use it with "
+                    "that version"
+                )
+            metadata, state = load_table(path, FORMAT)
+        except FileNotFoundError:
+            raise FileNotFoundError(f"no detector at {name}") from None
+        try:
+            return cls._from_table(metadata, state, engine)
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise damaged(path, error) from error
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"{name} is a damaged detector: {reason}") from error
+
+    @classmethod
+    def _from_table(
+        cls, metadata: Mapping[str, Any], state: Mapping[str, Tensor], engine: EngineName
+    ) -> SlipDetector:
+        """What ``save`` wrote."""
+
+        def part(name: str) -> dict[str, Any]:
+            start = f"{name}."
+            own = {key: value for key, value in state.items() if key.startswith(start)}
+            return {key.removeprefix(start): value for key, value in own.items()}
+
+        kernel, hand = metadata["kernel"], HandLayout.from_rows(metadata["channels"])
+        head: Head
+        if kernel is None:
+            head = QuadraticForm(**part("head"))
+        else:
+            head = KernelSum(**part("head"), kernel=kernel_from_dict(kernel))
+        pooling = metadata["pooling"]
+        return cls(
+            FeaturePool(hand, **metadata["pool"]),
+            ChannelFilter(
+                metadata["window_lengths"],
+                metadata["polyorder"],
+                metadata["align"],
+                metadata.get("kernels"),  # only where they are none of Savitzky-Golay's
+            ),
+            metadata["selected"],
+            FeatureScaler(**part("scaler")),
+            head,
+            metadata["info"],
+            state["imputation"],
+            ClassGaussians(**gaussians) if (gaussians := part("gaussians")) else None,
+            pooling and ChannelPooling.from_dict(hand, pooling, part("pooling")),
+            engine=engine,
+        )

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from tactslip_torch.features.ops import saturating
 from tactslip_torch.features.pool import LARGEST_SAMPLE, FeaturePool
-from tactslip_torch.model.detector_file import Head
-from tactslip_torch.model.kernels import QuadraticForm
+from tactslip_torch.model.kernels import Head, QuadraticForm
 from tactslip_torch.model.prediction import Prediction
 from tactslip_torch.model.scaling import FeatureScaler
 

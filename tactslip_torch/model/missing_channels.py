@@ -18,7 +18,7 @@ Reference:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -33,7 +33,6 @@ from tactslip_torch.runtime import has_values
 ChannelMask = Sequence[str] | Tensor
 """Channels that are not to be listened to: their names, or a mask ``[C]``, bool."""
 
-PREFIX = "gaussians."
 RESOLUTION = 1e-5
 """Variance that every scaled feature has at least (a sixth of a percent of its range), so that
 constant and repeated features leave a covariance that can be inverted."""
@@ -237,16 +236,6 @@ class ClassGaussians(nn.Module):
             found.append(_gaussian(z[mine].double(), weights[mine]))
         means, covariances = zip(*found, strict=True)
         return cls(torch.stack(means), torch.stack(covariances))
-
-    def tensors(self) -> dict[str, Tensor]:
-        """By the names under which a table of tensors holds them beside others."""
-        return {PREFIX + name: value for name, value in self.state_dict().items()}
-
-    @classmethod
-    def among(cls, tensors: Mapping[str, Tensor]) -> ClassGaussians | None:
-        """Those in a table of tensors, of which older ones hold none."""
-        own = {n.removeprefix(PREFIX): x for n, x in tensors.items() if n.startswith(PREFIX)}
-        return cls(**own) if own else None
 
 
 def _gaussian(z: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

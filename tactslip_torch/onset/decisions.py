@@ -14,9 +14,8 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from tactslip_torch.model.abstention import abstention_of
+from tactslip_torch.model.abstention import ABSTAIN, abstention_of, answers
 from tactslip_torch.model.calibration import probability
-from tactslip_torch.model.conformal import UNSURE, answers
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import widened_llr
 from tactslip_torch.model.prediction import Prediction
@@ -341,17 +340,17 @@ def is_usable(score: Tensor, is_missing: Tensor, needed_index: Tensor) -> Tensor
 
 
 def answer_of(detector: SlipDetector, decisions: Decisions) -> Tensor:
-    """1 for slip, 0 for non-slip, -1 for unsure.
+    """1 for slip, 0 for non-slip, -1 for none: the detector abstains.
 
-    By the detector's thresholds, without any by the sign of the score. Unsure too where a sensor in
+    By its thresholds, without any by the sign of the score. It abstains too where a sensor in
     use is dead or broken: thresholds were set on recordings in which all felt.
 
     Shape:
         - output: ``[*, m]`` as the decisions, int8
     """
     found = abstention_of(detector)
-    sure = found.answer(decisions.score) if found else answers(decisions.score, 0.0, 0.0)
-    return sure.masked_fill(~decisions.is_valid, UNSURE)
+    given = found.answer(decisions.score) if found else answers(decisions.score, 0.0, 0.0)
+    return given.masked_fill(~decisions.is_valid, ABSTAIN)
 
 
 class StreamStatistic(NamedTuple):

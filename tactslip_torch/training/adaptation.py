@@ -27,10 +27,9 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.cache import cache_key
-from tactslip_torch.model import abstention
-from tactslip_torch.model.abstention import abstention_of
+from tactslip_torch.model.abstention import KEY as ABSTAIN
+from tactslip_torch.model.abstention import Abstention, abstention_of, conformal_abstention
 from tactslip_torch.model.calibration import fit_platt
-from tactslip_torch.model.conformal import check_number, thresholds
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
@@ -41,14 +40,12 @@ from tactslip_torch.model.solve import solve_symmetric
 from tactslip_torch.onset.settings import KEY as ALARM
 from tactslip_torch.runtime import bar
 from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.fitting import TrainingPass, solve_facts
+from tactslip_torch.training.fitting import TrainingPass, solve_metadata
 from tactslip_torch.training.recipe import Recipe
-from tactslip_torch.training.selection import adds_up
 from tactslip_torch.training.statistics import (
     KnownBins,
     Machine,
     RecordingBins,
-    Rehearsal,
     Statistics,
     Step,
     detector_digest,
@@ -138,7 +135,7 @@ at best, so a tighter limit would refuse by chance. Their mean is told several t
 
 
 @dataclass(frozen=True)
-class Verdict:
+class AccuracyChange:
     """Balanced accuracy of every old material before and after a change.
 
     Args:
@@ -188,27 +185,25 @@ class Verdict:
         return {"before": dict(self.before), "after": dict(self.after)}
 
 
-def compared(before: Solved, after: Solved) -> Verdict:
+def compare(before: Solved, after: Solved) -> AccuracyChange:
     """Both machines on the bins of recordings that both know."""
     both = set(before.known.recordings) & set(after.known.recordings)
-    scores = accuracies(before, both), accuracies(after, both)
-    materials = scores[0].keys() & scores[1].keys()
-    return Verdict(*({name: of[name] for name in sorted(materials)} for of in scores))
+    return _change_of(accuracies(before, both), accuracies(after, both))
 
 
-def _since(before: Mapping[str, float], verdict: Verdict) -> Verdict:
-    """From an earlier ``before`` to a verdict's ``after``, of the materials in both."""
-    both = sorted(before.keys() & verdict.after.keys())
-    return Verdict({n: before[n] for n in both}, {n: verdict.after[n] for n in both})
+def _change_of(before: Mapping[str, float], after: Mapping[str, float]) -> AccuracyChange:
+    """Of the materials in both."""
+    both = sorted(before.keys() & after.keys())
+    return AccuracyChange({n: before[n] for n in both}, {n: after[n] for n in both})
 
 
 def accuracies(solved: Solved, recordings: Collection[str]) -> dict[str, float]:
     """Balanced accuracy of every material in these recordings, held out in closed form."""
     known, says_slip = solved.known, solved.scores >= 0
-    wanted = known.of(recordings)
+    wanted, material = known.of_recordings(recordings), known.material
     found = {}
-    for number, name in enumerate(known.materials):
-        mine = wanted & (known.material == number)
+    for number, name in enumerate(known.material_names):
+        mine = wanted & (material == number)
         if bool(mine.any()):
             found[name] = mean_recall(says_slip[mine], known.is_slip[mine])
     return found
@@ -243,20 +238,21 @@ class Change:
     Args:
         statistics: after it.
         solved: their machine.
-        verdict: old materials, before and after.
-        drift: those of them that there were before the first step, as they were then, and after.
+        old: old materials, before and after.
+        since_training: those of them that there were before the first step, as they were then,
+            and after.
         weight: of a bin that was added; ``None`` where none was.
         factor: the weight in parts of an average old material, where ``auto`` chose it.
         tried: such parts, each with the mean fall it brought; those that led to a machine.
-        new: balanced accuracy of the recordings that were added: ``before``, by the machine that
-            never met them, and ``after``, each without its own recording; of a lone recording that
+        new: balanced accuracy of the recordings that were added: ``before``, by the machine
+            without them, and ``after``, each without its own recording; of a lone recording that
             is ``None``.
     """
 
     statistics: Statistics
     solved: Solved
-    verdict: Verdict
-    drift: Verdict
+    old: AccuracyChange
+    since_training: AccuracyChange
     weight: float | None = None
     factor: float | None = None
     tried: Mapping[float, float] = field(default_factory=dict)
@@ -269,9 +265,9 @@ class Change:
             margin: that their mean may fall by, by all steps together.
             share: the part of it that this step may take.
         """
-        if problem := self.verdict.problem(share * margin):
+        if problem := self.old.problem(share * margin):
             return problem
-        problem = self.drift.problem(margin)
+        problem = self.since_training.problem(margin)
         return problem and f"since before the first step, {problem}"
 
 
@@ -329,7 +325,7 @@ def add(
         factor = FACTORS[low]
         chosen = changes.get(factor) or replace(change(factor * unit), factor=factor)
         changes[factor] = chosen
-    tried_falls = {factor: of.verdict.mean_fall for factor, of in sorted(changes.items())}
+    tried_falls = {factor: of.old.mean_fall for factor, of in sorted(changes.items())}
     return replace(chosen, tried=tried_falls, new=_new_scores(before, chosen.solved, bins))
 
 
@@ -363,9 +359,9 @@ def _change(
     solved: Solved,
     weight: float | None = None,
 ) -> Change:
-    verdict = compared(before, solved)
+    old = compare(before, solved)
     first = statistics.steps[0].entry.get("old", {}).get("before") if statistics.steps else None
-    return Change(after, solved, verdict, _since(first or verdict.before, verdict), weight)
+    return Change(after, solved, old, _change_of(first or old.before, old.after), weight)
 
 
 def undo(statistics: Statistics) -> tuple[Statistics, Tensor]:
@@ -385,10 +381,10 @@ def undo(statistics: Statistics) -> tuple[Statistics, Tensor]:
     ), last.file
 
 
-def taken(
+def accepted(
     before: Statistics, change: Change, entry: Mapping[str, object], file: Tensor, digest: str
 ) -> Statistics:
-    """The statistics behind a step that was accepted, with the step.
+    """The statistics after a step, with the step.
 
     Args:
         before: the statistics it started from.
@@ -442,8 +438,8 @@ def _average_weight(before: Solved, material: str, mine: Sequence[RecordingBins]
     rest = [bool((~own.is_slip).any()) for own in mine]
     counted = (known.is_slip & any(slip)) | (~known.is_slip & any(rest))
     totals = [
-        float(known.represents[counted & (known.material == number)].sum())
-        for number, name in enumerate(known.materials)
+        float(known.sample_weight[counted & (known.material == number)].sum())
+        for number, name in enumerate(known.material_names)
         if name != material
     ]
     totals = [total for total in totals if total > 0]
@@ -468,15 +464,15 @@ _JOURNAL = "adaptations"
 """Under which ``SlipDetector.info`` keeps the entries of all steps."""
 
 
-def renewed(
+def refitted(
     detector: SlipDetector, statistics: Statistics, solved: Solved, entry: Mapping[str, Any]
 ) -> SlipDetector:
     """A detector with another machine; features, scaling and filter stay.
 
-    As training does it, but of the bins that are known: what stands in for a missing sensor; the
-    calibration, of scores by machines that never met the bin's material, an alarm's too; thresholds
-    for unsure answers, by machines that never met the recording or, as in training, the material.
-    The latter go where they cannot be told. An alarm keeps its threshold, but promises no rate.
+    As training does it, but of the bins that are known: imputation values; the calibration, of
+    scores by machines without the bin's material, an alarm's too; thresholds for abstaining, by
+    machines without the recording or, as in training, the material. The latter go where they cannot
+    be told. An alarm keeps its threshold, which then stands for no rate.
 
     Args:
         detector: as it was; kept.
@@ -487,12 +483,12 @@ def renewed(
     new, known = copy.deepcopy(detector), solved.known
     new.head = solved.head
     bins = _training_bins(statistics, known)
-    _renew_stand_ins(new, bins)
+    _refit_imputation(new, bins)
     info = new.info
-    info["solve"] = solve_facts(solved.head)
+    info["solve"] = solve_metadata(solved.head)
     info["num_bins"] = int(statistics.sums.count.sum())
     info[_JOURNAL] = [*info.get(_JOURNAL, []), dict(entry)]
-    info["train_materials"] = [known.materials[i] for i in known.material.unique()]
+    info["train_materials"] = [known.material_names[i] for i in known.material.unique()]
     keys = info.get("train_recordings", {}) | {n: b.key for n, b in statistics.bins.items()}
     entries = statistics.sums.ledger.entries
     out = {name for name in statistics.bins if name not in entries}
@@ -504,18 +500,18 @@ def renewed(
         if ALARM in info:
             info[ALARM] = _alarm(info[ALARM], found)
     if (answers := abstention_of(new)) is not None:
-        info[abstention.KEY] = _thresholds(bins, known, statistics.machine, answers)
+        info[ABSTAIN] = _thresholds(bins, known, statistics.machine, answers)
     return new
 
 
 def _training_bins(statistics: Statistics, known: KnownBins) -> TrainingBins:
     """Known bins, each weighing as much as all that it stands for, the classes balanced."""
     scales = _class_scales(statistics.sums, statistics.machine)
-    weights = scales[known.is_slip.long()] * known.represents
+    weights = scales[known.is_slip.long()] * known.sample_weight
     return TrainingBins(known.z, known.is_slip, weights)
 
 
-def _renew_stand_ins(detector: SlipDetector, bins: TrainingBins) -> None:
+def _refit_imputation(detector: SlipDetector, bins: TrainingBins) -> None:
     """What is expected of a sensor that is missing."""
     gaussians = ClassGaussians.fit(bins.features, bins.is_slip, bins.weights)
     detector.imputation.copy_(gaussians.mean.mean(0))  # both classes counting alike
@@ -524,7 +520,7 @@ def _renew_stand_ins(detector: SlipDetector, bins: TrainingBins) -> None:
 
 
 def _scores_without(groups: Tensor, bins: TrainingBins, machine: Machine) -> Tensor:
-    """Of each known bin, by the machine of known bins that never met its group."""
+    """Of each known bin, by the machine of known bins without its group."""
     return HeldOut(bins, groups, Polynomial(2, machine.offset)).at(machine.penalty).scores
 
 
@@ -539,11 +535,11 @@ def _calibration(bins: TrainingBins, known: KnownBins, machine: Machine) -> dict
 
 
 def _alarm(plain: Mapping[str, Any], calibration: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Settings of an alarm that promise no rate, with the calibration if there is a new one."""
+    """Settings of an alarm without its rate, with the calibration if there is a new one."""
     which = "that of the machine before" if calibration is None else "made anew"
     said = (
-        "the machine changed after the threshold was set: no rate is promised; the calibration is "
-        f"{which}; train with +exp=onset"
+        "the machine changed after the threshold was set: it stands for no rate; the calibration "
+        f"is {which}; train with +exp=onset"
     )
     return {
         **plain,
@@ -554,34 +550,25 @@ def _alarm(plain: Mapping[str, Any], calibration: Mapping[str, Any] | None) -> d
 
 
 def _thresholds(
-    bins: TrainingBins, known: KnownBins, machine: Machine, answers: abstention.Abstention
+    bins: TrainingBins, known: KnownBins, machine: Machine, answers: Abstention
 ) -> dict[str, Any] | None:
     """Conformal thresholds for the same coverage on the recordings that are known."""
-    coverage = answers.coverage
-    left_out = "recording" if answers.facts.get("left_out") == "recording" else "material"
+    left_out = "recording" if answers.metadata.get("left_out") == "recording" else "material"
+    metadata = dict(answers.metadata) | {
+        "left_out": left_out,
+        "adapted": "set anew on all recordings that are known, added ones included, each bin "
+        f"scored by a machine of the others without its {left_out}",
+    }
     try:
         groups = known.recording if left_out == "recording" else known.material
         scores = _scores_without(groups, bins, machine)
-        found = thresholds(scores, known.is_slip, known.recording, coverage)
-        check_number(found, coverage)
+        found = conformal_abstention(
+            scores, known.is_slip, known.recording, answers.coverage, metadata
+        )
     except ValueError as error:
-        log.warning("no answer is unsure any more: %s", error)
+        log.warning("the detector abstains no more: %s", error)
         return None
-    facts = dict(answers.facts) | {
-        "left_out": left_out,
-        "num_recordings": {"slip": found.num_slip, "non_slip": found.num_non_slip},
-        "num_bins": len(scores),
-        "adapted": "set anew on all recordings that are known, added ones among them, each bin "
-        f"scored by a machine of the others that never met its {left_out}",
-    }
-    return abstention.Abstention(coverage, found.low, found.high, facts).to_dict()
-
-
-def materials_of(statistics: Statistics) -> dict[str, str]:
-    """The material of every recording that is or was in, by name."""
-    rehearsal = statistics.rehearsal
-    trained = dict(zip(rehearsal.recordings, rehearsal.materials, strict=True))
-    return trained | {name: own.material for name, own in statistics.bins.items()}
+    return found.to_dict()
 
 
 def known_names(
@@ -594,7 +581,7 @@ def known_names(
         trained: the keys it tells of recordings that it was trained on, by name.
         is_in: those alone that are in; else those that were taken out too.
     """
-    materials = materials_of(statistics)
+    materials = statistics.materials
     keys = dict(trained) | {name: own.key for name, own in statistics.bins.items()}
     order = sorted(keys, key=lambda name: statistics.weight_of(name) > 0)  # one that is in wins
     return {
@@ -681,7 +668,7 @@ def check_recipe(recipe: Recipe) -> None:
             "statistics=true needs a machine of degree 2 on features of channels, which "
             f"recipe={recipe.name} does not always make; take recipe=robust or recipe=paper"
         )
-    if not all(adds_up(kernel) for kernel in recipe.kernels):
+    if not all(isinstance(k, Polynomial) and k.degree == 2 for k in recipe.kernels):
         raise ValueError(
             "statistics=true needs recipe.kernel=polynomial recipe.degree=2, whose bins add up; "
             f"got {recipe.kernels[0]}"
@@ -718,7 +705,7 @@ def gathered_statistics(
     assert isinstance(plan.kernel, Polynomial)  # check_recipe
     sums = gathered.stats
     if sums is None:
-        sums = SufficientStats(len(plan.frame.selected))
+        sums = SufficientStats(len(plan.selection.selected))
         for name in sorted(gathered.bins):
             sums.update(name, *gathered.bins[name])
     return Statistics(
@@ -726,10 +713,10 @@ def gathered_statistics(
         Machine(
             plan.penalty,
             plan.kernel.offset,
-            "weights" if plan.balance == "weights" else "none",
+            "weights" if plan.recipe.balance == "weights" else "none",
         ),
         dict(labels),
-        Rehearsal.of(plan, sample, materials),
+        KnownBins.of(plan, sample, materials),
         detector_digest(detector),
         {},
         {},

@@ -15,8 +15,9 @@ import logging
 import math
 import statistics
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,161 +91,8 @@ class Method(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """The method as plain JSON types."""
-        calibrated = None if self.threshold is None else threshold_facts(self.threshold)
+        calibrated = None if self.threshold is None else asdict(self.threshold)
         return {"scorer": self.scorer, "calibrated": calibrated, **self.settings.to_dict()}
-
-
-@dataclass(frozen=True)
-class FalseAlarmBudget:
-    """What thresholds are set for.
-
-    Args:
-        false_alarms_per_hour: at most.
-        slip_free: the scene to count them on.
-        slip_share: how much of a stream is slip, for probabilities.
-        rearm_s: how long a statistic must stay low before the next alarm.
-        refractory_s: shortest time between two alarms.
-        level: of intervals.
-    """
-
-    false_alarms_per_hour: float
-    slip_free: str
-    slip_share: float
-    rearm_s: float
-    refractory_s: float
-    level: float
-
-    def calibrated(
-        self,
-        scorer: str,
-        rule: Rule,
-        calibration: Calibration,
-        streams: Sequence[Stream],
-        clock: Clock,
-    ) -> Method:
-        """A rule with the threshold for the promise, and the lead of its onset estimates.
-
-        Args:
-            scorer: whose scores.
-            rule: what makes statistics of them; a ``Cusum`` without ceiling gets one.
-            calibration: what makes ratios of them.
-            streams: that calibrate, those of the scene without slip among them.
-            clock: of the scores.
-        """
-        settings = AlarmSettings(
-            clock.hop_samples,
-            calibration,
-            rule,
-            math.inf,
-            self.false_alarms_per_hour,
-            self.slip_share,
-            self.rearm_s,
-            self.refractory_s,
-        )
-        quiet = [stream for stream in streams if stream.recording.scene == self.slip_free]
-        threshold = choose_threshold(
-            [made.statistic for _, made in decide(quiet, scorer, settings, clock)],
-            rule,
-            clock.hop_s,
-            self.false_alarms_per_hour,
-            rearm=settings.decisions(self.rearm_s, clock.sample_rate_hz),
-            refractory=settings.decisions(self.refractory_s, clock.sample_rate_hz),
-            ceiling=_largest(rule, calibration),
-            level=self.level,
-        )
-        if isinstance(rule, Cusum) and rule.ceiling == math.inf and threshold.value > 0:
-            settings, threshold = self._capped(rule, settings, threshold, quiet, scorer, clock)
-        else:
-            settings = replace(settings, threshold=threshold.value)
-        facts = {"slip_free": self.slip_free, "calibrated": threshold_facts(threshold)}
-        lead_s = _lead_s(streams, scorer, settings, clock)
-        return Method(scorer, replace(settings, lead_s=lead_s, facts=facts), threshold)
-
-    def _capped(
-        self,
-        rule: Cusum,
-        settings: AlarmSettings,
-        threshold: Threshold,
-        quiet: Sequence[Stream],
-        scorer: str,
-        clock: Clock,
-    ) -> tuple[AlarmSettings, Threshold]:
-        """The same sum with a ceiling above its threshold, which is raised until it keeps the rate.
-
-        A sum that is capped is sooner low again, so what was one alarm can be two: it is counted
-        anew, by the rule that goes into the file.
-        """
-        value, allowed = (
-            threshold.value,
-            math.floor(self.false_alarms_per_hour * threshold.rate.hours),
-        )
-        while True:
-            capped = replace(rule, ceiling=CEILING * value)
-            settings = replace(settings, rule=capped, threshold=value)
-            made = [decisions for _, decisions in decide(quiet, scorer, settings, clock)]
-            counts = [int(decisions.is_alarm.sum()) for decisions in made]
-            if sum(counts) <= allowed:
-                hours = [len(decisions.number) * clock.hop_s / 3600 for decisions in made]
-                rate = alarm_rate(counts, hours, self.level)
-                return settings, replace(threshold, value=value, rate=rate)
-            value *= _STEP
-
-    def first_transition(self, scorer: str, clock: Clock) -> Method:
-        """The paper's rule: every change of the score to slip is an alarm, one decision a bin.
-
-        There is no threshold but the score's own, and no memory beyond the bin before. The clock's
-        hop must divide the bin.
-        """
-        settings = AlarmSettings(
-            clock.bin_samples,
-            Platt(1.0, 0.0),
-            KOfN(1, 1),
-            _ABOVE_NEUTRAL,
-            self.false_alarms_per_hour,
-            self.slip_share,
-            rearm_s=0,
-            refractory_s=0,
-        )
-        return Method(scorer, settings, None)
-
-
-def _methods_of(
-    budget: FalseAlarmBudget,
-    rules: Mapping[str, Rule],
-    main: str,
-    fit: str,
-    streams: Sequence[Stream],
-    clocks: Mapping[str, Clock],
-) -> dict[str, Method]:
-    """Every rule on our scores, the main one on those of the others, and the paper's own.
-
-    Args:
-        budget: what thresholds are set for.
-        rules: by name.
-        main: the rule that the others get too; their methods have their own names.
-        fit: one of ``FITS``.
-        streams: that calibrate.
-        clocks: of every scorer, ``OURS`` among them.
-
-    The paper's rule, ``FIRST_TRANSITION``, is left out where the hop does not divide the bin.
-
-    Raises:
-        ValueError: if our scores cannot be calibrated; others whose cannot are left out.
-    """
-    methods = {}
-    for scorer, clock in clocks.items():
-        try:
-            calibration = FITS[fit](*labelled(streams, scorer, clock))
-        except ValueError as error:
-            if scorer == OURS:
-                raise
-            log.warning("%s is left out: %s", scorer, error)
-            continue
-        for name, rule in rules.items() if scorer == OURS else [(scorer, rules[main])]:
-            methods[name] = budget.calibrated(scorer, rule, calibration, streams, clock)
-        if scorer == OURS and clock.bin_samples % clock.hop_samples == 0:
-            methods[FIRST_TRANSITION] = budget.first_transition(scorer, clock)
-    return methods
 
 
 def labelled(streams: Sequence[Stream], scorer: str, clock: Clock) -> tuple[Tensor, Tensor]:
@@ -274,23 +122,6 @@ def _lead_s(streams: Sequence[Stream], scorer: str, settings: AlarmSettings, clo
     return statistics.median(errors) if errors else 0.0
 
 
-def threshold_facts(threshold: Threshold) -> dict[str, Any]:
-    """A threshold as JSON types."""
-    return {
-        "value": threshold.value,
-        "target_per_hour": threshold.target_per_hour,
-        "reached": threshold.reached,
-        "rate": dict(vars(threshold.rate)),
-    }
-
-
-def _largest(rule: Rule, calibration: Calibration) -> float:
-    """What the statistic of a rule that hands ratios on cannot exceed, by their calibration."""
-    if isinstance(rule, KOfN) and isinstance(calibration, Isotonic):
-        return max(calibration.llrs)
-    return math.inf
-
-
 LEAST, MOST = 0.1, 1000.0
 """False alarms an hour that are of interest."""
 
@@ -299,9 +130,9 @@ _NUM_TRIED = 100
 
 
 def threshold_curve(
-    quiet: Sequence[Stream], scorer: str, settings: AlarmSettings, clock: Clock
+    quiet: Sequence[Stream], settings: AlarmSettings, clock: Clock
 ) -> list[list[float]]:
-    """Thresholds and the false alarms an hour at each, of the rule as it stands in the settings.
+    """Thresholds and the false alarms of the detector an hour at each, by the rule in the settings.
 
     Rates fall as thresholds rise; from ``LEAST`` to ``MOST`` an hour, at most 25 points that are
     about equally far apart by the rate's logarithm. Fewer where the recordings show no more: none
@@ -309,11 +140,10 @@ def threshold_curve(
 
     Args:
         quiet: recordings in which nothing slips.
-        scorer: whose scores.
         settings: calibration, rule, re-arming; their threshold does not count.
         clock: of the scores.
     """
-    statistics = [made.statistic for _, made in decide(quiet, scorer, settings, clock)]
+    statistics = [made.statistic for _, made in decide(quiet, OURS, settings, clock)]
     hours = sum(len(statistic) for statistic in statistics) * clock.hop_s / 3600
     falling = torch.cat(statistics).sort(descending=True).values
     ranks = np.unique(np.geomspace(1, len(falling), _NUM_TRIED).astype(int)) - 1
@@ -343,34 +173,8 @@ def _thinned(points: list[list[float]]) -> list[list[float]]:
     return [points[place] for place in np.unique(nearest)]
 
 
-def events_of(
-    parts: Mapping[str, Sequence[Stream]],
-    methods: Mapping[str, Method],
-    clocks: Mapping[str, Clock],
-    compute_s: Mapping[str, float],
-    level: float,
-) -> dict[str, dict[str, Any]]:
-    """Event metrics of every method on every part of the streams.
-
-    Args:
-        parts: streams by name, such as ``"test stream"``.
-        methods: by name.
-        clocks: of every scorer.
-        compute_s: time of a decision, of scorers where it was measured.
-        level: of intervals.
-    """
-    events: dict[str, dict[str, Any]] = {}
-    for part, name in bar([(p, m) for p in parts for m in methods], "events", "table row"):
-        scorer, settings, _ = methods[name]
-        clock = clocks[scorer]
-        latency = LatencyParts(clock.look_ahead_s, clock.bin_s, compute_s.get(scorer))
-        seen = [watched(s, made) for s, made in decide(parts[part], scorer, settings, clock)]
-        events.setdefault(part, {})[name] = event_metrics(seen, EventRules(), latency, level=level)
-    return events
-
-
-def _reliability_of(
-    parts: Mapping[str, Sequence[Stream]], scorer: str, settings: AlarmSettings, clock: Clock
+def reliability_of(
+    parts: Mapping[str, Sequence[Stream]], settings: AlarmSettings, clock: Clock
 ) -> dict[str, Any]:
     """Stated probabilities beside what happened: of each part, and of each of its materials.
 
@@ -383,7 +187,7 @@ def _reliability_of(
             groups.setdefault(stream.recording.material, []).append(stream)
         rows = {}
         for material, own in groups.items():
-            scores, is_slip = labelled(own, scorer, clock)
+            scores, is_slip = labelled(own, OURS, clock)
             if bool(is_slip.any()) and not bool(is_slip.all()):
                 stated = probability(settings.calibration.llr(scores), settings.slip_share)
                 weights = weights_at_share(is_slip, settings.slip_share)
@@ -427,16 +231,16 @@ def amounts_of(streams: Mapping[str, Sequence[Stream]]) -> dict[str, dict[str, d
 
 @dataclass(frozen=True)
 class CalibratedAlarm:
-    """The stage behind the fit.
+    """Sets the alarm of a fitted detector for a false-alarm rate.
 
     Args:
-        streams: recordings, those trained on among them or not; of the paper's scene, without
-            slip, and of others to be fooled by.
+        streams: recordings, those trained on included or not; of the paper's scene, without
+            slip, and of confounding scenes.
         hop_ms: distance of two decisions.
-        false_alarms_per_hour: the budget.
+        false_alarms_per_hour: at most.
         hours: of recordings without slip, at most, to set thresholds on, and as many to check
             them on, for seen and for unseen materials.
-        slip_free: the scene without slip.
+        slip_free: the scene without slip, on which false alarms are counted.
         rules: of ``onset.rules``, by name.
         rule: the one that the detector's file gets; those of baselines are like it.
         calibration: ``"platt"`` or ``"isotonic"``.
@@ -464,36 +268,22 @@ class CalibratedAlarm:
     level: float = 0.95
 
     def __post_init__(self) -> None:
-        if self.rule not in self.rules:
+        scenes = sorted({recording.scene for recording in self.streams.ids})
+        for name, known in (("rule", list(self.rules)), ("calibration", list(FITS))):
+            if (value := getattr(self, name)) not in known:
+                raise ValueError(f"onset.{name} must be one of {', '.join(known)}, got {value!r}")
+        if self.slip_free not in scenes:
             raise ValueError(
-                f"onset.rule must be one of {', '.join(self.rules)}, got {self.rule!r}"
-            )
-        if self.calibration not in FITS:
-            raise ValueError(
-                f"onset.calibration must be one of {', '.join(FITS)}, got {self.calibration!r}"
+                f"onset.slip_free must be a scene of onset.streams, {', '.join(scenes)}, "
+                f"got {self.slip_free!r}"
             )
         for name in ("hop_ms", "false_alarms_per_hour", "hours"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"onset.{name} must be positive, got {getattr(self, name)}")
         if not 0 < self.level < 1:
             raise ValueError(f"onset.level must lie between 0 and 1, got {self.level}")
-        scenes = {recording.scene for recording in self.streams.ids}
-        if self.slip_free not in scenes:
-            raise ValueError(
-                f"onset.slip_free must be a scene of onset.streams, {', '.join(sorted(scenes))}, "
-                f"got {self.slip_free!r}"
-            )
         for rule in self.made_rules(self.hop_samples).values():  # bad numbers are refused now
-            AlarmSettings(
-                self.hop_samples,
-                Platt(1.0, 0.0),
-                rule,
-                math.inf,
-                self.false_alarms_per_hour,
-                self.slip_share,
-                self.rearm_s,
-                self.refractory_s,
-            )
+            self._settings(rule, Platt(1.0, 0.0), self.hop_samples)
 
     @property
     def hop_samples(self) -> int:
@@ -511,7 +301,7 @@ class CalibratedAlarm:
         return made
 
     def roles(self, detector: SlipDetector) -> dict[str, list[RecordingId]]:
-        """Which recordings calibrate, and which are judged, seen and unseen.
+        """Which recordings calibrate, and which evaluate, of seen and of unseen materials.
 
         Every second cycle of a seen material calibrates, of the paper's scene and the one without
         slip; nothing that was trained on has a role.
@@ -521,20 +311,17 @@ class CalibratedAlarm:
         """
         trained = set(detector.info.get("train_recordings", {}).values())
         seen = set(detector.info.get("train_materials", ()))
+        needed = (PAPER_SCENE, self.slip_free)
         roles: dict[str, list[RecordingId]] = {"calibrate": [], "test": [], "unseen": []}
-        places: dict[tuple[str, str], int] = {}
         hours = dict.fromkeys(roles, 0.0)
+        places: Counter[tuple[str, str]] = Counter()
         fresh = [r for r in self.streams.ids if cache_key(self.streams.key(r)) not in trained]
         for recording in sorted(fresh, key=lambda r: (r.scene, r.cycle, r.material)):
             of = (recording.material, recording.scene)
-            place = places[of] = places.get(of, -1) + 1
-            role = "unseen" if recording.material not in seen else "test"
-            if (
-                role == "test"
-                and recording.scene in (PAPER_SCENE, self.slip_free)
-                and place % 2 == 0
-            ):
+            role = "test" if recording.material in seen else "unseen"
+            if role == "test" and recording.scene in needed and places[of] % 2 == 0:
                 role = "calibrate"
+            places[of] += 1
             if recording.scene == self.slip_free:
                 if hours[role] >= self.hours:
                     continue
@@ -549,7 +336,7 @@ class CalibratedAlarm:
                     self.slip_free,
                     self.hours,
                 )
-        for scene in (PAPER_SCENE, self.slip_free):
+        for scene in needed:
             if not any(recording.scene == scene for recording in roles["calibrate"]):
                 raise ValueError(
                     f"no recording of scene {scene} that was not trained on is left to calibrate "
@@ -563,19 +350,19 @@ class CalibratedAlarm:
         others: Mapping[str, Scorer] | None = None,
         num_workers: int | None = None,
     ) -> dict[str, Any]:
-        """Set the alarm of a detector, in its ``info``, and say what became of it.
+        """Set the alarm of a detector, in its ``info``, and evaluate it.
 
         Args:
             detector: fitted.
-            others: baselines by name, which are calibrated and judged alike.
-            num_workers: processes that watch.
+            others: baselines by name, which are calibrated and evaluated alike.
+            num_workers: processes that score streams.
 
         Returns:
             JSON-able: ``"rule"``, ``"settings"`` of it, ``"sample_rate_hz"``; ``"streams"``,
             recordings, hours and slips of each role and scene; ``"methods"``; ``"reliability"`` of
-            each role; ``"events"`` of the protocol and its quiet, by role and method;
-            ``"scenes"``, the same of every other scene by role, and whether it was ``"trained"``
-            on.
+            each role; ``"events"`` of the protocol and of the scene without slip, by role and
+            method; ``"scenes"``, the same of every other scene by role, and whether it was
+            ``"trained"`` on.
 
         Raises:
             ValueError: if there is nothing to calibrate on.
@@ -591,29 +378,41 @@ class CalibratedAlarm:
             name: Clock(rate, self.hop_samples, scorer.pool.bin_samples, scorer.look_ahead)
             for name, scorer in scorers.items()
         }
+        amounts = amounts_of(streams)
         calibrating = streams.pop("calibrate")
-        methods = _methods_of(
-            self.budget(),
-            self.made_rules(detector.pool.bin_samples),
-            self.rule,
-            self.calibration,
-            calibrating,
-            clocks,
-        )
-        amounts = amounts_of({"calibrate": calibrating, **streams})
+        methods = self.methods(calibrating, clocks)
         settings = methods[self.rule].settings
-        quiet = [stream for stream in calibrating if stream.recording.scene == self.slip_free]
-        facts = {
+        metadata = {
             "simulated": self.streams.is_simulated,
             "streams": amounts["calibrate"],
-            "threshold_curve": threshold_curve(quiet, OURS, settings, clocks[OURS]),
+            "threshold_curve": threshold_curve(self._quiet(calibrating), settings, clocks[OURS]),
         }
-        settings = replace(settings, facts={**settings.facts, **facts})
+        settings = replace(settings, facts={**settings.facts, **metadata})
         detector.info[KEY] = settings.to_dict()
-        usual, scenes = self._parts(streams)
+        usual: dict[str, list[Stream]] = {}
+        scenes: dict[str, dict[str, list[Stream]]] = {}
+        for role, own in streams.items():
+            for stream in own:
+                scene = stream.recording.scene
+                if scene in (PAPER_SCENE, self.slip_free):
+                    usual.setdefault(f"{role} stream", []).append(stream)
+                else:
+                    scenes.setdefault(scene, {}).setdefault(role, []).append(stream)
         compute_s = {OURS: push_seconds(detector, settings)}
-        parts = {**usual, **{f"{role}/{scene}": own for (role, scene), own in scenes.items()}}
-        events = events_of(parts, methods, clocks, compute_s, self.level)
+        rows = [
+            (part, name)
+            for part in [*usual.values(), *(own for of in scenes.values() for own in of.values())]
+            for name in methods
+        ]
+        events: dict[int, dict[str, Any]] = {}
+        for part, name in bar(rows, "events", "table row"):
+            method = methods[name]
+            clock = clocks[method.scorer]
+            latency = LatencyParts(clock.look_ahead_s, clock.bin_s, compute_s.get(method.scorer))
+            made = decide(part, method.scorer, method.settings, clock)
+            seen = [watched(stream, decisions) for stream, decisions in made]
+            found = event_metrics(seen, EventRules(), latency, level=self.level)
+            events.setdefault(id(part), {})[name] = found
         trained = {
             name.split("/")[2]
             for name in detector.info.get("train_recordings", {})
@@ -625,42 +424,116 @@ class CalibratedAlarm:
             "settings": settings.to_dict(),
             "streams": amounts,
             "methods": {name: method.to_dict() for name, method in methods.items()},
-            "reliability": _reliability_of(usual, OURS, settings, clocks[OURS]),
-            "events": {part: events[part] for part in usual},
+            "reliability": reliability_of(usual, settings, clocks[OURS]),
+            "events": {name: events[id(part)] for name, part in usual.items()},
             "scenes": {
-                scene: {
-                    "trained": scene in trained,
-                    **{r: events[f"{r}/{s}"] for r, s in scenes if s == scene},
-                }
-                for scene in dict.fromkeys(scene for _, scene in scenes)
+                scene: {"trained": scene in trained}
+                | {role: events[id(part)] for role, part in by_role.items()}
+                for scene, by_role in scenes.items()
             },
         }
 
-    def budget(self) -> FalseAlarmBudget:
-        """What thresholds are set for."""
-        return FalseAlarmBudget(
+    def methods(self, streams: Sequence[Stream], clocks: Mapping[str, Clock]) -> dict[str, Method]:
+        """Every rule on our scores, the main one on those of the others, and the paper's own.
+
+        The paper's rule, ``FIRST_TRANSITION``, makes every change of the score to slip an alarm,
+        one decision a bin: there is no threshold but the score's own, and no memory beyond the bin
+        before. It is left out where the hop does not divide the bin.
+
+        Args:
+            streams: that calibrate.
+            clocks: of every scorer, ``OURS`` included.
+
+        Raises:
+            ValueError: if our scores cannot be calibrated; others whose cannot are left out.
+        """
+        rules, methods = self.made_rules(clocks[OURS].bin_samples), {}
+        for scorer, clock in clocks.items():
+            try:
+                calibration = FITS[self.calibration](*labelled(streams, scorer, clock))
+            except ValueError as error:
+                if scorer == OURS:
+                    raise
+                log.warning("%s is left out: %s", scorer, error)
+                continue
+            for name, rule in rules.items() if scorer == OURS else [(scorer, rules[self.rule])]:
+                methods[name] = self.calibrated(scorer, rule, calibration, streams, clock)
+            if scorer == OURS and clock.bin_samples % clock.hop_samples == 0:
+                settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), clock.bin_samples)
+                settings = replace(settings, threshold=_ABOVE_NEUTRAL, rearm_s=0, refractory_s=0)
+                methods[FIRST_TRANSITION] = Method(scorer, settings, None)
+        return methods
+
+    def calibrated(
+        self,
+        scorer: str,
+        rule: Rule,
+        calibration: Calibration,
+        streams: Sequence[Stream],
+        clock: Clock,
+    ) -> Method:
+        """A rule with the threshold for the rate, and the lead of its onset estimates.
+
+        A ``Cusum`` without ceiling gets one above its threshold. A sum that is capped is sooner low
+        again, so what was one alarm can be two: it is counted anew, by the rule that goes into the
+        file, and the threshold is raised until the rate is kept.
+
+        Args:
+            scorer: whose scores.
+            rule: what makes statistics of them.
+            calibration: what makes ratios of them.
+            streams: that calibrate, those of the scene without slip included.
+            clock: of the scores.
+        """
+        settings = self._settings(rule, calibration, clock.hop_samples)
+        quiet = self._quiet(streams)
+        highest = math.inf  # of a statistic that is itself a ratio, what the calibration gives
+        if isinstance(rule, KOfN) and isinstance(calibration, Isotonic):
+            highest = max(calibration.llrs)
+        threshold = choose_threshold(
+            [made.statistic for _, made in decide(quiet, scorer, settings, clock)],
+            rule,
+            clock.hop_s,
             self.false_alarms_per_hour,
-            self.slip_free,
+            rearm=settings.decisions(self.rearm_s, clock.sample_rate_hz),
+            refractory=settings.decisions(self.refractory_s, clock.sample_rate_hz),
+            ceiling=highest,
+            level=self.level,
+        )
+        settings = replace(settings, threshold=threshold.value)
+        if isinstance(rule, Cusum) and rule.ceiling == math.inf and threshold.value > 0:
+            allowed = math.floor(self.false_alarms_per_hour * threshold.rate.hours)
+            value = threshold.value
+            while True:
+                capped = replace(rule, ceiling=CEILING * value)
+                settings = replace(settings, rule=capped, threshold=value)
+                made = [decisions for _, decisions in decide(quiet, scorer, settings, clock)]
+                counts = [int(decisions.is_alarm.sum()) for decisions in made]
+                if sum(counts) <= allowed:
+                    break
+                value *= _STEP
+            hours = [len(decisions.number) * clock.hop_s / 3600 for decisions in made]
+            rate = alarm_rate(counts, hours, self.level)
+            threshold = replace(threshold, value=value, rate=rate)
+        facts = {"slip_free": self.slip_free, "calibrated": asdict(threshold)}
+        lead_s = _lead_s(streams, scorer, settings, clock)
+        return Method(scorer, replace(settings, lead_s=lead_s, facts=facts), threshold)
+
+    def _settings(self, rule: Rule, calibration: Calibration, hop_samples: int) -> AlarmSettings:
+        """Without a threshold yet."""
+        return AlarmSettings(
+            hop_samples,
+            calibration,
+            rule,
+            math.inf,
+            self.false_alarms_per_hour,
             self.slip_share,
             self.rearm_s,
             self.refractory_s,
-            self.level,
         )
 
-    def _parts(
-        self, streams: Mapping[str, list[Stream]]
-    ) -> tuple[dict[str, list[Stream]], dict[tuple[str, str], list[Stream]]]:
-        """The protocol and its quiet by role, and every other scene by role and scene."""
-        usual: dict[str, list[Stream]] = {}
-        scenes: dict[tuple[str, str], list[Stream]] = {}
-        for role, own in streams.items():
-            for stream in own:
-                scene = stream.recording.scene
-                if scene in (PAPER_SCENE, self.slip_free):
-                    usual.setdefault(f"{role} stream", []).append(stream)
-                else:
-                    scenes.setdefault((role, scene), []).append(stream)
-        return usual, scenes
+    def _quiet(self, streams: Sequence[Stream]) -> list[Stream]:
+        return [stream for stream in streams if stream.recording.scene == self.slip_free]
 
 
 @dataclass(frozen=True)
@@ -689,22 +562,19 @@ class DebouncedAlarm:
     refractory_s: float = 0.2
 
     def __post_init__(self) -> None:
-        for name in ("k", "n"):
-            if type(getattr(self, name)) is not int:
-                raise ValueError(
-                    f"onset.{name} must be a whole number, got {getattr(self, name)!r}"
-                )
-        for name in ("probability", "slip_share"):
-            value = getattr(self, name)
-            if type(value) not in (int, float) or not 0 < value < 1:
-                raise ValueError(f"onset.{name} must lie between 0 and 1, got {value!r}")
-        for name in ("rearm_s", "refractory_s"):
-            value = getattr(self, name)
-            if type(value) not in (int, float) or not 0 <= value < math.inf:
-                raise ValueError(f"onset.{name} must be seconds from 0, got {value!r}")
-        hop_ms = self.hop_ms
-        if hop_ms is not None and (type(hop_ms) not in (int, float) or not 0 < hop_ms < math.inf):
-            raise ValueError(f"onset.hop_ms must be positive, or null, got {hop_ms!r}")
+        for name, value in vars(self).items():
+            is_number = type(value) in (int, float)
+            if name in ("k", "n"):
+                is_fine, wanted = type(value) is int, "be a whole number"
+            elif name in ("probability", "slip_share"):
+                is_fine, wanted = is_number and 0 < value < 1, "lie between 0 and 1"
+            elif name == "hop_ms":
+                is_fine = value is None or (is_number and 0 < value < math.inf)
+                wanted = "be positive, or null"
+            else:
+                is_fine, wanted = is_number and 0 <= value < math.inf, "be seconds from 0"
+            if not is_fine:
+                raise ValueError(f"onset.{name} must {wanted}, got {value!r}")
         _ = KOfN(self.k, self.n)
 
     def hop_samples(self, sample_rate_hz: float, bin_samples: int) -> int:

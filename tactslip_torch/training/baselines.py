@@ -32,7 +32,7 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.rounding import is_rounding
 from tactslip_torch.model.threshold import FeatureThreshold, best_threshold
-from tactslip_torch.training.recipe import recalls_mean, sample_groups
+from tactslip_torch.training.recipe import balanced_accuracy, sample_groups
 
 POOLED_NUMBER = "best_pooled_number"
 KEY = "baselines"
@@ -150,7 +150,7 @@ class LogisticRegression:
                 for out in folds:
                     weights, constant = fitted(~out, candidate)
                     says_slip = z[out] @ weights + constant >= 0
-                    right.append(recalls_mean(says_slip, sample.is_slip[out]))
+                    right.append(balanced_accuracy(says_slip, sample.is_slip[out]))
                 known = [value for value in right if value is not None]
                 found[candidate] = sum(known) / max(len(known), 1)
             penalty = max(found, key=found.__getitem__)  # the strongest of equals

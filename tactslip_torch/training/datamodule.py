@@ -74,6 +74,13 @@ class RecordingFeatures(NamedTuple):
     roles: dict[str, Tensor]
     seconds: dict[str, float]
 
+    def of(self, mask: Tensor) -> RecordingFeatures:
+        """Some of its bins, by a mask ``[N]``."""
+        names = ("features", "is_slip", "speed_mm_s", "position", "stroke", "ends_s")
+        kept = {name: getattr(self, name)[mask] for name in names}
+        roles = {role: own[mask] for role, own in self.roles.items()}
+        return self._replace(**kept, roles=roles)
+
 
 class FeatureMaker:
     """Features of a recording of a source, computed or from the cache.

@@ -51,7 +51,7 @@ from tactslip_torch.training.adaptation import check_recipe, gathered_statistics
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.learner import SlipLearner, event_numbers, together
-from tactslip_torch.training.recipe import Recipe, stand_for
+from tactslip_torch.training.recipe import Recipe, sample_weight
 from tactslip_torch.training.statistics import FILE as STATISTICS
 from tactslip_torch.training.tuning import Tuning, settled_learner
 
@@ -405,13 +405,12 @@ def tune_fold(
     trainer.fit(first, datamodule=data)
     facts: dict[str, Any] = {"fit_s": time.perf_counter() - started}
     plan, (_, sample) = first.plan, first.gathered
-    counts = [float(sample.represents[sample.is_slip == kind].sum()) for kind in (False, True)]
-    weights = stand_for(sample, first.recipe, counts)
+    weights = sample_weight(first.recipe, sample)
     names = [str(name) for name in data.maker.pool.names]
     tuned = tuning(plan, first.recipe, sample, weights, names)
     facts |= tuned.facts
     start = facts["start"]
-    by_loss = settled_learner(first, data.maker, plan.frame, start["penalty"], start["offset"])
+    by_loss = settled_learner(first, data.maker, plan.selection, start["penalty"], start["offset"])
     other = make_trainer(config.trainer, folder / "start")
     other.fit(by_loss, datamodule=data)
     facts["splits"] = {}
@@ -424,8 +423,8 @@ def tune_fold(
             learner.detector.save(folder / f"{name}.pt")
     simulated = data.maker.source.is_simulated
     tuning_figure(facts, folder / "tuning.png", simulated=simulated)
-    learner = settled_learner(first, data.maker, tuned.frame, tuned.penalty, tuned.offset)
-    facts["validation"] = first.facts["validation"]
+    learner = settled_learner(first, data.maker, tuned.selection, tuned.penalty, tuned.offset)
+    facts["validation"] = first.metadata["validation"]
     return learner, facts
 
 
@@ -487,7 +486,7 @@ def run_fold(
         "events": events,
         **({"alarm": alarm} if alarm else {}),
         "recording_events": learner.events,  # for combined
-        **learner.facts,
+        **learner.metadata,
         **({} if tuned is None else {"tuning": tuned, "validation": tuned.pop("validation")}),
         "selected": [str(name) for name in detector.selected_names],
         "trained_on": {

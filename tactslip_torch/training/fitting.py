@@ -1,4 +1,4 @@
-"""From a second pass to a machine, in any order, on any number of workers and processes."""
+"""From the training bins of a plan to its machine, in any order, on any number of processes."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.bin_sample import bin_keys
 from tactslip_torch.ledger import Ledger, content_digest
 from tactslip_torch.model.fit import TrainingBins, fit_machine
-from tactslip_torch.model.kernels import Head, Polynomial, QuadraticForm
+from tactslip_torch.model.kernels import Head, Polynomial
 from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.training.selection import Plan, Progress
+from tactslip_torch.training.selection import Plan
+
+Made = TypeVar("Made")
 
 
 class TrainingPass:
@@ -36,132 +38,114 @@ class TrainingPass:
         self.stats: SufficientStats | None = None
         if plan.adds_up:
             assert isinstance(plan.kernel, Polynomial)
-            self.stats = SufficientStats(plan.frame.size, degree=plan.kernel.degree)
+            self.stats = SufficientStats(plan.selection.size, degree=plan.kernel.degree)
 
     def update(
         self, recording: str, features: Tensor, is_slip: Tensor, scene: str = PAPER_SCENE
     ) -> None:
         """Add the training bins of a recording, ``[N, F]`` and ``[N]``.
 
+        With ``recipe.drop_channels`` they come twice, without some channels the second time, each
+        copy counting half.
+
         Raises:
             ValueError: if the recording is there already.
         """
         plan = self.plan
-        z, labels = training_part(plan, recording, features, is_slip)
+        kept = is_kept(recording, is_slip, plan.fractions)
+        features, is_slip = features[kept], is_slip[kept].bool()
+        z, pooling = plan.selection(features), plan.selection.pooling
         of_class = torch.tensor(plan.scene_weights.get(scene, (1.0, 1.0)), dtype=torch.float64)
-        each = plan.stands_for / (2.0 if plan.drop_channels > 0 else 1.0)  # two copies
-        weights = of_class[labels.long()] * each
+        weights = plan.bin_weight * of_class[is_slip.long()]
+        if plan.recipe.drop_channels > 0 and pooling is not None:
+            is_missing = _dropped(recording, len(pooling.hand), plan.recipe.drop_channels)
+            fewer = plan.selection(features, is_missing.expand(len(z), -1))
+            z, is_slip, weights = torch.cat([z, fewer]), is_slip.repeat(2), weights.repeat(2) / 2
         if self.stats is not None:
-            self.stats.update(recording, z, labels, weights)
+            self.stats.update(recording, z, is_slip, weights)
             return
-        self.ledger.add(recording, content_digest(z, labels))
-        self.bins[recording] = (z, labels, weights)
+        self.ledger.add(recording, content_digest(z, is_slip))
+        self.bins[recording] = (z, is_slip, weights)
 
-    def merge(self, other: TrainingPass) -> None:
-        """Take over what another worker gathered.
+    def merge_processes(self) -> None:
+        """Put together what every process of a distributed fit gathered.
 
         Raises:
-            ValueError: if a recording is in both.
+            ValueError: if two of them saw one recording.
         """
-        if self.stats is not None and other.stats is not None:
-            self.stats.merge(other.stats)
+        if _num_processes() == 1:
             return
-        self.ledger.merge(other.ledger)
-        self.bins |= other.bins
+        stats = self.stats
+        if stats is None:
+            parts = of_all_processes((self.ledger, self.bins))
+            self.ledger = _merged(ledger for ledger, _ in parts)
+            self.bins = {name: own for _, bins in parts for name, own in bins.items()}
+            return
+        stats.ledger = _merged(of_all_processes(stats.ledger))
+        for total in (stats.sums, stats.count):
+            torch.distributed.all_reduce(total)
 
-    def solve(self, progress: Progress | None = None) -> Head:
+    def solve(self) -> Head:
         """The machine.
 
         Raises:
             ValueError: if a class is absent, or the system cannot be told in float64.
         """
         plan = self.plan
+        balance: Literal["weights", "none"] = "none"
+        if plan.recipe.balance == "weights" and not plan.scene_weights:  # which are balanced
+            balance = "weights"
         if self.stats is not None:
-            return solve_sums(plan, self.stats)
+            assert isinstance(plan.kernel, Polynomial)
+            return self.stats.solve(plan.penalty, plan.kernel.offset, balance=balance)
         parts = [self.bins[name] for name in sorted(self.bins)]
         z, is_slip, weights = (torch.cat(part) for part in zip(*parts, strict=True))
-        if _balance(plan) == "weights":
+        if balance == "weights":
             counts = torch.bincount(is_slip.long(), minlength=2).clamp(min=1)
             weights = weights * (len(z) / (2 * counts.double()))[is_slip.long()]
         return fit_machine(TrainingBins(z, is_slip, weights), plan.penalty, plan.kernel)
 
 
-def training_part(
-    plan: Plan, recording: str, features: Tensor, is_slip: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Scaled columns and labels of the bins of a recording that are trained on.
-
-    With ``plan.drop_channels`` they come twice, without some channels the second time, each copy
-    counting half.
-    """
-    kept = _is_kept(recording, is_slip, plan.shares)
-    z = plan.frame(features[kept])
-    pooling = plan.frame.pooling
-    if plan.drop_channels == 0 or pooling is None:
-        return z, is_slip[kept]
-    num = len(pooling.hand)
-    keys = bin_keys(f"{recording}, channels", num + 1)
-    most = math.floor(plan.drop_channels * num)
-    left_out = keys[1:].argsort()[: math.floor(float(keys[0]) * (most + 1))]
-    is_missing = torch.zeros(num, dtype=torch.bool)
-    is_missing[left_out] = True
-    fewer = plan.frame(features[kept], is_missing.expand(len(z), num))
-    return torch.cat([z, fewer]), is_slip[kept].repeat(2)
-
-
-def solve_sums(plan: Plan, stats: SufficientStats) -> QuadraticForm:
-    """The machine of sums.
-
-    Raises:
-        ValueError: if the plan's kernel is of another degree than the sums, a class is absent, or
-            the system cannot be told in float64.
-    """
-    if not isinstance(plan.kernel, Polynomial) or plan.kernel.degree != stats.degree:
-        raise ValueError(
-            f"these sums need a polynomial kernel of degree {stats.degree}, the plan has "
-            f"{plan.kernel}"
-        )
-    return stats.solve(plan.penalty, plan.kernel.offset, balance=_balance(plan))
-
-
-def solve_facts(head: Head) -> dict[str, Any]:
+def solve_metadata(head: Head) -> dict[str, Any]:
     """How a machine was solved for, JSON-able: method, condition, error (``SolveReport``)."""
     return {} if head.solved is None else head.solved.facts()
 
 
-def _balance(plan: Plan) -> Literal["weights", "none"]:
-    """How classes are balanced when a machine is solved; weights of scenes hold it already."""
-    return "weights" if plan.balance == "weights" and not plan.scene_weights else "none"
+def is_kept(recording: str, is_slip: Tensor, fractions: Sequence[float]) -> Tensor:
+    """Which bins ``[N]`` of a recording are trained on; it depends on the bin alone."""
+    if all(fraction >= 1 for fraction in fractions):
+        return torch.ones_like(is_slip, dtype=torch.bool)
+    keys = bin_keys(recording, len(is_slip))  # [N] in [0, 1)
+    return keys < torch.tensor(fractions, dtype=torch.float64)[is_slip.long()]
 
 
-def _is_kept(recording: str, is_slip: Tensor, shares: Sequence[float]) -> Tensor:
-    """Undersampling that depends on the bin alone, so on no order and no worker."""
-    if all(share >= 1 for share in shares):
-        return torch.ones_like(is_slip)
-    place = bin_keys(recording, len(is_slip))  # [N] in [0, 1)
-    return place < torch.tensor(shares, dtype=torch.float64)[is_slip.long()]
+def _dropped(recording: str, num: int, largest: float) -> Tensor:
+    """Channels that the second copy of a recording is without, ``[num]``, bool."""
+    keys = bin_keys(f"{recording}, channels", num + 1)
+    order = keys[1:].argsort()[: math.floor(float(keys[0]) * (math.floor(largest * num) + 1))]
+    return torch.zeros(num, dtype=torch.bool).index_fill(0, order, True)
 
 
-Made = TypeVar("Made")
+# Processes of a distributed fit -------------------------------------------------------------
 
 
-def _num_ranks() -> int:
+def _num_processes() -> int:
     ready = torch.distributed.is_available() and torch.distributed.is_initialized()
     return torch.distributed.get_world_size() if ready else 1
 
 
-def of_all_ranks(own: Made) -> list[Made]:
+def of_all_processes(own: Made) -> list[Made]:
     """What every process holds, in the order of their ranks."""
-    if _num_ranks() == 1:
+    if _num_processes() == 1:
         return [own]
-    parts: list[Any] = [None] * _num_ranks()
+    parts: list[Any] = [None] * _num_processes()
     torch.distributed.all_gather_object(parts, own)
     return parts
 
 
-def from_first_rank(make: Callable[[], Made]) -> Made:
+def from_first_process(make: Callable[[], Made]) -> Made:
     """What the first process makes, in every process; its error as well, so that none waits."""
-    if _num_ranks() == 1:
+    if _num_processes() == 1:
         return make()
     box: list[Any] = [None, None]
     if torch.distributed.get_rank() == 0:
@@ -176,19 +160,8 @@ def from_first_rank(make: Callable[[], Made]) -> Made:
     return made
 
 
-def sum_over_ranks(gathered: TrainingPass) -> None:
-    """Put together what every process gathered in the second pass; sums by one all-reduce."""
-    if _num_ranks() == 1:
-        return
-    if gathered.stats is None:
-        for rank, part in enumerate(of_all_ranks(gathered)):
-            if rank != torch.distributed.get_rank():
-                gathered.merge(part)
-        return
-    stats = gathered.stats
-    parts = of_all_ranks((stats.ledger, stats.count))
-    stats.ledger = Ledger()
-    for ledger, _ in parts:
-        stats.ledger.merge(ledger)  # refuses a recording that two of them saw
-    stats.count = torch.stack([count for _, count in parts]).sum(0)
-    torch.distributed.all_reduce(stats.sums)
+def _merged(ledgers: Any) -> Ledger:
+    whole = Ledger()
+    for ledger in ledgers:
+        whole.merge(ledger)  # refuses a recording that two of them saw
+    return whole

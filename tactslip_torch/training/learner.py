@@ -7,7 +7,6 @@ detector was not made for these rules; they show what its errors would mean in u
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -25,12 +24,9 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.abstention import KEY, abstention_of
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import ClassGaussians
-from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.onset.events import (
     EventRules,
     LatencyParts,
@@ -47,20 +43,18 @@ from tactslip_torch.report.metrics import (
     confusion_matrix,
     split_metrics,
 )
-from tactslip_torch.runtime import bar
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.abstention import Abstaining
 from tactslip_torch.training.baselines import KEY as BASELINES
 from tactslip_torch.training.baselines import Baselines
-from tactslip_torch.training.datamodule import Pace, RecordingFeatures, SlipDataModule, Stroke
+from tactslip_torch.training.datamodule import Pace, RecordingFeatures, SlipDataModule
 from tactslip_torch.training.fitting import (
     TrainingPass,
-    from_first_rank,
-    of_all_ranks,
-    solve_facts,
-    sum_over_ranks,
+    from_first_process,
+    of_all_processes,
+    solve_metadata,
 )
-from tactslip_torch.training.recipe import Frame, Recipe
+from tactslip_torch.training.recipe import FeatureSelection, Recipe
 from tactslip_torch.training.selection import Plan, plan_detector
 
 RULES: Mapping[str, KOfN] = MappingProxyType(
@@ -73,52 +67,38 @@ BINS_APART = "bins of one stroke are on both sides of this split"
 """Why a split by bin has no events."""
 
 
-class JudgedBins(NamedTuple):
+class EvaluatedBins(NamedTuple):
     """Decisions on bins of one recording that have one role.
 
     Attributes:
-        baselines: decisions of baselines by name (``tactslip_torch.training.baselines``).
+        bins: which they are; without features.
+        says_slip: of the detector, ``[N]``, bool.
+        baselines: decisions of baselines by name, ``[N]`` each.
         is_whole: whether these are all bins of the recording.
-        answer: slip, non-slip or unsure (``model.conformal``); None of a detector that is never
-            unsure.
-
-    Shape:
-        - truth, says_slip, speed_mm_s, position, stroke, ends_s, answer, each of baselines: ``[N]``
+        answer: slip, non-slip or none (``model.abstention``), ``[N]``; None of a detector that
+            never abstains.
     """
 
-    recording: RecordingId
-    truth: Tensor
+    bins: RecordingFeatures
     says_slip: Tensor
     baselines: Mapping[str, Tensor]
-    speed_mm_s: Tensor
-    position: Tensor
-    stroke: Tensor
-    ends_s: Tensor
-    strokes: tuple[Stroke, ...]
-    hop_s: float
     is_whole: bool
     answer: Tensor | None = None
 
 
-def judged_bins(
+def evaluated_bins(
     batch: RecordingFeatures,
     says_slip: Tensor,
     baselines: Mapping[str, Tensor],
     answer: Tensor | None = None,
-) -> dict[str, JudgedBins]:
+) -> dict[str, EvaluatedBins]:
     """Decisions ``[N]`` on the bins of a recording, for each role that some of them have."""
+    light = batch._replace(features=batch.features[:, :0])
     return {
-        role: JudgedBins(
-            batch.recording,
-            batch.is_slip[mask],
+        role: EvaluatedBins(
+            light.of(mask),
             says_slip[mask],
             {name: decisions[mask] for name, decisions in baselines.items()},
-            batch.speed_mm_s[mask],
-            batch.position[mask],
-            batch.stroke[mask],
-            batch.ends_s[mask],
-            batch.strokes,
-            batch.hop_s,
             bool(mask.all()),
             None if answer is None else answer[mask],
         )
@@ -127,16 +107,16 @@ def judged_bins(
     }
 
 
-def bin_scores(parts: Sequence[JudgedBins]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+def bin_scores(parts: Sequence[EvaluatedBins]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
     """``bin_metrics`` of the detector, and ``split_metrics`` of each baseline, on all bins."""
-    truth = torch.cat([part.truth for part in parts])
-    places = torch.cat([part.position for part in parts]).tolist()
+    truth = torch.cat([part.bins.is_slip for part in parts])
+    places = torch.cat([part.bins.position for part in parts]).tolist()
     scores = bin_metrics(
         truth,
         torch.cat([part.says_slip for part in parts]),
-        [part.recording.material for part in parts for _ in part.truth],
-        torch.cat([part.speed_mm_s for part in parts]).tolist(),
-        [part.recording.scene for part in parts for _ in part.truth],
+        [part.bins.recording.material for part in parts for _ in part.says_slip],
+        torch.cat([part.bins.speed_mm_s for part in parts]).tolist(),
+        [part.bins.recording.scene for part in parts for _ in part.says_slip],
         [None if place == NO_POSITION else place for place in places],
     )
     return scores, {
@@ -147,18 +127,8 @@ def bin_scores(parts: Sequence[JudgedBins]) -> tuple[dict[str, Any], dict[str, d
     }
 
 
-def answer_scores(parts: Sequence[JudgedBins], coverage: float) -> dict[str, Any]:
-    """``answer_metrics`` of bins that a detector with thresholds for unsure answers judged."""
-    counts = {
-        str(part.recording): answer_counts(part.truth, part.answer)
-        for part in parts
-        if part.answer is not None
-    }
-    return answer_metrics(counts, coverage)
-
-
 def events_by_rule(
-    parts: Sequence[JudgedBins], latency: LatencyParts
+    parts: Sequence[EvaluatedBins], latency: LatencyParts
 ) -> dict[str, list[RecordingEvents]]:
     """What each of ``RULES`` makes of the bins; no recordings where a split is by bin.
 
@@ -167,21 +137,23 @@ def events_by_rule(
     """
     if not all(part.is_whole for part in parts):
         return {name: [] for name in RULES}
-    streams = [(part, rows) for part in parts for rows in _stretches(part)]
-    says_slip = pad_sequence([part.says_slip[rows] for part, rows in streams], batch_first=True)
+    stretches = [(part, rows) for part in parts for rows in _stretches(part.bins)]
+    says_slip = pad_sequence([part.says_slip[rows] for part, rows in stretches], batch_first=True)
     llr = torch.where(says_slip, 1.0, -1.0)  # [streams, most bins]; what is padded changes nothing
     events = {}
     for name, rule in RULES.items():
         statistic, _ = rule.scan(llr, rule.start(llr[:, 0]))
         start = latch_start(llr[:, 0])
         is_alarm, is_on, _ = latch(statistic, 0.0, rearm=1, refractory=0, state=start)
-        heard: dict[RecordingId, list[_Stream]] = {}
-        for (part, rows), alarms, status in zip(streams, is_alarm, is_on, strict=True):
-            available_s = part.ends_s[rows] + latency.look_ahead_s
+        streams: dict[RecordingId, list[_Stream]] = {}
+        for (part, rows), alarms, status in zip(stretches, is_alarm, is_on, strict=True):
+            available_s = part.bins.ends_s[rows] + latency.look_ahead_s
             stream = _Stream(available_s, alarms[: len(rows)], status[: len(rows)])
-            heard.setdefault(part.recording, []).append(stream)
+            streams.setdefault(part.bins.recording, []).append(stream)
         events[name] = [
-            recording_events(_watched(part, heard[part.recording], latency), EventRules(), latency)
+            recording_events(
+                _watched(part, streams[part.bins.recording], latency), EventRules(), latency
+            )
             for part in parts
         ]
     return events
@@ -220,16 +192,17 @@ class _Stream(NamedTuple):
     is_on: Tensor
 
 
-def _stretches(part: JudgedBins) -> list[Tensor]:
+def _stretches(bins: RecordingFeatures) -> list[Tensor]:
     """The rows of each stroke, and of each unbroken stretch of bins of no stroke."""
-    rows = torch.arange(len(part.stroke))
-    is_apart = part.ends_s.diff() > part.hop_s + 1e-6
-    is_new = (part.stroke.diff() != 0) | ((part.stroke[1:] < 0) & is_apart)
+    rows = torch.arange(len(bins.stroke))
+    is_apart = bins.ends_s.diff() > bins.hop_s + 1e-6
+    is_new = (bins.stroke.diff() != 0) | ((bins.stroke[1:] < 0) & is_apart)
     return list(rows.tensor_split(rows[1:][is_new]))
 
 
-def _watched(part: JudgedBins, streams: Sequence[_Stream], latency: LatencyParts) -> Watched:
+def _watched(part: EvaluatedBins, streams: Sequence[_Stream], latency: LatencyParts) -> Watched:
     """A recording as the detector saw it through a rule."""
+    bins = part.bins
     alarms: list[tuple[float, float]] = []
     seen: list[tuple[float, float]] = []
     for stream in sorted(streams, key=lambda stream: float(stream.available_s[0])):
@@ -239,23 +212,23 @@ def _watched(part: JudgedBins, streams: Sequence[_Stream], latency: LatencyParts
             end = next((available_s[place] for place in ended if place > raised), math.inf)
             alarms.append((available_s[raised], end))
         before = seen[-1][1] if seen else -math.inf  # a hop may be longer than a bin
-        seen.append((max(available_s[0] - part.hop_s, before), available_s[-1]))
-    positive = part.ends_s[part.says_slip] + latency.look_ahead_s
-    of = part.stroke[part.says_slip]
+        seen.append((max(available_s[0] - bins.hop_s, before), available_s[-1]))
+    positive = bins.ends_s[part.says_slip] + latency.look_ahead_s
+    of = bins.stroke[part.says_slip]
     first = []
-    for number, stroke in enumerate(part.strokes):
+    for number, stroke in enumerate(bins.strokes):
         later = positive[(of == number) & (positive >= stroke.onset_s)]
         first.append(float(later.min()) if len(later) else math.nan)
     return Watched(
-        recording=str(part.recording),
-        material=part.recording.material,
-        scene=part.recording.scene,
+        recording=str(bins.recording),
+        material=bins.recording.material,
+        scene=bins.recording.scene,
         duration_s=seen[-1][1],
         alarms_s=tuple(alarm for alarm, _ in alarms),
         onset_estimates_s=(),
-        onsets_s=tuple(stroke.onset_s for stroke in part.strokes),
-        sliding_s=tuple((stroke.onset_s, stroke.slide_end_s) for stroke in part.strokes),
-        speeds_mm_s=tuple(stroke.speed_mm_s for stroke in part.strokes),
+        onsets_s=tuple(stroke.onset_s for stroke in bins.strokes),
+        sliding_s=tuple((stroke.onset_s, stroke.slide_end_s) for stroke in bins.strokes),
+        speeds_mm_s=tuple(stroke.speed_mm_s for stroke in bins.strokes),
         first_positive_s=tuple(first),
         watched_s=tuple(seen),
         alarm_ends_s=tuple(end for _, end in alarms),
@@ -263,22 +236,22 @@ def _watched(part: JudgedBins, streams: Sequence[_Stream], latency: LatencyParts
 
 
 class SlipLearner(L.LightningModule):
-    """Learns a ``SlipDetector`` in two epochs and judges it; nothing is optimised by steps.
+    """Learns a ``SlipDetector`` in two epochs and evaluates it; nothing is optimised by steps.
 
     Args:
         pool: the features of the bins it is given.
         channel_filter: of those bins, kept with the detector.
         recipe: how the machine is made.
-        detector: a finished one, to be judged only.
-        abstaining: how thresholds for unsure answers are set; by default none are.
-        frame: features and ranges that were settled elsewhere; by default the recipe finds them.
+        detector: a finished one, to be evaluated only.
+        abstaining: how thresholds for abstaining are set; by default none are.
+        selection: features and ranges that were chosen elsewhere; by default the recipe finds them.
         with_baselines: fit baselines on the sample of training bins, to be evaluated beside.
 
     Attributes:
         detector: the result, after the second epoch.
-        facts: what the recipe found, such as the penalty.
+        metadata: what the recipe found, such as the penalty.
         metrics: ``{"splits": ..., "baselines": ..., "events": ...}`` after a test; ``"answers"`` of
-            a detector that may be unsure.
+            a detector that may abstain.
         events: what the test found in each recording, by role and rule; to be pooled with others.
         seconds: time of each stage of the fit.
     """
@@ -290,7 +263,7 @@ class SlipLearner(L.LightningModule):
         recipe: Recipe | None = None,
         detector: SlipDetector | None = None,
         abstaining: Abstaining | None = None,
-        frame: Frame | None = None,
+        selection: FeatureSelection | None = None,
         *,
         with_baselines: bool = True,
     ) -> None:
@@ -300,14 +273,14 @@ class SlipLearner(L.LightningModule):
         self.channel_filter = channel_filter
         self.recipe = recipe or Recipe()
         self.abstaining = abstaining or Abstaining()
-        self._allowed = self.recipe.allowed(pool)
-        self._frame = frame
+        self.recipe.allowed(pool)  # refused before any work
+        self._selection = selection
         self.detector = detector
         self.with_baselines = with_baselines
         self.baselines: Baselines | None = None
         if detector and BASELINES in detector.info:
             self.baselines = Baselines.from_dict(detector.pool, detector.info[BASELINES])
-        self.facts: dict[str, Any] = {}
+        self.metadata: dict[str, Any] = {}
         self.metrics: dict[str, Any] = {}
         self.events: dict[str, dict[str, list[RecordingEvents]]] = {}
         self.seconds: dict[str, float] = {}
@@ -318,7 +291,7 @@ class SlipLearner(L.LightningModule):
         self._plan: Plan | None = None
         self._second: TrainingPass | None = None
         self._is_resumed = False
-        self._judged: dict[str, list[JudgedBins]] = {}
+        self._evaluated: dict[str, list[EvaluatedBins]] = {}
         # nothing is trained by it: torch's DistributedDataParallel refuses a module without one
         self._anchor = nn.Parameter(torch.zeros(()))
 
@@ -354,15 +327,15 @@ class SlipLearner(L.LightningModule):
         name = "survey_pass" if self._second is None else "training_pass"
         self.seconds[name] = passed - self._pass_started
         if self._second is None or self._is_resumed:
-            parts = of_all_ranks(self._survey)
+            parts = of_all_processes(self._survey)
             self._survey = parts[0]
             for part in parts[1:]:
                 self._survey.merge(part)
         if self._second is not None:
-            sum_over_ranks(self._second)
+            self._second.merge_processes()
             self._solve(self._second)
             return
-        self._plan = from_first_rank(self._planned)
+        self._plan = from_first_process(self._planned)
         self.seconds["validation"] = time.perf_counter() - passed
         if self._is_single_pass:
             self._second = self._sampled()
@@ -373,11 +346,7 @@ class SlipLearner(L.LightningModule):
         if self._plan is None:
             return
         checkpoint["fingerprint"] = self._fingerprint()
-        checkpoint["plan"] = json.dumps(self._plan.facts())
-        checkpoint["scaler"] = dict(self._plan.frame.scaler.state_dict())
-        checkpoint["gaussians"] = self._plan.gaussians and self._plan.gaussians.tensors()
-        if (pooling := self._plan.frame.pooling) is not None:
-            checkpoint["pooling"] = (pooling.to_dict(), dict(pooling.state_dict()))
+        checkpoint["plan"] = self._plan.to_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take up what ``on_save_checkpoint`` kept.
@@ -390,23 +359,18 @@ class SlipLearner(L.LightningModule):
                 "the checkpoint was gathered from other training bins; resume with the code, "
                 "data, labels, split, recipe and seed it was made with"
             )
-        scaler = FeatureScaler(**checkpoint["scaler"])
-        gaussians = ClassGaussians.among(checkpoint.get("gaussians") or {})
-        pooling = None
-        if kept := checkpoint.get("pooling"):
-            pooling = ChannelPooling.from_dict(self.pool.hand, *kept)
-        self._plan = Plan.of(json.loads(checkpoint["plan"]), scaler, gaussians, pooling)
+        self._plan = Plan.from_dict(checkpoint["plan"], self.recipe, self.pool)
         self._is_resumed = True  # baselines need the first pass's sample: drawn in the second
 
     def on_test_start(self) -> None:
-        """Forget what an earlier test judged.
+        """Forget what an earlier test found.
 
         Raises:
             ValueError: if there is no detector yet.
         """
         if self.detector is None:
             raise ValueError("nothing to test: fit first, or give the learner a detector")
-        self._judged = {role: [] for role in ROLES}
+        self._evaluated = {role: [] for role in ROLES}
         self._num_threads = torch.get_num_threads()
         torch.set_num_threads(1)
 
@@ -422,8 +386,8 @@ class SlipLearner(L.LightningModule):
         baselines = self.baselines(batch.features, scaled.cpu()) if self.baselines else {}
         abstention = abstention_of(self.detector)
         answer = abstention.answer(score) if abstention else None
-        for role, part in judged_bins(batch, says_slip, baselines, answer).items():
-            self._judged[role].append(part)
+        for role, part in evaluated_bins(batch, says_slip, baselines, answer).items():
+            self._evaluated[role].append(part)
 
     def on_test_epoch_end(self) -> None:
         """Turn decisions into metrics."""
@@ -438,10 +402,10 @@ class SlipLearner(L.LightningModule):
         latency = LatencyParts(
             self.detector.look_ahead / rate_hz, self.detector.pool.bin_samples / rate_hz
         )
-        shares = of_all_ranks(self._judged)
+        shares = of_all_processes(self._evaluated)
         for role in ROLES:
             parts = [part for share in shares for part in share[role]]
-            parts.sort(key=lambda part: part.recording)
+            parts.sort(key=lambda part: part.bins.recording)
             if not parts:
                 continue
             scores, of_baselines = bin_scores(parts)
@@ -450,7 +414,12 @@ class SlipLearner(L.LightningModule):
             self.metrics["splits"][role] = scores
             self.events[role] = events_by_rule(parts, latency)
             if abstention := abstention_of(self.detector):
-                answers = answer_scores(parts, abstention.coverage)
+                counts = {
+                    str(part.bins.recording): answer_counts(part.bins.is_slip, part.answer)
+                    for part in parts
+                    if part.answer is not None
+                }
+                answers = answer_metrics(counts, abstention.coverage)
                 self.metrics.setdefault("answers", {})[role] = answers
             for name in ("accuracy", "balanced_accuracy"):
                 if scores[name] is not None:
@@ -485,51 +454,41 @@ class SlipLearner(L.LightningModule):
         return f"{data.fingerprint()} by {self.recipe}, {self.abstaining}"
 
     def _planned(self) -> Plan:
-        parts = (self.recipe, self._survey, bar, self._frame, self._allowed)
-        plan = plan_detector(*parts, pool=self.pool, is_settled=self._frame is not None)
-        return self.abstaining.settle(plan, self.recipe, self._survey)
+        is_settled = self._selection is not None
+        parts = (self.recipe, self._survey, self.pool, self._selection)
+        plan = plan_detector(*parts, is_settled=is_settled, show=True)
+        return self.abstaining.settle(plan, self._survey.sample.bins())
 
     def _sampled(self) -> TrainingPass:
         """What a second pass would gather, of the bins the first one sampled."""
-        assert self._plan is not None  # on_train_epoch_end
         sample = self._survey.sample.bins()
-        gathered = TrainingPass(replace(self._plan, shares=(1.0, 1.0)))
+        gathered = TrainingPass(replace(self.plan, fractions=(1.0, 1.0)))
         gathered.update("sample", sample.features, sample.is_slip)
         return gathered
 
     def _solve(self, gathered: TrainingPass) -> None:
         started = time.perf_counter()
         plan = gathered.plan
-        head = from_first_rank(lambda: gathered.solve(bar))
+        head = from_first_process(gathered.solve)
         self.log("penalty", plan.penalty, batch_size=1)
-        facts = plan.facts()
-        self.facts = {"recipe": self.recipe.name} | {
-            name: facts[name] for name in ("kernel", "penalty", "balance", "num_bins", "validation")
+        self.metadata = plan.metadata | {
+            "validation": plan.validation,
+            "nested_validation": plan.nested,
+            "head": head.cost._asdict(),
+            "solve": solve_metadata(head),
+            "feature_filter": plan.feature_filter,
         }
-        self.facts |= {"nested_validation": plan.nested}
-        of_head = {"head": head.cost._asdict(), "solve": solve_facts(head)}
-        self.facts |= of_head | {"among": plan.among}
         solved = time.perf_counter()
         self.seconds["solve"] = solved - started
+        info = self.metadata | {"calibration": plan.calibration, KEY: plan.abstain}
         if self.with_baselines:
             sample = self._survey.sample.bins()
-            self.baselines = from_first_rank(
-                lambda: Baselines.fit(self.pool, plan.frame(sample.features), sample)
+            self.baselines = from_first_process(
+                lambda: Baselines.fit(self.pool, plan.selection(sample.features), sample)
             )
             self.seconds["baselines"] = time.perf_counter() - solved
-        self.detector = SlipDetector(
-            self.pool,
-            self.channel_filter,
-            plan.frame.selected,
-            plan.frame.scaler,
-            head,
-            self.facts
-            | {"calibration": plan.calibration, KEY: plan.abstain}
-            | ({BASELINES: self.baselines.to_dict()} if self.baselines else {}),
-            plan.imputation,
-            plan.gaussians,
-            plan.frame.pooling,
-        )
+            info[BASELINES] = self.baselines.to_dict()
+        self.detector = plan.detector(self.pool, self.channel_filter, head, info)
 
     def rates(self) -> dict[str, str]:
         """How fast one worker goes through each stage it has met, for the progress bar."""

@@ -1,15 +1,14 @@
-"""How a detector is made: rank, scale, choose K, c and C on held-out groups, balance.
+"""How a detector is made: how features are ranked and scaled, and what is chosen from.
 
-A ``Recipe`` is the choice of methods; ``plan_detector`` applies it to what the first pass over the
-training recordings learned. Pure of any engine: ``learning`` runs it under Lightning, ``stats``
-and ``crossval`` without.
+A ``Recipe`` is the choice of methods; ``training.selection`` applies it to the statistics that the
+first pass over the training recordings gathered.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
@@ -35,6 +34,15 @@ FREE_CONSTANT = 1.0e6
 """``c`` of degree 1, where it weighs the constant alone: so large, the penalty does not reach it.
 A penalised constant moves the threshold of a machine with few bins or a strong penalty."""
 _SCENE = "|"  # between group and scene in the name of a stratum
+_CHOICES = {
+    "use": ("channel", "pooled", "both"),
+    "score_variance": ("pooled", "welch"),
+    "kernel": ("polynomial", "rbf"),
+    "balance": ("undersample", "weights"),
+    "group_by": ("material", "cycle"),
+    "ranking": ("t", "gd"),
+    "validation": ("held", "nested"),
+}
 
 
 @dataclass(frozen=True)
@@ -43,31 +51,29 @@ class Recipe:
 
     Args:
         name: for folders and tables.
-        num_features: how many features are selected; ``None`` takes all; of several, validation
-            chooses.
+        num_features: how many features are selected; ``None`` takes all. Of several values of this,
+            ``degree``, ``offsets``, ``penalties`` or ``use`` validation chooses one.
         score_variance: of the t-test, ``"pooled"`` or ``"welch"``.
         most_correlation: features that correlate more than this within the classes with one
             already taken are passed over (ours); 1 takes them all.
         compress: scale the signed log of the features (ours).
         tail: share of sampled bins beyond the scaled range on either side; they are clipped.
         kernel: ``"polynomial"`` or ``"rbf"``.
-        degree: of the polynomial; 1 and 2 fold into a form of fixed size, others do not. Of
-            several, validation chooses.
-        offsets: values of the polynomial's ``c`` to choose from.
+        degree: of the polynomial; 1 and 2 fold into a form of fixed size, others do not.
+        offsets: of the polynomial, its ``c``.
         gamma: of the radial basis function.
-        penalties: values of ``C`` to choose from.
+        penalties: the paper's ``C``.
         balance: ``"undersample"`` (authors) or ``"weights"`` (ours).
         group_by: what a validation fold leaves out: a ``"material"`` or a fifth of the
             ``"cycle"`` numbers (ours; the authors' search is not described).
         sample_bins: bins of each group and class that the first pass keeps for quantiles,
             correlations, baselines and validation. Exact ranges and the t-test take
             every bin.
-        among: ranks only features that match (ours), such as ``{"kind": "SG", "descriptor":
-            "mean"}``: of each attribute a value, or one of several. ``num_features`` is cut to
-            what matches.
+        feature_filter: ranks only features that match (ours), such as ``{"kind": "SG",
+            "descriptor": "mean"}``: of each attribute a value, or one of several. ``num_features``
+            is cut to what matches.
         pooling: statistics over the channels of a kind, as ``features.pooling`` has them (ours).
-        use: ``"channel"`` features, ``"pooled"`` ones or ``"both"``; of several, validation
-            chooses.
+        use: ``"channel"`` features, ``"pooled"`` ones or ``"both"``.
         descriptors: those that may be used; ``None``: all.
         ranking: ``"t"``, the paper's t-test, or ``"gd"``, which knows of groups (ours:
             ``group_scores``).
@@ -100,7 +106,7 @@ class Recipe:
     balance: Balance = "undersample"
     group_by: GroupBy = "material"
     sample_bins: int = 400
-    among: Mapping[str, str | Sequence[str]] | None = None
+    feature_filter: Mapping[str, str | Sequence[str]] | None = None
     pooling: str | Sequence[str] | None = None
     use: str | Sequence[str] = "channel"
     descriptors: Sequence[str] | None = None
@@ -118,79 +124,66 @@ class Recipe:
             if value is not None and not isinstance(value, str):
                 object.__setattr__(self, name, tuple(value))
         object.__setattr__(self, "scene_weights", dict(self.scene_weights))
-        self._check_nested()
-        if self.among is not None:
-            object.__setattr__(self, "among", checked_attributes("recipe.among", self.among))
-        choices = {
-            "score_variance": ("pooled", "welch"),
-            "kernel": ("polynomial", "rbf"),
-            "balance": ("undersample", "weights"),
-            "group_by": ("material", "cycle"),
-            "ranking": ("t", "gd"),
-            "validation": ("held", "nested"),
-        }
-        for name, known in choices.items():
-            if getattr(self, name) not in known:
-                raise ValueError(
-                    f"recipe.{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}"
-                )
-        if not _several(self.num_features) or any(size < 1 for size in self.sizes):
-            raise ValueError(f"recipe.num_features must be at least 1, got {list(self.sizes)}")
-        if self.sample_bins < 2:
-            raise ValueError(f"recipe.sample_bins must be at least 2, got {self.sample_bins}")
-        if any(size != int(size) for size in self.sizes):
-            raise ValueError(f"recipe.num_features must be whole numbers, got {list(self.sizes)}")
-        penalties, offsets = self.penalties_ascending, _several(self.offsets)
-        if not penalties or any(not value > 0 for value in penalties):
-            raise ValueError(f"recipe.penalties must be positive, got {list(penalties)}")
-        if len(penalties) > 1 and not math.isfinite(penalties[-1]):
-            raise ValueError(
-                "recipe.penalties: validation needs finite values; give inf alone, or leave it out"
+        if self.feature_filter is not None:
+            object.__setattr__(
+                self,
+                "feature_filter",
+                checked_attributes("recipe.feature_filter", self.feature_filter),
             )
-        if not offsets or any(not value >= 0 for value in offsets):
-            raise ValueError(f"recipe.offsets must not be negative, got {list(offsets)}")
-        if not 0 <= self.tail < 0.5:
-            raise ValueError(f"recipe.tail must lie in [0, 0.5), got {self.tail}")
-        if not 0 < self.most_correlation <= 1:
-            raise ValueError(
-                f"recipe.most_correlation must lie in (0, 1], got {self.most_correlation}"
-            )
-        if self.kernel == "rbf" and self.gamma is None:
-            raise ValueError("recipe.kernel=rbf needs recipe.gamma, such as 0.01")
+        if problem := next(self._problems(), None):
+            raise ValueError(f"recipe{problem}")
         _ = self.kernels  # their own checks
 
-    def _check_nested(self) -> None:
-        """Refuse what only a nested validation can do, without one."""
-        known = ("channel", "pooled", "both")
-        if unknown := [name for name in self.uses if name not in known]:
-            raise ValueError(f"recipe.use must be some of {', '.join(known)}, got {unknown[0]!r}")
-        if not 0 <= self.tolerance < 1:
-            raise ValueError(f"recipe.tolerance must lie in [0, 1), got {self.tolerance}")
-        if not 0 <= self.drop_channels < 1:
-            raise ValueError(f"recipe.drop_channels must lie in [0, 1), got {self.drop_channels}")
+    def _problems(self) -> Iterator[str]:
+        """What is wrong with the arguments, most basic first."""
+        for name, known in _CHOICES.items():
+            for value in _several(getattr(self, name)):
+                if value not in known:
+                    yield f".{name} must be one of {', '.join(known)}, got {value!r}"
+        sizes, penalties, offsets = self.sizes, self.penalties_ascending, _several(self.offsets)
+        if not _several(self.num_features) or any(size < 1 for size in sizes):
+            yield f".num_features must be at least 1, got {list(sizes)}"
+        if any(size != int(size) for size in sizes):
+            yield f".num_features must be whole numbers, got {list(sizes)}"
+        if self.sample_bins < 2:
+            yield f".sample_bins must be at least 2, got {self.sample_bins}"
+        if not penalties or any(not value > 0 for value in penalties):
+            yield f".penalties must be positive, got {list(penalties)}"
+        if len(penalties) > 1 and not math.isfinite(penalties[-1]):
+            yield ".penalties: validation needs finite values; give inf alone, or leave it out"
+        if not offsets or any(not value >= 0 for value in offsets):
+            yield f".offsets must not be negative, got {list(offsets)}"
+        if not 0 <= self.tail < 0.5:
+            yield f".tail must lie in [0, 0.5), got {self.tail}"
+        if not 0 < self.most_correlation <= 1:
+            yield f".most_correlation must lie in (0, 1], got {self.most_correlation}"
+        if self.kernel == "rbf" and self.gamma is None:
+            yield ".kernel=rbf needs recipe.gamma, such as 0.01"
+        for name in ("tolerance", "drop_channels"):
+            if not 0 <= getattr(self, name) < 1:
+                yield f".{name} must lie in [0, 1), got {getattr(self, name)}"
         for scene, weight in self.scene_weights.items():
             if not 0 < weight < math.inf:
-                raise ValueError(f"recipe.scene_weights.{scene} must be positive, got {weight}")
+                yield f".scene_weights.{scene} must be positive, got {weight}"
         if set(self.uses) != {"channel"} and self.pooling is None:
-            raise ValueError(
-                "recipe.use=pooled needs statistics over channels; set features.pooling=[mean, std]"
-            )
+            yield ".use=pooled needs statistics over channels; set features.pooling=[mean, std]"
+        degrees = _several(self.degree)
         if self.validation == "nested":
-            if self.kernel != "polynomial" or not set(_several(self.degree)) <= {1, 2}:
-                raise ValueError(
-                    "recipe.validation=nested needs recipe.kernel=polynomial of degree 1 or 2, got "
-                    f"{self.kernel} of degree {list(_several(self.degree))}"
+            if self.kernel != "polynomial" or not set(degrees) <= {1, 2}:
+                yield (
+                    ".validation=nested needs recipe.kernel=polynomial of degree 1 or 2, got "
+                    f"{self.kernel} of degree {list(degrees)}"
                 )
             return
-        wants = {
+        for name, is_wanted in {
             "use": set(self.uses) != {"channel"},
             "num_features=null": self.takes_all,
-            "several degrees": len(_several(self.degree)) > 1,
+            "several degrees": len(degrees) > 1,
             "ranking=gd": self.ranking == "gd",
             "scene_weights": bool(self.scene_weights),
-        }
-        if wanted := [name for name, is_wanted in wants.items() if is_wanted]:
-            raise ValueError(f"recipe: {wanted[0]} needs recipe.validation=nested, as general has")
+        }.items():
+            if is_wanted:
+                yield f": {name} needs recipe.validation=nested, as general has"
 
     @property
     def uses(self) -> tuple[str, ...]:
@@ -225,12 +218,12 @@ class Recipe:
             )
 
     def allowed(self, pool: FeaturePool) -> Tensor | None:
-        """Which features of a pool may be selected, ``[F]``, bool; ``None`` if all.
+        """Which features of a pool may be selected, ``[F]``, bool; ``None`` if all may.
 
         Those that rounding decides, as some wavelets have them, never may.
 
         Raises:
-            ValueError: if ``among`` names a value that no feature has, or nothing matches.
+            ValueError: if ``feature_filter`` names a value that no feature has, or nothing matches.
         """
         is_firm = ~is_rounding(pool)
         if self.descriptors is not None:
@@ -241,14 +234,16 @@ class Recipe:
                     f"{', '.join(sorted(known))}"
                 )
             is_firm &= torch.tensor([name.descriptor in self.descriptors for name in pool.names])
-        if self.among is None:
+        if self.feature_filter is None:
             return None if bool(is_firm.all()) else is_firm
         try:
-            mask = matching(pool.hand, pool.names, self.among) & is_firm
+            mask = matching(pool.hand, pool.names, self.feature_filter) & is_firm
         except ValueError as error:
-            raise ValueError(f"recipe.among: {error}") from None
+            raise ValueError(f"recipe.feature_filter: {error}") from None
         if not bool(mask.any()):
-            raise ValueError(f"recipe.among: of {pool.wavelet}, rounding decides all that match")
+            raise ValueError(
+                f"recipe.feature_filter: of {pool.wavelet}, rounding decides all that match"
+            )
         return mask
 
     @property
@@ -263,14 +258,6 @@ class Recipe:
             for c in ([FREE_CONSTANT] if degree == 1 else offsets)
         )
 
-    def facts(self) -> dict[str, Any]:
-        """All arguments as JSON-able values; ``Recipe(**facts)`` is the same again."""
-        facts = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
-        if self.among is not None:
-            facts["among"] = {k: list(_several(v)) for k, v in self.among.items()}
-        inf = not math.isfinite(self.penalties_ascending[-1])
-        return facts | ({"penalties": ["inf"]} if inf else {})  # JSON has no infinity
-
     def group(self, recording: RecordingId) -> str:
         """The validation group of a recording."""
         if self.group_by == "material":
@@ -284,7 +271,7 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class Frame:
+class FeatureSelection:
     """Which features, and how they are scaled.
 
     Args:
@@ -302,42 +289,42 @@ class Frame:
         """Number of columns, K."""
         return len(self.scaler.minimum)
 
-    def columns(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
-        """What is scaled, in float64: ``[N, F] -> [N, K]``."""
-        chosen = features[:, list(self.selected)].double()
-        return chosen if self.pooling is None else self.pooling(chosen, is_missing)
-
     def __call__(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
-        """Scaled columns in float64: ``[N, F] -> [N, K]``."""
-        scaled: Tensor = self.scaler(self.columns(features, is_missing))
+        """Scaled columns in float64, ``[N, F] -> [N, K]``, without channels ``[N, C]`` or with."""
+        columns = features[:, list(self.selected)].double()
+        if self.pooling is not None:
+            columns = self.pooling(columns, is_missing)
+        scaled: Tensor = self.scaler(columns)
         return scaled
 
-    def first(self, num: int) -> Frame:
-        """The frame of the best ``num`` columns."""
+    def first(self, num: int) -> FeatureSelection:
+        """The best ``num`` columns alone."""
         scaler = self.scaler
         knee = None if scaler.knee is None else scaler.knee[:num]
         scaler = FeatureScaler(scaler.minimum[:num], scaler.maximum[:num], knee)
         if self.pooling is None:
-            return Frame(self.selected[:num], scaler)
+            return FeatureSelection(self.selected[:num], scaler)
         place = dict(zip(self.pooling.inputs, self.selected, strict=True))
         layer = self.pooling.select(range(min(num, self.size)))
-        return Frame(tuple(place[name] for name in layer.inputs), scaler, layer)
+        return FeatureSelection(tuple(place[name] for name in layer.inputs), scaler, layer)
 
 
-def choose_frame(recipe: Recipe, survey: Survey, allowed: Tensor | None = None) -> Frame:
-    """Rank and scale on what the first pass learned of the training bins.
+def select_features(
+    recipe: Recipe, survey: Survey, allowed: Tensor | None = None
+) -> FeatureSelection:
+    """Rank and scale by the statistics of the training bins.
 
     Args:
         recipe: how.
-        survey: what was learned.
-        allowed: what ``recipe.allowed`` says; no more features are taken than it lets pass.
+        survey: the statistics.
+        allowed: what ``recipe.allowed`` gives; no more features are taken than it lets pass.
 
     Raises:
         ValueError: if a class is absent, the pool is smaller than the selection, or a recipe with
-            ``among`` comes without ``allowed``.
+            ``feature_filter`` comes without ``allowed``.
     """
-    if recipe.among is not None and allowed is None:
-        raise ValueError("recipe.among needs the names of features; hand over recipe.allowed(pool)")
+    if recipe.feature_filter is not None and allowed is None:
+        raise ValueError("recipe.feature_filter needs the names of features; hand over the pool")
     sample, most = survey.sample.bins(), recipe.sizes[-1]
     scores, features = t_scores(survey.moments, recipe.score_variance), sample.features
     places = torch.arange(len(scores))
@@ -348,106 +335,112 @@ def choose_frame(recipe: Recipe, survey: Survey, allowed: Tensor | None = None) 
         order = rank_distinct(scores, features, sample.is_slip, most, recipe.most_correlation)
     else:
         order = rank_features(scores, most)
-    return fit_frame(recipe, survey, places[order].tolist())
+    return scaled_selection(recipe, survey, places[order].tolist())
 
 
-def fit_frame(recipe: Recipe, survey: Survey, selected: Sequence[int]) -> Frame:
-    """Scale these features on what the first pass learned of the training bins."""
-    sample = survey.sample.bins()
+def scaled_selection(recipe: Recipe, survey: Survey, selected: Sequence[int]) -> FeatureSelection:
+    """Scale these features by the statistics of the training bins."""
+    index = list(selected)
     if recipe.compress or recipe.tail > 0:
-        chosen = sample.features[:, list(selected)].double()
+        chosen = survey.sample.bins().features[:, index].double()
         scaler = FeatureScaler.fit(chosen, compress=recipe.compress, tail=recipe.tail)
     else:  # the exact range of every training bin
-        index = list(selected)
         scaler = FeatureScaler(survey.minimum[index].double(), survey.maximum[index].double())
-    return Frame(tuple(selected), scaler)
+    return FeatureSelection(tuple(selected), scaler)
 
 
-def bin_weights(recipe: Recipe, counts: Sequence[float], is_slip: Tensor) -> Tensor:
-    """The weight of every bin under the recipe's balance, ``[N]`` float64.
+def balanced_accuracy(
+    says_slip: Tensor, is_slip: Tensor, weights: Tensor | None = None
+) -> float | None:
+    """Mean recall of both classes, of decisions and truths ``[N]``; ``None`` if one is absent."""
+    is_right = says_slip == is_slip
+    weights = torch.ones(len(is_slip), dtype=torch.float64) if weights is None else weights
+    recalls = [
+        float(weights[mine & is_right].sum() / weights[mine].sum())
+        for mine in (~is_slip, is_slip)
+        if bool(mine.any())
+    ]
+    return sum(recalls) / 2 if len(recalls) == 2 else None
 
-    Args:
-        recipe: says how classes are balanced.
-        counts: training bins of non-slip and of slip.
-        is_slip: ``[N]``, bool.
 
-    Under ``undersample`` it is the share of its class that is kept, so that a sample stands for
-    the bins that will be trained on.
+def class_counts(sample: SampledBins) -> list[int]:
+    """How many training bins of non-slip and of slip a sample was drawn from.
 
     Raises:
-        ValueError: if a class is absent.
+        ValueError: if there is none of a class.
     """
+    counts = [
+        round(float(sample.represents[mine].sum())) for mine in (~sample.is_slip, sample.is_slip)
+    ]
     for name, count in zip(("non-slip", "slip"), counts, strict=True):
         if not count:
             raise ValueError(f"training needs bins of both classes, got no {name} bin")
-    if recipe.balance == "undersample":
-        share = kept_shares(recipe, counts)
-    else:
-        share = [sum(counts) / (2 * count) for count in counts]
-    return torch.tensor(share, dtype=torch.float64)[is_slip.long()]
+    return counts
 
 
-def kept_shares(recipe: Recipe, counts: Sequence[float]) -> list[float]:
-    """Which share of non-slip and of slip bins is trained on."""
+def class_fractions(recipe: Recipe, sample: SampledBins) -> tuple[float, float]:
+    """The part of non-slip and of slip bins that is trained on."""
+    counts = class_counts(sample)
     if recipe.balance != "undersample":
-        return [1.0, 1.0]
-    return [min(counts) / count for count in counts]
+        return 1.0, 1.0
+    return min(counts) / counts[0], min(counts) / counts[1]
 
 
-def recalls_mean(says_slip: Tensor, is_slip: Tensor, weights: Tensor | None = None) -> float | None:
-    """Balanced accuracy of decisions ``[N]``; ``None`` if a class is absent."""
-    weights = torch.ones(len(is_slip), dtype=torch.float64) if weights is None else weights
-    recalls = []
-    for value in (False, True):
-        mask = is_slip == value
-        if not bool(mask.any()):
-            return None
-        recalls.append(float(weights[mask & (says_slip == value)].sum() / weights[mask].sum()))
-    return sum(recalls) / 2
+def sample_weight(recipe: Recipe, sample: SampledBins) -> Tensor:
+    """The weight of each sampled bin, for all bins that it was drawn from, ``[n]`` float64.
 
-
-def stand_for(sample: SampledBins, recipe: Recipe, counts: Sequence[float]) -> Tensor:
-    """Weights with which sampled bins stand for all bins that are trained on, ``[n]``."""
-    if not recipe.scene_weights:
-        return bin_weights(recipe, counts, sample.is_slip) * sample.represents
-    weights = sample.represents.clone()
-    scenes = [name.split(_SCENE)[-1] for name in sample.group_names]
-    by_scene = scene_weights(recipe, sample)
-    for index, scene in enumerate(scenes):
-        for is_slip in (False, True):
-            mine = (sample.group == index) & (sample.is_slip == is_slip)
-            weights[mine] *= by_scene.get(scene, (1.0, 1.0))[is_slip]
-    return weights
-
-
-def scene_weights(recipe: Recipe, sample: SampledBins) -> dict[str, tuple[float, float]]:
-    """Weight of each bin of a scene, non-slip and slip, with both classes balanced.
+    Classes are balanced: under ``undersample`` by the fraction of the class that is trained on,
+    under ``weights`` by a factor, and where scenes are weighed as ``scene_weights`` says.
 
     Raises:
         ValueError: if a class is absent, or a scene is weighed that no recording is of.
     """
-    scenes = [name.split(_SCENE)[-1] for name in sample.group_names]
-    totals = {scene: [0.0, 0.0] for scene in scenes}
-    for index, scene in enumerate(scenes):
-        for is_slip in (False, True):
-            mine = (sample.group == index) & (sample.is_slip == is_slip)
-            totals[scene][is_slip] += float(sample.represents[mine].sum())
-    if strangers := sorted(set(recipe.scene_weights) - set(totals) - {PAPER_SCENE}):
+    is_slip = sample.is_slip.long()
+    if recipe.scene_weights:
+        by_scene = scene_weights(recipe, sample)
+        of_stratum = sample.represents.new_tensor(
+            [by_scene[_scene(name)] for name in sample.group_names]
+        )
+        return sample.represents * of_stratum[sample.group, is_slip]
+    of_class = sample.represents.new_tensor(_balance(recipe, class_counts(sample)))
+    return sample.represents * of_class[is_slip]
+
+
+def scene_weights(recipe: Recipe, sample: SampledBins) -> dict[str, tuple[float, float]]:
+    """The weight of each bin of a scene, non-slip and slip, with both classes balanced.
+
+    Raises:
+        ValueError: if a class is absent, or a scene is weighed that no recording is of.
+    """
+    scenes = list(dict.fromkeys(map(_scene, sample.group_names)))
+    if strangers := sorted(set(recipe.scene_weights) - set(scenes) - {PAPER_SCENE}):
         raise ValueError(
             f"recipe.scene_weights names {strangers[0]!r}, of which there is no training recording;"
-            f" there is {', '.join(totals)}"
+            f" there is {', '.join(scenes)}"
         )
-    protocol = totals.get(PAPER_SCENE, [0.0, 0.0])
-    found = {}
-    for scene, counts in totals.items():
-        share = recipe.scene_weights.get(scene)
-        found[scene] = [
-            share * protocol[i] / counts[i] if share and counts[i] and protocol[i] else 1.0
-            for i in (0, 1)
-        ]
-    whole = [sum(totals[scene][i] * found[scene][i] for scene in totals) for i in (0, 1)]
-    balance = bin_weights(recipe, whole, torch.tensor([False, True])).tolist()
-    return {scene: (own[0] * balance[0], own[1] * balance[1]) for scene, own in found.items()}
+    place = torch.tensor([scenes.index(_scene(name)) for name in sample.group_names])
+    totals = torch.zeros(len(scenes), 2, dtype=torch.float64)
+    totals.index_put_((place[sample.group], sample.is_slip.long()), sample.represents, True)
+    weights = torch.ones_like(totals)
+    protocol = totals[scenes.index(PAPER_SCENE)] if PAPER_SCENE in scenes else 0 * totals[0]
+    for row, scene in enumerate(scenes):
+        wanted = recipe.scene_weights.get(scene, 0.0) * protocol / totals[row]
+        weights[row] = torch.where((wanted > 0) & wanted.isfinite(), wanted, 1.0)
+    counts = (totals * weights).sum(0)
+    class_counts(sample)  # refuses one that is absent
+    weights *= weights.new_tensor(_balance(recipe, counts.tolist()))
+    return {scene: (own[0], own[1]) for scene, own in zip(scenes, weights.tolist(), strict=True)}
+
+
+def _balance(recipe: Recipe, counts: Sequence[float]) -> list[float]:
+    """The factor of the weights of non-slip and of slip bins."""
+    if recipe.balance == "undersample":
+        return [min(counts) / count for count in counts]
+    return [sum(counts) / (2 * count) for count in counts]
+
+
+def _scene(stratum: str) -> str:
+    return stratum.split(_SCENE)[-1]
 
 
 def sample_groups(sample: SampledBins) -> tuple[Tensor, tuple[str, ...]]:

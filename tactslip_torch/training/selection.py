@@ -1,13 +1,14 @@
-"""From a first pass to a plan: features, scaling, K, degree, c and C, chosen on groups left out.
+"""From training statistics to a plan: features, scaling, K, degree, c and C, by held-out groups.
 
-``plan_detector`` chooses by what the first pass learned of the training bins, in one of two ways.
+``plan_detector`` chooses in one of two ways.
 
 **Held** (``validation="held"``): features are ranked and scaled once; a held-out score is that of
-the machine refitted without the bin's group, in closed form.
+the machine refitted without the bin's group, in closed form (``HeldOut``). Ranking and scaling have
+seen the group, so these scores choose, and are not what may be reported.
 
 **Nested** (``"nested"``): a candidate is a set of features (of channels, pooled, or both; all or
 the best K), a degree and a penalty C. In each fold everything that is learned, compression
-constants, ranking and scaling among it, is learned without the group that is left out. Of the
+constants, ranking and scaling included, is learned without the group that is left out. Of the
 candidates within a tolerance of the best, the simplest machine with the strongest penalty is taken:
 penalties over several decades tie in validation and differ by far on a material that was not
 trained on. The choice itself is evaluated by leaving out two groups: for each group the same choice
@@ -22,40 +23,43 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, cast
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.features.extractor import EngineName
+from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.calibration import fit_platt
+from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins
-from tactslip_torch.model.kernels import Kernel, Polynomial, kernel_from_dict
+from tactslip_torch.model.kernels import Head, Kernel, Polynomial, kernel_from_dict
 from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import best_threshold
-from tactslip_torch.runtime import for_each
+from tactslip_torch.runtime import Ticker, bar, for_each
+from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.recipe import (
-    Frame,
+    FeatureSelection,
     Recipe,
-    choose_frame,
-    kept_shares,
-    recalls_mean,
+    balanced_accuracy,
+    class_counts,
+    class_fractions,
     sample_groups,
+    sample_weight,
     scene_weights,
-    stand_for,
+    select_features,
 )
 
 log = logging.getLogger(__name__)
-
-Progress = Callable[[Iterable[Any], str], Iterable[Any]]
 
 TRAINING_BINS = 100
 """Bins of each stratum and class that a validation fold is fitted to, at most, so that machines
@@ -80,177 +84,173 @@ class Plan:
     """What is decided before the second pass.
 
     Args:
-        frame: which features, how scaled.
+        recipe: that it follows.
+        selection: which features, how scaled.
         kernel: of the machine.
         penalty: the paper's ``C``.
-        balance: how the classes are balanced.
-        shares: of non-slip and slip bins that are trained on.
-        stands_for: how many bins each of those stands for, as in validation.
-        num_bins: how many bins are trained on; about, where shares are below 1.
-        imputation: mean of the scaled features, both classes counting alike; it stands in where a
-            sensor is missing.
+        fractions: the part of non-slip and slip bins that is trained on.
+        bin_weight: how many bins each of those stands for, as in validation.
+        num_bins: how many bins are trained on; about, where fractions are below 1.
+        imputation: mean of the scaled features, both classes counting alike; for channels that are
+            missing.
+        gaussians: of the scaled features, for channels that are missing; of a kernel that folds.
         validation: one row per choice: what was chosen from, the balanced accuracy of each
-            held-out group, and the calibration of held-out scores.
-        among: of a recipe that restricts the ranking: to what, how many features that leaves
-            (``matching``), and the numbers chosen from after cutting them to it; else ``None``.
-        abstain: thresholds for unsure answers, as ``Abstention.to_dict`` has them, if set.
-        gaussians: of the scaled features, for sensors that are missing; of a kernel that folds and
-            at most ``MOST_GAUSSIAN`` features of channels.
+            held-out group; of the one that was taken also ``chosen``, and the calibration of its
+            held-out scores.
         nested: balanced accuracy of the whole choice on groups that it did not see, if it was
-            judged.
-        scene_weights: weight of a bin by scene, non-slip and slip, balance among it; empty if
+            evaluated.
+        feature_filter: of a recipe that restricts the ranking: to what, how many features that
+            leaves (``matching``), and the numbers chosen from after cutting them to it.
+        abstain: thresholds for abstaining, as ``Abstention.to_dict`` has them, if set.
+        scene_weights: weight of a bin by scene, non-slip and slip, classes balanced; empty if
             scenes are not weighed.
-        drop_channels: the largest part of channels left out of second copies of recordings.
     """
 
-    frame: Frame
+    recipe: Recipe
+    selection: FeatureSelection
     kernel: Kernel
     penalty: float
-    balance: str
-    shares: tuple[float, float]
-    stands_for: float
+    fractions: tuple[float, float]
+    bin_weight: float
     num_bins: int
-    imputation: tuple[float, ...]
-    validation: list[dict[str, Any]] = field(default_factory=list)
-    among: dict[str, Any] | None = None
-    abstain: dict[str, Any] | None = None
+    imputation: Tensor
     gaussians: ClassGaussians | None = None
+    validation: list[dict[str, Any]] = field(default_factory=list)
     nested: dict[str, Any] | None = None
+    feature_filter: dict[str, Any] | None = None
+    abstain: dict[str, Any] | None = None
     scene_weights: dict[str, tuple[float, float]] = field(default_factory=dict)
-    drop_channels: float = 0.0
 
     @property
     def adds_up(self) -> bool:
         """Whether training bins become sums of fixed size; few bins, or other kernels, do not."""
         if not isinstance(self.kernel, Polynomial) or not self.kernel.collapses:
             return False
-        return self.num_bins > self.kernel.num_monomials(self.frame.size)
+        return self.num_bins > self.kernel.num_monomials(self.selection.size)
 
     @property
     def calibration(self) -> dict[str, Any] | None:
         """By held-out scores of the choice that was taken; None if there was nothing to choose."""
-        chosen = (self.frame.size, self.kernel.to_dict(), self.penalty)
-        for row in self.validation:
-            same = (row["num_features"], row["kernel"], row["penalty"]) == chosen
-            if row.get("chosen", same and "use" not in row):
-                return cast("dict[str, Any] | None", row.get("calibration"))
-        return None
+        chosen = (row.get("calibration") for row in self.validation if row.get("chosen"))
+        return next(chosen, None)
 
-    def facts(self) -> dict[str, Any]:
-        """JSON-able; ``Plan.of`` takes it together with the scaler and the Gaussians."""
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What was decided, for files, JSON-able."""
         return {
-            "selected": list(self.frame.selected),
+            "recipe": self.recipe.name,
             "kernel": self.kernel.to_dict(),
-            "penalty": _json_number(self.penalty),
-            "balance": self.balance,
-            "shares": list(self.shares),
-            "stands_for": self.stands_for,
+            "penalty": self.penalty if math.isfinite(self.penalty) else "inf",  # JSON has none
+            "balance": self.recipe.balance,
             "num_bins": self.num_bins,
-            "imputation": list(self.imputation),
-            "validation": self.validation,
-            "among": self.among,
-            "abstain": self.abstain,
-            "nested": self.nested,
-            "scene_weights": self.scene_weights,
-            "drop_channels": self.drop_channels,
         }
 
-    def tensors(self) -> dict[str, Tensor]:
-        """What ``facts`` leaves out: the scaler, and the Gaussians among it."""
-        of_features = {} if self.gaussians is None else self.gaussians.tensors()
-        return dict(self.frame.scaler.state_dict()) | of_features
+    def training_bins(self, sample: SampledBins) -> TrainingBins:
+        """Sampled bins, scaled, each with the weight of all that it was drawn from."""
+        weights = sample_weight(self.recipe, sample)
+        return TrainingBins(self.selection(sample.features), sample.is_slip, weights)
+
+    def detector(
+        self,
+        pool: FeaturePool,
+        channel_filter: ChannelFilter,
+        head: Head,
+        info: Mapping[str, Any],
+        engine: EngineName = "auto",
+    ) -> SlipDetector:
+        """The detector of this plan with a machine that was solved for it."""
+        selection = self.selection
+        return SlipDetector(
+            pool,
+            channel_filter,
+            selection.selected,
+            selection.scaler,
+            head,
+            info,
+            self.imputation,
+            self.gaussians,
+            selection.pooling,
+            engine=engine,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values and tensors, for a checkpoint; without the recipe."""
+        plain = {k: v for k, v in vars(self).items() if k not in ("recipe", "selection")}
+        pooling = self.selection.pooling
+        return plain | {
+            "selected": self.selection.selected,
+            "scaler": dict(self.selection.scaler.state_dict()),
+            "pooling": pooling and (pooling.to_dict(), dict(pooling.state_dict())),
+            "kernel": self.kernel.to_dict(),
+            "gaussians": self.gaussians and dict(self.gaussians.state_dict()),
+        }
 
     @classmethod
-    def of(
-        cls,
-        facts: Mapping[str, Any],
-        scaler: FeatureScaler,
-        gaussians: ClassGaussians | None = None,
-        pooling: ChannelPooling | None = None,
-    ) -> Plan:
-        """The plan that ``facts`` described."""
-        return cls(
-            frame=Frame(tuple(facts["selected"]), scaler, pooling),
-            kernel=kernel_from_dict(facts["kernel"]),
-            penalty=float(facts["penalty"]),
-            balance=facts["balance"],
-            shares=(facts["shares"][0], facts["shares"][1]),
-            stands_for=facts["stands_for"],
-            num_bins=facts["num_bins"],
-            imputation=tuple(facts["imputation"]),
-            validation=list(facts["validation"]),
-            among=facts.get("among"),  # older plans know no such restriction
-            abstain=facts.get("abstain"),  # nor unsure answers
-            gaussians=gaussians,
-            nested=facts.get("nested"),
-            scene_weights={k: (v[0], v[1]) for k, v in facts.get("scene_weights", {}).items()},
-            drop_channels=facts.get("drop_channels", 0.0),
-        )
+    def from_dict(cls, plain: Mapping[str, Any], recipe: Recipe, pool: FeaturePool) -> Plan:
+        """What ``to_dict`` described, of the same recipe and pool."""
+        values = dict(plain)
+        selected, scaler = values.pop("selected"), FeatureScaler(**values.pop("scaler"))
+        pooling = values.pop("pooling")
+        pooling = pooling and ChannelPooling.from_dict(pool.hand, *pooling)
+        values["kernel"] = kernel_from_dict(values["kernel"])
+        values["gaussians"] = values["gaussians"] and ClassGaussians(**values["gaussians"])
+        return cls(recipe, FeatureSelection(tuple(selected), scaler, pooling), **values)
 
 
 def plan_detector(
     recipe: Recipe,
     survey: Survey,
-    progress: Progress,
-    frame: Frame | None = None,
-    allowed: Tensor | None = None,
-    *,
     pool: FeaturePool | None = None,
+    selection: FeatureSelection | None = None,
+    *,
     is_settled: bool = False,
     is_nested: bool = True,
+    show: bool = False,
 ) -> Plan:
     """Choose the features and the machine by validation on held-out groups.
-
-    A recipe with ``validation="nested"`` chooses by ``choose_model`` and needs the ``pool``;
-    ``is_nested=False`` does not evaluate the choice itself. For other recipes: rank, scale, and
-    choose K, c and C by closed-form validation. Features that were ranked and scaled elsewhere come
-    as a ``frame``; which ones may be selected here, for a recipe that restricts them, as
-    ``allowed``, what ``recipe.allowed`` says.
 
     Of a recipe that leaves no choice nothing is validated, unless it ``is_settled``, by tuning:
     then held-out scores are wanted for what follows from them, such as a calibration.
 
-    A held-out score is that of the machine refitted without the bin's group, from one
-    factorisation per choice (``HeldOut``), with ranking and scaling held. So it chooses,
-    but it is not what may be reported: for that, ranking and scaling are redone (``crossval``).
+    Args:
+        recipe: what to choose from, and how.
+        survey: statistics of the training bins.
+        pool: of the features; only without it may every feature be selected whatever its name.
+        selection: features that were ranked and scaled elsewhere.
+        is_settled: whether to validate a single choice too.
+        is_nested: whether to evaluate a nested choice itself.
+        show: a progress bar.
 
     Raises:
-        ValueError: if a class is absent or a solve fails.
+        ValueError: if a class is absent, a solve fails, or the recipe needs the pool.
     """
-    if recipe.validation == "nested" and frame is None:
+    sample = survey.sample.bins()
+    allowed = None if pool is None else recipe.allowed(pool)
+    fractions = class_fractions(recipe, sample)
+    num_bins: float = _num_bins(recipe, sample)
+    rows: list[dict[str, Any]] = []
+    nested = None
+    kernel: Kernel
+    if recipe.validation == "nested" and selection is None:
         if pool is None:
             raise ValueError("recipe.validation=nested needs the pool; hand it over as pool=")
-        return _plan_nested(recipe, survey, progress, pool, allowed, is_nested=is_nested)
-    frame = frame or choose_frame(recipe, survey, allowed)
-    sizes = sorted({min(size, frame.size) for size in recipe.sizes})
-    if sizes[-1] < recipe.sizes[-1]:
-        log.warning(
-            "recipe.num_features=%d is cut to %d: no more match", recipe.sizes[-1], sizes[-1]
-        )
-    sample = survey.sample.bins()
-    counts = survey.moments.count.tolist()
-    weights = stand_for(sample, recipe, counts)
-    choices = [
-        (size, kernel, penalty)
-        for size in sizes
-        for kernel in recipe.kernels
-        for penalty in recipe.penalties_ascending
-    ]
-    rows: list[dict[str, Any]] = []
-    if (len(choices) > 1 or is_settled) and len(sample.group_names) > 1:
-        bins = TrainingBins(frame(sample.features), sample.is_slip, weights)
-        rows = validate(bins, sample.group, sample.group_names, choices, progress)
-        best = max(row["mean"] for row in rows)
-        place = next(i for i, row in enumerate(rows) if row["mean"] == best)
+        structure = candidates(recipe, round(num_bins))[0]
+        penalty = recipe.penalties_ascending[len(recipe.penalties_ascending) // 2]
+        if len(sample_groups(sample)[1]) > 1:
+            choice = choose_model(recipe, pool, sample, is_nested=is_nested, show=show)
+            structure, penalty = choice.structure, choice.penalty
+            rows, nested = choice.rows, choice.nested
+            if choice.edge:
+                log.warning("%s", choice.edge)
+        else:
+            log.warning("%s, C=%g are taken unvalidated: one group", structure, penalty)
+        kernel, selection = structure.kernel, fitted_selection(recipe, pool, sample, structure)
+        has_gaussians = selection.size <= MOST_GAUSSIAN
     else:
-        num = len(recipe.penalties_ascending)  # of the most features and the last kernel
-        place = len(choices) - num + num // 2
-        if len(choices) > 1:
-            log.warning("K=%d, %s, C=%g are taken unvalidated: one group", *choices[place])
-    size, kernel, penalty = choices[place]
-    shares = kept_shares(recipe, counts)
-    num_bins = sum(count * share for count, share in zip(counts, shares, strict=True))
-    stands_for = 1.0
+        selection = selection or select_features(recipe, survey, allowed)
+        rows, size, kernel, penalty = _validated(recipe, selection, sample, is_settled, show)
+        selection, has_gaussians = selection.first(size), kernel.collapses
+    bin_weight = 1.0
     if num_bins > MOST_KEPT_BINS and not kernel.collapses:
         log.warning(
             "%s takes %d of %d training bins: its machine does not fold to a fixed size",
@@ -258,99 +258,72 @@ def plan_detector(
             MOST_KEPT_BINS,
             num_bins,
         )
-        stands_for = num_bins / MOST_KEPT_BINS
-        shares = [share / stands_for for share in shares]
-        num_bins = MOST_KEPT_BINS
-    frame = frame.first(size)
-    z = frame(sample.features)
-    has_gaussians = kernel.collapses and frame.pooling is None
+        bin_weight, num_bins = num_bins / MOST_KEPT_BINS, MOST_KEPT_BINS
+        fractions = fractions[0] / bin_weight, fractions[1] / bin_weight
+    z, weights = selection(sample.features), sample_weight(recipe, sample)
+    means = [
+        weights[own] @ z[own] / weights[own].sum() for own in (sample.is_slip, ~sample.is_slip)
+    ]
+    feature_filter = None
+    if recipe.feature_filter is not None and allowed is not None:
+        matching = int(allowed.sum())
+        wanted = {name: list(values) for name, values in recipe.feature_filter.items()}
+        sizes = sorted({min(size, matching) for size in recipe.sizes})
+        feature_filter = {"wanted": wanted, "matching": matching, "num_features": sizes}
     return Plan(
-        frame=frame,
+        recipe=recipe,
+        selection=selection,
         kernel=kernel,
         penalty=penalty,
-        balance=recipe.balance,
-        shares=(shares[0], shares[1]),
-        stands_for=stands_for,
+        fractions=fractions,
+        bin_weight=bin_weight,
         num_bins=round(num_bins),
-        imputation=_imputation(z, sample.is_slip, weights),
+        imputation=(means[0] + means[1]) / 2,
+        gaussians=(
+            ClassGaussians.fit(z, sample.is_slip, weights)
+            if has_gaussians and selection.pooling is None
+            else None
+        ),
         validation=rows,
-        among=None if allowed is None else _narrowed(recipe, allowed, sizes),
-        gaussians=ClassGaussians.fit(z, sample.is_slip, weights) if has_gaussians else None,
-        drop_channels=0.0 if frame.pooling is None else recipe.drop_channels,
-    )
-
-
-def _plan_nested(
-    recipe: Recipe,
-    survey: Survey,
-    progress: Progress,
-    pool: FeaturePool,
-    allowed: Tensor | None,
-    *,
-    is_nested: bool,
-) -> Plan:
-    """``plan_detector`` by nested validation."""
-    sample = survey.sample.bins()
-    counts = survey.moments.count.tolist()
-    weights = stand_for(sample, recipe, counts)
-    shares = kept_shares(recipe, counts)
-    num_bins = round(sum(count * share for count, share in zip(counts, shares, strict=True)))
-    structures = candidates(recipe, num_bins)
-    rows: list[dict[str, Any]] = []
-    nested = None
-    structure = structures[0]
-    penalty = recipe.penalties_ascending[len(recipe.penalties_ascending) // 2]
-    if len(sample_groups(sample)[1]) > 1:
-        options: dict[str, Any] = {"num_bins": num_bins, "allowed": allowed, "is_nested": is_nested}
-        choice = choose_model(recipe, pool, sample, weights, progress, **options)
-        structure, penalty = choice.structure, choice.penalty
-        rows, nested = choice.rows, choice.nested
-        if choice.edge:
-            log.warning("%s", choice.edge)
-    else:
-        log.warning("%s, C=%g are taken unvalidated: one group", structure, penalty)
-    frame = fitted_frame(recipe, pool, sample, structure, allowed)
-    z = frame(sample.features)
-    has_gaussians = frame.pooling is None and frame.size <= MOST_GAUSSIAN
-    return Plan(
-        frame=frame,
-        kernel=structure.kernel,
-        penalty=penalty,
-        balance=recipe.balance,
-        shares=(shares[0], shares[1]),
-        stands_for=1.0,
-        num_bins=num_bins,
-        imputation=_imputation(z, sample.is_slip, weights),
-        validation=rows,
-        among=None if recipe.among is None or allowed is None else _narrowed(recipe, allowed, []),
-        gaussians=ClassGaussians.fit(z, sample.is_slip, weights) if has_gaussians else None,
         nested=nested,
+        feature_filter=feature_filter,
         scene_weights=scene_weights(recipe, sample) if recipe.scene_weights else {},
-        drop_channels=recipe.drop_channels if frame.pooling is not None else 0.0,
     )
 
 
-def _narrowed(recipe: Recipe, allowed: Tensor, sizes: Sequence[int]) -> dict[str, Any]:
-    matching = int(allowed.sum())
-    return {"wanted": recipe.facts()["among"], "matching": matching, "num_features": list(sizes)}
-
-
-def _imputation(scaled: Tensor, is_slip: Tensor, weights: Tensor) -> tuple[float, ...]:
-    """Mean of scaled features ``[N, K]``, both classes counting alike; K numbers."""
-    means = [weights[mine] @ scaled[mine] / weights[mine].sum() for mine in (is_slip, ~is_slip)]
-    return tuple(((means[0] + means[1]) / 2).tolist())
-
-
-def adds_up(kernel: Kernel) -> bool:
-    """Whether training bins add up to sums of fixed size, as they do for degree 2."""
-    return isinstance(kernel, Polynomial) and kernel.degree == 2
-
-
-def _json_number(value: float) -> float | str:
-    return value if math.isfinite(value) else "inf"  # JSON has no infinity
+def _num_bins(recipe: Recipe, sample: SampledBins) -> int:
+    """How many training bins there are, classes balanced."""
+    counts, fractions = class_counts(sample), class_fractions(recipe, sample)
+    return round(counts[0] * fractions[0] + counts[1] * fractions[1])
 
 
 # Held validation --------------------------------------------------------------------------
+
+
+def _validated(
+    recipe: Recipe, selection: FeatureSelection, sample: SampledBins, is_settled: bool, show: bool
+) -> tuple[list[dict[str, Any]], int, Kernel, float]:
+    """Rows of the validation, and the K, kernel and C of the best of them."""
+    sizes = sorted({min(size, selection.size) for size in recipe.sizes})
+    if sizes[-1] < recipe.sizes[-1]:
+        log.warning(
+            "recipe.num_features=%d is cut to %d: no more match", recipe.sizes[-1], sizes[-1]
+        )
+    penalties = recipe.penalties_ascending
+    choices = list(itertools.product(sizes, recipe.kernels, penalties))
+    if (len(choices) > 1 or is_settled) and len(sample.group_names) > 1:
+        bins = TrainingBins(
+            selection(sample.features), sample.is_slip, sample_weight(recipe, sample)
+        )
+        rows = validate(bins, sample.group, sample.group_names, choices, show=show)
+        place = max(range(len(rows)), key=lambda i: rows[i]["mean"])
+        rows[place]["chosen"] = True
+        return rows, *choices[place]
+    # of the most features and the last kernel
+    chosen = choices[len(choices) - len(penalties) + len(penalties) // 2]
+    if len(choices) > 1:
+        log.warning("K=%d, %s, C=%g are taken unvalidated: one group", *chosen)
+    return [], *chosen
 
 
 def validate(
@@ -358,7 +331,8 @@ def validate(
     groups: Tensor,
     names: Sequence[str],
     choices: Sequence[tuple[int, Kernel, float]],
-    progress: Progress,
+    *,
+    show: bool = False,
 ) -> list[dict[str, Any]]:
     """Balanced accuracy of each held-out group for each choice of K, kernel and C, in order.
 
@@ -367,7 +341,7 @@ def validate(
         groups: ``[N]``, which group each bin is of, an index into ``names``.
         names: of the groups.
         choices: in any order; those of one K and kernel that stand together cost least.
-        progress: wraps what is gone through.
+        show: a progress bar.
 
     Returns:
         One row per choice; ``mean`` is over the groups that have bins of both classes.
@@ -376,18 +350,14 @@ def validate(
         ValueError: if no group has, or held-out scores cannot be told (``HeldOut``).
     """
     rows = []
-    machine: HeldOut | None = None
-    made_of: Any = None
-    for number in progress(range(len(choices)), "choose C on held-out groups"):
-        size, kernel, penalty = choices[number]
-        if made_of != (size, kernel):
+    machine, made_of = None, None
+    for size, kernel, penalty in bar(choices, "choose C on held-out groups", show=show):
+        if machine is None or made_of != (size, kernel):
             few = TrainingBins(bins.features[:, :size], bins.is_slip, bins.weights)
             machine, made_of = HeldOut(few, groups, kernel), (size, kernel)
-        assert machine is not None
         scores = machine.at(penalty).scores
-        says_slip = scores >= 0
         by_group = {
-            name: recalls_mean(says_slip[groups == index], bins.is_slip[groups == index])
+            name: balanced_accuracy(scores[groups == index] >= 0, bins.is_slip[groups == index])
             for index, name in enumerate(names)
         }
         known = [value for value in by_group.values() if value is not None]
@@ -434,6 +404,15 @@ class Structure(NamedTuple):
     num_features: int | None
     kernel: Polynomial
 
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The kinds of columns it takes."""
+        return ("channel", "pooled") if self.use == "both" else (self.use,)
+
+
+Candidate = tuple[Structure, float]
+"""A structure and its penalty."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -457,112 +436,21 @@ class Choice:
     edge: str
 
 
-def choose_model(
-    recipe: Recipe,
-    pool: FeaturePool,
-    sample: SampledBins,
-    weights: Tensor,
-    progress: Progress,
-    *,
-    num_bins: int,
-    allowed: Tensor | None = None,
-    is_nested: bool = True,
-) -> Choice:
-    """Choose among the candidates of a recipe.
-
-    Args:
-        recipe: with ``validation="nested"``.
-        pool: the features of the sampled bins.
-        sample: of the training bins.
-        weights: for how many training bins each sampled one stands, classes balanced, ``[n]``.
-        progress: wraps the folds.
-        num_bins: that the machine will be trained on.
-        allowed: which features may be used, ``[F]``, bool.
-        is_nested: whether to evaluate the choice itself by leaving out two groups.
-
-    Raises:
-        ValueError: if no group has bins of both classes, or there is one group only.
-    """
-    groups, names = sample_groups(sample)
-    whole = [
-        index
-        for index in range(len(names))
-        if bool(sample.is_slip[groups == index].any())
-        and not bool(sample.is_slip[groups == index].all())
-    ]
-    if len(whole) < 2:
-        lacking = [
-            f"{name} has no {'non-slip' if bool(sample.is_slip[groups == index].all()) else 'slip'}"
-            for index, name in enumerate(names)
-            if index not in whole
-        ]
-        raise ValueError(
-            "validation leaves out groups and needs two with bins of both classes, got "
-            f"{len(whole)} ({', '.join(lacking) or 'there is one group'}); add recordings or take "
-            "another recipe.group_by"
-        )
-    structures = candidates(recipe, num_bins)
-    folds = [frozenset([group]) for group in whole]
-    if is_nested and len(whole) > 2:
-        folds += [frozenset(pair) for pair in itertools.combinations(whole, 2)]
-    data = _Data(recipe, pool, sample, weights, groups, allowed)
-    if not all(each.use == "pooled" and each.kernel.degree == 1 for each in structures):
-        data.thin_out()
-    penalties = list(recipe.penalties_ascending)
-    found: dict[frozenset[int], _Scores] = {}
-    steps, lock = iter(progress(folds, "validation, groups left out")), threading.Lock()
-
-    def leave_out(fold: frozenset[int]) -> None:
-        found[fold] = _Fold(data, fold, structures).at(penalties)
-        with lock:
-            next(steps, None)
-
-    next(steps, None)  # shows the bar
-    for_each(leave_out, folds)
-    single = {group: found[frozenset([group])] for group in whole}
-    edge = _extended(data, found, penalties, structures, whole, recipe.tolerance)
-
-    def accuracy(fold: frozenset[int], group: int) -> Mapping[tuple[int, float], float]:
-        return found[fold].accuracy[group]
-
-    table = {group: accuracy(frozenset([group]), group) for group in whole}
-    chosen = _best(table, structures, recipe.tolerance)
-    by_key = {key: _row(structures, key, single, data, names) for key in sorted(_means(table))}
-    rows, chosen_row = list(by_key.values()), by_key[chosen]
-    scores = torch.cat([of.scores[group][chosen] for group, of in single.items()])
-    rows_of = torch.cat([(groups == group).nonzero().flatten() for group in single])
-    calibration = _calibration(scores, data.is_slip[rows_of], data.weights[rows_of])
-    chosen_row |= {"chosen": True, "calibration": calibration}
-    nested = None
-    if is_nested and len(whole) > 2:
-        by_group = {}
-        for group in whole:
-            others = [other for other in whole if other != group]
-            inner = {other: accuracy(frozenset([group, other]), other) for other in others}
-            by_group[names[group]] = table[group][_best(inner, structures, recipe.tolerance)]
-        nested = {
-            "mean": sum(by_group.values()) / len(by_group),
-            "balanced_accuracy": by_group,
-        }
-    return Choice(structures[chosen[0]], chosen[1], rows, nested, edge)
-
-
 def candidates(recipe: Recipe, num_bins: int) -> list[Structure]:
-    """All structures of a recipe, the simplest first.
+    """All structures of a recipe for a machine of so many training bins, the simplest first.
 
     Raises:
         ValueError: if there is none.
     """
     sizes: list[int | None] = [None] if recipe.takes_all else []
-    sizes += recipe.sizes
+    may_grow = num_bins <= MOST_DUAL_BINS
     found = [
         Structure(use, size, kernel)
-        for size in sizes
+        for size in [*sizes, *recipe.sizes]
         for kernel in recipe.kernels
         if isinstance(kernel, Polynomial)
         for use in recipe.uses
-        if kernel.degree == 1 or size is not None or num_bins <= MOST_DUAL_BINS
-        if kernel.degree == 1 or not recipe.scene_weights or num_bins <= MOST_DUAL_BINS
+        if kernel.degree == 1 or may_grow or (size is not None and not recipe.scene_weights)
     ]
     if not found:
         raise ValueError(
@@ -572,31 +460,90 @@ def candidates(recipe: Recipe, num_bins: int) -> list[Structure]:
     return found
 
 
-def fitted_frame(
+def choose_model(
+    recipe: Recipe,
+    pool: FeaturePool,
+    sample: SampledBins,
+    allowed: Tensor | None = None,
+    *,
+    is_nested: bool = True,
+    show: bool = False,
+) -> Choice:
+    """Choose among the candidates of a recipe.
+
+    Args:
+        recipe: with ``validation="nested"``.
+        pool: the features of the sampled bins.
+        sample: of the training bins.
+        allowed: which features may be used, ``[F]``, bool; by default those the recipe allows.
+        is_nested: whether to evaluate the choice itself by leaving out two groups.
+        show: a progress bar.
+
+    Raises:
+        ValueError: if no group has bins of both classes, or there is one group only.
+    """
+    bins = _Bins(recipe, pool, sample, allowed)
+    groups = bins.whole_groups()
+    structures = candidates(recipe, _num_bins(recipe, sample))
+    if not all(each.use == "pooled" and each.kernel.degree == 1 for each in structures):
+        bins.thin_out()
+    folds = [frozenset([group]) for group in groups]
+    if is_nested := is_nested and len(groups) > 2:
+        folds += [frozenset(pair) for pair in itertools.combinations(groups, 2)]
+    with Ticker("validation, groups left out", "step", len(folds), show=show) as ticker:
+
+        def leave_out(fold: frozenset[int]) -> None:
+            bins.leave_out(fold, structures, recipe.penalties_ascending)
+            ticker.tick()
+
+        for_each(leave_out, folds)
+    edge = _extend_grid(bins)
+    accuracy = bins.accuracies(groups)
+    chosen = _best(accuracy, recipe.tolerance)
+    order = sorted(accuracy[groups[0]], key=lambda key: (structures.index(key[0]), key[1]))
+    rows = []
+    for key in order:
+        by_group = {group: of[key] for group, of in accuracy.items()}
+        rows.append(_row(bins, key, by_group))
+        if key == chosen:
+            scores = torch.cat([bins.scores[frozenset([group])][group][key] for group in groups])
+            places = torch.cat([bins.of(group) for group in groups])
+            calibration = _calibration(scores, bins.is_slip[places], bins.weights[places])
+            rows[-1] |= {"chosen": True, "calibration": calibration}
+    nested = None
+    if is_nested:
+        by_name = {}
+        for group in groups:
+            inner = bins.accuracies([other for other in groups if other != group], group)
+            by_name[bins.names[group]] = accuracy[group][_best(inner, recipe.tolerance)]
+        nested = {"mean": sum(by_name.values()) / len(by_name), "balanced_accuracy": by_name}
+    return Choice(*chosen, rows, nested, edge)
+
+
+def fitted_selection(
     recipe: Recipe,
     pool: FeaturePool,
     sample: SampledBins,
     structure: Structure,
     allowed: Tensor | None = None,
-) -> Frame:
-    """Compression, ranking and scaling of a structure, learned from a sample of training bins."""
-    everything = torch.ones(len(sample.is_slip), dtype=torch.bool)
-    weights = sample.represents
-    groups, _ = sample_groups(sample)
-    data = _Data(recipe, pool, sample, weights, groups, allowed)
-    columns = _Columns(data, everything, everything, [structure.use])
+) -> FeatureSelection:
+    """Compression, ranking and scaling of a structure, learned from a sample of training bins.
+
+    ``allowed`` as in ``choose_model``.
+    """
+    bins = _Bins(recipe, pool, sample, allowed)
+    columns = _Columns(bins, torch.ones_like(bins.is_slip), bins.is_slip | True, structure.parts)
     places = columns.ranked(structure)
-    names = [columns.names(structure.use)[place] for place in places.tolist()]
-    scaler = columns.scaler(structure.use, places)
+    names = columns.names(structure.parts)
+    names = [names[place] for place in places.tolist()]
+    scaler, layer = columns.scaler(structure, places), columns.pooling
     index = {name: place for place, name in enumerate(pool.names)}
-    if not any(name.is_pooled for name in names):
-        return Frame(tuple(index[name] for name in names), scaler)
-    assert columns.pooling is not None  # something is pooled
-    layer = columns.pooling
+    if layer is None or not any(name.is_pooled for name in names):
+        return FeatureSelection(tuple(index[name] for name in names), scaler)
     if structure.use == "both":
-        layer = layer.with_channels(data.names)
+        layer = layer.with_channels(bins.feature_names)
     layer = layer.select([layer.names.index(name) for name in names])
-    return Frame(tuple(index[name] for name in layer.inputs), scaler, layer)
+    return FeatureSelection(tuple(index[name] for name in layer.inputs), scaler, layer)
 
 
 def group_scores(columns: Tensor, is_slip: Tensor, groups: Tensor) -> Tensor:
@@ -626,26 +573,57 @@ def group_scores(columns: Tensor, is_slip: Tensor, groups: Tensor) -> Tensor:
     return torch.where(square > 0, found, 0.0)
 
 
-class _Data:
-    """The sampled bins of the features that may be used."""
+class _Bins:
+    """The sampled bins of the features that may be used, in their validation groups."""
 
     def __init__(
-        self,
-        recipe: Recipe,
-        pool: FeaturePool,
-        sample: SampledBins,
-        weights: Tensor,
-        groups: Tensor,
-        allowed: Tensor | None,
+        self, recipe: Recipe, pool: FeaturePool, sample: SampledBins, allowed: Tensor | None
     ) -> None:
         self.recipe, self.hand = recipe, pool.hand
-        self.is_slip, self.groups = sample.is_slip, groups
+        self.is_slip, self.weights = sample.is_slip, sample_weight(recipe, sample)
+        self.groups, self.names = sample_groups(sample)
+        allowed = recipe.allowed(pool) if allowed is None else allowed
         places = torch.arange(len(pool.names)) if allowed is None else allowed.nonzero().flatten()
-        self.names = [pool.names[place] for place in places.tolist()]
+        self.feature_names = [pool.names[place] for place in places.tolist()]
         self.features = sample.features[:, places]
-        self.weights = weights.clone()
         self.is_kept = torch.ones_like(sample.is_slip)
+        self.scores: dict[frozenset[int], dict[int, dict[Candidate, Tensor]]] = {}
         self._stratum = 2 * sample.group + sample.is_slip.long()
+
+    def of(self, group: int) -> Tensor:
+        """Places of the bins of a group."""
+        return (self.groups == group).nonzero().flatten()
+
+    def accuracies(self, groups: Sequence[int], *others: int) -> _Table:
+        """Balanced accuracy on each group, by the machines without it and without the others."""
+        table = {}
+        for group in groups:
+            is_slip = self.is_slip[self.of(group)]
+            scores = self.scores[frozenset([group, *others])][group]
+            found = {key: balanced_accuracy(own >= 0, is_slip) for key, own in scores.items()}
+            table[group] = {key: value for key, value in found.items() if value is not None}
+        return table
+
+    def whole_groups(self) -> list[int]:
+        """The groups with bins of both classes.
+
+        Raises:
+            ValueError: if there are not two.
+        """
+        is_slip = [self.is_slip[self.of(group)] for group in range(len(self.names))]
+        whole = [i for i, own in enumerate(is_slip) if bool(own.any()) and not bool(own.all())]
+        if len(whole) < 2:
+            lacking = [
+                f"{self.names[i]} has no {'non-slip' if bool(own.all()) else 'slip'}"
+                for i, own in enumerate(is_slip)
+                if i not in whole
+            ]
+            raise ValueError(
+                "validation leaves out groups and needs two with bins of both classes, got "
+                f"{len(whole)} ({', '.join(lacking) or 'there is one group'}); add recordings or "
+                "take another recipe.group_by"
+            )
+        return whole
 
     def thin_out(self) -> None:
         """Fit to fewer bins of each stratum; those that stay weigh more."""
@@ -659,56 +637,65 @@ class _Data:
             self.is_kept[mine[kept]] = True
             self.weights[mine] *= len(mine) / len(kept)
 
+    def leave_out(
+        self, fold: frozenset[int], structures: Sequence[Structure], penalties: Sequence[float]
+    ) -> None:
+        """Score each group of a fold by machines that saw no group of it."""
+        is_out = torch.isin(self.groups, torch.tensor(sorted(fold)))
+        train = self.is_kept & ~is_out
+        parts = sorted({part for structure in structures for part in structure.parts})
+        columns = _Columns(self, train | is_out, train, parts)
+        targets = torch.where(self.is_slip, 1.0, -1.0).double()[train]
+        member = self.groups[is_out]
+        found = self.scores.setdefault(fold, {group: {} for group in fold})
+        for structure in structures:
+            by_penalty = _ridge_scores(columns, structure, targets, self.weights[train], penalties)
+            for penalty, scores in zip(penalties, by_penalty, strict=True):
+                for group in fold:
+                    found[group][structure, penalty] = scores[member == group]
+
 
 class _Columns:
-    """Columns of some sampled bins, with what the training bins among them taught."""
+    """Scaled columns of some sampled bins, with what the training bins among them taught."""
 
-    def __init__(self, data: _Data, rows: Tensor, train: Tensor, uses: Sequence[str]) -> None:
-        self._data, features = data, data.features[rows]
-        self.train = train[rows]
-        self.is_slip, self.groups = data.is_slip[rows], data.groups[rows]
+    def __init__(self, bins: _Bins, rows: Tensor, train: Tensor, parts: Sequence[str]) -> None:
+        self._bins, self.train = bins, train[rows]
+        self._is_slip, self._groups = bins.is_slip[train], bins.groups[train]
+        features = bins.features[rows]
         self.pooling: ChannelPooling | None = None
-        parts = {"channel": features} if set(uses) != {"pooled"} else {}
-        if set(uses) != {"channel"}:
-            setting = data.recipe.pooling
+        columns = {"channel": features} if "channel" in parts else {}
+        if "pooled" in parts:
+            setting = bins.recipe.pooling
             assert setting is not None  # recipe
             own = features[self.train]
-            self.pooling = layer = ChannelPooling.fit(data.hand, data.names, own, setting)
-            place = {name: index for index, name in enumerate(data.names)}
+            layer = ChannelPooling.fit(bins.hand, bins.feature_names, own, setting)
+            place = {name: index for index, name in enumerate(bins.feature_names)}
             inputs = torch.tensor([place[name] for name in layer.inputs])
-            parts["pooled"] = layer(features.index_select(1, inputs).double())
-        compress, tail = data.recipe.compress, data.recipe.tail
-        self._fitted: dict[str, FeatureScaler] = {}
+            self.pooling = layer
+            columns["pooled"] = layer(features.index_select(1, inputs).double())
+        options: dict[str, Any] = {"compress": bins.recipe.compress, "tail": bins.recipe.tail}
+        self._scalers: dict[str, FeatureScaler] = {}
         self._scaled: dict[str, Tensor] = {}
-        for name, x in parts.items():
-            x = x.double()
-            scaler = FeatureScaler.fit(x[self.train], compress=compress, tail=tail)
-            self._fitted[name], self._scaled[name] = scaler, scaler(x)
+        for name, x in columns.items():
+            scaler = FeatureScaler.fit(x[self.train].double(), **options)
+            self._scalers[name], self._scaled[name] = scaler, scaler(x.double())
         self._ranks: dict[str, Tensor] = {}
         self._products: dict[str, Tensor] = {}
 
-    def names(self, use: str) -> list[Any]:
-        """Of the columns of a use."""
-        pooled = [] if self.pooling is None else list(self.pooling.names)
-        return [
-            *(self._data.names if use != "pooled" else []),
-            *(pooled if use != "channel" else []),
-        ]
+    def names(self, parts: Sequence[str]) -> list[FeatureName]:
+        """Of the columns of these kinds."""
+        pooled = () if self.pooling is None else self.pooling.names
+        of = {"channel": self._bins.feature_names, "pooled": pooled}
+        return [name for part in parts for name in of[part]]
 
-    def scaled(self, use: str) -> Tensor:
-        """Scaled columns of all bins, ``[n, K]``."""
-        if use == "both":
-            return torch.cat([self._scaled["channel"], self._scaled["pooled"]], 1)
-        return self._scaled[use]
-
-    def num_columns(self, structure: Structure) -> int:
+    def num(self, structure: Structure) -> int:
         """K of a structure."""
-        num = sum(self._scaled[name].shape[1] for name in _parts(structure.use))
+        num = sum(self._scaled[name].shape[1] for name in structure.parts)
         return min(num, structure.num_features or num)
 
     def of(self, structure: Structure) -> Tensor:
         """Scaled columns of a structure, best first, ``[n, K]``."""
-        z = self.scaled(structure.use)
+        z = torch.cat([self._scaled[name] for name in structure.parts], 1)
         return z if structure.num_features is None else z[:, self.ranked(structure)]
 
     def products(self, structure: Structure) -> Tensor:
@@ -716,82 +703,33 @@ class _Columns:
         if structure.num_features is not None:
             z = self.of(structure)
             return z @ z[self.train].mT
-        total: Tensor | None = None
-        for name in _parts(structure.use):
+        for name in structure.parts:
             if name not in self._products:
                 z = self._scaled[name]
                 self._products[name] = z @ z[self.train].mT
-            total = self._products[name] if total is None else total + self._products[name]
-        assert total is not None  # of at least one part
-        return total
+        first, *others = (self._products[name] for name in structure.parts)
+        return sum(others, first)
 
-    def scaler(self, use: str, places: Tensor) -> FeatureScaler:
-        """Of some columns."""
-        parts = [self._fitted[name] for name in _parts(use)]
-        knees = [part.knee for part in parts if part.knee is not None]
+    def scaler(self, structure: Structure, places: Tensor) -> FeatureScaler:
+        """Of some columns of a structure."""
+        scalers = [self._scalers[name] for name in structure.parts]
+        knees = [scaler.knee for scaler in scalers if scaler.knee is not None]
         return FeatureScaler(
-            torch.cat([part.minimum for part in parts])[places],
-            torch.cat([part.maximum for part in parts])[places],
+            torch.cat([scaler.minimum for scaler in scalers])[places],
+            torch.cat([scaler.maximum for scaler in scalers])[places],
             torch.cat(knees)[places] if knees else None,
         )
 
     def ranked(self, structure: Structure) -> Tensor:
         """Places of the columns of a structure, best first; all in their order."""
         if structure.num_features is None:
-            return torch.arange(len(self.names(structure.use)))
-        own = _parts(structure.use)
-        for name in own:
+            return torch.arange(self.num(structure))
+        for name in structure.parts:
             if name not in self._ranks:
                 z = self._scaled[name][self.train]
-                is_slip, groups = self.is_slip[self.train], self.groups[self.train]
-                self._ranks[name] = group_scores(z, is_slip, groups)
-        scores = torch.cat([self._ranks[name] for name in own])
+                self._ranks[name] = group_scores(z, self._is_slip, self._groups)
+        scores = torch.cat([self._ranks[name] for name in structure.parts])
         return scores.argsort(descending=True, stable=True)[: structure.num_features]
-
-
-def _parts(use: str) -> tuple[str, ...]:
-    return ("channel", "pooled") if use == "both" else (use,)
-
-
-@dataclass(frozen=True)
-class _Scores:
-    """Scores of the left-out groups, and their balanced accuracies."""
-
-    scores: dict[int, dict[tuple[int, float], Tensor]]
-    accuracy: dict[int, dict[tuple[int, float], float]]
-
-
-class _Fold:
-    """Machines without some groups.
-
-    Columns are formed anew for other penalties rather than kept: they are large.
-    """
-
-    def __init__(self, data: _Data, left_out: frozenset[int], structures: list[Structure]) -> None:
-        self._data, self._left_out, self._structures = data, left_out, structures
-
-    def at(self, penalties: Sequence[float], places: Sequence[int] | None = None) -> _Scores:
-        """Balanced accuracies for some penalties; of some structures, by default of all."""
-        data = self._data
-        places = range(len(self._structures)) if places is None else places
-        is_out = torch.isin(data.groups, torch.tensor(sorted(self._left_out)))
-        train = data.is_kept & ~is_out
-        rows = train | is_out
-        columns = _Columns(data, rows, train, sorted({self._structures[p].use for p in places}))
-        targets = torch.where(data.is_slip, 1.0, -1.0).double()[train]
-        is_train, truths = columns.train, columns.is_slip[~columns.train]
-        of_group = {g: columns.groups[~is_train] == g for g in self._left_out}
-        found = _Scores({g: {} for g in self._left_out}, {g: {} for g in self._left_out})
-        for place in places:
-            structure = self._structures[place]
-            by_penalty = _ridge_scores(columns, structure, targets, data.weights[train], penalties)
-            for penalty, scores in zip(penalties, by_penalty, strict=True):
-                for group, mine in of_group.items():
-                    accuracy = recalls_mean(scores[mine] >= 0, truths[mine])
-                    assert accuracy is not None  # of groups with both classes
-                    found.accuracy[group][place, penalty] = accuracy
-                    found.scores[group][place, penalty] = scores[mine]
-        return found
 
 
 def _ridge_scores(
@@ -806,8 +744,7 @@ def _ridge_scores(
     Through the primal or the dual, whichever has fewer unknowns.
     """
     kernel, is_train = structure.kernel, columns.train
-    num = columns.num_columns(structure)
-    if kernel.degree == 1 and num < len(targets):
+    if kernel.degree == 1 and columns.num(structure) < len(targets):
         z = columns.of(structure)
         x = torch.cat([z, torch.full_like(z[:, :1], math.sqrt(kernel.offset))], 1)
         system = x[is_train].mT @ (x[is_train] * weights[:, None])
@@ -828,88 +765,68 @@ def _ridge_scores(
     return (others @ torch.cat(solved, 1)).mT
 
 
-Table = Mapping[int, Mapping[tuple[int, float], float]]
-"""Balanced accuracy by group and candidate, a place among the structures with a penalty."""
+_Table = Mapping[int, Mapping[Candidate, float]]
+"""Balanced accuracy by group and candidate."""
 
 
-def _means(table: Table) -> dict[tuple[int, float], float]:
+def _means(table: _Table) -> dict[Candidate, float]:
     first = next(iter(table.values()))
     return {key: sum(of[key] for of in table.values()) / len(table) for key in first}
 
 
-def _best(table: Table, structures: Sequence[Structure], tolerance: float) -> tuple[int, float]:
+def _best(table: _Table, tolerance: float) -> Candidate:
     """Of those within the tolerance: no selection, the lower degree, fewer features, least C."""
     means = _means(table)
     least = max(means.values()) - tolerance
     uses = ("pooled", "channel", "both")  # by their number, of the paper's hand
 
-    def order(key: tuple[int, float]) -> tuple[bool, int, int, int, float]:
-        structure, penalty = structures[key[0]], key[1]
-        size = structure.num_features or 0
-        by_use = uses.index(structure.use)
-        return structure.num_features is not None, structure.kernel.degree, size, by_use, penalty
+    def order(key: Candidate) -> tuple[bool, int, int, int, float]:
+        (use, size, kernel), penalty = key
+        return size is not None, kernel.degree, size or 0, uses.index(use), penalty
 
     return min((key for key, mean in means.items() if mean >= least), key=order)
 
 
-def _extended(
-    data: _Data,
-    found: dict[frozenset[int], _Scores],
-    penalties: list[float],
-    structures: list[Structure],
-    whole: Sequence[int],
-    tolerance: float,
-) -> str:
-    """Extend a grid whose end was chosen, or is best; says what was done."""
+def _extend_grid(bins: _Bins) -> str:
+    """Extend a grid of penalties whose end was chosen, or is best; says what was done."""
+    groups, tolerance = bins.whole_groups(), bins.recipe.tolerance
+    if len(bins.recipe.penalties_ascending) < 2:
+        return ""
     said = []
     for is_low in (True, False):
         for _ in range(MOST_EXTENSIONS):
-            table = {group: found[frozenset([group])].accuracy[group] for group in whole}
+            table = bins.accuracies(groups)
             means = _means(table)
-            chosen, best = _best(table, structures, tolerance), max(means, key=means.__getitem__)
-            place, penalty = chosen if is_low else best
-            own = [key[1] for key in means if key[0] == place]
-            if penalty != (min(own) if is_low else max(own)) or len(penalties) < 2:
+            best = _best(table, tolerance) if is_low else max(means, key=means.__getitem__)
+            own = [penalty for structure, penalty in means if structure == best[0]]
+            if best[1] != (min(own) if is_low else max(own)):
                 break
-            beyond = penalty / 10 if is_low else penalty * 10
-
-            def extend(fold: frozenset[int], place: int = place, beyond: float = beyond) -> None:
-                more = _Fold(data, fold, structures).at([beyond], [place])
-                for group in fold:
-                    found[fold].accuracy[group].update(more.accuracy[group])
-                    found[fold].scores[group].update(more.scores[group])
-
-            for_each(extend, list(found))
+            beyond = best[1] / 10 if is_low else best[1] * 10
+            for_each(partial(bins.leave_out, structures=best[:1], penalties=[beyond]), bins.scores)
             said.append(f"{beyond:g}")
     if not said:
         return ""
     return f"recipe.penalties ended at its edge and was extended by {', '.join(said)}"
 
 
-def _row(
-    structures: Sequence[Structure],
-    key: tuple[int, float],
-    single: Mapping[int, _Scores],
-    data: _Data,
-    names: Sequence[str],
-) -> dict[str, Any]:
-    """What is told of a candidate."""
-    structure, penalty = structures[key[0]], key[1]
-    by_group = {group: of.accuracy[group][key] for group, of in single.items()}
+def _row(bins: _Bins, key: Candidate, by_group: Mapping[int, float]) -> dict[str, Any]:
+    """What a file says of a candidate."""
+    structure, penalty = key
     worst = min(by_group, key=by_group.__getitem__)
-    scores, truth = single[worst].scores[worst][key], data.is_slip[data.groups == worst]
-    rule = best_threshold(scores[:, None], truth)
+    scores = bins.scores[frozenset([worst])][worst][key][:, None]
+    is_slip = bins.is_slip[bins.of(worst)]
+    rule = best_threshold(scores, is_slip)
     return {
         "use": structure.use,
         "num_features": structure.num_features,
         "kernel": structure.kernel.to_dict(),
         "penalty": penalty,
         "mean": sum(by_group.values()) / len(by_group),
-        "balanced_accuracy": {names[group]: value for group, value in by_group.items()},
+        "balanced_accuracy": {bins.names[group]: value for group, value in by_group.items()},
         "worst": {
-            "group": names[worst],
+            "group": bins.names[worst],
             "balanced_accuracy": by_group[worst],
             "best_threshold": rule.threshold,
-            "at_best_threshold": recalls_mean(rule(scores[:, None]), truth),
+            "at_best_threshold": balanced_accuracy(rule(scores), is_slip),
         },
     }

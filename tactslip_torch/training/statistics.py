@@ -1,8 +1,8 @@
 """What a detector is solved again from, in one file beside it: ``statistics.pt``.
 
-Sums over all training bins, a bounded sample of these bins (``Rehearsal``), and all that came
-later: recordings with their bins and weights, and every step with the detector it replaced. Bins
-are taken out as they were taken in, so any step can be taken back.
+Sums over all training bins, a bounded sample of these bins, and all that came later: recordings
+with their bins and weights, and every step with the detector it replaced. Bins are taken out as
+they were taken in, so any step can be taken back.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -24,6 +24,9 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.runtime import load_table, save_table
 from tactslip_torch.training.selection import Plan
+
+FILE = "statistics.pt"
+FORMAT = "tactslip_torch statistics 3"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +47,14 @@ class RecordingBins:
 
 
 @dataclass(frozen=True, eq=False)
-class Rehearsal:
-    """A bounded sample of the training bins, each in the sums with weight 1.
+class KnownBins:
+    """Bins in the sums that are known one by one: a sample of training, and all that were added.
 
     Args:
         z: ``[n, K]``, float64, scaled selected features.
         is_slip: ``[n]``, bool.
-        represents: ``[n]``, float64, for how many training bins each stands.
+        weight: ``[n]``, float64, of each bin in the sums; 1 of those of training.
+        sample_weight: ``[n]``, float64, total weight of the bins that it was drawn from.
         recording: ``[n]``, int64, index into the two lists that follow.
         recordings: names.
         materials: of each of these recordings.
@@ -58,129 +62,69 @@ class Rehearsal:
 
     z: Tensor
     is_slip: Tensor
-    represents: Tensor
+    weight: Tensor
+    sample_weight: Tensor
     recording: Tensor
     recordings: tuple[str, ...]
     materials: tuple[str, ...]
 
     @classmethod
-    def of(cls, plan: Plan, sample: SampledBins, materials: Mapping[str, str]) -> Rehearsal:
-        """Those bins of a survey's sample that were trained on.
+    def of(cls, plan: Plan, sample: SampledBins, materials: Mapping[str, str]) -> KnownBins:
+        """Those bins of the first pass's sample that were trained on.
 
         Args:
-            plan: which features, how scaled, and which share of each class was trained on.
+            plan: which features, how scaled, and which part of each class was trained on.
             sample: of the first pass.
             materials: of each recording, by its name.
         """
-        shares = torch.tensor(plan.shares, dtype=torch.float64)[sample.is_slip.long()]
+        part = torch.tensor(plan.fractions, dtype=torch.float64)[sample.is_slip.long()]
         most = int(sample.bin_index.max()) + 1
         keys = torch.stack([bin_keys(name, most) for name in sample.recording_names])
-        kept = (shares >= 1) | (keys[sample.recording, sample.bin_index] < shares)
+        kept = (part >= 1) | (keys[sample.recording, sample.bin_index] < part)
         return cls(
-            plan.frame(sample.features[kept]),
+            plan.selection(sample.features[kept]),
             sample.is_slip[kept],
-            (sample.represents * shares)[kept],
+            torch.ones_like(part[kept]),
+            (sample.represents * part)[kept],
             sample.recording[kept],
             sample.recording_names,
             tuple(materials[name] for name in sample.recording_names),
         )
 
-    def without(self, recordings: Collection[str]) -> Rehearsal:
-        """Those of other recordings."""
-        out = torch.tensor([name in recordings for name in self.recordings])
+    def with_others(
+        self, bins: Mapping[str, RecordingBins], weights: Mapping[str, float]
+    ) -> KnownBins:
+        """These without the bins of some recordings, in whose place come all that are weighed."""
+        out = torch.tensor([name in bins for name in self.recordings])
         kept = ~out[self.recording]
-        return Rehearsal(
-            self.z[kept],
-            self.is_slip[kept],
-            self.represents[kept],
-            self.recording[kept],
-            self.recordings,
-            self.materials,
+        new = {name: own for name, own in sorted(bins.items()) if weights[name] > 0}
+        sizes = torch.tensor([len(own.z) for own in new.values()], dtype=torch.int64)
+        place = torch.arange(len(new)).repeat_interleave(sizes)
+        weight = torch.tensor([weights[name] for name in new], dtype=torch.float64)[place]
+        return KnownBins(
+            torch.cat([self.z[kept], *(own.z for own in new.values())]),
+            torch.cat([self.is_slip[kept], *(own.is_slip for own in new.values())]),
+            torch.cat([self.weight[kept], weight]),
+            torch.cat([self.sample_weight[kept], weight]),
+            torch.cat([self.recording[kept], place + len(self.recordings)]),
+            (*self.recordings, *new),
+            (*self.materials, *(own.material for own in new.values())),
         )
 
-    def tensors(self) -> dict[str, Tensor]:
-        """For a file."""
-        return {name: getattr(self, name) for name in ("z", "is_slip", "represents", "recording")}
+    @property
+    def material_names(self) -> list[str]:
+        """Of all recordings, ascending."""
+        return sorted(set(self.materials))
 
-    def facts(self) -> dict[str, Any]:
-        """For a file, JSON-able."""
-        return {"recordings": list(self.recordings), "materials": list(self.materials)}
+    @property
+    def material(self) -> Tensor:
+        """``[n]``, int64, index into ``material_names``."""
+        names = self.material_names
+        return torch.tensor([names.index(name) for name in self.materials])[self.recording]
 
-    @classmethod
-    def from_file(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Rehearsal:
-        """What ``facts`` and ``tensors`` told."""
-        return cls(
-            tensors["z"],
-            tensors["is_slip"],
-            tensors["represents"],
-            tensors["recording"],
-            tuple(facts["recordings"]),
-            tuple(facts["materials"]),
-        )
-
-
-class KnownBins(NamedTuple):
-    """Bins that are in the sums, of old and new materials.
-
-    Attributes:
-        z: ``[n, K]``, float64.
-        is_slip: ``[n]``, bool.
-        weight: ``[n]``, float64, of each bin in the sums.
-        represents: ``[n]``, float64, total weight of the bins that it stands for.
-        material: ``[n]``, int64, index into ``materials``.
-        recording: ``[n]``, int64, index into ``recordings``.
-        materials: names, ascending.
-        recordings: names.
-    """
-
-    z: Tensor
-    is_slip: Tensor
-    weight: Tensor
-    represents: Tensor
-    material: Tensor
-    recording: Tensor
-    materials: tuple[str, ...]
-    recordings: tuple[str, ...]
-
-    def of(self, recordings: Collection[str]) -> Tensor:
+    def of_recordings(self, recordings: Collection[str]) -> Tensor:
         """Which bins are of these recordings, ``[n]``, bool."""
         return torch.tensor([name in recordings for name in self.recordings])[self.recording]
-
-
-def _known_bins(
-    rehearsal: Rehearsal, bins: Mapping[str, RecordingBins], weights: Mapping[str, float]
-) -> KnownBins:
-    """Rehearsal, and all bins of recordings that came later and are in.
-
-    Args:
-        rehearsal: of training; those of recordings in ``bins`` give way to all of their bins.
-        bins: by recording.
-        weights: of a bin of each recording of ``bins``; 0 where it is out.
-    """
-    old = rehearsal.without(bins)
-    new = {name: own for name, own in sorted(bins.items()) if weights[name] > 0}
-    materials = sorted({*old.materials, *(own.material for own in new.values())})
-    place = torch.tensor([materials.index(name) for name in old.materials])
-    sizes = torch.tensor([len(own.z) for own in new.values()], dtype=torch.int64)
-    of_new = torch.arange(len(new)).repeat_interleave(sizes)
-    weight = torch.tensor([weights[name] for name in new], dtype=torch.float64)[of_new]
-    material = torch.tensor(
-        [materials.index(own.material) for own in new.values()], dtype=torch.int64
-    )[of_new]
-    return KnownBins(
-        torch.cat([old.z, *(own.z for own in new.values())]),
-        torch.cat([old.is_slip, *(own.is_slip for own in new.values())]),
-        torch.cat([torch.ones_like(old.represents), weight]),
-        torch.cat([old.represents, weight]),
-        torch.cat([place[old.recording], material]),
-        torch.cat([old.recording, of_new + len(old.recordings)]),
-        tuple(materials),
-        (*old.recordings, *new),
-    )
-
-
-FILE = "statistics.pt"
-FORMAT = "tactslip_torch statistics 3"
 
 
 @dataclass(frozen=True)
@@ -221,13 +165,13 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """Sums, rehearsal, and what changed since training.
+    """Sums, a sample of training bins, and what changed since training.
 
     Args:
         sums: over all bins that are in.
         machine: how they are solved.
         labels: how bins were laid and labelled, arguments of ``LabelRule``.
-        rehearsal: of the training bins.
+        rehearsal: a bounded sample of the training bins.
         detector: digest of the detector that these sums make.
         bins: of recordings that were added, or trained on and taken out, by name.
         weights: of a bin of each recording of ``bins``; 0 where it is out.
@@ -237,7 +181,7 @@ class Statistics:
     sums: SufficientStats
     machine: Machine
     labels: Mapping[str, Any]
-    rehearsal: Rehearsal
+    rehearsal: KnownBins
     detector: str
     bins: Mapping[str, RecordingBins]
     weights: Mapping[str, float]
@@ -249,7 +193,13 @@ class Statistics:
 
     def known(self) -> KnownBins:
         """Bins that are in the sums and known one by one."""
-        return _known_bins(self.rehearsal, self.bins, self.weights)
+        return self.rehearsal.with_others(self.bins, self.weights)
+
+    @property
+    def materials(self) -> dict[str, str]:
+        """The material of every recording that is or was in, by name."""
+        trained = dict(zip(self.rehearsal.recordings, self.rehearsal.materials, strict=True))
+        return trained | {name: own.material for name, own in self.bins.items()}
 
     def reweighed(
         self, weights: Mapping[str, float], bins: Mapping[str, RecordingBins] | None = None
@@ -277,36 +227,36 @@ class Statistics:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a file, whole or not at all."""
-        facts = {
-            "sums": {
-                "num_features": self.sums.num_features,
-                "about": self.sums.about,
-            },
+        tensors = {"sums": self.sums.sums, "count": self.sums.count}
+        rehearsal = vars(self.rehearsal)
+        for name, value in rehearsal.items():
+            if isinstance(value, Tensor):
+                tensors[f"rehearsal.{name}"] = value
+
+        def listed(bins: Mapping[str, RecordingBins], place: str) -> list[list[str]]:
+            for number, own in enumerate(bins.values()):
+                tensors[f"{place}.{number}.z"] = own.z
+                tensors[f"{place}.{number}.is_slip"] = own.is_slip
+            return [[name, own.material, own.key] for name, own in bins.items()]
+
+        for number, step in enumerate(self.steps):
+            tensors[f"steps.{number}"] = step.file
+        metadata = {
+            "sums": {"num_features": self.sums.num_features, "about": self.sums.about},
             "batches": self.sums.ledger.entries,
             "machine": vars(self.machine),
             "labels": dict(self.labels),
-            "rehearsal": self.rehearsal.facts(),
+            "rehearsal": {name: rehearsal[name] for name in ("recordings", "materials")},
             "detector": self.detector,
-            "bins": _bins_facts(self.bins),
+            "bins": listed(self.bins, "bins"),
             "weights": dict(self.weights),
             "steps": [
-                [
-                    step.entry,
-                    dict(step.weights),
-                    dict(step.changed),
-                    _bins_facts(step.replaced),
-                    step.detector,
-                ]
-                for step in self.steps
+                {name: value for name, value in vars(step).items() if name != "file"}
+                | {"replaced": listed(step.replaced, f"steps.{number}.replaced")}
+                for number, step in enumerate(self.steps)
             ],
         }
-        tensors = {"sums": self.sums.sums, "count": self.sums.count}
-        tensors |= {f"rehearsal.{name}": t for name, t in self.rehearsal.tensors().items()}
-        tensors |= _bins_tensors("bins", self.bins)
-        for number, step in enumerate(self.steps):
-            tensors |= {f"steps.{number}": step.file}
-            tensors |= _bins_tensors(f"steps.{number}.replaced", step.replaced)
-        save_table(path, FORMAT, facts, tensors)
+        save_table(path, FORMAT, metadata, tensors)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Statistics:
@@ -316,53 +266,38 @@ class Statistics:
             FileNotFoundError: if there is no such file.
             ValueError: if it is another kind of file, or damaged.
         """
-        facts, tensors = load_table(path, FORMAT)
-        sums = SufficientStats(**facts["sums"])
-        sums.ledger = Ledger(facts["batches"])
+        metadata, tensors = load_table(path, FORMAT)
+        sums = SufficientStats(**metadata["sums"])
+        sums.ledger = Ledger(metadata["batches"])
         sums.sums, sums.count = tensors["sums"], tensors["count"]
-        of_witnesses = {n.partition(".")[2]: t for n, t in tensors.items() if n[:9] == "rehearsal"}
+
+        def bins(listed: Sequence[Sequence[str]], place: str) -> dict[str, RecordingBins]:
+            found = {}
+            for number, (name, material, key) in enumerate(listed):
+                at = f"{place}.{number}"
+                z, is_slip = tensors[f"{at}.z"], tensors[f"{at}.is_slip"]
+                found[name] = RecordingBins(material, z, is_slip, key)
+            return found
+
+        start = "rehearsal."
+        rehearsal: dict[str, Any] = {
+            name.removeprefix(start): x for name, x in tensors.items() if name.startswith(start)
+        }
+        rehearsal |= {name: tuple(value) for name, value in metadata["rehearsal"].items()}
+        steps = []
+        for number, plain in enumerate(metadata["steps"]):
+            replaced = bins(plain["replaced"], f"steps.{number}.replaced")
+            steps.append(Step(**plain | {"replaced": replaced, "file": tensors[f"steps.{number}"]}))
         return cls(
             sums,
-            Machine(**facts["machine"]),
-            facts["labels"],
-            Rehearsal.from_file(facts["rehearsal"], of_witnesses),
-            facts["detector"],
-            _bins_of_file(facts["bins"], tensors, "bins"),
-            facts["weights"],
-            tuple(
-                Step(
-                    entry,
-                    weights,
-                    changed,
-                    _bins_of_file(replaced, tensors, f"steps.{number}.replaced"),
-                    digest,
-                    tensors[f"steps.{number}"],
-                )
-                for number, (entry, weights, changed, replaced, digest) in enumerate(facts["steps"])
-            ),
+            Machine(**metadata["machine"]),
+            metadata["labels"],
+            KnownBins(**rehearsal),
+            metadata["detector"],
+            bins(metadata["bins"], "bins"),
+            metadata["weights"],
+            tuple(steps),
         )
-
-
-def _bins_facts(bins: Mapping[str, RecordingBins]) -> list[list[str]]:
-    return [[name, own.material, own.key] for name, own in bins.items()]
-
-
-def _bins_tensors(place: str, bins: Mapping[str, RecordingBins]) -> dict[str, Tensor]:
-    found: dict[str, Tensor] = {}
-    for number, own in enumerate(bins.values()):
-        found |= {f"{place}.{number}.z": own.z, f"{place}.{number}.is_slip": own.is_slip}
-    return found
-
-
-def _bins_of_file(
-    facts: Sequence[Sequence[str]], tensors: Mapping[str, Tensor], place: str
-) -> dict[str, RecordingBins]:
-    return {
-        name: RecordingBins(
-            material, tensors[f"{place}.{number}.z"], tensors[f"{place}.{number}.is_slip"], key
-        )
-        for number, (name, material, key) in enumerate(facts)
-    }
 
 
 def detector_digest(detector: SlipDetector) -> str:

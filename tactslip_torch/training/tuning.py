@@ -32,7 +32,7 @@ from tactslip_torch.model.scaling import FeatureScaler, signed_log
 from tactslip_torch.runtime import bar
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.learner import SlipLearner
-from tactslip_torch.training.recipe import Frame, Recipe
+from tactslip_torch.training.recipe import FeatureSelection, Recipe
 from tactslip_torch.training.selection import Plan
 
 _Setting = Literal["penalty", "offset", "scales"]
@@ -43,13 +43,13 @@ class Tuned(NamedTuple):
     """What tuning found.
 
     Attributes:
-        frame: features and ranges.
+        selection: features and ranges.
         penalty: C.
         offset: the kernel's c.
         facts: JSON-able: curves, the grid, what was learned, seconds.
     """
 
-    frame: Frame
+    selection: FeatureSelection
     penalty: float
     offset: float
     facts: dict[str, Any]
@@ -135,15 +135,18 @@ class Tuning:
             ValueError: if scores of groups left out tell slip backwards.
         """
         started = time.perf_counter()
-        bins = tuning_bins(sample, plan.frame.selected, weights, self.bins)
+        bins = tuning_bins(sample, plan.selection.selected, weights, self.bins)
         groups = range(len(bins.names))
         grids = {
             held: grid_points(
-                plan.frame.scaler, bins.without(held), recipe.penalties_ascending, _offsets(recipe)
+                plan.selection.scaler,
+                bins.without(held),
+                recipe.penalties_ascending,
+                _offsets(recipe),
             )
             for held in (None, *groups)
         }
-        scaler = plan.frame.scaler
+        scaler = plan.selection.scaler
         *rotations, final = descents = [
             _Descent(self.learn, least_loss(grids[held]), scaler, bins, held)
             for held in (*groups, None)
@@ -154,7 +157,7 @@ class Tuning:
         settings = final.settings.requires_grad_(False)
         settings.load_state_dict(states[steps])
         penalty, offset = float(settings.penalty), float(settings.offset)
-        selected = [names[index] for index in plan.frame.selected]
+        selected = [names[index] for index in plan.selection.selected]
         facts: dict[str, Any] = {
             "learned": list(self.learn),
             "bins": len(bins.is_slip),
@@ -175,7 +178,9 @@ class Tuning:
             ],
             "seconds": time.perf_counter() - started,
         }
-        return Tuned(Frame(plan.frame.selected, settings.scaler()), penalty, offset, facts)
+        return Tuned(
+            FeatureSelection(plan.selection.selected, settings.scaler()), penalty, offset, facts
+        )
 
     def _descend(self, descents: Sequence[_Descent]) -> list[dict[str, Tensor]]:
         """All descents, until held groups no longer gain; states of the last one, step by step."""
@@ -204,24 +209,28 @@ class Tuning:
 
 
 def settled_learner(
-    first: SlipLearner, maker: FeatureMaker, frame: Frame, penalty: float, offset: float
+    first: SlipLearner,
+    maker: FeatureMaker,
+    selection: FeatureSelection,
+    penalty: float,
+    offset: float,
 ) -> SlipLearner:
     """A learner with nothing left to choose.
 
     Args:
         first: whose recipe it takes else.
         maker: of its features.
-        frame: which, and how scaled.
+        selection: which, and how scaled.
         penalty: C.
         offset: the kernel's c.
     """
-    changes: dict[str, Any] = {"num_features": len(frame.selected)}
-    recipe = Recipe(**first.recipe.facts() | changes | {"penalties": penalty, "offsets": offset})
+    num = len(selection.selected)
+    recipe = replace(first.recipe, num_features=num, penalties=penalty, offsets=offset)
     return SlipLearner(
         maker.pool,
         maker.channel_filter,
         recipe,
-        frame=frame,
+        selection=selection,
         abstaining=first.abstaining,
         with_baselines=first.with_baselines,
     )
