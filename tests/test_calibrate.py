@@ -151,7 +151,7 @@ def test_the_command_leaves_all_it_tried(found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("among", [(), ("recipe.among={kind:PVDF,domain:freq}",)])
+@pytest.mark.parametrize("among", [(), ("recipe.feature_filter={kind:PVDF,domain:freq}",)])
 def test_accuracy_is_what_train_reports_for_the_same_parameters_and_seed(tmp_path, found, among):
     if among:
         point = command.evaluate_point(tiny(*among), 0.0)

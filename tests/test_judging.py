@@ -14,10 +14,9 @@ from tactslip_torch.training.learner import (
     BINS_APART,
     RULES,
     bin_scores,
+    evaluated_bins,
     event_numbers,
     events_by_rule,
-    judged_bins,
-    together,
 )
 
 RATE_HZ = 2000.0
@@ -47,7 +46,7 @@ def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), recording=None, r
 
 
 def events_of(batch, says_slip, latency=LATENCY, role="test"):
-    part = judged_bins(batch, says_slip, {})[role]
+    part = evaluated_bins(batch, says_slip, {})[role]
     return {name: own[0] for name, own in events_by_rule([part], latency).items()}
 
 
@@ -201,17 +200,17 @@ def test_a_split_by_bin_has_no_events_and_says_why():
     num = len(whole.is_slip)
     some = torch.arange(num) % 5 > 0
     apart = batch_of(roles={"train": some, "test": ~some, "unseen": torch.zeros_like(some)})
-    parts = judged_bins(apart, apart.is_slip, {})
+    parts = evaluated_bins(apart, apart.is_slip, {})
     assert list(parts) == ["train", "test"]
     assert [part.is_whole for part in parts.values()] == [False, False]
-    assert sum(len(part.truth) for part in parts.values()) == num
+    assert sum(len(part.says_slip) for part in parts.values()) == num
     events = {role: events_by_rule([part], LATENCY) for role, part in parts.items()}
     for by_rule in event_numbers(events).values():
         assert list(by_rule) == list(RULES)
         for numbers in by_rule.values():
             assert numbers["reason"] == BINS_APART
             assert numbers["found"] is numbers["false_alarms_per_minute"] is None
-    of_whole = judged_bins(whole, whole.is_slip, {})["test"]
+    of_whole = evaluated_bins(whole, whole.is_slip, {})["test"]
     assert events_by_rule([of_whole, parts["test"]], LATENCY) == {name: [] for name in RULES}
     numbers = event_numbers({"test": events_by_rule([of_whole], LATENCY)})
     assert "reason" not in numbers["test"]["first_transition"]
@@ -223,37 +222,18 @@ def test_recordings_of_different_length_do_not_mix():
     parts = []
     for batch, wrong in ((short, [(0, -12)]), (long, [(1, -4), (1, 3)])):
         decisions = says(batch, wrong=wrong)
-        parts.append(judged_bins(batch, decisions, {})["test"])
+        parts.append(evaluated_bins(batch, decisions, {})["test"])
     alone = [events_by_rule([part], LATENCY) for part in parts]
     for name, own in events_by_rule(parts, LATENCY).items():
         assert own == [one[name][0] for one in alone]
         assert [(one.recording, one.material) for one in own] == [("M2/1", "M2"), ("M1/0", "M1")]
 
 
-def test_tests_of_several_folds_are_pooled_by_role_and_rule():
-    def fold(cycle, wrong):
-        batch = batch_of(recording=RecordingId("M1", cycle))
-        decisions = says(batch, wrong=wrong)
-        part = judged_bins(batch, decisions, {})["test"]
-        return {"test": events_by_rule([part], LATENCY)}
-
-    folds = [fold(0, [(0, -10)]), fold(1, []), {"unseen": fold(2, [])["test"]}]
-    merged = together(folds)
-    assert {role: len(of["two_of_three"]) for role, of in merged.items()} == {
-        "test": 2,
-        "unseen": 1,
-    }
-    numbers = event_numbers(merged)["test"]["first_transition"]
-    assert (numbers["num_recordings"], numbers["num_onsets"]) == (2, 4)
-    assert numbers["num_false_alarms"] == 1
-    assert len(folds[0]["test"]["two_of_three"]) == 1  # those that came in are as they were
-
-
 def test_scores_are_of_all_bins_of_a_role():
     first, second = batch_of(), batch_of(onsets=(), ends=(), stretches=((1.0, 2.0),))
     never = [torch.zeros_like(batch.is_slip) for batch in (first, second)]
     parts = [
-        judged_bins(batch, batch.is_slip, {"never": none, "right": batch.is_slip})["test"]
+        evaluated_bins(batch, batch.is_slip, {"never": none, "right": batch.is_slip})["test"]
         for batch, none in zip((first, second), never, strict=True)
     ]
     scores, baselines = bin_scores(parts)
