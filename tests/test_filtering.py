@@ -1,29 +1,48 @@
+"""The filter of whole recordings, of bins, and of recordings that come in pieces."""
+
+import copy
+import json
+import pickle
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
 import oracles
 import pytest
 import torch
+from any_hands import own_kernels
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
-from tactslip_torch.signals.filtering import ChannelFilter, reach, savgol_filter
+from tactslip_torch.signals.filtering import (
+    ChannelFilter,
+    _edges_of_kernel,
+    _savgol_edges,
+    convolve_valid,
+    extended,
+    past_matrix,
+    reach,
+    savgol_filter,
+)
+from tactslip_torch.signals.stream import FilterStream, SampleClock
 
-WINDOWS = [(1, 0), (3, 1), (5, 2), (11, 1), (51, 1), (51, 3), (11, 0), (7, 6)]
-WINDOW_OF_CHANNEL = [51, 11, 51, 5]
+FRAMES = [(1, 0), (3, 1), (5, 2), (11, 1), (51, 1), (51, 3), (11, 0), (7, 6)]
+LENGTHS = [51, 11, 51, 5]
 ALIGNS = ["centred", "causal", "trailing"]
-CHOICES = [(0, 1), (2, 3), (1, 2), (0, 1, 2, 3)]
+aligned = pytest.mark.parametrize("align", ALIGNS)
 
 
-@pytest.mark.parametrize(("window", "order"), WINDOWS)
-@pytest.mark.parametrize("num_samples", [51, 52, 200, 333])
-@pytest.mark.parametrize("make", [oracles.random_bins, oracles.integer_bins])
-def test_equals_scipy(window, order, num_samples, make, rng):
-    x = make(rng, 40, num_samples)
-    actual = savgol_filter(torch.from_numpy(x), window, order)
-    oracles.assert_columns_close(actual, oracles.savgol(x, window, order))
+def recording(num_samples, seed=0):
+    return torch.from_numpy(np.random.default_rng(seed).standard_normal((4, num_samples)))
+
+
+def with_own_kernels(align="centred", lengths=(11, 1, 5, 11)):
+    return ChannelFilter(lengths, 1, align, own_kernels(ChannelFilter(lengths, 1, align)))
+
+
+# --- one frame ----------------------------------------------------------------------------------
 
 
 def causal(x, window, order=1):
@@ -36,14 +55,6 @@ def causal(x, window, order=1):
     return np.concatenate([head, rest], axis=-1)
 
 
-@pytest.mark.parametrize(("window", "order"), WINDOWS)
-@pytest.mark.parametrize("num_samples", [51, 52, 200])
-def test_causal_equals_scipys_coefficients(window, order, num_samples, rng):
-    x = oracles.random_bins(rng, 20, num_samples)
-    actual = savgol_filter(torch.from_numpy(x), window, order, "causal")
-    oracles.assert_columns_close(actual, causal(x, window, order), 1e-9)
-
-
 def trailing(x, window, order=1):
     """The centred filter half a frame late; the first half frame holds what it begins with."""
     centred, half = oracles.savgol(x, window, order), window // 2
@@ -51,289 +62,403 @@ def trailing(x, window, order=1):
     return np.concatenate([np.repeat(inside[..., :1], half, axis=-1), inside], axis=-1)
 
 
-@pytest.mark.parametrize(("window", "order"), WINDOWS)
-@pytest.mark.parametrize("num_samples", [51, 52, 200])
-def test_trailing_is_scipys_centred_filter_half_a_frame_late(window, order, num_samples, rng):
-    x = oracles.random_bins(rng, 20, num_samples)
-    actual = savgol_filter(torch.from_numpy(x), window, order, "trailing")
-    oracles.assert_columns_close(actual, trailing(x, window, order), 1e-9)
+ORACLES = {"centred": oracles.savgol, "causal": causal, "trailing": trailing}
 
 
-def test_trailing_of_order_one_is_the_mean_of_the_last_samples(rng):
-    x = oracles.random_bins(rng, 90)
-    found = savgol_filter(torch.from_numpy(x), 11, align="trailing")
-    means = [x[i - 10 : i + 1].mean() for i in range(10, 90)]
-    np.testing.assert_allclose(found[10:], means, rtol=1e-12, atol=1e-12)
+@aligned
+@pytest.mark.parametrize(("window", "order"), FRAMES)
+@pytest.mark.parametrize("num_samples", [51, 200])
+def test_equals_scipy(window, order, num_samples, align, rng):
+    tolerance = 1e-10 if align == "centred" else 1e-9
+    for make in (oracles.random_bins, oracles.integer_bins):
+        x = make(rng, 20, num_samples)
+        actual = savgol_filter(torch.from_numpy(x), window, order, align)
+        oracles.assert_columns_close(actual, ORACLES[align](x, window, order), tolerance)
 
 
-@pytest.mark.parametrize("align", ["causal", "trailing"])
-@pytest.mark.parametrize("window", [11, 51])
-def test_nothing_behind_a_sample_is_used_without_look_ahead(window, align, rng):
-    x = torch.from_numpy(oracles.random_bins(rng, 300))
-    changed = x.clone()
-    changed[200:] += 100
-    before, after = (savgol_filter(y, window, align=align) for y in (x, changed))
-    assert torch.equal(after[:200], before[:200])
-    assert (after[200] - before[200]).abs() > 1
-    changed = x.clone()
-    changed[200] += 100
-    last = savgol_filter(changed, window, align=align) - savgol_filter(x, window, align=align)
-    assert (last[:200] == 0).all()
-    assert last[200 + window - 1].abs() > 1e-3  # the frame reaches so far back
-    assert (last[200 + window :] == 0).all()
-
-
-@pytest.mark.parametrize(("window", "gain", "corner_hz"), [(11, 3.5, 200.0), (51, 3.885, 44.0)])
-def test_what_causal_lets_through_is_as_stated(window, gain, corner_hz):
-    impulse = torch.zeros(8 * window, dtype=torch.float64)
-    impulse[2 * window] = 1
-    taps = savgol_filter(impulse, window, align="causal")
-    assert float(taps.square().sum() * window) == pytest.approx(gain, abs=1e-3)
-    t = torch.arange(4000, dtype=torch.float64) / 2000.0
-    tone = torch.sin(2 * torch.pi * corner_hz * t)
-    inside = slice(200, -200)
-    passed = savgol_filter(tone, window, align="causal")[inside].std() / tone[inside].std()
-    assert 20 * torch.log10(passed) == pytest.approx(-3, abs=0.2)
-
-
-def test_default_order_is_one(rng):
-    x = oracles.random_bins(rng, 2, 60)
-    oracles.assert_columns_close(savgol_filter(torch.from_numpy(x), 11), oracles.savgol(x, 11, 1))
-
-
-@given(half=st.integers(1, 20), extra=st.integers(0, 30), seed=st.integers(0, 99), data=st.data())
-def test_equals_scipy_at_any_length(half, extra, seed, data):
+@given(half=st.integers(1, 20), extra=st.integers(0, 30), data=st.data())
+def test_equals_scipy_at_any_length(half, extra, data):
     window = 2 * half + 1
     order = data.draw(st.integers(0, min(3, window - 1)))
-    x = oracles.random_bins(np.random.default_rng(seed), 20, window + extra)
+    x = oracles.random_bins(np.random.default_rng(extra), 20, window + extra)
     actual = savgol_filter(torch.from_numpy(x), window, order)
     oracles.assert_columns_close(actual, oracles.savgol(x, window, order))
 
 
+@aligned
 @pytest.mark.parametrize("window", [11, 51])
-def test_manners(window, rng, device):
-    x = torch.from_numpy(oracles.random_bins(rng, 4, 120)).to(device)
-    oracles.assert_manners(lambda x: savgol_filter(x, window), x)
+def test_nothing_beyond_its_reach_is_used(window, align, rng):
+    x = torch.from_numpy(oracles.random_bins(rng, 300))
+    before, after = reach(window, align)
+    changed = x.clone()
+    changed[200] += 100
+    moved = savgol_filter(changed, window, align=align) - savgol_filter(x, window, align=align)
+    assert (moved[: 200 - after] == 0).all()
+    assert (moved[200 + before + 1 :] == 0).all()
+    assert moved[200 - after].abs() > 1e-3  # and it is used as far as that
+    assert moved[200 + before].abs() > 1e-3
 
 
-def test_float32_is_close_to_float64(rng):
-    x = torch.from_numpy(oracles.random_bins(rng, 3, 200))
-    actual = savgol_filter(x.float(), 51)
-    torch.testing.assert_close(actual.double(), savgol_filter(x, 51), rtol=1e-5, atol=1e-6)
-
-
-def test_gradcheck(rng):
-    x = torch.from_numpy(oracles.random_bins(rng, 2, 14)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: savgol_filter(x, 5, 2), x)
-
-
-@pytest.mark.parametrize("window", [3, 11, 51])
-@pytest.mark.parametrize("order", [1, 2])
-def test_polynomials_of_its_order_pass_unchanged(window, order):
-    t = torch.linspace(-1, 1, 120, dtype=torch.float64)
-    line = 3 + 2 * t - (4 * t**2 if order == 2 else 0)
-    torch.testing.assert_close(savgol_filter(line, window, order), line, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize(("window", "corner_hz"), [(11, 81.0), (51, 17.0)])
-def test_a_tone_at_the_stated_corner_loses_three_decibels(window, corner_hz):
+@pytest.mark.parametrize(
+    ("window", "align", "corner_hz"),
+    [(11, "centred", 81.0), (51, "centred", 17.0), (11, "causal", 200.0), (51, "causal", 44.0)],
+)
+def test_a_tone_at_the_stated_corner_loses_three_decibels(window, align, corner_hz):
     t = torch.arange(4000, dtype=torch.float64) / 2000.0
-    tone = torch.sin(2 * torch.pi * corner_hz * t)
-    inside = slice(200, -200)
-    gain = savgol_filter(tone, window)[inside].std() / tone[inside].std()
+    tone, inside = torch.sin(2 * torch.pi * corner_hz * t), slice(200, -200)
+    gain = savgol_filter(tone, window, align=align)[inside].std() / tone[inside].std()
     assert 20 * torch.log10(gain) == pytest.approx(-3, abs=0.2)
 
 
-@pytest.mark.parametrize("window", [11, 51])
-def test_nothing_beyond_half_a_window_is_used(window, rng):
-    x = torch.from_numpy(oracles.random_bins(rng, 300))
-    changed = x.clone()
-    changed[200:] += 100
-    half = window // 2
-    before, after = savgol_filter(x, window), savgol_filter(changed, window)
-    torch.testing.assert_close(after[: 200 - half], before[: 200 - half], rtol=0, atol=1e-12)
-    assert (after[200 - half] - before[200 - half]).abs() > 1e-3
-
-
-def test_constant_and_zero_and_nan():
-    torch.testing.assert_close(
-        savgol_filter(torch.full((80,), 5.0, dtype=torch.float64), 11),
-        torch.full((80,), 5.0, dtype=torch.float64),
-        rtol=1e-14,
-        atol=0,
-    )
-    assert (savgol_filter(torch.zeros(80), 51) == 0).all()
-    x = torch.zeros(80)
-    x[40] = float("nan")
-    touched = savgol_filter(x, 11).isnan()
+def test_polynomials_of_its_order_pass_unchanged_and_a_nan_reaches_as_far_as_a_frame():
+    t = torch.linspace(-1, 1, 120, dtype=torch.float64)
+    for window, order, line in ((3, 1, 3 + 2 * t), (51, 2, 3 + 2 * t - 4 * t**2), (11, 1, 0 * t)):
+        torch.testing.assert_close(savgol_filter(line, window, order), line, rtol=1e-12, atol=1e-12)
+    t[40] = torch.nan
+    touched = savgol_filter(t, 11).isnan()
     assert touched[35:46].all()
     assert touched.sum() == 11
 
 
+def test_manners(rng, device):
+    x = torch.from_numpy(oracles.random_bins(rng, 4, 120)).to(device)
+    oracles.assert_manners(lambda x: savgol_filter(x, 11), x)
+    single = savgol_filter(x.float(), 51).double()
+    torch.testing.assert_close(single, savgol_filter(x, 51), rtol=1e-5, atol=1e-6)
+    small = torch.from_numpy(oracles.random_bins(rng, 2, 14)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: savgol_filter(x, 5, 2), small)
+
+
 @pytest.mark.parametrize(
-    ("num_samples", "window", "order", "message"),
+    ("num_samples", "window", "order", "align", "message"),
     [
-        (80, 10, 1, r"odd.*10"),
-        (80, 0, 0, r"odd.*0"),
-        (80, 5, 5, r"polyorder.*5"),
-        (80, 5, -1, r"polyorder.*-1"),
-        (50, 51, 1, r"50 samples.*51"),
+        (80, 10, 1, "centred", r"odd and positive, got 10"),
+        (80, 0, 0, "centred", r"odd.*0"),
+        (80, 5, 5, "centred", r"polyorder must lie in 0\.\.4.*5"),
+        (80, 5, -1, "centred", r"polyorder.*-1"),
+        (50, 51, 1, "centred", r"50 samples.*51"),
+        (50, 11, 1, "left", r"one of centred, causal, trailing, got 'left'"),
     ],
 )
-def test_errors_name_the_value(num_samples, window, order, message):
+def test_errors_name_the_value(num_samples, window, order, align, message):
     with pytest.raises(ValueError, match=message):
-        savgol_filter(torch.zeros(num_samples), window, order)
+        savgol_filter(torch.zeros(num_samples), window, order, align)
 
 
-def test_each_channel_gets_its_own_window(rng):
-    x = oracles.random_bins(rng, 4, 160)
-    expected = np.stack([oracles.savgol(x[c], w) for c, w in enumerate(WINDOW_OF_CHANNEL)])
-    actual = ChannelFilter(WINDOW_OF_CHANNEL)(torch.from_numpy(x))
-    oracles.assert_columns_close(actual, expected)
-    quadratic = np.stack([oracles.savgol(x[c], w, 2) for c, w in enumerate(WINDOW_OF_CHANNEL)])
-    actual = ChannelFilter(WINDOW_OF_CHANNEL, polyorder=2)(torch.from_numpy(x))
-    oracles.assert_columns_close(actual, quadratic)
+# --- what was before a signal -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("num_samples", [1, 100, 101])
-def test_valid_is_the_centre_of_the_filtered_whole(num_samples, rng):
-    layer = ChannelFilter(WINDOW_OF_CHANNEL)
-    assert layer.context == 25
-    x = torch.from_numpy(oracles.random_bins(rng, 3, 4, num_samples + 50))
-    inside = slice(layer.context, layer.context + num_samples)
-    expected = np.stack(
-        [oracles.savgol(x[:, c].numpy(), w)[..., inside] for c, w in enumerate(WINDOW_OF_CHANNEL)],
-        axis=1,
-    )
-    actual = layer.valid(x)
-    assert actual.shape == (3, 4, num_samples)
-    torch.testing.assert_close(actual, torch.from_numpy(expected), rtol=1e-12, atol=1e-12)
+def with_past(x, window, order, align):
+    return torch.cat([x[0] + past_matrix(window, order, align) @ (x[:window] - x[0]), x])
 
 
-@pytest.mark.parametrize("num_samples", [1, 100, 101])
+@aligned
+@pytest.mark.parametrize(("window", "order"), [*FRAMES, (1, 3), (3, 2), (5, 4), (11, 3), (51, 2)])
+def test_the_plain_filter_of_past_and_signal_is_the_filter(window, order, align, rng):
+    x = torch.from_numpy(rng.standard_normal(120) + rng.uniform(-5, 5))
+    edges, after = _savgol_edges(window, order, align), reach(window, align)[1]
+    ours = convolve_valid(with_past(x, window, order, align), edges.kernel)
+    expected = savgol_filter(x, window, order, align)[: 120 - after]
+    torch.testing.assert_close(ours, expected, rtol=0, atol=1e-11)
+    still = torch.full((60,), 0.1, dtype=torch.float64)  # a constant was the same before
+    assert (with_past(still, window, order, align) == 0.1).all()
+    if window > 1 and order < 3:  # and any kernel's edges are, with these weights, these
+        for own, exact in zip(
+            _edges_of_kernel(edges.kernel.tolist(), order, align), edges, strict=True
+        ):
+            torch.testing.assert_close(own, exact, rtol=0, atol=1e-11)
+
+
+@aligned
+def test_a_hole_in_the_first_frame_is_in_all_of_the_past_and_a_later_one_in_none(align):
+    x = torch.arange(60, dtype=torch.float64)
+    x[51] = torch.nan
+    assert with_past(x, 51, 1, align)[:-60].isfinite().all()
+    x[7] = torch.inf
+    assert not with_past(x, 51, 1, align)[:-60].isfinite().any()
+
+
+# --- a frame for every channel ------------------------------------------------------------------
+
+
+@aligned
 @pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize(("align", "oracle"), [("causal", causal), ("trailing", trailing)])
-def test_valid_without_look_ahead_is_the_end_of_the_filtered_whole(
-    num_samples, order, align, oracle, rng
+@pytest.mark.parametrize("num_samples", [1, 100, 101])
+def test_each_channel_gets_its_own_frame_and_bins_are_parts_of_the_whole(
+    num_samples, order, align, rng
 ):
-    layer = ChannelFilter(WINDOW_OF_CHANNEL, order, align)
-    assert (layer.context_before, layer.context_after, layer.context) == (50, 0, 25)
-    assert layer.reaches == ((50, 0), (10, 0), (50, 0), (4, 0))
+    layer = ChannelFilter(LENGTHS, order, align)
+    before, after = (25, 25) if align == "centred" else (50, 0)
+    assert (layer.context_before, layer.context_after, layer.context) == (before, after, 25)
     x = oracles.random_bins(rng, 3, 4, 20 + 50 + num_samples)  # 20 samples that nobody needs
-    expected = np.stack(
-        [oracle(x[:, c], w, order)[:, 70:] for c, w in enumerate(WINDOW_OF_CHANNEL)], axis=1
-    )
-    actual = layer.valid(torch.from_numpy(x[..., 20:].copy()))
-    np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-9)
-    whole = layer(torch.from_numpy(x))
-    np.testing.assert_allclose(whole[..., 70:], expected, rtol=1e-9, atol=1e-9)
-
-
-def test_valid_keeps_its_matrices_to_itself(rng):
-    layer = ChannelFilter(WINDOW_OF_CHANNEL)
-    x = torch.from_numpy(oracles.random_bins(rng, 4, 150))
-    with torch.inference_mode():
-        first = layer.valid(x)
-    wanting = x.clone().requires_grad_()
-    again = layer.valid(wanting)
-    again.sum().backward()
-    torch.testing.assert_close(first, again, rtol=1e-13, atol=1e-13)
-    assert layer.valid(x.float()).dtype == torch.float32
-    assert layer.valid(x[:, :149]).shape == (4, 99)
-    assert torch.equal(layer.valid(x), first)
-    assert layer.state_dict() == {}
+    expected = np.stack([ORACLES[align](x[:, c], w, order) for c, w in enumerate(LENGTHS)], 1)
+    np.testing.assert_allclose(layer(torch.from_numpy(x)), expected, rtol=1e-9, atol=1e-9)
+    bins = layer.valid(torch.from_numpy(x[..., 20:].copy()))
+    assert bins.shape == (3, 4, num_samples)
+    inside = expected[..., 20 + before : 20 + before + num_samples]
+    np.testing.assert_allclose(bins, inside, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("channels", [None, (1, 2), (3,), (0, 1, 2, 3)])
-@pytest.mark.parametrize("align", ALIGNS)
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_few_bins_are_filtered_as_many_are(channels, align, dtype, rng):
-    x = torch.from_numpy(oracles.random_bins(rng, 9, 4, 150)).to(dtype)
+@aligned
+def test_few_bins_are_filtered_as_many_are_and_only_where_it_is_wanted(channels, align, rng):
+    """The others come back as their largest magnitude, which shows what is not finite."""
+    x = torch.from_numpy(oracles.random_bins(rng, 9, 4, 150))
     x[0, 1, 40] = torch.nan
     x[1, 0, 0 if align == "centred" else 149] = torch.inf
     x[2, 3, 75] = -torch.inf
-    layer = ChannelFilter(WINDOW_OF_CHANNEL, align=align)
-    many = layer.valid(x, channels)
-    for few in (x[:1], x[:4], x[2], x.flip(-1)[:4].flip(-1)):
-        found = layer.valid(few, channels)
+    layer = ChannelFilter(LENGTHS, align=align)
+    whole, many = layer.valid(x), layer.valid(x, channels)
+    assert whole[0, 1].isnan().all()
+    for channel, (before, after) in enumerate(layer.reaches):
+        if channel in (channels or range(4)):
+            torch.testing.assert_close(many[:, channel], whole[:, channel], equal_nan=True)
+        else:
+            start = layer.context_before - before
+            frame = x[:, channel, start : start + before + 100 + after].abs()
+            assert torch.equal(
+                many[:, channel].nan_to_num(), frame.amax(-1, True).nan_to_num().expand(9, 100)
+            )
+    for few in (x[:1], x[:4], x[2]):
         wanted = many[2] if few.ndim == 2 else many[: len(few)]
-        assert found.dtype == dtype
-        close = 1e-5 if dtype == torch.float32 else 1e-13
-        torch.testing.assert_close(found, wanted, rtol=close, atol=close, equal_nan=True)
+        for dtype, close in ((torch.float64, 1e-13), (torch.float32, 1e-4)):
+            ours = layer.valid(few.to(dtype), channels)
+            assert ours.dtype == dtype
+            torch.testing.assert_close(
+                ours.double(), wanted, rtol=close, atol=close, equal_nan=True
+            )
 
 
-@pytest.mark.parametrize("align", ALIGNS)
+@aligned
 def test_channel_filter_manners(align, rng, device):
     x = torch.from_numpy(oracles.random_bins(rng, 2, 4, 160)).to(device)
-    layer = ChannelFilter(WINDOW_OF_CHANNEL, align=align).to(device)
+    layer = ChannelFilter(LENGTHS, align=align).to(device)
     oracles.assert_manners(layer, x, num_axes=2)
     oracles.assert_manners(layer.valid, x, num_axes=2)
-    assert torch.autograd.gradcheck(
-        ChannelFilter([3, 5], align=align),
-        torch.randn(2, 9, dtype=torch.float64, requires_grad=True),
-    )
+    small = torch.randn(2, 9, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(ChannelFilter([3, 5], align=align), small)
+    with torch.inference_mode():
+        first = layer.valid(x)
+    again = layer.valid(x.clone().requires_grad_())
+    again.sum().backward()  # the matrix that was made in inference mode does
+    torch.testing.assert_close(first, again, rtol=1e-13, atol=1e-13)
+    assert layer.state_dict() == {}
+
+
+def test_a_frame_of_one_sample_leaves_a_signal_as_it_is():
+    x = torch.tensor([1.0, -0.0, 3.0, torch.nan, torch.inf], dtype=torch.float64)
+    ours = savgol_filter(x, 1)
+    assert ours.numpy().tobytes() == x.numpy().tobytes()
+    assert ours.data_ptr() != x.data_ptr()
+    whole = recording(40)
+    layer = ChannelFilter([1, 5, 1, 1])
+    assert torch.equal(layer(whole)[[0, 2]], whole[[0, 2]])
+    assert torch.equal(layer.valid(whole)[[0, 2]], whole[[0, 2], 2:38])
 
 
 def test_channel_filter_errors():
-    layer = ChannelFilter(WINDOW_OF_CHANNEL)
-    with pytest.raises(ValueError, match=r"4.*\(3, 100\)"):
-        layer(torch.zeros(3, 100))
-    with pytest.raises(ValueError, match=r"4.*\(3, 100\)"):
-        layer.valid(torch.zeros(3, 100))
+    layer = ChannelFilter(LENGTHS)
+    for call in (layer, layer.valid):
+        with pytest.raises(ValueError, match=r"4.*\(3, 100\)"):
+            call(torch.zeros(3, 100))
     with pytest.raises(ValueError, match=r"25 samples of context before and 25 behind.* 50"):
         layer.valid(torch.zeros(4, 50))
-    for align in ("causal", "trailing"):
-        with pytest.raises(ValueError, match=r"50 samples of context before and 0 behind.* 50"):
-            ChannelFilter(WINDOW_OF_CHANNEL, align=align).valid(torch.zeros(4, 50))
-    with pytest.raises(ValueError, match=r"centred, causal, trailing, got 'left'"):
-        ChannelFilter([11], align="left")
-    with pytest.raises(ValueError, match=r"centred, causal, trailing, got 'left'"):
-        reach(11, "left")
-    with pytest.raises(ValueError, match=r"50 samples.*51"):
-        layer(torch.zeros(4, 50))
+    with pytest.raises(ValueError, match=r"50 samples of context before and 0 behind.* 50"):
+        ChannelFilter(LENGTHS, align="causal").valid(torch.zeros(4, 50))
+    for call in (layer, lambda x: extended(x, layer)):
+        with pytest.raises(ValueError, match=r"50 samples.*51"):
+            call(torch.zeros(4, 50))
     with pytest.raises(ValueError, match=r"odd.*10"):
         ChannelFilter([11, 10])
-
-
-@pytest.mark.parametrize("align", ALIGNS)
-def test_only_the_channels_wanted_are_filtered(align, rng):
-    """The others come back as their largest magnitude, which shows what is not finite."""
-    smooth = ChannelFilter([51, 51, 11, 11], align=align)
-    samples = torch.from_numpy(rng.standard_normal((3, 4, 150)))
-    samples[1, 0, 60] = torch.nan
-    samples[2, 3, 80] = -torch.inf
-    whole, part = smooth.valid(samples), smooth.valid(samples, {1, 2})
-    torch.testing.assert_close(part[:, 1:3], whole[:, 1:3], rtol=1e-13, atol=1e-14)
-    start = smooth.context_before - smooth.reaches[3][0]
-    in_frame = samples[0, 3, start : start + 110].abs().max()
-    assert (part[0, 3] == in_frame).all()
-    assert part[1, 0].isnan().all()
-    assert (part[2, 3] == torch.inf).all()
 
 
 def test_threads_share_a_filter(rng):
     """Each asks for other channels first; the interpreter changes threads as often as it can."""
     samples = torch.from_numpy(rng.standard_normal((1, 4, 150)))
-    expected = {
-        wanted: ChannelFilter([51, 51, 11, 11]).valid(samples, wanted) for wanted in CHOICES
-    }
+    choices = [(0, 1), (2, 3), (1, 2), (0, 1, 2, 3)]
+    expected = {wanted: ChannelFilter(LENGTHS).valid(samples, wanted) for wanted in choices}
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     try:
         with ThreadPoolExecutor(4) as pool:
-            for _ in range(100):
-                smooth = ChannelFilter([51, 51, 11, 11])
-                tasks = [(w, pool.submit(smooth.valid, samples, w)) for w in CHOICES * 4]
+            for _ in range(50):
+                layer = ChannelFilter(LENGTHS)
+                tasks = [(w, pool.submit(layer.valid, samples, w)) for w in choices * 4]
                 for wanted, task in tasks:
                     torch.testing.assert_close(task.result(), expected[wanted])
     finally:
         sys.setswitchinterval(before)
 
 
-@pytest.mark.parametrize("align", ALIGNS)
-def test_a_recording_is_filtered_in_the_channels_wanted_alone(align, rng):
-    samples = torch.from_numpy(rng.standard_normal((3, 4, 40)))
-    smooth = ChannelFilter([51, 11, 51, 11], align=align)
-    found = smooth(samples, {1, 3})  # the frames of the others would not fit
-    assert torch.equal(found[:, [0, 2]], samples[:, [0, 2]])
-    assert torch.equal(found[:, [1, 3]], savgol_filter(samples[:, [1, 3]], 11, align=align))
+# --- kernels of one's own -----------------------------------------------------------------------
+
+
+@aligned
+def test_own_kernels_are_convolutions_that_keep_constants_and_come_back(align):
+    layer, x = with_own_kernels(align), recording(80)
+    ours = layer(x)
+    for channel, (before, after) in enumerate(layer.reaches):
+        expected = np.convolve(x[channel], layer.kernel(channel).flip(0), mode="valid")
+        inside = ours[channel, before : 80 - after].numpy()
+        np.testing.assert_allclose(inside, expected, rtol=0, atol=1e-13)
+    assert not torch.allclose(ours, ChannelFilter(layer.window_lengths, align=align)(x))
+    still = torch.full((4, 40), 3.0, dtype=torch.float64)
+    torch.testing.assert_close(layer(still), still)
+    again = ChannelFilter(**json.loads(json.dumps(layer.config())))
+    assert again.config() == layer.config()
+    assert torch.equal(again(x), ours)
+    assert set(ChannelFilter([3]).config()) == {"window_lengths", "polyorder", "align"}
+
+
+@aligned
+@pytest.mark.parametrize("num_samples", [11, 80])
+def test_bins_of_an_extended_recording_are_the_recording_filtered_whole(align, num_samples):
+    own, x = with_own_kernels(align), recording(num_samples)
+    plain = ChannelFilter(own.window_lengths, align=align)
+    whole = extended(x, plain)
+    assert torch.equal(whole[:, own.context_before : own.context_before + num_samples], x)
+    for layer in (own, plain):
+        torch.testing.assert_close(layer.valid(whole), layer(x), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kernels", "message"),
+    [
+        ({7: [1 / 7] * 7}, r"a kernel of 7 samples fits none of the frames \[5, 11\]"),
+        ({1: [1.0]}, "a kernel of 1 samples fits none"),
+        ({5: [0.25] * 4}, "a frame of 5 samples needs as many weights, got 4"),
+        ({5: [0.25] * 5}, r"must be finite and sum to 1, got 1\.25; divide"),
+        ({5: [float("nan")] + [0.25] * 4}, "must be finite and sum to 1, got nan"),
+    ],
+)
+def test_what_is_no_kernel_is_refused_in_one_line(kernels, message):
+    with pytest.raises(ValueError, match=message) as error:
+        ChannelFilter([11, 1, 5, 11], kernels=kernels)
+    assert "\n" not in str(error.value)
+
+
+# --- in pieces ----------------------------------------------------------------------------------
+
+
+def in_pieces(stream, samples, cuts):
+    places = [0, *sorted(min(cut, samples.shape[-1]) for cut in cuts), samples.shape[-1]]
+    pieces = [stream.push(samples[:, a:b]) for a, b in pairwise(places)]
+    return torch.cat([*pieces, stream.flush()], dim=-1)
+
+
+WANTED = [None, (1,), (1, 3), (0, 3), (0, 1, 2, 3)]
+
+
+@given(
+    num_samples=st.integers(51, 300),
+    cuts=st.lists(st.integers(0, 300), max_size=40),
+    frames=st.sampled_from(
+        [(LENGTHS, 1), (LENGTHS, 3), ([51, 1, 7, 1], 0), ([1, 1, 1, 1], 0), None]
+    ),
+    align=st.sampled_from(ALIGNS),
+    dtype=st.sampled_from([torch.float64, torch.float32]),
+    wanted=st.sampled_from(WANTED),
+)
+def test_any_cut_gives_the_recording_filtered_whole(
+    num_samples, cuts, frames, align, dtype, wanted
+):
+    layer = ChannelFilter(*frames, align) if frames else with_own_kernels(align)
+    samples = recording(num_samples).to(dtype)
+    ours, whole = (
+        in_pieces(FilterStream(layer, dtype, wanted), samples, cuts),
+        layer(samples, wanted),
+    )
+    assert ours.dtype == dtype
+    inside = slice(layer.context_before, num_samples - layer.context_after)
+    assert torch.equal(ours[:, inside], whole[:, inside])
+    close = 1e-12 if dtype == torch.float64 else 1e-5
+    torch.testing.assert_close(ours, whole, rtol=close, atol=close)
+
+
+@aligned
+@pytest.mark.parametrize("wanted", WANTED)
+def test_a_sample_is_handed_on_as_soon_as_its_look_ahead_has_come(align, wanted):
+    stream = FilterStream(ChannelFilter(LENGTHS, align=align), channels=wanted)
+    longest = max(LENGTHS[c] for c in (wanted or range(4)))
+    assert stream.frame == longest
+    assert stream.look_ahead == (longest // 2 if align == "centred" else 0)
+    settled = 0
+    for num in range(1, 120):
+        settled += stream.push(recording(1)).shape[-1]
+        assert settled == (0 if num < longest else num - stream.look_ahead)
+    assert settled + stream.flush().shape[-1] == 119
+
+
+@aligned
+def test_samples_to_come_change_nothing_before_and_a_nan_no_more_than_its_frame(align):
+    layer = ChannelFilter(LENGTHS, align=align)
+    one, other = recording(200, 1), recording(200, 1)
+    other[:, 120:] = torch.nan
+    settled = []
+    for samples in (one, other):
+        stream = FilterStream(layer)
+        settled.append(torch.cat([stream.push(piece) for piece in samples.split(40, -1)][:3], -1))
+    assert settled[0].shape[-1] == 120 - stream.look_ahead
+    assert torch.equal(*settled)
+    one[0, 100], one[1, 100] = torch.nan, torch.inf
+    is_bad = ~in_pieces(FilterStream(layer), one, range(0, 200, 7)).isfinite()
+    assert is_bad.sum(-1).tolist() == [51, 11, 0, 0]
+
+
+def test_what_was_pushed_may_be_overwritten_and_no_more_than_a_frame_is_remembered():
+    stream, samples = FilterStream(ChannelFilter(LENGTHS)), recording(200)
+    buffer, pieces = torch.empty(4, 10, dtype=torch.float64), []
+    for piece in samples.split(10, dim=-1):
+        pieces.append(stream.push(buffer.copy_(piece)))
+        buffer.fill_(torch.nan)
+    ours = torch.cat([*pieces, stream.flush()], dim=-1)
+    torch.testing.assert_close(ours, ChannelFilter(LENGTHS)(samples), rtol=1e-12, atol=1e-12)
+    for num in (3, 4000, 1, 0, 500):
+        stream.push(recording(num))
+        assert stream.num_bytes <= 4 * 51 * 8
+    assert stream.num_pushed == 4504
+
+
+@pytest.mark.parametrize("end", ["reset", "flush"])
+def test_a_stream_begins_again_and_a_copy_goes_on_by_itself(end):
+    stream, samples = FilterStream(ChannelFilter(LENGTHS)), recording(200)
+    stream.push(recording(123, 5))
+    getattr(stream, end)()
+    assert stream.num_pushed == 0
+    stream.push(samples[:, :77])
+    twins = [copy.deepcopy(stream), pickle.loads(pickle.dumps(stream))]
+    ours = [torch.cat([s.push(samples[:, 77:]), s.flush()], -1) for s in (stream, *twins)]
+    whole = ChannelFilter(LENGTHS)(samples)
+    for rest in ours:
+        torch.testing.assert_close(rest, whole[:, 77 - 25 :], rtol=1e-12, atol=1e-12)
+    stream.push(samples[:, :50])  # shorter than a frame: no samples
+    assert stream.flush().shape == (4, 0)
+
+
+def test_errors_of_a_stream_are_one_line_and_change_nothing():
+    stream = FilterStream(ChannelFilter(LENGTHS))
+    stream.push(recording(60))
+    for shape in ((3, 10), (10,), (2, 4, 10)):
+        with pytest.raises(ValueError, match=r"^expected samples \[4, n\].*got \(.*\)$"):
+            stream.push(torch.zeros(shape))
+    assert stream.num_pushed == 60
+    with pytest.raises(ValueError, match=r"float32 or float64, got torch.float16"):
+        FilterStream(ChannelFilter(LENGTHS), torch.float16)
+    with pytest.raises(ValueError, match=r"no channel is wanted"):
+        FilterStream(ChannelFilter(LENGTHS), channels=[])
+
+
+def test_a_clock_is_exact_after_months():
+    """Whole numbers are counted; a float that adds half a millisecond at a time would be off."""
+    clock, month = SampleClock(2000.0), 30 * 24 * 3600 * 2000
+    none = np.zeros(0, np.int64), np.zeros(0)
+    for num in (1, month, 7):
+        clock.take(num, *none)
+    assert clock.end_s(np.array([month + 8]))[0] == (month + 8) / 2000
+    clock.take(3, np.array([0]), np.array([1.7e9]))
+    clock.take(month, *none)
+    assert clock.missing(np.array([1.7e9 + 1.5e-3 + month / 2000])).tolist() == [0]
+    assert clock.missing(np.array([1.7e9 + 2.5e-3 + month / 2000])).tolist() == [2]
+    with pytest.raises(ValueError, match=r"goes back: sample 0 .* 1 samples before its turn"):
+        clock.missing(np.array([1.7e9 + 1e-3 + month / 2000]))
+    assert clock.num_samples == 2 * month + 11

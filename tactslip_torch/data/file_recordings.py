@@ -61,7 +61,7 @@ from tactslip_torch.data.manifest import (
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.hand import KNOWN_KINDS, Adapting, Channel, HandLayout
 from tactslip_torch.runtime import in_processes, whole_file
-from tactslip_torch.signals.resampling import MOST_CUT_S, resample
+from tactslip_torch.signals.resampling import resample
 
 
 def file_digest(path: Path) -> str:
@@ -710,6 +710,7 @@ BEFORE_ONSET_S = 1.01
 """What ``labels=whole_slide`` takes as non-slip before an onset."""
 _PATIENCE_S = 2.0  # what takes longer is done by several processes, and not again
 _ROUNDING = 1e-9
+_MOST_CUT_S = 0.1  # by so much may files that belong together end apart
 
 
 @dataclass(frozen=True)
@@ -831,7 +832,7 @@ def _timed(plan: Plan, entry: Entry, parts: tuple[Part, ...]) -> tuple[Surveyed,
             wrong.append(str(error).removeprefix("it: "))
     ends_s = [how.num_recorded(part) / (how.resample_hz or part.rate_hz) for part in parts]
     duration_s = min(ends_s)
-    if max(ends_s) - duration_s > MOST_CUT_S:
+    if max(ends_s) - duration_s > _MOST_CUT_S:
         wrong.append(
             f"its streams last {duration_s:.4g} to {max(ends_s):.4g} s; cut the longer one"
         )

@@ -345,7 +345,7 @@ class SlipDetector(nn.Module):
         metadata = {
             "channels": self.pool.hand.to_rows(),
             "pool": self.pool.facts(),
-            **self.channel_filter.facts(),
+            **self.channel_filter.config(),
             "selected": list(self.selected),
             "pooling": None if self.pooling is None else self.pooling.to_dict(),
             "kernel": self.head.kernel.to_dict() if isinstance(self.head, KernelSum) else None,

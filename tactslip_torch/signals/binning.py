@@ -8,37 +8,6 @@ import torch
 from torch import Tensor
 
 
-def split_bins(x: Tensor, bin_samples: int, hop_samples: int | None = None) -> Tensor:
-    """Cut a recording into bins from its first sample on; a rest shorter than a bin is dropped.
-
-    Args:
-        x: filtered channels.
-        bin_samples: length of a bin; 100 in the paper (50 ms at 2 kHz).
-        hop_samples: distance between the starts of two bins. ``None`` is ``bin_samples``, the
-            paper's choice of no overlap; a shorter hop is ours.
-
-    Shape:
-        - x: ``[*, C, T]``
-        - output: ``[*, N, C, bin_samples]``, a copy
-
-    Raises:
-        ValueError: if bin or hop is not positive or no whole bin fits.
-
-    Example:
-        >>> split_bins(torch.arange(7.0).reshape(1, 7), 3).squeeze(1)
-        tensor([[0., 1., 2.],
-                [3., 4., 5.]])
-    """
-    hop = bin_samples if hop_samples is None else hop_samples
-    if bin_samples < 1 or hop < 1:
-        raise ValueError(
-            f"bin_samples and hop_samples must be positive, got {bin_samples} and {hop_samples}"
-        )
-    if x.shape[-1] < bin_samples:
-        raise ValueError(f"no bin of {bin_samples} samples fits into {x.shape[-1]} samples")
-    return x.unfold(-1, bin_samples, hop).movedim(-2, -3).contiguous()
-
-
 def bins_at(x: Tensor, starts: Tensor, bin_samples: int) -> Tensor:
     """The bins that begin at given samples.
 

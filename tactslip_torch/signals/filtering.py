@@ -1,12 +1,13 @@
 """The Savitzky-Golay filter of a hand, the first step (paper IV-B, REFERENCE.md section 2).
 
-Order 1 is a moving average: -3 dB at 81 Hz for the 11-sample frame of the films and at 17 Hz for
-the 51-sample frame of the gauges. Where in its frame a sample lies is a choice of noise and delay.
-Centred, it looks half a frame ahead: 2.5 ms and 12.5 ms. Causal (ours), the polynomial of the frame
-behind a sample is evaluated at that sample, the frame's last: no look-ahead, but at order 1 nearly
-four times the variance of white noise comes through, some tones below the corner are raised by a
-third, and the corners move to 200 Hz and 44 Hz. Trailing (ours), a sample gets what the sample half
-a frame before it gets if centred: no look-ahead and no more noise, but half a frame late.
+Order 1 is a moving average: -3 dB at 81 Hz for the 11-sample frame of the PVDF channels and at
+17 Hz for the 51-sample frame of the SG channels. Where in its frame a sample lies is a choice of
+noise and delay. Centred, it looks half a frame ahead: 2.5 ms and 12.5 ms. Causal (ours), the
+polynomial of the frame behind a sample is evaluated at that sample, the frame's last: no
+look-ahead, but at order 1 nearly four times the variance of white noise comes through, some tones
+below the corner are raised by a third, and the corners move to 200 Hz and 44 Hz. Trailing (ours), a
+sample gets what the sample half a frame before it gets if centred: no look-ahead and no more noise,
+but half a frame late.
 
 ``savgol_filter`` is the filter of one frame; ``ChannelFilter`` has a frame of its own for every
 channel, of whole recordings and of bins, with Savitzky-Golay's weights or others.
@@ -15,7 +16,7 @@ channel, of whole recordings and of bins, with Savitzky-Golay's weights or other
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -29,8 +30,56 @@ Align = Literal["centred", "causal", "trailing"]
 ``"centred"``: the middle of the frame around it; ``"causal"``: the end of the frame behind it;
 ``"trailing"``: the middle of the frame behind it.
 """
-Edges = tuple[Tensor, Tensor, Tensor]
-"""Head, kernel and tail of a filter: see ``edge_matrices``."""
+
+
+class Edges(NamedTuple):
+    """What makes the first samples of a signal, those in between and its last ones; float64.
+
+    Args:
+        head: of the first frame, the samples before the first whole one, ``[before, W]``.
+        kernel: of its own frame, any sample, ``[W]``.
+        tail: of the last frame, the samples behind the last whole one, ``[after, W]``.
+    """
+
+    head: Tensor
+    kernel: Tensor
+    tail: Tensor
+
+    def filtered(self, x: Tensor) -> Tensor:
+        """A whole signal ``[*, T]`` filtered.
+
+        Raises:
+            ValueError: if the signal is shorter than the kernel.
+        """
+        head, kernel, tail = (matrix.to(x) for matrix in self)
+        _check_length(x, len(kernel))
+        if len(kernel) == 1:
+            return x.clone()
+        first, last = x[..., : len(kernel)] @ head.T, x[..., -len(kernel) :] @ tail.T
+        return torch.cat([first, convolve_valid(x, kernel), last], dim=-1)
+
+
+def _check_length(x: Tensor, window_length: int) -> None:
+    if x.shape[-1] < window_length:
+        raise ValueError(
+            f"a signal of {x.shape[-1]} samples is shorter than window_length {window_length}"
+        )
+
+
+def reach(window_length: int, align: Align) -> tuple[int, int]:
+    """Samples before and after its own that a filtered sample is made of.
+
+    Raises:
+        ValueError: if the alignment is unknown.
+
+    Example:
+        >>> reach(51, "centred"), reach(51, "causal"), reach(51, "trailing")
+        ((25, 25), (50, 0), (50, 0))
+    """
+    if align not in get_args(Align):
+        raise ValueError(f"align must be one of {', '.join(get_args(Align))}, got {align!r}")
+    half = window_length // 2
+    return (half, half) if align == "centred" else (2 * half, 0)
 
 
 def _fit_matrix(window_length: int, polyorder: int) -> Tensor:
@@ -60,17 +109,8 @@ def _fit_matrix(window_length: int, polyorder: int) -> Tensor:
     return basis @ basis.T
 
 
-def edge_matrices(window_length: int, polyorder: int, align: Align) -> Edges:
-    """What makes the first samples, one in between, and the last ones, from a frame each.
-
-    Returns:
-        ``head``, of the first frame the samples before the first whole one; ``kernel``, of its own
-        frame any sample; ``tail``, of the last frame the samples behind the last whole one.
-
-    Shape:
-        - head: ``[before, window_length]``, float64, with ``before, after`` of ``reach``
-        - kernel: ``[window_length]``
-        - tail: ``[after, window_length]``
+def _savgol_edges(window_length: int, polyorder: int, align: Align) -> Edges:
+    """The polynomial of the first frame, of a frame of its own, and of the last frame.
 
     Raises:
         ValueError: if the frame is even or does not exceed the order, or the alignment is unknown.
@@ -79,7 +119,7 @@ def edge_matrices(window_length: int, polyorder: int, align: Align) -> Edges:
     before, after = reach(window_length, align)
     late = window_length // 2 if align == "trailing" else 0
     place = (torch.arange(before + 1) - late).clamp(min=0)  # of a sample in the polynomial
-    return fit[place[:before]], fit[place[before]], fit[window_length - after :]
+    return Edges(fit[place[:before]], fit[place[before]], fit[window_length - after :])
 
 
 def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
@@ -94,7 +134,7 @@ def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
           rows sum to 1
 
     Raises:
-        ValueError: as ``edge_matrices``.
+        ValueError: if the frame is even or does not exceed the order, or the alignment is unknown.
 
     Example:
         >>> x = torch.tensor([0.0, 2.0, 4.0], dtype=torch.float64)
@@ -102,7 +142,7 @@ def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
         >>> past.round(decimals=9)
         tensor([-2.], dtype=torch.float64)
     """
-    head, kernel, _ = edge_matrices(window_length, polyorder, align)
+    head, kernel, _ = _savgol_edges(window_length, polyorder, align)
     before = len(head)
     if polyorder >= window_length - 1:  # goes through all samples: nothing is smoothed
         return torch.eye(window_length, dtype=torch.float64)[:1].repeat(before, 1)
@@ -112,6 +152,31 @@ def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
     past, known = rows[:, :before], rows[:, before:]
     solution: Tensor = torch.linalg.lstsq(past, head - known, driver="gelsd").solution
     return solution
+
+
+def _future_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
+    """Samples behind a signal, of its last frame: the mirror image of its past if centred."""
+    past = past_matrix(window_length, polyorder, align)
+    return past.flip(0, 1) if align == "centred" else past[:0]
+
+
+def _edges_of_kernel(weights: Sequence[float], polyorder: int, align: Align) -> Edges:
+    """Edges of any kernel, none of Savitzky-Golay's, in such a filter's frame.
+
+    Samples whose frame would leave the signal need more of it. In front it is the made-up past of
+    ``past_matrix``, under which the Savitzky-Golay filter is one thing from end to end; behind,
+    where a centred frame looks ahead, its mirror image. The kernel goes over that as over anything
+    else, so it gives what the Savitzky-Golay filter gives if it has its weights, and a detector in
+    a graph, which begins with the same past, what the whole recording gives. For causal and
+    trailing frames of order 2 and more the weights of the past are large, and the first samples of
+    a signal are as loud.
+    """
+    kernel = torch.tensor(weights, dtype=torch.float64)
+    frame = torch.eye(len(kernel), dtype=torch.float64)
+    past = past_matrix(len(kernel), polyorder, align)
+    future = _future_matrix(len(kernel), polyorder, align)
+    before, after = torch.cat([past, frame[:-1]]), torch.cat([frame[1:], future])
+    return Edges(convolve_valid(before.T, kernel).T, kernel, convolve_valid(after.T, kernel).T)
 
 
 def savgol_filter(
@@ -148,44 +213,7 @@ def savgol_filter(
         >>> savgol_filter(torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0]), 3, align="trailing")
         tensor([-0.5000, -0.5000,  1.0000,  1.0000,  1.0000])
     """
-    return _filter_by(x, edge_matrices(window_length, polyorder, align))
-
-
-def _filter_by(x: Tensor, edges: Edges) -> Tensor:
-    """Filter along the last axis by head, kernel and tail.
-
-    Shape:
-        - x, output: ``[*, T]``, with ``T`` at least the kernel's length
-
-    Raises:
-        ValueError: if the signal is shorter than the kernel.
-    """
-    head, kernel, tail = (part.to(x) for part in edges)
-    window_length = len(kernel)
-    if x.shape[-1] < window_length:
-        raise ValueError(
-            f"a signal of {x.shape[-1]} samples is shorter than window_length {window_length}"
-        )
-    if window_length == 1:
-        return x.clone()
-    first, last = x[..., :window_length] @ head.T, x[..., -window_length:] @ tail.T
-    return torch.cat([first, convolve_valid(x, kernel), last], dim=-1)
-
-
-def reach(window_length: int, align: Align) -> tuple[int, int]:
-    """Samples before and after its own that a filtered sample is made of.
-
-    Raises:
-        ValueError: if the alignment is unknown.
-
-    Example:
-        >>> reach(51, "centred"), reach(51, "causal"), reach(51, "trailing")
-        ((25, 25), (50, 0), (50, 0))
-    """
-    if align not in get_args(Align):
-        raise ValueError(f"align must be one of {', '.join(get_args(Align))}, got {align!r}")
-    half = window_length // 2
-    return (half, half) if align == "centred" else (2 * half, 0)
+    return _savgol_edges(window_length, polyorder, align).filtered(x)
 
 
 def convolve_valid(x: Tensor, kernel: Tensor) -> Tensor:
@@ -216,58 +244,10 @@ def overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
     return padded.unfold(0, num_kept + len(kernel) - 1, 1).flip(0).T
 
 
-_TOLERANCE = 1e-9
-
-
-def _around(window_length: int, polyorder: int, align: Align) -> tuple[Tensor, Tensor]:
-    """What was before a signal, of its first frame, and what comes behind it, of its last.
-
-    Shape:
-        - past: ``[before, window_length]``, float64, with ``before, after`` of ``reach``
-        - future: ``[after, window_length]``
-
-    Raises:
-        ValueError: as ``edge_matrices``.
-    """
-    past = past_matrix(window_length, polyorder, align)
-    _, after = reach(window_length, align)
-    future = past.flip(0, 1) if after else past[:0]
-    return past, future
-
-
-def _edges_by(kernel: Tensor, polyorder: int, align: Align) -> Edges:
-    """``edge_matrices`` of any kernel, none of Savitzky-Golay's, in such a filter's frame.
-
-    Samples whose frame would leave the signal need more of it. In front it is the made-up past of
-    ``past_matrix``, under which the Savitzky-Golay filter is one thing from end to end; behind,
-    where a centred frame looks ahead, its mirror image. The kernel goes over that as over anything
-    else, so it gives what the Savitzky-Golay filter gives if it has its weights, and a detector in
-    a graph, which begins with the same past, what the whole recording gives. For causal and
-    trailing frames of order 2 and more the weights of the past are large, and the first samples of
-    a signal are as loud.
-
-    Shape:
-        - kernel: ``[W]``
-        - output: head ``[before, W]``, the kernel, tail ``[after, W]``, in the kernel's dtype
-
-    Raises:
-        ValueError: as ``edge_matrices``.
-    """
-    length = len(kernel)
-    past, future = (part.to(kernel) for part in _around(length, polyorder, align))
-    whole = torch.eye(length, dtype=kernel.dtype, device=kernel.device)
-    nothing = kernel.new_zeros(0, length)
-    head = (
-        overlap_matrix(kernel, len(past)).T @ torch.cat([past, whole[:-1]])
-        if len(past)
-        else nothing
-    )
-    tail = (
-        overlap_matrix(kernel, len(future)).T @ torch.cat([whole[1:], future])
-        if len(future)
-        else nothing
-    )
-    return head, kernel, tail
+def as_index(channels: Sequence[int]) -> slice | list[int]:
+    """The same channels, so that they are looked up without a copy if they are neighbours."""
+    first, last = channels[0], channels[-1]
+    return slice(first, last + 1) if last - first + 1 == len(channels) else list(channels)
 
 
 def _checked_kernels(
@@ -278,29 +258,42 @@ def _checked_kernels(
     Raises:
         ValueError: if a kernel is of no frame, of another length, not finite, or does not sum to 1.
     """
-    checked = dict[int, tuple[float, ...]]()
-    for key, weights in kernels.items():
-        length, kernel = int(key), tuple(float(weight) for weight in weights)
-        if length == 1 or length not in window_lengths:
-            frames = sorted({own for own in window_lengths if own > 1})
+    checked = {int(key): tuple(map(float, weights)) for key, weights in kernels.items()}
+    frames = sorted({length for length in window_lengths if length > 1})
+    for length, kernel in checked.items():
+        if length not in frames:
             raise ValueError(f"a kernel of {length} samples fits none of the frames {frames}")
         if len(kernel) != length:
             raise ValueError(
                 f"a frame of {length} samples needs as many weights, got {len(kernel)}"
             )
-        total = torch.tensor(kernel, dtype=torch.float64).sum()
-        if not abs(total - 1) <= _TOLERANCE:
+        if not abs(sum(kernel) - 1) <= _TOLERANCE:
             raise ValueError(
-                f"the kernel of {length} samples must be finite and sum to 1, got {float(total)}; "
+                f"the kernel of {length} samples must be finite and sum to 1, got {sum(kernel)}; "
                 "divide it by its sum"
             )
-        checked[length] = kernel
     return checked
 
 
-_MOST_MATRICES = 16
+_TOLERANCE = 1e-9  # of the sum of a kernel
+_MOST_MATRICES = 16  # that are kept
 _FEW_BINS = 4
-_Group = tuple[int, int, list[int], bool]
+
+
+class _Group(NamedTuple):
+    """Channels that share a frame.
+
+    Args:
+        length: of the frame.
+        start: of the frame of a bin's first sample, in the bin with its context.
+        channels: positions.
+        is_wanted: whether they are to be filtered.
+    """
+
+    length: int
+    start: int
+    channels: slice | list[int]
+    is_wanted: bool
 
 
 class ChannelFilter(nn.Module):
@@ -314,7 +307,7 @@ class ChannelFilter(nn.Module):
         polyorder: order of the fitted polynomial.
         align: where in its frame a sample lies.
         kernels: other weights than Savitzky-Golay's, by length of the frame; each sums to 1. The
-            ends of a signal get what is said at ``_edges_by``.
+            ends of a signal are then filtered between a made-up past and future.
 
     Attributes:
         context: half the longest frame; a bin comes with twice as many samples around it.
@@ -340,27 +333,28 @@ class ChannelFilter(nn.Module):
         self.align: Align = align
         self.kernels = _checked_kernels(kernels or {}, self.window_lengths)
         # float64 and outside the state: cast on use, so they never lose digits
-        self._edges = {length: self._edges_of(length) for length in self.window_lengths}
+        self._edges = {
+            length: _edges_of_kernel(self.kernels[length], polyorder, align)
+            if length in self.kernels
+            else _savgol_edges(length, polyorder, align)
+            for length in self.window_lengths
+        }
         self.reaches = tuple(reach(length, align) for length in self.window_lengths)
         self.context = max(self.window_lengths) // 2
         self.context_before, self.context_after = reach(max(self.window_lengths), align)
         self._matrices: dict[tuple[int, int, torch.dtype, torch.device], Tensor] = {}
         self._wanted: dict[tuple[int, ...] | None, list[_Group]] = {}
-        self._groups = [  # frames and their channels, the frame of the first channel first
-            (length, [i for i, own in enumerate(self.window_lengths) if own == length])
-            for length in dict.fromkeys(self.window_lengths)
-        ]
 
-    def facts(self) -> dict[str, Any]:
-        """All arguments as JSON-able values; ``ChannelFilter(**facts)``. Kernels only if given."""
-        facts: dict[str, Any] = {
+    def config(self) -> dict[str, Any]:
+        """All arguments as JSON-able values; ``ChannelFilter(**config)``. Kernels only if given."""
+        config: dict[str, Any] = {
             "window_lengths": list(self.window_lengths),
             "polyorder": self.polyorder,
             "align": self.align,
         }
         if self.kernels:
-            facts["kernels"] = {str(length): list(own) for length, own in self.kernels.items()}
-        return facts
+            config["kernels"] = {str(length): list(own) for length, own in self.kernels.items()}
+        return config
 
     def forward(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:
         """Filter whole recordings.
@@ -376,14 +370,12 @@ class ChannelFilter(nn.Module):
             ValueError: if the number of channels is another, or ``T`` is shorter than a frame.
         """
         self.check(samples)
-        parts, order = [], list[int]()
-        for length, _, chosen, is_wanted in self._groups_for(channels):
-            order += chosen
-            part = _channels(samples, chosen)
+        filtered = samples.clone()
+        for length, _, channels_of, is_wanted in self._groups_for(channels):
             if is_wanted:
-                part = _filter_by(part, self._edges[length])
-            parts.append(part)
-        return _in_order(parts, order)
+                own = samples[..., channels_of, :]
+                filtered[..., channels_of, :] = self._edges[length].filtered(own)
+        return filtered
 
     def valid(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:
         """Filter bins that come with their context, keeping only the bins.
@@ -411,16 +403,15 @@ class ChannelFilter(nn.Module):
             )
         if is_plain(samples) and samples.shape[:-2].numel() <= _FEW_BINS:
             return self._valid_of_few(samples, num_samples, channels)
-        parts, order = [], list[int]()
+        filtered = samples.narrow(-1, 0, num_samples).clone()
         for length, start, chosen, is_wanted in self._groups_for(channels):
-            order += chosen
-            kept = _channels(samples, chosen).narrow(-1, start, num_samples + length - 1)
+            kept = samples[..., chosen, start : start + num_samples + length - 1]
             if is_wanted:
-                parts.append(kept.contiguous() @ self._matrix(length, num_samples, samples))
+                matrix = self._matrix(length, num_samples, samples)
+                filtered[..., chosen, :] = kept.contiguous() @ matrix
             else:
-                largest = torch.maximum(kept.amax(-1), -kept.amin(-1))[..., None]
-                parts.append(largest.expand(*kept.shape[:-1], num_samples))
-        return _in_order(parts, order)
+                filtered[..., chosen, :] = torch.maximum(kept.amax(-1), -kept.amin(-1))[..., None]
+        return filtered
 
     def _valid_of_few(
         self, samples: Tensor, num_samples: int, channels: Collection[int] | None
@@ -439,16 +430,24 @@ class ChannelFilter(nn.Module):
         return torch.from_numpy(filtered)
 
     def _groups_for(self, channels: Collection[int] | None) -> list[_Group]:
-        """Frames, where theirs starts, channels of theirs, and whether these are wanted."""
+        """The channels by their frames, those that are wanted apart from the others."""
         key = None if channels is None else tuple(channels)
         if (groups := self._wanted.get(key)) is None:
-            wanted = range(len(self.window_lengths)) if key is None else frozenset(key)
-            groups = []
-            for length, own in self._groups:
-                start = self.context_before - reach(length, self.align)[0]
-                for is_wanted in (True, False):
-                    if chosen := [c for c in own if (c in wanted) == is_wanted]:
-                        groups.append((length, start, chosen, is_wanted))
+            everything = range(len(self.window_lengths))
+            wanted = set(everything if key is None else key)
+            by_frame: dict[tuple[int, bool], list[int]] = {}
+            for channel in everything:
+                frame = (self.window_lengths[channel], channel in wanted)
+                by_frame.setdefault(frame, []).append(channel)
+            groups = [
+                _Group(
+                    length,
+                    self.context_before - reach(length, self.align)[0],
+                    as_index(chosen),
+                    is_wanted,
+                )
+                for (length, is_wanted), chosen in by_frame.items()
+            ]
             self._wanted = {key: groups}  # the last one asked for, whole: other threads may look
         return groups
 
@@ -457,18 +456,8 @@ class ChannelFilter(nn.Module):
         return self.edges(channel)[1]
 
     def edges(self, channel: int) -> Edges:
-        """What makes a channel's first samples, those in between and its last; float64.
-
-        Shape:
-            - output: as ``edge_matrices`` has them
-        """
+        """What makes a channel's first samples, those in between and its last."""
         return self._edges[self.window_lengths[channel]]
-
-    def _edges_of(self, length: int) -> Edges:
-        if length not in self.kernels:
-            return edge_matrices(length, self.polyorder, self.align)
-        kernel = torch.tensor(self.kernels[length], dtype=torch.float64)
-        return _edges_by(kernel, self.polyorder, self.align)
 
     def check(self, samples: Tensor) -> None:
         """Refuse what are no samples of this hand.
@@ -500,21 +489,6 @@ class ChannelFilter(nn.Module):
         return matrix
 
 
-def _in_order(parts: Sequence[Tensor], order: Sequence[int]) -> Tensor:
-    """The parts' channels, which are those of ``order``, in the order of the hand."""
-    filtered = torch.cat(list(parts), dim=-2)
-    if list(order) == sorted(order):
-        return filtered
-    return filtered[..., sorted(range(len(order)), key=order.__getitem__), :]
-
-
-def _channels(samples: Tensor, chosen: Sequence[int]) -> Tensor:
-    """The chosen channels of ``[*, C, T]``; neighbours without a copy."""
-    if chosen[-1] - chosen[0] + 1 == len(chosen):
-        return samples.narrow(-2, chosen[0], len(chosen))
-    return samples[..., list(chosen), :]
-
-
 def extended(samples: Tensor, channel_filter: ChannelFilter) -> Tensor:
     """A whole recording between what its filter takes to lie before and behind it.
 
@@ -530,24 +504,19 @@ def extended(samples: Tensor, channel_filter: ChannelFilter) -> Tensor:
         ValueError: if the number of channels is another, or ``T`` is shorter than a frame.
     """
     channel_filter.check(samples)
-    longest = max(channel_filter.window_lengths)
-    if samples.shape[-1] < longest:
-        raise ValueError(
-            f"a signal of {samples.shape[-1]} samples is shorter than window_length {longest}"
-        )
+    _check_length(samples, max(channel_filter.window_lengths))
     first, last = samples[..., :1], samples[..., -1:]
     before = first.repeat_interleave(channel_filter.context_before, -1)
     after = last.repeat_interleave(channel_filter.context_after, -1)
     whole = torch.cat([before, samples, after], dim=-1)
+    start = channel_filter.context_before
+    stop = start + samples.shape[-1]
     for channel, length in enumerate(channel_filter.window_lengths):
-        past, future = (
-            part.to(samples)
-            for part in _around(length, channel_filter.polyorder, channel_filter.align)
-        )
-        x, start = samples[..., channel, :], channel_filter.context_before
-        of_past = x[..., :1] + (x[..., :length] - x[..., :1]) @ past.T
-        of_future = x[..., -1:] + (x[..., -length:] - x[..., -1:]) @ future.T
-        stop = start + samples.shape[-1]
+        frame = (length, channel_filter.polyorder, channel_filter.align)
+        past, future = past_matrix(*frame).to(samples), _future_matrix(*frame).to(samples)
+        x, begin, end = samples[..., channel, :], first[..., channel, :], last[..., channel, :]
+        of_past = begin + (x[..., :length] - begin) @ past.T
+        of_future = end + (x[..., -length:] - end) @ future.T
         whole[..., channel, start - len(past) : start] = of_past
         whole[..., channel, stop : stop + len(future)] = of_future
     return whole

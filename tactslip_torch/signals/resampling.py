@@ -1,4 +1,4 @@
-"""Samples at another rate, and channels of several rates brought to one. Only on request.
+"""Samples at another rate. Only on request.
 
 A polyphase low-pass over 20 samples of the lower rate, Kaiser-windowed: SciPy's ``resample_poly``.
 Up to .8 of half the lower rate tones stay within .5 %, in phase; beyond 1.2 of it at most .5 % of
@@ -8,7 +8,6 @@ one is left to fold back. A constant stays one.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -19,10 +18,8 @@ from torch import Tensor
 
 MOST = 50_000
 """Largest numerator and denominator of a ratio of rates."""
-_NEAREST = 1e-7
-"""Relative error that a ratio may be off: a sample in ten million."""
-MOST_CUT_S = 0.1
-"""By so much parts that belong together may end apart."""
+
+_NEAREST = 1e-7  # relative error that a ratio may be off: a sample in ten million
 _HALF = 10  # samples of the lower rate on either side, as SciPy has it
 
 
@@ -77,52 +74,11 @@ def resample(samples: Tensor, from_hz: float, to_hz: float) -> Tensor:
     return torch.from_numpy(found).to(samples)
 
 
-def bring_together(parts: Sequence[tuple[Tensor, float]], to_hz: float | None = None) -> Tensor:
-    """Channels that were sampled at rates of their own, as one set of samples.
-
-    All begin at once. The set ends with the part that ends first.
-
-    Args:
-        parts: samples ``[C_i, T_i]`` and their rate in hertz, at least one.
-        to_hz: the rate wanted; ``None`` if all have one.
-
-    Shape:
-        - output: ``[sum C, T]``, in the finest dtype of the parts
-
-    Raises:
-        ValueError: if rates differ and none is asked for, parts end more than ``MOST_CUT_S`` apart,
-            or one cannot be resampled.
-
-    Example:
-        >>> bring_together([(torch.zeros(2, 10), 100.0), (torch.ones(1, 5), 50.0)], 100.0).shape
-        torch.Size([3, 10])
-    """
-    if not parts:
-        raise ValueError("there is nothing to bring together; give at least one set of channels")
-    rates = [float(rate) for _, rate in parts]
-    _refuse_no_rates(*rates)
-    if to_hz is None and len(set(rates)) > 1:
-        named = ", ".join(f"{rate:g}" for rate in dict.fromkeys(rates))
-        raise ValueError(
-            f"channels come at {named} Hz; say to which rate to resample them, as "
-            f"data.resample_hz={max(rates):g}"
-        )
-    ends_s = [samples.shape[-1] / rate for (samples, _), rate in zip(parts, rates, strict=True)]
-    if max(ends_s) - min(ends_s) > MOST_CUT_S:
-        raise ValueError(
-            f"sets of channels that belong together last {min(ends_s):g} to {max(ends_s):g} s; "
-            f"cut them to lengths within {MOST_CUT_S:g} s of each other"
-        )
-    wanted = rates[0] if to_hz is None else to_hz
-    made = [resample(samples, rate, wanted) for samples, rate in parts]
-    num = min(samples.shape[-1] for samples in made)
-    dtype = torch.float64 if any(m.dtype == torch.float64 for m in made) else torch.float32
-    return torch.cat([samples[:, :num].to(dtype) for samples in made])
-
-
 def _ratio(from_hz: float, to_hz: float) -> Fraction:
     """Of the wanted rate to the given one, as near as whole numbers up to ``MOST`` come."""
-    _refuse_no_rates(from_hz, to_hz)
+    for rate in (from_hz, to_hz):
+        if not (math.isfinite(rate) and rate > 0):
+            raise ValueError(f"a rate must be positive to resample, got {rate:g} Hz")
     exact = Fraction(repr(float(to_hz))) / Fraction(repr(float(from_hz)))  # as they are written
     least = min(exact, 1 / exact)  # so that it is the larger of the two numbers that is limited
     nearest = least.limit_denominator(MOST)
@@ -132,12 +88,6 @@ def _ratio(from_hz: float, to_hz: float) -> Fraction:
             "resample to a rate further away, or less so, or state the rate that is meant"
         )
     return nearest if least == exact else 1 / nearest
-
-
-def _refuse_no_rates(*rates: float) -> None:
-    for rate in rates:
-        if not (math.isfinite(rate) and rate > 0):
-            raise ValueError(f"a rate must be positive to resample, got {rate:g} Hz")
 
 
 def _is_reached(is_bad: NDArray[Any], num: int, up: int, down: int) -> NDArray[np.bool_]:

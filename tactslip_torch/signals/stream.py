@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.signals.filtering import ChannelFilter, Edges, convolve_valid
+from tactslip_torch.signals.filtering import ChannelFilter, Edges, as_index, convolve_valid
 
 Array = NDArray[Any]
 
@@ -58,7 +58,7 @@ class FilterStream:
         self._groups = list[tuple[slice | list[int], Edges]]()
         for length in dict.fromkeys(lengths[channel] for channel in wanted):
             own = [channel for channel in wanted if lengths[channel] == length]
-            self._groups.append((_as_slice(own), channel_filter.edges(own[0])))
+            self._groups.append((as_index(own), channel_filter.edges(own[0])))
         self.reset()
 
     def reset(self) -> None:
@@ -151,12 +151,6 @@ class FilterStream:
         if stop > last:
             parts.append(held[:, -length:] @ tail[last - self.num_pushed + after :].T)
         return torch.cat(parts, dim=-1)
-
-
-def _as_slice(channels: list[int]) -> slice | list[int]:
-    """The same channels, so that they are looked up without a copy if they are neighbours."""
-    first, last = channels[0], channels[-1]
-    return slice(first, last + 1) if last - first + 1 == len(channels) else channels
 
 
 class SampleClock:

@@ -9,10 +9,10 @@ name that PyWavelets knows or, of one without a name, its four filters (``Wavele
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import pywt
@@ -20,10 +20,8 @@ import torch
 from ptwt.conv_transform import wavedec, waverec
 from torch import Tensor
 
-Bank = tuple[Tensor, Tensor, Tensor, Tensor]
-"""``dec_lo``, ``dec_hi``, ``rec_lo``, ``rec_hi``."""
 _FILTERS = ("dec_lo", "dec_hi", "rec_lo", "rec_hi")
-_TOLERANCE = 1e-9
+_TOLERANCE = 1e-9  # of reconstruction, and of the sum of a detail's filter
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class WaveletFilters:
                 f"the filters of {self.name} must have one even length, got "
                 f"{', '.join(map(str, lengths))}; fill up with zeros"
             )
-        if (error := _reconstruction_error(*self._arrays())) > _TOLERANCE:
+        if (error := self._reconstruction_error()) > _TOLERANCE:
             raise ValueError(
                 f"the filters of {self.name} do not reconstruct: off by {error:.1e}, at most "
                 f"{_TOLERANCE:g} is taken; give rec_lo and rec_hi that invert dec_lo and dec_hi"
@@ -70,6 +68,19 @@ class WaveletFilters:
                 "constant must have no detail"
             )
 
+    def _reconstruction_error(self) -> float:
+        """How far a unit impulse comes back from itself, ``L - 1`` later, and how large its alias.
+
+        Strang and Nguyen (1996), Wavelets and Filter Banks, section 4.1.
+        """
+        sign = (-1.0) ** np.arange(len(self))
+        impulse = np.zeros(2 * len(self) - 1)
+        impulse[len(self) - 1] = 2
+        kept = np.convolve(self.dec_lo, self.rec_lo) + np.convolve(self.dec_hi, self.rec_hi)
+        alias = np.convolve(sign * self.dec_lo, self.rec_lo)
+        alias += np.convolve(sign * self.dec_hi, self.rec_hi)
+        return float(max(np.abs(kept - impulse).max(), np.abs(alias).max()))
+
     def __len__(self) -> int:
         """Taps of a filter, zeros at its ends among them."""
         return len(self.dec_lo)
@@ -77,33 +88,24 @@ class WaveletFilters:
     def __str__(self) -> str:
         return self.name
 
-    @property
-    def bank(self) -> Bank:
-        """The filters as float64 tensors, ``[L]`` each."""
-        low, high, low_back, high_back = (torch.from_numpy(array) for array in self._arrays())
-        return low, high, low_back, high_back
-
     def to_dict(self) -> dict[str, Any]:
         """JSON-able, and exact: a float comes back as it was."""
         return {key: value if key == "name" else list(value) for key, value in asdict(self).items()}
 
     @classmethod
-    def from_dict(cls, facts: Mapping[str, Any]) -> WaveletFilters:
+    def from_dict(cls, filters: Mapping[str, Any]) -> WaveletFilters:
         """What ``to_dict`` gave.
 
         Raises:
             ValueError: if a key is missing or unknown, or as the constructor.
         """
         expected = ("name", *_FILTERS)
-        if set(facts) != set(expected):
+        if set(filters) != set(expected):
             raise ValueError(
                 f"a wavelet's filters have the keys {', '.join(expected)}, got "
-                f"{', '.join(map(str, facts)) or 'none'}"
+                f"{', '.join(map(str, filters)) or 'none'}"
             )
-        return cls(**facts)
-
-    def _arrays(self) -> list[np.ndarray[Any, np.dtype[np.float64]]]:
-        return [np.array(getattr(self, name), np.float64) for name in _FILTERS]
+        return cls(**filters)
 
 
 Wavelet: TypeAlias = str | WaveletFilters
@@ -138,24 +140,6 @@ def _numbers(name: str, values: Sequence[float]) -> tuple[float, ...]:
     return numbers
 
 
-def _reconstruction_error(
-    dec_lo: np.ndarray[Any, Any],
-    dec_hi: np.ndarray[Any, Any],
-    rec_lo: np.ndarray[Any, Any],
-    rec_hi: np.ndarray[Any, Any],
-) -> float:
-    """How far a unit impulse comes back from itself, ``L - 1`` later, and how large its alias is.
-
-    Strang and Nguyen (1996), Wavelets and Filter Banks, section 4.1.
-    """
-    sign = (-1.0) ** np.arange(len(dec_lo))
-    impulse = np.zeros(2 * len(dec_lo) - 1)
-    impulse[len(dec_lo) - 1] = 2
-    kept = np.convolve(dec_lo, rec_lo) + np.convolve(dec_hi, rec_hi) - impulse
-    alias = np.convolve(sign * dec_lo, rec_lo) + np.convolve(sign * dec_hi, rec_hi)
-    return float(max(np.abs(kept).max(), np.abs(alias).max()))
-
-
 ExtensionMode = Literal["symmetric", "reflect", "zero", "constant", "periodic"]
 
 
@@ -169,23 +153,15 @@ def branch_names(level: int) -> tuple[str, ...]:
     return tuple(f"{kind}{m}" for m in range(1, level + 1) for kind in "AD")
 
 
-def _named_bank(wavelet: str) -> Bank:
-    """The filters of a discrete wavelet of PyWavelets, float64.
-
-    Shape:
-        - output: four ``[L]``
-
-    Raises:
-        ValueError: if it is unknown.
-    """
+def _of_pywt(wavelet: Wavelet) -> pywt.Wavelet:
+    """The wavelet as PyWavelets and ptwt take it."""
+    if isinstance(wavelet, WaveletFilters):
+        return pywt.Wavelet(wavelet.name, [getattr(wavelet, name) for name in _FILTERS])
     if wavelet not in pywt.wavelist(kind="discrete"):
         raise ValueError(
             f"unknown wavelet {wavelet!r}; pywt.wavelist(kind='discrete') lists the known ones"
         )
-    low, high, low_back, high_back = (
-        torch.tensor(taps, dtype=torch.float64) for taps in pywt.Wavelet(wavelet).filter_bank
-    )
-    return low, high, low_back, high_back
+    return pywt.Wavelet(wavelet)
 
 
 def highest_level(num_samples: int, wavelet: Wavelet = "rbio2.2") -> int:
@@ -201,7 +177,7 @@ def highest_level(num_samples: int, wavelet: Wavelet = "rbio2.2") -> int:
         >>> highest_level(100, "rbio2.2"), highest_level(30, "db3")
         (4, 2)
     """
-    length = len(_named_bank(wavelet)[0]) if isinstance(wavelet, str) else len(wavelet)
+    length = _of_pywt(wavelet).dec_len
     highest = int(pywt.dwt_max_level(num_samples, length)) if num_samples > 0 else 0
     if highest < 1:
         raise ValueError(
@@ -235,7 +211,6 @@ def wavelet_branches(
     Reference:
         ``pywt.wavedec`` and ``pywt.waverec`` with all but one coefficient array zeroed.
     """
-    bank = _named_bank(wavelet) if isinstance(wavelet, str) else wavelet.bank
     num_samples = x.shape[-1]
     highest = highest_level(num_samples, wavelet)
     if not 1 <= level <= highest:
@@ -243,30 +218,18 @@ def wavelet_branches(
             f"level must lie in 1..{highest} for bins of {num_samples} samples and {wavelet}, "
             f"got {level}; use fewer levels or longer bins"
         )
-    flat = x.reshape(-1, num_samples)
-    taps = cast(Any, bank)  # ptwt takes tensors too, though its types do not say so
-    coefficients = wavedec(flat, taps, mode=mode, level=level)  # cA, cD(level), .., cD1
-    details = list(_details(coefficients[1:], bank, num_samples))  # D(level), .., D1
-    approximation = _rebuild([coefficients[0]], coefficients[1:], bank, num_samples)
+    filters = _of_pywt(wavelet)
+    coefficients = wavedec(x.reshape(-1, num_samples), filters, mode=mode, level=level)
+    alone = []  # each array of coefficients with zeros in place of the others, put together
+    for kept in range(level + 1):
+        arrays = [c if i == kept else torch.zeros_like(c) for i, c in enumerate(coefficients)]
+        alone.append(waverec(arrays, filters)[..., :num_samples])
+    approximation, *details = alone  # A(level), D(level), .., D1
     branches: list[Tensor] = []
     for detail in details:  # from the coarsest: A(m-1) = A(m) + D(m)
         branches = [approximation, detail, *branches]
         approximation = approximation + detail
     return torch.stack(branches, dim=-2).reshape(*x.shape[:-1], 2 * level, num_samples)
-
-
-def _details(details: list[Tensor], bank: Bank, num_samples: int) -> Iterator[Tensor]:
-    """Each detail alone, coarsest first."""
-    for kept in range(len(details)):
-        leading = [torch.zeros_like(details[0])]
-        leading += [torch.zeros_like(d) for d in details[:kept]]
-        yield _rebuild([*leading, details[kept]], details[kept + 1 :], bank, num_samples)
-
-
-def _rebuild(kept: list[Tensor], zeroed: list[Tensor], bank: Bank, num_samples: int) -> Tensor:
-    """Inverse transform of ``kept``, followed by zeros in the shapes of ``zeroed``."""
-    coefficients, taps = [*kept, *(torch.zeros_like(d) for d in zeroed)], cast(Any, bank)
-    return waverec(coefficients, taps)[..., :num_samples]
 
 
 @lru_cache(maxsize=16)

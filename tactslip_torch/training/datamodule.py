@@ -279,7 +279,7 @@ class FeatureMaker:
             "bin_samples": bins.bin_samples,
             "wavelet": [pool.facts()["wavelet"], pool.level],
             "spectrum": [pool.spectrum, pool.arithmetic],
-            "filter": list(self.channel_filter.facts().values()),
+            "filter": list(self.channel_filter.config().values()),
             "dtype": str(self.dtype),
             "engine": self.extractor.engine,
             "code": self._code,
