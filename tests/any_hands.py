@@ -169,7 +169,7 @@ HANDS = {
 
 
 @cache
-def detector_of(name: str, engine: EngineName = "eager") -> SlipDetector:
+def detector_of(name: str, engine: EngineName = "auto") -> SlipDetector:
     """A detector of one of ``HANDS``, trained on its noise."""
     hand = HANDS[name]
     pool, channel_filter = hand.pool(), hand.channel_filter()

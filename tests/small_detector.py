@@ -66,7 +66,7 @@ def small_detector(
 
 def alarming_detector(seed: int = 0) -> SlipDetector:
     """The small detector, with settings by which the simulated slip raises alarms."""
-    made = small_detector(seed, engine="eager")
+    made = small_detector(seed, engine="auto")
     scores = score_stream(made, simulated_stream(HAND, 2000.0, torch.float64), 20).score
     rise = 2.0 / float(scores.std())
     settings = AlarmSettings(

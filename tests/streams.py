@@ -23,7 +23,7 @@ def signal(num_samples, seed=0, dtype=torch.float64):
     return torch.from_numpy(samples + offsets).to(dtype)
 
 
-def detector_of(kind="all", align="centred", engine="eager"):
+def detector_of(kind="all", align="centred", engine="auto"):
     """The small detector, or that part of it which looks at films (``"PVDF"``) alone."""
     whole = small_detector(engine=engine)
     layer = ChannelFilter(whole.channel_filter.window_lengths, align=align)

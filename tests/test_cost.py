@@ -142,7 +142,7 @@ def test_a_bad_timing_does_not_move_the_line():
 
 def test_measured_prices_are_of_this_machine():
     costs = measure_costs(
-        POOL, ChannelFilter([51, 51, 11, 11]), [4, 8], "eager", ["mean", "std"], calls=5
+        POOL, ChannelFilter([51, 51, 11, 11]), [4, 8], "auto", ["mean", "std"], calls=5
     )
     assert costs.facts()["groups"].keys() == GROUPS.keys()
     assert costs.rest_us >= 0
@@ -156,7 +156,7 @@ def test_measured_prices_are_of_this_machine():
 
 
 def test_a_stand_in_gives_finite_scores():
-    detector = _stand_in(POOL, ChannelFilter([51, 51, 11, 11]), [0, 30, 100], "eager")
+    detector = _stand_in(POOL, ChannelFilter([51, 51, 11, 11]), [0, 30, 100], "auto")
     score = detector.predict_raw(torch.randn(7, 4, 150)).score
     assert score.isfinite().all()
 
@@ -199,11 +199,11 @@ def test_interrupted_calls_are_told_but_not_counted(monkeypatch):
 def test_a_saved_detector_is_timed_in_a_process_of_its_own(tmp_path, capsys):
     path = tmp_path / "detector.pt"
     small_detector().save(path)
-    timing = time_in_fresh_process(path, 20, "eager")
+    timing = time_in_fresh_process(path, 20, "auto")
     assert timing.calls == 20
     assert 0 < timing.p50_us <= timing.p99_us <= timing.p99_all_us
     before = torch.get_num_threads()
-    main([str(path), "10", "eager"])
+    main([str(path), "10", "auto"])
     assert torch.get_num_threads() == before
     printed = json.loads(capsys.readouterr().out)
     assert printed["calls"] == 10

@@ -100,7 +100,7 @@ def run(model, tmp_path_factory):
 
 def offline(samples, settings=SETTINGS):
     """The decisions on a recording that is known whole."""
-    detector = small_detector(SEED, engine="eager")
+    detector = small_detector(SEED, engine="auto")
     scores = score_stream(detector, samples, settings.hop_samples)
     decider = Decider(settings, RATE_HZ, detector.pool.bin_samples, detector.look_ahead)
     return decider.decide(scores.score, scores.is_valid)

@@ -18,7 +18,7 @@ from tactslip_torch.simulation.extremes import extreme_bins
 HAND = HandLayout.paper24()
 NUM = 100
 POOL = FeaturePool(HAND)
-ENGINES = {name: FeatureExtractor(POOL, engine=name) for name in ("reference", "eager", "compiled")}
+ENGINES = {name: FeatureExtractor(POOL, engine=name) for name in ("reference", "auto")}
 NAMES = oracles.pool_names()
 PLAIN = [" ".join(name) for name in NAMES]
 CHANNEL_OF = {name: i for i, name in enumerate(HAND.names)}

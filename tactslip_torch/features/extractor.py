@@ -1,79 +1,49 @@
-"""The front door to features: a pool or a part of it, by the fastest engine that may be used.
+"""Features of bins, the whole pool or a part of it, by the fastest engine that may be used.
 
 ``"reference"`` is ``FeaturePool`` itself: differentiable, on any device, the truth in tests.
-``"eager"`` and ``"compiled"`` carry out a plan of the least work, forwards only and on the CPU:
-PyTorch and NumPy, or kernels compiled by numba. All give the same values to rounding; where a
-value is all rounding (the sign of cv at a mean of 0, the mode of values equal but for rounding)
-they may differ. Where a derivative is asked for, a graph is recorded or bins lie on another device,
-the reference takes over; so it does for each bin with magnitudes beyond ``ordinary_sizes``.
+``"native"`` carries out a plan of the least work by ``native/engine.cpp``, forwards only and on the
+CPU. Both give the same values to rounding; where a value is all rounding (the sign of cv at a mean
+of 0, the mode of values equal but for rounding) they may differ. Where a derivative is asked for, a
+graph is recorded or bins lie on another device, the reference takes over; so it does for each bin
+with magnitudes beyond 2^-320 to 2^448.
 """
 
 from __future__ import annotations
 
-import logging
 import operator
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, Literal, Protocol, cast, get_args
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from tactslip_torch import native
 from tactslip_torch.features.bank import Bank
-from tactslip_torch.features.eager.engine import EagerEngine
-from tactslip_torch.features.guards import ordinary_sizes
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import saturating
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.runtime import for_each, is_plain, usable_engine
+from tactslip_torch.runtime import for_each, is_plain
+from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
+from tactslip_torch.signals.wavelet import wavelet_steps
 
-EngineName = Literal["auto", "compiled", "eager", "reference"]
-_LOG = logging.getLogger(__name__)
+EngineName = Literal["auto", "native", "reference"]
 _FEW_BINS = 4  # so few are done here: another thread would take longer to start
-_REFERENCE_CHUNK = 16  # what fits the cache of a processor
-
-
-class Engine(Protocol):
-    """Carries out a plan on ordinary bins; called from several threads at once.
-
-    Attributes:
-        chunk_bins: how many bins at once it is fastest with, and the most it takes.
-    """
-
-    chunk_bins: int
-
-    def read(self, bins: Tensor) -> tuple[Tensor, Tensor, np.ndarray[Any, Any]]:
-        """What ``__call__`` takes, in memory that is this thread's until its next call.
-
-        Shape:
-            - bins: ``[M, C, n]``, float32 or float64
-            - output: x and scale as below; ``[M]``, bool, whether a bin is ordinary: no NaN, no
-              Inf, and each magnitude 0 or within ``ordinary_sizes`` of float64
-        """
-
-    def __call__(self, x: Tensor, scale: Tensor, out: Tensor) -> None:
-        """Write the features of some bins.
-
-        Shape:
-            - x: ``[M, C', n]``, float64, contiguous: filtered bins of the plan's channels
-            - scale: ``[M, C']``, float64, largest magnitude of each: 0 or ordinary
-            - out: ``[M, K]``, float32 or float64, written
-        """
+_CHUNK = {"native": 32, "reference": 16}  # bins of a thread at a time, whose memory fits the cache
 
 
 class FeatureExtractor:
     """Features of filtered bins, the whole pool or those selected, as fast as can be.
 
     float32 bins are computed in float64 and rounded once; for a pool whose arithmetic is
-    ``"native"`` the fast engines form branches in float64 and take statistics in float32 of rows
+    ``"native"`` the native engine forms branches in float64 and takes statistics in float32 of rows
     scaled to order one, which is nearer to float64 than the reference in float32 throughout.
 
     Args:
         pool: what features there are.
         selected: pool indices of the features wanted, in the order of the output; default: all.
-        engine: ``"auto"`` takes the compiled one where numba is installed, else the eager one. Its
-            first use on a machine takes some 20 s (``warm_up``).
+        engine: ``"auto"`` takes the native one where it can be used (``native.why_not``).
 
     Attributes:
         plan: the least work for these features.
@@ -81,7 +51,7 @@ class FeatureExtractor:
 
     Raises:
         ValueError: for no feature, an index outside the pool, an unknown engine, or
-            ``"compiled"`` without numba.
+            ``"native"`` where it cannot be used.
 
     Example:
         >>> from tactslip_torch import HandLayout
@@ -107,7 +77,8 @@ class FeatureExtractor:
         self.selected = tuple(chosen)
         self.engine: EngineName = resolved(engine)
         self.plan = make_plan(pool.hand, pool.level, self.names)
-        self._start()
+        self._engines: dict[torch.dtype, native.FeatureEngine] = {}
+        self._banks: dict[torch.dtype, Bank] = {}
 
     @property
     def names(self) -> tuple[FeatureName, ...]:
@@ -128,126 +99,88 @@ class FeatureExtractor:
         self.pool.check(bins)
         dtype = dtype or bins.dtype
         if not is_plain(bins):
-            return self._reference(bins, dtype)
-        with torch.inference_mode(False), torch.no_grad():  # what engines keep outlives the mode
-            return self._values(bins, dtype)
+            return self._by_reference(bins, dtype)
+        with torch.inference_mode(False), torch.no_grad():  # what is kept outlives the mode
+            flat = bins.detach().reshape(-1, *bins.shape[-2:])
+            features = torch.empty(len(flat), len(self.selected), dtype=dtype, device="cpu")
+            describe = self._by_native if self.engine == "native" else self._into_by_reference
+            size = _CHUNK[self.engine]
+            starts = range(0, len(flat), size)
 
-    def warm_up(self) -> FeatureExtractor:
-        """Make ready what the first bins would wait for, kernels among it; returns itself."""
-        if self.engine != "reference":
-            for dtype in (torch.float64, torch.float32):
-                self._engine_for(dtype)
-        return self
+            def work(start: int) -> None:
+                describe(flat[start : start + size], features[start : start + size])
 
-    def stream(self, batches: Iterable[Tensor]) -> Iterator[Tensor]:
-        """Features of one batch of bins after the other; no more than one is held.
-
-        Shape:
-            - of each batch: ``[*, C, n]``; of what is handed on for it: ``[*, K]``
-        """
-        for bins in batches:
-            yield self(bins)
-
-    def _values(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
-        flat = bins.detach().flatten(0, -3) if bins.ndim > 2 else bins.detach()[None]
-        out = torch.empty(len(flat), len(self.selected), dtype=dtype, device="cpu")
-        engine = None if self.engine == "reference" else self._engine_for(bins.dtype)
-        chunk_bins = _REFERENCE_CHUNK if engine is None else engine.chunk_bins
-
-        def work(start: int) -> None:
-            part = slice(start, start + chunk_bins)
-            if engine is None:
-                out[part] = self._reference(flat[part], dtype)
+            if len(flat) <= _FEW_BINS:
+                for start in starts:
+                    work(start)
             else:
-                self._carry_out(engine, flat[part], out[part])
+                for_each(work, starts)
+            return features.reshape(*bins.shape[:-2], len(self.selected))
 
-        starts = range(0, len(flat), chunk_bins)
-        if len(flat) <= _FEW_BINS:
-            for start in starts:
-                work(start)
-        else:
-            for_each(work, starts)
-        return out.reshape(*bins.shape[:-2], len(self.selected))
+    def _by_native(self, bins: Tensor, features: Tensor) -> None:
+        engine = self._engine_for(bins.dtype)
+        is_odd = engine(bins.contiguous().numpy(), features.numpy())
+        for index in is_odd.nonzero()[0]:  # one by one: a product's bits depend on its size
+            features[index] = self._by_reference(bins[index], features.dtype)
 
-    def _carry_out(self, engine: Engine, bins: Tensor, out: Tensor) -> None:
-        """The plan by an engine, and the reference for bins that are not ordinary."""
-        x, scale, is_ordinary = engine.read(bins)
-        if is_ordinary.all():
-            engine(x, scale, out)
-            return
-        # the engine sees zeros where values are strange: bits do not depend on neighbours
-        low, high = ordinary_sizes(torch.float64)
-        broken, odd = [], []
-        for index in (~is_ordinary).nonzero()[0].tolist():
-            size = x[index].abs().amax(-1)
-            is_broken = ~size.isfinite()
-            if bool((is_broken | (size == 0) | ((size >= low) & (size <= high))).all()):
-                broken.append((index, is_broken.nonzero().flatten().tolist()))
-                x[index, is_broken], scale[index] = 0.0, torch.where(is_broken, 0.0, size)
-            else:
-                odd.append(index)
-                x[index], scale[index] = 0.0, 0.0
-        engine(x, scale, out)
-        for index, places in broken:
-            for place in places:
-                out[index, self._columns[place]] = torch.nan
-        for index in odd:
-            out[index] = self._reference(bins[index], out.dtype)
+    def _into_by_reference(self, bins: Tensor, features: Tensor) -> None:
+        features.copy_(self._by_reference(bins, features.dtype))
 
-    def _reference(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
+    def _by_reference(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
         x = self.pool.widen(bins)
         if x.dtype not in self._banks:
             self._banks[x.dtype] = self.pool.bank(self.plan, x.dtype)
         return saturating(self._banks[x.dtype].of_bins(x), dtype)
 
-    def _engine_for(self, bins: torch.dtype) -> Engine:
-        dtype = bins if self.pool.arithmetic == "native" else torch.float64
-        engine = self._engines.get(dtype)
-        if engine is None:  # two threads may make one each; a lock could be lost in a fork
-            engine = self._engines.setdefault(dtype, self._made(dtype))
-        return engine
+    def _engine_for(self, dtype: torch.dtype) -> native.FeatureEngine:
+        """The engine for bins of a dtype; two threads may make one each, to the same end."""
+        statistics = dtype if self.pool.arithmetic == "native" else torch.float64
+        if statistics not in self._engines:
+            with torch.device("cpu"):
+                self._engines[statistics] = self._make_engine(statistics)
+        return self._engines[statistics]
 
-    def _made(self, dtype: torch.dtype) -> Engine:
-        if self.engine == "eager":
-            return EagerEngine(self.pool, self.plan, dtype)
-        from tactslip_torch.features.compiled.engine import CompiledEngine  # numba takes a second
-
-        engine = CompiledEngine(self.pool, self.plan, dtype)
-        if not engine.is_ready():
-            _LOG.warning("compiling kernels for features: some 20 s, once; then they are kept")
-        engine.warm_up()  # here, where an interrupt is heard
-        return engine
-
-    def _start(self) -> None:
-        self._engines: dict[torch.dtype, Engine] = {}
-        self._banks: dict[torch.dtype, Bank] = {}
-        plan = self.plan
-        owner = [(plan.rows[w.row].channel, w.place) for w in plan.wanted]
-        owner += [(share.channel, share.place) for share in plan.shares]
-        self._columns = [[p for c, p in owner if c == channel] for channel in plan.channels]
+    def _make_engine(self, statistics: torch.dtype) -> native.FeatureEngine:
+        pool, plan = self.pool, self.plan
+        steps = wavelet_steps(pool.bin_samples, pool.wavelet, pool.level)
+        spectrum = spectrum_matrix(pool.bin_samples, pool.spectrum)
+        axis = frequency_axis_hz(pool.bin_samples, pool.sample_rate_hz, pool.spectrum)
+        num_branches = len(steps.out)
+        offset = {"gauge": 1, "time": 0, "freq": num_branches}  # a gauge is row 0 of its channel
+        rows = [(row.channel, offset[row.kind] + row.branch) for row in plan.rows]
+        wanted = [(*rows[w.row], native.DESCRIPTORS.index(w.descriptor), w.place)
+                  for w in plan.wanted]  # fmt: skip
+        wanted += [(s.channel, 2 * num_branches, s.branch, s.place) for s in plan.shares]
+        return native.FeatureEngine(
+            dtype=np.float32 if statistics == torch.float32 else np.float64,
+            num_channels=len(pool.hand),
+            slow=[channel for channel in plan.channels if channel in pool.hand.slow],
+            fast=[channel for channel in plan.channels if channel in pool.hand.fast],
+            wanted=wanted,
+            low=[matrix.numpy() for matrix in steps.low],
+            high=[matrix.numpy() for matrix in steps.high],
+            out=[matrix.numpy() for matrix in steps.out],
+            spectrum=torch.cat([spectrum.real, spectrum.imag]).numpy(),
+            frequency_hz=axis.numpy(),
+        )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without engines, which hold workspaces of threads."""
-        return {
-            name: value
-            for name, value in self.__dict__.items()
-            if name not in ("_engines", "_banks")
-        }
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._start()
+        """Without engines, which hold addresses, and banks, which are soon made."""
+        return {**self.__dict__, "_engines": {}, "_banks": {}}
 
 
 def resolved(engine: EngineName) -> EngineName:
     """The engine that a name means on this machine.
 
     Raises:
-        ValueError: for an unknown name, or ``"compiled"`` where numba is absent or cannot be used.
+        ValueError: for an unknown name, or ``"native"`` where it cannot be used.
     """
     known = get_args(EngineName)
-    return cast(EngineName, usable_engine(engine, known, _load_kernels, "features are made"))
-
-
-def _load_kernels() -> None:
-    from tactslip_torch.features.compiled import engine  # noqa: F401
+    if engine not in known:
+        raise ValueError(f"engine must be one of {', '.join(known)}, got {engine!r}")
+    if engine == "reference":
+        return engine
+    trouble = native.why_not()
+    if trouble and engine == "native":
+        raise ValueError(f'engine "native" cannot be used: {trouble}')
+    return "reference" if trouble else "native"

@@ -142,7 +142,7 @@ class Judged:
         self.unstated = WORST_PROBABILITY[form.precision]
         self.masked_channels: Tensor | None = None
         self.others: list[SlipDetector] = []
-        for engine in ("reference", "eager"):
+        for engine in ("reference", "auto"):
             other = copy.copy(self.detector)
             other.extractor = FeatureExtractor(other.pool, other.selected, engine)
             self.others.append(other)

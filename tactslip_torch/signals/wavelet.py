@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import pywt
@@ -249,3 +249,51 @@ def branch_matrix(
     """
     identity = torch.eye(num_samples, dtype=torch.float64)
     return wavelet_branches(identity, wavelet, level, mode).movedim(0, -1).contiguous()
+
+
+class WaveletSteps(NamedTuple):
+    """``branch_matrix`` in steps through the coefficients, whose matrices are narrow bands.
+
+    Args:
+        low: from a bin, or the approximation's coefficients of one level, to those of the next.
+        high: from the same to the detail's coefficients.
+        out: from its coefficients to each branch, in the order of ``branch_names``.
+
+    Shape:
+        - low, high: ``level`` matrices ``[r, n]``, where ``n`` is the ``r`` of the level before
+        - out: ``2 * level`` matrices ``[n, r]``
+    """
+
+    low: tuple[Tensor, ...]
+    high: tuple[Tensor, ...]
+    out: tuple[Tensor, ...]
+
+
+@lru_cache(maxsize=16)
+def wavelet_steps(
+    num_samples: int,
+    wavelet: Wavelet = "rbio2.2",
+    level: int = 4,
+    mode: ExtensionMode = "symmetric",
+) -> WaveletSteps:
+    """The steps from a bin to its branches, float64. Do not write into them.
+
+    Raises:
+        ValueError: as ``wavelet_branches``.
+    """
+    branch_matrix(num_samples, wavelet, level, mode)  # refuses what has no branches
+    filters = _of_pywt(wavelet)
+    low, high, out = [], [], []
+    sizes = [num_samples]  # and of the coefficients of each level, finest first
+    for _ in range(level):
+        identity = torch.eye(sizes[-1], dtype=torch.float64)
+        approximation, detail = wavedec(identity, filters, mode=mode, level=1)
+        low.append(approximation.T.contiguous())
+        high.append(detail.T.contiguous())
+        sizes.append(len(low[-1]))
+        one = torch.eye(sizes[-1], dtype=torch.float64)
+        finer = [one.new_zeros(sizes[-1], size) for size in sizes[-2:0:-1]]
+        for kept in ([one, 0 * one], [0 * one, one]):
+            branch = waverec([*kept, *finer], filters)[..., :num_samples]
+            out.append(branch.T.contiguous())
+    return WaveletSteps(tuple(low), tuple(high), tuple(out))

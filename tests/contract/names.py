@@ -26,7 +26,7 @@ from tactslip_torch.model.leave_one_group_out import held_out_scores
 PACKAGE = "tactslip_torch"
 REPLACED_NEXT = ("features/", "graph/", "model/few_bins")
 """Of the package, what the issue behind this one replaces; not counted in ``modules.py``."""
-ENGINES = ("eager", "compiled")
+ENGINES = ("native",)
 """Of ``FeatureExtractor``, beside the reference, which is the pool itself."""
 
 

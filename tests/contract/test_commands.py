@@ -281,7 +281,7 @@ def test_crossval_leaves_each_material_out_for_each_recipe(command, recordings, 
 def test_pareto_keeps_the_limits_it_was_given(command, recordings, cache, tmp_path):
     data = [*of_set(recordings), *split_of_set()]
     few = settings(search="quick", search_sizes=[4, 8], search_calls=10, search_timed=3)
-    few += settings(search_precisions=["double"], retime_calls=20, engine="eager")
+    few += settings(search_precisions=["double"], retime_calls=20, engine="auto")
     told = settings(deadline_ms=500, most_compute_us=400_000, workers=0, cache=cache, folder="run")
     command.well(tmp_path, "pareto", *data, *few, *told)
     content = read(tmp_path / "run" / PARETO)
@@ -297,7 +297,7 @@ def test_pareto_keeps_the_limits_it_was_given(command, recordings, cache, tmp_pa
 def test_pareto_says_when_nothing_meets_the_limits(command, recordings, cache, tmp_path):
     data = [*of_set(recordings), *split_of_set()]
     few = settings(search="quick", search_sizes=[4], search_calls=10, search_timed=2)
-    few += settings(search_precisions=["double"], retime_calls=20, engine="eager")
+    few += settings(search_precisions=["double"], retime_calls=20, engine="auto")
     told = settings(deadline_ms=500, most_compute_us=0.001, workers=0, cache=cache, folder="run")
     ran = command(tmp_path, "pareto", *data, *few, *told)
     assert ran.status == 1

@@ -1,1 +1,0 @@
-"""The compiled engine: a plan of features carried out by kernels that numba compiles."""

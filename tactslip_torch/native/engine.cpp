@@ -1,0 +1,704 @@
+// Features of filtered bins, in the order and under the names of features/descriptors.py.
+//
+// Lanes run across (bin, channel) pairs: element k of every vector belongs to pair k of a group, so
+// a line of code reads like its formula. A row (a slow channel's bin, a branch of a fast channel or
+// its spectrum) is formed by products with given matrices, in double, and brought to order one
+// before it is described: row = centre + span * d, with d in double or float. One sort of d feeds
+// median, mode, iqr and entropy.
+//
+// This file is compiled once for each instruction set (door.cpp chooses). Only vector types are
+// used that GCC and clang share, no intrinsics, and nothing of the C++ runtime.
+
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "engine.h"
+
+#if defined(__AVX512F__)
+#define VECTOR_BYTES 64
+#elif defined(__AVX2__)
+#define VECTOR_BYTES 32
+#else
+#define VECTOR_BYTES 16
+#endif
+#define INLINE static inline __attribute__((always_inline))
+#define NOINLINE static __attribute__((noinline))
+
+namespace {
+
+constexpr double NOISE = 16 * 0x1p-52;  // part of a channel's magnitude; a span below is rounding
+constexpr double CV_FLOOR = 1e-6;       // part of the rms that the mean counts as at least
+constexpr double CROWDED = 2e-3;        // part of a row's span; float rounds to 3e-8 of it
+constexpr double LEVELS = 255;          // of entropy's histogram, less one
+constexpr double SMALLEST = 0x1p-320, LARGEST = 0x1p448;  // between them squares are in range
+constexpr int USUAL = 100;              // values of a row whose sort is straight-line code
+
+constexpr uint32_t ORDERED = 1u << MEDIAN | 1u << MODE | 1u << IQR | 1u << ENTROPY;
+constexpr uint32_t WEIGHTED = 1u << SPECTRAL_CENTROID | 1u << SPECTRAL_SPREAD;
+
+// Vectors of double, and the T that describe as many lanes: W lanes of T are H vectors of double.
+typedef double D __attribute__((vector_size(VECTOR_BYTES)));
+constexpr int DL = VECTOR_BYTES / sizeof(double);
+
+template <class T> struct Lanes;
+template <> struct Lanes<double> {
+  typedef D V;
+  typedef D Part;
+  typedef int32_t Whole __attribute__((vector_size(VECTOR_BYTES / 2)));
+  typedef uint8_t Few __attribute__((vector_size(VECTOR_BYTES / 8)));
+};
+template <> struct Lanes<float> {
+  typedef float V __attribute__((vector_size(VECTOR_BYTES)));
+  typedef float Part __attribute__((vector_size(VECTOR_BYTES / 2)));
+  typedef int32_t Whole __attribute__((vector_size(VECTOR_BYTES)));
+  typedef uint8_t Few __attribute__((vector_size(VECTOR_BYTES / 4)));
+};
+typedef uint8_t Bytes __attribute__((vector_size(VECTOR_BYTES)));
+
+template <class V> INLINE V smaller(V a, V b) { return a < b ? a : b; }
+template <class V> INLINE V larger(V a, V b) { return a > b ? a : b; }
+template <class V> INLINE V magnitude(V a) { return larger(a, -a); }
+template <class V> INLINE V root(V a) {
+  constexpr int num = sizeof(V) / sizeof(a[0]);
+  for (int k = 0; k < num; ++k) a[k] = sizeof(a[0]) == 4 ? sqrtf(a[k]) : sqrt(a[k]);
+  return a;
+}
+template <class M> INLINE bool any(M mask) {
+  uint64_t words[sizeof(M) / 8], all = 0;
+  memcpy(words, &mask, sizeof(M));
+  for (uint64_t word : words) all |= word;
+  return all != 0;
+}
+
+// -- Sorting -------------------------------------------------------------------------------------
+
+template <class V> INLINE void exchange(V* a, V* b) {
+  V x = *a, y = *b;
+  *a = smaller(x, y);
+  *b = larger(x, y);
+}
+
+// Batcher's odd-even merge sort of v[0..N): sorts FROM .. FROM + SIZE, a power of two, in steps.
+template <int N, int FROM, int SIZE, int STEP, class V> INLINE void merge(V* v) {
+  if constexpr (FROM + STEP < N) {
+    if constexpr (2 * STEP < SIZE) {
+      merge<N, FROM, SIZE, 2 * STEP>(v);
+      merge<N, FROM + STEP, SIZE, 2 * STEP>(v);
+      constexpr int end = (FROM - FROM % SIZE) + SIZE;
+#pragma GCC unroll 128
+      for (int i = FROM + STEP; i + STEP < (end < N ? end : N); i += 2 * STEP)
+        exchange(v + i, v + i + STEP);
+    } else {
+      exchange(v + FROM, v + FROM + STEP);
+    }
+  }
+}
+template <int N, int FROM, int SIZE, class V> INLINE void sort_straight(V* v) {
+  if constexpr (SIZE > 1 && FROM < N) {
+    sort_straight<N, FROM, SIZE / 2>(v);
+    sort_straight<N, FROM + SIZE / 2, SIZE / 2>(v);
+    merge<N, FROM, SIZE, 1>(v);
+  }
+}
+
+// The same comparisons in loops, for any n: Knuth, volume 3, 5.2.2, algorithm M.
+template <class V> INLINE void sort_looped(V* v, int n) {
+  int most = 1;
+  while (2 * most < n) most *= 2;
+  for (int p = most; p > 0; p /= 2)
+    for (int q = most, r = 0, d = p;; d = q - p, q /= 2, r = p) {
+      for (int i = 0; i < n - d; ++i)
+        if ((i & p) == r) exchange(v + i, v + i + d);
+      if (q == p) break;
+    }
+}
+
+template <class V> NOINLINE void sort(V* v, int n) {
+  if (n == USUAL)
+    sort_straight<USUAL, 0, 128>(v);
+  else
+    sort_looped(v, n);
+}
+
+// -- Products ------------------------------------------------------------------------------------
+
+// out = matrix * x, R rows at a time, of which each block has its own columns that are not zero.
+template <int R, class E, class V> INLINE void product(const Matrix& matrix, const V* x, V* out) {
+  const E* values = (const E*)matrix.values;
+  for (int64_t block = 0; block < matrix.num_blocks; ++block) {
+    V sums[R] = {};
+    const V* from = x + matrix.first[block];
+    for (int64_t k = 0; k < matrix.width; ++k, values += R)
+#pragma GCC unroll 8
+      for (int r = 0; r < R; ++r) sums[r] += from[k] * values[r];
+#pragma GCC unroll 8
+    for (int r = 0; r < R; ++r) out[block * R + r] = sums[r];
+  }
+}
+
+struct Extent {
+  D low, high, mean;
+};
+INLINE Extent extent(const D* row, int64_t n) {
+  D low = row[0], high = low, total = low;
+  for (int64_t i = 1; i < n; ++i) {
+    low = smaller(low, row[i]);
+    high = larger(high, row[i]);
+    total += row[i];
+  }
+  return {low, high, total / (double)n};
+}
+
+// -- Descriptors of W rows at once ------------------------------------------------------------------
+
+// Sums over a row, in the unit of d.
+template <class V> struct Sums {
+  V first, second, third, fourth, both;
+};
+
+// What descriptors are made of, for half of the lanes: row = centre + span * d.
+struct Half {
+  D centre, span, top, energy, first, second, third, fourth, both, other;
+  double n;
+};
+
+template <class T> struct Describe {
+  typedef typename Lanes<T>::V V;
+  typedef typename Lanes<T>::Part Part;
+  static constexpr int W = VECTOR_BYTES / sizeof(T), H = W / DL;
+  typedef typename Lanes<T>::Whole Whole;
+  typedef typename Lanes<T>::Few Few;
+
+  INLINE D get(const V* from, int h) {
+    return __builtin_convertvector(*(const Part*)((const T*)from + h * DL), D);
+  }
+  INLINE void put(V* to, int h, D x) {
+    *(Part*)((T*)to + h * DL) = __builtin_convertvector(x, Part);
+  }
+
+  INLINE Sums<V> sums(const V* d, const V* other, int64_t n) {
+    Sums<V> s = {};
+    for (int64_t i = 0; i < n; ++i) {
+      V v = d[i], w = v * v;
+      s.first += magnitude(v);
+      s.second += w;
+      s.third += w * v;
+      s.fourth += w * w;
+      if (other) s.both += v * other[i];
+    }
+    return s;
+  }
+
+  static D mean(const Half& s) { return s.centre; }
+  static V median(const V* sorted, int64_t n) {
+    return n % 2 ? sorted[n / 2] : (sorted[n / 2 - 1] + sorted[n / 2]) * (T)0.5;
+  }
+  // The first value of the first longest run of neighbours within the tolerance.
+  static V mode(const V* sorted, V tolerance, int64_t n) {
+    V start = sorted[0], best = start, run = {}, longest = {};
+    for (int64_t i = 1; i < n; ++i) {
+      auto is_near = sorted[i] - sorted[i - 1] <= tolerance;
+      start = is_near ? start : sorted[i];
+      run = is_near ? run + (T)1 : V{};
+      auto is_longer = run > longest;
+      best = is_longer ? start : best;
+      longest = is_longer ? run : longest;
+    }
+    return best;
+  }
+  static D range(const Half& s) { return s.span; }
+  static D mean_deviation(const Half& s) { return s.span * s.first / s.n; }
+  static D std(const Half& s) { return s.span * root(s.second / (s.n - 1)); }
+  static D cv(const Half& s) {
+    D floor = larger(magnitude(s.centre), CV_FLOOR * root(s.energy / s.n));
+    D value = std(s) / (s.centre >= 0 ? floor : -floor);
+    return s.span > 0 ? value : D{};
+  }
+  template <class Any> INLINE Any quantile(const Any* sorted, double q, int64_t n) {
+    double position = q * n - 0.5;
+    position = position < 0 ? 0 : position > n - 1 ? n - 1 : position;
+    int64_t below = (int64_t)position, above = below + 1 < n ? below + 1 : n - 1;
+    T part = (T)(position - below);
+    return sorted[below] * (1 - part) + sorted[above] * part;
+  }
+  // Between quantiles at Hazen's positions.
+  template <class Any> INLINE Any iqr(const Any* sorted, int64_t n) {
+    return quantile(sorted, 0.75, n) - quantile(sorted, 0.25, n);
+  }
+  static D skewness(const Half& s) {
+    D value = s.third * root(s.n / s.second) / s.second;
+    return s.span > 0 ? value : D{};
+  }
+  static D kurtosis(const Half& s) {
+    D value = s.n * s.fourth / (s.second * s.second);
+    return s.span > 0 ? value : D{} + 3;
+  }
+  static D energy(const Half& s) { return s.energy; }
+  // Levels of sorted values as bytes; how many are equal to the one r places before is how often a
+  // cell holds more than r, and gain[r] what that adds. `levels` has VECTOR_BYTES to spare.
+  static V entropy(const V* sorted, const double* gain, uint8_t* levels, int64_t n) {
+    constexpr T half = 0.5 + (sizeof(T) == 4 ? 0x1p-13 : 1e-9);
+    V last = {}, low = sorted[0], factor = (T)LEVELS / (sorted[n - 1] - low);
+    for (int64_t i = 0; i < n; ++i) {
+      V level = (sorted[i] - low) * factor + half;
+      last = level < (T)LEVELS ? level : last;  // the second highest level joins the highest
+      Whole whole = __builtin_convertvector(last, Whole);
+      *(Few*)(levels + i * W) = __builtin_convertvector(whole, Few);
+    }
+    V total = {};
+    total += (T)(n * gain[0]);
+    constexpr int together = VECTOR_BYTES / W;  // samples in a vector of bytes
+    for (int64_t r = 1; r < n; ++r) {
+      V count = {};
+      for (int64_t from = r; from < n; from += 248) {  // sums of bytes stay below 256
+        int64_t to = from + 248 < n ? from + 248 : n;
+        Bytes equal = {};
+        int64_t i = from;
+        for (; i + together <= to; i += together)
+          equal -= (Bytes)(load(levels + i * W) == load(levels + (i - r) * W));
+        if (i < to) {
+          Bytes rest = (Bytes)(load(levels + i * W) == load(levels + (i - r) * W));
+          memset((uint8_t*)&rest + (to - i) * W, 0, VECTOR_BYTES - (to - i) * W);
+          equal -= rest;
+        }
+        fold<VECTOR_BYTES>((uint8_t*)&equal);
+        Few few;
+        memcpy(&few, &equal, W);
+        Whole whole = __builtin_convertvector(few, Whole);
+        count += __builtin_convertvector(whole, V);
+      }
+      if (!any(count != 0)) break;
+      total += count * (T)(gain[r] - gain[r - 1]);
+    }
+    return total;
+  }
+  static D peak_factor(const Half& s) {
+    D rms = root(s.energy / s.n);
+    D value = s.top / rms;
+    return rms > 0 ? value : D{};
+  }
+  static D correlation(const Half& s) {
+    D value = s.both / root(s.second * s.other);
+    return (s.span > 0) & (s.other > 0) ? value : D{};
+  }
+  static V spectral_centroid(const V* amplitude, V total, const double* frequency_hz, int64_t n) {
+    V moment = {};
+    for (int64_t i = 0; i < n; ++i) moment += amplitude[i] * (T)frequency_hz[i];
+    V value = moment / total;
+    return total > 0 ? value : V{};
+  }
+  static V spectral_spread(
+      const V* amplitude, V total, V centre, const double* frequency_hz, int64_t n) {
+    V moment = {};
+    for (int64_t i = 0; i < n; ++i) {
+      V away = (T)frequency_hz[i] - centre;
+      moment += away * away * amplitude[i];
+    }
+    V value = root(moment / total);
+    return total > 0 ? value : V{};
+  }
+
+  INLINE Bytes load(const uint8_t* from) {
+    Bytes bytes;
+    memcpy(&bytes, from, sizeof(bytes));
+    return bytes;
+  }
+  template <int N> INLINE void fold(uint8_t* bytes) {
+    if constexpr (N > W) {
+      typedef uint8_t Part __attribute__((vector_size(N / 2)));
+      Part a, b;
+      memcpy(&a, bytes, N / 2);
+      memcpy(&b, bytes + N / 2, N / 2);
+      a += b;
+      memcpy(bytes, &a, N / 2);
+      fold<N / 2>(bytes);
+    }
+  }
+};
+
+// -- A group of pairs ---------------------------------------------------------------------------------
+
+template <class T> struct Group : Describe<T> {
+  using Base = Describe<T>;
+  using typename Base::V;
+  using Base::get;
+  using Base::put;
+  static constexpr int W = Base::W, H = Base::H;
+
+  const Plan& plan;
+  int64_t n, num_lines, num_branches;
+  int64_t bin[W], channel[W];
+  int num;             // pairs in it; the other lanes repeat the first
+  bool is_broken[W];   // holds NaN or Inf
+  D first[H], scale[H], unit[H];
+  D *y[H], *approximation[H], *coefficients[H], *row[H];
+  V *raw, *d, *few, *lines, *total;
+  uint8_t* levels;
+  V other;             // sum of squares of raw
+  D is_constant[H], centre[H];
+  D values[MAX_BRANCHES][H];
+  uint32_t need[2 * MAX_BRANCHES + 1];
+  double limit;
+  void* out;
+  bool out_is_float;
+
+  explicit Group(const Plan& plan)
+      : plan(plan), n(plan.num_samples), num_lines(plan.num_lines), num_branches(plan.num_branches) {}
+
+  // Bytes of memory wanted; with a place, where everything lies in it.
+  size_t place(char* at) {
+    char* start = at;
+    auto take = [&at](size_t bytes) {
+      char* it = at;
+      at += (bytes + 2 * VECTOR_BYTES - 1) / VECTOR_BYTES * VECTOR_BYTES;
+      return it;
+    };
+    size_t samples = n + 8, spectrum = 2 * num_lines + 16, most = samples + spectrum;
+    for (int h = 0; h < H; ++h) {
+      y[h] = (D*)take(samples * sizeof(D));
+      row[h] = (D*)take(samples * sizeof(D));
+      approximation[h] = (D*)take(plan.num_coefficients * sizeof(D));
+      coefficients[h] = (D*)take(plan.num_coefficients * sizeof(D));
+    }
+    raw = (V*)take(samples * sizeof(V));
+    few = (V*)take(samples * sizeof(V));
+    d = (V*)take(most * sizeof(V));
+    lines = (V*)take(spectrum * sizeof(V));
+    total = (V*)take(spectrum * sizeof(V));
+    levels = (uint8_t*)take(most * W + VECTOR_BYTES);
+    return at - start;
+  }
+
+  // Samples less the first of each pair, and its magnitude. What is broken or odd is read as zeros.
+  template <class X> void read(const X* bins, uint8_t* is_odd) {
+    for (int k = 0; k < W; ++k) {
+      const X* from = bins + (bin[k] * plan.num_channels + channel[k]) * n;
+      double most = 0;
+      bool finite = true;
+      for (int64_t i = 0; i < n; ++i) {
+        double size = fabs((double)from[i]);
+        finite &= size <= 1.7976931348623157e308;
+        most = size > most ? size : most;
+      }
+      bool usual = most == 0 || (SMALLEST <= most && most <= LARGEST);
+      is_broken[k] = !finite;
+      is_odd[bin[k]] |= finite && !usual;
+      bool is_read = finite && usual;
+      double start = is_read ? (double)from[0] : 0;
+      double* to = (double*)y[k / DL] + k % DL;
+      for (int64_t i = 0; i < n; ++i) to[i * DL] = is_read ? (double)from[i] - start : 0;
+      ((double*)first)[k] = start;
+      ((double*)scale)[k] = is_read ? most : 0;
+      ((double*)unit)[k] = is_read && most > 0 ? 1 / most : 0;
+    }
+  }
+
+  // Features of the group's row to their columns.
+  void write(int64_t row_number) {
+    for (int k = 0; k < num; ++k) {
+      int64_t at = channel[k] * (2 * num_branches + 1) + row_number;
+      int64_t base = bin[k] * plan.num_features;
+      for (int64_t w = plan.first[at]; w < plan.first[at + 1]; ++w) {
+        double v = ((const double*)values[plan.descriptor[w]])[k];
+        v = v > limit ? limit : v < -limit ? -limit : v;
+        v = is_broken[k] ? (double)NAN : v;
+        if (out_is_float)
+          ((float*)out)[base + plan.column[w]] = (float)v;
+        else
+          ((double*)out)[base + plan.column[w]] = v;
+      }
+    }
+  }
+
+  // All that is wanted of the rows centre + span * d; sorts d.
+  void describe(uint32_t wanted, int64_t count, Half* halves, const V* with, const double* gain,
+                bool in_time) {
+    Sums<V> s = Base::sums(d, with, count);
+    for (int h = 0; h < H; ++h) {
+      Half& half = halves[h];
+      half.n = (double)count;
+      half.first = get(&s.first, h);
+      half.second = get(&s.second, h);
+      half.third = get(&s.third, h);
+      half.fourth = get(&s.fourth, h);
+      half.both = get(&s.both, h);
+      half.other = get(&other, h);
+      if (in_time)
+        half.energy = half.span * half.span * half.second + half.n * half.centre * half.centre;
+      values[MEAN][h] = Base::mean(half);
+      values[RANGE][h] = Base::range(half);
+      values[MEAN_DEVIATION][h] = Base::mean_deviation(half);
+      values[STD][h] = Base::std(half);
+      values[CV][h] = Base::cv(half);
+      values[SKEWNESS][h] = Base::skewness(half);
+      values[KURTOSIS][h] = Base::kurtosis(half);
+      values[ENERGY][h] = Base::energy(half);
+      values[PEAK_FACTOR][h] = Base::peak_factor(half);
+      values[CORRELATION][h] = Base::correlation(half);
+    }
+    if (!(wanted & ORDERED)) return;
+    sort(d, (int)count);
+    V tolerance, order[4] = {};
+    for (int h = 0; h < H; ++h) {
+      D near = 1e-12 * scale[h] / halves[h].span + (sizeof(T) == 4 ? 0x1p-22 : 0.0);
+      put(&tolerance, h, halves[h].span > 0 ? near : D{} + 1);
+    }
+    order[0] = Base::median(d, count);
+    if (wanted & 1u << MODE) order[1] = Base::mode(d, tolerance, count);
+    order[2] = Base::iqr(d, count);
+    if (wanted & 1u << ENTROPY) order[3] = Base::entropy(d, gain, levels, count);
+    for (int h = 0; h < H; ++h) {
+      D centre = halves[h].centre, span = halves[h].span;
+      values[MEDIAN][h] = centre + span * get(order + 0, h);
+      values[MODE][h] = centre + span * get(order + 1, h);
+      values[IQR][h] = span * get(order + 2, h);
+      values[ENTROPY][h] = span > 0 ? get(order + 3, h) : D{};
+    }
+    if (sizeof(T) == 4 && in_time && (wanted & (1u << MEDIAN | 1u << IQR))) uncrowd(halves);
+  }
+
+  // Where float values crowd about the median or between the quartiles, of a quiet bin with a tap
+  // say, their rounding is no small part of the result: the row is sorted in double.
+  void uncrowd(const Half* halves) {
+    int64_t few_values = n / 25, half = n / 2;
+    int64_t high = half + few_values < n ? half + few_values : n - 1;
+    int64_t low = half - 1 - few_values > 0 ? half - 1 - few_values : 0;
+    V about = d[high] - d[low], spread = Base::iqr(d, n);
+    auto is_crowded = (about < (T)CROWDED) | (spread < (T)CROWDED);
+    if (!any(is_crowded)) return;
+    V chosen = is_crowded ? V{} + 1 : V{};
+    for (int h = 0; h < H; ++h) {
+      sort(row[h], (int)n);
+      auto take = (get(&chosen, h) > 0) & (halves[h].span > 0);
+      // the row lies in memory less a constant, which is the centre less its mean
+      D exact = Describe<double>::median(row[h], n) + (halves[h].centre - centre[h]);
+      values[MEDIAN][h] = take ? exact : values[MEDIAN][h];
+      values[IQR][h] = take ? Describe<double>::iqr(row[h], n) : values[IQR][h];
+    }
+  }
+
+  // The row in memory, less `offset`: is it constant, and at what; its descriptors, if wanted.
+  void describe_time(uint32_t wanted, bool keeps_first, const V* with, int64_t row_number) {
+    Half halves[H];
+    for (int h = 0; h < H; ++h) {
+      Extent e = extent(row[h], n);
+      D span = e.high - e.low, offset = keeps_first ? first[h] : D{};
+      auto constant = span * (1 / NOISE) < scale[h];
+      span = constant ? D{} : span;
+      D middle = e.mean + offset;
+      if (!keeps_first) middle = constant ? D{} : middle;
+      halves[h].centre = middle;
+      halves[h].span = span;
+      halves[h].top = span > 0 ? e.high + offset : middle;
+      is_constant[h] = constant ? D{} + 1 : D{};
+      centre[h] = e.mean;
+    }
+    if (wanted) {
+      for (int h = 0; h < H; ++h) {
+        D mean = centre[h], factor = 1 / halves[h].span;
+        factor = halves[h].span > 0 ? factor : D{};
+        for (int64_t i = 0; i < n; ++i) put(d + i, h, (row[h][i] - mean) * factor);
+      }
+      describe(wanted, n, halves, with, plan.gain_time, true);
+      write(row_number);
+    }
+    for (int h = 0; h < H; ++h) centre[h] = halves[h].centre;
+  }
+
+  // The spectrum |gain * spectrum + offset * ones| in the unit of the channel: its energy.
+  void describe_lines(
+      uint32_t wanted, const V* spectrum, bool keeps_first, D* energies, int64_t row_number) {
+    V gain, offset, energy = {}, most = {};
+    for (int h = 0; h < H; ++h) {
+      auto constant = is_constant[h] > 0;
+      put(&gain, h, constant ? D{} : D{} + 1);
+      put(&offset, h, (constant ? centre[h] : keeps_first ? first[h] : D{}) * unit[h]);
+    }
+    const T* ones = (const T*)plan.ones;
+    int64_t count = num_lines;
+    for (int64_t i = 0; i < count; ++i) {
+      V real = gain * spectrum[i] + offset * ones[i];
+      V imaginary = gain * spectrum[count + i] + offset * ones[count + i];
+      V square = real * real + imaginary * imaginary;
+      d[i] = square;
+      energy += square;
+      most = larger(most, square);
+    }
+    for (int h = 0; h < H; ++h) energies[h] = get(&energy, h);
+    if (!wanted) return;
+    V inverse = 1 / most, low = V{} + 1, high = {}, sum = {};
+    inverse = most > 0 ? inverse : V{};
+    for (int64_t i = 0; i < count; ++i) {
+      V amplitude = root(d[i] * inverse);
+      d[i] = amplitude;
+      sum += amplitude;
+      low = smaller(low, amplitude);
+      high = larger(high, amplitude);
+    }
+    if (wanted & WEIGHTED) {
+      V centroid = Base::spectral_centroid(d, sum, plan.frequency_hz, count), spread = {};
+      if (wanted & 1u << SPECTRAL_SPREAD)
+        spread = Base::spectral_spread(d, sum, centroid, plan.frequency_hz, count);
+      for (int h = 0; h < H; ++h) {
+        values[SPECTRAL_CENTROID][h] = get(&centroid, h);
+        values[SPECTRAL_SPREAD][h] = get(&spread, h);
+      }
+    }
+    V mean = sum / (T)count, span = high - low, factor = 1 / span;
+    factor = span > 0 ? factor : V{};
+    for (int64_t i = 0; i < count; ++i) d[i] = (d[i] - mean) * factor;
+    Half halves[H];
+    for (int h = 0; h < H; ++h) {
+      D size = scale[h] * root(get(&most, h));
+      halves[h].centre = size * get(&mean, h);
+      halves[h].span = size * get(&span, h);
+      halves[h].top = size;
+      halves[h].energy = scale[h] * scale[h] * energies[h];
+    }
+    describe(wanted, count, halves, nullptr, plan.gain_lines, false);
+    write(row_number);
+  }
+
+  void describe_slow() {
+    for (int h = 0; h < H; ++h) memcpy(row[h], y[h], n * sizeof(D));
+    other = V{};
+    describe_time(need[0], true, nullptr, 0);
+  }
+
+  void describe_fast() {
+    for (int h = 0; h < H; ++h) {  // the bin itself, for correlation
+      Extent e = extent(y[h], n);
+      D span = e.high - e.low, factor = 1 / span;
+      factor = span * (1 / NOISE) < scale[h] ? D{} : factor;
+      factor = span > 0 ? factor : D{};
+      for (int64_t i = 0; i < n; ++i) put(raw + i, h, (y[h][i] - e.mean) * factor);
+    }
+    other = V{};
+    for (int64_t i = 0; i < n; ++i) other += raw[i] * raw[i];
+    uint32_t shares = need[2 * num_branches];
+    int64_t levels_wanted = 0;
+    for (int64_t b = 0; b < num_branches; ++b)
+      if (need[b] || need[num_branches + b] || shares) levels_wanted = b / 2 + 1;
+    // coefficients, finest first; those of level m lie from `starts[m]` on
+    int64_t starts[MAX_BRANCHES / 2 + 1] = {0};
+    for (int64_t m = 0; m < levels_wanted; ++m)
+      for (int h = 0; h < H; ++h) {
+        const D* from = m ? approximation[h] + starts[m - 1] : y[h];
+        product<4, double>(plan.low[m], from, approximation[h] + starts[m]);
+        product<4, double>(plan.high[m], from, coefficients[h] + starts[m]);
+        starts[m + 1] = starts[m] + 4 * plan.low[m].num_blocks;
+      }
+    D energies[MAX_BRANCHES][H];
+    bool has_total = false;  // the spectrum of the approximation last formed
+    for (int64_t m = levels_wanted - 1; m >= 0; --m) {
+      const uint32_t *in_time = need + 2 * m, *in_lines = need + num_branches + 2 * m;
+      bool wants_a = in_lines[0] || shares, wants_d = in_lines[1] || shares;
+      if (in_time[0] || wants_a) form(2 * m, approximation, starts[m], in_time[0]);
+      if (wants_a) {
+        if (!has_total) spectrum_of(2 * m, approximation, starts[m], total);
+        has_total = true;
+        describe_lines(in_lines[0], total, true, energies[2 * m], num_branches + 2 * m);
+      }
+      if (in_time[1] || wants_d) form(2 * m + 1, coefficients, starts[m], in_time[1]);
+      bool is_added = has_total && m > 0 && wants_finer(m, shares);
+      if (wants_d || is_added) spectrum_of(2 * m + 1, coefficients, starts[m], lines);
+      if (is_added)
+        for (int64_t i = 0; i < 2 * num_lines; ++i) total[i] += lines[i];
+      if (wants_d)
+        describe_lines(in_lines[1], lines, false, energies[2 * m + 1], num_branches + 2 * m + 1);
+    }
+    if (shares) band_energy_ratio(energies);
+  }
+
+  // Is the spectrum of an approximation finer than level m wanted?
+  bool wants_finer(int64_t m, uint32_t shares) {
+    uint32_t any_wanted = shares;
+    for (int64_t b = 0; b < 2 * m; b += 2) any_wanted |= need[num_branches + b];
+    return any_wanted != 0;
+  }
+
+  void form(int64_t branch, D* const* from, int64_t start, uint32_t wanted) {
+    for (int h = 0; h < H; ++h) product<4, double>(plan.out[branch], from[h] + start, row[h]);
+    describe_time(wanted, branch % 2 == 0, raw, branch);
+  }
+
+  void spectrum_of(int64_t branch, D* const* from, int64_t start, V* to) {
+    for (int h = 0; h < H; ++h)
+      for (int64_t k = 0; k < plan.lines[branch].num_columns; ++k)
+        put(few + k, h, from[h][start + k] * unit[h]);
+    product<8, T>(plan.lines[branch], few, to);
+  }
+
+  // Each branch's share of the energy of all spectra; 0 if all are zero.
+  void band_energy_ratio(const D (*energies)[H]) {
+    for (int h = 0; h < H; ++h) {
+      D sum = {};
+      for (int64_t b = 0; b < num_branches; ++b) sum += energies[b][h];
+      for (int64_t b = 0; b < num_branches; ++b) {
+        D value = energies[b][h] / sum;
+        values[b][h] = sum > 0 ? value : D{};
+      }
+    }
+    write(2 * num_branches);
+  }
+
+  // What is wanted of any of the pairs' channels.
+  void gather_needs() {
+    int64_t num_rows = 2 * num_branches + 1;
+    for (int64_t r = 0; r < num_rows; ++r) {
+      need[r] = 0;
+      for (int k = 0; k < num; ++k) need[r] |= plan.need[channel[k] * num_rows + r];
+    }
+  }
+};
+
+template <class T>
+int run(const Plan& plan, const void* bins, bool bins_are_float, int64_t num_bins, void* out,
+        bool out_is_float, uint8_t* is_odd) {
+  constexpr int W = Group<T>::W;
+  Group<T> sizes(plan);
+  size_t bytes = sizes.place(nullptr) + sizeof(Group<T>) + 2 * VECTOR_BYTES;
+  char* memory = (char*)malloc(bytes);
+  if (!memory) return 1;
+  uintptr_t aligned = ((uintptr_t)memory + VECTOR_BYTES - 1) / VECTOR_BYTES * VECTOR_BYTES;
+  alignas(VECTOR_BYTES) Group<T> group(plan);
+  group.place((char*)aligned);
+  group.out = out;
+  group.out_is_float = out_is_float;
+  group.limit = out_is_float ? 3.4028234663852886e38 : 1.7976931348623157e308;
+  const int64_t* channels[2] = {plan.slow, plan.fast};
+  const int64_t counts[2] = {plan.num_slow, plan.num_fast};
+  for (int kind = 0; kind < 2; ++kind) {
+    int64_t num_pairs = counts[kind] * num_bins;
+    for (int64_t from = 0; from < num_pairs; from += W) {
+      group.num = (int)(num_pairs - from < W ? num_pairs - from : W);
+      for (int k = 0; k < W; ++k) {
+        int64_t pair = from + (k < group.num ? k : 0);
+        group.bin[k] = pair % num_bins;
+        group.channel[k] = channels[kind][pair / num_bins];
+      }
+      group.gather_needs();
+      if (bins_are_float)
+        group.read((const float*)bins, is_odd);
+      else
+        group.read((const double*)bins, is_odd);
+      if (kind == 0)
+        group.describe_slow();
+      else
+        group.describe_fast();
+    }
+  }
+  free(memory);
+  return 0;
+}
+
+}  // namespace
+
+extern "C" int ENTRY(const Plan* plan, const void* bins, int bins_are_float, int64_t num_bins,
+                     void* out, int out_is_float, uint8_t* is_odd) {
+  return plan->is_float
+             ? run<float>(*plan, bins, bins_are_float, num_bins, out, out_is_float, is_odd)
+             : run<double>(*plan, bins, bins_are_float, num_bins, out, out_is_float, is_odd);
+}
