@@ -141,11 +141,9 @@ class Judged:
         self.calibrated = calibration_of(detector)
         self.unstated = WORST_PROBABILITY[form.precision]
         self.masked_channels: Tensor | None = None
-        self.others: list[SlipDetector] = []
-        for engine in ("reference", "auto"):
-            other = copy.copy(self.detector)
-            other.extractor = FeatureExtractor(other.pool, other.selected, engine)
-            self.others.append(other)
+        other = copy.copy(self.detector)
+        other.extractor = FeatureExtractor(other.pool, other.selected, "reference")
+        self.others = [other]
 
     def judge(self, samples: Tensor) -> Prediction:
         """By torch, scores in float64."""
