@@ -1,6 +1,5 @@
 import hashlib
 import json
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -129,19 +128,6 @@ def test_a_sample_goes_on_from_its_state(recordings, most, cut):
     assert_same(BinSample.from_state_dict(state), before)  # the state was left alone
 
 
-def test_merge_leaves_the_other_sample_alone():
-    recordings = make_recordings([9] * 8)
-    other = sample_of(recordings[:4], 5)
-    merged = BinSample(5)
-    merged.merge(other)
-    for recording in recordings[4:]:
-        merged.update(*recording)
-    assert_same(other, sample_of(recordings[:4], 5))
-    for recording in recordings[4:]:
-        other.update(*recording)
-    assert_same(other, merged)
-
-
 def test_the_input_may_change_afterwards():
     name, group, features, is_slip = make_recordings([9])[0]
     sample = sample_of([(name, group, features, is_slip)], 9)
@@ -149,18 +135,6 @@ def test_the_input_may_change_afterwards():
     features.zero_()
     assert torch.equal(sample.bins().features, before)
     assert (before != 0).all()
-
-
-def test_represents_adds_up_to_all_bins():
-    recordings = make_recordings([40] * 9)
-    sample = sample_of(recordings, 7)
-    bins = sample.bins()
-    totals = Counter()
-    for _, _, _, group, label, represents in rows_of(bins):
-        totals[group, label] += represents
-    assert totals == pytest.approx(sample.num_seen)
-    assert sum(sample.num_seen.values()) == 360
-    assert all(kept <= 7 for kept in Counter((r[3], r[4]) for r in rows_of(bins)).values())
 
 
 def test_every_bin_is_as_likely_as_any_other():
@@ -176,13 +150,6 @@ def test_every_bin_is_as_likely_as_any_other():
     by_recording = torch.bincount(bins.recording, minlength=20)
     assert ((by_recording - 50).abs() < 5 * 50**0.5).all()
     assert abs(float(bins.features.mean()) - 10_000) < 5 * 20_000 / 12**0.5 / 1000**0.5
-
-
-def test_memory_is_that_of_the_sample():
-    sample = BinSample(10)
-    for number in range(50):
-        sample.update(f"r{number}", "a", torch.zeros(100, 4), torch.zeros(100))
-    assert sample.state_dict()["tensors"]["features"].untyped_storage().size() == 40 * 4
 
 
 def test_a_sample_of_none_counts():
