@@ -53,8 +53,8 @@ def test_scaled_features_and_their_errors():
         filtered = detector.channel_filter.valid(samples)
         scaled = detector.scaler(detector.pool(filtered)[:, list(detector.selected)])
         coarse = detector.channel_filter.valid(samples.float())
-        features = detector.pool(coarse)[:, list(detector.selected)]
-        rounded = detector.scaler(features.double()).float()
+        features = detector.extractor(coarse, torch.float64)
+        rounded = detector.scaler(features).float()
     torch.testing.assert_close(compared.scaled, scaled, rtol=0, atol=1e-12)
     torch.testing.assert_close(
         compared.scaled_error, (rounded.double() - scaled).abs(), rtol=0, atol=3e-7

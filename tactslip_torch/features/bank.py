@@ -35,6 +35,7 @@ from tactslip_torch.features.plan import Plan, Row, RowKind
 _LEAST_LENGTH = 16 * torch.finfo(torch.float64).eps / 0.35
 """Of a row less its mean, as a part of its bin's magnitude; below it is rounding. A span of 16 eps:
 that of 100 centred values of length 1 lies between .2 (two levels) and 1.41."""
+_CHUNK_BINS = 32  # what fits the cache of a processor
 _OWN_ROWS = ("mode", "entropy", "correlation", "spectral_spread")
 """Descriptors of so much work that they are taken of the rows that want them alone."""
 
@@ -150,6 +151,11 @@ class Bank:
             - output: ``[*, K]``; what is beyond float64 saturates
         """
         bins = bounded_gradient(bins).double()
+        flat = bins.reshape(-1, *bins.shape[-2:])
+        features = torch.cat([self._of_chunk(chunk) for chunk in flat.split(_CHUNK_BINS)])
+        return features.reshape(*bins.shape[:-2], self._plan.num_features)
+
+    def _of_chunk(self, bins: Tensor) -> Tensor:
         magnitude = bins.detach().abs().amax(-1)
         is_broken = ~magnitude.isfinite()
         magnitude = torch.where(is_broken, 0.0, magnitude)

@@ -30,6 +30,7 @@ ENTROPY_LEVELS = 255
 RUN_TOLERANCE = {torch.float64: 1e-12, torch.float32: 2.0**-20}
 HALF_SLACK = {torch.float64: 1e-9, torch.float32: 2.0**-13}
 CV_FLOOR = 1e-6
+CV_ZERO = 1e-12
 _NEXT_TO_NOTHING = 1e-60  # instead of 0 in a divisor; variances of rows are 0 or far above
 
 
@@ -155,10 +156,12 @@ def std(x: Rows) -> Tensor:
 def cv(x: Rows) -> Tensor:
     """Coefficient of variation, ``std / mean``, signed.
 
-    The mean's magnitude counts as at least 1e-6 of the rms (ours); 0 for a zero row.
+    The mean's magnitude counts as at least 1e-6 of the rms, and a mean within 1e-12 of the rms, the
+    sign of which is rounding, as positive (both ours); 0 for a zero row.
     """
     floor = torch.maximum(x.mean.abs(), x.rms * CV_FLOOR)
-    return x.std / torch.where(x.mean < 0.0, -floor, floor)
+    is_negative = x.mean < x.rms * -CV_ZERO
+    return x.std / torch.where(is_negative, -floor, floor)
 
 
 def iqr(x: Rows) -> Tensor:

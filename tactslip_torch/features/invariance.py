@@ -47,7 +47,7 @@ class Invariance:
 
 
 _MODE = "an offset widens what counts as one value"
-_CV = "positive where the mean is exactly 0"
+_CV = "positive where the mean is 0"
 _ENERGY = "up to the largest finite number"
 _ENTROPY = "halves round up, the two highest levels share a cell"
 _PEAK = "the signed maximum"

@@ -32,7 +32,7 @@ def pooled(graph: Graph, features: Value, is_missing: Value, detector: SlipDetec
     if layer is None:
         return features
     used = detector.extractor.plan.channels
-    parts, is_some = [], []
+    parts, is_some = list[Any](), list[Value]()
     if layer.singles:
         parts.append(features.take(layer.singles, 1))
     for index, group in enumerate(layer.groups):
@@ -44,9 +44,9 @@ def pooled(graph: Graph, features: Value, is_missing: Value, detector: SlipDetec
         values = features.take(group.columns, 1).reshape(0, len(group.families), num)
         knee = layer.knee[list(group.families), None]
         size = (values.abs() * graph.constant(_of(1 / knee), F64) + 1.0).log()
-        bent = size * graph.op("Sign", values) * graph.constant(_of(knee), F64)
-        own: Any = over_channels(bent, in_use.unsqueeze(1), group.statistics, num)  # type: ignore
-        parts += own
+        bent: Any = size * graph.op("Sign", values) * graph.constant(_of(knee), F64)
+        in_rows: Any = in_use.unsqueeze(1)
+        parts += over_channels(bent, in_rows, group.statistics, num)
     columns = graph.concat(*parts, axis=1).take(layer.order, 1)
     always = is_some[0] | ~is_some[0]
     known = graph.concat(*is_some, always, axis=1).cast(F32).take(layer.kind_of, 1) > 0.0
