@@ -5,7 +5,7 @@ import pytest
 import torch
 from small_detector import HAND, raw_bins
 from test_dead_streams import alarming_with_gaussians
-from test_missing import with_gaussians
+from test_predictions import with_gaussians
 
 from tactslip_torch.graph.bins import bin_graph
 from tactslip_torch.graph.check import check_model

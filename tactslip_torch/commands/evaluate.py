@@ -26,7 +26,6 @@ from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, judged_once
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.report.metrics import merged_answers, merged_metrics
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
@@ -36,10 +35,10 @@ from tactslip_torch.training.experiment import (
     feature_cache,
     feature_rows,
     make_trainer,
-    merged_baselines,
+    merged_results,
     save_config,
 )
-from tactslip_torch.training.learner import SlipLearner, event_numbers, together
+from tactslip_torch.training.learner import SlipLearner
 
 
 def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
@@ -65,9 +64,6 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     if is_first:
         save_config(config, folder)
     parts: dict[str, dict[str, Any]] = {}
-    baselines: dict[str, dict[str, Any]] = {}
-    events: list[dict[str, Any]] = []
-    answers: dict[str, dict[str, Any]] = {}
     overlaps = {fold.name: overlap(detector, source, fold) for fold in folds}
     with feature_cache(config.cache) as cache:
         filters = detector.channel_filter
@@ -82,22 +78,9 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             trainer = make_trainer(config.trainer, place)
             data = SlipDataModule(maker, fold, config.num_workers)
             trainer.test(learner, datamodule=data, verbose=False)
-            parts[fold.name] = learner.metrics["splits"]
-            baselines[fold.name] = learner.metrics["baselines"]
-            events.append(learner.events)
-            for role, of_role in learner.metrics.get("answers", {}).items():
-                answers.setdefault(role, {})[fold.name] = of_role
-    roles = list(dict.fromkeys(role for splits in parts.values() for role in splits))
-    metrics = common_facts(source, detector.pool, config) | {
-        "splits": {
-            role: merged_metrics([splits[role] for splits in parts.values() if role in splits])
-            for role in roles
-        },
-        "baselines": learner.metrics["baselines"]
-        if len(once) == 1
-        else merged_baselines(baselines),
-        "events": event_numbers(together(events)),
-        "answers": {role: merged_answers(of_role) for role, of_role in answers.items()},
+            parts[fold.name] = learner.metrics | {"recording_events": learner.events}
+    metrics = common_facts(source, detector.pool, config) | merged_results(parts)
+    metrics |= {
         "selected": [str(name) for name in detector.selected_names],
         "timing_s": {"total": time.perf_counter() - started},
         "overlap": overlaps,

@@ -115,7 +115,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             if tuning is not None:
                 learner, found = tune_fold(config, place, data, learner, tuning)
             fold_metrics[fold.name] = run_fold(config, place, data, learner, alarming, found)
-    metrics = common_facts(source, pool, config) | combined(fold_metrics, are_rivals(folds))
+    metrics = common_facts(source, pool, config) | combined(fold_metrics, by_fold=are_rivals(folds))
     metrics["timing_s"]["total"] = time.perf_counter() - started
     names = list(pool.names)
     if recipe.pooling is not None:

@@ -1,4 +1,4 @@
-"""What rounding can do to a quadratic form over the box of scaled features: a bound, and a search.
+"""What rounding can do to a quadratic form over the box of scaled features: a bound, and examples.
 
 The bound counts roundings (Higham 2002, chapter 3): a value that ``n`` of them have met is off by
 the factor ``1 + theta``, ``|theta| <= gamma(n) = n u / (1 - n u)``. In ``z' Q z + l' z + a`` of K
@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from tactslip_torch.model.kernels import QuadraticForm
 
 _WIDE = 2.0**-52  # twice the unit roundoff of the float64 sums below
-_KEPT, _VARIED, _ROUNDS = 16, 32, 16
 
 
 class RoundingBound(NamedTuple):
@@ -92,18 +91,17 @@ def worst_error(
     num_points: int = 2048,
     also: Tensor | None = None,
 ) -> float:
-    """The worst error that a search over the box finds; infinite for a score that is not finite.
+    """The worst error at points of the box; infinite for a score that is not finite.
 
     In ``dtype`` against float64, both on the same z of ``dtype``; so it is known to the
-    ``rounding_bound`` of float64. Looks at points and corners at random, at the signs of
-    eigenvectors and rows of Q, at corners where the rounding of the coefficients adds up, and at
-    what varies the worst of them.
+    ``rounding_bound`` of float64. Looks at points and corners at random, and at the signs of the
+    rows and eigenvectors of Q.
 
     Args:
         head: the quadratic form, as fitted.
         dtype: in which it is stored and computed.
-        seed: of the search.
-        num_points: random ones to begin with.
+        seed: of the points.
+        num_points: random points, and as many corners.
         also: points to look at, scaled bins for instance.
 
     Shape:
@@ -112,69 +110,31 @@ def worst_error(
     Raises:
         ValueError: if ``also`` has another number of features or leaves the box.
     """
-    exact, rounded = _stored(head, torch.float64), _stored(head, dtype)
-    generator = torch.Generator().manual_seed(seed)
-    parts = [_starts(exact, rounded, num_points, generator)]
-    if also is not None:
-        if also.ndim != 2 or also.shape[1] != head.num_features or bool((also.abs() > 1).any()):
-            raise ValueError(
-                f"expected points [N, {head.num_features}] within [-1, 1], got "
-                f"{tuple(also.shape)}; scale them first"
-            )
-        parts.append(also.detach().cpu().double())
-    points = torch.cat(parts).to(dtype)
-    errors = _errors(exact, rounded, points)
-    worst = float(errors.max())
-    for _ in range(_ROUNDS):
-        best = points[errors.topk(min(_KEPT, len(errors))).indices]
-        points = torch.cat([best, _varied(best, generator)])
-        errors = _errors(exact, rounded, points)
-        worst = max(worst, float(errors.max()))  # a point in another batch is rounded otherwise
-    return worst
-
-
-def _stored(head: QuadraticForm, dtype: torch.dtype) -> QuadraticForm:
+    num = head.num_features
     parts = (head.dense_quadratic, head.linear, head.constant)
-    return QuadraticForm(*(part.detach().cpu().to(dtype) for part in parts))
-
-
-def _errors(exact: QuadraticForm, rounded: QuadraticForm, points: Tensor) -> Tensor:
-    errors: Tensor = (rounded(points).double() - exact(points.double())).abs()
-    return errors.nan_to_num(nan=math.inf, posinf=math.inf)
-
-
-def _starts(
-    exact: QuadraticForm, rounded: QuadraticForm, num_points: int, generator: torch.Generator
-) -> Tensor:
-    """Points to begin with, ``[M, K]`` in float64."""
-    num = exact.num_features
+    exact, rounded = (
+        QuadraticForm(*(part.detach().cpu().to(to) for part in parts))
+        for to in (torch.float64, dtype)
+    )
+    generator = torch.Generator().manual_seed(seed)
     inside = 2 * torch.rand(num_points, num, generator=generator, dtype=torch.float64) - 1
-    corners = _sign(torch.randn(num_points, num, generator=generator, dtype=torch.float64))
-    rows = _sign(exact.dense_quadratic)
-    parts = [inside, corners, rows, -rows, _sign(exact.linear)[None], torch.ones(1, num)]
-    lost = rounded.dense_quadratic.double() - exact.dense_quadratic
-    if bool(lost.isfinite().all()) and bool(exact.dense_quadratic.isfinite().all()):
-        bend = exact.dense_quadratic
+    corners = torch.randn(num_points, num, generator=generator, dtype=torch.float64)
+    bend = exact.dense_quadratic
+    points = [corners, bend, -bend, exact.linear[None], torch.ones(1, num)]
+    if bool(bend.isfinite().all()):
         vectors = torch.linalg.eigh(bend + bend.mT).eigenvectors.mT
-        parts += [_sign(vectors), -_sign(vectors), vectors / vectors.abs().amax(1, keepdim=True)]
-        uphill = corners
-        for _ in range(8):  # each step adds up more of what storing the coefficients lost
-            uphill = _sign(uphill @ (lost + lost.mT))
-        parts.append(uphill)
-    return torch.cat(parts)
-
-
-def _sign(x: Tensor) -> Tensor:
-    return torch.where(x < 0, -1.0, 1.0).double()
-
-
-def _varied(points: Tensor, generator: torch.Generator) -> Tensor:
-    """Copies of points with some coordinates turned round and some drawn anew."""
-    many = points.repeat_interleave(_VARIED, 0)
-    draw = torch.rand(3, *many.shape, generator=generator, dtype=torch.float64)
-    drawn = (2 * draw[0] - 1).to(points.dtype)
-    many = torch.where(draw[1] < 0.04, -many, many)
-    return torch.where(draw[2] < 0.02, drawn, many)
+        points += [vectors, -vectors]
+    points = [inside, *(torch.where(x < 0, -1.0, 1.0).double() for x in points)]
+    if also is not None:
+        if also.ndim != 2 or also.shape[1] != num or bool((also.abs() > 1).any()):
+            raise ValueError(
+                f"expected points [N, {num}] within [-1, 1], got {tuple(also.shape)}; scale them "
+                "first"
+            )
+        points.append(also.detach().cpu().double())
+    z = torch.cat(points).to(dtype)
+    errors = (rounded(z).double() - exact(z.double())).abs()
+    return float(errors.nan_to_num(nan=math.inf, posinf=math.inf).max())
 
 
 def head_facts(head: nn.Module, also: Tensor | None = None, seed: int = 0) -> dict[str, Any]:

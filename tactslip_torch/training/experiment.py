@@ -40,6 +40,7 @@ from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.decisions import Scorer
+from tactslip_torch.onset.events import RecordingEvents
 from tactslip_torch.onset.settings import KEY
 from tactslip_torch.report.metrics import merged_answers, merged_metrics, summed_metrics
 from tactslip_torch.report.results import tuning_figure
@@ -50,81 +51,73 @@ from tactslip_torch.signals.wavelet import highest_level
 from tactslip_torch.training.adaptation import check_recipe, gathered_statistics
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.datamodule import SlipDataModule
-from tactslip_torch.training.learner import SlipLearner, event_numbers, together
+from tactslip_torch.training.learner import SlipLearner, event_numbers
 from tactslip_torch.training.recipe import Recipe, sample_weight
 from tactslip_torch.training.statistics import FILE as STATISTICS
 from tactslip_torch.training.tuning import Tuning, settled_learner
 
 
-def combined(folds: dict[str, dict[str, Any]], of_rivals: bool) -> dict[str, Any]:
-    """One fold as it is; of several, bins and events are pooled, and the shared selection named.
-
-    Rivals are judged on the same bins, so theirs are not summed: ``splits`` then has each role of
-    each fold, such as ``"protocol/unseen"``.
-    """
-    found = {name: part.pop("recording_events") for name, part in folds.items()}
+def combined(folds: dict[str, dict[str, Any]], *, by_fold: bool) -> dict[str, Any]:
+    """One fold as it is; of several, ``merged_results``, and the features that all selected."""
     if len(folds) == 1:
-        return next(iter(folds.values()))
+        (found,) = folds.values()
+        del found["recording_events"]
+        return found
+    merged = merged_results(folds, by_fold=by_fold)
     parts = list(folds.values())
-    events = [
-        {f"{name}/{role}" if of_rivals else role: by_rule for role, by_rule in by_role.items()}
-        for name, by_role in found.items()
-    ]
-    splits: dict[str, list[dict[str, Any]]] = {}
-    for name, part in folds.items():
-        before = f"{name}/" if of_rivals else ""
-        for role, scores in part["splits"].items():
-            splits.setdefault(before + role, []).append(scores)
-    answers: dict[str, dict[str, Any]] = {}
-    for name, part in folds.items():
-        for role, found_of in part.get("answers", {}).items():
-            answers.setdefault(f"{name}/{role}" if of_rivals else role, {})[name] = found_of
+    for part in parts:
+        del part["recording_events"]
     shared = set.intersection(*(set(part["selected"]) for part in parts))
-    return {
-        "splits": {role: merged_metrics(scores) for role, scores in splits.items()},
-        "baselines": merged_baselines(
-            {name: part["baselines"] for name, part in folds.items()}, by_fold=of_rivals
-        ),
-        "events": event_numbers(together(events)),
-        "answers": {role: merged_answers(of) for role, of in answers.items()},
+    times = {name: [part.pop(name) for part in parts] for name in ("timing_s", "worker_s")}
+    return merged | {
         "selected": [name for name in parts[0]["selected"] if name in shared],
-        "timing_s": _summed([part.pop("timing_s") for part in parts]),
-        "worker_s": _summed([part.pop("worker_s") for part in parts]),
+        **{
+            name: {stage: sum(x.get(stage, 0.0) for x in own) for x in own for stage in x}
+            for name, own in times.items()
+        },
         "folds": folds,
     }
 
 
-def merged_baselines(
+def merged_results(
     folds: Mapping[str, Mapping[str, Any]], *, by_fold: bool = False
-) -> dict[str, dict[str, Any]]:
-    """Scores of baselines on the bins of all folds by role, or by fold and role.
-
-    One fold is returned as it is; of several, metadata (each fold's own) is left out.
+) -> dict[str, Any]:
+    """Splits, baselines, events and answers of several tests as of one, by role.
 
     Args:
-        folds: ``metrics["baselines"]`` of each fold.
-        by_fold: whether folds have the same bins, which then are not summed.
+        folds: of each its ``metrics`` as ``SlipLearner`` has them, and ``recording_events``.
+        by_fold: whether folds have the same bins, which then are not summed: results have each role
+            of each fold, such as ``"protocol/unseen"``.
     """
-    if len(folds) == 1:
-        return dict(next(iter(folds.values())))
-    splits: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    for fold, baselines in folds.items():
-        for name, about in baselines.items():
+    splits: dict[str, list[dict[str, Any]]] = {}
+    answers: dict[str, dict[str, Any]] = {}
+    baselines: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    events: dict[str, dict[str, list[RecordingEvents]]] = {}
+    for fold, found in folds.items():
+        before = f"{fold}/" if by_fold else ""
+        for role, scores in found["splits"].items():
+            splits.setdefault(before + role, []).append(scores)
+        for role, own in found.get("answers", {}).items():
+            answers.setdefault(before + role, {})[fold] = own
+        for name, about in found["baselines"].items():
             for role, scores in about["splits"].items():
-                key = f"{fold}/{role}" if by_fold else role
-                splits.setdefault(name, {}).setdefault(key, []).append(scores)
+                baselines.setdefault(name, {}).setdefault(before + role, []).append(scores)
+        for role, by_rule in found["recording_events"].items():
+            for name, recordings in by_rule.items():
+                events.setdefault(before + role, {}).setdefault(name, []).extend(recordings)
+    if len(folds) == 1:  # what baselines are is told of one fold alone
+        of_baselines = next(iter(folds.values()))["baselines"]
+    else:
+        of_baselines = {
+            name: {"splits": {role: summed_metrics(own) for role, own in by_role.items()}}
+            for name, by_role in baselines.items()
+        }
     return {
-        name: {"splits": {key: summed_metrics(of) for key, of in by_key.items()}}
-        for name, by_key in splits.items()
+        "splits": {role: merged_metrics(scores) for role, scores in splits.items()},
+        "baselines": of_baselines,
+        "events": event_numbers(events),
+        "answers": {role: merged_answers(own) for role, own in answers.items()},
     }
-
-
-def _summed(parts: list[dict[str, float]]) -> dict[str, float]:
-    total: dict[str, float] = {}
-    for part in parts:
-        for stage, seconds in part.items():
-            total[stage] = total.get(stage, 0.0) + seconds
-    return total
 
 
 MOST_LEVELS = 4
@@ -468,7 +461,7 @@ def run_fold(
         alarming = None  # hours of streams are no quick look
     if trainer.is_global_zero and alarming is not None:
         detector.save(folder / "detector.pt")  # what was fitted stays, whatever comes
-        alarm = alarming(detector, _rivals(detector), config.num_workers)
+        alarm = alarming(detector, _baselines(detector), config.num_workers)
     told = time.perf_counter()
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")
@@ -541,7 +534,7 @@ def _units(source: RecordingSource) -> dict[str, str]:
     return {} if units == "V" else {"units": units}
 
 
-def _rivals(detector: SlipDetector) -> dict[str, Scorer]:
+def _baselines(detector: SlipDetector) -> dict[str, Scorer]:
     """The methods that the paper argues against, on the detector's hand, filter and bins."""
     if not detector.pool.hand.fast:
         return {}

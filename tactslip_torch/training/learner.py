@@ -172,18 +172,6 @@ def event_numbers(
     }
 
 
-def together(
-    parts: Sequence[Mapping[str, Mapping[str, Sequence[RecordingEvents]]]],
-) -> dict[str, dict[str, list[RecordingEvents]]]:
-    """Events of several tests by role and rule, as of one."""
-    merged: dict[str, dict[str, list[RecordingEvents]]] = {}
-    for part in parts:
-        for role, by_rule in part.items():
-            for name, own in by_rule.items():
-                merged.setdefault(role, {}).setdefault(name, []).extend(own)
-    return merged
-
-
 class _Stream(NamedTuple):
     """Decisions in their order: when each is available, and what a rule made of them, ``[T]``."""
 

@@ -5,7 +5,7 @@ import warnings
 import pytest
 import torch
 from small_detector import raw_bins, small_detector
-from test_missing import with_gaussians
+from test_predictions import with_gaussians
 
 from tactslip_torch.model.detector import SlipDetector
 

@@ -1,0 +1,316 @@
+"""Predictions with their validity: NaN and Inf, masked and broken channels, extremes, float32."""
+
+import copy
+
+import pytest
+import torch
+from small_detector import HAND, raw_bins, small_detector
+from test_detector import noise, random_detector
+
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.missing_channels import ClassGaussians, ExpectedScore
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
+
+BAD = [float("nan"), float("inf"), -float("inf"), 1e308]
+
+
+def parts_of(detector):
+    return (detector.pool, detector.channel_filter, detector.selected, detector.scaler)
+
+
+def scaled_of(detector, samples):
+    """Scaled features of whole raw bins."""
+    bins = detector.channel_filter.valid(samples)
+    return detector.scaler(detector.pool(bins)[:, list(detector.selected)])
+
+
+def with_gaussians(**options):
+    """The small detector, with the Gaussians of some bins cut in two by their score."""
+    made = small_detector(**options)
+    z = scaled_of(made, raw_bins(200, 5))
+    gaussians = ClassGaussians.fit(z, made.head(z) >= 0)
+    return SlipDetector(*parts_of(made), made.head, made.info, gaussians=gaussians)
+
+
+@pytest.fixture(scope="module", params=["imputation", "gaussians"])
+def detector(request):
+    """With imputation values alone, and with Gaussians of the features."""
+    made = random_detector()
+    if request.param == "gaussians":
+        z = scaled_of(made, noise(100, seed=5))
+        made.gaussians = ClassGaussians.fit(z, made.head(z) >= 0)
+    return made
+
+
+@pytest.fixture(scope="module")
+def small():
+    return with_gaussians()
+
+
+def used_channel(detector):
+    return detector.pool.hand.names.index(detector.selected_names[0].channel)
+
+
+def unused_channel(detector):
+    used = {name.channel for name in detector.selected_names}
+    return next(i for i, name in enumerate(detector.pool.hand.names) if name not in used)
+
+
+# NaN and Inf -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_healthy_bins_are_scored_as_ever(dtype, detector):
+    samples = noise(9).to(dtype)
+    found = detector.predict_raw(samples, nonfinite="raise")
+    assert found.score.dtype == dtype
+    assert torch.equal(found.score, detector.score_raw(samples))
+    assert found.is_valid.tolist() == [True] * 9
+    assert not found.is_missing.any()
+    bins = detector.channel_filter.valid(samples)
+    assert torch.equal(detector.predict(bins).score, detector(bins))
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_a_missing_channel_gets_its_imputation_values(bad, detector):
+    """The score is that of features computed by hand, with the channel's own replaced."""
+    imputation = torch.linspace(-0.9, 0.9, len(detector.selected), dtype=torch.float64)
+    detector = SlipDetector(*parts_of(detector), detector.head, imputation=imputation)
+    bins, channel = detector.channel_filter.valid(noise(4)), used_channel(detector)
+    z = scaled_of(detector, noise(4))[2]
+    z = torch.where(detector.channel_index == channel, imputation, z)
+    bins[2, channel, 50] = bad
+    found = detector.predict(bins)
+    assert found.is_valid.tolist() == [True, True, False, True]
+    assert found.is_missing.nonzero().tolist() == [[2, channel]]
+    torch.testing.assert_close(found.score[2], detector.head(z), rtol=1e-12, atol=0)
+    assert detector(bins)[2].isnan() or bad == 1e308
+
+
+@pytest.mark.parametrize("num", [3, 30])
+@pytest.mark.parametrize("bad", [*BAD, "masked"])
+def test_a_channel_no_feature_needs_changes_nothing(bad, num, detector):
+    """Once an error of torch, of every detector with Gaussians: no bin to take the patterns of."""
+    samples, unused = noise(num), unused_channel(detector)
+    expected = detector.predict_raw(samples)
+    if bad == "masked":
+        name = detector.pool.hand.names[unused]
+        found = detector.predict_raw(samples, masked_channels=[name])
+    else:
+        samples[:, unused] = bad
+        found = detector.predict_raw(samples)
+    assert torch.equal(found.score, expected.score)
+    assert torch.equal(found.variance, torch.zeros_like(found.score))
+    assert found.is_valid.all()
+    assert found.is_missing.sum(-1).tolist() == [1] * num
+
+
+def test_a_broken_sample_is_refused_by_its_place_on_request(detector):
+    samples = noise(6).reshape(2, 3, 24, 150)
+    samples[1, 2, 14, 149] = torch.inf
+    said = r"bin 1, 2, channel PVDF1, sample 149 is inf; repair .* nonfinite='mask'"
+    with pytest.raises(ValueError, match=said):
+        detector.predict_raw(samples, nonfinite="raise")
+    alone = noise(1)[0]
+    found = detector.predict_raw(alone)
+    assert found.score.shape == found.is_valid.shape == ()
+    assert found.is_missing.shape == (24,)
+    alone[3, 0] = torch.nan
+    with pytest.raises(ValueError, match=r"^channel SG4, sample 0 is nan"):
+        detector.predict_raw(alone, nonfinite="raise")
+    with pytest.raises(ValueError, match="nonfinite must be 'mask' or 'raise', got 'drop'"):
+        detector.predict_raw(noise(1), nonfinite="drop")
+
+
+@pytest.mark.parametrize("kind", EXTREMES)
+def test_every_extreme_gives_a_finite_score_or_a_flag(kind, detector):
+    samples = extreme_bins(kind, (16, 24, 150), torch.Generator().manual_seed(3), torch.float32)
+    found = detector.predict_raw(samples)
+    assert found.score.isfinite().all()
+    if kind in ("constant", "zero"):
+        assert not found.is_valid.any()
+    if kind in ("plain", "integers", "rails", "alternating"):
+        assert found.is_valid.float().mean() > 0.9
+    single = copy.deepcopy(detector).float()  # as in float64 but for the head
+    z = scaled_of(detector, samples.double())
+    assert torch.equal(single.score_raw(samples), single.head(z.float()))
+
+
+def test_all_channels_missing_gives_the_score_of_what_is_known_beforehand(detector):
+    """That of imputation values, or the mean over both classes, alike in number."""
+    found = detector.predict(torch.full((2, 24, 100), torch.nan))
+    expected = detector.head(detector.imputation)
+    if (known := detector.gaussians) is not None:
+        lift = (detector.head.quadratic * known.covariance).sum((-2, -1))
+        expected = (detector.head(known.mean) + lift).mean()
+    torch.testing.assert_close(found.score.double(), expected.expand(2), rtol=1e-6, atol=1e-7)
+    assert not found.is_valid.any()
+
+
+def test_gradients_stay_finite_beside_a_missing_channel(detector):
+    samples, channel = noise(2), used_channel(detector)
+    samples[0, channel, 70] = torch.nan
+    samples.requires_grad_(True)
+    detector.predict_raw(samples).score.sum().backward()
+    others = samples.grad[:, torch.arange(24) != channel]
+    assert others.isfinite().all()
+    assert others[0].abs().max() > 0
+
+
+@pytest.mark.parametrize("arithmetic", ["double", "native"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("bad", BAD[:2])
+def test_filtered_bins_with_a_broken_channel(bad, dtype, arithmetic):
+    """Once NaN and not missing, for Inf in float32: the limit itself was rounded to Inf."""
+    detector = random_detector()
+    detector.pool.arithmetic = arithmetic
+    bins, channel = detector.channel_filter.valid(noise(3)).to(dtype), used_channel(detector)
+    bins[0, channel] = bad
+    bins[1, channel, 5] = bad
+    found = detector.predict(bins)
+    assert found.score.isfinite().all()
+    assert found.is_missing[:, channel].tolist() == [True, True, False]
+    assert found.is_valid.tolist() == [False, False, True]
+
+
+def test_a_head_that_overflows_is_not_valid():
+    detector = random_detector()
+    detector.head.quadratic *= 1e40
+    found = detector.float().predict_raw(noise(4).float())
+    assert not found.score.isfinite().all()
+    assert not found.is_valid[~found.score.isfinite()].any()
+
+
+def test_a_feature_far_from_zero_keeps_its_digits_in_a_float32_detector():
+    """A mean of 1e3 V that moves by 1e-2 V."""
+    detector = random_detector()
+    means = [i for i, n in enumerate(detector.pool.names) if str(n).endswith("raw time mean")][:12]
+    generator = torch.Generator().manual_seed(6)
+    bins = 1e3 + 1e-2 * torch.randn(200, 24, 1, generator=generator, dtype=torch.float64)
+    bins = bins + 1e-2 * torch.randn(200, 24, 100, generator=generator, dtype=torch.float64)
+    scaler = FeatureScaler.fit(detector.pool(bins)[:, means])
+    parts = (detector.pool, detector.channel_filter, means, scaler, detector.head)
+    samples = bins[:, :, :1] + torch.zeros(200, 24, 150)
+    exact = SlipDetector(*parts).score_raw(samples.float().double())
+    single = SlipDetector(*parts).float().score_raw(samples.float())
+    assert float((single - exact).abs().max() / exact.std()) < 1e-5
+
+
+@pytest.mark.parametrize("policy", ["mask", "raise"])
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        (torch.zeros(2, 24, 150, dtype=torch.int64), "float32 or float64 .*, got torch.int64"),
+        (torch.full((2, 25, 150), torch.nan), r"24, .*got \(2, 25, 150\)"),
+        (torch.full((150,), torch.nan), r"24, .*got \(150,\)"),
+    ],
+)
+def test_what_are_no_samples_of_this_hand_is_refused_in_words(samples, message, policy, detector):
+    with pytest.raises(ValueError, match=message):
+        detector.predict_raw(samples, nonfinite=policy)
+    with pytest.raises(ValueError, match=message.replace("150", "100")):
+        detector.predict(samples[..., :100], nonfinite=policy)
+
+
+def test_an_unknown_arithmetic_is_refused():
+    with pytest.raises(ValueError, match="arithmetic must be one of double, native, got 'half'"):
+        FeaturePool(HAND, arithmetic="half")
+
+
+# Masked channels -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num", [1, 9, 40], ids="of {} bins".format)
+def test_a_masked_channel_leaves_the_expected_score_and_its_variance(num, small):
+    samples, channel = raw_bins(num), int(small.channel_index[0])
+    is_lost = (small.channel_index == channel).expand(num, -1)
+    expected = ExpectedScore(small.head, small.gaussians)(scaled_of(small, samples), is_lost)
+    mask = torch.arange(len(HAND)) == channel
+    broken = samples.clone()
+    broken[:, channel] = torch.nan
+    samples[:, channel] = 5.0  # at a rail: what it says does not count
+    bins, name = small.channel_filter.valid(samples), HAND.names[channel]
+    for found in (
+        small.predict_raw(samples, masked_channels=mask),
+        small.predict_raw(samples, masked_channels=name),
+        small.predict(bins, masked_channels=[name]),
+        small.predict_raw(broken),
+    ):
+        torch.testing.assert_close((found.score, found.variance), expected, rtol=1e-9, atol=1e-9)
+        assert torch.equal(found.is_missing, mask.expand(num, -1))
+        assert not found.is_valid.any()
+    assert (found.variance > 0).all()
+    alone = small.predict(bins[0], masked_channels=[name])  # without batch axes
+    assert alone.score.shape == alone.variance.shape == ()
+    torch.testing.assert_close(alone.score, found.score[0], rtol=1e-12, atol=1e-12)
+
+
+def test_whole_bins_among_broken_ones_keep_their_score_and_are_certain(small):
+    samples = raw_bins(30)
+    whole = small.predict_raw(samples)
+    assert torch.equal(whole.variance, torch.zeros(30, dtype=torch.float64))
+    samples[::3, 3, 70] = torch.nan
+    found, kept = small.predict_raw(samples), torch.arange(30) % 3 != 0
+    assert torch.equal(found.score[kept], whole.score[kept])
+    assert torch.equal(found.variance > 0, ~kept)
+    assert torch.equal(found.is_valid, kept & whole.is_valid)
+
+
+def test_gradients_pass_by_a_masked_channel(small):
+    bins = small.channel_filter.valid(raw_bins(20)).requires_grad_()
+    small.predict(bins, masked_channels=["PVDF2"]).score.sum().backward()
+    assert bins.grad.isfinite().all()
+    assert torch.equal(bins.grad[:, 3], torch.zeros_like(bins.grad[:, 3]))
+    assert bins.grad[:, 2].abs().max() > 0
+
+
+@pytest.mark.parametrize("num", [2, 30])
+def test_a_head_that_changes_in_place_is_followed(num):
+    detector, samples = with_gaussians(), raw_bins(num)
+    before = detector.predict_raw(samples, masked_channels=["PVDF1"])
+    detector.head.constant += 1.0
+    after = detector.predict_raw(samples, masked_channels=["PVDF1"])
+    torch.testing.assert_close(after.score, before.score + 1, rtol=1e-10, atol=1e-10)
+    detector.gaussians.mean += 0.1
+    assert (detector.predict_raw(samples, masked_channels=["PVDF1"]).score != after.score).any()
+
+
+@pytest.mark.parametrize("kind", ["gaussians", "quadratic", "sum"])
+def test_the_file_holds_what_stands_in_for_a_channel(kind, small, tmp_path):
+    made = small
+    if kind != "gaussians":
+        made = small_detector(head=kind)
+        imputation = torch.linspace(-0.9, 0.9, 12, dtype=torch.float64)
+        made = SlipDetector(*parts_of(made), made.head, imputation=imputation)
+    made.save(tmp_path / "detector.pt")
+    again, samples = SlipDetector.load(tmp_path / "detector.pt"), raw_bins(9)
+    expected = made.predict_raw(samples, masked_channels=["PVDF1"])
+    found = again.predict_raw(samples, masked_channels=["PVDF1"])
+    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+    if kind == "gaussians":
+        single = copy.deepcopy(made).float()
+        assert torch.equal(single.gaussians.covariance, made.gaussians.covariance)
+        near = single.predict_raw(samples.float(), masked_channels=["PVDF1"])
+        assert near.variance.dtype == torch.float32
+        assert float((near.score - expected.score).abs().max()) < 1e-4 * expected.score.std()
+    else:
+        filled = torch.where(again.channel_index == 2, again.imputation, scaled_of(again, samples))
+        torch.testing.assert_close(found.score, again.head(filled), rtol=1e-9, atol=1e-9)
+        assert not found.variance.any()
+
+
+@pytest.mark.parametrize(
+    ("masked", "said"),
+    [
+        (["SG9"], r"^masked_channels names the channel 'SG9', .* take some of SG1, SG2, PVDF1, PV"),
+        ("SG", r"^masked_channels names the channel 'SG'"),
+        (3, r"^masked_channels must be a list of names of channels, got 3"),
+        (torch.zeros(3).bool(), r"bool mask \[4\], got torch.bool \(3,\)"),
+        (torch.zeros(4), r"bool mask \[4\], got torch.float32 \(4,\)"),
+    ],
+)
+def test_what_is_no_channel_of_the_hand_is_refused_in_one_line(masked, said, small):
+    with pytest.raises(ValueError, match=said):
+        small.predict_raw(raw_bins(1), masked_channels=masked)
