@@ -21,7 +21,6 @@ from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.onset.baselines import first_transition
 from tactslip_torch.onset.decisions import Decider
 from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
@@ -275,7 +274,7 @@ def knocked(number: int) -> Stream:
     return replace(stream, recording=RecordingId("a", number, "held"))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_rule_of_the_file_keeps_the_rate_not_one_like_it(seed):
     """A sum that gets its ceiling after its threshold was set re-arms sooner, and alarms more."""
     streams = [knocked(20 * seed + number) for number in range(20)]
@@ -443,8 +442,11 @@ def test_the_papers_rule_alarms_at_every_change_to_slip():
     changes = {"calibration": Platt(1.0, 0.0), "rearm_s": 0, "refractory_s": 0}
     settings = replace(settings_of(KOfN(1, 1), 100, threshold=1e-30), **changes)
     ((_, made),) = decide([stream_of(score)], OURS, settings, clock)
-    expected = first_transition(torch.from_numpy(score.astype(np.float32)) >= 0)
-    assert made.is_alarm.tolist() == expected.tolist()
+    is_slip = score >= 0
+    assert (
+        made.is_alarm.tolist()
+        == (is_slip & ~np.roll(is_slip, 1) | (is_slip & (np.arange(100) == 0))).tolist()
+    )
 
 
 @pytest.mark.parametrize("fit", FITS)

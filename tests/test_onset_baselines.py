@@ -5,8 +5,6 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from oracles import assert_manners, plausible_bins, wavelet_branches
 from small_detector import HAND, raw_bins, small_detector
 
@@ -17,7 +15,6 @@ from tactslip_torch.onset.baselines import (
     FLOOR_V,
     BaselineDetector,
     film_band_power,
-    first_transition,
     largest_detail,
 )
 from tactslip_torch.onset.decisions import score_stream
@@ -199,32 +196,12 @@ def test_what_is_no_baseline_is_refused(call, message):
 
 
 # ------------------------------------------------------------------------------ first transition
-def transitions(is_slip):
-    """The rule, read aloud: slip now and none before."""
-    return [now and not before for before, now in zip([False, *is_slip], is_slip, strict=False)]
-
-
-@given(st.lists(st.booleans(), max_size=30))
-def test_an_alarm_is_each_change_to_slip(is_slip):
-    stream = torch.tensor(is_slip, dtype=torch.bool)
-    assert first_transition(stream).tolist() == transitions(is_slip)
-
-
-def test_transitions_take_any_axes_and_are_causal(rng):
-    is_slip = torch.from_numpy(rng.uniform(size=(3, 2, 40)) < 0.4)
-    found = first_transition(is_slip)
-    for place in np.ndindex(3, 2):
-        assert found[place].tolist() == transitions(is_slip[place].tolist())
-    later = is_slip.clone()
-    later[..., 25:] = ~later[..., 25:]
-    assert torch.equal(first_transition(later)[..., :25], found[..., :25])
-
-
-def test_it_is_the_latch_without_debounce_and_pause(rng):
+def test_the_papers_rule_is_the_latch_without_debounce_and_pause(rng):
     llr = torch.from_numpy(rng.standard_normal((4, 100)))
     start = latch_start(llr[:, 0])
     is_alarm, is_on, _ = latch(llr, 0.0, rearm=1, refractory=0, state=start)
-    assert torch.equal(first_transition(llr >= 0), is_alarm)
+    before = torch.cat([torch.zeros(4, 1).bool(), (llr >= 0)[:, :-1]], 1)
+    assert torch.equal((llr >= 0) & ~before, is_alarm)
     assert torch.equal(llr >= 0, is_on)
 
 

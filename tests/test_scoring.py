@@ -1,4 +1,4 @@
-"""Scores of whole recordings against bins cut, filtered and judged one by one."""
+"""Prediction of whole recordings against bins cut, filtered and judged one by one."""
 
 import numpy as np
 import oracles
@@ -7,13 +7,14 @@ import torch
 from small_detector import small_detector
 from streams import detector_of, signal
 
-from tactslip_torch.onset.decisions import Scores, score_stream
+from tactslip_torch.model.prediction import Prediction
+from tactslip_torch.onset.decisions import score_stream
 
 HOP = 20
 LENGTHS = (51, 51, 11, 11)
 
 
-def assert_scores(found: Scores, expected: Scores) -> None:
+def assert_scores(found: Prediction, expected: Prediction) -> None:
     spread = float(expected.score.double().std())
     close = 1e-9 if found.score.dtype == torch.float64 else 1e-4
     torch.testing.assert_close(found.score, expected.score, rtol=0, atol=close * spread)
@@ -31,7 +32,7 @@ def test_every_bin_of_the_filtered_recording_is_judged():
     found = score_stream(detector, samples, HOP)
     assert len(found.score) == 12
     assert found.score.std() > 1
-    assert_scores(found, Scores(*map(torch.stack, zip(*one_by_one, strict=True))))
+    assert_scores(found, Prediction(*map(torch.stack, zip(*one_by_one, strict=True))))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -48,8 +49,8 @@ def test_bins_with_context_score_as_predict_raw_says(dtype, kind, align):
         detector.predict_raw(samples[:, s - before : s + 100 + after])
         for s in range(60, 500 - 100 - after, HOP)
     ]
-    expected = Scores(*map(torch.stack, zip(*judged, strict=True)))
-    assert_scores(Scores(*(x[3 : 3 + len(judged)] for x in found)), expected)
+    expected = Prediction(*map(torch.stack, zip(*judged, strict=True)))
+    assert_scores(Prediction(*(x[3 : 3 + len(judged)] for x in found)), expected)
     assert expected.is_valid.any()
     assert not expected.is_valid.all()
 

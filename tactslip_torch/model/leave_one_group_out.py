@@ -43,7 +43,7 @@ class HeldOutFit(NamedTuple):
 
     Attributes:
         head: the machine of all bins.
-        scores: ``[N]``, each from the machine that never met the bin's group.
+        scores: ``[N]``, each from the machine without the bin's group.
     """
 
     head: Head
@@ -189,7 +189,7 @@ def held_out_scores(
     offset: Tensor | float = 0.5,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """What each bin scores under the machine of degree 2 that never met its group, differentiable.
+    """What each bin scores under the machine of degree 2 without its group, differentiable.
 
     The scores of ``HeldOut(bins, groups, Polynomial(2, offset), route="dual").at(penalty)``, any
     number of times differentiable in ``z``, ``penalty``, ``offset`` and ``weights``.

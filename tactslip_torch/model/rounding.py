@@ -1,8 +1,8 @@
 """What rounding can do to a quadratic form over the box of scaled features: a bound, and examples.
 
-The bound counts roundings (Higham 2002, chapter 3): a value that ``n`` of them have met is off by
-the factor ``1 + theta``, ``|theta| <= gamma(n) = n u / (1 - n u)``. In ``z' Q z + l' z + a`` of K
-features an entry of Q meets at most ``2 K + 3``: one when it is stored in the narrower dtype, one
+The bound counts roundings (Higham 2002, chapter 3): a value that went through ``n`` of them is off
+by the factor ``1 + theta``, ``|theta| <= gamma(n) = n u / (1 - n u)``. In ``z' Q z + l' z + a`` of
+K features an entry of Q meets at most ``2 K + 3``: one when it is stored in the narrower dtype, one
 product and K sums in the row, one product and K sums over the rows. That count is of no order of
 summation, and an FMA only saves some of it, so the bound holds for any BLAS, thread count and batch
 size that computes in the dtype. TF32 and bfloat16 products are not of it.
@@ -214,7 +214,7 @@ def error_facts(error: Tensor, sd: float) -> dict[str, float | None]:
 
 
 def score_sd(scores: Tensor) -> float:
-    """Standard deviation of the scores of calibration bins, by which errors are judged.
+    """Standard deviation of the scores of calibration bins, the unit of errors.
 
     Shape:
         - scores: ``[N]``

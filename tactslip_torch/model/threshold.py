@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -21,10 +21,6 @@ class FeatureThreshold:
     index: int
     threshold: float
     sign: int
-
-    def to_dict(self) -> dict[str, float]:
-        """Plain values; ``FeatureThreshold(**values)`` is the same again."""
-        return asdict(self)
 
     def __call__(self, features: Tensor) -> Tensor:
         """Decisions: ``[*, K] -> [*]``, bool."""

@@ -1,1 +1,1 @@
-"""From scores to alarms: sequential rules, their threshold, streams, and how events are judged."""
+"""From scores to alarms: sequential rules, thresholds, streams, and the evaluation of events."""

@@ -1,4 +1,4 @@
-"""The methods that the paper argues against, as scores of a bin, and its own rule of transitions.
+"""The methods that the paper argues against, as scores of a bin.
 
 What is thresholded: "filtered vibration amplitudes" (paper II-B, after Romeo and Zollo 2020), here
 the power of the films' band; and "the maximal discrete wavelet transform (DWT) detail coefficient"
@@ -102,18 +102,6 @@ def largest_detail(
         return torch.maximum(branches.amax(-1), -branches.amin(-1))
 
     return _log_of_largest(bins, films, amplitude)
-
-
-def first_transition(is_slip: Tensor) -> Tensor:
-    """The paper's rule: each change from non-slip to slip is an onset (section IV-B).
-
-    No debounce and no pause between alarms; before the first bin there was no slip.
-
-    Shape:
-        - is_slip, output: ``[*, T]``, bool; what a bin is called, and whether it raises an alarm
-    """
-    before = torch.cat([torch.zeros_like(is_slip[..., :1]), is_slip[..., :-1]], dim=-1)
-    return is_slip & ~before
 
 
 @dataclass(frozen=True)

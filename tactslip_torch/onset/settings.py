@@ -17,7 +17,7 @@ KEY = "alarm"
 
 @dataclass(frozen=True)
 class AlarmSettings:
-    """How a stream of scores becomes alarms, and what was promised of it.
+    """How a stream of scores becomes alarms, and the rate it was set for.
 
     Args:
         hop_samples: distance of two decisions.
@@ -25,7 +25,7 @@ class AlarmSettings:
         rule: from these to a statistic.
         threshold: at which the statistic raises an alarm.
         target_per_hour: false alarms an hour that the threshold was set for; ``None``: for no rate,
-            so nothing is promised.
+            of false alarms.
         slip_share: how much of a stream is slip; the balance that probabilities are stated for.
         rearm_s: how long the statistic must stay low before the next alarm.
         refractory_s: shortest time between two alarms.
@@ -102,7 +102,7 @@ class AlarmSettings:
         if KEY not in detector.info:
             raise ValueError(
                 "this detector has no alarm threshold; train with +exp=onset, which sets one, or "
-                "with onset=debounced, which promises nothing"
+                "with onset=debounced, which is set for no rate"
             )
         return cls.from_dict(detector.info[KEY])
 

@@ -1,7 +1,7 @@
 """``StreamingDetector``: samples in as they come, decisions and alarms out as soon as they can be.
 
 The same mathematics as ``score_stream`` and ``Decider`` on the whole recording, at the look-ahead
-of the detector and with a memory of fixed size: a sample is filtered once, and a bin judged once.
+of the detector and with a memory of fixed size: a sample is filtered once, and a bin scored once.
 """
 
 from __future__ import annotations
@@ -243,11 +243,10 @@ class StreamingDetector:
         self._drop()
         hop = self.settings.hop_samples
         with torch.no_grad():
-            heard = without(self._filtered, self._masked_channels, self.detector.pool.hand.names)
-            scores = score_filtered(self.detector, heard, hop, self.dtype)
+            masked = without(self._filtered, self._masked_channels, self.detector.pool.hand.names)
+            scores = score_filtered(self.detector, masked, hop, self.dtype)
             tells = is_usable(scores.score, scores.is_missing, self.detector.needed_index)
-            judged = (scores.score, scores.is_valid, tells, scores.variance)
-            decisions = self._decider.decide(*judged)
+            decisions = self._decider.decide(scores.score, scores.is_valid, tells, scores.variance)
         self._number += len(decisions.number)
         self._due = int(self._samples_for(np.array(self._number)))
         self._drop()

@@ -301,7 +301,7 @@ _UNITS = {
 }
 
 
-class Pace:
+class Throughput:
     """What recordings took, added up.
 
     Attributes:

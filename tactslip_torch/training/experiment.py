@@ -385,8 +385,9 @@ def tune_fold(
 ) -> tuple[SlipLearner, dict[str, Any]]:
     """Fit as the recipe says, and learn from there: the second fit's learner, and what was found.
 
-    Detectors of the recipe's choice and of the grid's least loss are judged as the tuned one will
-    be, and kept as ``grid.pt`` and ``start.pt``: what is beyond the latter is due to the gradient.
+    Detectors of the recipe's choice and of the grid's least loss are evaluated as the tuned one
+    will be, and kept as ``grid.pt`` and ``start.pt``: what is beyond the latter is due to the
+    gradient.
     """
     started = time.perf_counter()
     trainer = make_trainer(config.trainer, folder / "grid")
@@ -407,9 +408,9 @@ def tune_fold(
     other = make_trainer(config.trainer, folder / "start")
     other.fit(by_loss, datamodule=data)
     facts["splits"] = {}
-    judged = (("grid", "recipe", trainer, first), ("start", "grid", other, by_loss))
-    for name, way, judge, learner in judged:
-        judge.test(learner, datamodule=data, verbose=False)
+    tests = (("grid", "recipe", trainer, first), ("start", "grid", other, by_loss))
+    for name, way, tester, learner in tests:
+        tester.test(learner, datamodule=data, verbose=False)
         facts["splits"][way] = learner.metrics["splits"]
         if learner.detector is not None:
             learner.detector.info |= _origin(config, data)

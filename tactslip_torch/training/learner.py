@@ -47,7 +47,7 @@ from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.abstention import Abstaining
 from tactslip_torch.training.baselines import KEY as BASELINES
 from tactslip_torch.training.baselines import Baselines
-from tactslip_torch.training.datamodule import Pace, RecordingFeatures, SlipDataModule
+from tactslip_torch.training.datamodule import RecordingFeatures, SlipDataModule, Throughput
 from tactslip_torch.training.fitting import (
     TrainingPass,
     from_first_process,
@@ -272,7 +272,7 @@ class SlipLearner(L.LightningModule):
         self.metrics: dict[str, Any] = {}
         self.events: dict[str, dict[str, list[RecordingEvents]]] = {}
         self.seconds: dict[str, float] = {}
-        self._pace = Pace()
+        self._throughput = Throughput()
         self._pass_started = 0.0
         self._num_threads = torch.get_num_threads()
         self._survey = Survey(len(pool.names), self.recipe.sample_bins)
@@ -299,7 +299,7 @@ class SlipLearner(L.LightningModule):
         """Survey in the first epoch, gather what the plan needs in the second."""
         if not batch:  # NOTHING
             return
-        self._pace.add(batch)
+        self._throughput.add(batch)
         mask = batch.roles["train"]
         features, is_slip = batch.features[mask], batch.is_slip[mask]
         if self._second is None or self._is_resumed:
@@ -365,7 +365,7 @@ class SlipLearner(L.LightningModule):
     def test_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
         """Score the bins of one recording."""
         assert self.detector is not None  # on_test_start
-        self._pace.add(batch)
+        self._throughput.add(batch)
         chosen = batch.features[:, list(self.detector.selected)].double()
         device = next(self.detector.buffers()).device  # Lightning may have moved it
         scaled = self.detector.scaled(chosen.to(device))
@@ -418,7 +418,7 @@ class SlipLearner(L.LightningModule):
     @property
     def worker_seconds(self) -> dict[str, float]:
         """What workers spent on each stage of making features, summed over them."""
-        return self._pace.seconds
+        return self._throughput.seconds
 
     @property
     def plan(self) -> Plan:
@@ -479,5 +479,5 @@ class SlipLearner(L.LightningModule):
         self.detector = plan.detector(self.pool, self.channel_filter, head, info)
 
     def rates(self) -> dict[str, str]:
-        """How fast one worker goes through each stage it has met, for the progress bar."""
-        return self._pace.rates()
+        """How fast one worker goes through each stage, for the progress bar."""
+        return self._throughput.rates()
