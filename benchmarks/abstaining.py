@@ -209,8 +209,8 @@ def _evaluated(bins: _Scored, low: float, high: float, coverage: float) -> dict[
     found = answer_metrics(counts, coverage)
     return {
         "covered": mean(found[name]["coverage"] or 0.0 for name in CLASSES),
-        "abstained": found["unsure"],
-        "right": found["sure_balanced_accuracy"] or 0.0,
+        "abstained": found["abstained"],
+        "right": found["decided_balanced"] or 0.0,
     }
 
 

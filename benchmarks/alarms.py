@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.harness import Benchmark, Job, Report, Table, result_of, take_figures
 from benchmarks.onset import QUICK_STREAMS, QUICK_TRAINING
-from tactslip_torch.report.results import kept_rows, promise_line, scene_rows
+from tactslip_torch.report.results import rate_rows, scene_rows, target_line
 
 _KEPT = ("simulated", "experiment", "seed", "versions", "events", "alarm")
 
@@ -47,10 +47,10 @@ class Alarms(Benchmark[Sizes]):
         """What was kept of the target, and confounders."""
         settings = numbers["alarm"]["settings"]
         hop_ms = 1e3 * settings["hop_samples"] / numbers["alarm"]["sample_rate_hz"]
-        about = f"Seed {numbers['seed']}, a decision every {hop_ms:g} ms; {promise_line(numbers)}."
+        about = f"Seed {numbers['seed']}, a decision every {hop_ms:g} ms; {target_line(numbers)}."
         confounders = "By the same threshold; the methods to the right by theirs."
         return {
-            "Alarms": Table.of(kept_rows(numbers), about),
+            "Alarms": Table.of(rate_rows(numbers), about),
             "Confounders": Table.of(scene_rows(numbers), confounders),
         }
 

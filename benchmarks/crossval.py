@@ -36,7 +36,7 @@ class Crossval(Benchmark[Sizes]):
             "materials=[M1,M2,iron]",
             "num_unseen=1",
             "train_bins=20",
-            "judged_bins=20",
+            "scored_bins=20",
             "~recipes.paper",
             "~recipes.general",
             "recipes.robust.num_features=10",

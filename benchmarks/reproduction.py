@@ -32,7 +32,7 @@ from benchmarks.harness import (
     trained,
     write_text,
 )
-from tactslip_torch.analysis.signal_checks import filtered, judge_facts
+from tactslip_torch.analysis.signal_checks import check_signals, filtered
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.report import published
@@ -213,7 +213,7 @@ def _signal_checks(seed: int, cycles: int) -> list[dict[str, Any]]:
         ]
         for material in SEEN_MATERIALS
     }
-    return judge_facts(recordings)
+    return check_signals(recordings)
 
 
 # --------------------------------------------------------------------- counts and scores of runs

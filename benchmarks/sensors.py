@@ -51,7 +51,7 @@ class Sensors(Benchmark[Sizes]):
         trained("detector for sensors", job.sizes.training, detector, job.folder / "cache")
         found = {}
         for way in RESELECT_WORDS:
-            overrides = [f"model={detector / 'detector.pt'}", f"anew={way}"]
+            overrides = [f"model={detector / 'detector.pt'}", f"reselect={way}"]
             overrides += [*job.sizes.overrides, *job.overrides]
             found[way] = result_of("importance", overrides, job.folder / way, "sensors.json")
         return {"ways": found, "folder": str(job.folder / next(iter(RESELECT_WORDS)))}

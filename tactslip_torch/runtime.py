@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import os
 import secrets
@@ -133,6 +134,17 @@ def _renew_lock() -> None:
 os.register_at_fork(after_in_child=_renew_lock)
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One intra-op thread, as a live loop has."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def is_recorded() -> bool:
     """Whether what runs is being written down as a graph, in which no value may be looked at."""
     is_traced = torch.jit.is_tracing()  # type: ignore[attr-defined,no-untyped-call]
@@ -208,6 +220,26 @@ def _trouble(load_kernels: Callable[[], object]) -> str:
     return ""
 
 
+def check_number(name: str, value: Any, *, least: float | None = None, whole: bool = False) -> None:
+    """Refuse what is no number, is not positive or not at least ``least``, or is not whole.
+
+    Raises:
+        ValueError: that names it.
+
+    Example:
+        >>> check_number("tries", 0, whole=True)
+        Traceback (most recent call last):
+        ValueError: tries must be a positive whole number, got 0
+    """
+    is_number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+    is_finite = is_number and abs(value) < (2**63 if whole else math.inf)
+    if is_finite and (value > 0 if least is None else value >= least):
+        return
+    kind = "whole number" if whole else "finite number"
+    wanted = f"a positive {kind}" if least is None else f"a {kind} of at least {least:g}"
+    raise ValueError(f"{name} must be {wanted}, got {value!r}")
+
+
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary name beside ``path`` to write to; renamed to ``path`` when all went well.
@@ -229,6 +261,29 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_json(path: str | os.PathLike[str], content: Any) -> None:
+    """Write JSON, whole or not at all; NaN and infinity, which JSON lacks, become null.
+
+    Example:
+        >>> path = getfixture("tmp_path") / "a.json"
+        >>> write_json(path, {"score": float("nan"), "names": ("a", "b")})
+        >>> json.loads(path.read_text())
+        {'score': None, 'names': ['a', 'b']}
+    """
+    with whole_file(path) as temporary:
+        text = json.dumps(plain(content), indent=1, allow_nan=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def plain(value: Any) -> Any:
+    """The same in what JSON has: lists for tuples, ``None`` for numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def save_table(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, is_hypothesis_test, seed, settings
+from matplotlib.figure import Figure
 
 settings.register_profile(
     "default",
@@ -83,6 +84,20 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     """Random numbers that depend on the test's name alone, so order and selection do not matter."""
     return np.random.default_rng(zlib.crc32(request.node.name.encode()))
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that were saved, in order; each file is written as well, small."""
+    figures: list[Figure] = []
+    write = Figure.savefig
+
+    def keep(self: Figure, target: object, **options: object) -> None:
+        figures.append(self)
+        write(self, target, **options | {"dpi": 40})
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    return figures
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])

@@ -25,7 +25,7 @@ from tactslip_torch.onset.decisions import Decider
 from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.report.results import alarm_figure, alarm_table, scenes_table
+from tactslip_torch.report.results import alarm_figure, alarm_table, scene_rows
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.alarm import (
     FIRST_TRANSITION,
@@ -257,8 +257,8 @@ def test_slips_are_found_in_time_and_all_is_said_in_plain_json(told, tmp_path):
     metrics = {"simulated": True, "events": found["events"], "alarm": found}
     assert "cusum" in alarm_table(metrics)
     assert alarm_table(metrics).startswith("SIMULATED")
-    row = next(line for line in scenes_table(metrics).splitlines() if line.startswith("taps"))
-    assert row.split()[1:3] == ["seen", "no"]
+    row = next(row for row in scene_rows(metrics) if row[0] == "taps")
+    assert row[1:3] == ["seen", "no"]
     alarm_figure(metrics, tmp_path / "alarm.png")
     assert (tmp_path / "alarm.png").stat().st_size > 10_000
 

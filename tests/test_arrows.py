@@ -25,7 +25,6 @@ PART = {"runtime": ("ledger",), "deploy": ("graph",)}
 KNOWN = (
     ("analysis.certificate", "simulation."),
     ("data.file_recordings", "signals.resampling"),
-    ("graph.export", "commands.certify"),
     ("graph.trials", "simulation."),
 )
 """Importer and imported, by how they begin: arrows that are still to be turned."""

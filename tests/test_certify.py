@@ -1,20 +1,24 @@
-"""``certify`` as a command: the files, the exit status, and which bins it draws."""
+"""``certify`` as a command: the files, the exit status, which bins it draws, what it refuses."""
 
 import hashlib
 import json
 import sys
 
 import pytest
-from hydra import compose, initialize_config_dir
-from small_detector import raw_bins, small_detector
-from test_commands import TinyRecordings
+import torch
+from drawing import assert_png
+from hydra.utils import instantiate
+from small_detector import certified, small_detector
+from test_commands import TinyRecordings, composed
 
-from tactslip_torch.analysis.certificate import certify as measure
-from tactslip_torch.commands.certify import _plain, certify, main
-from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.commands.certify import certify, draw_bins, main
+from tactslip_torch.data.labels import LabelRule, label_bins
+from tactslip_torch.data.splits import Split
 from tactslip_torch.features.cache import cache_key
-from tactslip_torch.report.certificate import certificate_figure, number, verdict
+from tactslip_torch.report.certificate import certificate_figure, conclusion, number
+from tactslip_torch.runtime import plain
 from tactslip_torch.simulation.extremes import EXTREMES
+from tactslip_torch.training.datamodule import FeatureMaker
 
 TINY = (
     "data._target_=test_commands.TinyRecordings",
@@ -24,14 +28,9 @@ TINY = (
     "split.unseen=[C]",
     "split.train_share=0.5",
     "bins=60",
-    "judged_bins=40",
+    "scored_bins=40",
     "extremes=3",
 )
-
-
-def composed(*overrides):
-    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        return compose("certify", [*TINY, *overrides])
 
 
 def source():
@@ -39,61 +38,44 @@ def source():
 
 
 def saved(folder, **options):
-    path = folder / "detector.pt"
     detector = small_detector(**options)
-    recordings = [r for r in source().ids if str(r) in ("A/0", "B/1", "C/2")]
-    known = {str(r): cache_key(source().key(r)) for r in recordings}
+    known = {str(r): cache_key(source().key(r)) for r in source().ids if r.cycle == 0}
     detector.info["train_recordings"] = known
-    detector.save(path)
-    return path
+    folder.mkdir(exist_ok=True)
+    detector.save(folder / "detector.pt")
+    return folder / "detector.pt"
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    path = saved(tmp_path_factory.mktemp("certified"))
-    returned, folder = certify(composed(f"model={path}"))
-    content = json.loads((folder / "certificate.json").read_text())
-    assert returned == content
-    return folder, content
+def written(path, *overrides):
+    content = certify(composed(*TINY, f"model={path}", *overrides, name="certify"))
+    kept = json.loads((path.parent / "certificate.json").read_text())
+    assert content == kept
+    return content
 
 
-# What it leaves ----------------------------------------------------------------------------------
-
-
-def test_the_files_stand_beside_the_detector(written):
-    folder, content = written
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "certificate.json",
-        "certificate.png",
-        "detector.pt",
-    ]
-    assert content["format"] == "tactslip_torch certificate 1"
-    assert content["holds"] is True
-    assert content["simulated"] is False
-    digest = hashlib.sha256((folder / "detector.pt").read_bytes()).hexdigest()
-    assert content["detector"]["sha256"] == digest
-    assert list(content["sets"]) == ["calibration", "test", "unseen"]
-    assert [row["bins"] for row in content["sets"].values()] == [60, 40, 40]
-    assert list(content["extremes"]) == list(EXTREMES)
-    assert {row["bins"] for row in content["extremes"].values()} == {3}
-    drawn = content["data"]["drawn"]
-    assert drawn["calibration"]["role"] == "train"
-    assert drawn["calibration"]["materials"] == ["A", "B"]
-    assert drawn["unseen"] == {
-        "role": "unseen",
-        "recordings": 1,
-        "recordings_of_training": drawn["unseen"]["recordings_of_training"],
-        "materials": ["C"],
-    }
-
-
-def test_a_second_run_replaces_the_first_and_finds_the_same(tmp_path):
+def test_the_files_stand_beside_the_detector_and_repeat(tmp_path):
     path = saved(tmp_path)
-    _, folder = certify(composed(f"model={path}", f"out={tmp_path / 'out'}"))
-    before = (folder / "certificate.json").read_text()
-    certify(composed(f"model={path}", f"out={tmp_path / 'out'}"))
-    assert (folder / "certificate.json").read_text() == before
-    assert sorted(p.name for p in folder.iterdir()) == ["certificate.json", "certificate.png"]
+    content = written(path)
+    assert_png(tmp_path / "certificate.png")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"certificate.json", "certificate.png", "detector.pt"}
+    assert content["format"] == "tactslip_torch certificate 1"
+    assert (content["holds"], content["simulated"]) == (True, False)
+    assert content["detector"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    num_bins = {name: row["bins"] for name, row in content["sets"].items()}
+    assert num_bins == {"calibration": 60, "test": 40, "unseen": 40}
+    assert {name: row["bins"] for name, row in content["extremes"].items()} == dict.fromkeys(
+        EXTREMES, 3
+    )
+    drawn = content["data"]["drawn"]
+    assert (drawn["calibration"]["role"], drawn["calibration"]["materials"]) == (
+        "train",
+        ["A", "B"],
+    )
+    assert (drawn["unseen"]["recordings"], drawn["unseen"]["materials"]) == (1, ["C"])
+    assert written(path) == content
+    one = written(path, "evaluate=unseen", "extremes=1", "bins=30")
+    assert list(one["sets"]) == ["calibration", "unseen"]
 
 
 @pytest.mark.parametrize(
@@ -103,24 +85,18 @@ def test_a_second_run_replaces_the_first_and_finds_the_same(tmp_path):
         ({"head": "sum"}, "as measured: this head has no bound"),
         (
             {"gain": 1e39},
-            "Does not hold: error of the head, worst seen is not finite, wanted <= inf, its bound",
+            "Does not hold: error of the head, worst seen is not finite, wanted <=",
         ),
     ],
 )
-def test_every_outcome_has_a_verdict_and_a_figure(options, words, written):
-    detector = small_detector(**options)
-    found = measure(detector, raw_bins(30), simulated=True, extremes=2)
-    rest = {k: v for k, v in written[1].items() if k in ("detector", "data", "versions")}
-    content = _plain(found.facts() | rest)
-    assert words in verdict(content)
-    points = {
-        name: (c.exact.abs().tolist(), c.error.tolist(), c.flips.tolist())
-        for name, c in found.sets.items()
-    }
-    assert certificate_figure(content, points).axes
-    recorded = content | {"simulated": False}
-    assert ["(simulated data)" in verdict(of) for of in (content, recorded)] == [True, False]
-    json.dumps(content, allow_nan=False)
+def test_every_outcome_has_a_conclusion_and_a_figure(options, words, tmp_path):
+    found = certified(small_detector(**options), num_bins=30, extremes=2)
+    content = plain(found.content)
+    assert words in conclusion(content)
+    certificate_figure(content, found.points(), tmp_path / "certificate.png")
+    assert_png(tmp_path / "certificate.png")
+    told = [conclusion(content | {"simulated": simulated}) for simulated in (True, False)]
+    assert ["(simulated data)" in line for line in told] == [True, False]
 
 
 def test_numbers_are_short():
@@ -128,50 +104,114 @@ def test_numbers_are_short():
     assert shown == ["1.2e-07", "0", "0.25", "1.2e+04", "7", "-", "words"]
 
 
-# The command -------------------------------------------------------------------------------------
+# The bins it draws -----------------------------------------------------------------------------
 
 
-def run(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["certify", *TINY, *arguments])
-    status = 0
-    try:
-        main()
-    except SystemExit as stop:
-        status = stop.code
-    done = capsys.readouterr()
-    lines = [x for x in done.err.splitlines() if x.startswith(("error", "Does not hold"))]
-    return status, done.out, lines
+def drawn(number, role="train", seed=0, fold=None):
+    config = composed(*TINY, "model=x", name="certify")
+    fold = fold or instantiate(config.split, _convert_="all")(source().ids)[0]
+    detector = small_detector()
+    maker = FeatureMaker(source(), detector.pool, detector.channel_filter, LabelRule())
+    return (*draw_bins(maker, fold, role, number, seed), fold)
 
 
-def test_the_exit_status_is_0_if_it_holds_and_1_if_not(tmp_path, monkeypatch, capsys):
+def keys_of(bins):
+    return [one.float().contiguous().numpy().tobytes() for one in bins]
+
+
+@pytest.mark.parametrize(("number", "num_recordings"), [(5, 1), (81, 3), (250, 4)])
+def test_drawn_bins_are_those_of_the_role_with_their_context(number, num_recordings):
+    bins, recordings, fold = drawn(number)
+    assert len(recordings) == num_recordings
+    known = {}
+    for recording in fold.having("train"):
+        times = source().timeline(recording)
+        own = label_bins(LabelRule(), times.onsets_s, times.sliding_s, times.duration_s, 2000.0)
+        samples = source().load(recording).samples
+        cut = [samples[:, start - 25 : start + 125] for start in own.starts.tolist()]
+        known |= dict.fromkeys(keys_of(cut), recording)
+    assert {known[key] for key in keys_of(bins)} == set(recordings)
+    assert len(set(keys_of(bins))) == len(bins) == number  # none twice
+    assert {recording.material for recording in recordings} <= {"A", "B"}
+    assert torch.equal(bins, drawn(number)[0])
+    assert not torch.equal(bins, drawn(number, seed=4)[0])
+
+
+def test_bins_of_one_recording_may_have_two_roles():
+    fold = Split("random_bins", dict.fromkeys(source().ids[:2], "train"), test_share_of_bins=0.5)
+    train, test = (set(keys_of(drawn(20, role, fold=fold)[0])) for role in ("train", "test"))
+    assert not train & test
+    with pytest.raises(ValueError, match="no recording has the role 'unseen' in random_bins; cho"):
+        drawn(5, "unseen", fold=fold)
+
+
+# The command -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Exit status, output and the lines on standard error that say how it went."""
     monkeypatch.chdir(tmp_path)
-    model = f"model={saved(tmp_path)}"
-    status, out, lines = run(monkeypatch, capsys, model)
+
+    def running(*arguments):
+        monkeypatch.setattr(sys, "argv", ["certify", *TINY, *map(str, arguments)])
+        status = 0
+        try:
+            main()
+        except SystemExit as stop:
+            status = stop.code
+        done = capsys.readouterr()
+        lines = [x for x in done.err.splitlines() if x.startswith(("error", "Does not hold"))]
+        return status, done.out, lines
+
+    return running
+
+
+def test_the_exit_status_is_0_if_it_holds_and_1_if_not(run, tmp_path):
+    status, out, lines = run(f"model={saved(tmp_path)}", "evaluate=[]")
     assert (status, lines) == (0, [])
     assert out.startswith("Holds: ")
-    assert "no held-out" not in out
+    assert "; no held-out bins were evaluated" in out
     assert str(tmp_path / "certificate.json") in out
-    (tmp_path / "b").mkdir()
-    model = f"model={saved(tmp_path / 'b', gain=1e39)}"
-    status, out, lines = run(monkeypatch, capsys, model)
-    assert status == 1
-    assert out == ""
-    (line,) = lines
+    status, out, (line,) = run(f"model={saved(tmp_path / 'b', gain=1e39)}", "extremes=1")
+    assert (status, out) == (1, "")
     assert line.startswith("Does not hold: error of the head")
     assert line.endswith("certificate.json")
     assert json.loads((tmp_path / "b" / "certificate.json").read_text())["holds"] is False
-    assert (tmp_path / "b" / "certificate.png").is_file()
 
 
-def test_nothing_judged_is_told(tmp_path, monkeypatch, capsys):
-    model = f"model={saved(tmp_path)}"
-    status, out, lines = run(monkeypatch, capsys, model, "judge=[]")
-    assert (status, lines) == (0, [])
-    assert "; no held-out bins were evaluated" in out
-
-
-def test_one_judged_role_may_be_named_alone(tmp_path):
-    path = saved(tmp_path)
-    _, folder = certify(composed(f"model={path}", "judge=unseen"))
-    content = json.loads((folder / "certificate.json").read_text())
-    assert list(content["sets"]) == ["calibration", "unseen"]
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("model=missing.pt", "no detector at missing.pt"),
+        ("calibrate=all", "calibrate and evaluate must be different roles of train, test, unseen"),
+        ("evaluate=[train]", "got calibrate=train evaluate=[train]"),
+        ("fold=other", "fold must be one of unseen4, got other"),
+        ("data.channels=3", "the features expect 4 channels SG1..PVDF2, the recordings have 3"),
+        ("+scene.broken=A/0", "repair or leave out A/0"),
+        ("out=taken", "taken is a file, out= must be a folder; give another"),
+        ("out=taken/deeper", "taken is a file, out= must be a folder; give another"),
+        ("out=foreign", "certificate.json is no certificate of ours; move it, or give another"),
+        *(
+            (f"{name}={value}", f"{name} must be a {wanted}, got ")
+            for name, wanted in (
+                ("bins", "positive whole number"),
+                ("scored_bins", "positive whole number"),
+                ("extremes", "positive whole number"),
+                ("seed", "whole number of at least 0"),
+            )
+            for value in ("abc", "1.5", "-1", str(2**63))
+        ),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_written(override, words, run, tmp_path):
+    (tmp_path / "taken").write_text("mine")
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "certificate.json").write_text("mine")
+    more = ["bins=200"] if "broken" in override else []
+    status, out, (line,) = run(f"model={saved(tmp_path)}", *more, override)
+    assert (status, out) == (2, "")
+    assert line.startswith("error: ")
+    assert words in line
+    assert (tmp_path / "foreign" / "certificate.json").read_text() == "mine"
+    assert not list(tmp_path.glob("certificate*"))

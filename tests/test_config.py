@@ -11,10 +11,10 @@ from torch.utils.data import DataLoader
 import tactslip_torch
 from tactslip_torch.commands.entry import (
     conf_dir,
+    entry_point,
     errors_in_one_line,
     fail,
     one_line,
-    run_entry_point,
     unknown_choice,
 )
 
@@ -98,21 +98,25 @@ def test_every_option_there_is_passes():
             assert unknown_choice([f"{plus}{group.name}={path.stem}"]) is None
 
 
-def test_an_entry_point_stops_before_hydra_starts(monkeypatch, capsys):
-    started = []
-    monkeypatch.setattr(sys, "argv", ["train", "split=seen7"])
+@pytest.mark.parametrize("argument", ["split=seen7", "hydra.run.dir=/dev/null/run"])
+def test_an_entry_point_stops_before_hydra_starts(monkeypatch, capsys, argument):
+    monkeypatch.setattr(sys, "argv", ["train", argument])
     with pytest.raises(SystemExit) as stop:
-        run_entry_point(lambda: started.append(True))
+        entry_point("train", lambda config, folder: pytest.fail("was called"))()
     assert stop.value.code == 2
-    assert not started
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.startswith("error: unknown split seen7; known: ")
+    assert err.startswith("error: ")
+    assert argument.split("=")[1] in err.replace(" ", "").replace("unknownsplit", "")
     assert err.count("\n") == 1
 
-    monkeypatch.setattr(sys, "argv", ["train", "split=seen6"])
-    run_entry_point(lambda: started.append(True))
-    assert started == [True]
+
+def test_an_entry_point_composes_its_configuration(monkeypatch, tmp_path):
+    folder = tmp_path / "run"
+    monkeypatch.setattr(sys, "argv", ["train", "split=seen6", f"hydra.run.dir={folder}"])
+    given = []
+    entry_point("train", lambda config, folder: given.append((config.split._target_, folder)))()
+    assert given == [("tactslip_torch.data.splits.seen6", folder)]
 
 
 # One line --------------------------------------------------------------------------------------

@@ -1,26 +1,17 @@
 """The bill of a selection by hand, the fit against known prices, and the clock."""
 
 import json
-import subprocess
-import sys
 
-import numpy as np
 import pytest
 import torch
-from scipy.optimize import nnls
 from small_detector import HAND, small_detector
 
 from tactslip_torch.analysis.latency import (
     GROUPS,
     CostModel,
     Timing,
-    _counted,
-    _designs,
-    _line,
-    _stand_in,
     main,
     measure_costs,
-    one_thread,
     parts_of,
     time_calls,
     time_in_fresh_process,
@@ -28,6 +19,7 @@ from tactslip_torch.analysis.latency import (
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.ranking import rank_per_cost
+from tactslip_torch.runtime import one_thread
 from tactslip_torch.signals.filtering import ChannelFilter
 
 POOL = FeaturePool(HAND)
@@ -113,52 +105,17 @@ def test_the_bill_for_a_ranking_adds_up_and_no_column_is_free():
     assert rank_per_cost(torch.tensor([1.0, 3.0, 2.0]), needs, prices, 3).tolist() == [1, 2, 0]
 
 
-def test_designs_tell_all_groups_apart():
-    needed = parts_of(make_plan(HAND, 4, POOL.names))
-    designs = list(_designs(needed, [8, 30]))
-    rows = np.stack([_counted(set().union(*(needed[i] for i in own))).numpy() for own in designs])
-    met = rows[:, 1:] > 0
-    assert met.any(0).all()  # every group, and parts of every group
-    # the call and the columns are in all of them; every other group is absent somewhere
-    groups = [name for name in GROUPS if name != "columns"]
-    assert not met[:, [list(GROUPS).index(name) for name in groups]].all(0).any()
-    # prices that made the timings are found again from the timings, up to what is in all of them
-    price = model()
-    truth = np.array([0.5, *price.group_us.values(), *price.part_us.values()])
-    timings = rows @ truth
-    found, _ = nnls(rows / timings[:, None], np.ones(len(rows)), maxiter=10_000)
-    assert np.abs(rows @ found / timings - 1).max() < 1e-3
-
-
-def test_a_bad_timing_does_not_move_the_line():
-    x = [8, 15, 30, 60, 120, 240]
-    y = [100 + 0.25 * size for size in x]
-    assert _line(x, y) == pytest.approx((100, 0.25))
-    y[3] += 400
-    assert _line(x, y) == pytest.approx((100, 0.25), rel=0.1)
-    assert _line([8, 16], [100.0, 90.0]) == (95.0, 0.0)
-    assert _line([8], [-5.0]) == (0.0, 0.0)
-
-
-def test_measured_prices_are_of_this_machine():
+def test_measured_prices_are_none_below_nothing():
+    """How long anything took is not looked at."""
     costs = measure_costs(
         POOL, ChannelFilter([51, 51, 11, 11]), [4, 8], "auto", ["mean", "std"], calls=5
     )
-    assert costs.facts()["groups"].keys() == GROUPS.keys()
-    assert costs.rest_us >= 0
-    assert costs.rest_of_one_us >= 0
-    assert costs.pooling_us >= 0  # a difference of two timings: noise may hide it on a busy machine
-    assert costs.pooling_of_one_us >= 0
+    assert costs.to_dict()["groups"].keys() == GROUPS.keys()
+    prices = (costs.rest_us, costs.rest_of_one_us, costs.pooling_us, costs.pooling_of_one_us)
+    assert min(prices) >= 0
     few, many = (set().union(*parts(*names)) for names in (POOL.names[:1], POOL.names))
-    assert 0 < costs.features_us(few) <= costs.features_us(many)
-    assert costs.tail >= 1
-    json.dumps(costs.facts(), allow_nan=False)
-
-
-def test_a_stand_in_gives_finite_scores():
-    detector = _stand_in(POOL, ChannelFilter([51, 51, 11, 11]), [0, 30, 100], "auto")
-    score = detector.predict_raw(torch.randn(7, 4, 150)).score
-    assert score.isfinite().all()
+    assert 0 <= costs.features_us(few) <= costs.features_us(many)
+    json.dumps(costs.to_dict(), allow_nan=False)
 
 
 # The clock -----------------------------------------------------------------------------------
@@ -202,9 +159,7 @@ def test_a_saved_detector_is_timed_in_a_process_of_its_own(tmp_path, capsys):
     timing = time_in_fresh_process(path, 20, "auto")
     assert timing.calls == 20
     assert 0 < timing.p50_us <= timing.p99_us <= timing.p99_all_us
-    before = torch.get_num_threads()
     main([str(path), "10", "auto"])
-    assert torch.get_num_threads() == before
     printed = json.loads(capsys.readouterr().out)
     assert printed["calls"] == 10
     with pytest.raises(ValueError, match=r"timing .*gone.pt in a fresh process failed: .*gone.pt"):
@@ -228,10 +183,3 @@ def test_threads_are_given_back():
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(1)
-
-
-def test_the_module_runs_as_a_command():
-    command = [sys.executable, "-m", "tactslip_torch.analysis.latency"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "usage: python -m tactslip_torch.analysis.latency detector.pt" in done.stderr

@@ -1,4 +1,4 @@
-"""``signals/coverage.py`` against plain NumPy."""
+"""What bins cover of the input, against plain NumPy."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_what_bins_cover(rng):
 
 def test_a_range_is_that_of_its_kind(rng):
     samples, filtered = drawn(rng)
-    facts = KnownInputs(covered(samples, filtered), KINDS).facts()
+    facts = KnownInputs(covered(samples, filtered), KINDS).to_dict()
     for kind, places in {"SG": [0, 1], "PVDF": [2]}.items():
         own = facts["kinds"][kind]
         assert own["low_v"] == samples[:, places].min()

@@ -9,7 +9,7 @@ import torch
 from small_set import SmallSet, small_maker, small_recipe
 from test_commands import composed
 
-from tactslip_torch.commands.crossval import Materials, crossval, judge
+from tactslip_torch.commands.crossval import Materials, crossval, evaluate_split
 from tactslip_torch.data.splits import seen6
 from tactslip_torch.report.crossval import PAPERS_UNSEEN, crossval_table, material_scores
 from tactslip_torch.training.datamodule import SlipDataModule
@@ -41,25 +41,28 @@ def test_an_unseen_material_teaches_nothing(balance):
     recipe = small_recipe(balance=balance)
     plain = SmallSet()
     louder = SmallSet(gains={r: 5.0 for r in plain.ids if r.material == "c"})
-    before, after = judge(read(plain), recipe, ["c"]), judge(read(louder), recipe, ["c"])
+    before, after = (
+        evaluate_split(read(plain), recipe, ["c"]),
+        evaluate_split(read(louder), recipe, ["c"]),
+    )
     assert before["test"] == after["test"]
     assert before["penalty"] == after["penalty"]
     assert before["unseen"] != after["unseen"]
-    seen = judge(read(louder), recipe, ["a"])
-    assert seen["test"] != judge(read(plain), recipe, ["a"])["test"]
+    seen = evaluate_split(read(louder), recipe, ["a"])
+    assert seen["test"] != evaluate_split(read(plain), recipe, ["a"])["test"]
 
 
 def test_a_score_is_the_mean_recall_on_all_bins_of_the_unseen_materials():
     source = SmallSet()
     materials = read(source)
-    found = judge(materials, small_recipe(), ["a", "c"])
+    found = evaluate_split(materials, small_recipe(), ["a", "c"])
     bins = materials.bins_of(["a", "c"], ("train", "test"))
     assert len(bins.is_slip) == 2 * 5 * 37  # every bin of both materials: none was sampled away
     assert set(found["per_material"]) == {"a", "c"}
     assert found["unseen"] == pytest.approx(sum(found["per_material"].values()) / 2)
 
 
-def test_the_command_judges_every_choice_with_every_recipe(tmp_path, capsys):
+def test_the_command_evaluates_every_choice_with_every_recipe(tmp_path, capsys):
     found = crossval(composed(*TINY, name="crossval"), tmp_path)
     assert json.loads((tmp_path / "crossval.json").read_text()) == found
     choices = {frozenset(pair) for pair in itertools.combinations("ABCD", 2)}

@@ -1,4 +1,4 @@
-"""``detect`` as a command: what it hears, what it leaves, and what it says of bad input."""
+"""``detect`` as a command: what it detects, what it leaves, and what it says of bad input."""
 
 import csv
 import json
@@ -16,7 +16,7 @@ from tactslip_torch import HandLayout, Recording
 from tactslip_torch.commands import detect as module
 from tactslip_torch.commands.detect import detect, main
 from tactslip_torch.commands.entry import conf_dir
-from tactslip_torch.data.formats import FORMATS, Format
+from tactslip_torch.data.formats import FORMATS
 from tactslip_torch.data.formats._arrays import ArraySamples
 from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.calibration import Platt
@@ -77,7 +77,7 @@ def composed(*overrides):
         return compose("detect", ["engine=eager", *overrides])
 
 
-def heard(model, place, folder, *overrides):
+def detected(model, place, folder, *overrides):
     """What ``detect`` returns, which is what it wrote."""
     content = detect(composed(f"model={model}", f"input={place}", *overrides), folder)
     assert json.loads((folder / "onsets.json").read_text()) == content
@@ -95,7 +95,7 @@ def run(model, tmp_path_factory):
     place, folder = tmp_path_factory.mktemp("in"), tmp_path_factory.mktemp("out")
     save(place / "a.npz", recording())
     save(place / "b.npz", quiet())
-    return folder, heard(model, place, folder, "decisions=true")
+    return folder, detected(model, place, folder, "decisions=true")
 
 
 def offline(samples, settings=SETTINGS):
@@ -106,7 +106,7 @@ def offline(samples, settings=SETTINGS):
     return decider.decide(scores.score, scores.is_valid)
 
 
-# What is heard -----------------------------------------------------------------------------------
+# What is detected ------------------------------------------------------------------------------
 
 
 def test_alarms_are_those_of_the_whole_recording(run):
@@ -155,7 +155,9 @@ def test_an_alarm_that_stands_before_the_slip_and_to_the_end_is_early(model, tmp
     samples = volts(4.0, ((1.9, 4.0),))
     truth = {"onsets_s": (2.0,), "sliding_s": ((2.0, 4.0),), "speeds_mm_s": (20.0,)}
     save(tmp_path / "a.npz", recording(samples, **truth))
-    (entry,) = heard(model, tmp_path, tmp_path / "out", "threshold=3", "figure=false")["recordings"]
+    (entry,) = detected(model, tmp_path, tmp_path / "out", "threshold=3", "figure=false")[
+        "recordings"
+    ]
     last = entry["alarms"][-1]
     assert 1.9 < last["alarm_s"] < 2.0
     assert (last["end_s"], last["outcome"]) == (None, "early")
@@ -204,7 +206,7 @@ def test_the_files_agree_with_each_other(run):
         assert image.format == "PNG"
 
 
-def test_a_detector_with_thresholds_is_unsure_between_them(tmp_path):
+def test_a_detector_with_thresholds_abstains_between_them(tmp_path):
     detector = small_detector(SEED)
     score = offline(volts()).score
     low, high = (float(score[side].median()) for side in (score < 0, score > 0))
@@ -212,9 +214,9 @@ def test_a_detector_with_thresholds_is_unsure_between_them(tmp_path):
         "alarm": SETTINGS.to_dict(),
         "abstain": Abstention(0.95, low, high).to_dict(),
     }
-    detector.save(tmp_path / "unsure.pt")
+    detector.save(tmp_path / "abstaining.pt")
     save(tmp_path / "a.npz", recording())
-    heard(tmp_path / "unsure.pt", tmp_path / "a.npz", tmp_path / "out", "decisions=true")
+    detected(tmp_path / "abstaining.pt", tmp_path / "a.npz", tmp_path / "out", "decisions=true")
     for row in rows_of(tmp_path / "out" / "a_decisions.csv"):
         wanted = 1 if float(row["score"]) >= high else 0 if float(row["score"]) < low else -1
         assert int(row["answer"]) == wanted
@@ -222,7 +224,7 @@ def test_a_detector_with_thresholds_is_unsure_between_them(tmp_path):
 
 def test_the_terminal_shows_a_table_a_rate_and_one_bar(model, tmp_path, capsys):
     save(tmp_path / "a.npz", recording())
-    content = heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+    content = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
     out, err = capsys.readouterr()
     lines = out.splitlines()
     assert lines[1].startswith("SIMULATED data")
@@ -236,29 +238,12 @@ def test_the_terminal_shows_a_table_a_rate_and_one_bar(model, tmp_path, capsys):
     assert not (tmp_path / "out" / "a_onsets.png").exists()
 
 
-def test_one_bar_counts_the_seconds_of_all_files(model, tmp_path, monkeypatch):
-    totals = []
-
-    def bar(items, what, unit, total):
-        done = 0
-        for item in items:
-            done += 1
-            yield item
-        totals.append((done, total, unit))
-
-    monkeypatch.setattr(module, "bar", bar)
-    save(tmp_path / "a.npz", recording())
-    save(tmp_path / "b.npz", quiet(4.3))
-    heard(model, tmp_path, tmp_path / "out", "figure=false")
-    assert totals == [(8 + 5, 13, "s of signal")]
-
-
 # What it is told ---------------------------------------------------------------------------------
 
 
 def test_another_threshold_can_be_given(model, tmp_path):
     save(tmp_path / "a.npz", recording())
-    content = heard(model, tmp_path / "a.npz", tmp_path / "out", "threshold=1e6", "figure=false")
+    content = detected(model, tmp_path / "a.npz", tmp_path / "out", "threshold=1e6", "figure=false")
     entry = content["recordings"][0]
     assert entry["alarms"] == []
     assert [onset["outcome"] for onset in entry["truth"]["onsets"]] == ["missed", "missed"]
@@ -269,34 +254,34 @@ def test_another_threshold_can_be_given(model, tmp_path):
     assert [row["true_onset_s"] for row in rows] == ["2.0", "5.0"]
 
 
-def test_dead_channels_are_not_listened_to(model, tmp_path):
+def test_masked_channels_are_not_used(model, tmp_path):
     save(tmp_path / "a.npz", recording())
     place = tmp_path / "a.npz"
-    content = heard(model, place, tmp_path / "out", "masked_channels=[PVDF2,SG1]", "figure=false")
+    content = detected(
+        model, place, tmp_path / "out", "masked_channels=[PVDF2,SG1]", "figure=false"
+    )
     assert content["masked_channels"] == ["SG1", "PVDF2"]
     numbers = content["recordings"][0]["decisions"]
     assert numbers["invalid"] == numbers["number"] > 0
-    whole = heard(model, place, tmp_path / "whole", "figure=false")
+    whole = detected(model, place, tmp_path / "whole", "figure=false")
     assert whole["masked_channels"] == []
     assert whole["recordings"][0]["decisions"]["invalid"] == 0
 
 
-def test_a_figure_may_show_a_stretch(model, tmp_path, monkeypatch):
-    views = []
-    monkeypatch.setattr(module, "onset_figure", lambda heard, *_, **__: views.append(heard.view))
+def test_a_figure_may_show_a_part(model, tmp_path, drawn):
     save(tmp_path / "a.npz", recording())
-    heard(model, tmp_path / "a.npz", tmp_path / "out", "view=[1.5,20]")
-    assert views == [(1.5, 8.0)]
+    detected(model, tmp_path / "a.npz", tmp_path / "out", "view=[1.5,20]")
+    assert drawn[0].axes[0].get_xlim() == (1.5, 8.0)
 
 
 @pytest.mark.parametrize("kind", ["npy", "npz"])
-def test_volts_alone_are_heard_but_judged_by_nobody(model, tmp_path, kind, capsys):
+def test_volts_alone_are_enough_but_have_no_truth(model, tmp_path, kind, capsys):
     samples = volts().numpy()
     if kind == "npy":
         np.save(tmp_path / "a.npy", samples.T)
     else:
         np.savez(tmp_path / "a.npz", samples=samples)
-    content = heard(
+    content = detected(
         model, tmp_path / f"a.{kind}", tmp_path / "out", "sample_rate_hz=2000", "decisions=true"
     )
     (entry,) = content["recordings"]
@@ -313,19 +298,19 @@ def test_a_recording_nobody_annotated_has_no_false_alarms(model, tmp_path):
     """No onset and not simulated: nothing says that there was no slip."""
     bare = recording(speeds_mm_s=(), onsets_s=(), sliding_s=(), provenance={})
     save(tmp_path / "a.npz", bare)
-    content = heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+    content = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
     assert content["recordings"][0]["truth"] is None
     assert content["recordings"][0]["simulated"] is False
     told = recording(speeds_mm_s=(), onsets_s=(), sliding_s=(), provenance={}, non_slip_s=((0, 8),))
     save(tmp_path / "a.npz", told)
-    content = heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+    content = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
     alarms = content["recordings"][0]["alarms"]
     assert len(content["recordings"][0]["truth"]["false_alarms_s"]) == len(alarms) > 0
 
 
-def test_samples_in_float64_are_heard_in_float64(model, tmp_path):
+def test_samples_in_float64_are_scored_in_float64(model, tmp_path):
     save(tmp_path / "a.npz", recording(volts().double()))
-    (entry,) = heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")["recordings"]
+    (entry,) = detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")["recordings"]
     for found, wanted in zip(entry["alarms"], offline(volts().double()).alarms, strict=True):
         assert found["score"] == pytest.approx(wanted.score, rel=1e-9)
 
@@ -336,7 +321,7 @@ def test_missing_samples_and_dead_channels_are_flagged(model, tmp_path, capsys):
     dead[2] = 0.0
     save(tmp_path / "dead.npz", recording(dead))
     save(tmp_path / "lost.npz", recording(lost))
-    content = heard(model, tmp_path, tmp_path / "out")
+    content = detected(model, tmp_path, tmp_path / "out")
     of_dead, of_lost = content["recordings"]
     wanted = [int((~offline(samples).is_valid).sum()) for samples in (dead, lost)]
     assert [of_dead["decisions"]["invalid"], of_lost["decisions"]["invalid"]] == wanted
@@ -344,16 +329,10 @@ def test_missing_samples_and_dead_channels_are_flagged(model, tmp_path, capsys):
     assert "of the decisions are not valid" in capsys.readouterr().out
 
 
-def test_a_further_format_is_a_further_line(model, tmp_path, monkeypatch):
-    monkeypatch.setitem(FORMATS, "tac", Format("npz", ("tac",), "_npz"))
-    save(tmp_path / "a.tac", recording())
-    assert len(heard(model, tmp_path, tmp_path / "out", "figure=false")["recordings"]) == 1
-
-
 def test_files_of_one_stem_keep_their_figures_apart(model, tmp_path):
     save(tmp_path / "a.npz", quiet())
     np.save(tmp_path / "a.npy", volts(2.0, ()).numpy().T)
-    heard(model, tmp_path, tmp_path / "out", "sample_rate_hz=2000")
+    detected(model, tmp_path, tmp_path / "out", "sample_rate_hz=2000")
     pictures = sorted(path.name for path in (tmp_path / "out").glob("*.png"))
     assert pictures == ["a.npy_onsets.png", "a.npz_onsets.png"]
 
@@ -380,7 +359,7 @@ def test_no_more_than_a_second_is_in_hand(model, tmp_path, monkeypatch):
     monkeypatch.setattr(ArraySamples, "read", watched)
     monkeypatch.setattr(module.StreamingDetector, "push", pushing)
     save(tmp_path / "a.npz", recording())
-    heard(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
+    detected(model, tmp_path / "a.npz", tmp_path / "out", "figure=false")
     assert max(asked) == max(pushed) == 2000
     assert sum(pushed) == 16000
     assert max(held) < 2000 * 4 * 4  # what a stream keeps is less than what it is given
@@ -428,7 +407,7 @@ def test_a_damaged_file_in_a_folder_costs_the_others_nothing(model, tmp_path, mo
     assert not [name for name in names if "tmp" in name or name.startswith("c_")]
 
 
-def test_what_was_heard_before_an_interruption_stays(model, tmp_path, monkeypatch):
+def test_what_was_detected_before_an_interruption_stays(model, tmp_path, monkeypatch):
     save(tmp_path / "a.npz", recording())
     save(tmp_path / "b.npz", quiet())
     push = module.StreamingDetector.push
@@ -451,126 +430,40 @@ def test_what_was_heard_before_an_interruption_stays(model, tmp_path, monkeypatc
     ]
 
 
-def other_hand(*, kinds=("SG", "SG", "PVDF", "PVDF"), names=None):
-    names = HAND.names if names is None else names
+def other_hand(names=HAND.names, kinds=("SG", "SG", "PVDF", "PVDF")):
     return HandLayout.from_rows(
         {"name": name, "kind": kind, "finger": "f", "segment": "distal"}
         for name, kind in zip(names, kinds, strict=True)
     )
 
 
-def of_other_names(place):
-    save(place / "a.npz", recording(), other_hand(names=("SG1", "PVDF1", "SG2", "PVDF2")))
-
-
-def of_other_kinds(place):
-    save(place / "a.npz", recording(), other_hand(kinds=("SG", "SG", "SG", "PVDF")))
-
-
-def of_fewer_channels(place):
-    save(place / "a.npz", recording(volts()[:3]), HandLayout(HAND.channels[:3]))
-
-
-def of_another_rate(place):
-    save(place / "a.npz", recording(sample_rate_hz=1999.5))
-
-
-def too_short(place):
-    save(place / "a.npz", quiet(0.049))
-
-
-def empty(place):
-    save(place / "a.npz", quiet(0.0))
-
-
-def arrays(place):
-    np.save(place / "a.npy", volts().numpy().T)
-
-
-def turned(place):
-    np.save(place / "a.npy", volts().numpy())
-
-
-def damaged(place):
-    (place / "a.npz").write_bytes(b"nothing")
-
-
-def whole(place):
-    save(place / "a.npz", recording())
-
-
-def in_counts(place):
-    save(place / "a.npz", recording(units="counts"))
-
-
-def of_a_slow_clock(place):
-    times_s = torch.arange(16000).double() / 1994.0  # 0.3 %: what is told in seconds would err so
-    write_table(place / "a.csv", volts(), [0, 1, 2, 3], times_s)
-
-
-def silent(place):
-    samples = volts()
-    samples[0, :1000] = torch.nan
-    save(place / "a.npz", recording(samples))
-
-
-def of_foreign_names(place):
-    table = torch.cat([torch.arange(16000)[None] / RATE_HZ, volts()]).T.numpy()
-    np.savetxt(place / "a.csv", table, delimiter=",", header="t,F2,F1,G2,G1", comments="")
-
-
-def nothing(place):
-    (place / "notes.md").write_text("no recording")
-
-
+OTHER_NAMES = other_hand(("SG1", "PVDF1", "SG2", "PVDF2"))
+OTHER_KINDS = other_hand(kinds=("SG", "SG", "SG", "PVDF"))
+FEWER = HandLayout(HAND.channels[:3])
 REFUSED = {
-    "no file": (nothing, ["input=nowhere.npz"], "no file or folder at nowhere.npz"),
-    "empty folder": (nothing, [], "no recording in {place}; give a folder of .npz or .npy or "),
-    "no recording": (nothing, ["input=in/notes.md"], "in/notes.md must end in .npz or .npy"),
-    "no input": (nothing, ["~input"], "input"),
-    "names": (of_other_names, [], "channel 2 of {place}/a.npz is PVDF1 (SG), not SG2 (SG); give"),
-    "kinds": (of_other_kinds, [], "channel 3 of {place}/a.npz is PVDF1 (SG), not PVDF1 (PVDF)"),
-    "channels": (of_fewer_channels, [], "{place}/a.npz has 3 channels, not 4"),
-    "columns": (
-        of_foreign_names,
-        [],
-        "has the channels F2, F1, G2, G1, not the 4 of data.",
-    ),
-    "rate": (of_another_rate, [], "a.npz is of 1999.5 Hz, the detector of 2000 Hz; resample it"),
-    "short": (too_short, [], "{place}/a.npz has 98 samples, too few for a decision"),
-    "empty": (empty, [], "{place}/a.npz holds no samples"),
-    "no rate": (arrays, [], "{place}/a.npy says no rate and has no times; give"),
-    "other rate": (arrays, ["sample_rate_hz=500"], "is of 500 Hz, the detector of 2000 Hz"),
-    "turned": (turned, ["sample_rate_hz=2000"], "{place}/a.npy has 16000 channels, not 4"),
-    "damaged": (damaged, [], "{place}/a.npz is damaged or no recording of ours"),
-    "threshold": (whole, ["threshold=high"], "threshold must be a finite number, got 'high'"),
-    "infinite": (whole, ["threshold=inf"], "threshold must be a finite number, got inf"),
-    "units": (in_counts, [], "a.npz is in counts, the detector was trained on V; give"),
-    "clock": (of_a_slow_clock, [], "Hz, the detector of 2000 Hz; resample it"),
-    "reading": (whole, ["reading=3"], "reading must be of sample_rate_hz, time"),
-    "reading.channels": (whole, ["reading.channels=3"], "reading.channels must be a list of"),
-    "tare": (whole, ["tare_s=[0,a]"], "tare_s must be [start, end] in seconds, got [0, 'a']"),
-    "tare of a number": (whole, ["tare_s=0.5"], "tare_s must be [start, end] in seconds, got 0.5"),
-    "nothing to tare on": (
-        silent,
-        ["tare_s=[0,0.5]"],
-        "a.npz has nothing finite in its column 1 to",
-    ),
-    "view": (whole, ["view=3"], "view must be [start, end] in seconds, got 3"),
-    "view of nothing": (whole, ["view=[9,10]"], "shows nothing of 8 s"),
-    "engine": (whole, ["engine=steam"], "steam"),
-    "dead": (
-        whole,
+    # what is saved (or the name of another file), overrides, words
+    "no file": (None, ["input=nowhere.npz"], "no file or folder at nowhere.npz"),
+    "no recording": (None, [], "no recording in {place}; give a folder of .npz or .npy or "),
+    "names": (recording, [OTHER_NAMES], "channel 2 of {place}/a.npz is PVDF1 (SG), not SG2 (SG)"),
+    "kinds": (recording, [OTHER_KINDS], "channel 3 of {place}/a.npz is PVDF1 (SG), not PVDF1 (PV"),
+    "channels": (lambda: recording(volts()[:3]), [FEWER], "{place}/a.npz has 3 channels, not 4"),
+    "rate": (lambda: recording(sample_rate_hz=1999.5), [], "a.npz is of 1999.5 Hz, the detector"),
+    "short": (lambda: quiet(0.049), [], "{place}/a.npz has 98 samples, too few for a decision"),
+    "empty": (lambda: quiet(0.0), [], "{place}/a.npz holds no samples"),
+    "units": (lambda: recording(units="counts"), [], "a.npz is in counts, the detector was traine"),
+    "threshold": (recording, ["threshold=high"], "threshold must be a finite number, got 'high'"),
+    "infinite": (recording, ["threshold=inf"], "threshold must be a finite number, got inf"),
+    "reading": (recording, ["reading=3"], "reading must be of sample_rate_hz, time"),
+    "tare": (recording, ["tare_s=[0,a]"], "tare_s must be [start, end] in seconds, got [0, 'a']"),
+    "view": (recording, ["view=3"], "view must be [start, end] in seconds, got 3"),
+    "view of nothing": (recording, ["view=[9,10]"], "shows nothing of 8 s"),
+    "engine": (recording, ["engine=steam"], "steam"),
+    "masked": (
+        recording,
         ["masked_channels=[SG1,SG9]"],
         "masked_channels names the channel 'SG9', which this hand does not",
     ),
-    "dead number": (
-        whole,
-        ["masked_channels=3"],
-        "masked_channels must be a list of names of channels, got 3",
-    ),
-    "no detector": (whole, ["model=missing.pt"], "no detector at missing.pt"),
-    "another file": (whole, ["model=in/a.npz"], "in/a.npz is damaged or no file of ours"),
+    "another file": (recording, ["model=in/a.npz"], "in/a.npz is damaged or no file of ours"),
 }
 
 
@@ -579,13 +472,13 @@ def test_bad_input_is_one_line_and_exit_status_2(name, model, tmp_path, monkeypa
     make, arguments, said = REFUSED[name]
     place = tmp_path / "in"
     place.mkdir()
-    make(place)
-    given = [f"model={model}", f"input={place}"]
-    if arguments == ["~input"]:
-        given, arguments = given[:1], []
-    status, _, lines = command(monkeypatch, capsys, tmp_path, *given, *arguments)
+    hand = next((given for given in arguments if isinstance(given, HandLayout)), HAND)
+    if make:
+        save(place / "a.npz", make(), hand)
+    more = [given for given in arguments if given is not hand]
+    given = [f"model={model}", f"input={place}", *more]
+    status, _, (line,) = command(monkeypatch, capsys, tmp_path, *given)
     assert status == 2
-    (line,) = lines
     assert said.format(place=place) in line
     assert not (tmp_path / "out" / "onsets.json").exists()
 
@@ -631,8 +524,8 @@ def test_a_table_of_others_gives_the_same_onsets(model, tmp_path):
     (tmp_path / "theirs").mkdir()
     times_s = 1e6 + torch.arange(content.samples.shape[1]).double() / RATE_HZ
     write_table(tmp_path / "theirs" / "a.csv", content.samples, [2, 0, 3, 1], times_s)
-    ours = heard(model, tmp_path / "ours", tmp_path / "out1", "figure=false")
-    theirs = heard(model, tmp_path / "theirs", tmp_path / "out2", "figure=false")
+    ours = detected(model, tmp_path / "ours", tmp_path / "out1", "figure=false")
+    theirs = detected(model, tmp_path / "theirs", tmp_path / "out2", "figure=false")
     (mine,), (other,) = ours["recordings"], theirs["recordings"]
     assert mine["alarms"]
     times = [[alarm["alarm_s"] for alarm in each["alarms"]] for each in (mine, other)]
@@ -650,7 +543,7 @@ def test_a_gap_in_the_times_is_missing_samples(model, tmp_path):
     whole = content.samples.clone()
     whole[:, 6000:6040] = torch.nan
     save(tmp_path / "b.npz", recording(samples=whole))
-    found = heard(model, tmp_path, tmp_path / "out", "figure=false")
+    found = detected(model, tmp_path, tmp_path / "out", "figure=false")
     of_table, of_ours = found["recordings"]
     assert of_table["decisions"] == of_ours["decisions"]
     assert of_table["decisions"]["invalid"] > 0
@@ -661,13 +554,13 @@ def test_what_training_tared_is_tared(model, tmp_path):
     level = torch.tensor([3.0, -2.0, 0.5, 1.0])[:, None]
     save(tmp_path / "a.npz", content)
     save(tmp_path / "b.npz", recording(samples=content.samples + level))
-    found = heard(model, tmp_path, tmp_path / "out", "figure=false", "tare_s=[0,0.5]")
+    found = detected(model, tmp_path, tmp_path / "out", "figure=false", "tare_s=[0,0.5]")
     first, second = found["recordings"]
     assert first["alarms"]
     assert [a["alarm_s"] for a in first["alarms"]] == [a["alarm_s"] for a in second["alarms"]]
 
 
-def test_a_detector_of_counts_hears_counts_and_what_says_no_units(model, tmp_path):
+def test_a_detector_of_counts_takes_counts_and_what_says_no_units(model, tmp_path):
     detector = small_detector(SEED)
     detector.info |= {"alarm": SETTINGS.to_dict(), "units": "counts"}
     detector.save(tmp_path / "counts.pt")
@@ -676,11 +569,11 @@ def test_a_detector_of_counts_hears_counts_and_what_says_no_units(model, tmp_pat
     write_table(tmp_path / "in" / "b.csv", volts(), [0, 1, 2, 3], torch.arange(16000) / RATE_HZ)
     save(tmp_path / "in" / "c.npz", recording())
     with pytest.raises(ValueError, match=r"1 of 3 .*c\.npz is in V, the detector was .* counts"):
-        heard(tmp_path / "counts.pt", tmp_path / "in", tmp_path / "out", "figure=false")
+        detected(tmp_path / "counts.pt", tmp_path / "in", tmp_path / "out", "figure=false")
 
 
-def test_a_clock_a_little_off_is_heard(model, tmp_path):
+def test_a_clock_a_little_off_is_detected(model, tmp_path):
     times_s = torch.arange(16000).double() / (RATE_HZ * 1.0005)
     write_table(tmp_path / "a.csv", volts(), [0, 1, 2, 3], times_s)
-    (entry,) = heard(model, tmp_path / "a.csv", tmp_path / "out", "figure=false")["recordings"]
+    (entry,) = detected(model, tmp_path / "a.csv", tmp_path / "out", "figure=false")["recordings"]
     assert entry["alarms"]

@@ -9,10 +9,9 @@ import pytest
 from small_detector import alarming_detector, certified, small_detector
 
 from tactslip_torch.commands import export as export_command
-from tactslip_torch.commands.certify import FORMAT as CERTIFICATE_FORMAT
 from tactslip_torch.graph import export
 from tactslip_torch.graph.export import export_detector, sidecar_facts, summary, worst_error
-from tactslip_torch.graph.facts import sidecar_path
+from tactslip_torch.graph.facts import CERTIFICATE_FORMAT, sidecar_path
 from tactslip_torch.training import experiment
 
 pytestmark = pytest.mark.onnx
@@ -53,7 +52,7 @@ def exported_with(source, certificate=None):
 @pytest.mark.usefixtures("quick")
 def test_the_certificate_of_this_detector_is_handed_on(kept):
     source, digest = kept
-    content = certified(small_detector()).facts()
+    content = certified(small_detector()).content
     content |= {"format": CERTIFICATE_FORMAT, "detector": {"sha256": digest}}
     facts, line = exported_with(source, json.dumps(content))
     assert facts["detector_sha256"] == digest
@@ -68,7 +67,7 @@ def test_the_certificate_of_this_detector_is_handed_on(kept):
 @pytest.mark.usefixtures("quick")
 def test_no_other_certificate_is_handed_on(kept):
     source, digest = kept
-    content = certified(small_detector()).facts()
+    content = certified(small_detector()).content
     of_another = content | {"format": CERTIFICATE_FORMAT, "detector": {"sha256": "0" * 64}}
     foreign = {"format": "another", "detector": {"sha256": digest}}
     hollow = {"format": CERTIFICATE_FORMAT, "detector": {"sha256": digest}}

@@ -7,11 +7,12 @@ import pytest
 import torch
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
 
-from tactslip_torch.analysis.latency import GROUPS, CostModel, Latency, Limits
+from tactslip_torch.analysis.latency import GROUPS, CostModel, Latency, Limits, Timing
 from tactslip_torch.analysis.pareto import (
     Candidate,
     Search,
     Searcher,
+    Timed,
     landmarks,
     nondominated,
     worth_naming,
@@ -393,17 +394,21 @@ NONE = Limits(1.0, 1.0, [5.0])
 
 
 def test_landmarks_are_the_best_the_cheap_and_the_small():
-    def found(*rows):
-        get = [lambda row, i=i: row[i] for i in range(3)]
-        return list(landmarks(rows, *get).values())
+    def timed(accuracy, us, size):
+        made = candidate(60.0, us, accuracy, size)
+        return Timed(made, "double", Timing(us, us, us, 20), made.latency, us)
 
-    best, third, poor = (0.99, 300.0, 100), (0.981, 100.0, 60), (0.979, 10.0, 30)
-    few, fewer = (0.95, 200.0, 20), (0.94, 90.0, 8)
+    def found(*rows):
+        return list(landmarks(rows).values())
+
+    best, third, poor = timed(0.99, 300.0, 100), timed(0.981, 100.0, 60), timed(0.979, 10.0, 30)
+    few, fewer = timed(0.95, 200.0, 20), timed(0.94, 90.0, 8)
     assert found(poor, few, third, best, fewer) == [best, third, few]
     assert found(poor, few, best) == [best, None, few]
     assert found(best, third, poor) == [best, third, None]
-    quick = (0.99, 200.0, 100)  # of the same accuracy: the quickest
+    quick = timed(0.99, 200.0, 100)  # of the same accuracy: the quickest
     assert found(best, quick, third) == [quick, None, None]
+    assert found() == [None, None, None]
 
 
 def test_the_best_of_each_group_and_of_few_numbers_may_be_named():

@@ -5,11 +5,8 @@ import pytest
 from tactslip_torch.analysis.latency import (
     Latency,
     Limits,
-    _longest_hop,
     check_hops,
-    least_latency_ms,
     look_ahead_samples,
-    shortest_hop,
 )
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -34,8 +31,8 @@ def test_no_onset_waits_longer_and_one_waits_so_long(look_ahead, hop):
     assert max(played) <= stated.worst_ms + 1e-9
     # an onset just behind the first sample of a bin is the worst: it misses that bin by nothing
     assert max(played) == pytest.approx(stated.worst_ms - sample_ms)
-    assert stated.facts()["worst_ms"] == pytest.approx(
-        sum(stated.facts()[part] for part in ("look_ahead_ms", "bin_ms", "hop_ms")) + 0.7
+    assert stated.to_dict()["worst_ms"] == pytest.approx(
+        sum(stated.to_dict()[part] for part in ("look_ahead_ms", "bin_ms", "hop_ms")) + 0.7
     )
 
 
@@ -51,39 +48,42 @@ def test_look_ahead_is_of_the_channels_in_use():
 
 def test_what_is_missed_is_named():
     latency = Latency(2.5, 50.0, 5.0, 400.0)
-    assert latency.misses(57.9, 400) == []
-    assert latency.misses(57.8, 399) == [
+    assert Limits(57.9, 400, [5.0]).misses(latency) == []
+    assert Limits(57.8, 399, [5.0]).misses(latency) == [
         "latency 57.90 ms above deadline_ms=57.8",
         "compute 400 us above compute_us=399",
     ]
-    assert Latency(0.0, 50.0, 5.0, 5000.0).misses(100, 9999) == [
+    assert Limits(100, 9999, [5.0]).misses(Latency(0.0, 50.0, 5.0, 5000.0)) == [
         "compute 5000 us not below the hop 5 ms"
     ]
     assert Latency(0.0, 50.0, 5.0, 1000.0).load == pytest.approx(0.2)
 
 
-def test_hops():
-    hops = [50.0, 5.0, 10.0, 25.0]
-    parts = Latency(12.5, 50.0, 5.0, 300.0)
-    assert _longest_hop(parts, hops, 200, 500).hop_ms == 50
-    assert _longest_hop(parts, hops, 72.8, 500).hop_ms == 10
-    assert _longest_hop(parts, hops, 72.7, 500).hop_ms == 5
-    assert _longest_hop(parts, hops, 60, 500).hop_ms == 5  # none: the shortest
-    assert _longest_hop(parts, hops, 200, 200).hop_ms == 5  # too slow at any
-    slow = Latency(0.0, 50.0, 5.0, 12_000.0)
-    assert shortest_hop(slow, hops).hop_ms == 25
-    assert shortest_hop(Latency(0.0, 50.0, 5.0, 60_000.0), hops).hop_ms == 50
-    assert shortest_hop(Latency(0.0, 50.0, 5.0, 5_000.0), hops).hop_ms == 10  # below, not at
-    assert least_latency_ms(50.0, hops, 2.5) == 57.5
+@pytest.mark.parametrize(
+    ("deadline_ms", "compute_us", "hop_ms"),
+    [(200, 500, 50), (72.8, 500, 10), (72.7, 500, 5), (60, 500, 5), (200, 200, 5)],
+)
+def test_the_longest_hop_that_keeps_the_limits_else_the_shortest(deadline_ms, compute_us, hop_ms):
+    limits = Limits(deadline_ms, compute_us, [50.0, 5.0, 10.0, 25.0])
+    assert limits.latency(Latency(12.5, 50.0, 5.0, 300.0), 300.0).hop_ms == hop_ms
+
+
+@pytest.mark.parametrize(("us", "hop_ms"), [(12_000.0, 25), (60_000.0, 50), (5_000.0, 10)])
+def test_the_shortest_hop_that_compute_fits_into(us, hop_ms):
+    latency = Latency(0.0, 50.0, 5.0, us).with_shortest_hop([50.0, 5.0, 10.0, 25.0])
+    assert latency.hop_ms == hop_ms
 
 
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ((-1.0, 50.0, 5.0, 1.0), "look_ahead_ms must not be negative, got -1"),
-        ((0.0, 0.0, 5.0, 1.0), "bin_ms must be positive, got 0"),
-        ((0.0, 50.0, 0.0, 1.0), "hop_ms must be positive, got 0"),
-        ((0.0, 50.0, 5.0, float("nan")), "compute_us must not be negative, got nan"),
+        ((-1.0, 50.0, 5.0, 1.0), "look_ahead_ms must be a finite number of at least 0, got -1"),
+        ((0.0, 0.0, 5.0, 1.0), "bin_ms must be a positive finite number, got 0"),
+        ((0.0, 50.0, 0.0, 1.0), "hop_ms must be a positive finite number, got 0"),
+        (
+            (0.0, 50.0, 5.0, float("nan")),
+            "compute_us must be a finite number of at least 0",
+        ),
     ],
 )
 def test_parts_that_are_none_are_refused(parts, message):

@@ -249,7 +249,7 @@ def test_an_order_statistic_and_both_kinds_of_column_are_exported(detector, run,
 def test_certify_measures_it(detector, recording):
     length = detector.context_before + detector.pool.bin_samples + detector.context_after
     bins = recording.unfold(-1, length, 300).transpose(0, 1).contiguous()
-    found = certify(detector, bins[::2], {"test": bins[1::2]}, simulated=True, extremes=4).facts()
+    found = certify(detector, bins[::2], {"test": bins[1::2]}, simulated=True, extremes=4).content
     assert found["sets"]["calibration"]["outside_range"] == 0
     flips = [facts["flips"]["outside_margin"] for facts in found["sets"].values()]
     assert flips == [0, 0]
@@ -265,9 +265,9 @@ def pooled_run(tmp_path_factory):
 
 
 def sensors_of(run, folder, *overrides):
-    small = ("bins=20", "judged_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
+    small = ("bins=20", "scored_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
     given = (*small, f"model={run / 'detector.pt'}", "cache=off", *overrides)
-    return sensors(composed(*given, name="sensors"), folder)
+    return sensors(composed(*given, name="importance"), folder)
 
 
 def test_sensors_are_left_out_of_the_pools(pooled_run, tmp_path):
@@ -279,9 +279,9 @@ def test_sensors_are_left_out_of_the_pools(pooled_run, tmp_path):
     rows = {row["name"]: row for row in found["units"] if row["unit"] == "channel"}
     assert {name: row["features_in_use"] for name, row in rows.items()} == own
     whole = found["with_all"]
-    assert whole["as_selected"] == whole["selected_anew"]
+    assert whole["as_selected"] == whole["reselected"]
     assert whole["as_selected"]["balanced_accuracy"]["test"] > 0.9
-    assert all(row["lost"] == row["lost_anew"] for row in rows.values())
+    assert all(row["lost"] == row["lost_reselected"] for row in rows.values())
     assert found["best"]["channel"][-1]["num_features"] == len(detector.selected)
     assert found["best"]["channel"][-1]["lost"]["test"]["lost"] == 0.0
     assert rows["PVDF1"]["gradient"]["slip"] > 0
@@ -306,10 +306,10 @@ def test_refitted_columns_are_those_of_a_hand_without_the_channel(detector, reco
     torch.testing.assert_close(found, detector.scaled(given, is_missing.expand(num, -1)))
 
 
-@pytest.mark.parametrize("override", ["num_features=3", "anew=shared"])
+@pytest.mark.parametrize("override", ["num_features=3", "reselect=shared"])
 def test_sensors_select_nothing_anew_where_all_is_pooled(override, pooled_run, tmp_path):
     with pytest.raises(
-        ValueError, match="leave out num_features and anew, or train with"
+        ValueError, match="leave out num_features and reselect, or train with"
     ) as caught:
         sensors_of(pooled_run, tmp_path, override)
     assert "\n" not in str(caught.value)

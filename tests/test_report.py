@@ -1,65 +1,69 @@
+"""Tables and figures of a run: what they say, of what, and that files are written whole."""
+
 import json
-import re
-from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from matplotlib.image import imread
+from drawing import assert_png, rows_of
 from matplotlib.text import Text
-from sklearn.metrics import accuracy_score, balanced_accuracy_score, recall_score
-from sklearn.metrics import confusion_matrix as oracle_confusion
 
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.report import (
-    bin_metrics,
+from tactslip_torch.onset.events import (
+    EventRules,
+    LatencyParts,
+    Watched,
+    event_metrics,
+    pooled_metrics,
+)
+from tactslip_torch.report import pipeline_figure, published
+from tactslip_torch.report.metrics import answer_metrics, bin_metrics, split_metrics
+from tactslip_torch.report.results import (
+    PAPER_LINE,
+    answers_figure,
+    answers_table,
     confusion_figure,
-    confusion_matrix,
+    events_figure,
+    events_table,
     materials_table,
-    pipeline_figure,
-    published,
+    print_results,
+    reliability_figure,
+    reliability_table,
     selected_features_figure,
     selected_table,
     solve_line,
-    split_metrics,
     splits_table,
     timing_table,
+    tuning_figure,
+    tuning_tables,
+    validation_figure,
+    validation_table,
+    write_results,
 )
-from tactslip_torch.report.metrics import merged_metrics
-from tactslip_torch.report.results import PAPER_LINE
+from tactslip_torch.report.style import table
 
-SCORE_KEYS = {
-    "accuracy",
-    "balanced_accuracy",
-    "non_slip_recall",
-    "slip_recall",
-    "confusion",
-    "num_bins",
-}
+REASON = "nobody looked"
 
 
-def random_bins(seed: int, num_bins: int = 500) -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    truth = torch.rand(num_bins, generator=generator) < 0.75
-    return truth, truth ^ (torch.rand(num_bins, generator=generator) < 0.1)
+def scores_of(seed=0, scenes=("paper",)):
+    rng = np.random.default_rng(seed)
+    truth = torch.from_numpy(rng.random(500) < 0.75)
+    predicted = truth ^ torch.from_numpy(rng.random(500) < 0.1)
+    materials = ["ABS" if i % 2 else "acrylic" for i in range(500)]
+    speeds = [(60.0, 20.0, 40.0)[i % 3] for i in range(500)]
+    return bin_metrics(truth, predicted, materials, speeds, [scenes[i // 6 % len(scenes)] for i in
+                                                            range(500)])  # fmt: skip
 
 
-def metrics_of(simulated: bool) -> dict[str, Any]:
-    splits = {}
-    for seed, name in enumerate(["train", "test", "unseen"]):
-        truth, predicted = random_bins(seed)
-        materials = ["ABS" if i % 2 else "acrylic" for i in range(len(truth))]
-        speeds = [(60.0, 20.0, 40.0)[i % 3] for i in range(len(truth))]
-        splits[name] = bin_metrics(truth, predicted, materials, speeds)
-    return {"simulated": simulated, "splits": splits}
+def metrics_of(**more):
+    splits = {name: scores_of(seed) for seed, name in enumerate(["train", "test", "unseen"])}
+    return {"simulated": True, "splits": splits} | more
 
 
-@pytest.fixture
-def selected() -> list[dict[str, str]]:
+def features(hand=None):
     rows = []
-    for number, channel in enumerate(HandLayout.paper24().channels):
+    for number, channel in enumerate((hand or HandLayout.paper24()).channels):
         component = "raw" if channel.kind == "SG" else f"{'AD'[number % 2]}{1 + number % 4}"
         row = {"channel": channel.name, "component": component, "domain": "time"}
         row |= {"descriptor": ("kurtosis", "std", "energy")[number % 3]}
@@ -67,357 +71,348 @@ def selected() -> list[dict[str, str]]:
     return rows
 
 
-# ------------------------------------------------------------------------------------- scores
-@pytest.mark.parametrize("seed", range(3))
-def test_scores_equal_scikit_learn(seed: int) -> None:
-    truth, predicted = random_bins(seed)
-    confusion = confusion_matrix(truth, predicted)
-    scores = split_metrics(confusion)
-    assert confusion == oracle_confusion(truth.numpy(), predicted.numpy()).tolist()
-    expected = {
-        "accuracy": accuracy_score(truth, predicted),
-        "balanced_accuracy": balanced_accuracy_score(truth, predicted),
-        "non_slip_recall": recall_score(truth, predicted, pos_label=False),
-        "slip_recall": recall_score(truth, predicted, pos_label=True),
-    }
-    for key, value in expected.items():
-        assert scores[key] == pytest.approx(value, abs=1e-14), key
-    assert scores["num_bins"] == len(truth)
-
-
-def test_groups_equal_the_scores_of_their_own_bins_and_add_up() -> None:
-    truth, predicted = random_bins(3)
-    materials = [("iron", "ABS", "wood")[i % 3] for i in range(len(truth))]
-    speeds = [(60.0, 40.0, 20.0, 100.0)[i % 4] for i in range(len(truth))]
-    scores = bin_metrics(truth, predicted, materials, speeds)
-    assert list(scores["per_material"]) == ["iron", "ABS", "wood"]
-    assert list(scores["per_speed"]) == ["20", "40", "60", "100"]
-    wood = torch.tensor([material == "wood" for material in materials])
-    slow = torch.tensor([speed == 20 for speed in speeds])
-    for got, rows in ((scores["per_material"]["wood"], wood), (scores["per_speed"]["20"], slow)):
-        assert got == split_metrics(confusion_matrix(truth[rows], predicted[rows]))
-    for groups in (scores["per_material"], scores["per_speed"]):
-        added = sum(np.array(group["confusion"]) for group in groups.values())
-        assert added.tolist() == scores["confusion"]
-        assert all(set(group) == SCORE_KEYS for group in groups.values())
-    assert set(scores) == SCORE_KEYS | {"per_material", "per_speed"}
-
-
-def test_of_several_scenes_groups_count_the_papers_bins_alone() -> None:
-    truth, predicted = random_bins(7)
-    num = len(truth)
-    scenes = [("taps", "paper", "grips")[i % 3] for i in range(num)]
-    groups = [["a" if i < 200 else "b" for i in range(num)], [20.0 * (i % 4) for i in range(num)]]
-    positions = [i % 9 - 4 for i in range(num)]
-    scores = bin_metrics(truth, predicted, *groups, scenes, positions)
-    rows = [i for i in range(num) if scenes[i] == "paper"]
-    labels = [[group[i] for i in rows] for group in groups]
-    places = [positions[i] for i in rows]
-    expected = bin_metrics(truth[rows], predicted[rows], *labels, None, places)
-    for kind in ("per_material", "per_speed", "per_position"):
-        assert scores[kind] == expected[kind]
-    assert scores["num_bins"] == num
-    unlike = ["taps" if scene == "paper" else "grips" for scene in scenes]  # and none the paper's
-    none = bin_metrics(truth, predicted, *groups, unlike, positions)
-    assert none["per_material"] == none["per_speed"] == none["per_position"] == {}
-    for parts in (scenes, unlike):
-        by_scene = [
-            bin_metrics(
-                truth[own],
-                predicted[own],
-                *([group[i] for i in own] for group in groups),
-                [scene] * len(own),
-                [positions[i] for i in own],
+def events_of(seed=0, *, quiet_s=60.0, compute_s=None, num=20):
+    """Of recordings with one slip each: some found, some early, some missed, some false alarms."""
+    rng = np.random.default_rng(seed)
+    many = []
+    for number in range(num):
+        alarms = [float(time) for time in rng.uniform(4.0, 3.0 + quiet_s / num, rng.poisson(2))]
+        if (kind := rng.choice(["found", "early", "missed"], p=[0.7, 0.1, 0.2])) != "missed":
+            alarms.append(0.9 if kind == "early" else 1.0 + rng.exponential(0.05))
+        many.append(
+            Watched(
+                recording=str(number),
+                material="M1",
+                scene="paper",
+                duration_s=3.0 + quiet_s / num,
+                alarms_s=tuple(sorted(alarms)),
+                onset_estimates_s=(),
+                onsets_s=(1.0,),
+                sliding_s=((1.0, 2.0),),
+                speeds_mm_s=(20.0,),
             )
-            for scene in dict.fromkeys(parts)
-            for own in [[i for i in range(num) if parts[i] == scene]]
-        ]
-        assert merged_metrics(by_scene) == bin_metrics(truth, predicted, *groups, parts, positions)
-    taps = [i for i in range(num) if scenes[i] == "taps"]  # of one kind, whichever, all count
-    labels = [[group[i] for i in taps] for group in groups]
-    one = bin_metrics(truth[taps], predicted[taps], *labels, ["taps"] * len(taps))
-    assert sum(of["num_bins"] for of in one["per_material"].values()) == len(taps)
-
-
-def test_recall_by_position_is_the_share_of_right_bins_there(rng: np.random.Generator) -> None:
-    num_bins = 4000
-    places = rng.integers(-24, 60, num_bins)
-    truth = torch.from_numpy(places >= 0)
-    predicted = truth ^ torch.from_numpy(rng.random(num_bins) < 0.2)
-    of_stroke = rng.random(num_bins) < 0.9
-    positions = [int(p) if mine else None for p, mine in zip(places, of_stroke, strict=True)]
-    scores = bin_metrics(truth, predicted, ["a"] * num_bins, [0.0] * num_bins, None, positions)
-    found = scores["per_position"]
-    assert list(found) == ["<-20", *map(str, range(-20, 20)), "20+"]
-    at = {"<-20": places < -20, "20+": places >= 20} | {str(p): places == p for p in range(-20, 20)}
-    for label, rows in at.items():
-        rows = rows & of_stroke
-        expected = recall_score(
-            truth[rows],
-            predicted[rows],
-            pos_label=label == "20+" or (label[0] != "<" and int(label) >= 0),
         )
-        assert found[label]["recall"] == pytest.approx(expected, abs=1e-14)
-        assert found[label]["num_bins"] == rows.sum()
-    assert "per_scene" not in scores
-    assert json.loads(json.dumps(scores, allow_nan=False)) == scores
+    latency = LatencyParts(0.0125, 0.05, compute_s)
+    return event_metrics(many, EventRules(settle_s=0.1), latency, num_resamples=50)
 
 
-def test_merged_scores_equal_those_of_all_bins_together(rng: np.random.Generator) -> None:
-    truth, predicted = random_bins(4)
-    materials = ["ABS" if i < 200 else "iron" for i in range(len(truth))]  # iron: second part only
-    speeds = [(20.0, 40.0)[i % 2] for i in range(len(truth))]
-    scenes = ["paper" if i < 300 else "taps" for i in range(len(truth))]
-    places = [int(p) if p > -25 else None for p in rng.integers(-30, 30, len(truth))]
-    groups = (materials, speeds, scenes, places)
-    parts = [
-        bin_metrics(truth[rows], predicted[rows], *(group[rows] for group in groups))
-        for rows in (slice(0, 150), slice(150, None))
+def no_events():
+    return pooled_metrics([], num_resamples=50) | {"reason": REASON}
+
+
+RECORDINGS = {"a/0": [[1, 3, 0], [2, 0, 2]], "a/1": [[0, 1, 1], [0, 1, 9]]}
+ANSWERS = {"unseen": answer_metrics(RECORDINGS, 0.8), "test": answer_metrics({}, 0.8)}
+
+
+def stated(ece, count, **more):
+    curve = {"probabilities": [0.1, 0.8], "slip_shares": [0.2, 0.7]}
+    scores = {"ece": ece, "mce": 2 * ece, "brier": 0.0625, "log_loss": 0.25}
+    return curve | scores | {"counts": [count / 4, 3 * count / 4], **more}
+
+
+BY_ROLE = {
+    "test": stated(0.0125, 4000, per_material={"M1": stated(0.02, 800)}),
+    "unseen": stated(0.08, 1200, per_material={"iron": stated(0.05, 400)}),
+}
+
+
+def choice(size, penalty, **scores):
+    known = [score for score in scores.values() if score is not None]
+    kernel = {"kind": "polynomial", "degree": 2, "offset": 0.5}
+    return {
+        "num_features": size,
+        "kernel": kernel,
+        "penalty": penalty,
+        "mean": sum(known) / len(known),
+        "balanced_accuracy": scores,
+    }
+
+
+CHOICES = [
+    choice(60, 0.1, M1=0.9, M2=0.7, M3=None),
+    choice(60, 1.0, M1=0.8, M2=0.9, M3=None),
+    choice(120, 0.1, M1=0.95, M2=0.75, M3=None),
+]
+RBF = choice(60, 0.3, M1=0.5, M2=None, M3=0.4) | {"kernel": {"kind": "rbf", "gamma": 1}}
+
+
+def tuning():
+    """Of two groups held out in turn, one step each."""
+    won = {"loss": 0.2, "balanced_accuracy": 0.9}
+    history = [{"held_loss": 0.3, "loss": 0.4}, {"held_loss": 0.2, "loss": 0.3}]
+    ways = {"recipe": won, "grid": won, "tuned": won | {"steps": 1}}
+    held = [{"held": name, "history": history, **ways} for name in ("M1", "M2")]
+    splits = {"test": split_metrics([[9, 1], [2, 8]])}
+    return {
+        "held": held,
+        "history": history,
+        "splits": {"recipe": splits, "grid": splits},
+        "start": {"penalty": 1.0, "offset": 0.5},
+        "penalty": 2.0,
+        "offset": 0.25,
+        "steps": 1,
+        "bins": 40,
+        "seconds": 3.0,
+        "fit_s": 1.0,
+        "learned": ["penalty", "offset", "scales"],
+        "scales": {f"f{i}": 1 + i / 10 for i in range(8)},
+    }
+
+
+# Tables ----------------------------------------------------------------------------------------
+
+
+def test_cells_are_text_and_repeated_labels_are_left_blank():
+    rows = [["a", "b", "c"], ["x", 1, None], ["x", 2, True], ["y", 2, False]]
+    assert table(rows, merged=2).splitlines() == [
+        "a  b    c",
+        "x  1    -",
+        "   2  yes",
+        "y  2   no",
     ]
-    assert merged_metrics(parts) == bin_metrics(truth, predicted, *groups)
-    plain = [
-        bin_metrics(truth[rows], predicted[rows], materials[rows], speeds[rows])
-        for rows in (slice(0, 150), slice(150, None))
-    ]
-    assert merged_metrics(plain) == bin_metrics(truth, predicted, materials, speeds)
 
 
-@pytest.mark.parametrize("slip", [True, False])
-def test_a_class_without_bins_has_no_recall(slip: bool) -> None:
-    truth = torch.full((8,), slip)
-    predicted = torch.arange(8) < 6
-    scores = split_metrics(confusion_matrix(truth, predicted))
-    present, absent = ("slip", "non_slip") if slip else ("non_slip", "slip")
-    assert scores[f"{absent}_recall"] is None
-    assert scores["balanced_accuracy"] is None
-    assert scores[f"{present}_recall"] == scores["accuracy"] == (0.75 if slip else 0.25)
-
-
-def test_no_bins_give_no_scores() -> None:
-    nothing = torch.zeros(0, dtype=torch.bool)
-    scores = bin_metrics(nothing, nothing, [], [])
-    assert scores["confusion"] == [[0, 0], [0, 0]]
-    assert [scores[key] for key in ("accuracy", "balanced_accuracy", "num_bins")] == [None, None, 0]
-
-
-def test_wrong_input_is_named() -> None:
-    truth, predicted = random_bins(0, 4)
-    with pytest.raises(ValueError, match=r"is_slip_predicted must be \[N\] bool.*float32"):
-        confusion_matrix(truth, predicted.float())
-    with pytest.raises(ValueError, match="is_slip_true must be"):
-        confusion_matrix(truth[None], predicted[None])
-    with pytest.raises(ValueError, match="got 4 and 3 bins"):
-        confusion_matrix(truth, predicted[:3])
-    with pytest.raises(ValueError, match=r"materials must have one entry per bin, 4, got 1"):
-        bin_metrics(truth, predicted, ["ABS"], [20.0] * 4)
-    with pytest.raises(ValueError, match=r"speeds_mm_s must have one entry per bin, 4, got 5"):
-        bin_metrics(truth, predicted, ["ABS"] * 4, [20.0] * 5)
-    with pytest.raises(ValueError, match=r"scenes must have one entry per bin, 4, got 3"):
-        bin_metrics(truth, predicted, ["ABS"] * 4, [20.0] * 4, ["paper"] * 3)
-    with pytest.raises(ValueError, match=r"positions must have one entry per bin, 4, got 0"):
-        bin_metrics(truth, predicted, ["ABS"] * 4, [20.0] * 4, positions=[])
-
-
-# ---------------------------------------------------------------------------------- published
-def test_published_numbers_agree_with_each_other() -> None:
+def test_published_numbers_agree_with_each_other():
     by_finger = published.SELECTED_BY_FINGER
     assert sum(published.SELECTED_BY_KIND.values()) == published.NUM_SELECTED
     for kind, count in published.SELECTED_BY_KIND.items():
         assert sum(by_finger[kind].values()) == count
     assert len({*published.DESCRIPTORS_RANKED, *published.DESCRIPTORS_NEVER}) == 17
-    for name in ("test", "unseen"):
-        split = published.SPLITS[name]
-        assert split.non_slip_recall is not None
-        assert split.slip_recall is not None
-        mean = (split.non_slip_recall + split.slip_recall) / 2
-        assert split.balanced_accuracy == pytest.approx(mean)
-        # one share of non-slip bins, 24.66 %, explains accuracy from the recalls
-        accuracy = 0.2466 * split.non_slip_recall + 0.7534 * split.slip_recall
-        assert split.accuracy == pytest.approx(accuracy, abs=6e-4)
+    for split in (published.SPLITS["test"], published.SPLITS["unseen"]):
+        recalls = np.array([split.non_slip_recall, split.slip_recall])
+        assert split.balanced_accuracy == pytest.approx(recalls.mean())
+        # one fraction of non-slip bins, 24.66 %, explains accuracy from the recalls
+        assert split.accuracy == pytest.approx(recalls @ [0.2466, 0.7534], abs=6e-4)
 
 
-# ------------------------------------------------------------------------------------- tables
-def rows_of(table: str) -> list[list[str]]:
-    return [re.split(r"\s{2,}", line.strip()) for line in table.splitlines()]
+def test_splits_stand_beside_baselines_and_the_papers_numbers():
+    metrics = metrics_of()
+    baseline = {"splits": {"unseen": metrics["splits"]["test"]}}
+    printed = splits_table(metrics | {"baselines": {"logistic_regression": baseline}})
+    assert printed.startswith("SIMULATED")
+    rows = rows_of(printed)
 
+    def cells(name):
+        keys = ("accuracy", "balanced_accuracy", "non_slip_recall", "slip_recall")
+        return [f"{100 * metrics['splits'][name][key]:.2f}" for key in keys]
 
-def test_splits_table_has_ours_and_the_papers_numbers() -> None:
-    metrics = metrics_of(simulated=True)
-    table = splits_table(metrics)
-    assert table.startswith("SIMULATED")
-    rows = rows_of(table)
-    scores = metrics["splits"]["unseen"]
-    keys = ("accuracy", "balanced_accuracy", "non_slip_recall", "slip_recall")
-    position = [row[0] for row in rows].index("unseen")
-    assert rows[position] == ["unseen", *(f"{100 * scores[key]:.2f}" for key in keys), "500"]
-    assert rows[position + 1] == ["paper", "91.95", "86.05", "74.40", "97.70", "-"]
-    train = [row[0] for row in rows].index("train")
-    assert rows[train + 1] == ["paper", "96.59", "-", "-", "-", "-"]
-    widths = {len(line) for line in table.splitlines()[1:8]}
-    assert len(widths) == 1  # aligned
-
-
-def test_a_split_unknown_to_the_paper_stands_alone_and_none_is_a_dash() -> None:
-    scores = split_metrics([[0, 0], [1, 3]])
-    rows = rows_of(splits_table({"simulated": False, "splits": {"validation": scores}}))
-    assert rows[1] == ["validation", "75.00", "-", "-", "75.00", "4"]
-    assert rows[2][0].startswith("paper:")  # the source line, no row of numbers
-
-
-def test_materials_table_has_each_material_and_speed_of_each_split() -> None:
-    metrics = metrics_of(simulated=True)
-    rows = rows_of(materials_table(metrics))[2:]
-    assert [row[0] for row in rows[::5]] == ["train", "test", "unseen"]
-    groups = [row[-6] for row in rows[:5]]
-    assert groups == ["acrylic", "ABS", "20 mm/s", "40 mm/s", "60 mm/s"]
-    assert sum(int(row[-1]) for row in rows[:2]) == 500
-
-
-def test_materials_table_has_scenes_where_there_are_several() -> None:
-    truth, predicted = random_bins(6)
-    scenes = [("paper", "taps")[i % 2] for i in range(len(truth))]
-    for given, expected in ((scenes, ["scene paper", "scene taps"]), (["paper"] * len(truth), [])):
-        scores = bin_metrics(truth, predicted, ["a"] * len(truth), [20.0] * len(truth), given)
-        table = materials_table({"simulated": False, "splits": {"test": scores}})
-        line = "of several scenes: materials and speeds are of the paper's scene alone"
-        assert (table.splitlines()[0] == line) == bool(expected)
-        assert [row[-6] for row in rows_of(table)[1 + bool(expected) :]] == [
-            "a",
-            "20 mm/s",
-            *expected,
-        ]
-
-
-def test_timing_table_takes_a_given_total() -> None:
-    rows = rows_of(timing_table({"total": 50.0, "features": 20.0}))
-    assert rows[1:] == [["features", "20.00", "40.00"], ["total", "50.00", "100.00"]]
-    assert rows_of(timing_table({}))[1:] == [["total", "0.00", "-"]]
-
-
-def test_solve_line_says_how_far_rounding_may_reach() -> None:
-    facts = {"method": "eigen", "rank": 7, "size": 9, "condition": "inf", "error": 2.2e-16}
-    line = "solved by eigen: 7 of 9 unknowns, condition inf, relative error of the weights about"
-    assert solve_line(facts) == f"{line} 2e-16"
-    facts |= {"left_out": 0.01, "error": 0.01}
-    assert solve_line(facts) == f"{line} 1e-02, unless what is left out is null"
-
-
-def test_selected_table_counts_every_key(selected: list[dict[str, str]]) -> None:
-    rows = rows_of(selected_table(selected))
-    assert ["kind", "SG", "14", "6"] in rows
-    assert ["PVDF", "10", "114"] in rows
-    assert ["index", "5", "48"] in rows
-    assert ["middle", "5", "21"] in rows
-    assert ["domain", "time", "24", "-"] in rows
-    assert ["D1", "0", "0"] in rows
-    assert ["peak_factor", "0", "#1"] in rows
-    assert ["mode", "0", "0"] in rows
-    count = Counter(row["descriptor"] for row in selected)["energy"]
-    assert ["energy", str(count), "0"] in rows
-    assert rows[-2] == ["all", "24", "120"]
-
-
-# ------------------------------------------------------------------------------------ figures
-def assert_drawn_atomically(path: Path) -> None:
-    assert [entry.name for entry in path.parent.iterdir()] == [path.name]  # nothing left behind
-    pixels = imread(path)
-    assert min(pixels.shape[:2]) > 300
-    assert 0.02 < (pixels[..., :3].min(axis=-1) < 0.9).mean() < 0.9  # neither blank nor black
-    for edge in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]):
-        assert edge.min() == 1.0  # nothing is cut off at the border
-
-
-@pytest.mark.parametrize("simulated", [True, False])
-def test_confusion_figure(tmp_path: Path, simulated: bool) -> None:
-    path = tmp_path / "confusion.png"
-    path.write_bytes(b"an older figure")
-    confusion_figure(metrics_of(simulated), path)
-    assert_drawn_atomically(path)
+    at = [row[0] for row in rows].index("unseen")
+    assert rows[at] == ["unseen", *cells("unseen"), "500"]
+    assert rows[at + 1] == ["logistic regression, same features", *cells("test"), "-"]
+    assert rows[at + 2] == ["paper", "91.95", "86.05", "74.40", "97.70", "-"]
+    assert ["paper", "96.59", "-", "-", "-", "-"] in rows
+    alone = {"simulated": False, "splits": {"other": split_metrics([[0, 0], [1, 3]])}}
+    rows = rows_of(splits_table(alone))
+    assert rows[1] == ["other", "75.00", "-", "-", "75.00", "4"]
+    assert rows[2][0] == PAPER_LINE
 
 
 @pytest.mark.parametrize(
     ("scenes", "is_papers"), [(("paper",), True), (("taps",), False), (("paper", "taps"), False)]
 )
-def test_the_papers_numbers_stand_beside_its_own_scenes_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenes: tuple[str, ...], is_papers: bool
-) -> None:
-    truth, predicted = random_bins(9)
-    kinds = [scenes[i % len(scenes)] for i in range(len(truth))]
-    scores = bin_metrics(truth, predicted, ["a"] * len(truth), [20.0] * len(truth), kinds)
-    metrics = {"simulated": True, "splits": {"test": scores}}
-    drawn = []
-
-    def keep(figure: Any, target: Path, **_: object) -> None:
-        drawn.append(figure)
-        target.write_bytes(b"drawn")
-
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", keep)
-    confusion_figure(metrics, tmp_path / "confusion.png")
-    (panel,) = drawn[0].axes
-    assert ("paper: non-slip 93.8" in panel.get_xlabel()) == is_papers
-    assert any(row[0] == "paper" for row in rows_of(splits_table(metrics))) == is_papers
+def test_the_papers_numbers_stand_beside_its_own_scenes_alone(drawn, tmp_path, scenes, is_papers):
+    metrics = {"simulated": True, "splits": {"test": scores_of(scenes=scenes)}}
     elsewhere = metrics | {"is_papers_hand": False}
-    confusion_figure(elsewhere, tmp_path / "confusion.png")
-    assert drawn[1].axes[0].get_xlabel() == "prediction\n\n"
-    assert PAPER_LINE in splits_table(metrics)
+    for given in (metrics, elsewhere):
+        confusion_figure(given, tmp_path / "confusion.png")
+    own, other = (figure.axes[0].get_xlabel() for figure in drawn)
+    assert ("paper: non-slip 93.8" in own) == is_papers
+    assert other == "prediction\n\n"
+    assert any(row[0] == "paper" for row in rows_of(splits_table(metrics))) == is_papers
     assert PAPER_LINE not in splits_table(elsewhere)
+    lines = materials_table(metrics).splitlines()
+    expected = ["acrylic", "ABS", "20 mm/s", "40 mm/s", "60 mm/s"]
+    expected = expected if "paper" in scenes or len(scenes) == 1 else []
+    if len(scenes) > 1:
+        assert lines.pop(1) == (
+            "of several scenes: materials and speeds are of the paper's scene alone"
+        )
+        expected += [f"scene {scene}" for scene in scenes]
+    assert sorted(rows_of(line)[0][-6] for line in lines[2:]) == sorted(expected)
 
 
-def test_confusion_figure_with_many_splits_and_an_absent_class(tmp_path: Path) -> None:
-    splits = {f"fold {i}": split_metrics([[0, 0], [i, 5]]) for i in range(5)}
-    confusion_figure({"simulated": True, "splits": splits}, str(tmp_path / "confusion.png"))
-    assert_drawn_atomically(tmp_path / "confusion.png")
+def test_timing_and_solve_are_told():
+    rows = rows_of(timing_table({"total": 50.0, "features": 20.0}))
+    assert rows[1:] == [["features", "20.00", "40.00"], ["total", "50.00", "100.00"]]
+    assert rows_of(timing_table({}))[1:] == [["total", "0.00", "-"]]
+    facts = {"method": "eigen", "rank": 7, "size": 9, "condition": "inf", "error": 2.2e-16}
+    line = "solved by eigen: 7 of 9 unknowns, condition inf, relative error of the weights about"
+    assert solve_line(facts) == f"{line} 2e-16"
+    left_out = facts | {"left_out": 0.01, "error": 0.01}
+    assert solve_line(left_out) == f"{line} 1e-02, unless what is left out is null"
 
 
-def test_selected_features_figure(tmp_path: Path, selected: list[dict[str, str]]) -> None:
-    selected_features_figure(selected, tmp_path / "selected.png", simulated=True)
-    assert_drawn_atomically(tmp_path / "selected.png")
+def test_selected_features_are_counted_beside_the_papers():
+    rows = rows_of(selected_table(features()))
+    for row in (
+        *(["kind", "SG", "14", "6"], ["PVDF", "10", "114"], ["middle", "5", "21"]),
+        *(["index", "5", "48"], ["domain", "time", "24", "-"], ["D1", "0", "0"]),
+        *(["peak_factor", "0", "#1"], ["mode", "0", "0"], ["energy", "8", "0"]),
+    ):
+        assert row in rows
+    assert rows[-2] == ["all", "24", "120"]
 
 
-@pytest.mark.parametrize("kinds", [("SG",), ("electrode",), ("IMU", "SG"), tuple("abcdefghi")])
-def test_selected_features_of_another_hand_stand_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kinds: tuple[str, ...]
-) -> None:
+def test_choices_mark_the_best_and_name_the_worst_group():
+    lines = validation_table(CHOICES, simulated=True).splitlines()
+    assert lines[0].startswith("SIMULATED")
+    cells = [line.split() for line in lines[2:]]
+    assert cells[0] == ["60", "degree", "2,", "c", "0.5", "0.1", "80.00", "70.00", "M2"]
+    assert cells[1] == ["*", "60", "degree", "2,", "c", "0.5", "1", "85.00", "80.00", "M1"]
+    more = [
+        row | {"use": use, "chosen": use == "pooled", "worst": {"at_best_threshold": 0.5}}
+        for row in CHOICES[:2]
+        for use in ("channel", "pooled")
+    ]
+    nested = {"mean": 0.8, "balanced_accuracy": {"M1": 0.7, "M2": 0.9}}
+    lines = validation_table(more, simulated=False, nested=nested).splitlines()
+    assert len(lines) == 1 + 3 + 1  # the best of each structure, and the one that was chosen
+    assert lines[-1].endswith("evaluated on it: 80.00 % (M1 70.00, M2 90.00)")
+
+
+def test_tuning_says_what_was_learned():
+    metrics = metrics_of(tuning=tuning())
+    metrics["splits"] = {"test": metrics["splits"]["test"]}
+    (text,) = tuning_tables(metrics)
+    assert "tuned by gradient" in text
+    assert "1 steps from C=1, c=0.5 to C=2, c=0.25; learned: penalty, offset, scales" in text
+    assert tuning_tables(metrics_of()) == []
+
+
+def test_reliability_and_prediction_sets_have_a_row_for_each_role():
+    lines = reliability_table(BY_ROLE, simulated=True).splitlines()
+    rows = [line.split() for line in lines[2:]]
+    assert rows[0] == ["test", "all", "4000", "1.25", "2.50", "0.0625", "0.2500"]
+    assert rows[1] == ["M1", "800", "2.00", "4.00", "0.0625", "0.2500"]
+    assert [row[0] for row in rows[2:]] == ["unseen", "iron"]
+    lines = answers_table(metrics_of(answers=ANSWERS)).splitlines()
+    assert lines[2].split()[:4] == ["unseen", "15.00", "88.24", "85.83"]
+    assert set(lines[3].split()[1:-1]) == {"-"}
+    assert lines[4].startswith("asked: 80 % covered")
+
+
+def test_events_have_a_row_for_each_role_and_rule():
+    events = {
+        role: {"first_transition": events_of(seed), "two_of_three": events_of(seed + 1)}
+        for seed, role in ((0, "test"), (5, "unseen"))
+    }
+    lines = events_table(metrics_of(events=events)).splitlines()
+    assert lines[0].startswith("SIMULATED")
+    assert len(lines) == 2 + 4
+    found = iter(lines[2:])
+    for role, by_rule in events.items():
+        for rule, numbers in by_rule.items():
+            rate = numbers["false_alarms_per_minute"]
+            head = [role] if rule == "first_transition" else []
+            assert rows_of(next(found))[0] == [
+                *head,
+                rule.replace("_", " "),
+                str(numbers["num_onsets"]),
+                *(f"{100 * numbers[name]['value']:.1f}" for name in ("found", "early", "missed")),
+                *(f"{numbers['delay_ms'][name]['value']:.1f}" for name in ("median", "p95")),
+                f"{rate['value']:.1f} /min [{rate['low']:.1f}, {rate['high']:.1f}]",
+                f"{60 * numbers['quiet_hours']:.1f} min",
+                f"{numbers['alarms_per_slip']['value']:.2f}",
+            ]
+    timed = {"test": {"rule": events_of(), "cusum at 1/h": events_of(compute_s=0.0021)}}
+    lines = events_table(metrics_of(events=timed)).splitlines()
+    assert rows_of(lines[6])[0][-1] == "-"
+    parts = [float(cell) for cell in rows_of(lines[7])[0][1:]]
+    assert (parts[0], parts[4]) == (12.5, 2.1)
+    assert sum(parts[:3]) == pytest.approx(parts[3], abs=0.2)
+    nothing = {role: {"a": no_events(), "b": no_events()} for role in ("train", "test")}
+    lines = events_table(metrics_of(events=nothing)).splitlines()
+    assert rows_of(lines[2])[0][2:] == ["0", *["-"] * 8]
+    assert [line for line in lines if REASON in line] == [f"no events: {REASON}"]
+
+
+# Figures ---------------------------------------------------------------------------------------
+
+NEVER = events_of() | {"delay_ms": None, "found": {"value": 0.0, "low": 0.0, "high": 0.1}}
+MANY = {f"rule {number}": events_of(number) for number in range(8)}  # more than colours
+FIGURES = {
+    "confusion": lambda path, of: confusion_figure(metrics_of(simulated=of), path),
+    "many splits, an absent class": lambda path, of: confusion_figure(
+        {"simulated": of, "splits": {str(i): split_metrics([[0, 0], [i, 5]]) for i in range(5)}},
+        path,
+    ),
+    "selected": lambda path, of: selected_features_figure(features(), path, simulated=of),
+    "validation": lambda path, of: validation_figure([*CHOICES, RBF], path, simulated=of),
+    "reliability": lambda path, of: reliability_figure(BY_ROLE, path, simulated=of),
+    "tuning": lambda path, of: tuning_figure(tuning(), path, simulated=of),
+    "answers": lambda path, of: answers_figure(metrics_of(simulated=of, answers=ANSWERS), path),
+    "events": lambda path, of: events_figure(
+        metrics_of(
+            simulated=of,
+            events={"test": MANY, "unseen": {"x": events_of(quiet_s=7200.0)}}
+            | {"held": {"y": no_events()}, "silent": {"z": NEVER}},
+        ),
+        path,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_is_written_whole_and_says_what_is_simulated(drawn, tmp_path, name):
+    path = tmp_path / "figure.png"
+    path.write_bytes(b"an older figure")
+    for simulated in (True, False):
+        FIGURES[name](path, simulated)
+    assert_png(path)
+    assert ["SIMULATED" in figure.get_suptitle() for figure in drawn] == [True, False]
+
+
+def test_the_pipeline_is_drawn(drawn, tmp_path):
+    pipeline_figure(tmp_path / "pipeline.png")
+    assert_png(tmp_path / "pipeline.png")
+
+
+@pytest.mark.parametrize("kinds", [("SG",), ("IMU", "SG"), tuple("abcdefghi")])
+def test_selected_features_of_another_hand_stand_alone(drawn, tmp_path, kinds):
     row = {"channel": "X1", "component": "D6", "domain": "freq", "descriptor": "mean"}
     rows = [row | {"name": "X1", "kind": kind, "finger": "palm"} for kind in kinds]
     selected_features_figure(rows, tmp_path / "selected.png", simulated=False)
-    assert_drawn_atomically(tmp_path / "selected.png")
-    drawn = []
-    monkeypatch.setattr(
-        "matplotlib.figure.Figure.savefig",
-        lambda figure, target, **_: drawn.append(figure) or Path(target).touch(),
-    )
-    selected_features_figure(rows, tmp_path / "again.png", simulated=False)
     bars = drawn[0].axes[0]
     heights = {layer.get_label(): sum(b.get_height() for b in layer) for layer in bars.containers}
     assert {kind: heights[kind] for kind in kinds} == dict.fromkeys(kinds, 1)
     words = [text.get_text() for axes in drawn[0].axes for text in axes.findobj(Text)]
     assert not any("paper" in word or "[" in word for word in words)
     assert "paper" not in selected_table(rows)
-    assert {row[0] for row in rows_of(selected_table(rows))} >= {"kind", "all"}
 
 
-def test_pipeline_figure(tmp_path: Path) -> None:
-    pipeline_figure(tmp_path / "pipeline.png")
-    assert_drawn_atomically(tmp_path / "pipeline.png")
+def test_a_rule_has_one_line_in_the_legend_however_it_is_written(drawn, tmp_path):
+    numbers = events_of()
+    events = {"test": {"k_of_n": numbers}, "stream": {"k of n": numbers, "cusum": numbers}}
+    events_figure(metrics_of(events=events), tmp_path / "events.png")
+    labels = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert labels[:3] == ["k of n", "cusum", "median"]
 
 
-def test_nothing_to_draw_is_an_error_and_leaves_no_file(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no split"):
-        confusion_figure({"simulated": True, "splits": {}}, tmp_path / "confusion.png")
-    with pytest.raises(ValueError, match="no selected feature"):
-        selected_features_figure([], tmp_path / "selected.png", simulated=True)
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda path: confusion_figure({"simulated": True, "splits": {}}, path), "no split"),
+        (lambda path: selected_features_figure([], path, simulated=True), "no selected feature"),
+        (lambda path: reliability_figure({}, path, simulated=True), "no role"),
+        (lambda path: events_figure(metrics_of(), path), "no events to draw"),
+        (
+            lambda path: events_figure(metrics_of(events={"test": {"a": no_events()}}), path),
+            "no events to draw",
+        ),
+    ],
+)
+def test_nothing_to_draw_is_an_error_and_leaves_no_file(tmp_path, draw, message):
+    with pytest.raises(ValueError, match=message):
+        draw(tmp_path / "figure.png")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failed_write_keeps_the_older_figure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_keeps_the_older_figure(tmp_path, monkeypatch):
     path = tmp_path / "pipeline.png"
     path.write_bytes(b"an older figure")
 
-    def full_disk(self: object, target: Path, **_: object) -> None:
-        target.write_bytes(b"half")
+    def full_disk(self, target, **_):
+        Path(target).write_bytes(b"half")
         raise OSError("no space left on device")
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", full_disk)
@@ -425,3 +420,34 @@ def test_a_failed_write_keeps_the_older_figure(
         pipeline_figure(path)
     assert path.read_bytes() == b"an older figure"
     assert list(tmp_path.iterdir()) == [path]
+
+
+# All of a run ----------------------------------------------------------------------------------
+
+
+def test_results_have_a_table_and_a_figure_of_all_there_is(drawn, tmp_path, capsys):
+    solve = {"method": "eigen", "rank": 7, "size": 9, "condition": 1.0, "error": 1e-16}
+    everything = metrics_of(
+        events={"test": {"two_of_three": events_of()}},
+        answers=ANSWERS,
+        validation=CHOICES,
+        solve=solve,
+        timing_s={"features": 1.0},
+        trained_on={"materials": ["A", "B"]},
+    )
+    write_results(tmp_path / "all", everything, features())
+    print_results(everything, features())
+    out = capsys.readouterr().out
+    for words in ("two of three", "asked: 80 %", "solved by eigen", "trained on materials A, B"):
+        assert words in out
+    assert {path.name for path in (tmp_path / "all").iterdir()} == {
+        *("metrics.json", "confusion.png", "selected_features.png", "events.png"),
+        *("answers.png", "validation.png"),
+    }
+    kept = json.loads((tmp_path / "all" / "metrics.json").read_text())
+    assert kept["splits"] == everything["splits"]
+    few = metrics_of(events={"test": {"two_of_three": no_events()}})
+    write_results(tmp_path / "few", few, [])
+    print_results(few, [])
+    assert REASON in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "few").iterdir()} == {"metrics.json", "confusion.png"}

@@ -27,13 +27,13 @@ from tactslip_torch.report.importance import (
 )
 from tactslip_torch.report.style import kind_colours
 
-SMALL = ("bins=20", "judged_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
+SMALL = ("bins=20", "scored_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
 CHANNELS = ["SG1", "SG2", "PVDF1", "PVDF2"]
 
 
 def composed(*overrides):
     with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        return compose("sensors", [*SMALL, *overrides])
+        return compose("importance", [*SMALL, *overrides])
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_every_channel_finger_and_kind_has_its_row(found):
     in_use = {row["name"]: row["features_in_use"] for row in content["units"]}
     assert sum(in_use[name] for name in CHANNELS) == content["detector"]["features"] == 10
     for row in content["units"]:
-        assert list(row["lost"]) == list(row["lost_anew"]) == list(row["alone"]) == roles
+        assert list(row["lost"]) == list(row["lost_reselected"]) == list(row["alone"]) == roles
         if row["unit"] == "channel":
             assert (row["gradient"]["slip"] > 0) is (row["features_in_use"] > 0)
         if not row["features_in_use"]:
@@ -86,7 +86,7 @@ def test_every_channel_finger_and_kind_has_its_row(found):
 
 def test_what_is_lost_is_the_difference_of_accuracies(found):
     _, content = found
-    whole = content["with_all"]["selected_anew"]["balanced_accuracy"]
+    whole = content["with_all"]["reselected"]["balanced_accuracy"]
     for steps in content["best"].values():
         for step in steps:
             for role, accuracy in step["balanced_accuracy"].items():
@@ -99,7 +99,7 @@ def test_what_is_lost_is_the_difference_of_accuracies(found):
     # two fingers: what is left without one is the other
     other = next(name for name in fingers if name != first["joins"])
     row = next(row for row in content["units"] if row["name"] == other)
-    assert row["lost_anew"]["test"]["lost"] == pytest.approx(
+    assert row["lost_reselected"]["test"]["lost"] == pytest.approx(
         whole["test"] - first["balanced_accuracy"]["test"]
     )
 
@@ -110,18 +110,22 @@ def test_csv_has_the_numbers_of_json(found):
         rows = list(csv.DictReader(file))
     for row, of_json in zip(rows, content["units"], strict=True):
         assert row["name"] == of_json["name"]
-        assert float(row["lost_anew_unseen_high"]) == of_json["lost_anew"]["unseen"]["high"]
+        assert (
+            float(row["lost_reselected_unseen_high"])
+            == of_json["lost_reselected"]["unseen"]["high"]
+        )
         assert float(row["alone_test"]) == of_json["alone"]["test"]
     joins = {row["name"]: row["joins_as"] for row in rows if row["unit"] == "channel"}
     assert joins[content["best"]["channel"][0]["joins"]] == "1"
 
 
-def test_simulated_numbers_say_so(found):
+def test_simulated_numbers_say_so(found, tmp_path):
     _, content = found
     for simulated in (True, False):
         content = content | {"simulated": simulated}
         assert ("SIMULATED" in sensors_table(content)) is simulated
-        assert (sensors_csv(content).splitlines()[1].endswith("True")) is simulated
+        sensors_csv(content, tmp_path / "sensors.csv")
+        assert (tmp_path / "sensors.csv").read_text().endswith(f"{simulated}\n")
 
 
 def test_tables_name_every_unit_and_number_of_sensors(found):
@@ -189,11 +193,11 @@ def content_of(hand):
     ]
     return {
         "simulated": True,
-        "settings": {"anew": "ranked"},
+        "settings": {"reselect": "ranked"},
         "num_bins": dict.fromkeys(roles, 10),
         "channels": hand.to_rows(),
         "units": units,
-        "with_all": {"selected_anew": {"balanced_accuracy": dict.fromkeys(roles, 0.9)}},
+        "with_all": {"reselected": {"balanced_accuracy": dict.fromkeys(roles, 0.9)}},
         "best": {"channel": steps},
     }
 
@@ -232,7 +236,7 @@ def test_fingers_stand_in_order_with_tips_up_and_the_thumb_leaning_out():
 
 
 def refused(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["sensors", *SMALL, "cache=off", *arguments])
+    monkeypatch.setattr(sys, "argv", ["importance", *SMALL, "cache=off", *arguments])
     with pytest.raises(SystemExit) as stop:
         main()
     assert stop.value.code == 2
@@ -247,11 +251,11 @@ def test_bad_input_is_one_line(monkeypatch, capsys, run, tmp_path):
     assert "no value for model" in refused(monkeypatch, capsys, here)
     assert "nothing.pt" in refused(monkeypatch, capsys, here, "model=nothing.pt")
     wrong = refused(monkeypatch, capsys, here, model, "bins=1")
-    assert "bins must be a whole number from 2 on, got 1" in wrong
+    assert "bins must be a whole number of at least 2, got 1" in wrong
     wrong = refused(monkeypatch, capsys, here, model, "num_features=0")
-    assert "num_features must be null or a whole number from 1 on, got 0" in wrong
-    wrong = refused(monkeypatch, capsys, here, model, "anew=equal")
-    assert "anew must be ranked or shared, got 'equal'" in wrong
+    assert "num_features must be a positive whole number, got 0" in wrong
+    wrong = refused(monkeypatch, capsys, here, model, "reselect=equal")
+    assert "reselect must be ranked or shared, got 'equal'" in wrong
 
 
 def moved(run, folder, *, change=None):

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from matplotlib.colors import to_rgba
 from PIL import Image
 
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.report.onset import envelope, lane_height
+from tactslip_torch.report.onset import lane_height
 from tactslip_torch.report.recordings import (
     DrawnRecording,
     channel_colours,
@@ -44,41 +42,6 @@ def spans_of(axes):
 def lasting(axes):
     """Times of the onset lines."""
     return [line.get_xdata()[0] for line in axes.lines if line.get_linestyle() == "-."]
-
-
-# The envelope --------------------------------------------------------------------------------
-
-
-@given(
-    num_samples=st.integers(1, 400),
-    num_stretches=st.integers(1, 60),
-    seed=st.integers(0, 2**32 - 1),
-    share_lost=st.sampled_from([0.0, 0.3, 1.0]),
-)
-def test_an_envelope_is_samples_in_order_with_every_extreme(
-    num_samples, num_stretches, seed, share_lost
-):
-    rng = np.random.default_rng(seed)
-    values = rng.standard_normal((3, num_samples))
-    values[rng.random(values.shape) < share_lost] = rng.choice([np.nan, np.inf, -np.inf])
-    before = values.copy()
-    places, seen = envelope(values, num_stretches)
-    np.testing.assert_array_equal(values, before)
-    assert places.shape == seen.shape
-    assert places.shape[1] <= 2 * num_stretches
-    assert (np.diff(places, axis=1) >= 0).all()
-    assert ((places >= 0) & (places < num_samples)).all()
-    finite = np.where(np.isfinite(values), values, np.nan)
-    size = 1 if num_samples <= 2 * num_stretches else -(-num_samples // num_stretches)
-    for channel in range(3):
-        np.testing.assert_array_equal(seen[channel], finite[channel, places[channel]])
-        for start in range(0, num_samples, size):
-            part = finite[channel, start : start + size]
-            drawn = seen[channel][(places[channel] >= start) & (places[channel] < start + size)]
-            if np.isnan(part).all():
-                assert np.isnan(drawn).all()
-            else:
-                assert (np.nanmin(drawn), np.nanmax(drawn)) == (np.nanmin(part), np.nanmax(part))
 
 
 # What is drawn -------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scene_files import CONTACTS, RATE_HZ, contacts, scene_on, volts
-from test_facts import BY_NAME, HAND, changed, shuffled
+from test_signal_checks import BY_NAME, HAND, changed, shuffled
 
 from tactslip_torch import runtime
 from tactslip_torch.analysis.signal_checks import filtered

@@ -98,7 +98,7 @@ class KnownInputs:
             inside &= (own.relative_span >= known.relative_span).all(-1)
         return inside
 
-    def facts(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Least and greatest samples and least spans, by kind and by channel."""
 
         def of(places: list[int]) -> dict[str, float]:
@@ -224,7 +224,7 @@ class Certificate:
     """What ``certify`` found.
 
     Args:
-        content: as ``facts()`` hands out.
+        content: everything that was found, as plain values; infinite where the head overflows.
         sets: ``calibration``, the held-out ones and the kinds of extremes, bin by bin.
     """
 
@@ -236,9 +236,16 @@ class Certificate:
         """Whether no condition failed."""
         return bool(self.content["holds"])
 
-    def facts(self) -> dict[str, Any]:
-        """Everything that was found, as plain values; infinite where the head overflows."""
-        return dict(self.content)
+    def points(self) -> dict[str, dict[str, list[Any]]]:
+        """By set and kind, of each bin ``score`` (its size), ``error`` and whether it ``flips``."""
+        return {
+            name: {
+                "score": compared.exact.abs().tolist(),
+                "error": compared.error.tolist(),
+                "flips": compared.flips.tolist(),
+            }
+            for name, compared in self.sets.items()
+        }
 
 
 def certify(
@@ -292,7 +299,7 @@ def certify(
         "simulated": simulated,
         "seed": seed,
         "threads": torch.get_num_threads(),
-        "dtype": {"judged": "float32", "reference": "float64", "inside": detector.pool.arithmetic},
+        "dtype": {"tested": "float32", "reference": "float64", "inside": detector.pool.arithmetic},
         "score_sd": sd,
         "margin": {
             "score": margin,
@@ -310,7 +317,7 @@ def certify(
                 "per_volt": gradient_facts(double.score_raw, thinned),
             },
         },
-        "range": known.facts() | {"validity": VALIDITY},
+        "range": known.to_dict() | {"validity": VALIDITY},
     }
     content["conditions"] = _conditions(content)
     content["holds"] = all(row["holds"] is not False for row in content["conditions"])

@@ -1,9 +1,9 @@
-"""Which sensors matter: by gradient, by leaving them out, and by making do with the best few.
+"""Which sensors matter: by gradient, by leaving them out, and by using only the best few.
 
 Accuracies are balanced: of each group, a material as a rule, the mean of its two recalls; then the
 mean over groups. So a material with many bins does not drown the others, and a sample of as many
 bins of every group and class needs no weights. Machines are refitted in closed form on a sample of
-training bins; held-out groups choose, judged roles choose nothing.
+training bins; held-out groups of these make every choice, bins of other roles none.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.analysis.raw_bins import bins_inside, in_turn
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
 from tactslip_torch.features.pooling import ChannelPooling
@@ -29,14 +29,14 @@ from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.kernels import Kernel
 from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.runtime import bar, for_each
+from tactslip_torch.runtime import bar, in_parts
 from tactslip_torch.signals.binning import refuse_nonfinite
 from tactslip_torch.training.datamodule import FeatureMaker
 
 _COVERAGE = 0.95
 
 
-class Tally(NamedTuple):
+class RecordingCounts(NamedTuple):
     """Right decisions by recording: all that accuracy and its draws need to know.
 
     Shape:
@@ -50,15 +50,7 @@ class Tally(NamedTuple):
     group: Tensor
 
 
-class Difference(NamedTuple):
-    """Balanced accuracy lost, and the ends of its interval; shares, not percent."""
-
-    lost: float
-    low: float
-    high: float
-
-
-def tally(is_right: Tensor, bins: SampledBins) -> Tally:
+def count_right(is_right: Tensor, bins: SampledBins) -> RecordingCounts:
     """Count right decisions by recording and class.
 
     Shape:
@@ -70,27 +62,27 @@ def tally(is_right: Tensor, bins: SampledBins) -> Tally:
     right = torch.bincount(cell[is_right], minlength=2 * num).double().view(num, 2)
     group = torch.zeros(num, dtype=torch.int64)
     group[bins.recording] = bins.group  # a recording is of one group
-    return Tally(right, whole, group)
+    return RecordingCounts(right, whole, group)
 
 
-def balanced_accuracy(found: Tally, times: Tensor | None = None) -> Tensor:
+def balanced_accuracy(counts: RecordingCounts, times: Tensor | None = None) -> Tensor:
     """The mean over groups of their balanced accuracy, in draws of recordings or in all of them.
 
     Groups without bins of both classes are passed over; NaN where none is left.
 
     Args:
-        found: of a machine.
+        counts: of a machine.
         times: how often each recording is in each draw; default once each in one draw.
 
     Shape:
         - times: ``[D, R]``, float64
         - output: ``[D]``, float64
     """
-    times = torch.ones_like(found.whole[:, 0])[None] if times is None else times
+    times = torch.ones_like(counts.whole[:, 0])[None] if times is None else times
     by_group = []
-    for name in found.group.unique():
-        mine = found.group == name
-        recalls = (times[:, mine] @ found.right[mine]) / (times[:, mine] @ found.whole[mine])
+    for name in counts.group.unique():
+        mine = counts.group == name
+        recalls = (times[:, mine] @ counts.right[mine]) / (times[:, mine] @ counts.whole[mine])
         by_group.append(recalls.mean(-1))
     return torch.stack(by_group).nanmean(0)
 
@@ -111,10 +103,12 @@ def _draw_recordings(group: Tensor, num_draws: int, seed: int) -> Tensor:
     return times
 
 
-def difference(before: Tally, after: Tally, num_draws: int, seed: int) -> Difference:
+def difference(
+    before: RecordingCounts, after: RecordingCounts, num_draws: int, seed: int
+) -> dict[str, float]:
     """Balanced accuracy that ``after`` lacks, with a bootstrap interval over recordings.
 
-    Paired: both machines are judged on the same draws, so what makes a recording hard for both
+    Paired: both machines are evaluated on the same draws, so what makes a recording hard for both
     cancels. The machines are held: another draw of training recordings would change more.
 
     Args:
@@ -122,6 +116,9 @@ def difference(before: Tally, after: Tally, num_draws: int, seed: int) -> Differ
         after: of the other, on the same bins.
         num_draws: how many.
         seed: of the draws.
+
+    Returns:
+        ``lost`` and the ends of its interval, ``low`` and ``high``: fractions, not percent.
 
     Raises:
         ValueError: if nothing is to be drawn.
@@ -134,48 +131,57 @@ def difference(before: Tally, after: Tally, num_draws: int, seed: int) -> Differ
     times = _draw_recordings(before.group, num_draws, seed)
     gaps = balanced_accuracy(before, times) - balanced_accuracy(after, times)
     tail = (1 - _COVERAGE) / 2
-    ends = torch.tensor([tail, 1 - tail], dtype=torch.float64)
-    low, high = gaps.nanquantile(ends).tolist()
-    return Difference(float(balanced_accuracy(before) - balanced_accuracy(after)), low, high)
+    low, high = gaps.nanquantile(torch.tensor([tail, 1 - tail], dtype=torch.float64)).tolist()
+    lost = float(balanced_accuracy(before) - balanced_accuracy(after))
+    return {"lost": lost, "low": low, "high": high}
 
 
 HELD_OUT = "held_out"
-"""Training bins, each judged by the machine that never met its group."""
+"""Training bins, each scored by the machine that was fitted without its group."""
 
 
-class Verdict(NamedTuple):
+class Result(NamedTuple):
     """How well a machine does.
 
     Attributes:
         num_features: that it has.
         penalty: its C.
-        tallies: of ``HELD_OUT`` and of every judged role.
+        counts: of ``HELD_OUT`` and of every other role.
         error: weighted mean square of held-out residuals; breaks ties of accuracy.
     """
 
     num_features: int
     penalty: float
-    tallies: dict[str, Tally]
+    counts: dict[str, RecordingCounts]
     error: float
 
-    def accuracy(self, role: str = HELD_OUT) -> float:
-        """Balanced accuracy, the mean over groups."""
-        return float(balanced_accuracy(self.tallies[role]))
+    @property
+    def accuracies(self) -> dict[str, float]:
+        """Balanced accuracy by role, the mean over groups."""
+        return {role: float(balanced_accuracy(counts)) for role, counts in self.counts.items()}
 
     @property
     def merit(self) -> tuple[float, float]:
         """What machines are chosen by, larger is better: held-out bins of training alone."""
-        return self.accuracy(), -self.error
+        return float(balanced_accuracy(self.counts[HELD_OUT])), -self.error
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        return {
+            "num_features": self.num_features,
+            "penalty": self.penalty,
+            "balanced_accuracy": self.accuracies,
+        }
 
 
 @dataclass(frozen=True)
 class Refit:
-    """Fits and judges a machine of some features of the pool.
+    """Fits and evaluates a machine of some features of the pool.
 
     Args:
         train: sampled training bins with the whole pool.
         weights: ``[n]`` of those, positive.
-        judged: bins of other roles; they choose nothing.
+        scored: bins of other roles; they choose nothing.
         scaler: of the whole pool or, with ``pooling``, of its columns.
         kernel: of the machines.
         penalties: values of C to choose from.
@@ -186,16 +192,16 @@ class Refit:
 
     train: SampledBins
     weights: Tensor
-    judged: Mapping[str, SampledBins]
+    scored: Mapping[str, SampledBins]
     scaler: FeatureScaler
     kernel: Kernel
     penalties: Sequence[float]
     pooling: ChannelPooling | None = None
     inputs: Sequence[int] = ()
-    _known: dict[Any, tuple[Verdict, Any]] = field(default_factory=dict, repr=False, compare=False)
+    _known: dict[Any, tuple[Result, Any]] = field(default_factory=dict, repr=False, compare=False)
 
-    def __call__(self, features: Sequence[int]) -> Verdict:
-        """The machine of these features, judged on every role.
+    def __call__(self, features: Sequence[int]) -> Result:
+        """The machine of these features, evaluated on every role.
 
         C is the one of largest merit. Without a feature it always says slip: balanced accuracy
         one half.
@@ -204,41 +210,45 @@ class Refit:
             features: pool indices.
 
         Raises:
-            ValueError: if held-out scores cannot be told (``HeldOut``).
+            ValueError: if held-out scores cannot be computed (``HeldOut``).
         """
-        verdict, head = self._best(features, self.penalties)
-        tallies = dict(verdict.tallies)
-        for role, bins in self.judged.items():
+        result, head = self._best(features, self.penalties)
+        counts = dict(result.counts)
+        for role, bins in self.scored.items():
             if head is None:
                 is_right = bins.is_slip
             else:
                 is_right = (head(self._scaled(bins, features)) >= 0) == bins.is_slip
-            tallies[role] = tally(is_right, bins)
-        return verdict._replace(tallies=tallies)
+            counts[role] = count_right(is_right, bins)
+        return result._replace(counts=counts)
 
-    def held_out(self, features: Sequence[int], penalties: Sequence[float]) -> Verdict:
+    def held_out(self, features: Sequence[int], penalties: Sequence[float]) -> Result:
         """The same on held-out groups alone, with C from other choices: what sets compete by."""
         return self._best(features, penalties)[0]
 
-    def _best(self, features: Sequence[int], penalties: Sequence[float]) -> tuple[Verdict, Any]:
+    def _best(self, features: Sequence[int], penalties: Sequence[float]) -> tuple[Result, Any]:
+        """The best result over C with its head; a set that comes again is not fitted again."""
         choice = tuple(features), tuple(penalties)
-        if choice not in self._known:  # many a sensor has no feature in use: the same set again
-            self._known[choice] = self._chosen(*choice)
+        if choice not in self._known:
+            self._known[choice] = self._fitted(*choice)
         return self._known[choice]
 
-    def _chosen(self, features: Sequence[int], penalties: Sequence[float]) -> tuple[Verdict, Any]:
-        if not len(features):
-            always = tally(self.train.is_slip, self.train)
-            return Verdict(0, penalties[len(penalties) // 2], {HELD_OUT: always}, 1.0), None
-        scaled = self._scaled(self.train, features)
-        bins = TrainingBins(scaled, self.train.is_slip, self.weights)
+    def _fitted(self, features: Sequence[int], penalties: Sequence[float]) -> tuple[Result, Any]:
+        is_slip = self.train.is_slip
+        if not features:
+            always = count_right(is_slip, self.train)
+            return Result(0, penalties[len(penalties) // 2], {HELD_OUT: always}, 1.0), None
+        bins = TrainingBins(self._scaled(self.train, features), is_slip, self.weights)
         machine = HeldOut(bins, self.train.group, self.kernel)
-        found = []
+        results = []
         for penalty in penalties:
             fitted = machine.at(penalty)
-            verdict = self._held_out(fitted.scores, len(features), penalty)
-            found.append((verdict, fitted.head))
-        return max(found, key=lambda pair: pair[0].merit)  # of equal ones the smallest C
+            residuals = torch.where(is_slip, 1.0, -1.0) - fitted.scores
+            error = float(self.weights @ residuals.square() / self.weights.sum())
+            counts = count_right((fitted.scores >= 0) == is_slip, self.train)
+            result = Result(len(features), penalty, {HELD_OUT: counts}, error)
+            results.append((result, fitted.head))
+        return max(results, key=lambda pair: pair[0].merit)  # of equal ones the smallest C
 
     def _scaled(self, bins: SampledBins, features: Sequence[int]) -> Tensor:
         if self.pooling is not None:
@@ -251,47 +261,33 @@ class Refit:
 
     def _pooled(self, layer: ChannelPooling, bins: SampledBins, features: set[int]) -> Tensor:
         """Columns of the channels of these features; of other channels, the middle of the range."""
-        pairs = list(zip(layer.inputs, self.inputs, strict=True))
-        heard = {name.channel for name, index in pairs if index in features}
-        is_missing = torch.tensor([name not in heard for name in layer.hand.names])
+        inputs = zip(layer.inputs, self.inputs, strict=True)
+        used = {name.channel for name, index in inputs if index in features}
+        is_missing = torch.tensor([name not in used for name in layer.hand.names])
         values = bins.features[:, list(self.inputs)].double()
         scaled: Tensor = self.scaler(layer(values, is_missing.expand(len(values), -1)))
-        single = [not name.is_pooled and name.channel not in heard for name in layer.names]
+        single = [not name.is_pooled and name.channel not in used for name in layer.names]
         return scaled.masked_fill(torch.tensor(single), 0.0)
-
-    def _held_out(self, scores: Tensor, num_features: int, penalty: float) -> Verdict:
-        residuals = torch.where(self.train.is_slip, 1.0, -1.0) - scores
-        error = float(self.weights @ residuals.square() / self.weights.sum())
-        is_right = (scores >= 0) == self.train.is_slip
-        return Verdict(num_features, penalty, {HELD_OUT: tally(is_right, self.train)}, error)
-
-
-_Item = TypeVar("_Item")
-_Units = Mapping[str, frozenset[str]]
-"""What is taken or left out together, by name: the channels of each."""
 
 
 def units_of(hand: HandLayout) -> dict[str, dict[str, frozenset[str]]]:
-    """The channels of a hand one by one, by finger and by kind.
+    """What is taken or left out together: the channels of a hand one by one, by finger, by kind.
 
     Example:
         >>> units = units_of(HandLayout.paper24())
         >>> sorted(units["finger"]["thumb"]), len(units["kind"]["SG"])
         (['PVDF10', 'PVDF9', 'SG13', 'SG14'], 14)
     """
-    found: dict[str, dict[str, set[str]]] = {"channel": {}, "finger": {}, "kind": {}}
+    units: dict[str, dict[str, frozenset[str]]] = {"channel": {}, "finger": {}, "kind": {}}
     for channel in hand.channels:
-        for what, name in zip(found, (channel.name, channel.finger, channel.kind), strict=True):
-            found[what].setdefault(name, set()).add(channel.name)
-    return {
-        what: {name: frozenset(channels) for name, channels in units.items()}
-        for what, units in found.items()
-    }
+        for unit, name in zip(units, (channel.name, channel.finger, channel.kind), strict=True):
+            units[unit][name] = units[unit].get(name, frozenset()) | {channel.name}
+    return units
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """Selects features anew among some channels.
+    """Selects features again among some channels.
 
     Args:
         scores: ``[F]``, of the t-test on all training bins, made once.
@@ -300,8 +296,8 @@ class Ranking:
         sample: of training bins, for correlations.
         num_features: how many are selected, where there are so many.
         most_correlation: as in ``Recipe``.
-        is_shared: every channel gives as many features (one at least), so that none of them is
-            crowded out by others with larger scores; else the recipe's way, the best of all.
+        is_shared: every channel gives as many features (one at least), however large the
+            scores of others are; else the recipe's way, the best of all.
     """
 
     scores: Tensor
@@ -317,8 +313,8 @@ class Ranking:
         if not self.is_shared:
             return self._best(channels, self.num_features)
         each = max(1, self.num_features // max(1, len(channels)))
-        found = [index for name in sorted(channels) for index in self._best({name}, each)]
-        return sorted(found, key=lambda index: (-float(self.scores[index]), index))
+        best = [index for name in sorted(channels) for index in self._best({name}, each)]
+        return sorted(best, key=lambda index: (-float(self.scores[index]), index))
 
     def _best(self, channels: Collection[str], most: int) -> list[int]:
         wanted = torch.tensor([name in channels for name in self.channels])
@@ -346,69 +342,47 @@ def without(features: Iterable[int], channels: Collection[str], names: Sequence[
     return [index for index in features if names[index] not in channels]
 
 
-def _side_by_side(function: Callable[[_Item], Verdict], items: Sequence[_Item]) -> list[Verdict]:
-    """``function`` of every item, on as many threads as torch has; the same bits on any number."""
-    found: dict[int, Verdict] = {}
-
-    def judge(place: int) -> None:
-        found[place] = function(items[place])
-
-    for_each(judge, range(len(items)))
-    return [found[place] for place in range(len(items))]
-
-
 def best_first(
     refit: Refit,
     select: Callable[[Collection[str]], Sequence[int]],
-    units: _Units,
+    units: Mapping[str, frozenset[str]],
     most: int,
     what: str,
-) -> list[tuple[str, Verdict]]:
-    """Greedy forward selection: at each step the unit that serves held-out groups best joins.
+) -> list[tuple[str, Result]]:
+    """Greedy forward selection: at each step the unit joins that serves held-out groups best.
 
-    Features are selected anew among the channels taken. Candidates are compared at the C of the
-    step before (the first at every C), and C is chosen anew for the one that joins. _Units that
+    Features are selected again among the channels taken. Candidates are compared at the C of the
+    step before (the first at every C), and C is chosen again for the one that joins. Units that
     tie go by the smaller held-out error, then in order. That a set was chosen by its held-out
-    accuracy makes this one optimistic; judged roles choose nothing.
+    accuracy makes this one optimistic; other roles choose nothing.
 
     Args:
-        refit: fits and judges.
+        refit: fits and evaluates.
         select: features of channels, such as a ``Ranking``.
         units: to choose from; those none of whose features may be selected never join.
         most: steps at most.
         what: is done, for the progress bar.
 
     Returns:
-        For each step the name of the unit that joined, and the verdict with it.
+        For each step the name of the unit that joined, and the result with it.
     """
     left = [name for name, channels in units.items() if len(select(channels))]
     taken: frozenset[str] = frozenset()
-    steps: list[tuple[str, Verdict]] = []
+    steps: list[tuple[str, Result]] = []
     for number in bar(range(min(most, len(left))), what):
-        sets = [taken | units[name] for name in left]
         near = [steps[-1][1].penalty] if number else refit.penalties
-        selections = [select(channels) for channels in sets]
-        verdicts = _side_by_side(partial(refit.held_out, penalties=near), selections)
-        best = max(range(len(left)), key=lambda i: (*verdicts[i].merit, -i))
+        selections = [select(taken | units[name]) for name in left]
+        results = in_parts(partial(refit.held_out, penalties=near), selections)
+        best = max(range(len(left)), key=lambda place: (*results[place].merit, -place))
+        taken |= units[left[best]]
         steps.append((left.pop(best), refit(selections[best])))
-        taken = sets[best]
     return steps
 
 
 _CHUNK = 32  # bins whose graphs are held at once
 
 
-class FirstOrder(NamedTuple):
-    """In standard deviations of the score, ``[C]`` each: at non-slip bins and at slip bins."""
-
-    non_slip: Tensor
-    slip: Tensor
-
-
-def score_gradients(
-    detector: SlipDetector,
-    samples: Tensor,
-) -> tuple[Tensor, Tensor]:
+def score_gradients(detector: SlipDetector, samples: Tensor) -> tuple[Tensor, Tensor]:
     """Scores of raw bins and their derivatives with respect to every volt, in float64.
 
     Through filter, branches, spectra, descriptors, scaling and the quadratic form. What is clipped
@@ -432,7 +406,7 @@ def score_gradients(
     return torch.cat(scores), torch.cat(gradients)
 
 
-def first_order(scores: Tensor, gradients: Tensor, samples: Tensor, is_slip: Tensor) -> FirstOrder:
+def first_order(scores: Tensor, gradients: Tensor, samples: Tensor, is_slip: Tensor) -> Tensor:
     """Root mean square over bins of the gradient times the channel's own spread.
 
     The spread is the covariance ``S_c`` of the channel's samples over all bins given, so level and
@@ -449,6 +423,7 @@ def first_order(scores: Tensor, gradients: Tensor, samples: Tensor, is_slip: Ten
     Shape:
         - scores, is_slip: ``[N]``
         - gradients, samples: ``[N, C, T]``
+        - output: ``[2, C]``, at non-slip bins and at slip bins
 
     Raises:
         ValueError: if shapes disagree, a class is absent, or the scores are all the same.
@@ -460,27 +435,21 @@ def first_order(scores: Tensor, gradients: Tensor, samples: Tensor, is_slip: Ten
             f"{tuple(samples.shape)}"
         )
     if not bool(is_slip.any()) or bool(is_slip.all()):
-        raise ValueError("gradients are told by class: give bins of slip and of non-slip")
+        raise ValueError("gradients are reported by class: give bins of slip and of non-slip")
     spread = scores.std()
     if not bool(spread > 0):
         raise ValueError(f"all {len(scores)} scores are {float(scores[0]):g}; nothing moves them")
     deviations = (samples.double() - samples.double().mean(0)) / (len(samples) - 1) ** 0.5
     moved = torch.einsum("nct,mct->cnm", gradients, deviations).square().sum(-1)  # [C, N]
-    non_slip, slip = (
-        moved[:, is_slip == value].mean(-1).sqrt() / spread for value in (False, True)
-    )
-    return FirstOrder(non_slip, slip)
+    by_class = [moved[:, is_slip == value].mean(-1).sqrt() / spread for value in (False, True)]
+    return torch.stack(by_class)
 
 
 _MOST_RECORDINGS = 60
 """So many at most are read or simulated; of more, materials in turn."""
 
 
-def draw_raw_bins(
-    maker: FeatureMaker,
-    fold: Split,
-    number: int,
-) -> tuple[Tensor, Tensor]:
+def draw_raw_bins(maker: FeatureMaker, fold: Split, number: int) -> tuple[Tensor, Tensor]:
     """Training bins in volts, half of each class, drawn by ``bin_keys``: the same every time.
 
     A bin whose context leaves its recording is passed over.
@@ -497,50 +466,25 @@ def draw_raw_bins(
     Raises:
         ValueError: if a class has no such bin, or a sample is not finite.
     """
-    recordings = _in_turn(fold.having("train"))[:_MOST_RECORDINGS]
+    by_key = sorted(fold.having("train"), key=lambda r: float(bin_keys(str(r), 1)[0]))
+    recordings = in_turn(by_key)[:_MOST_RECORDINGS]
     each = max(1, math.ceil(number / 2 / len(recordings)))
-    before, after = maker.channel_filter.context_before, maker.channel_filter.context_after
-    parts: list[Tensor] = []
+    drawn: list[Tensor] = []
     labels: list[Tensor] = []
     for recording in bar(recordings, "raw bins"):
-        times = maker.source.timeline(recording)
-        bins = maker.lay_bins(times)
-        first, last = bins.starts - before, bins.starts + bins.bin_samples + after
-        may = fold.bin_roles(recording, len(first))["train"] & (first >= 0)
-        may &= last <= round(times.duration_s * maker.source.sample_rate_hz)
-        keys = torch.where(may, bin_keys(str(recording), len(first)), torch.inf)
-        chosen = list[Tensor]()
-        for value in (False, True):
-            mine = torch.where(bins.is_slip == value, keys, torch.inf)
-            chosen.append(mine.argsort()[: min(each, int(mine.isfinite().sum()))])
-        index = torch.cat(chosen)
-        parts.append(maker.raw_bins(recording, index))
-        labels.append(bins.is_slip[index])
-        refuse_nonfinite(parts[-1], maker.source.hand.names, f"repair or leave out {recording}")
+        bins, inside = bins_inside(maker, fold, recording, "train")
+        order = inside[bin_keys(str(recording), len(bins.starts))[inside].argsort()]
+        by_class = [order[bins.is_slip[order] == value][:each] for value in (False, True)]
+        drawn.append(maker.raw_bins(recording, torch.cat(by_class)))
+        labels.append(bins.is_slip[torch.cat(by_class)])
+        refuse_nonfinite(drawn[-1], maker.source.hand.names, f"repair or leave out {recording}")
     is_slip = torch.cat(labels)
     for value, name in ((False, "non-slip"), (True, "slip")):
         if not bool((is_slip == value).any()):
             raise ValueError(
                 f"no {name} bin lies far enough inside its recording; take longer ones"
             )
-    return torch.cat(parts), is_slip
-
-
-def _in_turn(recordings: list[RecordingId]) -> list[RecordingId]:
-    """The same in an order by key, but one of each material before a second of any."""
-    met: dict[str, int] = {}
-    places = []
-    for recording in sorted(recordings, key=lambda r: float(bin_keys(str(r), 1)[0])):
-        met[recording.material] = met.get(recording.material, 0) + 1
-        places.append((met[recording.material], recording.material, recording))
-    return [recording for *_, recording in sorted(places)]
-
-
-class Draws(NamedTuple):
-    """How recordings are drawn for intervals."""
-
-    num: int
-    seed: int
+    return torch.cat(drawn), is_slip
 
 
 def measure(
@@ -551,75 +495,63 @@ def measure(
     gradient: Mapping[str, Mapping[str, float]],
     *,
     most: int,
-    draws: Draws,
+    draws: int,
+    seed: int,
 ) -> dict[str, Any]:
-    """What absence costs, what each tells alone, and the best few.
+    """What absence costs, how well each unit does alone, and the best few.
 
     Args:
-        refit: fits and judges.
-        ranking: selects features anew.
+        refit: fits and evaluates.
+        ranking: selects features again.
         selected: pool indices of the features that the detector has.
         hand: whose channels, fingers and kinds are gone through.
         gradient: by channel, to be put into its row.
         most: of the best few, at most.
-        draws: for intervals.
+        draws: of recordings, for intervals.
+        seed: of the draws.
 
     Returns:
         ``with_all``: machines with every sensor. ``units``: a row for every channel, finger and
-        kind. ``best``: by these, the steps in which they join. Accuracies are shares.
+        kind. ``best``: by these, the steps in which they join. Accuracies are fractions.
     """
     everything = frozenset(hand.names)
-    whole = {"as_selected": refit(selected), "selected_anew": refit(ranking(everything))}
+    as_selected, reselected = refit(selected), refit(ranking(everything))
     in_use = Counter(ranking.channels[index] for index in selected)
+
+    def lost(whole: Result, part: Result) -> dict[str, dict[str, float]]:
+        return {
+            role: difference(counts, part.counts[role], draws, seed)
+            for role, counts in whole.counts.items()
+        }
+
     rows: list[dict[str, Any]] = []
     best: dict[str, list[dict[str, Any]]] = {}
-    for what, units in units_of(hand).items():
-        for name in bar(list(units), f"without each {what}"):
-            channels = units[name]
+    for unit, members in units_of(hand).items():
+        for name, channels in bar(list(members.items()), f"without each {unit}"):
             choices = [
                 without(selected, channels, ranking.channels),
                 ranking(everything - channels),
                 ranking(channels),
             ]
-            fewer, anew, alone = _side_by_side(refit, choices)
+            fewer, again, alone = in_parts(refit, choices)
             rows.append(
                 {
-                    "unit": what,
+                    "unit": unit,
                     "name": name,
                     "num_channels": len(channels),
                     "features_in_use": sum(in_use[channel] for channel in channels),
-                    "gradient": dict(gradient[name]) if what == "channel" else None,
-                    "lost": _lost(whole["as_selected"], fewer, draws),
-                    "lost_anew": _lost(whole["selected_anew"], anew, draws),
-                    "alone": _accuracies(alone),
+                    "gradient": dict(gradient[name]) if unit == "channel" else None,
+                    "lost": lost(as_selected, fewer),
+                    "lost_reselected": lost(reselected, again),
+                    "alone": alone.accuracies,
                 }
             )
-        steps = best_first(refit, ranking, units, most, f"best {what}s")
-        best[what] = [
-            {"joins": name, "lost": _lost(whole["selected_anew"], verdict, draws)} | _facts(verdict)
-            for name, verdict in steps
+        best[unit] = [
+            {"joins": name, "lost": lost(reselected, result)} | result.to_dict()
+            for name, result in best_first(refit, ranking, members, most, f"best {unit}s")
         ]
     return {
-        "with_all": {name: _facts(verdict) for name, verdict in whole.items()},
+        "with_all": {"as_selected": as_selected.to_dict(), "reselected": reselected.to_dict()},
         "units": rows,
         "best": best,
-    }
-
-
-def _lost(whole: Verdict, part: Verdict, draws: Draws) -> dict[str, dict[str, float]]:
-    return {
-        role: difference(tallies, part.tallies[role], draws.num, draws.seed)._asdict()
-        for role, tallies in whole.tallies.items()
-    }
-
-
-def _accuracies(verdict: Verdict) -> dict[str, float]:
-    return {role: verdict.accuracy(role) for role in verdict.tallies}
-
-
-def _facts(verdict: Verdict) -> dict[str, Any]:
-    return {
-        "num_features": verdict.num_features,
-        "penalty": verdict.penalty,
-        "balanced_accuracy": _accuracies(verdict),
     }

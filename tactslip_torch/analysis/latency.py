@@ -32,8 +32,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple, cast
@@ -50,7 +49,7 @@ from tactslip_torch.features.pooling import ChannelPooling, pooled_names
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.runtime import bar
+from tactslip_torch.runtime import bar, check_number, one_thread
 from tactslip_torch.signals.filtering import ChannelFilter
 
 DEFINITION = (
@@ -84,12 +83,10 @@ class Latency:
     compute_us: float
 
     def __post_init__(self) -> None:
-        for name in ("look_ahead_ms", "bin_ms", "hop_ms", "compute_us"):
-            value = getattr(self, name)
-            may_be_nothing = name in ("look_ahead_ms", "compute_us")
-            if not (value > 0 or (value == 0 and may_be_nothing)):
-                wanted = "not be negative" if may_be_nothing else "be positive"
-                raise ValueError(f"{name} must {wanted}, got {value}")
+        for name in ("bin_ms", "hop_ms"):
+            check_number(name, getattr(self, name))
+        for name in ("look_ahead_ms", "compute_us"):
+            check_number(name, getattr(self, name), least=0)
 
     @property
     def samples_ms(self) -> float:
@@ -103,40 +100,23 @@ class Latency:
 
     @property
     def load(self) -> float:
-        """Share of one processor that computing takes."""
+        """Fraction of one processor that computing takes."""
         return self.compute_us / 1000 / self.hop_ms
 
-    def misses(self, deadline_ms: float, compute_us: float) -> list[str]:
-        """Which of the limits are not met, in words; none if all are.
-
-        Args:
-            deadline_ms: for ``worst_ms``.
-            compute_us: for compute.
-        """
-        found = []
-        if self.worst_ms > deadline_ms:
-            found.append(f"latency {self.worst_ms:.2f} ms above deadline_ms={deadline_ms:g}")
-        if self.compute_us > compute_us:
-            found.append(f"compute {self.compute_us:.0f} us above compute_us={compute_us:g}")
-        if self.load >= 1:
-            found.append(f"compute {self.compute_us:.0f} us not below the hop {self.hop_ms:g} ms")
-        return found
-
-    def facts(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, float]:
         """All parts and what they come to, JSON-able."""
-        return {
-            "worst_ms": self.worst_ms,
-            "look_ahead_ms": self.look_ahead_ms,
-            "bin_ms": self.bin_ms,
-            "hop_ms": self.hop_ms,
-            "compute_us": self.compute_us,
-            "load": self.load,
-        }
+        return {"worst_ms": self.worst_ms, **asdict(self), "load": self.load}
+
+    def with_shortest_hop(self, hops_ms: Sequence[float]) -> Latency:
+        """The same with the shortest hop that compute fits into; the longest of all if none."""
+        hops = sorted(hops_ms)
+        hop = next((each for each in hops if self.compute_us / 1000 < each), hops[-1])
+        return replace(self, hop_ms=hop)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a detector has to keep.
+    """The limits that a detector has to keep.
 
     Args:
         deadline_ms: from the onset of slip to the decision, at worst.
@@ -158,46 +138,39 @@ class Limits:
     def latency(self, parts: Latency, compute_us: float, headroom: float = 1.0) -> Latency:
         """The same parts with another compute, and the longest hop that keeps the limits.
 
-        Where a hop keeps them with ``headroom`` times the compute as well, the longest of those.
+        A long hop spares the processor. Where a hop keeps the limits with ``headroom`` times the
+        compute as well, it is the longest of those; where none keeps them, the shortest that
+        compute fits into.
         """
         for factor in (headroom, 1.0):
-            given = replace(parts, compute_us=factor * compute_us)
-            found = _longest_hop(given, self.hops_ms, self.deadline_ms, self.compute_us)
-            if not self.misses(found):
-                break
-        return replace(found, compute_us=compute_us)
+            longest_first = (
+                replace(parts, hop_ms=hop, compute_us=factor * compute_us)
+                for hop in sorted(self.hops_ms, reverse=True)
+            )
+            if kept := next((each for each in longest_first if not self.misses(each)), None):
+                return replace(kept, compute_us=compute_us)
+        return replace(parts, compute_us=compute_us).with_shortest_hop(self.hops_ms)
 
     def misses(self, latency: Latency) -> list[str]:
-        """Which limits are not kept, in words."""
-        return latency.misses(self.deadline_ms, self.compute_us)
+        """Which limits are not kept, in words; none if all are."""
+        found = []
+        if latency.worst_ms > self.deadline_ms:
+            found.append(
+                f"latency {latency.worst_ms:.2f} ms above deadline_ms={self.deadline_ms:g}"
+            )
+        if latency.compute_us > self.compute_us:
+            found.append(
+                f"compute {latency.compute_us:.0f} us above compute_us={self.compute_us:g}"
+            )
+        if latency.load >= 1:
+            us, hop_ms = latency.compute_us, latency.hop_ms
+            found.append(f"compute {us:.0f} us not below the hop {hop_ms:g} ms")
+        return found
 
     def headroom(self, latency: Latency) -> float:
         """How many times its compute a detector could take; less than 1 if it misses a limit."""
         left_us = 1000 * min(self.deadline_ms - latency.samples_ms, latency.hop_ms)
         return min(self.compute_us, left_us) / latency.compute_us
-
-
-def check_number(
-    name: str, value: object, *, least: float | None = None, whole: bool = False
-) -> None:
-    """Refuse what is no finite number, positive or of at least so much, and whole if it has to be.
-
-    Raises:
-        ValueError: that names it.
-
-    Example:
-        >>> check_number("tries", 0, whole=True)
-        Traceback (most recent call last):
-        ValueError: tries must be a positive whole number, got 0
-    """
-    kinds = int if whole else (int, float)
-    if isinstance(value, kinds) and not isinstance(value, bool) and math.isfinite(value):
-        is_enough = value > 0 if least is None else value >= least
-        if is_enough:
-            return
-    kind = "whole number" if whole else "finite number"
-    wanted = f"a positive {kind}" if least is None else f"a {kind} of at least {least:g}"
-    raise ValueError(f"{name} must be {wanted}, got {value!r}")
 
 
 def check_hops(hops_ms: Sequence[float], sample_rate_hz: float) -> None:
@@ -235,40 +208,6 @@ def look_ahead_samples(channel_filter: ChannelFilter, channels: Iterable[int]) -
     return max(channel_filter.reaches[channel][1] for channel in used)
 
 
-def least_latency_ms(bin_ms: float, hops_ms: Sequence[float], look_ahead_ms: float) -> float:
-    """What no computer comes below: compute of nothing, at the shortest hop."""
-    return Latency(look_ahead_ms, bin_ms, min(hops_ms), 0.0).worst_ms
-
-
-def _longest_hop(
-    parts: Latency, hops_ms: Sequence[float], deadline_ms: float, compute_us: float
-) -> Latency:
-    """The same with the longest hop that meets the limits, which spares the processor most.
-
-    The shortest hop that compute fits into where none does; the longest of all if none is longer
-    than compute.
-
-    Example:
-        >>> _longest_hop(Latency(12.5, 50.0, 5.0, 300.0), [5.0, 10.0, 25.0], 80.0, 500.0).hop_ms
-        10.0
-    """
-    all_of_them = [
-        Latency(parts.look_ahead_ms, parts.bin_ms, hop, parts.compute_us)
-        for hop in sorted(hops_ms, reverse=True)
-    ]
-    meeting = [each for each in all_of_them if not each.misses(deadline_ms, compute_us)]
-    if meeting:
-        return meeting[0]
-    return shortest_hop(parts, hops_ms)
-
-
-def shortest_hop(parts: Latency, hops_ms: Sequence[float]) -> Latency:
-    """The same with the shortest hop that compute fits into; the longest of all if into none."""
-    hops = sorted(hops_ms)
-    hop = next((each for each in hops if parts.compute_us / 1000 < each), hops[-1])
-    return Latency(parts.look_ahead_ms, parts.bin_ms, hop, parts.compute_us)
-
-
 try:
     from resource import RUSAGE_THREAD, getrusage
 except ImportError:  # only Linux counts for each thread
@@ -283,7 +222,7 @@ class Timing(NamedTuple):
         p99_us: 99 of 100 calls take no longer.
         p99_all_us: the same with the calls that were interrupted.
         calls: counted in each run.
-        interrupted: share of all calls that were interrupted, and not counted.
+        interrupted: fraction of all calls that were interrupted, and not counted.
     """
 
     p50_us: float
@@ -355,17 +294,6 @@ def _p99(taken_ns: Sequence[int]) -> float:
 def _interruptions() -> int:
     """How often this thread has lost the processor against its will; 0 where nobody counts."""
     return 0 if getrusage is None else getrusage(RUSAGE_THREAD).ru_nivcsw
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """One intra-op thread, as a live loop has."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def single_bins(pool: FeaturePool, num_samples: int) -> list[Tensor]:
@@ -446,7 +374,7 @@ class CostModel:
     def bill(self, needed: Sequence[set[_Part]]) -> tuple[Tensor, Tensor]:
         """What ``rank_per_cost`` takes: which parts each feature needs, and their prices.
 
-        A column's price holds its share of the rest, and is never nothing.
+        A column's price holds its part of the rest, and is never nothing.
 
         Shape:
             - first output: ``[F, P]``, bool
@@ -463,7 +391,7 @@ class CostModel:
                 prices[index] += max(round(1000 * self.rest_of_one_us), 1)
         return needs, torch.tensor(prices)
 
-    def facts(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """All prices, JSON-able."""
         return {
             "base_us": self.base_us,
@@ -549,9 +477,8 @@ def measure_costs(
     taken = torch.tensor([timing.p50_us for timing in timings], dtype=torch.float64)
     counts = torch.stack([_counted(set().union(*(needed[i] for i in s))) for s in designs])
     rows = (counts / taken[:, None]).numpy()
-    prices = torch.from_numpy(
-        nnls(rows, np.ones(len(rows)), maxiter=10_000)[0]
-    )  # relative errors count
+    solution, _ = nnls(rows, np.ones(len(rows)), maxiter=10_000)  # relative errors count
+    prices = torch.from_numpy(solution)
     names = list(GROUPS)
     return CostModel(
         base_us=float(prices[0]),

@@ -15,7 +15,7 @@ import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -25,17 +25,14 @@ from tactslip_torch.analysis.latency import (
     Latency,
     Limits,
     Timing,
-    check_number,
     look_ahead_samples,
     measure_costs,
-    one_thread,
     parts_of,
-    shortest_hop,
     single_bins,
     time_calls,
     time_detector,
 )
-from tactslip_torch.data.labels import needed_windows
+from tactslip_torch.analysis.raw_bins import bins_inside
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.cache import cache_key
@@ -53,8 +50,7 @@ from tactslip_torch.graph.runs import session_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
-from tactslip_torch.runtime import Ticker, bar, for_each
-from tactslip_torch.signals.binning import bins_at
+from tactslip_torch.runtime import Ticker, bar, check_number, in_parts, one_thread
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.fitting import TrainingPass, solve_metadata
@@ -77,8 +73,6 @@ _MODEL_ERRS = (1.5, 1.0, 1 / 1.5)  # modelled compute over what will be measured
 _FEW_NUMBERS = 20
 _LESS_ACCURATE = 0.01
 _LESS_COMPUTE = 1 / 3
-
-_T = TypeVar("_T")
 
 
 class Candidate(NamedTuple):
@@ -155,33 +149,22 @@ def nondominated(points: Sequence[Sequence[float]]) -> list[int]:
     return sorted(kept)
 
 
-def landmarks(
-    detectors: Sequence[_T],
-    accuracy: Callable[[_T], float],
-    compute: Callable[[_T], float],
-    size: Callable[[_T], int],
-) -> dict[str, _T | None]:
-    """The detectors that a user asks for first, of several equally accurate ones the quickest.
-
-    Args:
-        detectors: at least one.
-        accuracy: of a detector.
-        compute: of a detector.
-        size: how many numbers its machine takes.
+def landmarks(timed: Sequence[Timed]) -> dict[str, Timed | None]:
+    """The detectors that a user asks for first; of several equally accurate ones the quickest.
 
     Returns:
         ``"most_accurate"``; ``"cheap"``, at most 1 point worse, with at most a third of its
-        compute; ``"few"``, of at most 20 numbers. ``None`` where there is no such detector.
+        compute as a graph; ``"few"``, of at most 20 numbers. ``None`` where there is none.
     """
 
-    def best(some: Sequence[_T]) -> _T | None:
-        return min(some, key=lambda each: (-accuracy(each), compute(each)), default=None)
+    def best(some: Iterable[Timed]) -> Timed | None:
+        return min(some, key=lambda each: (-each.accuracy, each.graph_us), default=None)
 
-    top = best(detectors)
-    assert top is not None
-    most, least = _LESS_COMPUTE * compute(top), accuracy(top) - _LESS_ACCURATE
-    cheap = [each for each in detectors if compute(each) <= most and accuracy(each) >= least]
-    few = [each for each in detectors if size(each) <= _FEW_NUMBERS]
+    if (top := best(timed)) is None:
+        return dict.fromkeys(("most_accurate", "cheap", "few"))
+    most, least = _LESS_COMPUTE * top.graph_us, top.accuracy - _LESS_ACCURATE
+    cheap = (each for each in timed if each.graph_us <= most and each.accuracy >= least)
+    few = (each for each in timed if each.candidate.selection.size <= _FEW_NUMBERS)
     return {"most_accurate": top, "cheap": best(cheap), "few": best(few)}
 
 
@@ -452,15 +435,14 @@ class Searcher:
 
     def _all(self, jobs: Sequence[Callable[[], list[Candidate]]]) -> list[list[Candidate]]:
         """What each job finds, in their order; every job is done by one thread."""
-        found: list[list[Candidate]] = [[] for _ in jobs]
         with Ticker("search, groups", "step", len(jobs)) as ticker:
 
-            def work(number: int) -> None:
-                found[number] = jobs[number]()
+            def work(job: Callable[[], list[Candidate]]) -> list[Candidate]:
+                found = job()
                 ticker.tick()
+                return found
 
-            for_each(work, range(len(jobs)))
-        return found
+            return in_parts(work, jobs)
 
     def _scored(
         self,
@@ -487,21 +469,8 @@ class Searcher:
             choices = [(size, kernel, penalty) for penalty in self.search.penalties]
             rows = validate(bins, sample.group, sample.group_names, choices)
             best = max(rows, key=lambda row: float(row["mean"]))
-            found.append(
-                Candidate(
-                    align,
-                    channels,
-                    components,
-                    "channel",
-                    ranking,
-                    degree,
-                    best["penalty"],
-                    selection.first(size),
-                    best["mean"],
-                    best["balanced_accuracy"],
-                    self._latency(align, selection.first(size)),
-                )
-            )
+            said = align, channels, components, "channel", ranking
+            found.append(self._candidate(*said, best, selection.first(size)))
         return found
 
     def _pooled(
@@ -541,22 +510,46 @@ class Searcher:
                 (row for row in alike if row["mean"] >= least), key=lambda row: row["penalty"]
             )
             first = selection if size is None else selection.first(min(size, selection.size))
-            found.append(
-                Candidate(
-                    align,
-                    channels,
-                    components,
-                    f"pooled {', '.join(statistics)}",
-                    "none" if size is None else "gd",
-                    best["kernel"]["degree"],
-                    best["penalty"],
-                    first,
-                    best["mean"],
-                    best["balanced_accuracy"],
-                    self._latency(align, first),
-                )
-            )
+            columns, ranking = f"pooled {', '.join(statistics)}", "none" if size is None else "gd"
+            said = align, channels, components, columns, ranking
+            found.append(self._candidate(*said, best, first))
         return found
+
+    def _candidate(
+        self,
+        align: Align,
+        channels: str,
+        components: str,
+        columns: str,
+        ranking: str,
+        chosen: Mapping[str, Any],
+        selection: FeatureSelection,
+    ) -> Candidate:
+        """The candidate of a row of validation, its latency modelled."""
+        selected = selection.selected
+        parts = set().union(*(self._needed[index] for index in selected))
+        num_pooled = 0 if selection.pooling is None else len(selected)
+        used = {self._channel_of[index] for index in selected}
+        rate = self.pool.sample_rate_hz / 1000
+        latency = Latency(
+            look_ahead_ms=look_ahead_samples(self.filters[align], used) / rate,
+            bin_ms=self.pool.bin_samples / rate,
+            hop_ms=self.search.hops_ms[0],
+            compute_us=self.costs.compute_us(parts, selection.size, num_pooled),
+        )
+        return Candidate(
+            align=align,
+            channels=channels,
+            components=components,
+            columns=columns,
+            ranking=ranking,
+            degree=chosen["kernel"]["degree"],
+            penalty=chosen["penalty"],
+            selection=selection,
+            balanced_accuracy=chosen["mean"],
+            by_group=chosen["balanced_accuracy"],
+            latency=latency.with_shortest_hop(self.search.hops_ms),
+        )
 
     def _ranked(
         self, ranking: str, survey: Survey, sample: SampledBins, places: Tensor, num: int
@@ -575,18 +568,6 @@ class Searcher:
             return rank_distinct(scores, features, sample.is_slip, num, most)
         return rank_features(scores, num)
 
-    def _latency(self, align: Align, selection: FeatureSelection) -> Latency:
-        selected = selection.selected
-        parts = set().union(*(self._needed[index] for index in selected))
-        num_pooled = 0 if selection.pooling is None else len(selected)
-        compute_us = self.costs.compute_us(parts, selection.size, num_pooled)
-        used = {self._channel_of[index] for index in selected}
-        ahead = look_ahead_samples(self.filters[align], used)
-        rate = self.pool.sample_rate_hz / 1000
-        hops = self.search.hops_ms
-        parts_ms = Latency(ahead / rate, self.pool.bin_samples / rate, hops[0], compute_us)
-        return shortest_hop(parts_ms, hops)
-
 
 def _offset_of(recipe: Recipe) -> float:
     """The polynomial's c: the first of the recipe's."""
@@ -601,7 +582,7 @@ class Timed:
     Args:
         candidate: what it is.
         arithmetic: of its pool.
-        timing: of ``predict_raw``.
+        timing: of a call with one raw bin.
         latency: with the shortest hop that compute at p99 fits into.
         graph_us: median of its ONNX graph in onnxruntime, of samples in float32; of the pool in
             float64.
@@ -614,13 +595,18 @@ class Timed:
     graph_us: float
 
     @property
+    def accuracy(self) -> float:
+        """Balanced accuracy in validation."""
+        return self.candidate.balanced_accuracy
+
+    @property
     def point(self) -> tuple[float, float, float]:
         """What is traded, smaller is better: latency, compute, errors."""
-        return self.latency.worst_ms, self.timing.p99_us, -self.candidate.balanced_accuracy
+        return self.latency.worst_ms, self.timing.p99_us, -self.accuracy
 
 
 class Workshop:
-    """Makes, times and judges detectors of candidates.
+    """Makes, times and evaluates detectors of candidates.
 
     Args:
         makers: of features, by alignment of the filter; one source, pool and engine.
@@ -698,7 +684,7 @@ class Workshop:
                 with one_thread():
                     timing = time_detector(self.make(candidate, arithmetic), self.search.calls)
                 latency = replace(candidate.latency, compute_us=timing.p99_us)
-                latency = shortest_hop(latency, self.search.hops_ms)
+                latency = latency.with_shortest_hop(self.search.hops_ms)
                 found.append(Timed(candidate, arithmetic, timing, latency, graph_us))
         return found
 
@@ -742,24 +728,16 @@ class Workshop:
         engine = data.maker.extractor.engine
         return plan.detector(pool, data.maker.channel_filter, head, info, engine)
 
-    def judged(self, detector: SlipDetector) -> dict[str, Any]:
-        """Balanced accuracy on raw bins of the test cycles, as a live loop would judge them."""
+    def evaluated(self, detector: SlipDetector) -> dict[str, Any]:
+        """Balanced accuracy on raw bins of the test cycles, scored as a live loop would."""
         maker = self.makers[detector.channel_filter.align]
-        source, channel_filter = maker.source, detector.channel_filter
-        before, after = channel_filter.context_before, channel_filter.context_after
         says, truth = [], []
         for recording in bar(self.fold.having("test"), "the chosen one, test", "recording"):
-            times = source.timeline(recording)
-            bins = maker.lay_bins(times)
-            windows = needed_windows(bins, before, times.duration_s, source.sample_rate_hz)
-            samples = source.load(recording, windows).samples
-            is_inside = bins.starts >= before
-            is_inside &= bins.starts + bins.bin_samples + after <= samples.shape[-1]
-            kept = is_inside & self.fold.bin_roles(recording, len(is_inside))["test"]
-            raw = bins_at(samples, bins.starts[kept] - before, before + bins.bin_samples + after)
+            bins, inside = bins_inside(maker, self.fold, recording, "test")
+            raw = maker.raw_bins(recording, inside)
             with torch.inference_mode():
                 says.append(detector.predict_raw(raw.float()).score >= 0)
-            truth.append(bins.is_slip[kept])
+            truth.append(bins.is_slip[inside])
         is_slip = torch.cat(truth)
         return {
             "balanced_accuracy": balanced_accuracy(torch.cat(says), is_slip),

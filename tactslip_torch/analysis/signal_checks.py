@@ -1,8 +1,9 @@
-"""What recordings of the hand must look like: REFERENCE.md section 6, row *signals*, as numbers.
+"""Checks that recordings look like the paper's (REFERENCE.md section 6, row *signals*).
 
-The paper shows and describes its signals. Each ``Fact`` is one sentence of that: a statistic of
-filtered recordings and the range it must lie in. ``judge_facts`` takes recordings of any origin;
-the tests hold the simulated ones against them, and ``calibrate`` keeps to knobs at which they hold.
+The paper shows and describes its signals. Each ``SignalCheck`` is one sentence of that: a statistic
+of filtered recordings and the range it must lie in. ``check_signals`` takes recordings of any
+origin; the tests check the simulated ones, and ``calibrate`` keeps to parameters at which they
+hold.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class Signals:
         onset_s = self.onsets_s[stroke]
         if onset_s < 1.2:
             raise ValueError(
-                f"facts need 1.2 s of rest before each onset, onset {stroke + 1} is at "
+                f"checks need 1.2 s of rest before each onset, onset {stroke + 1} is at "
                 f"{onset_s:.3f} s; record or simulate a longer pause before the stroke"
             )
         return self.part(samples, onset_s - 1.2, onset_s - 0.3)
@@ -84,9 +85,11 @@ def filtered(recording: Recording, hand: HandLayout) -> Signals:
     """
     kinds = [channel.kind for channel in hand.channels]
     if not {"SG", "PVDF"} <= set(kinds):
-        raise ValueError(f"facts need SG and PVDF channels, the hand has {sorted(set(kinds))}")
+        raise ValueError(
+            f"signal checks need SG and PVDF channels, the hand has {sorted(set(kinds))}"
+        )
     if len(recording.onsets_s) < 3:
-        raise ValueError(f"facts need three strokes, got {len(recording.onsets_s)}")
+        raise ValueError(f"checks need three strokes, got {len(recording.onsets_s)}")
     channel_filter = ChannelFilter([FRAMES[kind] for kind in kinds])
     samples = channel_filter(recording.samples.double())
     rows = {kind: [row for row, own in enumerate(kinds) if own == kind] for kind in FRAMES}
@@ -150,7 +153,7 @@ def pvdf_speed_growth(seen: Sequence[Signals]) -> float:
 
 
 def num_barely_responding(seen: Sequence[Signals]) -> float:
-    """PVDF channels a recording in which the onset is hardly felt."""
+    """PVDF channels a recording in which the onset is hardly visible."""
     ratio = [
         rms(s.part(s.pvdf, s.onsets_s[1] - 0.05, s.onsets_s[1] + 0.1)) / rms(s.rest(s.pvdf, 1))
         for s in seen
@@ -158,7 +161,7 @@ def num_barely_responding(seen: Sequence[Signals]) -> float:
     return float(np.mean([np.sum(r < 4.0) for r in ratio]))
 
 
-def finest_detail_share(seen: Sequence[Signals]) -> float:
+def d1_fraction(seen: Sequence[Signals]) -> float:
     """Power of the branch D1 over the vibration's, while sliding."""
     shares = []
     for s in seen:
@@ -168,22 +171,22 @@ def finest_detail_share(seen: Sequence[Signals]) -> float:
     return float(np.median(np.concatenate(shares)))
 
 
-# --- facts: statistics with the range they must lie in ------------------------------------------
+# --- checks: statistics with the range they must lie in ------------------------------------------
 
 
 @dataclass(frozen=True)
-class Fact:
+class SignalCheck:
     """A statement about recordings that holds or does not.
 
     Args:
-        name: of the fact.
+        name: of the check.
         says: what the paper shows or says.
         statistic: of the recordings of one material, or of several together.
-        materials: to judge one by one; all at once if ``pooled``.
+        materials: to check one by one; all at once if ``pooled``.
         low: below every value.
         high: above every value.
         over: compare the least value of ``materials`` with the largest of these.
-        pooled: whether the recordings of all ``materials`` are judged as one set.
+        pooled: whether the recordings of all ``materials`` are checked as one set.
     """
 
     name: str
@@ -215,18 +218,18 @@ class Fact:
         return self.low < value < self.high
 
 
-FACTS = (
-    Fact("sg_offset", "SGs stand at offsets before onset", sg_offset_spread, ALL, 30.0),
-    Fact("sg_rise", "SG levels rise with sliding", sg_rise_v, ALL, 0.02, 1.0),
-    Fact("sg_variation", "SGs vary more in sliding than at rest", sg_variation, ALL, 1.3),
-    Fact(
+SIGNAL_CHECKS = (
+    SignalCheck("sg_offset", "SGs stand at offsets before onset", sg_offset_spread, ALL, 30.0),
+    SignalCheck("sg_rise", "SG levels rise with sliding", sg_rise_v, ALL, 0.02, 1.0),
+    SignalCheck("sg_variation", "SGs vary more in sliding than at rest", sg_variation, ALL, 1.3),
+    SignalCheck(
         "pvdf_abrupt",
         "PVDF is abrupt at onset, then quiet for M2 to M5",
         pvdf_onset_burst,
         QUIET,
         2.5,
     ),
-    Fact(
+    SignalCheck(
         "pvdf_abrupt_contrast",
         "M2 to M5 fall off behind the onset, M1 and M6 do not",
         pvdf_onset_burst,
@@ -234,22 +237,22 @@ FACTS = (
         1.5,
         over=SUSTAINED,
     ),
-    Fact(
+    SignalCheck(
         "pvdf_slide_over_rest",
         "every material is louder in sliding than at rest",
         pvdf_slide_over_rest,
         ALL,
         1.5,
     ),
-    Fact(
+    SignalCheck(
         "pvdf_sustained",
         "PVDF vibrates throughout the slide for M1 and M6",
         pvdf_slide_over_rest,
         SUSTAINED,
         8.0,
     ),
-    Fact("speed", "amplitude grows with speed", pvdf_speed_growth, ALL, 1.05, 3.0),
-    Fact(
+    SignalCheck("speed", "amplitude grows with speed", pvdf_speed_growth, ALL, 1.05, 3.0),
+    SignalCheck(
         "barely",
         "a few channels barely respond",
         num_barely_responding,
@@ -258,34 +261,34 @@ FACTS = (
         4.0,
         pooled=True,
     ),
-    Fact("d1", "D1 is nearly empty behind the filter", finest_detail_share, ALL, 0.0, 0.02),
+    SignalCheck("d1", "D1 is nearly empty behind the filter", d1_fraction, ALL, 0.0, 0.02),
 )
 """All of REFERENCE.md section 6, row *signals*, and PHYSICS.md's floor of slide over rest."""
 
 
-def judge_facts(recordings: Mapping[str, Sequence[Signals]]) -> list[dict[str, Any]]:
-    """Every fact that the materials at hand can show, JSON-able.
+def check_signals(recordings: Mapping[str, Sequence[Signals]]) -> list[dict[str, Any]]:
+    """Every check that the materials at hand can show, JSON-able.
 
     Args:
         recordings: by material, some of each.
 
     Returns:
-        For each fact ``name``, ``says``, ``low``, ``high`` (``None``: unbounded), ``values`` and
+        For each check ``name``, ``says``, ``low``, ``high`` (``None``: unbounded), ``values`` and
         ``holds``.
     """
-    judged = []
-    for fact in FACTS:
-        values = fact.values(recordings)
+    results = []
+    for check in SIGNAL_CHECKS:
+        values = check.values(recordings)
         if not values:
             continue
-        judged.append(
+        results.append(
             {
-                "name": fact.name,
-                "says": fact.says,
-                "low": fact.low,
-                "high": fact.high if math.isfinite(fact.high) else None,
+                "name": check.name,
+                "says": check.says,
+                "low": check.low,
+                "high": check.high if math.isfinite(check.high) else None,
                 "values": values,
-                "holds": all(map(fact.allows, values.values())),
+                "holds": all(map(check.allows, values.values())),
             }
         )
-    return judged
+    return results

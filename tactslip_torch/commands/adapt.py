@@ -8,7 +8,6 @@ recordings out, ``action=undo`` takes the last step back, bit for bit, ``action=
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -16,20 +15,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import hydra
 import torch
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from tactslip_torch.commands.entry import conf_dir, errors_in_one_line, run_entry_point
+from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.graph.export import export_detector, stale_graphs
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import KEY as ALARM
 from tactslip_torch.report.adaptation import adaptation_figure, adaptation_table, journal_table
-from tactslip_torch.runtime import whole_file
+from tactslip_torch.runtime import whole_file, write_json
 from tactslip_torch.training.adaptation import (
     Change,
     accepted,
@@ -131,8 +128,7 @@ def _stepped(
         "versions": versions(),
     }
     save_config(config, folder)
-    with whole_file(folder / "adaptation.json") as temporary:
-        temporary.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+    write_json(folder / "adaptation.json", content)
     adaptation_figure(content, folder / "adaptation.png")
     print("\n" + adaptation_table(content))
     if not is_accepted:
@@ -278,12 +274,7 @@ def _weight(value: Any) -> float | None:
     return float(value)
 
 
-@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="adapt")
-def main(config: DictConfig) -> None:
-    """Entry point."""
-    with errors_in_one_line():
-        adapt(config, Path(HydraConfig.get().runtime.output_dir))
-
+main = entry_point("adapt", adapt)
 
 if __name__ == "__main__":
-    run_entry_point(main)
+    main()

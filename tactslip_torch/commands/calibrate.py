@@ -15,16 +15,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 import tactslip_torch
-from tactslip_torch.analysis.signal_checks import Signals, filtered, judge_facts
-from tactslip_torch.commands.entry import conf_dir, errors_in_one_line, run_entry_point
+from tactslip_torch.analysis.signal_checks import Signals, check_signals, filtered
+from tactslip_torch.commands.entry import conf_dir, entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.features.survey import Survey
@@ -184,7 +182,7 @@ def evaluate_point(config: DictConfig, difficulty: float) -> dict[str, Any]:
             if recording.cycle < config.fact_cycles:
                 signals = filtered(source.load(recording), source.hand)
                 recordings.setdefault(recording.material, []).append(signals)
-    checks = judge_facts(recordings)
+    checks = check_signals(recordings)
     return {
         "difficulty": difficulty,
         "parameters": parameters,
@@ -340,12 +338,7 @@ def _outcome(config: DictConfig, points: Sequence[Point], kept: Point, target: f
     return f"{100 * missing:+.2f} points from the target: {why}"
 
 
-@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="calibrate")
-def main(config: DictConfig) -> None:
-    """Entry point."""
-    with errors_in_one_line():
-        calibrate(config, Path(HydraConfig.get().runtime.output_dir))
-
+main = entry_point("calibrate", calibrate)
 
 if __name__ == "__main__":
-    run_entry_point(main)
+    main()

@@ -1,43 +1,35 @@
 """Every choice of unseen materials: ``python -m tactslip_torch crossval``.
 
-The paper judges one choice of four unseen materials; out of ten there are 210. For each of them
+The paper evaluates one choice of four unseen materials; out of ten there are 210. For each of them
 and for each recipe, features are ranked and scaled, K and C chosen, and a machine fitted on the
-other materials alone; then it is judged on the unseen ones and on held-out cycles of the seen ones.
-Fits take a bounded sample of bins (``train_bins`` of each material and class), so that all splits
-take minutes; each sampled bin weighs what it stands for, so the balance of a recipe enters as
-weights only. Validation groups are the materials. Leaves ``crossval.json``, ``crossval.png`` and
-the resolved configuration.
+other materials alone; then it is evaluated on the unseen ones and on held-out cycles of the seen
+ones. Fits take a bounded sample of bins (``train_bins`` of each material and class), so that all
+splits take minutes; sampled bins are weighted by how many they represent, so the balance of a
+recipe enters as weights only. Validation groups are the materials. Leaves ``crossval.json``,
+``crossval.png`` and the resolved configuration.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
-import multiprocessing
-import os
 import time
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import hydra
-import torch
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from tactslip_torch.commands.entry import conf_dir, errors_in_one_line, run_entry_point
-from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.commands.entry import entry_point, leave_results
 from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.data.splits import Split, seen6
+from tactslip_torch.data.splits import seen6
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.fit import fit_machine
 from tactslip_torch.report.crossval import crossval_figure, crossval_table
-from tactslip_torch.runtime import bar, whole_file
+from tactslip_torch.runtime import bar, in_processes, one_thread
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import feature_cache, feature_parts, save_config
 from tactslip_torch.training.recipe import Recipe, balanced_accuracy
@@ -50,50 +42,48 @@ class Materials:
     Args:
         pool: the features.
         train_bins: bins of each material and class to fit on.
-        judged_bins: and to judge on.
+        scored_bins: and to evaluate on.
 
     Attributes:
         surveys: of the training cycles, by material.
-        judged: bins by material, of ``"train"`` and of ``"test"`` cycles.
     """
 
-    def __init__(self, pool: FeaturePool, train_bins: int, judged_bins: int) -> None:
+    def __init__(self, pool: FeaturePool, train_bins: int, scored_bins: int) -> None:
         self.pool = pool
-        self.num_features = len(pool.names)
-        self.train_bins = train_bins
-        self.judged_bins = judged_bins
         self.surveys: dict[str, Survey] = {}
-        self.judged: dict[str, dict[str, BinSample]] = {}
+        self._train_bins, self._scored_bins = train_bins, scored_bins
+        self._samples: dict[tuple[str, str], BinSample] = {}  # by material and role
 
     def update(self, batch: Any, role: str) -> None:
-        """Add a recording whose cycle is for training or for test."""
+        """Add a recording whose cycle is for ``"train"`` or for ``"test"``."""
         name, material = str(batch.recording), batch.recording.material
         if role == "train":
-            survey = self.surveys.setdefault(material, Survey(self.num_features, self.train_bins))
+            survey = self.surveys.setdefault(material, self._survey())
             survey.update(name, material, batch.features, batch.is_slip)
-        by_role = self.judged.setdefault(
-            material, {r: BinSample(self.judged_bins) for r in ("train", "test")}
-        )
-        by_role[role].update(name, material, batch.features, batch.is_slip)
+        sample = self._samples.setdefault((material, role), BinSample(self._scored_bins))
+        sample.update(name, material, batch.features, batch.is_slip)
 
     def survey_of(self, materials: Iterable[str]) -> Survey:
         """One survey of the training cycles of several materials."""
-        merged = Survey(self.num_features, self.train_bins)
+        merged = self._survey()
         for material in sorted(materials):
             merged.merge(self.surveys[material])
         return merged
 
     def bins_of(self, materials: Iterable[str], roles: Sequence[str]) -> SampledBins:
-        """The bins to judge on."""
-        merged = BinSample(self.judged_bins)
-        for material in sorted(materials):
-            for role in roles:
-                merged.merge(self.judged[material][role])
+        """The bins to evaluate on."""
+        merged = BinSample(self._scored_bins)
+        for key in itertools.product(sorted(materials), roles):
+            if key in self._samples:
+                merged.merge(self._samples[key])
         return merged.bins()
 
+    def _survey(self) -> Survey:
+        return Survey(len(self.pool.names), self._train_bins)
 
-def judge(materials: Materials, recipe: Recipe, unseen: Sequence[str]) -> dict[str, Any]:
-    """Fit on all materials but the unseen ones, and judge.
+
+def evaluate_split(materials: Materials, recipe: Recipe, unseen: Sequence[str]) -> dict[str, Any]:
+    """Fit on all materials but the unseen ones, and evaluate.
 
     Returns:
         ``unseen``, ``test`` (balanced accuracies), ``per_material`` (of the unseen ones),
@@ -127,7 +117,7 @@ def judge(materials: Materials, recipe: Recipe, unseen: Sequence[str]) -> dict[s
 
 
 def crossval(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Judge every recipe on every choice of unseen materials and write the results.
+    """Evaluate every recipe on every choice of unseen materials and write the results.
 
     Args:
         config: composed from ``conf/crossval.yaml``.
@@ -154,78 +144,48 @@ def crossval(config: DictConfig, folder: Path) -> dict[str, Any]:
     save_config(config, folder)
     materials = _read(config, source, names, recipes.values())
     choices = list(itertools.combinations(names, num_unseen))
-    jobs = [(recipe, unseen) for recipe in recipes.values() for unseen in choices]
-    found_in_order = iter(_each(materials, jobs, config.num_workers))
-    results = {name: [next(found_in_order) for _ in choices] for name in recipes}
-    found = {
+
+    def work(job: tuple[str, Sequence[str]]) -> dict[str, Any]:
+        return evaluate_split(materials, recipes[job[0]], job[1])
+
+    jobs = list(itertools.product(recipes, choices))
+    results = list(in_processes(work, jobs, "splits", "split", config.num_workers))
+    content = {
         "simulated": source.is_simulated,
         "seed": config.seed,
         "num_unseen": num_unseen,
         "train_bins": config.train_bins,
         "materials": names,
-        "splits": results,
+        "splits": {
+            name: [result for job, result in zip(jobs, results, strict=True) if job[0] == name]
+            for name in recipes
+        },
         "seconds": time.perf_counter() - started,
     }
-    with whole_file(folder / "crossval.json") as temporary:
-        temporary.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
-    crossval_figure(found, folder / "crossval.png")
-    print("\n" + crossval_table(found))
-    print(f"\nresults in {folder}")
-    return found
+    leave_results(folder, "crossval", content, crossval_figure, crossval_table(content))
+    return content
 
 
 def _read(
     config: DictConfig, source: RecordingSource, names: Sequence[str], recipes: Iterable[Recipe]
 ) -> Materials:
-    rule: LabelRule = instantiate(config.labels)
-    by_cycle: Split = seen6(
-        source.ids, seen=names, train_share=config.train_share, seed=config.seed
-    )[0]
+    """One pass over all recordings."""
+    rule = instantiate(config.labels)
+    share = config.train_share
+    by_cycle = seen6(source.ids, seen=names, train_share=share, seed=config.seed)[0]
     pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
     for recipe in recipes:
         recipe.allowed(pool)  # refuses before any work
-    materials = Materials(pool, config.train_bins, config.judged_bins)
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the processors belong to those who make features
-    with feature_cache(config.cache) as cache:
+    materials = Materials(pool, config.train_bins, config.scored_bins)
+    with feature_cache(config.cache) as cache, one_thread():  # workers need the processors
         maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, engine)
         data = SlipDataModule(maker, by_cycle, config.num_workers)
         for batch in bar(data.loader(["train", "test"]), "features of all materials", "recording"):
             materials.update(batch, by_cycle.roles[batch.recording])
-    torch.set_num_threads(num_threads)
     return materials
 
 
-_shared: Materials | None = None
-"""What forked workers find in their memory."""
-
-
-def _each(
-    materials: Materials, jobs: Sequence[tuple[Recipe, Sequence[str]]], num_workers: int | None
-) -> Iterable[dict[str, Any]]:
-    """Results in the order of the jobs, from as many processes as there are processors."""
-    global _shared
-    _shared = materials
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    count = min(count, 8) if num_workers is None else num_workers
-    if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
-        return [_job(job) for job in bar(jobs, "splits", "split")]
-    context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(count, context, torch.set_num_threads, (1,)) as pool:
-        return list(bar(pool.map(_job, jobs), "splits", "split", total=len(jobs)))
-
-
-def _job(job: tuple[Recipe, Sequence[str]]) -> dict[str, Any]:
-    assert _shared is not None  # _each
-    return judge(_shared, *job)
-
-
-@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="crossval")
-def main(config: DictConfig) -> None:
-    """Entry point."""
-    with errors_in_one_line():
-        crossval(config, Path(HydraConfig.get().runtime.output_dir))
-
+main = entry_point("crossval", crossval)
 
 if __name__ == "__main__":
-    run_entry_point(main)
+    main()

@@ -12,19 +12,12 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import hydra
 import numpy as np
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig
 
 import tactslip_torch
-from tactslip_torch.commands.entry import (
-    conf_dir,
-    errors_in_one_line,
-    fail,
-    one_line,
-    run_entry_point,
-)
+from tactslip_torch.commands.entry import entry_point, fail, one_line
 from tactslip_torch.data.file_recordings import FileRecordings, Inspected, inspected, oddities
 from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest
 from tactslip_torch.data.manifest import Problem, write_template
@@ -248,17 +241,17 @@ def _converted_table(done: Sequence[Written], failed: Sequence[str], seconds: fl
     return f"{table([header, cells])}\ntook {seconds:.1f} s"
 
 
-@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="data_tool")
-def main(config: DictConfig) -> None:
-    """Entry point."""
-    with errors_in_one_line():
-        if config.action not in ACTIONS:
-            known = ", ".join(ACTIONS)
-            raise ValueError(f"action must be one of {known}, got {config.action!r}")
-        found = ACTIONS[config.action](config)
-        if config.action == "check" and found:
-            fail(f"{found} problems in {config.root}, listed above")
+def _act(config: DictConfig, _: Path) -> None:
+    """Do what ``action`` says; problems that ``check`` found end in exit status 2."""
+    if config.action not in ACTIONS:
+        known = ", ".join(ACTIONS)
+        raise ValueError(f"action must be one of {known}, got {config.action!r}")
+    found = ACTIONS[config.action](config)
+    if config.action == "check" and found:
+        fail(f"{found} problems in {config.root}, listed above")
 
+
+main = entry_point("data_tool", _act)
 
 if __name__ == "__main__":
-    run_entry_point(main)
+    main()

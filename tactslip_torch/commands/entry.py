@@ -1,4 +1,4 @@
-"""Where the configuration lives, and errors a person can read."""
+"""What every command does: find its configuration, run, write results, report bad input."""
 
 from __future__ import annotations
 
@@ -6,17 +6,20 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 import tactslip_torch
-from tactslip_torch.runtime import is_first_process, process_number
+from tactslip_torch.runtime import is_first_process, process_number, write_json
 
 CONF_HINT = "train.yaml"
 EXIT_BAD_INPUT = 2
@@ -75,8 +78,12 @@ def _further_folders(arguments: Sequence[str]) -> list[Path]:
     return [Path(value) for value in given]
 
 
-def folder_problem(arguments: Sequence[str]) -> str | None:
+def folder_problem(arguments: Sequence[str], default: str = "outputs") -> str | None:
     """One line about a results folder that cannot be made; Hydra alone would show a trace.
+
+    Args:
+        arguments: of the command line.
+        default: where results go if no argument says so; ``"."`` is not looked at.
 
     Example:
         >>> folder_problem(["hydra.run.dir=/dev/null/recordings"])
@@ -84,7 +91,9 @@ def folder_problem(arguments: Sequence[str]) -> str | None:
     """
     given = {key.lstrip("+"): value for key, _, value in (a.partition("=") for a in arguments)}
     name = "hydra.sweep.dir" if {"-m", "--multirun"} & set(arguments) else "hydra.run.dir"
-    folder = Path(given.get(name, "outputs").strip("'\"")).absolute()
+    if (wanted := given.get(name, default)) == ".":
+        return None
+    folder = Path(wanted.strip("'\"")).absolute()
     nearest = next(place for place in (folder, *folder.parents) if place.exists())
     try:
         with tempfile.TemporaryDirectory(dir=nearest):
@@ -93,17 +102,53 @@ def folder_problem(arguments: Sequence[str]) -> str | None:
         return f"cannot write to {name}={folder}: {error.strerror} at {nearest}"
 
 
-def run_entry_point(main: Callable[[], Any]) -> None:
-    """Run a Hydra entry point; a choice that does not exist is one line and exit status 2.
+def entry_point(
+    name: str, run: Callable[[DictConfig, Path], Any], config_name: str | None = None
+) -> Callable[[], None]:
+    """The command ``name`` as a function of the command line alone.
 
-    Of the processes that torchrun starts, the first alone gets a folder for its results.
+    It refuses a choice or a folder that does not exist, composes the configuration, and calls
+    ``run`` with it and the folder for results. What bad input raises is printed in one line, and
+    the exit status is 2. Of the processes that torchrun starts, only the first gets a folder.
+
+    Args:
+        name: of the module in ``commands``.
+        run: does the work.
+        config_name: of the file in ``conf``, if that is another.
     """
-    problem = unknown_choice(sys.argv[1:])
-    if problem:
-        fail(problem)
-    if "TORCHELASTIC_RUN_ID" in os.environ and not is_first_process():
-        sys.argv += ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
-    main()
+    config_name = config_name or name
+
+    def composed(config: DictConfig) -> None:
+        with errors_in_one_line():
+            run(config, Path(HydraConfig.get().runtime.output_dir))
+
+    def main() -> None:
+        arguments = sys.argv[1:]
+        own: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{config_name}.yaml"))
+        default = own["hydra"]["run"]["dir"].split("/")[0]
+        if problem := unknown_choice(arguments) or folder_problem(arguments, default):
+            fail(problem)
+        if "TORCHELASTIC_RUN_ID" in os.environ and not is_first_process():
+            sys.argv += ["hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=stdout"]
+        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(
+            composed
+        )()
+
+    composed.__module__ = f"{__package__}.{name}"  # Hydra names job and log file by it
+    return main
+
+
+def leave_results(
+    folder: Path,
+    name: str,
+    content: Mapping[str, Any],
+    figure: Callable[[Mapping[str, Any], Path], None],
+    *texts: str,
+) -> None:
+    """Write ``NAME.json`` and ``NAME.png``, print tables, and say where the files are."""
+    write_json(folder / f"{name}.json", content)
+    figure(content, folder / f"{name}.png")
+    print("\n" + "\n\n".join([*texts, f"results in {folder}"]))
 
 
 @contextmanager

@@ -1,8 +1,8 @@
-"""Judge a saved detector: ``python -m tactslip_torch evaluate model=detector.pt split=unseen4``.
+"""Evaluate a saved detector: ``python -m tactslip_torch evaluate model=detector.pt split=unseen4``.
 
 Prints the tables and writes the figures that ``train`` does, for any set, labels and split. Says so
-where recordings the detector was trained on are among those it is judged on. Recordings that
-several folds hold out are judged once.
+where recordings the detector was trained on are among those it is evaluated on. Recordings that
+several folds hold out count once.
 """
 
 from __future__ import annotations
@@ -11,16 +11,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from tactslip_torch.commands.entry import (
-    conf_dir,
-    errors_in_one_line,
-    run_entry_point,
-)
+from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, judged_once
@@ -42,7 +36,7 @@ from tactslip_torch.training.learner import SlipLearner
 
 
 def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Judge the detector of ``config.model`` and write the results.
+    """Evaluate the detector of ``config.model`` and write the results.
 
     Args:
         config: composed from ``conf/evaluate.yaml``.
@@ -60,17 +54,16 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     source: RecordingSource = instantiate(config.data, _convert_="all")
     rule: LabelRule = instantiate(config.labels)
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
-    is_first = is_first_process()
-    if is_first:
-        save_config(config, folder)
-    parts: dict[str, dict[str, Any]] = {}
     overlaps = {fold.name: overlap(detector, source, fold) for fold in folds}
+    if is_first_process():
+        save_config(config, folder)
+        for fold in folds:
+            _print_overlap(fold, overlaps[fold.name])
+    results: dict[str, dict[str, Any]] = {}
     with feature_cache(config.cache) as cache:
         filters = detector.channel_filter
         dtype = DTYPES[detector.info.get("features_dtype", "float64")]
         maker = FeatureMaker(source, detector.pool, filters, rule, cache, dtype)
-        for fold in folds if is_first else ():
-            _note(fold, overlaps[fold.name])
         once = judged_once(folds)
         for fold in once:
             learner = SlipLearner(detector.pool, filters, detector=detector)
@@ -78,8 +71,8 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             trainer = make_trainer(config.trainer, place)
             data = SlipDataModule(maker, fold, config.num_workers)
             trainer.test(learner, datamodule=data, verbose=False)
-            parts[fold.name] = learner.metrics | {"recording_events": learner.events}
-    metrics = common_facts(source, detector.pool, config) | merged_results(parts)
+            results[fold.name] = learner.metrics | {"recording_events": learner.events}
+    metrics = common_facts(source, detector.pool, config) | merged_results(results)
     metrics |= {
         "selected": [str(name) for name in detector.selected_names],
         "timing_s": {"total": time.perf_counter() - started},
@@ -87,7 +80,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
         "detector": detector.info,
     }
     rows = feature_rows(detector.selected_names, source.hand)
-    if is_first:
+    if is_first_process():
         write_results(folder, metrics, rows)
         print_results(metrics, rows)
         print(f"\nresults in {folder}")
@@ -108,8 +101,8 @@ def overlap(detector: SlipDetector, source: RecordingSource, fold: Split) -> dic
     }
 
 
-def _note(fold: Split, found: dict[str, list[str]]) -> None:
-    for what, names in found.items():
+def _print_overlap(fold: Split, trained_on: dict[str, list[str]]) -> None:
+    for what, names in trained_on.items():
         if names:
             print(
                 f"note: the detector was trained on {len(names)} {what.replace('_', ' ')} that "
@@ -117,12 +110,7 @@ def _note(fold: Split, found: dict[str, list[str]]) -> None:
             )
 
 
-@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="evaluate")
-def main(config: DictConfig) -> None:
-    """Entry point."""
-    with errors_in_one_line():
-        evaluate(config, Path(HydraConfig.get().runtime.output_dir))
-
+main = entry_point("evaluate", evaluate)
 
 if __name__ == "__main__":
-    run_entry_point(main)
+    main()

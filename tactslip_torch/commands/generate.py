@@ -10,26 +10,17 @@ around an onset as in the paper's signal figure.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import hydra
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig
 
 import tactslip_torch
-from tactslip_torch.commands.entry import (
-    conf_dir,
-    errors_in_one_line,
-    fail,
-    folder_problem,
-    run_entry_point,
-)
+from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written, write_manifest
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.features.cache import source_digest
@@ -146,14 +137,7 @@ def _draw(
         signals_figure(rows, hand.to_rows(), files.folder / name, title=title, views=seen)
 
 
-@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="generate")
-def main(config: DictConfig) -> None:
-    """Entry point."""
-    with errors_in_one_line():
-        generate(config, Path(HydraConfig.get().runtime.output_dir))
-
+main = entry_point("generate", generate)
 
 if __name__ == "__main__":
-    if problem := folder_problem(sys.argv[1:]):
-        fail(problem)
-    run_entry_point(main)
+    main()

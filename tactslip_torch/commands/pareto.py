@@ -15,7 +15,6 @@ once it is chosen; of unseen materials nothing is read.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -24,8 +23,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
@@ -36,9 +33,6 @@ from tactslip_torch.analysis.latency import (
     Limits,
     Timing,
     check_hops,
-    check_number,
-    least_latency_ms,
-    shortest_hop,
     time_in_fresh_process,
 )
 from tactslip_torch.analysis.pareto import (
@@ -53,13 +47,13 @@ from tactslip_torch.analysis.pareto import (
     worth_naming,
     worth_timing,
 )
-from tactslip_torch.commands.entry import conf_dir, errors_in_one_line, run_entry_point
+from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.cache import FeatureCache
 from tactslip_torch.report.pareto import none_meets, pareto_figure, pareto_table
-from tactslip_torch.runtime import bar, whole_file
+from tactslip_torch.runtime import bar, check_number, write_json
 from tactslip_torch.signals.filtering import Align
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.experiment import (
@@ -116,8 +110,7 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
             found = _chosen(config, limits, shop, timed, trial)
             found = _facts(config, limits, shop, costs, candidates, timed) | found
             found["seconds"] = time.perf_counter() - started
-            with whole_file(folder / "pareto.json") as temporary:
-                temporary.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
+            write_json(folder / "pareto.json", found)
             pareto_figure(found, folder / "pareto.png")
             if found["chosen"]:
                 trial.replace(folder / "detector.pt")
@@ -138,12 +131,7 @@ def _facts(
 ) -> dict[str, Any]:
     """What was searched and timed, JSON-able."""
     front = [timed[place] for place in nondominated([each.point for each in timed])]
-    named = landmarks(
-        sorted(timed, key=_preferred),
-        lambda each: each.candidate.balanced_accuracy,
-        lambda each: each.graph_us,
-        lambda each: each.candidate.selection.size,
-    )
+    named = landmarks(sorted(timed, key=_preferred))
     scale = median(each.timing.p99_us / each.candidate.latency.compute_us for each in timed)
     source = next(iter(shop.makers.values())).source
     return common_facts(source, shop.pool, config) | {
@@ -161,7 +149,7 @@ def _facts(
         "searched": len(candidates),
         "measured_over_modelled": scale,
         "modelled": [_modelled(each, scale, limits) for each in candidates],
-        "costs": costs.facts(),
+        "costs": costs.to_dict(),
     }
 
 
@@ -195,7 +183,7 @@ def _check_physics(limits: Limits, bin_ms: float, makers: dict[Align, FeatureMak
     """Refuse a deadline that passes before the last sample has come."""
     ahead = min(after for maker in makers.values() for _, after in maker.channel_filter.reaches)
     rate = next(iter(makers.values())).source.sample_rate_hz / 1000
-    least = least_latency_ms(bin_ms, limits.hops_ms, ahead / rate)
+    least = Latency(ahead / rate, bin_ms, min(limits.hops_ms), 0.0).worst_ms
     if limits.deadline_ms <= least:
         raise ValueError(
             f"deadline_ms={limits.deadline_ms:g} cannot be met: bin {bin_ms:g} ms, shortest hop "
@@ -233,7 +221,7 @@ def _chosen(
             if tries[-1]["misses"]:
                 break
         else:
-            chosen = tries[-1] | {"test": shop.judged(detector)}
+            chosen = tries[-1] | {"test": shop.evaluated(detector)}
             break
     return {"chosen": chosen, "tries": tries, "tried": tried, "not_tried": len(able) - tried}
 
@@ -251,7 +239,7 @@ def _in_turn(able: Sequence[Timed], limits: Limits, tries: int) -> list[Timed]:
 def _modelled(candidate: Candidate, scale: float, limits: Limits) -> list[float]:
     """Latency, compute and accuracy as modelled, brought to what was measured."""
     latency = replace(candidate.latency, compute_us=scale * candidate.latency.compute_us)
-    latency = shortest_hop(latency, limits.hops_ms)
+    latency = latency.with_shortest_hop(limits.hops_ms)
     return [latency.worst_ms, latency.compute_us, candidate.balanced_accuracy]
 
 
@@ -279,7 +267,7 @@ def row_of(
         "degree": candidate.degree,
         "penalty": candidate.penalty,
         "arithmetic": timed.arithmetic,
-        "latency": latency.facts(),
+        "latency": latency.to_dict(),
         "misses": limits.misses(latency),
         "p50_us": timing.p50_us,
         "p99_us": timing.p99_us,
@@ -293,19 +281,19 @@ def row_of(
     }
 
 
-@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="pareto")
-def main(config: DictConfig) -> None:
-    """Entry point."""
-    with errors_in_one_line():
-        try:
-            found = pareto(config, Path(HydraConfig.get().runtime.output_dir))
-        except KeyboardInterrupt:
-            print("interrupted: no detector is written", file=sys.stderr)
-            raise SystemExit(_EXIT_INTERRUPTED) from None
-        if found["chosen"] is None:
-            print(none_meets(found), file=sys.stderr)
-            raise SystemExit(_EXIT_NONE_MEETS)
+def _pareto_or_exit(config: DictConfig, folder: Path) -> None:
+    """As a command: exit status 1 if no detector meets the limits, 130 if interrupted."""
+    try:
+        found = pareto(config, folder)
+    except KeyboardInterrupt:
+        print("interrupted: no detector is written", file=sys.stderr)
+        raise SystemExit(_EXIT_INTERRUPTED) from None
+    if found["chosen"] is None:
+        print(none_meets(found), file=sys.stderr)
+        raise SystemExit(_EXIT_NONE_MEETS)
 
+
+main = entry_point("pareto", _pareto_or_exit)
 
 if __name__ == "__main__":
-    run_entry_point(main)
+    main()

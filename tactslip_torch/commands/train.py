@@ -13,17 +13,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-import hydra
 import lightning as L
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from tactslip_torch.commands.entry import (
-    conf_dir,
-    errors_in_one_line,
-    run_entry_point,
-)
+from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split, are_rivals
@@ -137,12 +131,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     }
 
 
-@hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="train")
-def main(config: DictConfig) -> None:
-    """Entry point."""
-    with errors_in_one_line():
-        train(config, Path(HydraConfig.get().runtime.output_dir))
-
+main = entry_point("train", train)
 
 if __name__ == "__main__":
-    run_entry_point(main)
+    main()

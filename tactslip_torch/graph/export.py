@@ -19,10 +19,10 @@ from typing import Any, get_args
 import onnx
 
 import tactslip_torch
-from tactslip_torch.commands.certify import FORMAT as CERTIFICATE_FORMAT
 from tactslip_torch.graph.bins import bin_graph
 from tactslip_torch.graph.check import check_file, check_model
 from tactslip_torch.graph.facts import (
+    CERTIFICATE_FORMAT,
     GraphKind,
     Origin,
     certificate_facts,

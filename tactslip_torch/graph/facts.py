@@ -17,6 +17,7 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import AlarmSettings, calibration_of
 
 FORMAT = "tactslip_torch onnx 1"
+CERTIFICATE_FORMAT = "tactslip_torch certificate 1"
 GraphKind = Literal["bin", "stream"]
 
 

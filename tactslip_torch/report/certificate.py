@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from tactslip_torch.report.style import (
     GREY,
@@ -18,16 +18,17 @@ from tactslip_torch.report.style import (
     colours_of,
     lanes,
     new_figure,
+    save,
 )
 
-Points = Mapping[str, tuple[Sequence[float], Sequence[float], Sequence[bool]]]
-"""By set or kind: ``|score|``, size of its error and whether the decision flips, for each bin."""
+Points = Mapping[str, Mapping[str, Sequence[Any]]]
+"""By set or kind, of each bin ``score`` (its size), its ``error`` and whether it ``flips``."""
 
 _BAD = "#B84300"
 _VALID, _FLAGGED = np.array([0.34, 0.62, 0.80]), np.array([0.78, 0.78, 0.78])
 
 
-def verdict(content: Mapping[str, Any]) -> str:
+def conclusion(content: Mapping[str, Any]) -> str:
     """The certificate in one line."""
     kind = " (simulated data)" if content["simulated"] else ""
     failed = [row for row in content["conditions"] if row["holds"] is False]
@@ -59,12 +60,13 @@ def number(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def certificate_figure(content: Mapping[str, Any], points: Points) -> Figure:
-    """Draw error against ``|score|`` with margin and bound, and errors of generated extremes.
+def certificate_figure(content: Mapping[str, Any], points: Points, path: str | Path) -> None:
+    """Write error against ``|score|`` with margin and bound, and errors of generated extremes.
 
     Args:
         content: of ``certificate.json``.
         points: of every set.
+        path: the PNG to write, replaced as a whole if it exists.
     """
     figure = new_figure(11.0, 4.9)
     left, right = figure.subplots(1, 2, width_ratios=[1.15, 1])
@@ -75,12 +77,14 @@ def certificate_figure(content: Mapping[str, Any], points: Points) -> Figure:
     kind = "SIMULATED recordings" if content["simulated"] else "recordings"
     left.set_title(f"(a) every bin of {kind}", loc="left", fontsize=11)
     right.set_title("(b) generated extremes (grey: flagged)", loc="left", fontsize=11)
-    return figure
+    save(figure, path, dpi=170)
 
 
 def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
     """Above the diagonal an error is larger than its score: only there a decision can flip."""
-    scores, errors = (np.concatenate([np.asarray(p[i]) for p in points.values()]) for i in (0, 1))
+    scores, errors = (
+        np.concatenate([own[key] for own in points.values()]) for key in ("score", "error")
+    )
     margin, bound = content["margin"]["score"], content["head"]["bound"]
     known = [value for value in (margin, bound) if value]
     floor = _least_positive([*errors.tolist(), *known])
@@ -88,10 +92,10 @@ def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
     high = 2 * max(scores.max(), *known, 1e-300)
     top = 5 * max(np.max(errors, where=np.isfinite(errors), initial=floor), *known, floor)
     colours = colours_of(points)
-    for name, (score, error, flips) in points.items():
-        x, y = np.maximum(score, low), np.clip(error, floor, top / 1.5)
+    for name, own in points.items():
+        x, y = np.maximum(own["score"], low), np.clip(own["error"], floor, top / 1.5)
         axes.scatter(x, y, s=5, color=colours[name], alpha=0.45, linewidths=0, label=name)
-        flipped = np.asarray(flips, dtype=bool)
+        flipped = np.asarray(own["flips"], dtype=bool)
         axes.scatter(x[flipped], y[flipped], s=34, marker="x", color=_BAD, zorder=4)
     axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(floor / 2, top))
     axes.plot([low, high], [low, high], color=GREY, linewidth=0.9, linestyle=":")
@@ -99,7 +103,7 @@ def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
         axes.axvspan(low, margin, color="#F3E3D3", zorder=0)
         axes.axvline(margin, color=_BAD, linewidth=1.2)
         side = "right" if margin * margin > low * high else "left"
-        text = "  margin: to its left  \n  a decision may turn  "
+        text = "  margin: to its left  \n  a decision may change  "
         axes.text(margin, 3 * floor, text, color=_BAD, ha=side, multialignment=side)
     if bound:
         axes.axhline(bound, color=INK, linewidth=1.0, linestyle="--")

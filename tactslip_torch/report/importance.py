@@ -8,7 +8,6 @@ ones discs, in the colour of their kind, the deeper the larger the number.
 from __future__ import annotations
 
 import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -36,13 +35,14 @@ from tactslip_torch.report.style import (
     table,
     words,
 )
+from tactslip_torch.runtime import whole_file
 
 Row = Mapping[str, str]
 """A channel as ``HandLayout.to_rows`` has it."""
 ROLE_WORDS = {"held_out": "held-out", "test": "test", "unseen": "unseen"}
 """What the roles are called; ``held_out`` bins are training bins of groups left out in turn."""
 RESELECT_WORDS = {
-    "ranked": "by the recipe's ranking, in which strong channels crowd out others",
+    "ranked": "by the recipe's ranking, in which strong channels leave no room for others",
     "shared": "as many of each channel",
 }
 BEST_LINE = (
@@ -74,7 +74,8 @@ def lines_about(content: Mapping[str, Any]) -> list[str]:
         "moves score: root mean square of gradient times own spread, in sd of the score, at "
         "non-slip / slip bins",
         "lost: points of balanced accuracy without it, [95 % of draws of recordings]; reselected: "
-        f"features selected again among the others, {RESELECT_WORDS[content['settings']['anew']]}",
+        "features selected again among the others, "
+        + RESELECT_WORDS[content["settings"]["reselect"]],
     ]
 
 
@@ -82,17 +83,17 @@ def unit_rows(content: Mapping[str, Any], unit: str) -> list[list[str]]:
     """A header, and a row for each channel, finger or kind."""
     roles = list(content["num_bins"])
     rows = [[unit, "in use", "moves score"]]
-    rows[0] += [f"lost {ROLE_WORDS[role]}" for role in roles]
-    rows[0] += [f"reselected {ROLE_WORDS[role]}" for role in roles]
+    rows[0] += [f"{what} {ROLE_WORDS[role]}" for what in ("lost", "reselected") for role in roles]
     rows[0].append("alone, held-out %")
     for row in content["units"]:
-        if row["unit"] != unit:
-            continue
-        gradient = row["gradient"]
-        moved = "-" if gradient is None else f"{gradient['non_slip']:.2f} / {gradient['slip']:.2f}"
-        lost = [_interval(row[key][role]) for key in ("lost", "lost_anew") for role in roles]
-        cells = [row["name"], str(row["features_in_use"]), moved, *lost]
-        rows.append([*cells, percent(row["alone"]["held_out"])])
+        if row["unit"] == unit:
+            by_class = row["gradient"] or {}
+            moved = " / ".join(f"{value:.2f}" for value in by_class.values()) or "-"
+            cells = [row["name"], str(row["features_in_use"]), moved]
+            cells += [
+                _interval(row[key][role]) for key in ("lost", "lost_reselected") for role in roles
+            ]
+            rows.append([*cells, percent(row["alone"]["held_out"])])
     return rows
 
 
@@ -102,7 +103,7 @@ def with_all_line(content: Mapping[str, Any]) -> str:
     for name, result in content["with_all"].items():
         scores = result["balanced_accuracy"].items()
         listed = ", ".join(f"{ROLE_WORDS[role]} {percent(score)}" for role, score in scores)
-        reached.append(f"{words(name).replace('anew', 'again')}: {listed} %")
+        reached.append(f"{words(name)}: {listed} %")
     return "all sensors, features " + "; ".join(reached)
 
 
@@ -124,9 +125,14 @@ def best_rows(content: Mapping[str, Any], unit: str) -> list[list[str]]:
     return rows
 
 
-def sensors_csv(content: Mapping[str, Any]) -> str:
-    """One row per channel, finger and kind, all of its numbers in columns."""
-    places = {
+def sensors_csv(content: Mapping[str, Any], path: str | Path) -> None:
+    """Write one row per channel, finger and kind, all of its numbers in columns.
+
+    Args:
+        content: of ``sensors.json``.
+        path: of the file, replaced as a whole if it exists.
+    """
+    order = {
         (unit, step["joins"]): number
         for unit, steps in content["best"].items()
         for number, step in enumerate(steps, 1)
@@ -134,23 +140,22 @@ def sensors_csv(content: Mapping[str, Any]) -> str:
     rows = []
     for row in content["units"]:
         flat = {name: row[name] for name in ("unit", "name", "num_channels", "features_in_use")}
-        flat["joins_as"] = places.get((row["unit"], row["name"]), "")
+        flat["joins_as"] = order.get((row["unit"], row["name"]))
         for at in ("non_slip", "slip"):
-            flat[f"moves_score_{at}"] = "" if row["gradient"] is None else row["gradient"][at]
-        for what in ("lost", "lost_anew"):
+            flat[f"moves_score_{at}"] = (row["gradient"] or {}).get(at)
+        for what in ("lost", "lost_reselected"):
             for role, numbers in row[what].items():
                 flat |= {f"{what}_{role}_{end}": value for end, value in numbers.items()}
         flat |= {f"alone_{role}": value for role, value in row["alone"].items()}
         rows.append(flat | {"simulated": content["simulated"]})
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _interval(lost: Mapping[str, float]) -> str:
-    return f"{100 * lost['lost']:+.2f} [{100 * lost['low']:+.2f}, {100 * lost['high']:+.2f}]"
+    return "{lost:+.2f} [{low:+.2f}, {high:+.2f}]".format(**{k: 100 * v for k, v in lost.items()})
 
 
 # Figure ------------------------------------------------------------------------------------------
@@ -179,7 +184,7 @@ def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
     axes.set_title("(a) the trained detector moves with it", loc="left", fontsize=11)
     moves.draw(axes, "gradient times own spread, sd of the score; 0: not in use")
     axes = figure.add_subplot(grid[0, 1])
-    axes.set_title("(b) what it tells alone", loc="left", fontsize=11)
+    axes.set_title("(b) with it alone", loc="left", fontsize=11)
     tells.draw(axes, "balanced accuracy with this channel alone, held-out, %")
     _absences(figure.add_subplot(grid[0, 2]), content)
     _best_few(figure.add_subplot(grid[1, :]), content)
@@ -215,7 +220,7 @@ def _absences(axes: Axes, content: Mapping[str, Any]) -> None:
 
 def _best_few(axes: Axes, content: Mapping[str, Any]) -> None:
     """Accuracy against the number of channels, their names in the order in which they join."""
-    steps, whole = content["best"]["channel"], content["with_all"]["selected_anew"]
+    steps, whole = content["best"]["channel"], content["with_all"]["reselected"]
     kinds = {row["name"]: row["kind"] for row in content["channels"]}
     colours = kind_colours(kinds.values())
     at = np.arange(1, len(steps) + 1)
@@ -236,7 +241,7 @@ def _best_few(axes: Axes, content: Mapping[str, Any]) -> None:
     for tick, step in zip(axes.get_xticklabels(), steps, strict=True):
         tick.set(color=colours[kinds[step["joins"]]], fontweight="bold")
     axes.set_xlim(0.5, len(steps) + 0.5)
-    how = RESELECT_WORDS[content["settings"]["anew"]]
+    how = RESELECT_WORDS[content["settings"]["reselect"]]
     title = f"(d) the best few, in the order in which they serve held-out groups; features {how}"
     axes.set_title(title, loc="left", fontsize=11)
     axes.set_ylabel("balanced accuracy, %", fontsize=SMALL, color=GREY)

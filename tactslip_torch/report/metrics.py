@@ -170,17 +170,17 @@ def merged_metrics(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         for group in having:
             for label, of_label in group.items():
                 by_label.setdefault(label, []).append(of_label)
-        if kind != "per_position":
+        if kind == "per_position":
+            groups[kind] = {
+                label: _recall(
+                    sum(place["num_right"] for place in by_label[label]),
+                    sum(place["num_bins"] for place in by_label[label]),
+                )
+                for label in POSITIONS
+                if label in by_label
+            }
+        else:
             groups[kind] = {label: summed_metrics(of) for label, of in by_label.items()}
-            continue
-        groups[kind] = {
-            label: _recall(
-                sum(place["num_right"] for place in by_label[label]),
-                sum(place["num_bins"] for place in by_label[label]),
-            )
-            for label in POSITIONS
-            if label in by_label
-        }
     return {**summed_metrics(scores), **groups}
 
 
@@ -225,12 +225,13 @@ def answer_counts(is_slip: Tensor, answer: Tensor) -> list[list[int]]:
 def answer_metrics(recordings: Mapping[str, Counts], coverage: float) -> dict[str, Any]:
     """Scores of prediction sets: coverage by recording, how often it abstains, errors of the rest.
 
-    Returns ``coverage`` (as asked), ``unsure`` (fraction of all bins where the detector abstains),
-    ``sure_accuracy`` and ``sure_balanced_accuracy`` (of the other bins), ``counts`` (of all bins),
-    ``recordings`` (the counts of each) and for each of ``CLASSES`` a dict: ``coverage``, the mean
-    over recordings of the fraction of bins whose truth is in the answer; ``reached``, the fraction
-    of recordings that have at least what was asked, which is not guaranteed; ``unsure``, of its
-    bins; ``num_recordings``, with bins of it. None where there is nothing to divide by.
+    Returns ``coverage`` (as asked), ``abstained`` (fraction of all bins where the detector
+    abstains), ``decided_accuracy`` and ``decided_balanced`` (accuracies on the other bins),
+    ``counts`` (of all bins), ``recordings`` (the counts of each) and for each of ``CLASSES`` a
+    dict: ``coverage``, the mean over recordings of the fraction of bins whose truth is in the
+    answer; ``reached``, the fraction of recordings that have at least what was asked, which is not
+    guaranteed; ``abstained``, of its bins; ``num_recordings``, with bins of it. None where there
+    is nothing to divide by.
 
     Args:
         recordings: counts by name of the recording, as ``answer_counts`` has them.
@@ -238,27 +239,27 @@ def answer_metrics(recordings: Mapping[str, Counts], coverage: float) -> dict[st
     """
     table = torch.tensor(list(recordings.values()), dtype=torch.int64).view(-1, 2, 3)
     total = table.sum(0)
-    sure = total[:, 1:].double()
-    recalls = [_ratio(sure[c, c], sure[c].sum()) for c in (0, 1)]
+    decided = total[:, 1:].double()
+    recalls = [_ratio(decided[c, c], decided[c].sum()) for c in (0, 1)]
     scores: dict[str, Any] = {
         "coverage": coverage,
-        "unsure": _ratio(total[:, 0].sum(), total.sum()),
-        "sure_accuracy": _ratio(sure.diagonal().sum(), sure.sum()),
-        "sure_balanced_accuracy": _mean(recalls),
+        "abstained": _ratio(total[:, 0].sum(), total.sum()),
+        "decided_accuracy": _ratio(decided.diagonal().sum(), decided.sum()),
+        "decided_balanced": _mean(recalls),
         "counts": total.tolist(),
     }
     for index, name in enumerate(CLASSES):
-        shares = covered_shares(table, index)
+        covered = covered_fractions(table, index)
         scores[name] = {
-            "coverage": _ratio(shares.sum(), len(shares)),
-            "reached": _ratio((shares >= coverage - _ROUNDING).sum(), len(shares)),
-            "unsure": _ratio(total[index, 0], total[index].sum()),
-            "num_recordings": len(shares),
+            "coverage": _ratio(covered.sum(), len(covered)),
+            "reached": _ratio((covered >= coverage - _ROUNDING).sum(), len(covered)),
+            "abstained": _ratio(total[index, 0], total[index].sum()),
+            "num_recordings": len(covered),
         }
     return scores | {"recordings": {name: list(map(list, c)) for name, c in recordings.items()}}
 
 
-def covered_shares(table: Tensor, truth: int) -> Tensor:
+def covered_fractions(table: Tensor, truth: int) -> Tensor:
     """Of recordings with bins of a class, the fraction of these whose truth is in the answer.
 
     Shape:
@@ -326,11 +327,7 @@ def _position_label(position: int | None) -> str:
 
 
 def _recall(num_right: int, num_bins: int) -> dict[str, Any]:
-    return {
-        "recall": _ratio(num_right, num_bins),
-        "num_right": num_right,
-        "num_bins": num_bins,
-    }
+    return {"recall": _ratio(num_right, num_bins), "num_right": num_right, "num_bins": num_bins}
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -9,7 +9,6 @@ time at which it was known, so the delay of a decision can be seen.
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -37,14 +35,14 @@ from tactslip_torch.report.style import (
     save,
     table,
 )
-from tactslip_torch.runtime import whole_file
+from tactslip_torch.runtime import whole_file, write_json
 
 Array = NDArray[np.float64]
 Points = tuple[Array, Array]
 """Times in seconds and values there."""
 Segments = Sequence[tuple[float, float]]
 """Start and end of each, in seconds."""
-Write = Callable[[Iterable[Sequence[Any]]], None]
+_Write = Callable[[Iterable[Iterable[Any]]], None]
 
 REST, SLIP = BLUE, ORANGE
 COLUMNS = (
@@ -210,10 +208,13 @@ class Traces:
             self._first_s = float(available_s[is_seen][0])
         self._decisions.add(np.stack([probability, is_slip, is_valid, abstains])[:, is_seen])
 
-    def summary(
-        self, alarms: Segments, onsets_s: Sequence[float], sliding_s: Segments, *, is_known: bool
-    ) -> StreamSummary:
-        """What was gathered, with alarms and truth as ``StreamSummary`` has them."""
+    def summary(self, alarms: Segments, truth: Mapping[str, Any] | None = None) -> StreamSummary:
+        """What was gathered.
+
+        Args:
+            alarms: as ``StreamSummary`` has them.
+            truth: of an entry of ``onsets.json``; ``None`` if it is not known.
+        """
         places, samples = self._samples.points()
         times = (self._first + places) / self._sample_rate_hz
         numbers, values = self._decisions.points()
@@ -227,9 +228,9 @@ class Traces:
             is_valid=is_valid,
             abstains=abstains,
             alarms=alarms,
-            onsets_s=onsets_s,
-            sliding_s=sliding_s,
-            is_known=is_known,
+            onsets_s=[onset["onset_s"] for onset in truth["onsets"]] if truth else (),
+            sliding_s=truth["sliding_s"] if truth else (),
+            is_known=truth is not None,
             units=self._units,
         )
 
@@ -364,25 +365,27 @@ def onsets_title(entry: Mapping[str, Any], *, of_simulated: bool) -> str:
     return ", ".join(title)
 
 
-def onsets_table(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
-    """The first rows of ``onset_rows`` as text.
+def onsets_table(content: Mapping[str, Any]) -> str:
+    """The first rows of ``onset_rows`` as text; the first line says whether any is simulated.
 
     Args:
-        rows: of ``onset_rows``.
-        simulated: whether any recording is; the first line says so.
+        content: of ``onsets.json``.
     """
+    rows = onset_rows(content)
     cells = [["file", "alarm s", "onset s", "P(slip)", "valid", "true onset s", "delay s"]]
     cells[0].append("outcome")
-    for place, row in enumerate(rows[:_MOST_ROWS]):
-        is_first = place == 0 or rows[place - 1]["file"] != row["file"]
-        shown = [row["file"] if is_first else "", _seconds(row["alarm_s"])]
-        shown += [_seconds(row["onset_s"]), _seconds(row["probability"], 2)]
-        shown.append({None: "-", True: "yes", False: "NO"}[row["is_valid"]])
+    for row in rows[:_MOST_ROWS]:
+        shown = [row["file"], _seconds(row["alarm_s"]), _seconds(row["onset_s"])]
+        shown += [
+            _seconds(row["probability"], 2),
+            {None: "-", True: "yes"}.get(row["is_valid"], "NO"),
+        ]
         shown += [_seconds(row["true_onset_s"]), _seconds(row["delay_s"])]
         cells.append([*shown, row["outcome"] or "-"])
     rest = len(rows) - _MOST_ROWS
-    lines = [table(cells) if rows else "no alarm, and no slip missed"]
-    return marked(simulated, *lines, *([f"and {rest} more, see onsets.csv"] if rest > 0 else []))
+    lines = [table(cells, merged=1) if rows else "no alarm, and no slip missed"]
+    lines += [f"and {rest} more, see onsets.csv"] if rest > 0 else []
+    return marked(content["simulated"], *lines)
 
 
 def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
@@ -429,23 +432,13 @@ def write_onsets(content: Mapping[str, Any], folder: Path) -> None:
         content: of ``onsets.json``.
         folder: where they go.
     """
-    with whole_file(folder / "onsets.json") as temporary:
-        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    with decisions_file(folder / "onsets.csv", COLUMNS, wanted=True) as write:
-        write(list(row.values()) for row in onset_rows(content))
-
-
-def plain(value: Any) -> Any:
-    """The same with ``None`` for every number that JSON does not have."""
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    write_json(folder / "onsets.json", content)
+    with csv_writer(folder / "onsets.csv", COLUMNS) as write:
+        write(row.values() for row in onset_rows(content))
 
 
 @contextmanager
-def decisions_file(path: Path, columns: Sequence[str], *, wanted: bool) -> Iterator[Write]:
+def csv_writer(path: Path, columns: Sequence[str], *, wanted: bool = True) -> Iterator[_Write]:
     """Open a CSV file that is there, whole, when all went well; yields what writes its rows.
 
     Args:
@@ -464,15 +457,11 @@ def decisions_file(path: Path, columns: Sequence[str], *, wanted: bool) -> Itera
 
 # Figure ------------------------------------------------------------------------------------------
 def onset_figure(stream: StreamSummary, path: str | Path, *, title: str) -> None:
-    """Write the figure that ``draw_onsets`` draws as PNG, replaced as a whole if it exists."""
-    save(draw_onsets(stream, title=title), path, dpi=120)
-
-
-def draw_onsets(stream: StreamSummary, *, title: str) -> Figure:
-    """Draw channels in lanes, the decided and the true status, and the probability of slip.
+    """Write channels in lanes, the decided and the true status, and the probability of slip.
 
     Args:
         stream: what is drawn.
+        path: the PNG to write, replaced as a whole if it exists.
         title: of the figure; says what is simulated.
     """
     heights = [max(1.2, 0.42 * len(stream.channels)), 0.55, 1.3]
@@ -499,9 +488,9 @@ def draw_onsets(stream: StreamSummary, *, title: str) -> Figure:
     ]
     handles += [Line2D([], [], label="onset, true", **_ONSET)] if stream.onsets_s else []
     handles += [Patch(label="abstains", **_ABSTAINS)] if abstains else []
-    handles += [Patch(label="not to be relied on", **_INVALID)] if invalid else []
+    handles += [Patch(label="not valid", **_INVALID)] if invalid else []
     legend_below(figure, handles, len(handles))
-    return figure
+    save(figure, path, dpi=120)
 
 
 def _draw_channels(axes: Axes, stream: StreamSummary, slips: Segments) -> None:

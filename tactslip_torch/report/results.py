@@ -6,12 +6,11 @@ All functions read what ``metrics.json`` holds. Scores are printed in percent wi
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import mean
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +20,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from tactslip_torch.report import published
-from tactslip_torch.report.metrics import CLASSES, covered_shares
+from tactslip_torch.report.metrics import CLASSES, covered_fractions
 from tactslip_torch.report.style import (
     ALARM,
     BLUE,
@@ -47,9 +46,10 @@ from tactslip_torch.report.style import (
     save,
     stack,
     table,
+    text_rows,
     words,
 )
-from tactslip_torch.runtime import whole_file
+from tactslip_torch.runtime import write_json
 
 PAPER_LINE = f"paper: {published.PAPER}; real hand, random split over bins"
 PAPER_SCENE_LINE = "of several scenes: materials and speeds are of the paper's scene alone"
@@ -68,11 +68,11 @@ _SCORES = {
 }
 _CLASS_WORDS = {"non_slip": "non-slip", "slip": "slip"}
 _OUTCOMES = {"found": GREEN, "early": ORANGE, "missed": "#999999"}
+_Metrics = Mapping[str, Any]
+"""The content of ``metrics.json``, or a part of it."""
 
 
-def write_results(
-    folder: Path, metrics: Mapping[str, Any], selected: Sequence[Mapping[str, str]]
-) -> None:
+def write_results(folder: Path, metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> None:
     """Write ``metrics.json`` and the figures of a run into a folder.
 
     Results on several kinds of scenes also get ``confound.png``, those with events ``events.png``,
@@ -84,15 +84,14 @@ def write_results(
         metrics: JSON-able, with ``simulated`` and ``splits``.
         selected: one mapping per selected feature, as ``selected_features_figure`` takes them.
     """
-    with whole_file(folder / "metrics.json") as temporary:
-        temporary.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+    write_json(folder / "metrics.json", metrics)
     simulated = metrics["simulated"]
     confusion_figure(metrics, folder / "confusion.png")
     if selected:
         selected_features_figure(selected, folder / "selected_features.png", simulated=simulated)
     if by_detector(metrics):
         confound_figure(metrics, folder / "confound.png")
-    if has_events(metrics):
+    if _drawn_events(metrics):
         events_figure(metrics, folder / "events.png")
     if metrics.get("answers"):
         answers_figure(metrics, folder / "answers.png")
@@ -104,16 +103,16 @@ def write_results(
         validation_figure(rows, folder / "validation.png", simulated=simulated)
 
 
-def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, str]]) -> None:
+def print_results(metrics: _Metrics, selected: Sequence[Mapping[str, str]]) -> None:
     """Print the tables of a run."""
     simulated = metrics["simulated"]
-    texts = [splits_table(metrics), *trained_on_lines(metrics), materials_table(metrics)]
+    texts = [splits_table(metrics), *_trained_on_lines(metrics), materials_table(metrics)]
     if metrics.get("events"):
         texts.append(events_table(metrics))
     if metrics.get("answers"):
         texts.append(answers_table(metrics))
     if alarm := metrics.get("alarm"):
-        texts += [alarm_table(metrics), scenes_table(metrics)]
+        texts += [alarm_table(metrics), marked(simulated, table(scene_rows(metrics), num_left=2))]
         texts.append(reliability_table(alarm["reliability"], simulated=simulated))
     if by_detector(metrics):
         texts.append(confound_table(metrics))
@@ -131,7 +130,7 @@ def print_results(metrics: Mapping[str, Any], selected: Sequence[Mapping[str, st
 
 
 # Scores per bin ----------------------------------------------------------------------------------
-def splits_table(metrics: Mapping[str, Any]) -> str:
+def splits_table(metrics: _Metrics) -> str:
     """Accuracy, balanced accuracy, both recalls and bins of each split; baselines and paper below.
 
     The paper's row is left out where hand or scenes are not its own. The first line says SIMULATED
@@ -140,20 +139,20 @@ def splits_table(metrics: Mapping[str, Any]) -> str:
     Args:
         metrics: the content of ``metrics.json``.
     """
-    rows = [["split", *_SCORES.values(), "bins"]]
+    rows: list[list[object]] = [["split", *_SCORES.values(), "bins"]]
     for name, scores in metrics["splits"].items():
-        rows.append([name, *_score_cells(scores), str(scores["num_bins"])])
+        rows.append([name, *_score_cells(scores), scores["num_bins"]])
         for baseline, result in metrics.get("baselines", {}).items():
             if name in result["splits"]:
                 label = f"  {BASELINES.get(baseline, baseline)}"
-                rows.append([label, *_score_cells(result["splits"][name]), "-"])
+                rows.append([label, *_score_cells(result["splits"][name]), None])
         if paper := published.beside(metrics, name):
-            rows.append(["  paper", *_score_cells(vars(paper)), "-"])
+            rows.append(["  paper", *_score_cells(vars(paper)), None])
     source = [PAPER_LINE] if metrics.get("is_papers_hand", True) else []
     return marked(metrics["simulated"], table(rows), *source)
 
 
-def materials_table(metrics: Mapping[str, Any]) -> str:
+def materials_table(metrics: _Metrics) -> str:
     """The same scores within each split for each material, stroke speed and, of several, scene.
 
     Where there are several scenes, a line above says that materials and speeds are of the paper's
@@ -162,7 +161,7 @@ def materials_table(metrics: Mapping[str, Any]) -> str:
     Args:
         metrics: the content of ``metrics.json``.
     """
-    rows = [["split", "group", *_SCORES.values(), "bins"]]
+    rows: list[list[object]] = [["split", "group", *_SCORES.values(), "bins"]]
     head = []
     for name, split in metrics["splits"].items():
         groups = dict(split.get("per_material", {}))
@@ -171,13 +170,12 @@ def materials_table(metrics: Mapping[str, Any]) -> str:
         if len(scenes := split.get("per_scene", {})) > 1:
             head = [PAPER_SCENE_LINE]
             groups |= {f"scene {scene}": scores for scene, scores in scenes.items()}
-        for position, (group, scores) in enumerate(groups.items()):
-            first = name if position == 0 else ""
-            rows.append([first, group, *_score_cells(scores), str(scores["num_bins"])])
-    return marked(metrics["simulated"], *head, table(rows, num_left=2))
+        for group, scores in groups.items():
+            rows.append([name, group, *_score_cells(scores), scores["num_bins"]])
+    return marked(metrics["simulated"], *head, table(rows, num_left=2, merged=1))
 
 
-def trained_on_lines(metrics: Mapping[str, Any]) -> list[str]:
+def _trained_on_lines(metrics: _Metrics) -> list[str]:
     """Which materials, sessions and scenes were trained on, a line each fold that says so."""
     lines = []
     for name, fold in (metrics.get("folds") or {"": metrics}).items():
@@ -195,14 +193,14 @@ def timing_table(timing_s: Mapping[str, float]) -> str:
 
     Example:
         >>> print(timing_table({"features": 30.0, "solve": 10.0}))
-        stage     seconds  share %
-        features    30.00    75.00
-        solve       10.00    25.00
-        total       40.00   100.00
+        stage     seconds  of all %
+        features    30.00     75.00
+        solve       10.00     25.00
+        total       40.00    100.00
     """
     stages = {name: float(value) for name, value in timing_s.items() if name != "total"}
     total = float(timing_s.get("total", sum(stages.values())))
-    rows = [["stage", "seconds", "share %"]]
+    rows = [["stage", "seconds", "of all %"]]
     for name, seconds in (stages | {"total": total}).items():
         rows.append([name, f"{seconds:.2f}", percent(seconds / total if total else None)])
     return table(rows)
@@ -218,7 +216,7 @@ def solve_line(solve: Mapping[str, Any]) -> str:
     return f"{line}, unless what is left out is null" if solve.get("left_out") else line
 
 
-def confusion_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
+def confusion_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write one confusion matrix per split: bins counted, and percent of each true class.
 
     The paper's recalls are the caption of a panel where it states them, of scenes of its own.
@@ -245,7 +243,7 @@ def confusion_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
     save(figure, path, dpi=180)
 
 
-def _confusion_panel(axes: Axes, name: str, metrics: Mapping[str, Any]) -> None:
+def _confusion_panel(axes: Axes, name: str, metrics: _Metrics) -> None:
     """One split's 2 x 2 cells, coloured by the percentage of their row."""
     scores = metrics["splits"][name]
     counts = np.asarray(scores["confusion"], dtype=float)
@@ -256,9 +254,8 @@ def _confusion_panel(axes: Axes, name: str, metrics: Mapping[str, Any]) -> None:
         style["color"] = "white" if fractions[row, column] > 0.6 else INK
         value = percent(fractions[row, column] if counts[row].sum() else None)
         axes.text(column, row - 0.06, f"{value} %", fontsize=13, **style)
-        axes.text(
-            column, row + 0.16, f"{grouped(float(counts[row, column]))} bins", fontsize=9, **style
-        )
+        num_bins = grouped(float(counts[row, column]))
+        axes.text(column, row + 0.16, f"{num_bins} bins", fontsize=9, **style)
     axes.set_xticks([0, 1], ["non-slip", "slip"], fontsize=10)
     axes.set_yticks([0, 1], ["non-slip", "slip"], fontsize=10, rotation=90, va="center")
     axes.tick_params(length=0)
@@ -312,23 +309,20 @@ def selected_table(selected: Sequence[Mapping[str, str]]) -> str:
         "domain": {},
         "descriptor": ranks,
     }
-    rows = [["selected by", "", "ours", "paper"]]
+    rows: list[list[object]] = [["selected by", "", "ours", "paper"]]
     for key, of_paper in beside.items():
         shown = of_paper if is_papers else {}
         ours = Counter(feature[key] for feature in selected)
         counted = ours.most_common() + [(name, 0) for name in shown if name not in ours]
-        for position, (value, count) in enumerate(counted):
-            first = key if position == 0 else ""
-            rows.append([first, value, str(count), str(shown.get(value, "-"))])
-    rows.append(["all", "", str(len(selected)), str(published.NUM_SELECTED)])
+        rows += [[key, value, count, shown.get(value)] for value, count in counted]
+    rows.append(["all", "", len(selected), published.NUM_SELECTED])
     if not is_papers:
-        return table([row[:-1] for row in rows], num_left=2)
+        return table([row[:-1] for row in rows], num_left=2, merged=1)
     said = f"{published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
-    return f"{table(rows, num_left=2)}\npaper, in words: {said}"
+    return f"{table(rows, num_left=2, merged=1)}\npaper, in words: {said}"
 
 
 _COMPONENTS = ("raw", "A1", "A2", "A3", "A4", "D1", "D2", "D3", "D4")
-_DOMAIN_COLOURS = {"time": PURPLE, "freq": GREEN}
 _DOMAIN_WORDS = {"time": "time domain", "freq": "frequency domain"}
 
 
@@ -361,13 +355,14 @@ def selected_features_figure(
     is_papers = published.is_of_papers_hand(selected)
     known = ("SG", "PVDF") if is_papers else ()
     colours = kind_colours([*known, *sorted({feature["kind"] for feature in selected})])
+    kinds = [feature["kind"] for feature in selected]
 
     of_paper = {name: {name: count} for name, count in published.SELECTED_BY_KIND.items()}
-    pairs = [(feature["kind"], feature["kind"]) for feature in selected]
+    pairs = list(zip(kinds, kinds, strict=True))
     _counts(kind, "(a) sensor kind", pairs, list(colours), colours, of_paper if is_papers else {})
 
     pairs = [(_DOMAIN_WORDS[feature["domain"]], feature["component"]) for feature in selected]
-    of_domain = {_DOMAIN_WORDS[name]: colour for name, colour in _DOMAIN_COLOURS.items()}
+    of_domain = dict(zip(_DOMAIN_WORDS.values(), (PURPLE, GREEN), strict=True))
     _counts(component, "(b) signal component", pairs, list(_COMPONENTS), of_domain)
     if is_papers:
         said = f"paper: {published.COMPONENTS_IN_WORDS}; {published.DOMAINS_IN_WORDS}"
@@ -404,16 +399,29 @@ def _counts(
 ) -> list[str]:
     """Counts of (layer, column) pairs as stacked bars, the paper's hatched beside; the columns."""
     columns = [*order, *sorted({column for _, column in pairs} - set(order))]
-    ours = Counter(pairs)
+    layers = {layer: Counter(c for own, c in pairs if own == layer) for layer in colours}
     shift, width = (0.2, 0.36) if of_paper else (0.0, 0.6)
-    highest = _stacked(axes, ours, columns, colours, -shift, width, is_horizontal)
-    if of_paper:
-        paper = {(layer, name): n for layer, by in of_paper.items() for name, n in by.items()}
-        hatched = {layer: colours[layer] for layer in of_paper}
-        at = _stacked(axes, paper, columns, hatched, shift, width, is_horizontal, is_hatched=True)
-        highest = max(highest, at)
-    counted: Literal["x", "y"] = "x" if is_horizontal else "y"
-    clean(axes, counted)
+    draw, start = (axes.barh, "left") if is_horizontal else (axes.bar, "bottom")
+    beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9, "color": GREY}
+    beside |= {"va": "center"} if is_horizontal else {"ha": "center"}
+    highest = 0
+    for counts, way, is_paper in ((layers, -1, False), (of_paper or {}, 1, True)):
+        at, totals = np.arange(len(columns)) + way * shift, np.zeros(len(columns), dtype=int)
+        for layer, by_column in counts.items():
+            lengths = np.array([by_column.get(column, 0) for column in columns])
+            has = (lengths > 0) | (not is_paper)  # an empty hatched bar would still be outlined
+            style: dict[str, Any] = {"color": colours[layer], "label": layer}
+            if is_paper:
+                style = {"facecolor": "white", "edgecolor": colours[layer], "hatch": "////"}
+                style["label"] = f"{layer}, paper"
+            style[start] = totals[has]
+            draw(at[has], lengths[has], width, **style)
+            totals += lengths
+        for place, total in zip(at, totals, strict=True) if counts else ():
+            end, away = ((total, place), (3, 0)) if is_horizontal else ((place, total), (0, 2))
+            axes.annotate(f"{total}", end, away, **beside)
+        highest = max(highest, int(totals.max()))
+    clean(axes, "x" if is_horizontal else "y")
     axes.set_title(title, loc="left", fontsize=11)
     axis, limit = (axes.xaxis, axes.set_xlim) if is_horizontal else (axes.yaxis, axes.set_ylim)
     axis.set_major_locator(MaxNLocator(integer=True, nbins=6))
@@ -421,45 +429,9 @@ def _counts(
     if not is_horizontal:
         axes.set_xticks(range(len(columns)), columns, fontsize=10)
         axes.set_ylabel("features", fontsize=9, color=GREY)
-    place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
-    axes.legend(frameon=False, fontsize=9, ncols=4, borderaxespad=0.3, handlelength=1.4, **place)
+    place_of: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
+    axes.legend(frameon=False, fontsize=9, ncols=4, borderaxespad=0.3, handlelength=1.4, **place_of)
     return columns
-
-
-def _stacked(
-    axes: Axes,
-    counts: Mapping[tuple[str, str], int],
-    columns: Sequence[str],
-    colours: Mapping[str, str],
-    shift: float,
-    width: float,
-    is_horizontal: bool,
-    *,
-    is_hatched: bool = False,
-) -> int:
-    """Stacked bars with their totals beside the ends; the largest total."""
-    at = np.arange(len(columns)) + shift
-    totals = np.zeros(len(columns), dtype=int)
-    for layer, colour in colours.items():
-        lengths = np.array([counts.get((layer, column), 0) for column in columns])
-        has = np.full(len(columns), True)
-        style: dict[str, Any] = {"color": colour, "label": layer}
-        if is_hatched:
-            has = lengths > 0  # an empty bar would still draw its outline
-            style = {"facecolor": "white", "edgecolor": colour, "hatch": "////"}
-            style["label"] = f"{layer}, paper"
-        if is_horizontal:
-            axes.barh(at[has], lengths[has], width, left=totals[has], **style)
-        else:
-            axes.bar(at[has], lengths[has], width, bottom=totals[has], **style)
-        totals += lengths
-    style = {"textcoords": "offset points", "fontsize": 9, "color": GREY}
-    for place, total in zip(at, totals, strict=True):
-        if is_horizontal:
-            axes.annotate(f"{total}", (total, place), (3, 0), va="center", **style)
-        else:
-            axes.annotate(f"{total}", (place, total), (0, 2), ha="center", **style)
-    return int(totals.max())
 
 
 # Choice of the model -----------------------------------------------------------------------------
@@ -522,14 +494,12 @@ def validation_figure(
     figure = new_figure(8.4, 4.6, title, simulated=simulated)
     axes = figure.subplots()
     chosen = _chosen(rows)
-    by_structure: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
-    for row in sorted(rows, key=lambda row: float(row["penalty"])):
-        by_structure.setdefault(_structure(row), []).append(row)
     structures = list(dict.fromkeys(map(_structure, rows)))
     uses = colours_of(" ".join(structure[:-2]) for structure in structures)
     rests = list(dict.fromkeys(structure[-2:] for structure in structures))
     for place, structure in enumerate(structures):
-        line = by_structure[structure]
+        line = [row for row in rows if _structure(row) == structure]
+        line.sort(key=lambda row: float(row["penalty"]))
         *use, size, kernel = structure
         colour, dash = PALETTE[place % len(PALETTE)], "-"
         if len(uses) > 1:
@@ -598,7 +568,7 @@ def held_mean(tuning: Mapping[str, Any], way: str, name: str = "loss") -> float:
     return mean(float(group[way][name]) for group in tuning["held"])
 
 
-def tuning_tables(metrics: Mapping[str, Any]) -> list[str]:
+def tuning_tables(metrics: _Metrics) -> list[str]:
     """A table for each fold that was tuned: loss and accuracy of groups the choice did not see.
 
     Behind them the accuracy of the detectors. Empty where nothing was tuned.
@@ -665,7 +635,7 @@ def _draw_descents(axes: Axes, tuning: Mapping[str, Any]) -> None:
     axes.set_ylim(bottom=0)
     axes.set_xlabel("steps")
     axes.set_ylabel("held-out log loss, nats")
-    axes.set_title("groups held out; dots: steps that the others tell to take", fontsize=10)
+    axes.set_title("groups held out; dots: steps chosen by the other groups", fontsize=10)
     axes.legend(frameon=False, fontsize=SMALL, **UPPER_LEFT_OUTSIDE)
     clean(axes)
 
@@ -690,7 +660,7 @@ def _draw_scales(axes: Axes, scales: Mapping[str, float]) -> None:
 
 # Confounders: scenes that have motion without slip, or slip without motion ------------------------
 class _SceneScores(NamedTuple):
-    """Scores of one detector on one kind of scene."""
+    """Scores of one detector on one kind of scene; ``is_trained`` is None where nothing tells."""
 
     role: str
     scene: str
@@ -699,7 +669,7 @@ class _SceneScores(NamedTuple):
     scores: Mapping[str, Any]
 
 
-def by_detector(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+def by_detector(metrics: _Metrics) -> dict[str, Mapping[str, Any]]:
     """The splits of each fold, or of the one detector, if some held out are of several scenes.
 
     Empty otherwise, so that it also says whether there is anything to compare.
@@ -718,7 +688,7 @@ def by_detector(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     return detectors if several else {}
 
 
-def _scene_scores(metrics: Mapping[str, Any]) -> Iterator[_SceneScores]:
+def _scene_scores(metrics: _Metrics) -> Iterator[_SceneScores]:
     """Scores by role, then scene, then detector: the paper's scene first, then those trained on."""
     detectors = by_detector(metrics)
     is_fit = "detector" not in metrics  # evaluate's training role is not what was trained on
@@ -739,17 +709,8 @@ def _scene_scores(metrics: Mapping[str, Any]) -> Iterator[_SceneScores]:
                     yield _SceneScores(role, scene, name, is_trained, split["per_scene"][scene])
 
 
-def confound_table(metrics: Mapping[str, Any]) -> str:
+def confound_table(metrics: _Metrics) -> str:
     """Bins, recalls and balanced accuracy of each detector on each kind of scene, held out.
-
-    Args:
-        metrics: the content of ``metrics.json``.
-    """
-    return marked(metrics["simulated"], table(confound_rows(metrics), num_left=4))
-
-
-def confound_rows(metrics: Mapping[str, Any]) -> list[list[str]]:
-    """A header and one row per split, scene and detector; detectors on the same bins are beside.
 
     ``trained on it`` says whether other cycles of that scene were trained on, ``-`` where the
     results do not tell. A class without bins has the recall ``-``.
@@ -757,17 +718,15 @@ def confound_rows(metrics: Mapping[str, Any]) -> list[list[str]]:
     Args:
         metrics: the content of ``metrics.json``.
     """
-    rows = [["evaluated on", "scene", "detector", "trained on it", "bins"]]
+    rows: list[list[object]] = [["evaluated on", "scene", "detector", "trained on it", "bins"]]
     rows[0] += ["non-slip %", "slip %", "balanced %"]
-    for role, scene, detector, is_trained, scores in _scene_scores(metrics):
-        trained = {None: "-", False: "no", True: "yes"}[is_trained]
+    for *about, scores in _scene_scores(metrics):
         keys = ("non_slip_recall", "slip_recall", "balanced_accuracy")
-        cells = [str(scores["num_bins"]), *(percent(scores[key]) for key in keys)]
-        rows.append([role, scene, detector, trained, *cells])
-    return rows
+        rows.append([*about, scores["num_bins"], *(percent(scores[key]) for key in keys)])
+    return marked(metrics["simulated"], table(rows, num_left=4))
 
 
-def confound_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
+def confound_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write false slips and slips found of each detector on each kind of scene, as a PNG.
 
     In the paper's protocol the hand slides whenever the arm moves, so a detector of motors scores
@@ -814,7 +773,7 @@ def _draw_recalls(
     scored: Sequence[_SceneScores],
     scenes: Sequence[str],
     colours: Mapping[str, str],
-    key: Literal["non_slip_recall", "slip_recall"],
+    key: str,
 ) -> None:
     """A lane per scene with a dot for each detector: recall of slip, or what non-slip's lacks.
 
@@ -830,14 +789,19 @@ def _draw_recalls(
             style: dict[str, Any] = {"fontsize": 8.5, "color": GREY, "ha": "center", "va": "center"}
             style["bbox"] = {"fc": "white", "ec": "none", "pad": 2.0}
             axes.annotate(text, (0.5, lane), xycoords=axes.get_yaxis_transform(), **style)
-        heights = np.linspace(-0.13, 0.13, len(own)) + lane if len(own) > 1 else np.full(1, lane)
-        axes.plot(values, heights[: len(own)], color="#BBBBBB", lw=2, zorder=1)
-        for one, value, height in zip(own, values, heights, strict=False):
+        heights = lane + _spread(len(own), 0.13)
+        axes.plot(values, heights, color="#BBBBBB", lw=2, zorder=1)
+        for one, value, height in zip(own, values, heights, strict=True):
             colour = colours[one.detector]
             fill = "white" if one.is_trained is False else colour
             style = {"color": colour, "mfc": fill, "mew": 1.8, "ms": 7.5, "clip_on": False}
             axes.plot(value, height, "o", zorder=2, **style)
     lanes(axes, ["paper's protocol" if name == "paper" else words(name) for name in scenes])
+
+
+def _spread(number: int, width: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Heights beside the middle of a lane; of one, the middle."""
+    return np.linspace(-width, width, number) if number > 1 else np.zeros(number)
 
 
 # Stated probabilities ----------------------------------------------------------------------------
@@ -850,10 +814,10 @@ def reliability_table(by_role: Mapping[str, Mapping[str, Any]], *, simulated: bo
     """
     rows = [["role", "material", "bins", "ECE %", "worst cell %", "Brier", "log loss"]]
     for role, material, scores in _reliabilities(by_role):
-        row = ["" if material else role, material or "all", f"{sum(scores['counts']):.0f}"]
+        row = [role, material or "all", f"{sum(scores['counts']):.0f}"]
         row += [percent(scores["ece"]), percent(scores["mce"])]
         rows.append([*row, *(f"{scores[key]:.4f}" for key in ("brier", "log_loss"))])
-    return marked(simulated, table(rows, num_left=2))
+    return marked(simulated, table(rows, num_left=2, merged=1))
 
 
 def reliability_figure(
@@ -916,7 +880,7 @@ def _reliabilities(
 
 
 # Prediction sets ---------------------------------------------------------------------------------
-def answers_table(metrics: Mapping[str, Any]) -> str:
+def answers_table(metrics: _Metrics) -> str:
     """A row for each role: how often the detector abstains, how right the rest is, and coverage.
 
     ``covered`` is the mean over recordings of the fraction of bins that are not answered with the
@@ -926,15 +890,17 @@ def answers_table(metrics: Mapping[str, Any]) -> str:
     Args:
         metrics: the content of ``metrics.json``.
     """
-    rows = [["prediction sets", "abstains %", "of the others: right %", "balanced %"]]
+    rows: list[list[object]] = [
+        ["prediction sets", "abstains %", "of the others: right %", "balanced %"]
+    ]
     for name in CLASSES[::-1]:
         rows[0] += [f"{_CLASS_WORDS[name]}: covered %", "reached %", "abstains %"]
     rows[0].append("recordings")
     for role, scores in metrics["answers"].items():
-        row = [scores[key] for key in ("unsure", "sure_accuracy", "sure_balanced_accuracy")]
+        row = [scores[key] for key in ("abstained", "decided_accuracy", "decided_balanced")]
         for name in CLASSES[::-1]:
-            row += [scores[name][key] for key in ("coverage", "reached", "unsure")]
-        rows.append([role, *map(percent, row), str(len(scores["recordings"]))])
+            row += [scores[name][key] for key in ("coverage", "reached", "abstained")]
+        rows.append([role, *map(percent, row), len(scores["recordings"])])
     asked = sorted({scores["coverage"] for scores in metrics["answers"].values()})
     note = (
         f"asked: {', '.join(f'{100 * coverage:g}' for coverage in asked)} % covered, of either "
@@ -944,7 +910,7 @@ def answers_table(metrics: Mapping[str, Any]) -> str:
     return marked(metrics["simulated"], table(rows), note)
 
 
-def answers_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
+def answers_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the coverage of every recording, and what became of the bins of each role, as a PNG.
 
     Args:
@@ -960,11 +926,10 @@ def answers_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
     for lane, (role, name) in enumerate(rows):
         scores, truth = answers[role], CLASSES.index(name)
         counts = torch.tensor(list(scores["recordings"].values())).view(-1, 2, 3)
-        covered = 100 * covered_shares(counts, truth).numpy()
+        covered = 100 * covered_fractions(counts, truth).numpy()
         if len(covered):  # a dot for each recording, spread over the lane, and their mean
-            spread = np.linspace(-0.28, 0.28, len(covered)) if len(covered) > 1 else np.zeros(1)
-            colour = (BLUE, ORANGE)[truth]
-            left.plot(covered, lane + spread, "o", color=colour, ms=3, alpha=0.6, mew=0)
+            heights = lane + _spread(len(covered), 0.28)
+            left.plot(covered, heights, "o", color=(BLUE, ORANGE)[truth], ms=3, alpha=0.6, mew=0)
             left.plot([covered.mean()] * 2, [lane - 0.38, lane + 0.38], color=INK, lw=2)
         abstains, *rest = scores["counts"][truth]
         scale = 100 / max(abstains + sum(rest), 1)
@@ -990,7 +955,7 @@ def answers_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
 _REFLEX_MS = (60.0, 90.0)
 
 
-def events_table(metrics: Mapping[str, Any]) -> str:
+def events_table(metrics: _Metrics) -> str:
     """One row for each role and rule; brackets hold intervals.
 
     ``delay`` is the median from the exact onset to the alarm, look-ahead within; ``slip-free`` is
@@ -1007,24 +972,23 @@ def events_table(metrics: Mapping[str, Any]) -> str:
     delays[0].append("compute beside")
     reasons: dict[str, None] = {}
     for role, by_rule in metrics["events"].items():
-        for place, (rule, numbers) in enumerate(by_rule.items()):
-            first = [role if place == 0 else "", words(rule)]
+        for rule, numbers in by_rule.items():
             hours = numbers["quiet_hours"]
-            watched = f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min" if hours else "-"
-            row = [*first, str(numbers["num_onsets"]), *_event_cells(numbers)]
-            row += [_false_alarms(numbers), watched]
+            slip_free = f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min"
+            row = [role, words(rule), str(numbers["num_onsets"]), *_event_cells(numbers)]
+            row += [_false_alarms(numbers), slip_free if hours else "-"]
             rows.append([*row, _value(numbers["alarms_per_slip"], 2)])
             parts = numbers["latency_ms"] or {}
             names = ("look_ahead", "bin_fill", "decision", "delay", "compute")
             known = (parts.get(name) for name in names)
-            delays.append([*first, *("-" if ms is None else f"{ms:.1f}" for ms in known)])
+            delays.append([*row[:2], *("-" if ms is None else f"{ms:.1f}" for ms in known)])
             if reason := numbers.get("reason"):
                 reasons[reason] = None
-    lines = [table(rows, num_left=2)]
+    lines = [table(rows, num_left=2, merged=1)]
     if reasons:
         lines.append(f"no events: {'; '.join(reasons)}")
     if any(row[-1] != "-" for row in delays[1:]):
-        lines += ["", table(delays, num_left=2)]
+        lines += ["", table(delays, num_left=2, merged=1)]
     return marked(metrics["simulated"], *lines)
 
 
@@ -1049,16 +1013,7 @@ def _false_alarms(numbers: Mapping[str, Any]) -> str:
     return f"{rate['value']:.1f} /{unit} [{rate['low']:.1f}, {rate['high']:.1f}]"
 
 
-def has_events(metrics: Mapping[str, Any]) -> bool:
-    """Whether any rule was evaluated on a recording: something to draw.
-
-    Args:
-        metrics: the content of ``metrics.json``.
-    """
-    return bool(_drawn_events(metrics))
-
-
-def _drawn_events(metrics: Mapping[str, Any]) -> dict[str, dict[str, Mapping[str, Any]]]:
+def _drawn_events(metrics: _Metrics) -> dict[str, dict[str, Mapping[str, Any]]]:
     """By role, the rules in words that were evaluated on some recording."""
     drawn = {
         role: {words(rule): own for rule, own in by_rule.items() if own["num_recordings"]}
@@ -1067,7 +1022,7 @@ def _drawn_events(metrics: Mapping[str, Any]) -> dict[str, dict[str, Mapping[str
     return {role: by_rule for role, by_rule in drawn.items() if by_rule}
 
 
-def events_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
+def events_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write slips found by time since the onset, and what became of all, as a PNG.
 
     A row for each role: to the left the fraction of slips that were found so many ms behind the
@@ -1159,7 +1114,7 @@ _STREAMS = {
 _LEAST_RATE = 0.1  # an hour: where the figure's axis begins, and rates of 0 are drawn
 
 
-def kept_rows(metrics: Mapping[str, Any]) -> list[list[str]]:
+def rate_rows(metrics: _Metrics) -> list[list[str]]:
     """The false-alarm rate that was reached: a header, and a row for each method on each stream.
 
     Rates are false alarms an hour on recordings without slip, in brackets their intervals: *as
@@ -1169,28 +1124,26 @@ def kept_rows(metrics: Mapping[str, Any]) -> list[list[str]]:
         metrics: the content of ``metrics.json``, with ``alarm``.
     """
     target = metrics["alarm"]["settings"]["target_per_hour"]
-    rows = [["materials", "method", "false alarms an hour without slip", "against target"]]
+    rows: list[list[object]] = [
+        ["materials", "method", "false alarms an hour without slip", "against target"]
+    ]
     rows[0] += ["slips", "found %", "early %", "missed %", "delay ms", "p95 ms"]
     for role, (name, _) in _STREAMS.items():
         quiet = _quiet_rates(metrics, role)
-        for place, (method, numbers) in enumerate(metrics["events"].get(role, {}).items()):
-            cells = ["-", "-"]
+        for method, numbers in metrics["events"].get(role, {}).items():
+            reached, against = "-", "-"
             if method in quiet:
                 rate, hours = quiet[method]
                 ends = f"[{rate['low']:.2f}, {rate['high']:.2f}]"
-                cells = [f"{rate['value']:.2f} {ends} in {hours:.1f} h", "as asked"]
-                if rate["low"] > target:
-                    cells[1] = "more"
-                elif rate["high"] < target:
-                    cells[1] = "fewer"
-            first = ["" if place else name, words(method)]
-            rows.append([*first, *cells, str(numbers["num_onsets"]), *_event_cells(numbers)])
-    return rows
+                reached = f"{rate['value']:.2f} {ends} in {hours:.1f} h"
+                against = "more" if rate["low"] > target else "as asked"
+                against = "fewer" if rate["high"] < target else against
+            cells = [name, words(method), reached, against, numbers["num_onsets"]]
+            rows.append([*cells, *_event_cells(numbers)])
+    return text_rows(rows, merged=1)
 
 
-def _quiet_rates(
-    metrics: Mapping[str, Any], role: str
-) -> dict[str, tuple[Mapping[str, float], float]]:
+def _quiet_rates(metrics: _Metrics, role: str) -> dict[str, tuple[Mapping[str, float], float]]:
     """By method, false alarms an hour on the scene without slip, and its hours."""
     scene = metrics["alarm"]["settings"]["facts"]["slip_free"]
     rates = {}
@@ -1201,7 +1154,7 @@ def _quiet_rates(
     return rates
 
 
-def promise_line(metrics: Mapping[str, Any]) -> str:
+def target_line(metrics: _Metrics) -> str:
     """The rate that was asked for, on what the threshold was set, and what that gave there."""
     alarm = metrics["alarm"]
     settings, set_on = alarm["settings"], alarm["settings"]["facts"]["calibrated"]["rate"]
@@ -1212,17 +1165,17 @@ def promise_line(metrics: Mapping[str, Any]) -> str:
     )
 
 
-def alarm_table(metrics: Mapping[str, Any]) -> str:
-    """``promise_line`` and ``kept_rows`` for the terminal.
+def alarm_table(metrics: _Metrics) -> str:
+    """``target_line`` and ``rate_rows`` for the terminal.
 
     Args:
         metrics: the content of ``metrics.json``, with ``alarm``.
     """
-    rows = table(kept_rows(metrics), num_left=2)
-    return marked(metrics["simulated"], promise_line(metrics), rows)
+    rows = table(rate_rows(metrics), num_left=2)
+    return marked(metrics["simulated"], target_line(metrics), rows)
 
 
-def scene_rows(metrics: Mapping[str, Any]) -> list[list[str]]:
+def scene_rows(metrics: _Metrics) -> list[list[str]]:
     """False alarms and slips found in confounding scenes, by the detector's own rule.
 
     Behind it the false alarms of the paper's rule and of the other methods. A header and a row for
@@ -1235,32 +1188,24 @@ def scene_rows(metrics: Mapping[str, Any]) -> list[list[str]]:
     methods = alarm["methods"].items()
     beside = [name for name, method in methods if not method["calibrated"]]
     beside += [name for name, method in methods if method["scorer"] != "detector"]
-    rows = [["scene", "materials", "trained on", "quiet min", f"{words(alarm['rule'])} /h"]]
+    rows: list[list[object]] = [
+        ["scene", "materials", "trained on", "quiet min", f"{words(alarm['rule'])} /h"]
+    ]
     rows[0] += ["slips", "found %", "early %", "missed %", "delay ms"]
     rows[0] += [f"{name} /h" for name in beside]
     for scene, by_role in alarm["scenes"].items():
-        for role, by_method in by_role.items():
-            if role == "trained":
-                continue
-            numbers = by_method[alarm["rule"]]
-            cells = ["yes" if by_role["trained"] else "no", f"{60 * numbers['quiet_hours']:.0f}"]
-            cells += [_value(numbers["false_alarms_per_hour"], 1), str(numbers["num_onsets"])]
-            cells += _event_cells(numbers, digits=0)[:-1]
-            cells += [_value(by_method[name]["false_alarms_per_hour"], 1) for name in beside]
-            rows.append([words(scene), {"test": "seen"}.get(role, role), *cells])
-    return rows
+        for role in (role for role in by_role if role != "trained"):
+            numbers = by_role[role][alarm["rule"]]
+            row = [words(scene), {"test": "seen"}.get(role, role), bool(by_role["trained"])]
+            row += [f"{60 * numbers['quiet_hours']:.0f}"]
+            row += [_value(numbers["false_alarms_per_hour"], 1), numbers["num_onsets"]]
+            row += _event_cells(numbers, digits=0)[:-1]
+            row += [_value(by_role[role][name]["false_alarms_per_hour"], 1) for name in beside]
+            rows.append(row)
+    return text_rows(rows)
 
 
-def scenes_table(metrics: Mapping[str, Any]) -> str:
-    """``scene_rows`` for the terminal.
-
-    Args:
-        metrics: the content of ``metrics.json``, with ``alarm``.
-    """
-    return marked(metrics["simulated"], table(scene_rows(metrics), num_left=2))
-
-
-def alarm_figure(metrics: Mapping[str, Any], path: str | Path) -> None:
+def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
     """Write the false-alarm rates that were reached, and those of every scene, as a PNG.
 
     Args:

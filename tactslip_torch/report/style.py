@@ -30,27 +30,51 @@ UPPER_LEFT_OUTSIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.
 
 
 # Tables ------------------------------------------------------------------------------------------
-def table(rows: Sequence[Sequence[str]], num_left: int = 1) -> str:
+def table(rows: Sequence[Sequence[object]], num_left: int = 1, merged: int = 0) -> str:
     """Columns padded to their widest cell: ``num_left`` flush left, the others flush right.
 
     Args:
-        rows: cells; the first row is the header.
+        rows: cells as ``text_rows`` takes them; the first row is the header.
         num_left: number of columns that hold words.
+        merged: number of leading columns in which a repeated cell is left blank.
 
     Example:
-        >>> print(table([["stage", "seconds"], ["solve", "9.50"]]))
+        >>> print(table([["stage", "seconds"], ["solve", "9.50"], ["total", None]]))
         stage  seconds
         solve     9.50
+        total        -
     """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    texts = text_rows(rows, merged)
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     lines = []
-    for row in rows:
+    for row in texts:
         cells = [
             cell.ljust(width) if position < num_left else cell.rjust(width)
             for position, (cell, width) in enumerate(zip(row, widths, strict=True))
         ]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def text_rows(rows: Sequence[Sequence[object]], merged: int = 0) -> list[list[str]]:
+    """Cells as text: ``-`` for ``None``, ``yes`` or ``no`` for truth values.
+
+    Of the first ``merged`` columns a cell that repeats the one above is blank, as long as those to
+    its left repeat as well.
+    """
+    texts = [[_text(cell) for cell in row] for row in rows]
+    shown = [list(row) for row in texts]
+    for above, row, cells in zip(texts, texts[1:], shown[1:], strict=False):
+        for column in range(merged):
+            if above[: column + 1] == row[: column + 1]:
+                cells[column] = ""
+    return shown
+
+
+def _text(cell: object) -> str:
+    if cell is None:
+        return "-"
+    return ("yes" if cell else "no") if isinstance(cell, bool) else str(cell)
 
 
 def marked(simulated: bool, *lines: str) -> str:

@@ -77,7 +77,7 @@ KEYS = {
     "bins": "bins",
     "bins_of_fit": "train_bins",
     "bins_to_explain": "gradient_bins",
-    "bins_to_score": "judged_bins",
+    "bins_to_score": "scored_bins",
     "cache": "cache",
     "calibration_points": "most_points",
     "calibration_seeds": "seeds",

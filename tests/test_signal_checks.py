@@ -1,6 +1,6 @@
 """What a simulated recording must look like: REFERENCE.md section 6, row *signals*.
 
-Each fact holds on recordings of the seen materials, and fails once the samples are shuffled in
+Each check holds on recordings of the seen materials, and fails once the samples are shuffled in
 time (or negated, where sign matters).
 """
 
@@ -12,14 +12,14 @@ from scipy.signal import savgol_filter
 
 from tactslip_torch.analysis.signal_checks import (
     ALL,
-    FACTS,
     QUIET,
+    SIGNAL_CHECKS,
     SUSTAINED,
-    Fact,
+    SignalCheck,
     Signals,
+    check_signals,
+    d1_fraction,
     filtered,
-    finest_detail_share,
-    judge_facts,
     num_barely_responding,
     pvdf_onset_burst,
     pvdf_slide_over_rest,
@@ -34,7 +34,7 @@ from tactslip_torch.simulation import SEEN_MATERIALS, Scene, simulate
 HAND = HandLayout.paper24()
 NUM_CYCLES = 3
 RATE_HZ = 2000.0
-BY_NAME = {fact.name: fact for fact in FACTS}
+BY_NAME = {check.name: check for check in SIGNAL_CHECKS}
 
 
 @pytest.fixture(scope="module")
@@ -63,14 +63,14 @@ def shuffled(samples):
 
 
 @pytest.mark.parametrize("name", BY_NAME)
-def test_a_fact_holds_on_recordings_and_fails_on_shuffled_ones(recordings, name):
-    fact = BY_NAME[name]
-    values = fact.values(recordings)
+def test_a_check_holds_on_recordings_and_fails_on_shuffled_ones(recordings, name):
+    check = BY_NAME[name]
+    values = check.values(recordings)
     assert values
-    assert all(map(fact.allows, values.values())), values
-    spoilt = fact.values(changed(recordings, shuffled))
+    assert all(map(check.allows, values.values())), values
+    spoilt = check.values(changed(recordings, shuffled))
     assert spoilt.keys() == values.keys()
-    assert not any(map(fact.allows, spoilt.values())), spoilt
+    assert not any(map(check.allows, spoilt.values())), spoilt
 
 
 def test_levels_that_fall_are_no_rise(recordings):
@@ -86,40 +86,40 @@ def test_rough_and_tacky_materials_are_the_loudest(recordings):
     assert min(level_v[m] for m in SUSTAINED) > 3 * max(level_v[m] for m in QUIET)
 
 
-def test_the_facts_are_those_of_the_paper():
+def test_the_checks_are_those_of_the_paper():
     assert set(ALL) == set(SEEN_MATERIALS) == {*QUIET, *SUSTAINED}
     assert SUSTAINED == ("M1", "M6")
-    judged = {name: set(fact.materials) | set(fact.over) for name, fact in BY_NAME.items()}
-    assert judged.pop("pvdf_abrupt") == judged.pop("barely") == set(QUIET)
-    assert judged.pop("pvdf_sustained") == set(SUSTAINED)
-    assert all(materials == set(ALL) for materials in judged.values())
+    results = {name: set(check.materials) | set(check.over) for name, check in BY_NAME.items()}
+    assert results.pop("pvdf_abrupt") == results.pop("barely") == set(QUIET)
+    assert results.pop("pvdf_sustained") == set(SUSTAINED)
+    assert all(materials == set(ALL) for materials in results.values())
     floor = BY_NAME["pvdf_slide_over_rest"]
     assert (floor.statistic, floor.low) == (pvdf_slide_over_rest, 1.5)  # PHYSICS.md
 
 
-def test_judging_says_what_was_found(recordings):
+def test_checking_says_what_was_found(recordings):
     some = {material: recordings[material] for material in ("M1", "M2")}
-    judged = {fact["name"]: fact for fact in judge_facts(some)}
-    assert set(judged) == set(BY_NAME)
-    for name, fact in judged.items():
-        assert fact["values"] == BY_NAME[name].values(some)
-        assert fact["holds"]
-    assert judged["d1"]["values"].keys() == some.keys()
-    spoilt = judge_facts(changed(some, shuffled))
-    assert not any(fact["holds"] for fact in spoilt)
+    results = {check["name"]: check for check in check_signals(some)}
+    assert set(results) == set(BY_NAME)
+    for name, check in results.items():
+        assert check["values"] == BY_NAME[name].values(some)
+        assert check["holds"]
+    assert results["d1"]["values"].keys() == some.keys()
+    spoilt = check_signals(changed(some, shuffled))
+    assert not any(check["holds"] for check in spoilt)
 
 
-def test_facts_about_materials_that_are_not_there_are_not_judged(recordings):
-    names = {fact["name"] for fact in judge_facts({"M1": recordings["M1"]})}
+def test_checks_of_materials_that_are_not_there_are_left_out(recordings):
+    names = {check["name"] for check in check_signals({"M1": recordings["M1"]})}
     gone = {"pvdf_abrupt", "pvdf_abrupt_contrast", "barely"}
     assert names == set(BY_NAME) - gone
 
 
 def test_one_material_outside_the_range_is_enough_to_fail(recordings):
     quiet = changed({"M3": recordings["M3"]}, shuffled)
-    judged = {fact["name"]: fact for fact in judge_facts(recordings | quiet)}
-    assert not judged["pvdf_slide_over_rest"]["holds"]
-    assert judged["pvdf_sustained"]["holds"]
+    results = {check["name"]: check for check in check_signals(recordings | quiet)}
+    assert not results["pvdf_slide_over_rest"]["holds"]
+    assert results["pvdf_sustained"]["holds"]
 
 
 # --- statistics on signals made by hand ---------------------------------------------------------
@@ -158,9 +158,9 @@ def test_a_burst_is_the_onset_over_the_slide():
     assert pvdf_onset_burst([made(pvdf=pvdf)]) == pytest.approx(5.0, rel=1e-3)
 
 
-def test_channels_that_hear_no_onset_are_counted():
-    deaf, keen = tone(1.0, (1.0, 1.0, 1.0)), tone(1.0, (9.0, 9.0, 9.0))
-    seen = [made(pvdf=np.concatenate([deaf, keen, deaf])), made(pvdf=np.concatenate([keen, deaf]))]
+def test_channels_that_show_no_onset_are_counted():
+    dull, keen = tone(1.0, (1.0, 1.0, 1.0)), tone(1.0, (9.0, 9.0, 9.0))
+    seen = [made(pvdf=np.concatenate([dull, keen, dull])), made(pvdf=np.concatenate([keen, dull]))]
     assert num_barely_responding(seen) == 1.5
 
 
@@ -177,15 +177,15 @@ def test_the_spread_of_offsets_counts_in_variations():
 
 def test_the_finest_detail_is_what_alternates():
     slow, fast = tone(1.0, (1, 1, 1), hertz=20.0), tone(1.0, (1, 1, 1), hertz=900.0)
-    assert finest_detail_share([made(pvdf=slow)]) < 1e-4
-    assert finest_detail_share([made(pvdf=fast)]) > 0.8
+    assert d1_fraction([made(pvdf=slow)]) < 1e-4
+    assert d1_fraction([made(pvdf=fast)]) > 0.8
 
 
 def test_a_contrast_is_the_least_over_the_largest():
-    fact = Fact("contrast", "", pvdf_slide_over_rest, ("a", "b"), 1.5, over=("c", "d"))
+    check = SignalCheck("contrast", "", pvdf_slide_over_rest, ("a", "b"), 1.5, over=("c", "d"))
     levels = {"a": 3.0, "b": 4.0, "c": 1.0, "d": 2.0}
     recordings = {name: [made(pvdf=tone(1.0, (v, v, v)))] for name, v in levels.items()}
-    (value,) = fact.values(recordings).values()
+    (value,) = check.values(recordings).values()
     assert value == pytest.approx(1.5, rel=1e-3)
 
 
@@ -212,20 +212,20 @@ def test_kinds_are_told_by_the_hand_not_by_place():
     )
 
 
-def test_a_hand_or_protocol_that_shows_no_facts_is_refused():
+def test_a_hand_or_protocol_that_cannot_be_checked_is_refused():
     films = HandLayout.from_rows([row for row in HAND.to_rows() if row["kind"] == "PVDF"])
     recording = simulate(Scene("M1"), channels=["PVDF1"])
-    with pytest.raises(ValueError, match=r"facts need SG and PVDF channels, the hand has \['PVDF'"):
+    with pytest.raises(ValueError, match=r"checks need SG and PVDF .* has \['PVDF'"):
         filtered(replace(recording, samples=recording.samples[14:]), films)
     short = simulate(Scene("M1", strokes=Scene("M1").strokes[:2]), channels=["PVDF1"])
-    with pytest.raises(ValueError, match="facts need three strokes, got 2"):
+    with pytest.raises(ValueError, match="checks need three strokes, got 2"):
         filtered(short, HAND)
 
 
 def test_an_onset_without_rest_before_it_is_refused():
     ramp = np.arange(32000.0)[None] / RATE_HZ  # its value is its time
     early = replace(made(sg=ramp), onsets_s=(1.1, 1.2, 9.0))
-    with pytest.raises(ValueError, match=r"^facts need 1\.2 s of rest .* onset 1 is at 1\.100 s"):
+    with pytest.raises(ValueError, match=r"^checks need 1\.2 s of rest .* onset 1 is at 1\.100 s"):
         early.rest(early.sg)
     np.testing.assert_allclose(early.rest(early.sg, 1)[0, [0, -1]], [0.0, 0.8995], atol=1e-9)
     np.testing.assert_allclose(early.rest(early.sg, 2)[0, [0, -1]], [7.8, 8.6995], atol=1e-9)

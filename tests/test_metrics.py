@@ -1,0 +1,234 @@
+"""Scores per bin, of groups, of folds together, and of prediction sets."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from sklearn.metrics import accuracy_score, balanced_accuracy_score, recall_score
+from sklearn.metrics import confusion_matrix as oracle_confusion
+
+from tactslip_torch.model.calibration import reliability
+from tactslip_torch.report.metrics import (
+    answer_counts,
+    answer_metrics,
+    bin_metrics,
+    confusion_matrix,
+    covered_fractions,
+    merged_answers,
+    merged_metrics,
+    split_metrics,
+    weights_at_share,
+)
+
+
+def random_bins(seed, num_bins=500):
+    generator = torch.Generator().manual_seed(seed)
+    truth = torch.rand(num_bins, generator=generator) < 0.75
+    return truth, truth ^ (torch.rand(num_bins, generator=generator) < 0.1)
+
+
+def labels(num_bins=500, scenes=("taps", "paper", "grips")):
+    """Material, speed, scene and position of each bin."""
+    return (
+        [("iron", "ABS", "wood")[i * i % 7 % 3] for i in range(num_bins)],
+        [(60.0, 40.0, 20.0, 100.0)[i % 4] for i in range(num_bins)],
+        [scenes[i % len(scenes)] for i in range(num_bins)],
+        [None if i % 10 == 0 else i * 7 % 60 - 30 for i in range(num_bins)],
+    )
+
+
+def some(rows, *groups):
+    return [[group[row] for row in rows] for group in groups]
+
+
+def test_scores_equal_scikit_learn():
+    truth, predicted = random_bins(0)
+    confusion = confusion_matrix(truth, predicted)
+    assert confusion == oracle_confusion(truth.numpy(), predicted.numpy()).tolist()
+    assert split_metrics(confusion) == {
+        "accuracy": pytest.approx(accuracy_score(truth, predicted), abs=1e-14),
+        "balanced_accuracy": pytest.approx(balanced_accuracy_score(truth, predicted), abs=1e-14),
+        "non_slip_recall": pytest.approx(recall_score(truth, predicted, pos_label=False)),
+        "slip_recall": pytest.approx(recall_score(truth, predicted, pos_label=True)),
+        "confusion": confusion,
+        "num_bins": 500,
+    }
+
+
+def test_groups_are_scores_of_their_own_bins():
+    truth, predicted = random_bins(1)
+    materials, speeds, scenes, places = labels(scenes=("paper",))
+    scores = bin_metrics(truth, predicted, materials, speeds, scenes, places)
+    assert list(scores["per_material"]) == list(dict.fromkeys(materials))
+    assert list(scores["per_speed"]) == ["20", "40", "60", "100"]
+    for kind, given in (("per_material", materials), ("per_speed", [f"{s:g}" for s in speeds])):
+        for name, found in scores[kind].items():
+            rows = torch.tensor([label == name for label in given])
+            assert found == split_metrics(confusion_matrix(truth[rows], predicted[rows]))
+    bounds = {"<-20": (-99, -20), "20+": (20, 99)} | {str(p): (p, p + 1) for p in range(-20, 20)}
+    for name, found in scores["per_position"].items():
+        rows = [i for i, p in enumerate(places) if p is not None and p in range(*bounds[name])]
+        assert found["num_bins"] == len(rows)
+        assert found["num_right"] == int((truth == predicted)[rows].sum())
+        assert found["recall"] == found["num_right"] / found["num_bins"]
+    assert list(scores["per_position"]) == [name for name in ("<-20", *map(str, range(-20, 20)),
+                                            "20+") if name in scores["per_position"]]  # fmt: skip
+    assert json.loads(json.dumps(scores, allow_nan=False)) == scores
+    assert not {"per_scene", "per_position"} & set(bin_metrics(truth, predicted, materials, speeds))
+
+
+def test_of_several_scenes_groups_count_the_papers_bins_alone():
+    truth, predicted = random_bins(2)
+    groups = labels()
+    scores = bin_metrics(truth, predicted, *groups)
+    rows = [i for i, scene in enumerate(groups[2]) if scene == "paper"]
+    materials, speeds, places = some(rows, groups[0], groups[1], groups[3])
+    papers = bin_metrics(truth[rows], predicted[rows], materials, speeds, None, places)
+    for kind in ("per_material", "per_speed", "per_position"):
+        assert scores[kind] == papers[kind]
+    assert list(scores["per_scene"]) == ["taps", "paper", "grips"]
+    elsewhere = ["taps" if scene == "paper" else "grips" for scene in groups[2]]
+    none = bin_metrics(truth, predicted, *groups[:2], elsewhere, groups[3])
+    assert none["per_material"] == none["per_speed"] == none["per_position"] == {}
+    only = bin_metrics(truth, predicted, *groups[:2], ["taps"] * 500)  # of one kind all count
+    assert sum(of["num_bins"] for of in only["per_material"].values()) == 500
+
+
+@pytest.mark.parametrize("by", ["halves", "scenes"])
+@pytest.mark.parametrize("num_groups", [2, 4])
+def test_merged_scores_equal_those_of_all_bins_together(by, num_groups):
+    truth, predicted = random_bins(3)
+    groups = labels()[:num_groups]
+    if by == "halves" or num_groups == 2:
+        parts = [range(150), range(150, 500)]
+    else:
+        parts = [[i for i in range(500) if groups[2][i] == s] for s in ("taps", "paper", "grips")]
+    scores = [bin_metrics(truth[r], predicted[r], *some(r, *groups)) for r in map(list, parts)]
+    assert merged_metrics(scores) == bin_metrics(truth, predicted, *groups)
+
+
+@pytest.mark.parametrize("slip", [True, False])
+def test_a_class_without_bins_has_no_recall(slip):
+    scores = split_metrics(confusion_matrix(torch.full((8,), slip), torch.arange(8) < 6))
+    present, absent = ("slip", "non_slip") if slip else ("non_slip", "slip")
+    assert scores[f"{absent}_recall"] is scores["balanced_accuracy"] is None
+    assert scores[f"{present}_recall"] == scores["accuracy"] == (0.75 if slip else 0.25)
+    nothing = torch.zeros(0, dtype=torch.bool)
+    empty = bin_metrics(nothing, nothing, [], [])
+    assert (empty["confusion"], empty["accuracy"], empty["num_bins"]) == ([[0, 0], [0, 0]], None, 0)
+
+
+FOUR = torch.tensor([True, False, True, True])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: confusion_matrix(FOUR, FOUR.float()), r"is_slip_predicted must be \[N\] bool.*fl"),
+        (lambda: confusion_matrix(FOUR[None], FOUR[None]), "is_slip_true must be"),
+        (lambda: confusion_matrix(FOUR, FOUR[:3]), "got 4 and 3 bins"),
+        (lambda: bin_metrics(FOUR, FOUR, ["a"], [2.0] * 4), "materials must have one.*, 4, got 1"),
+        (lambda: bin_metrics(FOUR, FOUR, ["a"] * 4, [2.0]), "speeds_mm_s must have one.*, 4, got"),
+        (lambda: bin_metrics(FOUR, FOUR, "abcd", [2] * 4, ["s"]), "scenes must have one.*got 1"),
+        (lambda: bin_metrics(FOUR, FOUR, "abcd", [2] * 4, None, []), "positions must have.*got 0"),
+        (lambda: answer_counts(FOUR, torch.ones(3)), "of one N"),
+        (lambda: answer_counts(FOUR, torch.tensor([1, 2, 0, 0])), "answers are -1, 0 or 1"),
+        (lambda: weights_at_share(FOUR[2:], 0.5), "bins of slip and of non-slip"),
+        (lambda: weights_at_share(FOUR[:0], 0.5), "bins of slip and of non-slip"),
+        (lambda: weights_at_share(FOUR, 0.0), "slip_share must lie between 0 and 1"),
+        (lambda: weights_at_share(FOUR, float("nan")), "slip_share must lie between 0 and 1"),
+    ],
+)  # fmt: skip
+def test_wrong_input_is_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+# Prediction sets -------------------------------------------------------------------------------
+
+# truth by row (non-slip, slip), answer by column (abstains, non-slip, slip)
+RECORDINGS = {
+    "a/0": [[1, 3, 0], [2, 0, 2]],  # nothing wrong
+    "a/1": [[0, 1, 1], [0, 1, 9]],  # half of non-slip, a tenth of slip
+    "b/0": [[0, 0, 0], [1, 3, 0]],  # three quarters of slip; no non-slip
+}
+
+
+def test_answer_counts_are_those_of_a_loop():
+    is_slip, _ = random_bins(4)
+    answer = torch.arange(500) * 7 % 11 % 3 - 1
+    wanted = [[0, 0, 0], [0, 0, 0]]
+    for truth, given in zip(is_slip.tolist(), answer.tolist(), strict=True):
+        wanted[int(truth)][given + 1] += 1
+    assert answer_counts(is_slip, answer) == wanted
+
+
+def test_coverage_is_a_mean_over_recordings_that_have_the_class():
+    found = answer_metrics(RECORDINGS, 0.8)
+    assert found == {
+        "coverage": 0.8,
+        "abstained": pytest.approx(4 / 24),
+        "decided_accuracy": pytest.approx((4 + 11) / 20),
+        "decided_balanced": pytest.approx((4 / 5 + 11 / 15) / 2),
+        "counts": [[1, 4, 1], [3, 4, 11]],
+        "recordings": RECORDINGS,
+        "slip": {
+            "coverage": pytest.approx((1 + 0.9 + 0.25) / 3),
+            "reached": pytest.approx(2 / 3),
+            "abstained": pytest.approx(3 / 18),
+            "num_recordings": 3,
+        },
+        "non_slip": {
+            "coverage": pytest.approx((1 + 0.5) / 2),
+            "reached": pytest.approx(1 / 2),
+            "abstained": pytest.approx(1 / 6),
+            "num_recordings": 2,
+        },
+    }
+    assert covered_fractions(torch.tensor(list(RECORDINGS.values())), 0).tolist() == [1.0, 0.5]
+    exactly = {str(i): [[0, 0, 0], [0, 1, 19]] for i in range(3)}
+    assert answer_metrics(exactly, 0.95)["slip"]["reached"] == 1
+
+
+def test_of_nothing_there_is_no_score():
+    found = answer_metrics({}, 0.9)
+    assert found["abstained"] is found["decided_accuracy"] is found["decided_balanced"] is None
+    assert set(found["slip"].values()) == {None, 0}
+    undecided = answer_metrics({"a/0": [[4, 0, 0], [5, 0, 0]]}, 0.9)
+    assert undecided["abstained"] == undecided["slip"]["coverage"] == 1
+    assert undecided["decided_accuracy"] is None
+
+
+def test_folds_are_pooled_by_recording():
+    parts = list(RECORDINGS.items())
+    folds = {"x": answer_metrics(dict(parts[:2]), 0.8), "y": answer_metrics(dict(parts[2:]), 0.8)}
+    pooled, whole = merged_answers(folds), answer_metrics(RECORDINGS, 0.8)
+    assert list(pooled["recordings"]) == ["x/a/0", "x/a/1", "y/b/0"]
+    assert {**pooled, "recordings": None} == {**whole, "recordings": None}
+    assert merged_answers({"x": whole, "y": whole})["slip"]["num_recordings"] == 6
+    assert merged_answers({"x": whole}) == whole
+
+
+# Weights ---------------------------------------------------------------------------------------
+
+
+def test_weights_bring_bins_to_the_balance_of_a_stream(rng):
+    """Probabilities that are right at 5 % slip are right on bins of 70 %, weighted so."""
+    gap, share = 2.0, 0.05
+
+    def stated(of_slip):
+        is_slip = rng.uniform(size=60_000) < of_slip
+        score = gap * is_slip + rng.normal(size=60_000)
+        odds = np.exp(gap * score - gap**2 / 2) * share / (1 - share)  # two Gaussians
+        return torch.from_numpy(odds / (1 + odds)), torch.from_numpy(is_slip)
+
+    p, is_slip = stated(0.7)
+    weights = weights_at_share(is_slip, share)
+    assert weights.mean() == pytest.approx(1)
+    assert weights[is_slip].sum() / weights.sum() == pytest.approx(share)
+    assert len(weights.unique()) == 2
+    weighted = reliability(p, is_slip, weights=weights)
+    assert weighted.ece < 0.01
+    assert weighted.brier == pytest.approx(reliability(*stated(share)).brier, abs=0.005)
+    assert reliability(p, is_slip).ece > 0.2
