@@ -48,7 +48,7 @@ def solve(run: Path, out: Path, shards: list[Path]) -> None:
     info = detector.info
     detector.head = sums.solve(info["penalty"], info["kernel"]["offset"], balance="weights")
     detector.save(out)
-    print(f"{out}: {int(sums.count.sum())} bins of {len(sums.ledger)} recordings")
+    print(f"{out}: {int(sums.count.sum())} bins of {len(sums.seen_batches)} recordings")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""What every part may use: threads, processes, progress bars, and files that are written whole."""
+"""Threads, processes, progress bars, files that are written whole, and batches that were seen."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import multiprocessing
@@ -21,8 +22,6 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 from tqdm.auto import tqdm
-
-from tactslip_torch.ledger import content_digest
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -145,10 +144,10 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def is_recorded() -> bool:
+def is_traced() -> bool:
     """Whether what runs is being written down as a graph, in which no value may be looked at."""
-    is_traced = torch.jit.is_tracing()  # type: ignore[attr-defined,no-untyped-call]
-    return bool(is_traced or torch.compiler.is_compiling())
+    is_jit = torch.jit.is_tracing()  # type: ignore[attr-defined,no-untyped-call]
+    return bool(is_jit or torch.compiler.is_compiling())
 
 
 def has_values(x: Tensor) -> bool:
@@ -156,7 +155,7 @@ def has_values(x: Tensor) -> bool:
 
     Not so where a graph is recorded or ``x`` is transformed (vmap, func.grad, jvp).
     """
-    if is_recorded():
+    if is_traced():
         return False
     try:
         x.detach().flatten()[:0].cpu().numpy()  # of what is transformed not even nothing
@@ -165,13 +164,13 @@ def has_values(x: Tensor) -> bool:
     return True
 
 
-def is_plain(x: Tensor) -> bool:
+def is_concrete(x: Tensor) -> bool:
     """Whether only values are asked for, and lie in memory that can be looked at.
 
     Not so where a gradient or a tangent is carried along, a graph is recorded, ``x`` is transformed
     (vmap), or lies on another device than the CPU.
     """
-    if x.device.type != "cpu" or is_recorded() or (x.requires_grad and torch.is_grad_enabled()):
+    if x.device.type != "cpu" or is_traced() or (x.requires_grad and torch.is_grad_enabled()):
         return False
     try:
         x.detach().numpy()  # under vmap and other transforms there is no memory to look at
@@ -366,6 +365,62 @@ def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
     names = sorted(tensors)
     head = torch.frombuffer(bytearray((text + "\n".join(names)).encode()), dtype=torch.uint8)
     return content_digest(head, *(tensors[name] for name in names))
+
+
+class SeenBatches(dict[str, str]):
+    """Which batches a statistic holds: their ids, each with a digest of what the batch held.
+
+    None is in it twice, none is taken out unseen, none is mixed with another.
+    """
+
+    def add(self, batch_id: str, digest: str) -> None:
+        """Note a batch.
+
+        Raises:
+            ValueError: if the id is there already.
+        """
+        if batch_id in self:
+            raise ValueError(f"batch {batch_id!r} is in these statistics already; add it once")
+        self[batch_id] = digest
+
+    def remove(self, batch_id: str, digest: str) -> None:
+        """Strike a batch out.
+
+        Raises:
+            ValueError: if it was never added, or held something else.
+        """
+        if batch_id not in self:
+            raise ValueError(f"batch {batch_id!r} was never added to these statistics")
+        if self[batch_id] != digest:
+            raise ValueError(
+                f"batch {batch_id!r} was added with other content; remove what was added"
+            )
+        del self[batch_id]
+
+    def merge(self, other: Mapping[str, str]) -> None:
+        """Take over other batches.
+
+        Raises:
+            ValueError: if a batch is in both; nothing is taken over then.
+        """
+        if both := sorted(self.keys() & other.keys()):
+            raise ValueError(
+                f"{len(both)} batches are in both statistics, such as {both[0]!r}; "
+                "merge each shard once"
+            )
+        self.update(other)
+
+
+def content_digest(*tensors: Tensor) -> str:
+    """A digest of dtype, shape and bytes of tensors."""
+    digest = hashlib.blake2b(digest_size=16)
+    for tensor in tensors:
+        digest.update(f"{tensor.dtype}{tuple(tensor.shape)}".encode())
+        if tensor.numel():  # an empty one may have strides that no view of bytes takes
+            flat = tensor.detach().cpu().contiguous().as_strided((tensor.numel(),), (1,))
+            content = flat.view(torch.uint8)  # which strides of axes of length 1 would not allow
+            digest.update(content.numpy().data)  # no copy, and NumPy need not know the dtype
+    return digest.hexdigest()
 
 
 LEAD = 31

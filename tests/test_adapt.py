@@ -170,7 +170,7 @@ def test_undo_restores_the_detector_to_the_bit_and_its_sums(run, files):
         adapt(settings(run, "action=undo"), run / "results")
         assert state()[0] == detector
         torch.testing.assert_close(state()[1].sums, sums.sums, rtol=0, atol=1e-11)
-        assert state()[1].ledger.entries == sums.ledger.entries
+        assert state()[1].seen_batches == sums.seen_batches
     with pytest.raises(ValueError, match="nothing to undo"):
         adapt(settings(run, "action=undo"), run / "results")
 
@@ -186,12 +186,12 @@ def test_what_is_forgotten_leaves_the_machine_it_came_to(run, files, trained):
 
 def test_a_training_material_is_forgotten_from_its_files(run, files):
     before = Statistics.load(run / "statistics.pt")
-    trained_on = [name for name in before.sums.ledger.entries if name.startswith("B")]
+    trained_on = [name for name in before.sums.seen_batches if name.startswith("B")]
     cycles = f"data.manifest={only(files, trained_on)}"
     adapt(settings(run, "action=forget", f"recordings={files}", cycles), run / "results")
     after = Statistics.load(run / "statistics.pt")
-    assert sorted(after.sums.ledger.entries) == sorted(
-        set(before.sums.ledger.entries) - set(trained_on)
+    assert sorted(after.sums.seen_batches) == sorted(
+        set(before.sums.seen_batches) - set(trained_on)
     )
     assert SlipDetector.load(run / "detector.pt").info["train_materials"] == ["A"]
 

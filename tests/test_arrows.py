@@ -20,7 +20,7 @@ ARROWS = {
     "report": (),
 }
 """Importer: what it may import beside itself and ``runtime``; what is not named may import all."""
-PART = {"runtime": ("ledger",), "deploy": ("graph",)}
+PART = {"deploy": ("graph",)}
 """Modules and folders that stand for a part until they are in its folder."""
 KNOWN = (
     ("analysis.certificate", "simulation."),

@@ -136,7 +136,9 @@ def test_too_few_materials_to_train_on_is_refused(tmp_path, num):
 
 def test_one_pass_keeps_training_and_test_cycles_apart():
     materials = read(SmallSet())
-    assert {name: len(s.ledger) for name, s in materials.surveys.items()} == dict.fromkeys("abc", 4)
+    assert {name: len(s.seen_batches) for name, s in materials.surveys.items()} == dict.fromkeys(
+        "abc", 4
+    )
     test = materials.bins_of(["b"], ("test",))
     assert len(test.is_slip) == 37
     assert torch.equal(test.represents, torch.ones(37, dtype=torch.float64))

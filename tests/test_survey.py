@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.selection import ClassMoments
 from tactslip_torch.features.survey import Survey
-from tactslip_torch.ledger import content_digest
+from tactslip_torch.runtime import content_digest
 
 NUM = 4
 
@@ -46,7 +46,7 @@ def bits_of(survey):
         name: (str(tensor.dtype), tuple(tensor.shape), tensor.numpy().tobytes())
         for name, tensor in tensors.items()
     }
-    return sorted(survey.ledger.entries.items()), sample["facts"], bits
+    return sorted(survey.seen_batches.items()), sample["facts"], bits
 
 
 def test_a_survey_is_its_parts():
@@ -64,7 +64,7 @@ def test_a_survey_is_its_parts():
     assert torch.equal(survey.minimum, features.amin(0))
     assert torch.equal(survey.maximum, features.amax(0))
     assert torch.equal(survey.sample.bins().features, sample.bins().features)
-    assert survey.ledger.entries == {r[0]: content_digest(r[2], r[3]) for r in recordings}
+    assert survey.seen_batches == {r[0]: content_digest(r[2], r[3]) for r in recordings}
     assert survey.num_features == NUM
     assert survey.minimum.dtype == survey.maximum.dtype == torch.float32
 
@@ -100,7 +100,7 @@ def test_ranges_without_bins_take_in_any_other():
     other.update("one", "a", torch.tensor([[-3.0, 5.0]]), torch.ones(1))
     survey.merge(other)
     assert survey.minimum.tolist() == survey.maximum.tolist() == [-3, 5]
-    assert len(survey.ledger) == 2
+    assert len(survey.seen_batches) == 2
 
 
 def test_layout_labels_and_gradients_do_not_matter():

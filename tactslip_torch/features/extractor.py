@@ -24,7 +24,7 @@ from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import saturating
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.runtime import for_each, is_plain
+from tactslip_torch.runtime import for_each, is_concrete
 from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import wavelet_steps
 
@@ -98,7 +98,7 @@ class FeatureExtractor:
         """
         self.pool.check(bins)
         dtype = dtype or bins.dtype
-        if not is_plain(bins):
+        if not is_concrete(bins):
             return self._by_reference(bins, dtype)
         with torch.inference_mode(False), torch.no_grad():  # what is kept outlives the mode
             flat = bins.detach().reshape(-1, *bins.shape[-2:])

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.runtime import has_values, is_plain, is_recorded
+from tactslip_torch.runtime import has_values, is_concrete, is_traced
 
 TINY = 1e-300
 """Instead of 0 in a divisor, where a quotient of 0 is to be 0."""
@@ -32,7 +32,7 @@ def ascending(x: Tensor, num: int) -> Tensor:
     """
     if not isinstance(x, Tensor):
         return x.ascending(num)
-    if is_plain(x):
+    if is_concrete(x):
         return torch.from_numpy(np.sort(x.detach().numpy(), axis=-1))
     return x.sort(-1).values
 
@@ -79,7 +79,7 @@ def bounded_gradient(x: Tensor) -> Tensor:
     Shape:
         - x, output: ``[*]``
     """
-    if not (x.requires_grad and torch.is_grad_enabled()) or is_recorded():
+    if not (x.requires_grad and torch.is_grad_enabled()) or is_traced():
         return x
     x = x.view_as(x)
     largest = torch.finfo(x.dtype).max

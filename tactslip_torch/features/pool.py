@@ -19,7 +19,7 @@ from tactslip_torch.features.names import pool_names
 from tactslip_torch.features.ops import bounded_gradient, saturating
 from tactslip_torch.features.plan import Plan, make_plan
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.runtime import is_recorded
+from tactslip_torch.runtime import is_traced
 from tactslip_torch.signals.spectrum import SpectrumMethod
 from tactslip_torch.signals.wavelet import WaveletFilters, as_wavelet, wavelet_fact
 
@@ -191,7 +191,7 @@ class FeaturePool(nn.Module):
             - output: ``[*, C]``, bool
         """
         largest = min(LARGEST_SAMPLE, torch.finfo(bins.dtype).max)
-        if is_recorded():  # onnxruntime's maxima pass over NaN
+        if is_traced():  # onnxruntime's maxima pass over NaN
             return (~(bins.abs() <= largest)).any(-1)
         return ~(torch.maximum(bins.amax(-1), -bins.amin(-1)) <= largest)
 

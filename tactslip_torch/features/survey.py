@@ -7,11 +7,11 @@ from torch import Tensor
 
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.selection import ClassMoments
-from tactslip_torch.ledger import Ledger, content_digest
+from tactslip_torch.runtime import SeenBatches, content_digest
 
 
 class Survey:
-    """Moments, ranges and a sample of training bins, with a ledger of their recordings.
+    """Moments, ranges and a sample of training bins, and which recordings they are of.
 
     Memory grows with the sample and the number of recordings, not with that of bins. Ranges and
     the sample forget what they pass over, so a recording cannot be taken out again: survey the
@@ -26,7 +26,7 @@ class Survey:
         minimum: ``[F]``, float32, of all bins; +inf without any.
         maximum: ``[F]``, float32; -inf without any.
         sample: bins by group and class.
-        ledger: recording names and digests of their bins.
+        seen_batches: recording names and digests of their bins.
     """
 
     def __init__(self, num_features: int, sample_bins: int) -> None:
@@ -34,7 +34,7 @@ class Survey:
         self.minimum = torch.full((num_features,), torch.inf)
         self.maximum = torch.full((num_features,), -torch.inf)
         self.sample = BinSample(sample_bins)
-        self.ledger = Ledger()
+        self.seen_batches = SeenBatches()
 
     @property
     def num_features(self) -> int:
@@ -54,11 +54,11 @@ class Survey:
         """
         features, is_slip = features.detach().cpu(), is_slip.cpu().bool()
         digest = content_digest(features, is_slip)
-        self.ledger.add(recording, digest)
+        self.seen_batches.add(recording, digest)
         try:
             self.moments.update(features, is_slip)
         except ValueError as error:
-            self.ledger.remove(recording, digest)
+            self.seen_batches.remove(recording, digest)
             raise ValueError(f"recording {recording!r}: {error}") from None
         self.sample.update(recording, group, features, is_slip)
         if len(features):
@@ -74,7 +74,7 @@ class Survey:
         if (ours := self.sample.most) != (theirs := other.sample.most):
             raise ValueError(f"cannot merge surveys of {ours} and {theirs} sample_bins")
         moments = self.moments.merge(other.moments)
-        self.ledger.merge(other.ledger)
+        self.seen_batches.merge(other.seen_batches)
         self.moments = moments
         self.sample.merge(other.sample)
         self._widen(other.minimum, other.maximum)

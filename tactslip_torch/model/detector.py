@@ -28,7 +28,7 @@ from tactslip_torch.model.missing_channels import (
 )
 from tactslip_torch.model.prediction import Nonfinite, Prediction, check_nonfinite, predict_in_parts
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.runtime import is_plain, load_table, save_table, table_form
+from tactslip_torch.runtime import is_concrete, load_table, save_table, table_form
 from tactslip_torch.signals.filtering import ChannelFilter
 
 FORMAT = "tactslip_torch detector 3"
@@ -281,7 +281,7 @@ class SlipDetector(nn.Module):
     def _few_bins(self, bins: Tensor, most: int) -> FewBins | None:
         """The way for few bins and values alone, if this is one for it."""
         is_watched = any(m._forward_hooks or m._forward_pre_hooks for m in (self.scaler, self.head))
-        if is_watched or not is_plain(bins) or bins.shape[:-2].numel() > most:
+        if is_watched or not is_concrete(bins) or bins.shape[:-2].numel() > most:
             return None
         if self._few is None or not self._few.is_of(self):
             self._few = FewBins(self) if FewBins.suits(self.scaler, self.head) else None

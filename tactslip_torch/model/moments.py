@@ -19,10 +19,9 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from tactslip_torch.ledger import Ledger, content_digest, first_difference
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.solve import solve_symmetric
-from tactslip_torch.runtime import load_table, save_table
+from tactslip_torch.runtime import SeenBatches, content_digest, load_table, save_table
 
 FORMAT = "tactslip_torch sums 2"
 _CLASSES = ("non-slip", "slip")
@@ -46,7 +45,7 @@ class SufficientStats:
     Attributes:
         sums: ``[2, num_held]``, float64: of non-slip and slip, as ``ProductSums`` lays them out.
         count: ``[2]``, int64: number of bins.
-        ledger: names and digests of batches.
+        seen_batches: names and digests of batches.
         about: as given.
 
     Raises:
@@ -56,7 +55,7 @@ class SufficientStats:
         >>> stats = SufficientStats(2)
         >>> z = torch.tensor([[0.5, -0.25], [-0.5, 0.0], [1.0, 0.5]])
         >>> stats.update("M1/c00", z, torch.tensor([True, False, True]))
-        >>> stats.count, len(stats.ledger)
+        >>> stats.count, len(stats.seen_batches)
         (tensor([1, 2]), 1)
         >>> stats.solve(penalty=1.0)(z.double()) > 0
         tensor([ True, False,  True])
@@ -74,7 +73,7 @@ class SufficientStats:
         self._layout = ProductSums(num_features, degree)
         self.sums = torch.zeros(2, self._layout.num_held, dtype=torch.float64)
         self.count = torch.zeros(2, dtype=torch.int64)
-        self.ledger = Ledger()
+        self.seen_batches = SeenBatches()
 
     @property
     def weight(self) -> Tensor:
@@ -100,7 +99,7 @@ class SufficientStats:
                 allowed.
         """
         batch = self._checked(batch_id, z, is_slip, weights)
-        self.ledger.add(batch_id, content_digest(*batch))
+        self.seen_batches.add(batch_id, content_digest(*batch))
         self._add(*batch, sign=1)
 
     def remove(
@@ -118,7 +117,7 @@ class SufficientStats:
             ValueError: if the batch was never added or held something else.
         """
         batch = self._checked(batch_id, z, is_slip, weights)
-        self.ledger.remove(batch_id, content_digest(*batch))
+        self.seen_batches.remove(batch_id, content_digest(*batch))
         self._add(*batch, sign=-1)
         self.sums[self.count == 0] = 0.0
 
@@ -130,9 +129,9 @@ class SufficientStats:
                 degree or in the number of features.
         """
         for name in ("num_features", "degree", "about"):
-            if found := first_difference(getattr(self, name), getattr(other, name), name):
+            if found := _first_difference(getattr(self, name), getattr(other, name), name):
                 raise ValueError(f"cannot merge sums that differ in {found}")
-        self.ledger.merge(other.ledger)
+        self.seen_batches.merge(other.seen_batches)
         self.sums += other.sums
         self.count += other.count
 
@@ -142,7 +141,7 @@ class SufficientStats:
             "num_features": self.num_features,
             "degree": self.degree,
             "about": self.about,
-            "batches": self.ledger.entries,
+            "batches": self.seen_batches,
         }
         save_table(path, FORMAT, facts, {"sums": self.sums, "count": self.count})
 
@@ -156,7 +155,7 @@ class SufficientStats:
         """
         facts, tensors = load_table(path, FORMAT)
         stats = cls(facts["num_features"], facts["about"], facts["degree"])
-        stats.ledger = Ledger(facts["batches"])
+        stats.seen_batches = SeenBatches(facts["batches"])
         stats.sums, stats.count = tensors["sums"], tensors["count"]
         return stats
 
@@ -399,3 +398,28 @@ class ProductSums:
 
 def _triangle(num: int) -> int:
     return num * (num + 1) // 2
+
+
+def _first_difference(ours: Any, theirs: Any, name: str = "") -> str:
+    """The path of the first differing key of nested mappings and lists, with both values."""
+    if ours == theirs:
+        return ""
+    if type(ours) is type(theirs) is list:
+        ours, theirs = dict(enumerate(ours)), dict(enumerate(theirs))
+    if type(ours) is type(theirs) is dict:
+        for key in sorted(ours.keys() | theirs.keys()):
+            ours_there = ours.get(key, _ABSENT)
+            found = _first_difference(ours_there, theirs.get(key, _ABSENT), f"{name}.{key}")
+            if found:
+                return found
+    return f"{name.removeprefix('.')}: {_shown(ours)} and {_shown(theirs)}"
+
+
+_ABSENT = object()
+
+
+def _shown(value: Any) -> str:
+    if value is _ABSENT:
+        return "nothing"
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

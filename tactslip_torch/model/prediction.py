@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple, TypeVar, get_args
 import torch
 from torch import Tensor
 
-from tactslip_torch.runtime import in_parts, is_plain
+from tactslip_torch.runtime import in_parts, is_concrete
 from tactslip_torch.signals.binning import refuse_nonfinite
 
 Nonfinite = Literal["mask", "raise"]
@@ -52,7 +52,7 @@ def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
 
 def predict_in_parts(predict: Callable[[Tensor], Said], x: Tensor) -> Said:
     """What ``predict`` says of bins ``[*, C, n]``: of many in parts that stay in a cache."""
-    if not is_plain(x) or x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS:
+    if not is_concrete(x) or x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS:
         return predict(x)
 
     def joined(parts: Sequence[Tensor]) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from tactslip_torch.features.pooling import signed_log as signed_log
-from tactslip_torch.runtime import is_plain
+from tactslip_torch.runtime import is_concrete
 
 _COLUMNS = 128  # sorted at a time, which keeps memory small
 
@@ -110,7 +110,7 @@ class FeatureScaler(nn.Module):
         if self.knee is not None:
             features = signed_log(features, self.knee)
         width = self.maximum - self.minimum
-        if is_plain(width) and width.numel() and width.numpy().min() > 0:
+        if is_concrete(width) and width.numel() and width.numpy().min() > 0:
             return (2 * ((features - self.minimum) / width) - 1).clamp(-1, 1)
         is_constant = width == 0
         relative = (features - self.minimum) / torch.where(is_constant, 1.0, width)

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.runtime import is_plain
+from tactslip_torch.runtime import is_concrete
 
 Align = Literal["centred", "causal", "trailing"]
 """Which part of its frame's polynomial a sample takes, and where the frame lies.
@@ -401,7 +401,7 @@ class ChannelFilter(nn.Module):
                 f"expected bins with {self.context_before} samples of context before and "
                 f"{self.context_after} behind, got {samples.shape[-1]} samples in all"
             )
-        if is_plain(samples) and samples.shape[:-2].numel() <= _FEW_BINS:
+        if is_concrete(samples) and samples.shape[:-2].numel() <= _FEW_BINS:
             return self._valid_of_few(samples, num_samples, channels)
         filtered = samples.narrow(-1, 0, num_samples).clone()
         for length, start, chosen, is_wanted in self._groups_for(channels):

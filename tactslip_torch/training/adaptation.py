@@ -490,7 +490,7 @@ def refitted(
     info[_JOURNAL] = [*info.get(_JOURNAL, []), dict(entry)]
     info["train_materials"] = [known.material_names[i] for i in known.material.unique()]
     keys = info.get("train_recordings", {}) | {n: b.key for n, b in statistics.bins.items()}
-    entries = statistics.sums.ledger.entries
+    entries = statistics.sums.seen_batches
     out = {name for name in statistics.bins if name not in entries}
     info["train_recordings"] = {n: key for n, key in keys.items() if n not in out}
     if info.get("calibration") or ALARM in info:

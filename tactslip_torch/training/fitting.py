@@ -12,10 +12,10 @@ from torch import Tensor
 
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.bin_sample import bin_keys
-from tactslip_torch.ledger import Ledger, content_digest
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Head, Polynomial
 from tactslip_torch.model.moments import SufficientStats
+from tactslip_torch.runtime import SeenBatches, content_digest
 from tactslip_torch.training.selection import Plan
 
 Made = TypeVar("Made")
@@ -33,7 +33,7 @@ class TrainingPass:
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self.ledger = Ledger()
+        self.seen_batches = SeenBatches()
         self.bins: dict[str, tuple[Tensor, ...]] = {}
         self.stats: SufficientStats | None = None
         if plan.adds_up:
@@ -64,7 +64,7 @@ class TrainingPass:
         if self.stats is not None:
             self.stats.update(recording, z, is_slip, weights)
             return
-        self.ledger.add(recording, content_digest(z, is_slip))
+        self.seen_batches.add(recording, content_digest(z, is_slip))
         self.bins[recording] = (z, is_slip, weights)
 
     def merge_processes(self) -> None:
@@ -77,11 +77,11 @@ class TrainingPass:
             return
         stats = self.stats
         if stats is None:
-            parts = of_all_processes((self.ledger, self.bins))
-            self.ledger = _merged(ledger for ledger, _ in parts)
+            parts = of_all_processes((self.seen_batches, self.bins))
+            self.seen_batches = _merged(seen for seen, _ in parts)
             self.bins = {name: own for _, bins in parts for name, own in bins.items()}
             return
-        stats.ledger = _merged(of_all_processes(stats.ledger))
+        stats.seen_batches = _merged(of_all_processes(stats.seen_batches))
         for total in (stats.sums, stats.count):
             torch.distributed.all_reduce(total)
 
@@ -160,8 +160,8 @@ def from_first_process(make: Callable[[], Made]) -> Made:
     return made
 
 
-def _merged(ledgers: Any) -> Ledger:
-    whole = Ledger()
-    for ledger in ledgers:
-        whole.merge(ledger)  # refuses a recording that two of them saw
+def _merged(parts: Any) -> SeenBatches:
+    whole = SeenBatches()
+    for seen in parts:
+        whole.merge(seen)  # refuses a recording that two of them saw
     return whole

@@ -19,10 +19,9 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
-from tactslip_torch.ledger import Ledger, content_digest
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.runtime import load_table, save_table
+from tactslip_torch.runtime import SeenBatches, content_digest, load_table, save_table
 from tactslip_torch.training.selection import Plan
 
 FILE = "statistics.pt"
@@ -189,7 +188,7 @@ class Statistics:
 
     def weight_of(self, recording: str) -> float:
         """Of a bin of a recording: 1 as trained, 0 if it is not in."""
-        return self.weights.get(recording, float(recording in self.sums.ledger.entries))
+        return self.weights.get(recording, float(recording in self.sums.seen_batches))
 
     def known(self) -> KnownBins:
         """Bins that are in the sums and known one by one."""
@@ -243,7 +242,7 @@ class Statistics:
             tensors[f"steps.{number}"] = step.file
         metadata = {
             "sums": {"num_features": self.sums.num_features, "about": self.sums.about},
-            "batches": self.sums.ledger.entries,
+            "batches": self.sums.seen_batches,
             "machine": vars(self.machine),
             "labels": dict(self.labels),
             "rehearsal": {name: rehearsal[name] for name in ("recordings", "materials")},
@@ -268,7 +267,7 @@ class Statistics:
         """
         metadata, tensors = load_table(path, FORMAT)
         sums = SufficientStats(**metadata["sums"])
-        sums.ledger = Ledger(metadata["batches"])
+        sums.seen_batches = SeenBatches(metadata["batches"])
         sums.sums, sums.count = tensors["sums"], tensors["count"]
 
         def bins(listed: Sequence[Sequence[str]], place: str) -> dict[str, RecordingBins]:

@@ -1,0 +1,395 @@
+"""Threads, processes, files that are written whole, tables of tensors, and batches seen."""
+
+import hashlib
+import os
+import pickle
+import random
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from tactslip_torch.runtime import (
+    SeenBatches,
+    content_digest,
+    for_each,
+    in_parts,
+    in_processes,
+    load_table,
+    save_table,
+    table_form,
+    whole_file,
+)
+
+
+@pytest.fixture(autouse=True)
+def _one_thread_again():
+    yield
+    torch.set_num_threads(1)
+
+
+# --- threads ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_every_item_is_worked_on_once_with_one_thread_inside(number):
+    torch.set_num_threads(number)
+    for num_items in (0, 1, 2, 50):
+        items, inside = [], []
+        for_each(items.append, iter(range(num_items)))
+        for_each(lambda _, to=inside: to.append(torch.get_num_threads()), range(num_items))
+        assert sorted(items) == list(range(num_items))
+        assert inside == [1] * num_items
+        assert torch.get_num_threads() == number
+    starts = range(0, 30, 4)
+    expected = [sum(range(start, min(start + 4, 30))) for start in starts]
+    assert in_parts(lambda part: int(part.sum()), torch.arange(30).split(4)) == expected
+
+
+def test_as_many_threads_as_asked_work_at_once():
+    torch.set_num_threads(3)
+    together = threading.Barrier(3, timeout=60)  # breaks, and raises, if fewer come
+    for_each(lambda _: together.wait(), range(3))
+
+
+def test_making_the_threads_leaves_the_number_for_others():
+    torch.set_num_threads(5)  # of no other test, so the pool is made here
+    for_each(lambda _: None, range(5))
+    numbers = [torch.get_num_threads()]
+    thread = threading.Thread(target=lambda: numbers.append(torch.get_num_threads()))
+    thread.start()
+    thread.join()
+    assert numbers == [5, 5]  # a thread that has not computed yet takes the process's number
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_results_do_not_depend_on_the_number_of_threads(rng, number):
+    a, b = (torch.from_numpy(rng.standard_normal(shape)) for shape in ((300, 50), (50, 70)))
+
+    def product():
+        out = torch.empty(300, 70, dtype=torch.float64)
+        for_each(lambda t: torch.mm(a[t : t + 64], b, out=out[t : t + 64]), range(0, 300, 64))
+        return out
+
+    one = product()
+    torch.set_num_threads(number)
+    torch.testing.assert_close(product(), one, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(one, a @ b)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_an_error_is_raised_and_stops_the_rest(number):
+    torch.set_num_threads(number)
+    begun = []
+
+    def fail_at_three(i):
+        begun.append(i)
+        if i == 3:
+            raise KeyError("three")
+        time.sleep(0.002)
+
+    with pytest.raises(KeyError, match="three"):
+        for_each(fail_at_three, range(1000))
+    assert len(begun) < 900
+    before = list(begun)
+    time.sleep(0.02)
+    assert begun == before  # nothing runs on behind the error
+    assert torch.get_num_threads() == number
+
+
+def test_nested_calls_run_where_they_are_and_modes_are_the_callers():
+    torch.set_num_threads(2)
+    pairs, modes = [], []
+    for_each(lambda i: for_each(lambda j: pairs.append((i, j)), range(3)), range(4))
+    assert sorted(pairs) == [(i, j) for i in range(4) for j in range(3)]
+
+    def note(_):
+        modes.append((torch.is_grad_enabled(), torch.is_inference_mode_enabled()))
+
+    for_each(note, [0])
+    with torch.no_grad():
+        for_each(note, [0])
+    with torch.inference_mode():
+        held = torch.zeros(2)
+        for_each(lambda i: held[i].add_(1), range(2))  # refused outside inference mode
+        for_each(note, [0])
+    assert modes == [(True, False), (False, False), (False, True)]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # from Python 3.12 on
+def test_a_forked_child_makes_its_own_threads():
+    torch.set_num_threads(2)
+    for_each(lambda _: None, range(2))
+    child = os.fork()
+    if child == 0:  # the parent's threads are not here; waiting for them would never end
+        items = []
+        for_each(items.append, range(5))
+        os._exit(0 if sorted(items) == list(range(5)) else 1)
+    deadline = time.monotonic() + 60
+    while (ended := os.waitpid(child, os.WNOHANG)) == (0, 0) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    if ended == (0, 0):
+        os.kill(child, 9)
+        os.waitpid(child, 0)
+    assert ended == (child, 0)
+
+
+# --- processes ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num_workers", [0, 1, 2, 3])
+def test_results_of_processes_come_in_order_and_functions_may_hold_anything(num_workers, capsys):
+    here = os.getpid()
+    found = list(in_processes(lambda x: (x, os.getpid()), range(7), "w", "item", num_workers))
+    assert [x for x, _ in found] == list(range(7))
+    assert (here in {process for _, process in found}) == (num_workers < 2)
+
+
+def test_an_error_in_a_worker_is_raised_here(capsys):
+    def fails(x):
+        if x == 2:
+            raise ValueError("item 2 is bad")
+        return x
+
+    with pytest.raises(ValueError, match="item 2 is bad"):
+        list(in_processes(fails, range(5), "w", "item", 2))
+    for number in (-1, 1.5, "two", True):
+        with pytest.raises(ValueError, match="num_workers must be null or a number from 0, got"):
+            list(in_processes(abs, range(4), "w", "item", number))
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+def names_in(folder):
+    return [path.name for path in folder.iterdir()]
+
+
+def test_a_file_shows_when_it_is_whole_and_its_folder_is_made(tmp_path):
+    path = tmp_path / "b" / "a.png"
+    for text in ("old", "new"):
+        with whole_file(str(path)) as temporary:
+            temporary.write_text(text)
+            assert temporary.parent == path.parent  # a rename across file systems is no rename
+            assert temporary.suffix == ".png"  # some writers go by it
+            assert not path.exists() if text == "old" else path.read_text() == "old"
+        assert path.read_text() == text
+    assert names_in(path.parent) == ["a.png"]
+
+
+@pytest.mark.parametrize("old", [None, "old"])
+def test_a_failure_leaves_the_old_content_and_no_temporary_file(tmp_path, old):
+    path = tmp_path / "a.txt"
+    if old is not None:
+        path.write_text(old)
+
+    def write(text):
+        with whole_file(path) as temporary:
+            if text:
+                temporary.write_text(text)
+            raise RuntimeError("power is out")
+
+    for text in ("half", ""):
+        with pytest.raises(RuntimeError, match="power is out"):
+            write(text)
+        assert names_in(tmp_path) == ([] if old is None else ["a.txt"])
+    if old is not None:
+        assert path.read_text() == old
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path):
+    """Process ids do not tell them apart: threads share one, and so may two containers."""
+    path = tmp_path / "a.txt"
+    with whole_file(path) as first, whole_file(path) as second:
+        assert first != second
+        first.write_text("first")
+        second.write_text("second")
+    assert path.read_text() == "first"  # left last
+    assert names_in(tmp_path) == ["a.txt"]
+
+
+# --- tables -------------------------------------------------------------------------------------
+
+FORM = "test table 1"
+VALUES = {"names": ["M1", "é\n"], "numbers": {"a": 0.1, "b": None}, "is_slip": True}
+
+
+def tables():
+    return {
+        "float": torch.arange(12.0).reshape(3, 4) / 7,
+        "double": torch.tensor(0.1, dtype=torch.float64),
+        "long": torch.tensor([-(2**63), 2**63 - 1]),
+        "bool": torch.tensor([[True], [False]]),
+        "half": torch.tensor([1.5, float("nan"), float("inf")], dtype=torch.bfloat16),
+        "empty": torch.zeros(0, 3, dtype=torch.int32),
+    }
+
+
+def refusal(path):
+    """The one line with which a file is refused; None if it is read as it was saved."""
+    try:
+        values, tensors = load_table(path, FORM)
+    except ValueError as error:
+        return str(error)
+    assert values == VALUES
+    assert tensors.keys() == tables().keys()
+    for name, tensor in tables().items():
+        assert (tensors[name].dtype, tensors[name].shape) == (tensor.dtype, tensor.shape)
+        assert content_digest(tensors[name]) == content_digest(tensor)
+    return None
+
+
+@pytest.fixture
+def saved(tmp_path):
+    save_table(tmp_path / "a.pt", FORM, VALUES, tables())
+    return tmp_path / "a.pt"
+
+
+def test_a_table_comes_back_and_the_same_content_gives_the_same_bytes(tmp_path, saved):
+    assert refusal(saved) is None
+    assert table_form(str(saved)) == FORM
+    backwards = dict(reversed(tables().items()))
+    backwards["float"] = torch.nn.Parameter(backwards["float"].T.contiguous().T)
+    backwards["long"] = torch.cat([backwards["long"], backwards["long"]])[:2]
+    save_table(tmp_path / "other.name", FORM, dict(reversed(VALUES.items())), backwards)
+    assert saved.read_bytes() == (tmp_path / "other.name").read_bytes()
+    save_table(tmp_path / "b.pt", FORM, {}, {"a": torch.zeros(100_000)[:5]})
+    assert (tmp_path / "b.pt").stat().st_size < 5000  # a view does not bring all it is a view of
+
+
+def test_a_flipped_byte_is_refused_in_one_line_wherever_it_counts(saved):
+    """Some bytes of an archive carry nothing (padding, times); the content stands then."""
+    whole, draw, num_refused = saved.read_bytes(), random.Random(0), 0
+    content = tables()["float"].numpy().tobytes()
+    places = [draw.randrange(len(whole)) for _ in range(150)]
+    certain = range(whole.index(content), whole.index(content) + len(content), 5)
+    for place in (*places, *certain):
+        saved.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        if (line := refusal(saved)) is not None:
+            num_refused += 1
+            assert "\n" not in line
+            assert str(saved) in line
+            assert "make it again" in line or "must be of format" in line
+        assert line is not None or place not in certain
+    assert num_refused > 30
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.999])
+def test_a_cut_file_is_refused(saved, kept):
+    whole = saved.read_bytes()
+    saved.write_bytes(whole[: int(kept * len(whole))])
+    assert refusal(saved) == f"{saved} is damaged or no file of ours; make it again"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"digest": "0" * 32},
+        {"digest": None},
+        {"facts": "{}"},
+        {"facts": 3},
+        {"tensors": {}},
+        {"tensors": [1, 2]},
+        {"tensors": {"float": 1.0}},
+        {"tensors": {3: torch.zeros(2), "a": torch.zeros(2)}},
+        {"tensors": {"float": torch.zeros(3).to_sparse()}},
+    ],
+)
+def test_content_that_does_not_fit_its_digest_is_refused(saved, change):
+    content = torch.load(saved, weights_only=True) | change
+    torch.save(content, saved)
+    assert refusal(saved) == f"{saved} is damaged; make it again"
+    content.pop(next(iter(change)))
+    torch.save(content, saved)
+    assert refusal(saved) == f"{saved} is damaged; make it again"
+
+
+class Trap:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return type(self.mark).mkdir, (self.mark,)
+
+
+def test_other_files_are_refused_and_nothing_in_them_is_executed(tmp_path):
+    path, mark = tmp_path / "a.pt", tmp_path / "sprung"
+    trapped = {"format": FORM, "facts": "{}", "tensors": {}, "digest": Trap(mark)}
+    for content in (torch.zeros(3), {"format": torch.zeros(3)}, [FORM], {}, None, trapped):
+        torch.save(content, path)
+        assert refusal(path) == f"{path} is damaged or no file of ours; make it again"
+    path.write_bytes(pickle.dumps(Trap(mark)))
+    with pytest.raises(ValueError, match="no file of ours"):
+        table_form(path)
+    assert not mark.exists()
+    pickle.loads(path.read_bytes())
+    assert mark.exists(), "the trap is none"
+    save_table(path, "test table 2", VALUES, tables())
+    assert refusal(path) == f"{path} must be of format 'test table 1', got 'test table 2'"
+    for read in (lambda path: load_table(path, FORM), table_form):
+        with pytest.raises(FileNotFoundError, match=r"no file at .*nowhere\.pt"):
+            read(tmp_path / "nowhere.pt")
+
+
+def test_a_failed_save_leaves_the_old_table(tmp_path, saved):
+    with pytest.raises(TypeError, match="JSON"):
+        save_table(saved, FORM, {"a": object()}, {})
+    with pytest.raises(AttributeError):
+        save_table(saved, FORM, {}, {"a": 3})
+    assert refusal(saved) is None
+    assert names_in(tmp_path) == ["a.pt"]
+
+
+# --- batches seen and digests -------------------------------------------------------------------
+
+
+def test_a_batch_is_seen_once_and_removed_as_it_was():
+    source = {"a": "1"}
+    seen = SeenBatches(source)
+    seen.add("b", "1")
+    assert source == {"a": "1"}
+    assert seen == {"a": "1", "b": "1"}
+    for refused, message in (
+        (lambda: seen.add("a", "1"), r"'a' is in these statistics already; add it once"),
+        (lambda: seen.remove("c", "1"), r"'c' was never added"),
+        (lambda: seen.remove("a", "2"), r"'a' was added with other content"),
+        (lambda: seen.merge(SeenBatches({"c": "1", "b": "2"})), r"^1 .*such as 'b'; merge each"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            refused()
+        assert seen == {"a": "1", "b": "1"}
+    seen.remove("a", "1")
+    seen.merge(SeenBatches({"a": "2"}))
+    assert seen == {"b": "1", "a": "2"}
+
+
+def test_a_digest_is_of_dtype_shape_and_bytes():
+    expected = hashlib.blake2b(digest_size=16)
+    expected.update(b"torch.float32(2, 3)" + np.arange(6, dtype="<f4").tobytes())
+    expected.update(b"torch.bool(1,)\x01")
+    digest = content_digest(torch.arange(6.0).reshape(2, 3), torch.tensor([True]))
+    assert digest == expected.hexdigest()
+    tensors = [torch.zeros(shape) for shape in ((6,), (2, 3), (3, 2), (7,), (0,), (0, 3), ())]
+    tensors += [torch.zeros(6, dtype=torch.int32), torch.tensor([0, 0, 0, 0, 0, -0.0])]
+    digests = {content_digest(tensor) for tensor in tensors}
+    digests |= {content_digest(tensors[0], tensors[1]), content_digest(tensors[1], tensors[0])}
+    assert len(digests) == len(tensors) + 2
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.bool, torch.int64])
+def test_a_digest_does_not_see_layout_gradients_or_device(dtype, device):
+    tensor = torch.arange(12).reshape(3, 4).to(dtype)
+    digest = content_digest(tensor)
+    for same in (
+        tensor.T.contiguous().T,
+        torch.stack([tensor, tensor], dim=-1)[..., 0],
+        tensor.to(device),
+        tensor.requires_grad_() if dtype.is_floating_point else tensor,
+    ):
+        assert content_digest(same) == digest
+    odd = torch.zeros(1).as_strided((1,), (3,))  # a lone value may have any stride
+    assert content_digest(odd) == content_digest(torch.zeros(1))
