@@ -174,9 +174,9 @@ class HandLayout:
             for segment in ("distal", "middle", "proximal")
         ] + [("thumb", "distal"), ("thumb", "proximal")]
         with_film = [place for place in places if place[0] == "thumb" or place[1] != "proximal"]
-        gauges = [Channel(f"SG{i}", "SG", *place) for i, place in enumerate(places, 1)]
-        films = [Channel(f"PVDF{i}", "PVDF", *place) for i, place in enumerate(with_film, 1)]
-        return cls(tuple(gauges + films))
+        slow = [Channel(f"SG{i}", "SG", *place) for i, place in enumerate(places, 1)]
+        fast = [Channel(f"PVDF{i}", "PVDF", *place) for i, place in enumerate(with_film, 1)]
+        return cls(tuple(slow + fast))
 
     @classmethod
     def from_rows(cls, rows: Iterable[Mapping[str, str]]) -> HandLayout:

@@ -286,19 +286,22 @@ def plain(value: Any) -> Any:
 
 
 def save_table(
-    path: str | os.PathLike[str], form: str, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]
+    path: str | os.PathLike[str],
+    form: str,
+    metadata: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
 ) -> None:
-    """Write tensors and JSON-able facts to one file, whole or not at all.
+    """Write tensors and JSON-able metadata to one file, whole or not at all.
 
-    The same facts and tensors give the same bytes. Of a view, no more is written than it shows.
+    The same metadata and tensors give the same bytes. Of a view, no more is written than it shows.
 
     Args:
         path: of the file.
         form: names format and version; ``load_table`` wants the same.
-        facts: kept as JSON text.
+        metadata: kept as JSON text.
         tensors: by name.
     """
-    text = json.dumps(facts, sort_keys=True)
+    text = json.dumps(metadata, sort_keys=True)
     content = {
         "format": form,
         "facts": text,
@@ -310,7 +313,7 @@ def save_table(
 
 
 def load_table(path: str | os.PathLike[str], form: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Facts and tensors of a file that ``save_table`` wrote; nothing in it is executed.
+    """Metadata and tensors of a file that ``save_table`` wrote; nothing in it is executed.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -321,13 +324,13 @@ def load_table(path: str | os.PathLike[str], form: str) -> tuple[dict[str, Any],
     if content["format"] != form:
         raise ValueError(f"{name} must be of format {form!r}, got {content['format']!r}")
     try:
-        facts, tensors = content["facts"], content["tensors"]
-        is_whole = content["digest"] == _digest(facts, tensors)
+        metadata, tensors = content["facts"], content["tensors"]
+        is_whole = content["digest"] == _digest(metadata, tensors)
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError):
         is_whole = False
     if not is_whole:
         raise ValueError(f"{name} is damaged; make it again")
-    return json.loads(facts), tensors
+    return json.loads(metadata), tensors
 
 
 def table_form(path: str | os.PathLike[str]) -> str:
@@ -514,8 +517,8 @@ def in_processes(
     context = multiprocessing.get_context("fork")
     with ProcessPoolExecutor(count, context, _start, (function,)) as pool:
         try:
-            found = pool.map(_call, items)
-            yield from bar(found, what, unit, total=len(items))
+            results = pool.map(_call, items)
+            yield from bar(results, what, unit, total=len(items))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise

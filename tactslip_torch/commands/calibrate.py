@@ -272,10 +272,10 @@ def _check(config: DictConfig) -> None:
 
 def _changed_sections(config: DictConfig) -> list[str]:
     """Groups of the configuration that are not as ``conf/calibrate.yaml`` composes them."""
-    own: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "calibrate.yaml"))
-    options = {k: v for entry in own["defaults"] if entry != "_self_" for k, v in entry.items()}
+    default: Any = OmegaConf.to_container(OmegaConf.load(conf_dir() / "calibrate.yaml"))
+    options = {k: v for entry in default["defaults"] if entry != "_self_" for k, v in entry.items()}
     groups: Any = {k: OmegaConf.load(conf_dir() / k / f"{v}.yaml") for k, v in options.items()}
-    whole: Any = OmegaConf.to_container(OmegaConf.merge(groups, own))
+    whole: Any = OmegaConf.to_container(OmegaConf.merge(groups, default))
     given: Any = OmegaConf.to_container(config)  # unresolved: seeds come in turn
     return [group for group in groups if given[group] != whole[group]]
 

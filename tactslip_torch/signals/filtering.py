@@ -353,7 +353,7 @@ class ChannelFilter(nn.Module):
             "align": self.align,
         }
         if self.kernels:
-            config["kernels"] = {str(length): list(own) for length, own in self.kernels.items()}
+            config["kernels"] = {str(length): list(taps) for length, taps in self.kernels.items()}
         return config
 
     def forward(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:
@@ -373,8 +373,8 @@ class ChannelFilter(nn.Module):
         filtered = samples.clone()
         for length, _, channels_of, is_wanted in self._groups_for(channels):
             if is_wanted:
-                own = samples[..., channels_of, :]
-                filtered[..., channels_of, :] = self._edges[length].filtered(own)
+                raw = samples[..., channels_of, :]
+                filtered[..., channels_of, :] = self._edges[length].filtered(raw)
         return filtered
 
     def valid(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:

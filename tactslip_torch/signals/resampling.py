@@ -67,11 +67,13 @@ def resample(samples: Tensor, from_hz: float, to_hz: float) -> Tensor:
     padded = np.pad(np.where(is_good, x - offset, 0.0), margin, mode="edge")
     from scipy.signal import resample_poly  # takes half a second to import
 
-    found = resample_poly(padded, up, down, axis=-1)
-    found = found[:, blocks * up : blocks * up + num] + offset  # which would ripple a little
+    resampled = resample_poly(padded, up, down, axis=-1)
+    resampled = (
+        resampled[:, blocks * up : blocks * up + num] + offset
+    )  # which would ripple a little
     for row in np.flatnonzero(~is_good.all(-1)):
-        found[row, _is_reached(~is_good[row], num, up, down)] = np.nan
-    return torch.from_numpy(found).to(samples)
+        resampled[row, _is_reached(~is_good[row], num, up, down)] = np.nan
+    return torch.from_numpy(resampled).to(samples)
 
 
 def _ratio(from_hz: float, to_hz: float) -> Fraction:

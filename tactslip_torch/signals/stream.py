@@ -57,8 +57,8 @@ class FilterStream:
         self.look_ahead = max(after for _, after in reaches)
         self._groups = list[tuple[slice | list[int], Edges]]()
         for length in dict.fromkeys(lengths[channel] for channel in wanted):
-            own = [channel for channel in wanted if lengths[channel] == length]
-            self._groups.append((as_index(own), channel_filter.edges(own[0])))
+            group = [channel for channel in wanted if lengths[channel] == length]
+            self._groups.append((as_index(group), channel_filter.edges(group[0])))
         self.reset()
 
     def reset(self) -> None:
@@ -145,12 +145,12 @@ class FilterStream:
         first = max(start, before)
         last = min(stop, self.num_pushed - after)
         begin = first - before - self._num_dropped
-        parts = [convolve_valid(held[:, begin : begin + last - first + length - 1], kernel)]
+        pieces = [convolve_valid(held[:, begin : begin + last - first + length - 1], kernel)]
         if start == 0:
-            parts.insert(0, held[:, :length] @ head.T)
+            pieces.insert(0, held[:, :length] @ head.T)
         if stop > last:
-            parts.append(held[:, -length:] @ tail[last - self.num_pushed + after :].T)
-        return torch.cat(parts, dim=-1)
+            pieces.append(held[:, -length:] @ tail[last - self.num_pushed + after :].T)
+        return torch.cat(pieces, dim=-1)
 
 
 class SampleClock:

@@ -23,6 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from importlib.util import find_spec
+from itertools import chain
 
 import numpy as np
 import torch
@@ -407,16 +408,16 @@ def traces_of(
     if find_spec("numba") is None and engine == "auto":
         _say_slow()
     slides = [_slides_of(scene) for scene in scenes]
-    alike: dict[tuple[float, ...], list[_Slide]] = {}
-    for slide in (slide for own in slides for slide in own):
+    groups: dict[tuple[float, ...], list[_Slide]] = {}
+    for slide in chain.from_iterable(slides):
         scene = slide.scene
         every, num_bristles = _steps_per_sample(scene), scene.dynamics.num_bristles
-        alike.setdefault((slide.num, every, scene.sample_rate_hz, num_bristles), []).append(slide)
+        groups.setdefault((slide.num, every, scene.sample_rate_hz, num_bristles), []).append(slide)
     traces: dict[_Slide, StrokeTrace] = {}
-    for together in alike.values():
-        made = _integrated(together, torch.device(device), dtype, engine)
-        traces.update(zip(together, made, strict=True))
-    return [tuple(traces[slide] for slide in own) for own in slides]
+    for group in groups.values():
+        made = _integrated(group, torch.device(device), dtype, engine)
+        traces.update(zip(group, made, strict=True))
+    return [tuple(traces[slide] for slide in of_scene) for of_scene in slides]
 
 
 @cache
@@ -456,8 +457,8 @@ def _integrated(
     whole = np.concatenate([start[:, None], whole], axis=1)
     ends = np.cumsum([len(slide.shear) for slide in slides])[:-1]
     by = integrator(engine, dtype, device)
-    own = np.split(whole, ends, axis=2)
-    return [_trace(slide, values, by) for slide, values in zip(slides, own, strict=True)]
+    pieces = np.split(whole, ends, axis=2)
+    return [_trace(slide, values, by) for slide, values in zip(slides, pieces, strict=True)]
 
 
 def _trace(slide: _Slide, values: Array, by: Mapping[str, str]) -> StrokeTrace:

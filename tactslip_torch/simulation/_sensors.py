@@ -261,8 +261,8 @@ def slow_volts(scene: Scene, normal_n: Array, friction_n: Array, vibration: Vibr
     sensors = scene.sensors
     shear_v = sensors.sg_shear_v_per_n * friction_n
     shear_v = shear_v * (1.0 + _FORCE_FLUCTUATION * vibration.fluctuation)
-    heard = _SG_VIBRATION * (vibration.high + vibration.low)
-    return sensors.sg_preload_v_per_n * normal_n + shear_v + heard
+    vibration_v = _SG_VIBRATION * (vibration.high + vibration.low)
+    return sensors.sg_preload_v_per_n * normal_n + shear_v + vibration_v
 
 
 def fast_volts(scene: Scene, grid: Grid, force_n: Array, vibration: Vibration) -> Array:

@@ -2,7 +2,7 @@
 
 Defaults are the starting values of PHYSICS.md unless marked. Every ``*_spread`` is the standard
 deviation of the logarithm of a factor of median 1. Three parameters are *calibrated*: set once, by
-``python -m tactslip_torch calibrate``, on seen-material test accuracy and the qualitative facts
+``python -m tactslip_torch calibrate``, on seen-material test accuracy and the signal checks
 alone, and frozen with where they come from in ``calibrated.json``. They move together along one
 line of difficulty: ``d`` prior standard deviations harder means less friction noise, longer
 presliding and more bursts, each by its own spread to the power ``d``.
@@ -308,10 +308,10 @@ class Disturbances(_Parameters):
         motor_vibration_mv: rms of the vibration felt in every channel while the arm moves, at
             40 mm/s. In the paper's data slip *is* arm motion, so this one alone can tell slip.
             A pair is a range, drawn per recording, log-uniform.
-        mains_bursts_per_s: stretches of a tenth to a whole second in which the mains is stronger
+        mains_bursts_per_s: intervals of a tenth to a whole second in which the mains is stronger
             (a welder, a lift).
         mains_burst_mv: added amplitude of the fundamental in them, with its harmonics.
-        machine_mv: vibration of a neighbouring machine, rms, felt in every channel, in stretches
+        machine_mv: vibration of a neighbouring machine, rms, felt in every channel, in intervals
             that start and stop with the machine.
         machine_hz: range of its rotation; it has harmonics (prior, ours).
         burst_rate_hz: *calibrated.* Random bursts (knocks) a second.

@@ -176,10 +176,10 @@ def simulate_many(
         for start in range(0, len(scenes), at_once):
             some = scenes[start : start + at_once]
             distinct = list(dict.fromkeys(one for one in some if one.fidelity == "bristles"))
-            found = traces_of(distinct, device=device, dtype=dtype, engine=engine)
-            traces = dict(zip(distinct, found, strict=True))
-            for scene, own in zip(some, wanted[start : start + at_once], strict=True):
-                yield _recording(scene, traces.get(scene), own, channels)
+            integrated = traces_of(distinct, device=device, dtype=dtype, engine=engine)
+            traces = dict(zip(distinct, integrated, strict=True))
+            for scene, intervals in zip(some, wanted[start : start + at_once], strict=True):
+                yield _recording(scene, traces.get(scene), intervals, channels)
 
     return made()
 

@@ -28,7 +28,7 @@ class SimulatedRecordings:
             the kind's own number. They start from the same parameters as ``scene``.
         sessions: mountings of every material, each with all its cycles and kinds of scenes. The
             first one's recordings are those of a set with one session; further ones are named
-            "2", "3" and so on, and draw everything that belongs to a mounting anew: noise floor,
+            "2", "3" and so on, and draw everything that belongs to a mounting again: noise floor,
             mains, gains, offsets, load shares, couplings, skin, and the surface's own sample.
 
     Raises:
@@ -61,12 +61,14 @@ class SimulatedRecordings:
         self.hand = HandLayout.paper24() if channels is None else HandLayout.from_rows(channels)
         base = {"fidelity": fidelity, "name": PAPER, **(scene or {})}
         kinds = [{**base, "cycles": cycles}]
-        kinds += [{**kinds[0], **own, "name": name} for name, own in (others or {}).items()]
+        kinds += [{**kinds[0], **changes, "name": name} for name, changes in (others or {}).items()]
         materials = tuple(materials)
         self._scenes: dict[RecordingId, Scene] = {}
         for number in range(1, sessions + 1):
-            for own in kinds:
-                for scene_of in paper_scenes(seed=seed, materials=materials, hand=self.hand, **own):
+            for kind in kinds:
+                for scene_of in paper_scenes(
+                    seed=seed, materials=materials, hand=self.hand, **kind
+                ):
                     session = "" if number == 1 else str(number)
                     mounted = _in_session(scene_of, session)
                     name = RecordingId(mounted.material, mounted.cycle, mounted.name, session)
