@@ -98,7 +98,7 @@ class Bank:
             wanted[plan.rows[each.row]].add(each.descriptor)
         families = (_Family(maps, wanted, frames, is_film) for is_film in (False, True))
         self._families = [family for family in families if family.blocks]
-        self._forms: list[_Form] = []
+        self._sets: list[_RowSet] = []
         for is_freq in (False, True):
             own = {row: names for row, names in wanted.items() if (row.kind == "freq") == is_freq}
             steps = {row: names.intersection(ORDERED) for row, names in own.items()}
@@ -106,12 +106,12 @@ class Bank:
             sets = [(own, dtype)]
             if dtype != torch.float64:
                 sets = [(steps, torch.float64), (rest, dtype)]
-            for names_of, of_rows in sets:
+            for names_of, own_dtype in sets:
                 names_of = {row: names for row, names in names_of.items() if names}
                 if names_of:
-                    self._forms.append(_Form(self._families, maps, names_of, is_freq, of_rows))
+                    self._sets.append(_RowSet(self._families, maps, names_of, is_freq, own_dtype))
         self._ratios = [_Ratios(maps, plan, frame) for frame in frames]
-        made = [place for form in self._forms for place in form.made]
+        made = [place for rows in self._sets for place in rows.made]
         made += [place for ratios in self._ratios for place in ratios.made]
         column = {place: index for index, place in enumerate(made)}
         order = [0] * plan.num_features
@@ -132,7 +132,7 @@ class Bank:
             samples: of each frame.
         """
         families = [_Coordinates(family, samples) for family in self._families]
-        made = [value for form in self._forms for value in form(families)]
+        made = [value for rows in self._sets for value in rows(families)]
         made += [
             ratios(own, self.dtype)
             for ratios, own in zip(self._ratios, samples, strict=True)
@@ -206,60 +206,48 @@ class _Family:
         self.of_block = _ones_of(widths)  # [K, b]
         self.sums = torch.tensor(self.ends) - 1
         self.without_sum = self.of_block.index_fill(0, self.sums, 0.0)
-        of_sum = self.of_block - self.without_sum
-        self.with_mean = self.without_sum + of_sum / self.num
+        self.of_sum = self.of_block - self.without_sum
+        self.with_mean = self.without_sum + self.of_sum / self.num
         self.stays = torch.tensor([float(not each.is_detail) for each in blocks]).double()
 
 
 class _Coordinates:
-    """The coordinates of a family's channels, and what is made of them."""
+    """The coordinates of a family's channels, brought to length one, for branches and for spectra.
+
+    Attributes:
+        scaled: by whether they are for spectra, ``[*, c, K]``; exactly 0 but for the sum where a
+            block is constant, and 0 for constant details.
+        length: by which they were divided: of a block less its mean, of spectra in full,
+            ``[*, c, b]``.
+        mean: of the samples of each block, over its length, ``[*, c, b]``.
+        scale: largest magnitude of the filtered bins, ``[*, c]``.
+        unit: of all these but ``scaled`` and ``mean``, ``[*, c]``; None: volts.
+    """
 
     def __init__(self, family: _Family, samples: Sequence[Samples]) -> None:
         own = [samples[i] for i in family.frames]
-        x = torch.cat(
-            [
-                each.shifted @ like(m, each.shifted)
-                for each, m in zip(own, family.into, strict=True)
-            ],
-            dim=-2,
-        )
-        self.family = family
-        self.scale = torch.cat([each.scale for each in own], dim=-1)  # [*, c]
+        parts = zip((each.shifted for each in own), family.into, strict=True)
+        x = torch.cat([shifted @ like(into, shifted) for shifted, into in parts], dim=-2)
+        self.scale = torch.cat([each.scale for each in own], dim=-1)
         units = [each.unit for each in own if each.unit is not None]
         self.unit = torch.cat(units, dim=-1) if units else None
         self._moving = [each.moving for each in own]
-        squares = x.detach() * x.detach()
-        length = (squares @ like(family.without_sum, x)).sqrt()  # [*, c, b]
+        length = _length(x, family.without_sum)
         least = (self.scale * _LEAST_LENGTH).clamp(min=TINY)[..., None]
         is_kept = (length >= least).double()
-        self._x, self._is_kept = x, is_kept
-        self._made: dict[tuple[bool, torch.dtype], Tensor] = {}
-        self._lengths = {False: torch.maximum(length, least)}
-        self._scaled = {False: x * ((is_kept / self._lengths[False]) @ like(family.of_block.T, x))}
-
-    def length(self, is_freq: bool) -> Tensor:
-        """Length of each block, of spectra with its mean, ``[*, c, b]``; positive."""
-        self.scaled(is_freq, torch.float64)
-        return self._lengths[is_freq]
-
-    def scaled(self, is_freq: bool, dtype: torch.dtype) -> Tensor:
-        """Coordinates of length one, exactly 0 but for the mean where a block is constant."""
-        if is_freq not in self._scaled:
-            x, family = self._x, self.family
-            kept = self._is_kept @ like(family.without_sum.T, x)
-            kept = kept + self._mean_kept() @ like((family.of_block - family.without_sum).T, x)
-            x = x * kept
-            length = ((x.detach() * x.detach()) @ like(family.with_mean, x)).sqrt().clamp(min=TINY)
-            self._lengths[True] = length
-            self._scaled[True] = x * ((1.0 / length) @ like(family.of_block.T, x))
-        if (is_freq, dtype) not in self._made:
-            self._made[is_freq, dtype] = self._scaled[is_freq].to(dtype)
-        return self._made[is_freq, dtype]
-
-    def mean(self) -> Tensor:
-        """Mean of the samples of each block, in its length, ``[*, c, b]``."""
-        mean = taken(self._x, self.family.sums, -1) / self.family.num
-        return mean / self._lengths[False] * self._mean_kept()
+        mean_is_kept = torch.maximum(is_kept, like(family.stays, is_kept))
+        length = torch.maximum(length, least)
+        settled = x * (
+            is_kept @ like(family.without_sum.T, x) + mean_is_kept @ like(family.of_sum.T, x)
+        )
+        whole = _length(settled, family.with_mean).clamp(min=TINY)
+        to_all = like(family.of_block.T, x)
+        self.scaled = {
+            False: x * ((is_kept / length) @ to_all),
+            True: settled * ((1.0 / whole) @ to_all),
+        }
+        self.length = {False: length, True: whole}
+        self.mean = taken(x, family.sums, -1) / float(family.num) / length * mean_is_kept
 
     def films(self, dtype: torch.dtype) -> Tensor:
         """Filtered bins less their mean, of order one, ``[*, c, n]``; 0 where that is rounding."""
@@ -269,12 +257,13 @@ class _Coordinates:
         least = (self.scale * (8 * torch.finfo(torch.float64).eps)).clamp(min=TINY)[..., None]
         return (x * ((size >= least).double() / torch.maximum(size, least))).to(dtype)
 
-    def _mean_kept(self) -> Tensor:
-        """1, and 0 for constant details, ``[*, c, b]``."""
-        return torch.maximum(self._is_kept, like(self.family.stays, self._is_kept))
+
+def _length(x: Tensor, weights: Tensor) -> Tensor:
+    """Roots of weighted sums of squares; no gradient, as features do not depend on their unit."""
+    return ((x.detach() * x.detach()) @ like(weights, x)).sqrt()
 
 
-class _Form:
+class _RowSet:
     """Rows of one length and dtype, and the descriptors that are wanted of them."""
 
     def __init__(
@@ -318,7 +307,7 @@ class _Form:
         names = {name for own in wanted.values() for name in own}
         self._plain, self._ordered = [], []
         ordered = [i for i, row in enumerate(rows) if wanted[row].intersection(ORDERED)]
-        self._steps = _index(ordered, len(rows))
+        self._ordered_rows = _index(ordered, len(rows))
         self.made: list[tuple[Row, str]] = []
         for name in (n for n in DESCRIPTORS if n in names and n not in ORDERED):
             self._plain.append((name, self._chosen(name, rows, wanted)))
@@ -345,15 +334,16 @@ class _Form:
                 own = replace(own, film=taken(families[-1].films(self._dtype), self._film, -2))
             made.append(DESCRIPTORS[name](own))
         if self._ordered:
-            ordered = rows.take(self._steps).ordered()
+            ordered = rows.take(self._ordered_rows).ordered()
             made += [DESCRIPTORS[name](ordered.take(index)) for name, index in self._ordered]
         return made
 
     def _rows(self, families: Sequence[_Coordinates]) -> Rows:
         is_freq, own = self._is_freq, [families[i] for i in self._families]
+        scaled = {i: families[i].scaled[is_freq].to(self._dtype) for i in self._families}
         parts = []
         for number, columns, index, matrix in self._pieces:
-            x = families[number].scaled(is_freq, self._dtype)
+            x = scaled[number]
             x = taken(x[..., columns.start : columns.stop], index, -2)
             parts.append(x if matrix is None else x @ like(matrix, x))
         values = torch.cat(parts, dim=-2)
@@ -366,8 +356,8 @@ class _Form:
             values, mean = amplitude - middle, middle.squeeze(-1).double()
         else:
             num = self._maps.num_samples
-            mean = self._of_cells([each.mean() for each in own])
-        length = self._of_cells([each.length(is_freq) for each in own])
+            mean = self._of_cells([each.mean for each in own])
+        length = self._of_cells([each.length[is_freq] for each in own])
         scale = taken(torch.cat([each.scale for each in own], dim=-1), self._owners, -1)
         unit = length
         units = [each.unit for each in own if each.unit is not None]
