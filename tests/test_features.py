@@ -70,13 +70,14 @@ def features_by(backend, bins, **options):
     return found.double().numpy(), given.double().numpy()
 
 
-def through_onnx(pool, bins):
-    """All features by a graph whose filter passes everything."""
-    num = len(pool.names)
+def through_onnx(pool, bins, selected=None):
+    """Features by a graph whose filter passes everything."""
+    selected = range(len(pool.names)) if selected is None else selected
+    num = len(selected)
     ones, flat = torch.ones(num, dtype=torch.float64), torch.zeros(num, num, dtype=torch.float64)
     head = QuadraticForm(flat, flat[0], flat[0, 0])
     channel_filter = ChannelFilter([1] * len(HAND), polyorder=0)
-    detector = SlipDetector(pool, channel_filter, range(num), FeatureScaler(-ones, ones), head)
+    detector = SlipDetector(pool, channel_filter, selected, FeatureScaler(-ones, ones), head)
     form = Form(str(bins.dtype).removeprefix("torch."))
     graph = Graph()
     samples = graph.input("samples", form.dtype, ("batch", len(HAND), pool.bin_samples))
@@ -158,6 +159,16 @@ def test_a_selection_has_the_values_of_the_pool(paper_pool, rng):
     chosen = [int(i) for i in rng.permutation(len(PAPER))[:50]] + [7, 7]
     found = FeatureExtractor(paper_pool, chosen, engine="reference")(bins)
     torch.testing.assert_close(found, paper_pool(bins)[:, chosen], rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("num", [99, 100, 101, 102])
+@pytest.mark.parametrize("wanted", [{"median"}, {"iqr"}, {"median", "iqr"}, {"median", "mode"}])
+def test_order_statistics_alone_sort_no_more_than_they_need(wanted, num, rng):
+    pool = FeaturePool(HAND, bin_samples=num, level=1)
+    bins = torch.from_numpy(rng.standard_normal((4, 3, num)))
+    chosen = [i for i, name in enumerate(pool.names) if name.descriptor in wanted]
+    found = through_onnx(pool, bins, chosen)
+    np.testing.assert_allclose(found, pool(bins)[:, chosen].numpy(), rtol=1e-9, atol=1e-12)
 
 
 # Constants and other extremes ----------------------------------------------------------------

@@ -334,7 +334,7 @@ class _RowSet:
                 own = replace(own, film=taken(families[-1].films(self._dtype), self._film, -2))
             made.append(DESCRIPTORS[name](own))
         if self._ordered:
-            ordered = rows.take(self._ordered_rows).ordered()
+            ordered = rows.take(self._ordered_rows).ordered(dict(self._ordered))
             made += [DESCRIPTORS[name](ordered.take(index)) for name, index in self._ordered]
         return made
 

@@ -17,7 +17,7 @@ the same row may have different ones. ``entropy`` is a step function: no gradien
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -79,9 +79,13 @@ class Rows:
             amplitude=None if self.amplitude is None else taken(self.amplitude, index, -2),
         )
 
-    def ordered(self) -> Rows:
-        """The same rows, values in ascending order."""
-        return replace(self, values=ascending(self.values, self.num), film=None, amplitude=None)
+    def ordered(self, names: Collection[str]) -> Rows:
+        """The same rows, values in ascending order, as many as these descriptors look at."""
+        count = self.num
+        if not {"mode", "entropy"}.intersection(names):
+            count = int(0.75 * self.num - 0.5) + 2 if "iqr" in names else self.num // 2 + 1
+        values = ascending(self.values, min(count, self.num))
+        return replace(self, values=values, film=None, amplitude=None)
 
     @cached_property
     def squares(self) -> Tensor:

@@ -25,13 +25,13 @@ def root(square: Tensor) -> Tensor:
     return torch.where(is_zero, 0.0, torch.where(is_zero, 1.0, square).sqrt())
 
 
-def ascending(x: Tensor, num: int) -> Tensor:
-    """Sorted along the last axis, which has ``num`` values.
+def ascending(x: Tensor, count: int) -> Tensor:
+    """The smallest values along the last axis, at least ``count`` of them, in ascending order.
 
     By NumPy where only values are asked for: it sorts short rows several times as fast.
     """
     if not isinstance(x, Tensor):
-        return x.ascending(num)
+        return x.ascending(count)
     if is_concrete(x):
         return torch.from_numpy(np.sort(x.detach().numpy(), axis=-1))
     return x.sort(-1).values

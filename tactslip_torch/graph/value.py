@@ -294,9 +294,10 @@ class Value:
         """With values added to the entries at these places."""
         return self.graph.op("ScatterElements", self, index, values, axis=axis, reduction="add")
 
-    def ascending(self, num: int) -> Value:
-        """Sorted along the last axis, which has ``num`` entries."""
-        return self.graph.ops("TopK", self, self.graph.axes(num), dtypes=(None, I64), largest=0)[0]
+    def ascending(self, count: int) -> Value:
+        """The smallest entries along the last axis, in ascending order."""
+        k = self.graph.axes(count)
+        return self.graph.ops("TopK", self, k, dtypes=(None, I64), largest=0)[0]
 
     def entries_of(self, table: torch.Tensor) -> Value:
         """Of a constant table of float64, at the places that are these values."""
