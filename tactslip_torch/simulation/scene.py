@@ -36,7 +36,10 @@ FIDELITIES = ("kinematic", "bristles")
 """How contacts are modelled: by closed forms, or by skin and bristles integrated in time."""
 
 SIMULATION_VERSION = 2
-"""Raised whenever the samples of some scene change; part of ``Scene.to_dict``, so of cache keys."""
+"""Raised when samples of some scene change by more than a step of the converter here and there.
+
+It is part of ``Scene.to_dict``, so of cache keys.
+"""
 
 MAX_PRESLIDING_FACTOR = 1.5
 """Largest factor of an element's presliding travel on the recording's (ours)."""
