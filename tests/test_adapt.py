@@ -248,6 +248,7 @@ def test_a_step_cut_off_between_its_files_is_told_and_taken_back(run, files, tra
     torch.testing.assert_close(sums, before, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_second_visit_is_numbered_on_and_known_recordings_are_found_again(run, files, tmp_path):
     more = write_files(tmp_path / "more", ["C"], cycles=2, seed=1)
     add_c(run, files, "weight=2", "material=3")
@@ -260,6 +261,7 @@ def test_a_second_visit_is_numbered_on_and_known_recordings_are_found_again(run,
     assert found["recordings"] == [f"3/{i}" for i in range(4)]
 
 
+@pytest.mark.slow
 def test_no_recording_comes_in_twice_by_another_name(run, files, tmp_path):
     add_c(run, files, "weight=2", "material=wood")
     state = content(run)
@@ -287,6 +289,7 @@ def test_what_was_trained_on_does_not_come_in_again(run, files):
         add_c(run, files, "weight=2", "material=wood")
 
 
+@pytest.mark.slow
 def test_two_programs_do_not_change_a_detector_at_once(run, files):
     state = content(run)
     with locked(run / "detector.pt"), pytest.raises(ValueError, match="another adapt is changing"):
@@ -387,6 +390,7 @@ def test_training_refuses_statistics_that_it_cannot_leave(tmp_path, overrides, m
         train(composed(*TRAINING, *overrides), tmp_path)
 
 
+@pytest.mark.slow
 def test_the_command_ends_with_status_2_and_one_line(run):
     command = [sys.executable, "-m", "tactslip_torch", "adapt", f"model={run / 'nothing.pt'}"]
     ended = subprocess.run(

@@ -467,6 +467,7 @@ def composed(*overrides):
         return compose("train", list(overrides))
 
 
+@pytest.mark.slow
 def test_the_experiment_has_ten_hours_to_set_the_alarm_and_as_many_to_check_it():
     config = composed("+exp=onset")
     source: RecordingSource = instantiate(config.data, _convert_="all")
@@ -499,6 +500,7 @@ def test_one_alarm_for_several_detectors_is_refused_before_the_fit(tmp_path):
         train(config, tmp_path)
 
 
+@pytest.mark.slow
 def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
     dropped = ("taps", "grips", "machine", "mains_bursts", "pulled", "arm_motion")
     config = composed(

@@ -92,32 +92,6 @@ def test_the_line_is_the_best_one_for_scores_and_weights_of_all_sizes(rng):
     assert num_fitted > 30
 
 
-@pytest.mark.parametrize("share", [0.5, 0.1])
-def test_platt_finds_the_slope_and_the_balance_free_offset_of_a_known_model(share, rng):
-    """Gaussians of one spread: the ratio is known in closed form, whatever the balance."""
-    gap, slope, offset = [], 1.6, -0.4  # N(m, 1) against N(m - slope, 1)
-    middle = -offset / slope
-    for _ in range(60):
-        is_slip = rng.uniform(size=500) < share
-        scores = middle + slope * (is_slip - 0.5) + rng.normal(size=500)
-        fitted = fit_platt(*tensors(scores, is_slip))
-        gap.append([fitted.slope - slope, fitted.offset - offset])
-    gap = np.array(gap)
-    error = gap.std(axis=0, ddof=1) / math.sqrt(len(gap))
-    assert (np.abs(gap.mean(axis=0)) < 4 * error + 0.02).all()  # shrunk a little by the targets
-    assert (error < 0.05).all()
-
-
-def test_whole_weights_are_bins_given_several_times(rng):
-    scores, is_slip = logistic_bins(rng, 150, 1.0, 0.3)
-    times = rng.integers(0, 4, 150)
-    for fit in FITS.values():
-        once = fit(*tensors(scores, is_slip, times.astype(float)))
-        again = fit(*tensors(np.repeat(scores, times), np.repeat(is_slip, times)))
-        x = torch.linspace(-5, 5, 101, dtype=torch.float64)
-        torch.testing.assert_close(once.llr(x), again.llr(x), rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.parametrize("scale", [1e-200, 1.0, 1e30, 1e250])
 @pytest.mark.parametrize("name", FITS)
 def test_separable_scores_get_a_finite_ratio(name, scale):
@@ -196,20 +170,6 @@ def test_between_knots_a_line_and_outside_flat():
     x = np.concatenate([np.linspace(-3, 4, 71), [-1e30, 1e30, np.inf, -np.inf]])
     llr = fitted.llr(torch.from_numpy(x))
     np.testing.assert_allclose(llr, np.interp(x, fitted.scores, fitted.llrs), atol=1e-14)
-
-
-def test_isotonic_finds_a_ratio_that_no_line_has(rng):
-    """Scores of a bend: its ratio saturates, which steps follow and a line cannot."""
-    x = rng.normal(0, 2, 40_000)
-    true = 3 * np.tanh(x)
-    is_slip = rng.uniform(size=len(x)) < expit(true)
-    at = torch.linspace(-3, 3, 25, dtype=torch.float64)
-    errors = {
-        name: float((fit(*tensors(x, is_slip)).llr(at) - 3 * at.tanh()).abs().mean())
-        for name, fit in FITS.items()
-    }
-    assert errors["isotonic"] < 0.3
-    assert errors["isotonic"] < 0.5 * errors["platt"]
 
 
 # ----------------------------------------------------------------------------- what all share
@@ -345,22 +305,6 @@ def test_probability_is_bayes_at_another_balance(share):
     np.testing.assert_allclose(probability(llr, share), posterior, rtol=1e-12)
 
 
-def test_a_fit_at_one_balance_is_right_at_another(rng):
-    """Fitted where half of the bins slip, judged where one in twenty does."""
-
-    def drawn(share):
-        is_slip = rng.uniform(size=40_000) < share
-        return tensors(2.0 * is_slip + rng.normal(size=40_000), is_slip)
-
-    fitted = [fit(*drawn(0.5)) for fit in FITS.values()]
-    scores, is_slip = drawn(0.05)
-    for calibration in fitted:
-        llr = calibration.llr(scores)
-        right = reliability(probability(llr, 0.05), is_slip)
-        wrong = reliability(probability(llr, 0.5), is_slip)
-        assert right.ece < 0.01 < 0.1 < wrong.ece
-
-
 def test_probability_of_huge_ratios_and_of_no_share():
     llr = torch.tensor([-1e30, 0.0, 1e30])
     assert probability(llr, 0.5).tolist() == [0.0, 0.5, 1.0]
@@ -407,11 +351,6 @@ def test_cells_and_errors_are_the_definitions(weighted, levels, rng):
     inside = np.clip(p, 1e-9, 1 - 1e-9)
     found = reliability(*tensors(inside, y), weights=torch.from_numpy(w))
     assert found.log_loss == pytest.approx(log_loss(y, inside, sample_weight=w), rel=1e-9)
-
-
-def test_cells_hold_equal_numbers_where_no_two_are_equal():
-    p = torch.rand(1500, generator=torch.Generator().manual_seed(1)).double()
-    assert reliability(p, p > 0.5).counts == (100.0,) * 15
 
 
 def test_a_certain_detector_is_right_or_wrong():

@@ -214,47 +214,6 @@ def test_rounding_moves_no_alarm_over_an_edge():
     assert outcomes([0.68], [0.18]) == ["found"]
 
 
-def test_an_early_alarm_counts_only_while_its_status_holds():
-    for ends, outcome in (((0.95,), "missed"), ((1.0,), "missed"), ((1.001,), "early")):
-        assert outcomes([0.9], alarm_ends_s=ends) == [outcome]
-        assert false_alarms([0.9], alarm_ends_s=ends) == ()  # nor is it false
-    assert outcomes([0.9, 1.1], alarm_ends_s=(0.95, math.inf)) == ["found"]
-    assert outcomes([0.9, 1.1], alarm_ends_s=(1.05, math.inf)) == ["early"]
-    assert outcomes([0.9, 1.1]) == ["early"]  # ends not known: until the next
-    assert outcomes([0.81, 0.9], alarm_ends_s=(0.85, 0.95)) == ["missed"]
-
-
-def test_a_status_that_always_stands_finds_nothing():
-    slips = (1.0, 4.0, 7.0)
-    assert outcomes([0.0], slips) == ["missed"] * 3
-    assert false_alarms([0.0], slips) == (0.0,)
-
-
-def test_alarms_between_slides_are_false_and_several_of_one_slip_are_not():
-    alarms = (1.1, 1.4, 2.9, 3.05, 3.5, 4.2, 5.1)
-    events = recording_events(watched(alarms, (1.0, 5.0)), RULES, LATENCY)
-    assert events.false_alarms_s == (3.5, 4.2)
-    assert [onset.num_alarms for onset in events.onsets] == [4, 1]
-    metrics = event_metrics([watched(alarms, (1.0, 5.0))], RULES, LATENCY, **QUICK)
-    assert metrics["alarms_per_slip"]["value"] == 2.5
-    # 10 s but 0.8 to 3.1 and 4.8 to 7.1
-    assert metrics["false_alarms_per_minute"]["value"] == pytest.approx(60 * 2 / 5.4)
-
-
-def test_a_short_slide_is_found_while_it_lasts_and_settles():
-    slides = ((1.0, 1.05),)
-    assert outcomes([1.15], slides=slides) == ["found"]
-    assert outcomes([1.16], slides=slides) == ["missed"]
-    assert false_alarms([1.16], slides=slides) == (1.16,)
-
-
-def test_an_alarm_behind_the_next_onset_does_not_find_the_slip_before():
-    onsets, slides = (1.0, 1.12), ((1.0, 1.1), (1.12, 2.0))
-    assert outcomes([1.15], onsets, slides) == ["missed", "found"]
-    assert outcomes([1.12], onsets, slides) == ["missed", "found"]
-    assert outcomes([1.1], onsets, slides) == ["found", "early"]
-
-
 def test_the_settling_time_is_of_bin_and_look_ahead_unless_it_is_given():
     last = 3.0 + 0.05 + 0.0125 + 0.05
     for alarm, expected in ((last, ()), (last + 1e-6, (last + 1e-6,))):

@@ -50,12 +50,6 @@ def ridge(bins, penalty, kernel=PAPER_KERNEL):
 # Balance -------------------------------------------------------------------------------------
 
 
-def test_targets_are_plus_one_for_slip():
-    bins = TrainingBins(torch.zeros(2, 1, dtype=torch.float64), torch.tensor([True, False]))
-    assert bins.targets.tolist() == [1.0, -1.0]
-    assert bins.targets.dtype == torch.float64
-
-
 @pytest.mark.parametrize(
     ("is_slip", "weights", "message"),
     [
@@ -182,17 +176,6 @@ def test_an_infinite_penalty_is_least_squares(num_bins, degree, route, rng):
     design = np.stack(columns, axis=-1)
     fitted = design @ np.linalg.lstsq(design, bins.targets.numpy(), rcond=None)[0]
     np.testing.assert_allclose(machine(bins.features).numpy(), fitted, rtol=1e-7, atol=1e-7)
-
-
-def test_twice_the_weight_is_twice_the_bin(rng):
-    bins = draw(rng, 30)
-    doubled = TrainingBins(
-        torch.cat([bins.features, bins.features[:5]]), torch.cat([bins.is_slip, bins.is_slip[:5]])
-    )
-    weights = torch.where(torch.arange(30) < 5, 2.0, 1.0).double()
-    weighted = fit_machine(TrainingBins(bins.features, bins.is_slip, weights), 0.3)
-    for name, value in fit_machine(doubled, 0.3).state_dict().items():
-        torch.testing.assert_close(weighted.state_dict()[name], value, rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize("num_bins", [8, 40])

@@ -58,10 +58,6 @@ def test_manners(kernel, rng, device):
         torch.testing.assert_close(batched[i], kernel(a[i], b + i), rtol=1e-12, atol=1e-12)
 
 
-def test_the_papers_kernel_is_the_default():
-    assert Polynomial() == PAPER_KERNEL == Polynomial(2, 0.5)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_no_distance_is_negative(dtype, rng):
     """Squares and products of far bins cancel to less than nothing; the kernel is at most 1."""

@@ -212,16 +212,6 @@ def test_events_are_of_the_detectors_own_decisions_and_the_exact_onset():
     assert len(learner.events["unseen"]["two_of_three"]) == 5
 
 
-def test_a_split_by_bin_says_why_it_has_no_events():
-    source = SmallSet()
-    events = learn(source, random_bins(source.ids, seen=["a", "b", "c"])[0]).metrics["events"]
-    assert list(events) == ["train", "test"]
-    for by_rule in events.values():
-        for numbers in by_rule.values():
-            assert numbers["found"] is None
-            assert "both sides" in numbers["reason"]
-
-
 def test_the_detector_judges_filtered_bins_as_the_test_did():
     source = SmallSet()
     learner = learn(source, unseen_c(source))
@@ -272,6 +262,7 @@ def test_a_test_without_a_detector_is_refused():
         trainer().test(learner, datamodule=SlipDataModule(maker, unseen_c(source), 0))
 
 
+@pytest.mark.slow
 def test_shuffled_labels_are_not_learned():
     source = SmallSet(cycles=30)
     split = seen6(source.ids, seen=["a", "b", "c"])[0]

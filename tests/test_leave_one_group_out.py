@@ -94,16 +94,6 @@ def test_scores_are_those_of_refits(
 
 
 @pytest.mark.parametrize("route", ["primal", "dual"])
-def test_leaving_one_bin_out_is_the_classic_formula(route, rng):
-    """``beta_i / (G^-1)_ii`` (Rasmussen 2006, 5.12)."""
-    bins = draw(rng, 50, 5)
-    z, t = bins.features.numpy(), bins.targets.numpy()
-    inverse = np.linalg.inv(gram(PAPER_KERNEL, z, z) + np.eye(50) / 2.0)
-    scores = HeldOut(bins, torch.arange(50), route=route).at(2.0).scores
-    np.testing.assert_allclose(t - scores.numpy(), (inverse @ t) / np.diag(inverse), rtol=1e-10)
-
-
-@pytest.mark.parametrize("route", ["primal", "dual"])
 @pytest.mark.parametrize("kind", ["bins", "materials"])
 def test_labels_of_a_group_do_not_move_its_scores(kind, route, rng):
     bins, groups = draw(rng, 60, 3), grouped(rng, 60, kind)

@@ -90,6 +90,7 @@ def test_a_trace_holds_for_other_bins(bins_of, detector):
         assert_same(traced(bins), detector.predict(bins), most=1e-4)
 
 
+@pytest.mark.slow
 def test_compiled_it_holds_for_other_bins(detector, monkeypatch):
     """With samples for features, as capturing the descriptors takes half a minute."""
 

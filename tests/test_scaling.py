@@ -23,17 +23,6 @@ def test_equals_sklearn(num_bins, rng):
     assert (scaler(torch.from_numpy(new)).abs() == 1).any(), "nothing was clipped"
 
 
-def test_fit_and_the_constructor_are_the_same(rng):
-    train = torch.from_numpy(rng.standard_normal((20, 4)))
-    fitted = FeatureScaler.fit(train)
-    given = FeatureScaler(train.min(0).values, train.max(0).values)
-    assert torch.equal(fitted.minimum, given.minimum)
-    assert torch.equal(fitted.maximum, given.maximum)
-    scaled = fitted(train)
-    assert torch.equal(scaled.min(0).values, -torch.ones(4, dtype=torch.float64))
-    assert torch.equal(scaled.max(0).values, torch.ones(4, dtype=torch.float64))
-
-
 def test_what_leaves_the_range_is_clipped():
     scaler = FeatureScaler(torch.tensor([0.0, -4.0]), torch.tensor([2.0, 4.0]))
     features = torch.tensor([[0.5, 0.0], [-9.0, 1e30], [math.inf, -math.inf]])
@@ -267,20 +256,6 @@ def test_a_tail_of_equal_values_falls_back_to_all_of_the_range():
         assert (scaler(train)[:, 1] == 0).all()
 
 
-def test_compression_keeps_the_order_and_spreads_the_bulk(rng):
-    train = torch.from_numpy(rng.standard_cauchy((2001, 1)))
-    plain, bent = FeatureScaler.fit(train), FeatureScaler.fit(train, compress=True, tail=0.01)
-    ordered = train.sort(0).values
-    assert (bent(ordered).diff(dim=0) >= 0).all()
-    assert bent(train).std() > 5 * plain(train).std()
-
-
-def test_one_bin_will_do():
-    scaler = FeatureScaler.fit(torch.tensor([[2.0, 0.0]]), compress=True, tail=0.2)
-    assert scaler.knee.tolist() == [2, 1]
-    assert scaler(torch.tensor([[5.0, 5.0]])).tolist() == [[0, 0]]
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_scaled_values_are_finite_and_bounded_up_to_the_largest_float(dtype):
     largest = torch.finfo(dtype).max
@@ -297,15 +272,6 @@ def test_scaled_values_are_finite_and_bounded_up_to_the_largest_float(dtype):
     beyond = torch.tensor([[math.inf, -math.inf, math.nan]], dtype=dtype)
     assert scaler(beyond)[0, :2].tolist() == [1, -1]
     assert scaler(beyond)[0, 2].isnan()
-
-
-def test_manners_with_a_knee(rng, device):
-    train = torch.from_numpy(rng.standard_cauchy((40, 4))).to(device)
-    scaler = {
-        dtype: FeatureScaler.fit(train.to(dtype), compress=True, tail=0.05) for dtype in DTYPES
-    }
-    features = torch.from_numpy(rng.standard_cauchy((6, 4))).to(device)
-    oracles.assert_manners(lambda x: scaler[x.dtype](x), features)
 
 
 def test_a_knee_is_saved_and_none_leaves_the_state_as_it_was(rng):

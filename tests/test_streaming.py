@@ -95,17 +95,6 @@ def test_any_cut_gives_what_the_whole_recording_gives(
     assert_same(found, offline(detector, settings, samples))
 
 
-@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_sample_by_sample_raises_the_same_alarms(rule, dtype):
-    samples, settings = signal(6000, 8, dtype), settings_of(rule)
-    expected = offline(DETECTOR, settings, samples)
-    assert len(expected.alarms) > 5
-    found = in_pieces(stream_of(DETECTOR, settings, dtype), samples, range(6000))
-    assert_same(found, expected)
-    assert [alarm.alarm_s for alarm in found.alarms] == [a.alarm_s for a in expected.alarms]
-
-
 @pytest.mark.parametrize("kind", DETECTORS, ids="-".join)
 @pytest.mark.parametrize("hop", [20, 130])
 def test_a_decision_comes_with_the_last_sample_of_its_look_ahead(kind, hop):
@@ -131,25 +120,6 @@ def test_bins_shorter_than_a_frame_wait_for_the_first_frame(start_s):
         said += found.available_s.tolist()
     assert came == [151, 151, 151, 160, 180, 200]
     assert said == pytest.approx([(start_s or 0.0) + num / RATE for num in came], abs=1e-12)
-
-
-def test_samples_to_come_change_no_decision():
-    one, other = signal(3000, 1), signal(3000, 2)
-    other[:, :1500] = one[:, :1500]
-    other[:, 1600:1700], other[0, 1900] = 1e30, torch.nan
-    streams = stream_of(), stream_of()
-    before = [
-        joined([s.push(part.T) for part in x[:, :1500].split(77, -1)])
-        for s, x in zip(streams, (one, other), strict=True)
-    ]
-    assert all(torch.equal(a, b) for a, b in zip(*before, strict=True))
-    assert before[0].number[-1] == (1500 - 125) // HOP
-    assert len(before[0].alarms) > 0
-    behind = [s.push(x[:, 1500:].T) for s, x in zip(streams, (one, other), strict=True)]
-    assert not torch.equal(behind[0].score, behind[1].score)
-    assert_same(
-        joined([before[0], behind[0], streams[0].flush()]), offline(DETECTOR, settings_of(), one)
-    )
 
 
 # What is missing or broken ---------------------------------------------------------------------
@@ -521,6 +491,7 @@ def test_a_copy_of_a_running_stream_goes_on_by_itself(copied, rule):
     assert torch.equal(joined([*before, rest[0]]).is_alarm, whole.is_alarm)
 
 
+@pytest.mark.slow
 def test_an_hour_needs_no_more_memory_than_a_second():
     """What is pickled holds all that a stream remembers; the detector is left out of it."""
     settings = settings_of(RULES[0], hop=2000)
