@@ -237,7 +237,7 @@ def _bins(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str, A
         ways[f"onnxruntime, {precision}"] = session.scores
         detector = main.detector(DTYPES[precision])
         ways[f"tactslip_torch, {precision}"] = partial(_score, detector, DTYPES[precision])
-    ways[REFERENCE] = partial(_score, main.detector(FLOAT64, "reference"), FLOAT64)
+    ways[REFERENCE] = partial(_score, main.detector(FLOAT64, "torch"), FLOAT64)
     us: dict[str, dict[str, Spread]] = {name: {} for name in ways}
     for size in (1, *sizes.bulk):
         say(f"deployment: {size} bins at once")

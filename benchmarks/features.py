@@ -61,7 +61,7 @@ class Features(Benchmark[Sizes]):
     about = "all features of filtered simulated bins of 24 channels and 50 ms"
     sizes = Sizes()
     quick = Sizes(bins=32, slow_bins=4, num_kernels=168, rounds=2)
-    libraries = ("numba", "PyWavelets", "ptwt", "tsfel", "aeon")
+    libraries = ("PyWavelets", "ptwt", "tsfel", "aeon")
 
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
         """Every way once a round."""

@@ -99,11 +99,11 @@ def recordings(
     """The features of some recordings of a set."""
     source = instantiate(config.data, _convert_="all")
     rule = instantiate(config.labels)
-    pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
+    pool, channel_filter, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
     chosen = keep(source)
     torch.set_num_threads(1)  # the processors belong to those who make features
     with feature_cache(str(cache)) as kept:
-        maker = FeatureMaker(source, pool, channel_filter, rule, kept, dtype, engine)
+        maker = FeatureMaker(source, pool, channel_filter, rule, kept, dtype, backend)
         data = SlipDataModule(maker, Split("benchmark", dict.fromkeys(chosen, "unseen")), None)
         yield from bar(data.loader(["unseen"]), what, "recording", total=len(chosen))
 

@@ -85,7 +85,7 @@ class Latency(Benchmark[Sizes]):
     )
     sizes = Sizes()
     quick = Sizes(recordings=1, bins=4, looped=1, rounds=2, block_s=2e-3, num_kernels=168)
-    libraries = ("numba", "PyWavelets", "onnxruntime", "aeon")
+    libraries = ("PyWavelets", "onnxruntime", "aeon")
 
     @torch.inference_mode()
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
@@ -113,7 +113,7 @@ class Latency(Benchmark[Sizes]):
         """From one raw bin ``[1, C, n + 2 * context]``, float32, to its score."""
         main = MainJobDetector.fitted(sizes.recordings)
         fast, exact = main.detector(FLOAT32), main.detector(FLOAT64)
-        slow = main.detector(FLOAT64, "reference")
+        slow = main.detector(FLOAT64, "torch")
         support, targets = main.z.numpy(), main.training.targets.numpy()
         svc = SVC(kernel="poly", degree=2, gamma=1.0, coef0=main.kernel.offset)
         svc.fit(support, targets)

@@ -205,8 +205,8 @@ def read_windows(config: DictConfig, sizes: Sizes) -> tuple[Windows, list[Split]
     if source.is_simulated:
         raise ValueError("recordings of data.root say that they are simulated; give real ones")
     rule = instantiate(config.labels)
-    pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
-    maker = FeatureMaker(source, pool, channel_filter, rule, None, dtype, engine)
+    pool, channel_filter, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
+    maker = FeatureMaker(source, pool, channel_filter, rule, None, dtype, backend)
     recordings = _some_of(source.ids, sizes)
     folds: list[Split] = instantiate(config.split, _convert_="all")(recordings)
     samples, labels, places = [], [], []
@@ -666,7 +666,7 @@ class Real(Benchmark[Sizes]):
     about = "slip against stable touch on a real BioTac SP, each object left out in turn"
     page = "REAL_DATA.md"
     is_simulated = False
-    libraries = ("numba", "aeon")
+    libraries = ("aeon",)
     sizes = Sizes()
     quick = Sizes(3, 1, 2, (0, 1), 168, 84, 4, 5, (1,), (0.1, 1.0), 50, 2, 8)
 

@@ -80,7 +80,7 @@ class Simulation(Benchmark[Sizes]):
     quick = Sizes(
         (250.0, 500.0), 1, 1, materials=("M1", "M2"), cycles=4, train_bins=20, num_features=10
     )
-    libraries = ("numba",)
+    libraries = ()
 
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
         """Costs and differences by level and step; accuracies by level."""

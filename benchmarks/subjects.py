@@ -26,12 +26,13 @@ from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split, seen6
 from tactslip_torch.features.cache import FeatureCache
-from tactslip_torch.features.extractor import EngineName, FeatureExtractor
+from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import KernelSum, Polynomial, kernel_from_dict
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.native import BackendName
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -127,7 +128,7 @@ class MainJobDetector:
         return TrainingBins(self.z, self.is_slip)
 
     def detector(
-        self, dtype: torch.dtype = FLOAT64, engine: EngineName = "auto", hop: int = 20
+        self, dtype: torch.dtype = FLOAT64, backend: BackendName = "auto", hop: int = 20
     ) -> SlipDetector:
         """A detector of its own, which computes in this dtype, with settings for streams."""
         pool = FeaturePool(
@@ -136,7 +137,7 @@ class MainJobDetector:
         head = fit_machine(self.training, self.penalty, self.kernel)
         scaler = copy.deepcopy(self.scaler)
         made = SlipDetector(
-            pool, ChannelFilter(WINDOW_LENGTHS), self.selected, scaler, head, engine=engine
+            pool, ChannelFilter(WINDOW_LENGTHS), self.selected, scaler, head, backend=backend
         )
         made.info = {"simulated": True, KEY: alarm_settings(hop).to_dict()}
         return made.to(dtype).eval()
@@ -183,9 +184,9 @@ class Trained:
         config = composed("train", overrides)
         source, rule = instantiate(config.data, _convert_="all"), instantiate(config.labels)
         (split,) = instantiate(config.split, _convert_="all")(source.ids)
-        pool, filters, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
+        pool, filters, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
         cached = FeatureCache(cache_folder)
-        maker = FeatureMaker(source, pool, filters, rule, cached, dtype, engine)
+        maker = FeatureMaker(source, pool, filters, rule, cached, dtype, backend)
         recipe = instantiate(config.recipe, _convert_="all")
         detector = SlipDetector.load(folder / "detector.pt")
         return cls(folder, detector, recipe, split, maker, metrics)
@@ -211,8 +212,8 @@ def surveyed(
     """What one pass over all recordings keeps of each material, split by cycle."""
     rule = instantiate(config.labels)
     by_cycle = seen6(source.ids, seen=list(seen), train_share=train_share, seed=seed)[0]
-    pool, filters, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
-    maker = FeatureMaker(source, pool, filters, rule, None, dtype, engine)
+    pool, filters, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
+    maker = FeatureMaker(source, pool, filters, rule, None, dtype, backend)
     materials = Materials(pool, train_bins, judged_bins)
     for place, recording in enumerate(source.ids):
         if place % 20 == 0:

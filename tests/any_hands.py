@@ -9,7 +9,6 @@ import pywt
 import torch
 
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.selection import ClassMoments, rank_features, t_scores
 from tactslip_torch.hand import Channel, HandLayout
@@ -17,6 +16,7 @@ from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.native import BackendName
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.signals.filtering import Align, ChannelFilter
@@ -169,7 +169,7 @@ HANDS = {
 
 
 @cache
-def detector_of(name: str, engine: EngineName = "auto") -> SlipDetector:
+def detector_of(name: str, backend: BackendName = "auto") -> SlipDetector:
     """A detector of one of ``HANDS``, trained on its noise."""
     hand = HANDS[name]
     pool, channel_filter = hand.pool(), hand.channel_filter()
@@ -188,7 +188,7 @@ def detector_of(name: str, engine: EngineName = "auto") -> SlipDetector:
         hand.hop, Platt(4.0, 0.0), rule, threshold=2.0137, target_per_hour=1.0, rearm_s=0.0
     )
     info = {"simulated": False, KEY: settings.to_dict()}
-    return SlipDetector(pool, channel_filter, selected, scaler, machine, info, engine=engine)
+    return SlipDetector(pool, channel_filter, selected, scaler, machine, info, backend=backend)
 
 
 class AnyRecordings:

@@ -4,7 +4,6 @@ import numpy as np
 import torch
 
 from tactslip_torch.analysis.certificate import certify
-from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.graph.trials import simulated_stream
 from tactslip_torch.hand import HandLayout
@@ -12,6 +11,7 @@ from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import KernelSum, Polynomial, QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.native import BackendName
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.settings import KEY, AlarmSettings
@@ -39,7 +39,7 @@ def small_detector(
     head: str = "quadratic",
     arithmetic: str = "double",
     gain: float = 1.0,
-    engine: EngineName = "auto",
+    backend: BackendName = "auto",
 ) -> SlipDetector:
     rng = np.random.default_rng(seed)
     pool = FeaturePool(HAND, arithmetic=arithmetic)  # type: ignore[arg-type]
@@ -61,12 +61,12 @@ def small_detector(
         middle = -machine(centre).median()  # so that both decisions occur
         machine = QuadraticForm(bend + bend.T, linear, middle)
     facts = {"simulated": True}
-    return SlipDetector(pool, channel_filter, selected, scaler, machine, facts, engine=engine)
+    return SlipDetector(pool, channel_filter, selected, scaler, machine, facts, backend=backend)
 
 
 def alarming_detector(seed: int = 0) -> SlipDetector:
     """The small detector, with settings by which the simulated slip raises alarms."""
-    made = small_detector(seed, engine="auto")
+    made = small_detector(seed, backend="auto")
     scores = score_stream(made, simulated_stream(HAND, 2000.0, torch.float64), 20).score
     rise = 2.0 / float(scores.std())
     settings = AlarmSettings(

@@ -23,9 +23,9 @@ def signal(num_samples, seed=0, dtype=torch.float64):
     return torch.from_numpy(samples + offsets).to(dtype)
 
 
-def detector_of(kind="all", align="centred", engine="auto"):
+def detector_of(kind="all", align="centred", backend="auto"):
     """The small detector, or that part of it which looks at films (``"PVDF"``) alone."""
-    whole = small_detector(engine=engine)
+    whole = small_detector(backend=backend)
     layer = ChannelFilter(whole.channel_filter.window_lengths, align=align)
     names = whole.selected_names
     kept = [i for i, name in enumerate(names) if kind == "all" or name.channel.startswith(kind)]
@@ -33,4 +33,4 @@ def detector_of(kind="all", align="centred", engine="auto"):
     part = QuadraticForm(head.quadratic[kept][:, kept], head.linear[kept], head.constant)
     ranges = FeatureScaler(scaler.minimum[kept], scaler.maximum[kept])
     selected = [whole.selected[i] for i in kept]
-    return SlipDetector(whole.pool, layer, selected, ranges, part, engine=engine)
+    return SlipDetector(whole.pool, layer, selected, ranges, part, backend=backend)

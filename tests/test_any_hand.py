@@ -68,7 +68,7 @@ def test_a_detector_tells_slip_and_comes_back_from_its_file(name, tmp_path):
     assert ((score >= 0) == is_slip).double().mean() > 0.7  # one channel knows little
     path = tmp_path / "detector.pt"
     detector.save(path)
-    loaded = SlipDetector.load(path, engine="auto")
+    loaded = SlipDetector.load(path, backend="auto")
     assert loaded.pool.hand == detector.pool.hand == hand.layout()
     assert loaded.pool.facts() == detector.pool.facts()
     assert torch.equal(loaded.score_raw(samples), score)

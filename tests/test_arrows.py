@@ -4,6 +4,7 @@ import ast
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1] / "tactslip_torch"
+_LOWER = ("hand", "native", "signals", "data", "features", "model")
 ARROWS = {
     "runtime": (),
     "hand": (),
@@ -15,8 +16,8 @@ ARROWS = {
     "model": ("features", "signals", "native", "hand"),
     "onset": ("model", "features", "signals", "native", "hand"),
     "deploy": ("features", "model", "onset", "signals", "hand"),
-    "training": ("hand", "signals", "data", "features", "model", "onset", "deploy", "report"),
-    "analysis": ("hand", "signals", "data", "features", "model", "onset", "deploy", "training"),
+    "training": (*_LOWER, "onset", "deploy", "report"),
+    "analysis": (*_LOWER, "onset", "deploy", "training"),
     "report": (),
 }
 """Importer: what it may import beside itself and ``runtime``; what is not named may import all."""

@@ -11,10 +11,10 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from tactslip_torch import runtime
+from tactslip_torch import native
+from tactslip_torch.native import BackendName
 from tactslip_torch.simulation import _bristles
 from tactslip_torch.simulation._bristles import (
-    EngineName,
     Lanes,
     LaneState,
     Trace,
@@ -23,7 +23,9 @@ from tactslip_torch.simulation._bristles import (
     stage_times_s,
 )
 
-ENGINES = ("eager", "compiled")
+BACKENDS = ("torch", "native")
+NO_ENGINE = native.why_not()
+needs_engine = pytest.mark.skipif(bool(NO_ENGINE), reason=NO_ENGINE)
 Course = Callable[[float], float]
 
 
@@ -110,11 +112,11 @@ def at_rest(lanes: Lanes, force: torch.Tensor | float = 0.0) -> LaneState:
     return LaneState.sticking(lanes, torch.as_tensor(force).to(lanes.pressure).expand(shape))
 
 
-def carry(lanes, state, drive, num_steps, step_s, every=1, first_step=0, engine="auto"):
+def carry(lanes, state, drive, num_steps, step_s, every=1, first_step=0, backend="auto"):
     """``integrate`` under a drive that is a function of time."""
     arm, load = drive(stage_times_s(num_steps, step_s, first_step))
     arm, load = arm.to(lanes.pressure), load.to(lanes.pressure)
-    return integrate(lanes, state, arm, load, step_s, every, engine)
+    return integrate(lanes, state, arm, load, step_s, every, backend)
 
 
 def assert_close(one: tuple, other: tuple, tolerance: float = 0.0) -> None:
@@ -124,10 +126,10 @@ def assert_close(one: tuple, other: tuple, tolerance: float = 0.0) -> None:
         assert (mine.double() - its.double()).abs().max() <= tolerance * scale
 
 
-@pytest.fixture(params=ENGINES)
-def engine(request: pytest.FixtureRequest) -> EngineName:
-    if request.param == "compiled":
-        pytest.importorskip("numba")
+@pytest.fixture(params=BACKENDS)
+def backend(request: pytest.FixtureRequest) -> BackendName:
+    if request.param == "native" and NO_ENGINE:
+        pytest.skip(NO_ENGINE)
     return request.param
 
 
@@ -223,12 +225,12 @@ def test_drift_under_vibration_is_radaus(swing):
 # --- what the model does ------------------------------------------------------------------------
 
 
-def test_balance_of_forces_holds_in_the_trace(engine):
+def test_balance_of_forces_holds_in_the_trace(backend):
     element = replace(TACKY, sigma2=0.7, pressure=tuple(hertz_pressure(3).tolist()))
     lanes, step_s = element.lanes(), 250e-6
     state, drive = at_rest(lanes), driven(ramped(0.04))
     for number in range(200):
-        trace, state = carry(lanes, state, drive, 1, step_s, first_step=number, engine=engine)
+        trace, state = carry(lanes, state, drive, 1, step_s, first_step=number, backend=backend)
         arm, v = ramped(0.04)((number + 1) * step_s), float(state.speed_m_s)
         _, friction = element.rates(v, state.bristle_m[0].numpy(), 1.0)
         pulled = float(trace.friction_n) + element.c * (arm - v) - friction
@@ -326,36 +328,36 @@ def shaken(times: torch.Tensor, least: float = 0.0) -> tuple[torch.Tensor, torch
     return arm, load.clamp(least)
 
 
+@needs_engine
 @pytest.mark.parametrize("n", [1, 16])
-def test_engines_agree(n):
-    pytest.importorskip("numba")
+def test_backends_agree(n):
     lanes = varied(n)
-    results = [carry(lanes, at_rest(lanes, 0.2), shaken, 300, 250e-6, engine=e) for e in ENGINES]
+    results = [carry(lanes, at_rest(lanes, 0.2), shaken, 300, 250e-6, backend=e) for e in BACKENDS]
     for one, other in zip(*results, strict=True):
         assert_close(one, other, 1e-8)
 
 
-def test_a_load_below_nothing_is_none_and_nothing_is_changed(engine):
+def test_a_load_below_nothing_is_none_and_nothing_is_changed(backend):
     lanes = varied(2)
     start = at_rest(lanes, 0.1)
     before = [values.clone() for values in (*lanes, *start)]
     strided = LaneState(*(torch.stack([v, v], -1)[..., 0] for v in start))
-    none, state = carry(lanes, start, shaken, 100, 250e-6, engine=engine)
-    below, _ = carry(lanes, strided, lambda t: shaken(t, -1.0), 100, 250e-6, engine=engine)
+    none, state = carry(lanes, start, shaken, 100, 250e-6, backend=backend)
+    below, _ = carry(lanes, strided, lambda t: shaken(t, -1.0), 100, 250e-6, backend=backend)
     assert_close(none, below)
     assert all(torch.equal(x, old) for x, old in zip((*lanes, *start), before, strict=True))
     assert none.friction_n.shape == (100, 2, 3)
     assert state.bristle_m.shape == (2, 3, 2)
 
 
-def test_pieces_make_the_whole(engine):
+def test_pieces_make_the_whole(backend):
     lanes, step_s = varied(4), 2.0**-12
-    whole, end = carry(lanes, at_rest(lanes), shaken, 120, step_s, engine=engine)
-    third, same = carry(lanes, at_rest(lanes), shaken, 120, step_s, every=3, engine=engine)
+    whole, end = carry(lanes, at_rest(lanes), shaken, 120, step_s, backend=backend)
+    third, same = carry(lanes, at_rest(lanes), shaken, 120, step_s, every=3, backend=backend)
     assert_close(tuple(values[2::3] for values in whole), third)
     state, pieces = at_rest(lanes), []
     for first, num in ((0, 48), (48, 12), (60, 60)):
-        piece, state = carry(lanes, state, shaken, num, step_s, first_step=first, engine=engine)
+        piece, state = carry(lanes, state, shaken, num, step_s, first_step=first, backend=backend)
         pieces.append(piece)
     assert_close(whole, Trace(*map(torch.cat, zip(*pieces, strict=True))))
     assert_close(end, same)
@@ -368,7 +370,7 @@ def test_float32_and_any_device_do(device):
     for dtype in (torch.float32, torch.float64):
         lanes = TACKY.lanes(dtype, c=2.0, m=[2e-3, 5e-3, 1e-2], pressure=hertz_pressure(4))
         there = Lanes(*(values.to(device) for values in lanes))
-        trace, _ = carry(there, at_rest(there), driven(ramped(0.04)), 280, 250e-6, engine="eager")
+        trace, _ = carry(there, at_rest(there), driven(ramped(0.04)), 280, 250e-6, backend="torch")
         assert trace.slip_m_s.device == there.mu_s.device
         assert trace.slip_m_s.dtype == dtype
         traces.append(Trace(*(values.cpu().double() for values in trace)))
@@ -378,10 +380,10 @@ def test_float32_and_any_device_do(device):
     assert (error <= 2e-4).all()
 
 
+@needs_engine
 def test_auto_takes_what_it_can(monkeypatch):
-    pytest.importorskip("numba")
-    taken, compiled = [], _bristles._carry_compiled
-    monkeypatch.setattr(_bristles, "_carry_compiled", lambda *a: taken.append(1) or compiled(*a))
+    taken, compiled = [], _bristles._carry_native
+    monkeypatch.setattr(_bristles, "_carry_native", lambda *a: taken.append(1) or compiled(*a))
     lanes, single = varied(), varied(dtype=torch.float32)
     carry(lanes, at_rest(lanes), shaken, 2, 250e-6)
     assert taken
@@ -390,15 +392,15 @@ def test_auto_takes_what_it_can(monkeypatch):
     wanting = lanes._replace(mu_s=lanes.mu_s.clone().requires_grad_())
     trace, _ = carry(wanting, at_rest(lanes), shaken, 2, 250e-6)
     assert trace.friction_n.requires_grad
-    with pytest.raises(ValueError, match=r'"compiled" needs float64 on the CPU, got torch.float32'):
-        carry(single, at_rest(single), shaken, 2, 250e-6, engine="compiled")
-    with pytest.raises(ValueError, match="engine must be one of auto, compiled, eager, got 'fast'"):
-        carry(lanes, at_rest(lanes), shaken, 2, 250e-6, engine="fast")
-    monkeypatch.setattr(runtime, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r'"native" needs float64 on the CPU, got torch.float32'):
+        carry(single, at_rest(single), shaken, 2, 250e-6, backend="native")
+    with pytest.raises(ValueError, match="backend must be one of auto, native, torch, got 'fast'"):
+        carry(lanes, at_rest(lanes), shaken, 2, 250e-6, backend="fast")
+    monkeypatch.setattr(native, "_loaded", lambda: "no compiler")
     carry(lanes, at_rest(lanes), shaken, 2, 250e-6)
     assert not taken
-    with pytest.raises(ValueError, match='"compiled" needs numba, which is not installed'):
-        carry(lanes, at_rest(lanes), shaken, 2, 250e-6, engine="compiled")
+    with pytest.raises(ValueError, match='"native" cannot be used: no compiler'):
+        carry(lanes, at_rest(lanes), shaken, 2, 250e-6, backend="native")
 
 
 def test_gradients_are_those_of_the_scheme():
@@ -457,23 +459,23 @@ def largest_force(lanes: Lanes, speed: torch.Tensor, load: torch.Tensor) -> torc
 
 @pytest.mark.parametrize("step_s", [1e-6, 250e-6, 5e-3])
 @pytest.mark.parametrize(
-    ("n", "dtype", "engine", "num"),
+    ("n", "dtype", "backend", "num"),
     [
-        (1, torch.float64, "compiled", 60),
-        (4, torch.float64, "compiled", 60),
-        (2, torch.float32, "eager", 15),
+        (1, torch.float64, "native", 60),
+        (4, torch.float64, "native", 60),
+        (2, torch.float32, "torch", 15),
     ],
 )
-def test_bounded_and_within_the_cone(step_s, n, dtype, engine, num):
-    if engine == "compiled":
-        pytest.importorskip("numba")
+def test_bounded_and_within_the_cone(step_s, n, dtype, backend, num):
+    if backend == "native" and NO_ENGINE:
+        pytest.skip(NO_ENGINE)
     lanes, speed, load = extreme(n, dtype)
     drive, slack = turning(speed, load, num * step_s), 1.0 + 64 * torch.finfo(dtype).eps
     load_n, moving = load.to(dtype), speed.to(dtype)
     state = at_rest(lanes, 0.5 * lanes.mu_k * load_n)
     each, most = lanes.bristle_stiffness_n_m[:, None] / n, largest_force(lanes, moving, load_n)
     for number in range(num):
-        trace, state = carry(lanes, state, drive, 1, step_s, first_step=number, engine=engine)
+        trace, state = carry(lanes, state, drive, 1, step_s, first_step=number, backend=backend)
         assert all(values.isfinite().all() for values in (*trace, *state)), number
         now = drive(torch.tensor([(number + 1) * step_s], dtype=torch.float64))[1][0].to(dtype)
         cone = lanes.pressure * (lanes.mu_s * now)[:, None]
@@ -502,18 +504,21 @@ def test_no_stage_is_left_unsolved_and_engines_agree(step_s, monkeypatch):
     monkeypatch.setattr(_bristles._Stage, "root", watched)
     lanes, speed, load = extreme(2, torch.float64)
     state, drive = at_rest(lanes, 0.5 * lanes.mu_k * load), turning(speed, load, num * step_s)
-    eager, _ = carry(lanes, state, drive, num, step_s, engine="eager")
+    eager, _ = carry(lanes, state, drive, num, step_s, backend="torch")
     assert len(solved) == 2 * num
     assert torch.stack(solved).all()
-    pytest.importorskip("numba")
-    compiled, _ = carry(lanes, state, drive, 4, step_s, engine="compiled")
+    if NO_ENGINE:
+        return
+    compiled, _ = carry(lanes, state, drive, 4, step_s, backend="native")
     scale = 1e-6 * largest_force(lanes, speed, load)
     for name in ("friction_n", "inertia_n"):
         assert ((getattr(eager, name)[:4] - getattr(compiled, name)).abs() <= scale).all(), name
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
-def test_a_search_ends_though_nothing_can_be_found(engine, wrong):
+def test_a_search_ends_though_nothing_can_be_found(backend, wrong):
     lanes = SMOOTH.lanes(m=[0.0, 5e-3], pressure=hertz_pressure(2))
-    trace, _ = carry(lanes, at_rest(lanes, 0.3), driven(lambda t: wrong), 3, 250e-6, engine=engine)
+    trace, _ = carry(
+        lanes, at_rest(lanes, 0.3), driven(lambda t: wrong), 3, 250e-6, backend=backend
+    )
     assert not trace.friction_n.isfinite().any()

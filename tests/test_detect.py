@@ -74,7 +74,7 @@ def model(tmp_path_factory):
 
 def composed(*overrides):
     with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        return compose("detect", ["engine=eager", *overrides])
+        return compose("detect", ["backend=auto", *overrides])
 
 
 def detected(model, place, folder, *overrides):
@@ -100,7 +100,7 @@ def run(model, tmp_path_factory):
 
 def offline(samples, settings=SETTINGS):
     """The decisions on a recording that is known whole."""
-    detector = small_detector(SEED, engine="auto")
+    detector = small_detector(SEED, backend="auto")
     scores = score_stream(detector, samples, settings.hop_samples)
     decider = Decider(settings, RATE_HZ, detector.pool.bin_samples, detector.look_ahead)
     return decider.decide(scores.score, scores.is_valid)
@@ -372,7 +372,7 @@ def command(monkeypatch, capsys, tmp_path, *arguments):
     """The command as a user runs it: exit status, what it printed, its error line."""
     monkeypatch.chdir(tmp_path)
     run_dir = f"hydra.run.dir={tmp_path / 'out'}"
-    monkeypatch.setattr(sys, "argv", ["detect", "engine=eager", run_dir, *map(str, arguments)])
+    monkeypatch.setattr(sys, "argv", ["detect", "backend=auto", run_dir, *map(str, arguments)])
     status = 0
     try:
         main()
@@ -457,7 +457,7 @@ REFUSED = {
     "tare": (recording, ["tare_s=[0,a]"], "tare_s must be [start, end] in seconds, got [0, 'a']"),
     "view": (recording, ["view=3"], "view must be [start, end] in seconds, got 3"),
     "view of nothing": (recording, ["view=[9,10]"], "shows nothing of 8 s"),
-    "engine": (recording, ["engine=steam"], "steam"),
+    "backend": (recording, ["backend=steam"], "steam"),
     "masked": (
         recording,
         ["masked_channels=[SG1,SG9]"],

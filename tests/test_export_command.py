@@ -29,7 +29,7 @@ def detector():
 def kept(tmp_path):
     """A detector in its file, and the digest of that."""
     source = tmp_path / "detector.pt"
-    small_detector(engine="auto").save(source)
+    small_detector(backend="auto").save(source)
     return source, hashlib.sha256(source.read_bytes()).hexdigest()
 
 
@@ -44,7 +44,7 @@ def exported_with(source, certificate=None):
     if certificate is not None:
         source.with_name("certificate.json").write_text(certificate)
     (path,) = export_detector(
-        small_detector(engine="auto"), source.parent, ["bin"], source=source, alone=False
+        small_detector(backend="auto"), source.parent, ["bin"], source=source, alone=False
     )
     return sidecar_facts(path), summary(path)
 

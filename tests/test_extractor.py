@@ -1,4 +1,4 @@
-"""The native engine gives the reference's values, and the reference steps in where it must."""
+"""The native backend gives the reference's values, and the reference steps in where it must."""
 
 import copy
 import pickle
@@ -218,10 +218,10 @@ def test_forward_mode_is_the_references():
 # Manners -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("engine", ["native", "reference"])
+@pytest.mark.parametrize("backend", ["native", "torch"])
 @pytest.mark.parametrize("num", [0, 1, 3, 131])
-def test_threads_and_number_of_bins_change_nothing(engine, num):
-    extractor, bins = FeatureExtractor(POOL, engine=engine), noise(num)
+def test_threads_and_number_of_bins_change_nothing(backend, num):
+    extractor, bins = FeatureExtractor(POOL, backend=backend), noise(num)
     before, found = torch.get_num_threads(), {}
     try:
         for threads in (1, 2):
@@ -244,9 +244,9 @@ def test_two_callers_at_once():
     assert all(torch.equal(a, b) for a, b in zip(found, expected * 3, strict=True))
 
 
-@pytest.mark.parametrize("engine", ["native", "reference"])
-def test_leading_axes_strides_copies_and_modes(engine):
-    extractor, bins = FeatureExtractor(POOL, [5, 90, 17], engine), noise(6, dtype=torch.float32)
+@pytest.mark.parametrize("backend", ["native", "torch"])
+def test_leading_axes_strides_copies_and_modes(backend):
+    extractor, bins = FeatureExtractor(POOL, [5, 90, 17], backend), noise(6, dtype=torch.float32)
     flat = extractor(bins)
     assert flat.dtype == torch.float32
     torch.testing.assert_close(extractor(bins.reshape(2, 3, *bins.shape[1:])).flatten(0, 1), flat)
@@ -255,7 +255,7 @@ def test_leading_axes_strides_copies_and_modes(engine):
     for other in (extractor, copy.deepcopy(extractor), pickle.loads(pickle.dumps(extractor))):
         assert torch.equal(other(strided), flat)
     with torch.inference_mode():
-        inside = FeatureExtractor(POOL, [5, 90, 17], engine)
+        inside = FeatureExtractor(POOL, [5, 90, 17], backend)
         assert torch.equal(inside(bins), flat)
     assert torch.equal(inside(bins), flat)
     with torch.device("meta"):
@@ -274,7 +274,7 @@ def test_a_selection_is_any_sequence_of_whole_numbers(kind):
     [
         ({"selected": []}, "empty selection"),
         ({"selected": [len(NAMES)]}, rf"must lie in 0..{len(NAMES) - 1}, the pool's {len(NAMES)}"),
-        ({"engine": "fast"}, "engine must be one of auto, native, reference, got 'fast'"),
+        ({"backend": "fast"}, "backend must be one of auto, native, torch, got 'fast'"),
     ],
 )
 def test_what_is_refused_is_one_line(arguments, message):
@@ -283,9 +283,9 @@ def test_what_is_refused_is_one_line(arguments, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("engine", ["native", "reference"])
-def test_wrong_bins_are_refused_as_the_pool_does(engine):
-    extractor = FeatureExtractor(POOL, engine=engine)
+@pytest.mark.parametrize("backend", ["native", "torch"])
+def test_wrong_bins_are_refused_as_the_pool_does(backend):
+    extractor = FeatureExtractor(POOL, backend=backend)
     with pytest.raises(ValueError, match=r"expected bins \[\*, 3, 100\]"):
         extractor(torch.zeros(2, 4, 100))
     with pytest.raises(ValueError, match="expected float32 or float64 bins"):

@@ -157,7 +157,7 @@ def test_a_hand_may_have_channels_of_one_kind_only(kind, rng):
 def test_a_selection_has_the_values_of_the_pool(paper_pool, rng):
     bins = torch.from_numpy(rng.standard_normal((3, 24, 100)))
     chosen = [int(i) for i in rng.permutation(len(PAPER))[:50]] + [7, 7]
-    found = FeatureExtractor(paper_pool, chosen, engine="reference")(bins)
+    found = FeatureExtractor(paper_pool, chosen, backend="torch")(bins)
     torch.testing.assert_close(found, paper_pool(bins)[:, chosen], rtol=1e-12, atol=1e-13)
 
 
@@ -314,7 +314,7 @@ def test_first_and_second_derivatives(descriptor, num, rng):
     hand = HandLayout.from_rows(HAND.to_rows()[:2])
     pool = FeaturePool(hand, bin_samples=num, level=1)
     own = [i for i, name in enumerate(pool.names) if name.descriptor == descriptor]
-    extractor = FeatureExtractor(pool, own, engine="reference")
+    extractor = FeatureExtractor(pool, own, backend="torch")
     bins = torch.from_numpy(rng.standard_normal((2, num))).requires_grad_()
 
     def values(bins):

@@ -158,7 +158,7 @@ def test_what_float32_may_float64_may_not(detector):
 
 
 def test_a_probability_comes_only_of_a_calibration(detector):
-    plain = small_detector(engine="auto")
+    plain = small_detector(backend="auto")
     with pytest.raises(ValueError, match="it gives probability"):
         check_bins(bin_run(detector), plain, SINGLE)
 

@@ -38,9 +38,9 @@ def learn(source, split, maker=None, recipe=None):
     maker = maker or small_maker(source)
     data = SlipDataModule(maker, split, num_workers=0)
     learner = SlipLearner(maker.pool, maker.channel_filter, recipe or small_recipe())
-    engine = trainer()
-    engine.fit(learner, datamodule=data)
-    engine.test(learner, datamodule=data, verbose=False)
+    backend = trainer()
+    backend.fit(learner, datamodule=data)
+    backend.test(learner, datamodule=data, verbose=False)
     return learner
 
 
@@ -248,8 +248,8 @@ def test_a_finished_pass_survives_a_checkpoint(tmp_path):
     half.save_checkpoint(tmp_path / "half.ckpt")
 
     second = SlipLearner(maker.pool, maker.channel_filter, small_recipe())
-    engine = trainer()
-    engine.fit(second, datamodule=data, ckpt_path=tmp_path / "half.ckpt", weights_only=True)
+    backend = trainer()
+    backend.fit(second, datamodule=data, ckpt_path=tmp_path / "half.ckpt", weights_only=True)
     assert "survey_pass" not in second.seconds
     assert_same(learned_state(whole), learned_state(second))
 

@@ -28,17 +28,17 @@ def script(path, text):
     return path
 
 
-def test_switched_off_the_reference_carries_on_and_says_so(anew, caplog):
+def test_switched_off_torch_carries_on_and_says_so(anew, caplog):
     anew.setenv(build.SWITCH, "0")
     pool = FeaturePool(HandLayout.paper24())
     extractor = FeatureExtractor(pool, [7])
-    assert extractor.engine == "reference"
+    assert extractor.backend == "torch"
     assert extractor(torch.ones(2, 24, 100)).shape == (2, 1)
     assert caplog.messages == [
         "features and simulation are made by torch, which is slower: "
         "the native engine is switched off by TACTSLIP_NATIVE=0"
     ]
-    with pytest.raises(ValueError, match=r'engine "native" cannot be used: .* TACTSLIP_NATIVE=0'):
+    with pytest.raises(ValueError, match=r'backend "native" cannot be used: .* TACTSLIP_NATIVE=0'):
         FeatureExtractor(pool, [7], "native")
 
 

@@ -58,21 +58,21 @@ def test_other_filters_are_another_entry_of_the_cache(tmp_path):
 
 @pytest.fixture
 def detector():
-    plain = small_detector(engine="auto")
+    plain = small_detector(backend="auto")
     pool = FeaturePool(HAND, wavelet=WAVELET)
     layer = ChannelFilter([51, 51, 11, 11], kernels=KERNELS)
     return SlipDetector(pool, layer, plain.selected, plain.scaler, plain.head, plain.info)
 
 
-@pytest.mark.parametrize("engine", ["reference", "native"])
-def test_a_detector_comes_back_with_its_filters_in_any_engine(tmp_path, detector, engine):
+@pytest.mark.parametrize("backend", ["torch", "native"])
+def test_a_detector_comes_back_with_its_filters_in_any_engine(tmp_path, detector, backend):
     detector.save(tmp_path / "detector.pt")
-    loaded = SlipDetector.load(tmp_path / "detector.pt", engine=engine)
-    assert loaded.extractor.engine == engine
+    loaded = SlipDetector.load(tmp_path / "detector.pt", backend=backend)
+    assert loaded.extractor.backend == backend
     assert loaded.pool.wavelet == detector.pool.wavelet
     assert loaded.channel_filter.kernels == detector.channel_filter.kernels
     samples = raw_bins(30, seed=1)
-    expected = small_detector(engine="auto").score_raw(samples)
+    expected = small_detector(backend="auto").score_raw(samples)
     score = loaded.score_raw(samples)
     torch.testing.assert_close(score, detector.score_raw(samples), rtol=1e-9, atol=1e-9)
     assert not torch.allclose(score, expected, rtol=1e-3)

@@ -41,7 +41,7 @@ TINY = (
     "search.arithmetics=[double]",
     "search.calls=10",
     "search.most_timed=3",
-    "features.engine=eager",
+    "features.backend=auto",
     "retime_calls=20",
     "num_workers=0",
 )
@@ -137,7 +137,7 @@ def test_the_table_says_what_the_files_do(written, capsys):
     assert "look-ahead" in table
     assert f"{100 * found['chosen']['test']['balanced_accuracy']:.2f} %" in table
     assert "SIMULATED" in pareto_table(found | {"simulated": True})
-    assert "engine eager; p50" in table
+    assert "backend eager; p50" in table
     assert f"{found['tried']} tried there, {found['not_tried']} not tried" in table
     chosen = found["chosen"]
     assert f"p99 of all calls {chosen['p99_all_us']:.0f} us" in table
@@ -219,7 +219,7 @@ def test_none_that_meets_the_limits_is_said_plainly(monkeypatch, capsys, tmp_pat
 def test_one_that_fails_in_the_fresh_process_gives_way_to_the_next(monkeypatch, tmp_path):
     given = iter([900_000.0, 100.0, 100.0])
 
-    def played(path, calls, engine):
+    def played(path, calls, backend):
         assert path.exists()
         us = next(given)
         return Timing(50.0, us, us, calls)

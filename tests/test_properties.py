@@ -17,7 +17,7 @@ from tactslip_torch.signals.wavelet import branch_matrix
 HAND = HandLayout.paper24()
 NUM = 100
 POOL = FeaturePool(HAND)
-ENGINES = {name: FeatureExtractor(POOL, engine=name) for name in ("reference", "auto")}
+BACKENDS = {name: FeatureExtractor(POOL, backend=name) for name in ("torch", "auto")}
 NAMES = oracles.pool_names()
 PLAIN = [" ".join(name) for name in NAMES]
 CHANNEL_OF = {name: i for i, name in enumerate(HAND.names)}
@@ -88,13 +88,13 @@ def bounds_of(features, dtype):
             yield name, columns(name, domain), excess - (slack if name == "kurtosis" else least)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("dtype", DTYPES)
 @settings(max_examples=40)
 @given(data=st.data())
-def test_every_value_is_finite_and_within_its_bounds(dtype, engine, data):
+def test_every_value_is_finite_and_within_its_bounds(dtype, backend, data):
     batch = data.draw(batches(32, dtype))
-    features = ENGINES[engine](batch.bins)
+    features = BACKENDS[backend](batch.bins)
     assert features.dtype == dtype
     assert_none(~features.isfinite(), batch, "not finite")
     for name, where, excess in bounds_of(features, dtype):
@@ -106,14 +106,14 @@ def test_every_value_is_finite_and_within_its_bounds(dtype, engine, data):
     assert (ratios[~is_zero] - 1).abs().max() <= slack
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("dtype", DTYPES)
 @settings(max_examples=8)
 @given(data=st.data())
-def test_locations_lie_between_the_extremes(dtype, engine, data):
+def test_locations_lie_between_the_extremes(dtype, backend, data):
     """mean, median and mode, of gauges by their bins and of films by NumPy's product."""
     batch = data.draw(batches(32, dtype))
-    features, bins = ENGINES[engine](batch.bins).double(), batch.bins.double().numpy()
+    features, bins = BACKENDS[backend](batch.bins).double(), batch.bins.double().numpy()
     eps = torch.finfo(dtype).eps
     weights = branch_matrix(NUM).numpy()
     first = bins[:, 14:, :1]
@@ -154,15 +154,15 @@ def test_validity_is_its_rule(dtype, data):
     assert np.array_equal(POOL.validity(bins).numpy(), expected)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("backend", BACKENDS)
 @settings(max_examples=25)
 @given(data=st.data())
-def test_float32_bins_give_what_they_give_in_float64_rounded_once(engine, data):
+def test_float32_bins_give_what_they_give_in_float64_rounded_once(backend, data):
     batch = data.draw(batches(32, torch.float32))
     largest = torch.finfo(torch.float32).max
-    exact = ENGINES[engine](batch.bins.double())
+    exact = BACKENDS[backend](batch.bins.double())
     expected = exact.clamp(-largest, largest).float()
-    assert_none(ENGINES[engine](batch.bins) != expected, batch, "float32 differs")
+    assert_none(BACKENDS[backend](batch.bins) != expected, batch, "float32 differs")
 
 
 # Gradients -----------------------------------------------------------------------------------
@@ -219,18 +219,18 @@ def test_validity_where_64_eps_of_the_magnitude_is_denormal(dtype):
 # Who influences whom -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("dtype", DTYPES)
 @settings(max_examples=8)
 @given(data=st.data())
-def test_a_bin_speaks_for_itself_alone(dtype, engine, data):
+def test_a_bin_speaks_for_itself_alone(dtype, backend, data):
     """Bit by bit, whatever the other bins are, NaN too, and however the batch is folded."""
     batch, other = data.draw(batches(16, dtype)), data.draw(batches(16, dtype))
     is_kept = torch.rand(16, generator=generated.generator(batch.drawn)) < 0.5
     others = torch.where(torch.arange(16)[:, None, None] % 3 == 0, math.nan, other.bins)
     mixed = torch.where(is_kept[:, None, None], batch.bins, others)
-    features = ENGINES[engine](batch.bins)
-    wrong = is_kept[:, None] & (ENGINES[engine](mixed) != features)
+    features = BACKENDS[backend](batch.bins)
+    wrong = is_kept[:, None] & (BACKENDS[backend](mixed) != features)
     assert_none(wrong, batch, "another bin shows")
-    folded = ENGINES[engine](batch.bins.reshape(2, 8, 24, NUM)).flatten(0, 1)
+    folded = BACKENDS[backend](batch.bins.reshape(2, 8, 24, NUM)).flatten(0, 1)
     assert_none(folded != features, batch, "folding shows")

@@ -10,7 +10,7 @@ import torch
 from scene_files import CONTACTS, RATE_HZ, contacts, scene_on, volts
 from test_signal_checks import BY_NAME, HAND, changed, shuffled
 
-from tactslip_torch import runtime
+from tactslip_torch import native
 from tactslip_torch.analysis.signal_checks import filtered
 from tactslip_torch.simulation import (
     MATERIALS,
@@ -257,7 +257,7 @@ def test_a_batch_in_float32_or_by_the_eager_engine_is_the_same_to_rounding():
     scenes = [scene_on("one", "M2", cycle, **changes) for cycle in (0, 1)]
     exact = [simulate(scene) for scene in scenes]
     for options, tolerance in (
-        ({"engine": "eager"}, 4e-4),  # a step of the converter is 1.5e-4 V
+        ({"backend": "torch"}, 4e-4),  # a step of the converter is 1.5e-4 V
         ({"dtype": torch.float32}, 2e-2),
     ):
         for one, other in zip(simulate_many(scenes, **options), exact, strict=True):
@@ -329,22 +329,22 @@ def test_a_timeline_and_its_samples_integrate_once():
     assert scene_traces.cache_info().misses == 1
 
 
-def test_provenance_and_keys_name_the_engine_of_bristles(monkeypatch):
-    pytest.importorskip("numba")
+@pytest.mark.skipif(bool(native.why_not()), reason=native.why_not())
+def test_provenance_and_keys_name_the_backend_of_bristles(monkeypatch):
     strokes = (Stroke(60.0, 16.0, 0.1),)
     scene = scene_on("many", "M2", strokes=strokes)
-    compiled = {"engine": "compiled", "numba_version": version("numba")}
-    compiled |= {"dtype": "float64", "device": "cpu"}
-    assert simulate(scene, windows=[]).provenance["integrator"] == compiled
-    for fidelity, engines in (("kinematic", [None, None]), ("bristles", ["compiled", "eager"])):
+    by_engine = {"backend": "native", "tactslip_torch_version": version("tactslip_torch")}
+    by_engine |= {"dtype": "float64", "device": "cpu"}
+    assert simulate(scene, windows=[]).provenance["integrator"] == by_engine
+    for fidelity, backends in (("kinematic", [None, None]), ("bristles", ["native", "torch"])):
         source = SimulatedRecordings(
             cycles=1, materials=["M2"], fidelity=fidelity, scene={"strokes": strokes}
         )
         keys = [json.loads(json.dumps(source.key(source.ids[0])))]
         with monkeypatch.context() as without:
-            without.setattr(runtime, "find_spec", lambda name: None)
+            without.setattr(native, "_loaded", lambda: "no compiler")
             keys.append(source.key(source.ids[0]))
-        assert [key.get("integrator", {}).get("engine") for key in keys] == engines
+        assert [key.get("integrator", {}).get("backend") for key in keys] == backends
         assert Scene.from_dict(keys[0]) == replace(scene, fidelity=fidelity)
 
 

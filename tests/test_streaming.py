@@ -446,7 +446,7 @@ def test_settings_come_from_the_detectors_file(tmp_path):
     detector = detector_of()
     detector.info[KEY] = settings_of(RULES[1]).to_dict()
     detector.save(tmp_path / "detector.pt")
-    stream = StreamingDetector(type(detector).load(tmp_path / "detector.pt", engine="auto"))
+    stream = StreamingDetector(type(detector).load(tmp_path / "detector.pt", backend="auto"))
     assert (stream.dtype, stream.settings) == (torch.float32, settings_of(RULES[1]))
     assert (stream.hop_s, stream.bin_s, stream.look_ahead_s) == (0.01, 0.05, 0.0125)
     samples = signal(900, 6, torch.float32)

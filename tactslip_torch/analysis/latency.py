@@ -7,7 +7,7 @@ ignore (the look-ahead of a film, 2.5 ms) another may not. Bins that straddle th
 slip earlier; nothing here counts on it.
 
 *Computing* is timed with one bin and one thread, as a live loop calls it, from raw samples to the
-decision; ``python -m tactslip_torch.analysis.latency detector.pt [calls [engine]]`` prints a line
+decision; ``python -m tactslip_torch.analysis.latency detector.pt [calls [backend]]`` prints a line
 of JSON, p50 and p99 in microseconds. Calls in which the system gave the processor to someone else
 (an involuntary context switch, where the system counts them) are left out, and their fraction is
 told, as is the p99 of all calls with them: what they took says how busy the machine was, and a
@@ -42,13 +42,14 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from tactslip_torch.features.extractor import EngineName, FeatureExtractor
+from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.plan import ORDERED, Plan, make_plan
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling, pooled_names
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import bar, check_number, one_thread
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -270,7 +271,7 @@ def time_detector(detector: SlipDetector, calls: int, runs: int = 3) -> Timing:
 
 
 def time_in_fresh_process(
-    path: str | os.PathLike[str], calls: int, engine: EngineName = "auto"
+    path: str | os.PathLike[str], calls: int, backend: BackendName = "auto"
 ) -> Timing:
     """``time_detector`` of a saved detector in a process that has done nothing else.
 
@@ -278,7 +279,7 @@ def time_in_fresh_process(
         ValueError: if that process fails; its last line is named.
     """
     command = [sys.executable, "-m", "tactslip_torch.analysis.latency", os.fspath(path), str(calls)]
-    command.append(engine)
+    command.append(backend)
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         said = (done.stderr.strip() or f"exit status {done.returncode}").splitlines()[-1]
@@ -431,7 +432,7 @@ def measure_costs(
     pool: FeaturePool,
     channel_filter: ChannelFilter,
     sizes: Sequence[int],
-    engine: EngineName = "auto",
+    backend: BackendName = "auto",
     statistics: Sequence[str] = (),
     *,
     calls: int = 100,
@@ -442,7 +443,7 @@ def measure_costs(
         pool: what features there are.
         channel_filter: of the hand.
         sizes: numbers of features for which the rest is timed.
-        engine: what computes features.
+        backend: what computes features.
         statistics: over channels, whose pooling is timed; none: it is not.
         calls: of each selection, in each of three runs.
     """
@@ -453,23 +454,23 @@ def measure_costs(
     designs = list(_designs(needed, sizes))
     with one_thread():
         for selected in bar(designs, "cost of feature groups"):
-            extractor = FeatureExtractor(pool, selected, engine)
+            extractor = FeatureExtractor(pool, selected, backend)
             timings.append(time_calls(extractor, bins, calls))
 
         def whole(selected: Sequence[int], layer: ChannelPooling | None = None) -> Timing:
-            return time_detector(_stand_in(pool, channel_filter, selected, engine, layer), calls)
+            return time_detector(_stand_in(pool, channel_filter, selected, backend, layer), calls)
 
         rest, tails, pooling = [], [], []
         for size in sizes:
             some = _spread(range(len(pool.names)), size)
-            of_features = time_calls(FeatureExtractor(pool, some, engine), bins, calls)
+            of_features = time_calls(FeatureExtractor(pool, some, backend), bins, calls)
             of_all = whole(some)
             tails.append(of_all.p99_us / of_all.p50_us)
             rest.append(of_all.p50_us - of_features.p50_us)
         rest_us, rest_of_one_us = _line(sizes, rest)
         for layer in layers:
             some = [pool.names.index(name) for name in layer.inputs]
-            of_features = time_calls(FeatureExtractor(pool, some, engine), bins, calls)
+            of_features = time_calls(FeatureExtractor(pool, some, backend), bins, calls)
             of_head_us = rest_us + len(layer.names) * rest_of_one_us
             pooling.append(whole(some, layer).p50_us - of_features.p50_us - of_head_us)
     lengths = [len(layer.inputs) for layer in layers]
@@ -497,7 +498,7 @@ def _stand_in(
     pool: FeaturePool,
     channel_filter: ChannelFilter,
     selected: Sequence[int],
-    engine: EngineName = "auto",
+    backend: BackendName = "auto",
     layer: ChannelPooling | None = None,
 ) -> SlipDetector:
     """A detector that nobody trained, which takes as long as one that somebody did."""
@@ -507,7 +508,9 @@ def _stand_in(
     ends = torch.ones(num, dtype=torch.float64)
     head = QuadraticForm(bend + bend.T, bend[0].clone(), torch.tensor(0.5, dtype=torch.float64))
     scaler = FeatureScaler(-ends, ends, ends)
-    return SlipDetector(pool, channel_filter, selected, scaler, head, pooling=layer, engine=engine)
+    return SlipDetector(
+        pool, channel_filter, selected, scaler, head, pooling=layer, backend=backend
+    )
 
 
 def _layers(pool: FeaturePool, statistics: Sequence[str]) -> Iterator[ChannelPooling]:
@@ -571,11 +574,11 @@ def main(arguments: Sequence[str]) -> None:
     """Print the timing of a saved detector as a line of JSON."""
     if not 1 <= len(arguments) <= 3:
         raise SystemExit(
-            "usage: python -m tactslip_torch.analysis.latency detector.pt [calls [engine]]"
+            "usage: python -m tactslip_torch.analysis.latency detector.pt [calls [backend]]"
         )
-    path, calls, engine = [*arguments, *("1000", "auto")[len(arguments) - 1 :]]
+    path, calls, backend = [*arguments, *("1000", "auto")[len(arguments) - 1 :]]
     with one_thread():
-        detector = SlipDetector.load(Path(path), cast(EngineName, engine))
+        detector = SlipDetector.load(Path(path), cast(BackendName, backend))
         timing = time_detector(detector, int(calls), runs=5)
     print(json.dumps(timing._asdict()))
 

@@ -609,7 +609,7 @@ class Workshop:
     """Makes, times and evaluates detectors of candidates.
 
     Args:
-        makers: of features, by alignment of the filter; one source, pool and engine.
+        makers: of features, by alignment of the filter; one source, pool and backend.
         fold: who is trained on.
         search: what is searched.
         recipe: how features are scaled and classes balanced.
@@ -670,7 +670,7 @@ class Workshop:
             self.pool,
             maker.channel_filter,
             sizes,
-            maker.extractor.engine,
+            maker.extractor.backend,
             max(self.search.statistics, key=len, default=()),
             calls=calls,
         )
@@ -725,8 +725,8 @@ class Workshop:
             "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
         }
         pool = FeaturePool(self.pool.hand, **self.pool.facts() | {"arithmetic": arithmetic})
-        engine = data.maker.extractor.engine
-        return plan.detector(pool, data.maker.channel_filter, head, info, engine)
+        backend = data.maker.extractor.backend
+        return plan.detector(pool, data.maker.channel_filter, head, info, backend)
 
     def evaluated(self, detector: SlipDetector) -> dict[str, Any]:
         """Balanced accuracy on raw bins of the test cycles, scored as a live loop would."""

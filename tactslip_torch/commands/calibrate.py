@@ -173,9 +173,11 @@ def evaluate_point(config: DictConfig, difficulty: float) -> dict[str, Any]:
         rule: LabelRule = instantiate(of_seed.labels)
         recipe: Recipe = instantiate(of_seed.recipe, _convert_="all")
         (split,) = instantiate(of_seed.split, _convert_="all")(source.ids)
-        pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **of_seed.features)
+        pool, channel_filter, dtype, backend = feature_parts(
+            source, rule.bin_ms, **of_seed.features
+        )
         recipe.check_pool(len(pool.names))
-        maker = FeatureMaker(source, pool, channel_filter, rule, None, dtype, engine)
+        maker = FeatureMaker(source, pool, channel_filter, rule, None, dtype, backend)
         data = SlipDataModule(maker, split, of_seed.num_workers)
         accuracies.append(seen_accuracy(maker, data, recipe, f"d {difficulty:+.2f}, seed {seed}"))
         for recording in source.ids:

@@ -173,12 +173,12 @@ def _read(
     rule = instantiate(config.labels)
     share = config.train_share
     by_cycle = seen6(source.ids, seen=names, train_share=share, seed=config.seed)[0]
-    pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
+    pool, channel_filter, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
     for recipe in recipes:
         recipe.allowed(pool)  # refuses before any work
     materials = Materials(pool, config.train_bins, config.scored_bins)
     with feature_cache(config.cache) as cache, one_thread():  # workers need the processors
-        maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, engine)
+        maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, backend)
         data = SlipDataModule(maker, by_cycle, config.num_workers)
         for batch in bar(data.loader(["train", "test"]), "features of all materials", "recording"):
             materials.update(batch, by_cycle.roles[batch.recording])

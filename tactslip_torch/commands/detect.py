@@ -91,7 +91,7 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
         FileNotFoundError: if there is no such detector or recording.
     """
     started = time.perf_counter()
-    detector = SlipDetector.load(config.model, engine=config.engine)
+    detector = SlipDetector.load(config.model, backend=config.backend)
     said = config.reading
     said = OmegaConf.to_container(said, resolve=True) if OmegaConf.is_config(said) else said
     reading = stream_of({"reading": said}).reading

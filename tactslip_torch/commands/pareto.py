@@ -139,7 +139,7 @@ def _facts(
         "limits": {"deadline_ms": limits.deadline_ms, "compute_us": limits.compute_us},
         "headroom": config.headroom,
         "validation": _VALIDATION,
-        "engine": next(iter(shop.makers.values())).extractor.engine,
+        "backend": next(iter(shop.makers.values())).extractor.backend,
         "front": [row_of(shop, each, limits, each.latency, each.timing) for each in front],
         "named": {
             name: each and row_of(shop, each, limits, each.latency, each.timing)
@@ -171,8 +171,8 @@ def _prepared(config: DictConfig, cache: FeatureCache) -> tuple[Limits, Workshop
     makers: dict[Align, FeatureMaker] = {}
     for align in search.aligns:
         features = {**config.features, "align": align}
-        pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **features)
-        makers[align] = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, engine)
+        pool, channel_filter, dtype, backend = feature_parts(source, rule.bin_ms, **features)
+        makers[align] = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, backend)
     search.groups(pool)  # refuses an empty selection before any work
     _check_physics(limits, rule.bin_ms, makers)
     shop = Workshop(makers, folds[0], search, recipe, config.most_summed, config.num_workers)
@@ -213,10 +213,10 @@ def _chosen(
             detector = shop.make(each.candidate, each.arithmetic, from_all=from_all)
             detector.info |= {"experiment": config.name, "seed": config.seed}
             detector.save(trial)
-            engine = detector.extractor.engine
-            timing = time_in_fresh_process(trial, config.retime_calls, engine)
+            backend = detector.extractor.backend
+            timing = time_in_fresh_process(trial, config.retime_calls, backend)
             latency = limits.latency(each.latency, timing.p99_us, config.headroom)
-            about = {"fitted_to": detector.info["fitted_to"], "engine": engine}
+            about = {"fitted_to": detector.info["fitted_to"], "backend": backend}
             tries.append(row_of(shop, each, limits, latency, timing) | about)
             if tries[-1]["misses"]:
                 break

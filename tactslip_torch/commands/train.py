@@ -67,7 +67,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     rule: LabelRule = instantiate(config.labels)
     recipe: Recipe = instantiate(config.recipe, _convert_="all")
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
-    pool, channel_filter, dtype, engine = feature_parts(source, rule.bin_ms, **config.features)
+    pool, channel_filter, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
     recipe.check_pool(len(pool.names))
     if config.statistics:
         check_statistics(config, recipe)
@@ -94,7 +94,7 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         save_config(config, folder)
     fold_metrics: dict[str, dict[str, Any]] = {}
     with feature_cache(config.cache) as cache:
-        maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, engine)
+        maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, backend)
         for fold in folds:
             place = folder if len(folds) == 1 else folder / fold.name
             data = SlipDataModule(maker, fold, config.num_workers)

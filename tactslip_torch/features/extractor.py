@@ -1,10 +1,10 @@
-"""Features of bins, the whole pool or a part of it, by the fastest engine that may be used.
+"""Features of bins, the whole pool or a part of it, by the fastest backend that may be used.
 
-``"reference"`` is ``FeaturePool`` itself: differentiable, on any device, the truth in tests.
+``"torch"`` is the definitions (``FeaturePool``): differentiable, on any device, the truth in tests.
 ``"native"`` carries out a plan of the least work by ``native/engine.cpp``, forwards only and on the
 CPU. Both give the same values to rounding; where a value is all rounding (the sign of cv at a mean
 of 0, the mode of values equal but for rounding) they may differ. Where a derivative is asked for, a
-graph is recorded or bins lie on another device, the reference takes over; so it does for each bin
+graph is recorded or bins lie on another device, torch takes over; so it does for each bin
 with magnitudes beyond 2^-320 to 2^448.
 """
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,13 +24,13 @@ from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import saturating
 from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import for_each, is_concrete
 from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import wavelet_steps
 
-EngineName = Literal["auto", "native", "reference"]
 _FEW_BINS = 4  # so few are done here: another thread would take longer to start
-_CHUNK = {"native": 32, "reference": 16}  # bins of a thread at a time, whose memory fits the cache
+_CHUNK = {"native": 32, "torch": 16}  # bins of a thread at a time, whose memory fits the cache
 
 
 class FeatureExtractor:
@@ -43,14 +43,14 @@ class FeatureExtractor:
     Args:
         pool: what features there are.
         selected: pool indices of the features wanted, in the order of the output; default: all.
-        engine: ``"auto"`` takes the native one where it can be used (``native.why_not``).
+        backend: ``"auto"`` takes the native one where it can be used (``native.why_not``).
 
     Attributes:
         plan: the least work for these features.
-        engine: the engine in use, never ``"auto"``.
+        backend: the one in use, never ``"auto"``.
 
     Raises:
-        ValueError: for no feature, an index outside the pool, an unknown engine, or
+        ValueError: for no feature, an index outside the pool, an unknown backend, or
             ``"native"`` where it cannot be used.
 
     Example:
@@ -64,7 +64,7 @@ class FeatureExtractor:
         self,
         pool: FeaturePool,
         selected: Sequence[int] | None = None,
-        engine: EngineName = "auto",
+        backend: BackendName = "auto",
     ) -> None:
         num = len(pool.names)
         chosen = range(num) if selected is None else [operator.index(i) for i in selected]
@@ -75,7 +75,7 @@ class FeatureExtractor:
             )
         self.pool = pool
         self.selected = tuple(chosen)
-        self.engine: EngineName = resolved(engine)
+        self.backend = native.backend_of(backend)
         self.plan = make_plan(pool.hand, pool.level, self.names)
         self._engines: dict[torch.dtype, native.FeatureEngine] = {}
         self._banks: dict[torch.dtype, Bank] = {}
@@ -99,12 +99,12 @@ class FeatureExtractor:
         self.pool.check(bins)
         dtype = dtype or bins.dtype
         if not is_concrete(bins):
-            return self._by_reference(bins, dtype)
+            return self._by_torch(bins, dtype)
         with torch.inference_mode(False), torch.no_grad():  # what is kept outlives the mode
             flat = bins.detach().reshape(-1, *bins.shape[-2:])
             features = torch.empty(len(flat), len(self.selected), dtype=dtype, device="cpu")
-            describe = self._by_native if self.engine == "native" else self._into_by_reference
-            size = _CHUNK[self.engine]
+            describe = self._by_native if self.backend == "native" else self._into_by_torch
+            size = _CHUNK[self.backend]
             starts = range(0, len(flat), size)
 
             def work(start: int) -> None:
@@ -121,12 +121,12 @@ class FeatureExtractor:
         engine = self._engine_for(bins.dtype)
         is_odd = engine(bins.contiguous().numpy(), features.numpy())
         for index in is_odd.nonzero()[0]:  # one by one: a product's bits depend on its size
-            features[index] = self._by_reference(bins[index], features.dtype)
+            features[index] = self._by_torch(bins[index], features.dtype)
 
-    def _into_by_reference(self, bins: Tensor, features: Tensor) -> None:
-        features.copy_(self._by_reference(bins, features.dtype))
+    def _into_by_torch(self, bins: Tensor, features: Tensor) -> None:
+        features.copy_(self._by_torch(bins, features.dtype))
 
-    def _by_reference(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
+    def _by_torch(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
         x = self.pool.widen(bins)
         if x.dtype not in self._banks:
             self._banks[x.dtype] = self.pool.bank(self.plan, x.dtype)
@@ -167,20 +167,3 @@ class FeatureExtractor:
     def __getstate__(self) -> dict[str, Any]:
         """Without engines, which hold addresses, and banks, which are soon made."""
         return {**self.__dict__, "_engines": {}, "_banks": {}}
-
-
-def resolved(engine: EngineName) -> EngineName:
-    """The engine that a name means on this machine.
-
-    Raises:
-        ValueError: for an unknown name, or ``"native"`` where it cannot be used.
-    """
-    known = get_args(EngineName)
-    if engine not in known:
-        raise ValueError(f"engine must be one of {', '.join(known)}, got {engine!r}")
-    if engine == "reference":
-        return engine
-    trouble = native.why_not()
-    if trouble and engine == "native":
-        raise ValueError(f'engine "native" cannot be used: {trouble}')
-    return "reference" if trouble else "native"

@@ -1,6 +1,6 @@
 """The least work that yields a set of features: which channels, branches and spectra, and for what.
 
-A plan is names and places only. The engines (``eager``, ``compiled``) carry it out; what nobody
+A plan is names and places only. The backends carry it out; what nobody
 wants is not read, formed, sorted or counted.
 """
 

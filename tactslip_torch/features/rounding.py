@@ -1,7 +1,7 @@
 """Features that rounding alone decides, whatever a channel feels: of some wavelets there are a few.
 
 The details of Haar's, for one, come in pairs of opposite sign, so that their mean, their median and
-their skewness are zero but for rounding. Two engines differ in them altogether, and a machine that
+their skewness are zero but for rounding. Two backends differ in them altogether, and a machine that
 took them in would be another on every host.
 """
 

@@ -142,7 +142,7 @@ class Judged:
         self.unstated = WORST_PROBABILITY[form.precision]
         self.masked_channels: Tensor | None = None
         other = copy.copy(self.detector)
-        other.extractor = FeatureExtractor(other.pool, other.selected, "reference")
+        other.extractor = FeatureExtractor(other.pool, other.selected, "torch")
         self.others = [other]
 
     def judge(self, samples: Tensor) -> Prediction:
@@ -155,7 +155,7 @@ class Judged:
         return self.exact(samples)._replace(is_valid=trusted.is_valid)
 
     def exact(self, samples: Tensor, detector: SlipDetector | None = None) -> Prediction:
-        """In float64, by the detector or one of ``others``, whose features other engines make."""
+        """In float64, by the detector or one of ``others``, whose features other backends make."""
         detector = detector or self.detector
         with torch.no_grad():
             return detector.predict_raw(
@@ -174,7 +174,7 @@ class Judged:
         """Bins ``[N]`` whose score another rounding changes by more than ``most``.
 
         Such as the sign of a mean of 0, by which the coefficient of variation takes its own, or a
-        step between values of few digits. Rounding is another in another engine, and where samples
+        step between values of few digits. Rounding is another in another backend, and where samples
         are moved by 4 eps of the largest magnitude of their channel in float64, together and each
         by itself, up and down: a constant stays one.
         """

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.extractor import EngineName, FeatureExtractor, resolved
+from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import is_nowhere, saturating
 from tactslip_torch.features.pool import FeaturePool
@@ -28,6 +28,7 @@ from tactslip_torch.model.missing_channels import (
 )
 from tactslip_torch.model.prediction import Nonfinite, Prediction, check_nonfinite, predict_in_parts
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.native import BackendName, backend_of
 from tactslip_torch.runtime import is_concrete, load_table, save_table, table_form
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -53,7 +54,7 @@ class SlipDetector(nn.Module):
         gaussians: of the scaled features; with them, what is missing leaves the expected score and
             its variance (``ExpectedScore``), instead of the score of ``imputation`` values.
         pooling: from the features that are read to the columns; ``None``: they are the columns.
-        engine: what features are made by where no gradient is asked for (``FeatureExtractor``).
+        backend: what features are made by where no gradient is asked for (``FeatureExtractor``).
 
     Shape:
         - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
@@ -82,13 +83,13 @@ class SlipDetector(nn.Module):
         gaussians: ClassGaussians | None = None,
         pooling: ChannelPooling | None = None,
         *,
-        engine: EngineName = "auto",
+        backend: BackendName = "auto",
     ) -> None:
         super().__init__()
         if imputation is None:
             imputation = torch.zeros(len(scaler.minimum))
         self.pool, self.channel_filter = pool, channel_filter
-        self.extractor = FeatureExtractor(pool, selected, engine)
+        self.extractor = FeatureExtractor(pool, selected, backend)
         self.selected = self.extractor.selected
         self.pooling, self.scaler, self.head, self.gaussians = pooling, scaler, head, gaussians
         self.info = dict(info or {})
@@ -355,14 +356,14 @@ class SlipDetector(nn.Module):
         save_table(path, FORMAT, metadata, tensors)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], engine: EngineName = "auto") -> SlipDetector:
+    def load(cls, path: str | os.PathLike[str], backend: BackendName = "auto") -> SlipDetector:
         """Read a detector; nothing in the file is executed.
 
         Raises:
             FileNotFoundError: if there is no such file.
             ValueError: if it is not a detector file, a damaged one, or of an earlier version.
         """
-        resolved(engine)
+        backend_of(backend)
         name = os.fspath(path)
         try:
             if table_form(path) in _EARLIER_FORMATS:
@@ -374,14 +375,14 @@ class SlipDetector(nn.Module):
         except FileNotFoundError:
             raise FileNotFoundError(f"no detector at {name}") from None
         try:
-            return cls._from_table(metadata, state, engine)
+            return cls._from_table(metadata, state, backend)
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
             raise ValueError(f"{name} is a damaged detector: {reason}") from error
 
     @classmethod
     def _from_table(
-        cls, metadata: Mapping[str, Any], state: Mapping[str, Tensor], engine: EngineName
+        cls, metadata: Mapping[str, Any], state: Mapping[str, Tensor], backend: BackendName
     ) -> SlipDetector:
         """What ``save`` wrote."""
 
@@ -412,5 +413,5 @@ class SlipDetector(nn.Module):
             state["imputation"],
             ClassGaussians(**gaussians) if (gaussians := part("gaussians")) else None,
             pooling and ChannelPooling.from_dict(hand, pooling, part("pooling")),
-            engine=engine,
+            backend=backend,
         )

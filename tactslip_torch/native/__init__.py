@@ -15,13 +15,14 @@ import re
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from tactslip_torch.native.build import REMEDY, SWITCH, build_library, is_off, library_name
 
 Array = np.ndarray[Any, Any]
+BackendName = Literal["auto", "native", "torch"]
 _LOG = logging.getLogger(__name__)
 DESCRIPTORS = (
     "mean", "median", "mode", "range", "mean_deviation", "std", "cv", "iqr", "skewness",
@@ -55,6 +56,17 @@ class _Plan(ctypes.Structure):
         [(name, ctypes.c_int64) for name in _numbers]
         + [(name, ctypes.c_void_p) for name in _pointers]
     )
+
+
+class _BristleRun(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in (
+            "num_lanes", "num_bristles", "num_steps", "every", "patience")),
+        ("step_s", ctypes.c_double),
+        ("gamma", ctypes.c_double),
+        *((name, ctypes.c_void_p) for name in (
+            "table", "pressure", "states", "bristles", "arm", "load", "out")),
+    )  # fmt: skip
 
 
 class FeatureEngine:
@@ -179,10 +191,70 @@ class FeatureEngine:
         return ctypes.addressof(made)
 
 
+def carry_bristles(
+    table: Array,
+    pressure: Array,
+    states: Array,
+    bristles: Array,
+    arm: Array,
+    load: Array,
+    *,
+    step_s: float,
+    gamma: float,
+    every: int,
+    patience: int,
+) -> Array:
+    """Carry lanes through time as ``simulation/_bristles.py`` defines it; float64, contiguous.
+
+    Args:
+        table: mass, k, k1, tau, c, mu_s, mu_k, Stribeck speed, stiffness and damping of a bristle,
+            ``1 / (1 + a / tau)`` and inertia of each lane.
+        pressure: part of the load on each bristle.
+        states: u, v and q, taken on.
+        bristles: deflections, taken on.
+        arm: speed at both stages of each step.
+        load: at the same times.
+        step_s: length of a step.
+        gamma: length of a stage in steps.
+        every: of how many steps the last is kept.
+        patience: evaluations after which every other step halves the bracket.
+
+    Shape:
+        - table: ``[12, L]``; pressure: ``[n]``; states: ``[3, L]``; bristles: ``[L, n]``;
+          arm, load: ``[2 steps, L]``
+        - output: friction, inertia and slip, ``[3, steps / every, L]``
+    """
+    library, num_steps = _library(), len(arm) // 2
+    out = np.empty((3, num_steps // every, len(bristles)))
+    arrays = (table, pressure, states, bristles, arm, load, out)
+    run = _BristleRun(
+        *bristles.shape, num_steps, every, patience, step_s, gamma,
+        *(array.ctypes.data for array in arrays),
+    )  # fmt: skip
+    if library.tactslip_bristles(_level(library), ctypes.byref(run)):
+        raise MemoryError("the native engine found no memory to work in")
+    return out
+
+
 def _entropy_growth(num: int) -> Array:
     """What the value of each rank in its cell adds to the entropy of ``num`` values, in bits."""
     p = np.arange(num + 1) / num
     return np.diff(-p * np.log2(p + np.finfo(np.float64).eps))
+
+
+def backend_of(name: BackendName) -> Literal["native", "torch"]:
+    """What a name means on this machine: ``"auto"`` is native where that can be used.
+
+    Raises:
+        ValueError: for an unknown name, or ``"native"`` where it cannot be used.
+    """
+    if name not in get_args(BackendName):
+        known = ", ".join(get_args(BackendName))
+        raise ValueError(f"backend must be one of {known}, got {name!r}")
+    trouble = "" if name == "torch" else why_not()
+    if trouble and name == "native":
+        raise ValueError(f'backend "native" cannot be used: {trouble}')
+    return "torch" if trouble or name == "torch" else "native"
 
 
 def why_not() -> str:
@@ -217,6 +289,7 @@ def _loaded() -> ctypes.CDLL | str:
     library.tactslip_features.argtypes = (
         number, pointer, pointer, number, ctypes.c_int64, pointer, number, pointer,
     )  # fmt: skip
+    library.tactslip_bristles.argtypes = (number, pointer)
     return library
 
 

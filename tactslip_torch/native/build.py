@@ -24,7 +24,7 @@ REMEDY = (
     "(features and simulation are then several times slower)"
 )
 _HERE = Path(__file__).parent
-_SOURCES = ("engine.h", "engine.cpp", "door.cpp")
+_SOURCES = ("engine.h", "vectors.h", "engine.cpp", "bristles.cpp", "door.cpp")
 _FLAGS = [
     *("-O3", "-std=c++17", "-fPIC", "-fno-exceptions", "-fno-rtti", "-fno-math-errno"),
     *("-fno-trapping-math", "-fno-strict-aliasing", "-ffp-contract=off", "-fvisibility=hidden"),
@@ -70,8 +70,11 @@ def build_library(folder: Path) -> Path:
         there = Path(name)
         jobs = [(["door.cpp"], "door.o")]
         for level in (2, 3, 4) if _is_x86() else (1,):
-            jobs.append((["engine.cpp", f"-DENTRY=features_v{level}", *_march(compiler, level)],
-                         f"engine{level}.o"))  # fmt: skip
+            for source, entry in (("engine", "features"), ("bristles", "bristles")):
+                define = f"-D{entry.upper()}_ENTRY={entry}_v{level}"
+                jobs.append(
+                    ([f"{source}.cpp", define, *_march(compiler, level)], f"{source}{level}.o")
+                )
         compile_ = [*compiler, *_FLAGS, *_target(compiler), "-I", str(_HERE), "-c"]
         _run([[*compile_, str(_HERE / source), *rest, "-o", str(there / to)]
               for (source, *rest), to in jobs])  # fmt: skip

@@ -8,12 +8,14 @@
 #define EXPORT extern "C" __attribute__((visibility("default")))
 #endif
 
+typedef int Bristles(const BristleRun*);
 typedef int Features(const Plan*, const void*, int, int64_t, void*, int, uint8_t*);
 
 #if defined(__x86_64__)
 #include <cpuid.h>
 
 extern "C" Features features_v2, features_v3, features_v4;
+extern "C" Bristles bristles_v2, bristles_v3, bristles_v4;
 
 static bool has(unsigned bits, unsigned wanted) { return (bits & wanted) == wanted; }
 
@@ -35,8 +37,13 @@ EXPORT int tactslip_features(int level, const Plan* plan, const void* bins, int 
   Features* engine = level >= 4 ? features_v4 : level == 3 ? features_v3 : features_v2;
   return engine(plan, bins, bins_are_float, num_bins, out, out_is_float, is_odd);
 }
+
+EXPORT int tactslip_bristles(int level, const BristleRun* run) {
+  return (level >= 4 ? bristles_v4 : level == 3 ? bristles_v3 : bristles_v2)(run);
+}
 #else
 extern "C" Features features_v1;
+extern "C" Bristles bristles_v1;
 
 EXPORT int tactslip_level() { return 1; }
 
@@ -44,4 +51,6 @@ EXPORT int tactslip_features(int, const Plan* plan, const void* bins, int bins_a
                              int64_t num_bins, void* out, int out_is_float, uint8_t* is_odd) {
   return features_v1(plan, bins, bins_are_float, num_bins, out, out_is_float, is_odd);
 }
+
+EXPORT int tactslip_bristles(int, const BristleRun* run) { return bristles_v1(run); }
 #endif

@@ -9,27 +9,16 @@
 // This file is compiled once for each instruction set (door.cpp chooses). Only vector types are
 // used that GCC and clang share, no intrinsics, and nothing of the C++ runtime.
 
-#include <math.h>
-#include <stdint.h>
 #include <stdlib.h>
-#include <string.h>
 
 #include "engine.h"
-
-#if defined(__AVX512F__)
-#define VECTOR_BYTES 64
-#elif defined(__AVX2__)
-#define VECTOR_BYTES 32
-#else
-#define VECTOR_BYTES 16
-#endif
-#define INLINE static inline __attribute__((always_inline))
-#define NOINLINE static __attribute__((noinline))
+#include "vectors.h"
 
 namespace {
 
 constexpr double NOISE = 16 * 0x1p-52;  // part of a channel's magnitude; a span below is rounding
 constexpr double CV_FLOOR = 1e-6;       // part of the rms that the mean counts as at least
+constexpr double CV_ZERO = 1e-12;       // part of it within which a mean has no sign
 constexpr double CROWDED = 2e-3;        // part of a row's span; float rounds to 3e-8 of it
 constexpr double LEVELS = 255;          // of entropy's histogram, less one
 constexpr double SMALLEST = 0x1p-320, LARGEST = 0x1p448;  // between them squares are in range
@@ -39,9 +28,6 @@ constexpr uint32_t ORDERED = 1u << MEDIAN | 1u << MODE | 1u << IQR | 1u << ENTRO
 constexpr uint32_t WEIGHTED = 1u << SPECTRAL_CENTROID | 1u << SPECTRAL_SPREAD;
 
 // Vectors of double, and the T that describe as many lanes: W lanes of T are H vectors of double.
-typedef double D __attribute__((vector_size(VECTOR_BYTES)));
-constexpr int DL = VECTOR_BYTES / sizeof(double);
-
 template <class T> struct Lanes;
 template <> struct Lanes<double> {
   typedef D V;
@@ -56,21 +42,6 @@ template <> struct Lanes<float> {
   typedef uint8_t Few __attribute__((vector_size(VECTOR_BYTES / 4)));
 };
 typedef uint8_t Bytes __attribute__((vector_size(VECTOR_BYTES)));
-
-template <class V> INLINE V smaller(V a, V b) { return a < b ? a : b; }
-template <class V> INLINE V larger(V a, V b) { return a > b ? a : b; }
-template <class V> INLINE V magnitude(V a) { return larger(a, -a); }
-template <class V> INLINE V root(V a) {
-  constexpr int num = sizeof(V) / sizeof(a[0]);
-  for (int k = 0; k < num; ++k) a[k] = sizeof(a[0]) == 4 ? sqrtf(a[k]) : sqrt(a[k]);
-  return a;
-}
-template <class M> INLINE bool any(M mask) {
-  uint64_t words[sizeof(M) / 8], all = 0;
-  memcpy(words, &mask, sizeof(M));
-  for (uint64_t word : words) all |= word;
-  return all != 0;
-}
 
 // -- Sorting -------------------------------------------------------------------------------------
 
@@ -212,8 +183,8 @@ template <class T> struct Describe {
   static D mean_deviation(const Half& s) { return s.span * s.first / s.n; }
   static D std(const Half& s) { return s.span * root(s.second / (s.n - 1)); }
   static D cv(const Half& s) {
-    D floor = larger(magnitude(s.centre), CV_FLOOR * root(s.energy / s.n));
-    D value = std(s) / (s.centre >= 0 ? floor : -floor);
+    D rms = root(s.energy / s.n), floor = larger(magnitude(s.centre), CV_FLOOR * rms);
+    D value = std(s) / (s.centre < -CV_ZERO * rms ? -floor : floor);
     return s.span > 0 ? value : D{};
   }
   template <class Any> INLINE Any quantile(const Any* sorted, double q, int64_t n) {
@@ -696,7 +667,7 @@ int run(const Plan& plan, const void* bins, bool bins_are_float, int64_t num_bin
 
 }  // namespace
 
-extern "C" int ENTRY(const Plan* plan, const void* bins, int bins_are_float, int64_t num_bins,
+extern "C" int FEATURES_ENTRY(const Plan* plan, const void* bins, int bins_are_float, int64_t num_bins,
                      void* out, int out_is_float, uint8_t* is_odd) {
   return plan->is_float
              ? run<float>(*plan, bins, bins_are_float, num_bins, out, out_is_float, is_odd)

@@ -28,3 +28,13 @@ struct Plan {
   const void* ones;  // [2 num_lines] spectrum of the constant 1
   const double *frequency_hz, *gain_time, *gain_lines;
 };
+
+// Lanes of skin and bristles to be carried through time; a lane's numbers lie num_lanes apart.
+struct BristleRun {
+  int64_t num_lanes, num_bristles, num_steps, every, patience;
+  double step_s, gamma;
+  const double *table, *pressure;  // [12, L], [n]
+  double *states, *bristles;       // [3, L] and [L, n], taken on
+  const double *arm, *load;        // [2 steps, L]
+  double* out;                     // [3, steps / every, L]
+};

@@ -42,8 +42,8 @@ def pareto_table(content: Mapping[str, Any]) -> str:
     limits = content["limits"]
     interrupted = max(row["interrupted"] for row in content["front"])
     head = [
-        f"front of {content['searched']} candidates, {content['timed']} timed (engine "
-        f"{content['engine']}, one bin, one thread); limits: deadline "
+        f"front of {content['searched']} candidates, {content['timed']} timed (backend "
+        f"{content['backend']}, one bin, one thread); limits: deadline "
         f"{limits['deadline_ms']:g} ms, compute {limits['compute_us']:g} us",
         content["definition"],
         f"validation: {content['validation']}",
@@ -95,8 +95,8 @@ def _chosen_lines(content: Mapping[str, Any]) -> list[str]:
     return [
         f"chosen: {latency['worst_ms']:.2f} ms = look-ahead {latency['look_ahead_ms']:g} + bin "
         f"{latency['bin_ms']:g} + hop {latency['hop_ms']:g} + compute "
-        f"{latency['compute_us'] / 1000:.3f} (p99 in a fresh process, engine "
-        f"{chosen['engine']}; p50 {chosen['p50_us']:.0f} us, p99 of all calls "
+        f"{latency['compute_us'] / 1000:.3f} (p99 in a fresh process, backend "
+        f"{chosen['backend']}; p50 {chosen['p50_us']:.0f} us, p99 of all calls "
         f"{chosen['p99_all_us']:.0f} us, {100 * latency['load']:.1f} % of a core, "
         f"{margin:.2f} times faster than asked)",
         f"  {chosen['num_features']} numbers ({chosen['columns']}) of "

@@ -16,8 +16,8 @@ values in small letters, the arm's speed ``w``::
 Skin and bristles are eliminated; the last is one scalar equation ``A V + B + a F(V) = 0`` a lane,
 with ``A > 0`` and ``F`` bounded, so there is always a root and a bracket.
 
-This module is the definition: torch on any device, differentiable. ``compiled.py`` carries it out
-for float64 on the CPU.
+This module is the definition: torch on any device, differentiable. ``native/bristles.cpp`` carries
+it out for float64 on the CPU.
 """
 
 from __future__ import annotations
@@ -25,15 +25,13 @@ from __future__ import annotations
 import math
 from importlib.metadata import version
 from itertools import count
-from typing import Literal, NamedTuple, cast, get_args
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.runtime import usable_engine
-
-EngineName = Literal["auto", "compiled", "eager"]
+from tactslip_torch import native
+from tactslip_torch.native import BackendName
 
 _GAMMA = 1.0 - 1.0 / math.sqrt(2.0)  # length of a stage in steps
 
@@ -153,7 +151,7 @@ def integrate(
     load_n: Tensor,
     step_s: float,
     every: int = 1,
-    engine: EngineName = "auto",
+    backend: BackendName = "auto",
 ) -> tuple[Trace, LaneState]:
     """Carry lanes through time under a drive.
 
@@ -167,8 +165,8 @@ def integrate(
         load_n: newtons at the same times.
         step_s: length of a step; 125 to 250 us are accurate, any is stable.
         every: of how many steps the last is kept; it divides their number.
-        engine: ``"compiled"`` is for float64 on the CPU and has no gradient; ``"auto"`` takes it
-            where it can, else ``"eager"``. They agree to rounding.
+        backend: ``"native"`` is for float64 on the CPU and has no gradient; ``"auto"`` takes it
+            where it can, else ``"torch"``. They agree to rounding.
 
     Returns:
         The trace, its entry ``i`` after ``(i + 1) every`` steps, and the last state.
@@ -178,36 +176,36 @@ def integrate(
         - output: ``[num_steps / every, *]``, in the lanes' kind of number and on their device
 
     Raises:
-        ValueError: for an unknown engine, or one that cannot do this.
+        ValueError: for an unknown backend, or one that cannot do this.
     """
-    chosen = _usable(engine)
-    if chosen == "compiled" and (lack := _compiled_lacks(lanes, state, arm_m_s, load_n)):
-        if engine == "compiled":
-            raise ValueError(f'engine "compiled" {lack}; use engine "eager"')
-        chosen = "eager"
-    carry = _carry_compiled if chosen == "compiled" else _carry_eager
+    chosen = native.backend_of(backend)
+    if chosen == "native" and (lack := _native_lacks(lanes, state, arm_m_s, load_n)):
+        if backend == "native":
+            raise ValueError(f'backend "native" {lack}; use backend "torch"')
+        chosen = "torch"
+    carry = _carry_native if chosen == "native" else _carry_torch
     return carry(lanes, state, arm_m_s, load_n, step_s, every)
 
 
 def integrator(
-    engine: EngineName = "auto",
+    backend: BackendName = "auto",
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> dict[str, str]:
-    """What carries lanes of a kind here without gradient: engines and their releases round apart.
+    """What carries lanes of a kind here without gradient: backends and their releases round apart.
 
     Raises:
-        ValueError: for an unknown engine, or one that cannot be used here.
+        ValueError: for an unknown backend, or one that cannot be used here.
 
     Example:
-        >>> integrator("eager")["engine"]
-        'eager'
+        >>> integrator("torch")["backend"]
+        'torch'
     """
     kind = torch.device(device).type
-    chosen = _usable(engine) if (dtype, kind) == (torch.float64, "cpu") else "eager"
-    runs_on = "numba" if chosen == "compiled" else "torch"
+    chosen = native.backend_of(backend) if (dtype, kind) == (torch.float64, "cpu") else "torch"
+    runs_on = "tactslip_torch" if chosen == "native" else "torch"
     return {
-        "engine": chosen,
+        "backend": chosen,
         f"{runs_on}_version": version(runs_on),
         "dtype": str(dtype).removeprefix("torch."),
         "device": kind,
@@ -217,7 +215,7 @@ def integrator(
 # --- the definition -----------------------------------------------------------------------------
 
 
-def _carry_eager(
+def _carry_torch(
     lanes: Lanes, state: LaneState, arm: Tensor, load: Tensor, step_s: float, every: int
 ) -> tuple[Trace, LaneState]:
     """All lanes at once, step by step, in torch."""
@@ -406,20 +404,10 @@ class _Stage:
         return speed
 
 
-# --- the compiled engine ------------------------------------------------------------------------
+# --- the native engine --------------------------------------------------------------------------
 
 
-def _usable(engine: EngineName) -> EngineName:
-    """The engine that a name means on this machine, or one line why it cannot be."""
-    known = get_args(EngineName)
-    return cast(EngineName, usable_engine(engine, known, _load_kernels, "bristles are integrated"))
-
-
-def _load_kernels() -> None:
-    from tactslip_torch.simulation import compiled  # noqa: F401  (numba takes a second)
-
-
-def _compiled_lacks(lanes: Lanes, state: LaneState, arm: Tensor, load: Tensor) -> str:
+def _native_lacks(lanes: Lanes, state: LaneState, arm: Tensor, load: Tensor) -> str:
     """Why kernels cannot do this; empty if they can."""
     if lanes.pressure.dtype != torch.float64 or lanes.pressure.device.type != "cpu":
         return f"needs float64 on the CPU, got {lanes.pressure.dtype} on {lanes.pressure.device}"
@@ -428,12 +416,10 @@ def _compiled_lacks(lanes: Lanes, state: LaneState, arm: Tensor, load: Tensor) -
     return ""
 
 
-def _carry_compiled(
+def _carry_native(
     lanes: Lanes, state: LaneState, arm: Tensor, load: Tensor, step_s: float, every: int
 ) -> tuple[Trace, LaneState]:
-    """``_carry_eager`` of float64 on the CPU, without gradient."""
-    from tactslip_torch.simulation.compiled import carry_blocks
-
+    """``_carry_torch`` of float64 on the CPU, without gradient."""
     *flat, bristle = (values.detach() for values in state)
     shape, n, stage = flat[0].shape, len(lanes.pressure), _Stage(lanes, _GAMMA * step_s)
     of_bristle = (stage.stiffness[..., 0], stage.damping[..., 0])
@@ -441,24 +427,21 @@ def _carry_compiled(
     table = torch.stack([row.detach().expand(shape).reshape(-1) for row in rows]).numpy()
     states = torch.stack([values.reshape(-1) for values in flat]).numpy()
     bristles = bristle.reshape(-1, n).numpy().copy()
-    out = np.empty((3, len(arm) // (2 * every), shape.numel()))
     arm, load = (
         values.detach().expand(len(arm), *shape).reshape(len(arm), -1).contiguous()
         for values in (arm, load)
     )
-    pressure = lanes.pressure.detach().contiguous().numpy()
-    carry_blocks(
+    out = native.carry_bristles(
         table,
+        lanes.pressure.detach().contiguous().numpy(),
         states,
         bristles,
-        pressure,
         arm.numpy(),
         load.numpy(),
-        step_s,
-        _GAMMA,
-        _PATIENCE,
-        every,
-        out,
+        step_s=step_s,
+        gamma=_GAMMA,
+        every=every,
+        patience=_PATIENCE,
     )
     trace = Trace(*(torch.from_numpy(values).reshape(-1, *shape) for values in out))
     u, v, q = torch.from_numpy(states).reshape(3, *shape)

@@ -17,21 +17,19 @@ channels are asked for.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
-from importlib.util import find_spec
+from functools import lru_cache
 from itertools import chain
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from tactslip_torch.native import BackendName
 from tactslip_torch.simulation._blocks import Array, Grid, generator, lognormal, smooth_step
 from tactslip_torch.simulation._bristles import (
-    EngineName,
     Lanes,
     LaneState,
     hertz_pressure,
@@ -389,24 +387,22 @@ def traces_of(
     *,
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float64,
-    engine: EngineName = "auto",
+    backend: BackendName = "auto",
 ) -> list[tuple[StrokeTrace, ...]]:
     """Every stroke that slides of every recording; those that last equally long run side by side.
 
-    However many run beside it, each is the same: bitwise by the compiled engine, to rounding by
-    the eager one.
+    However many run beside it, each is the same: bitwise by the native one, to rounding by
+    torch.
 
     Args:
         scenes: of fidelity ``"bristles"``.
         device: where lanes are integrated.
         dtype: in which they are.
-        engine: see ``integrate``.
+        backend: see ``integrate``.
 
     Raises:
         ValueError: if no whole number of steps makes a sample.
     """
-    if find_spec("numba") is None and engine == "auto":
-        _say_slow()
     slides = [_slides_of(scene) for scene in scenes]
     groups: dict[tuple[float, ...], list[_Slide]] = {}
     for slide in chain.from_iterable(slides):
@@ -415,21 +411,13 @@ def traces_of(
         groups.setdefault((slide.num, every, scene.sample_rate_hz, num_bristles), []).append(slide)
     traces: dict[_Slide, StrokeTrace] = {}
     for group in groups.values():
-        made = _integrated(group, torch.device(device), dtype, engine)
+        made = _integrated(group, torch.device(device), dtype, backend)
         traces.update(zip(group, made, strict=True))
     return [tuple(traces[slide] for slide in of_scene) for of_scene in slides]
 
 
-@cache
-def _say_slow() -> None:
-    logging.getLogger(__name__).warning(
-        "numba is not installed: bristles are integrated by engine eager, which is slow; "
-        'pip install "tactslip_torch[fast]"'
-    )
-
-
 def _integrated(
-    slides: list[_Slide], device: torch.device, dtype: torch.dtype, engine: EngineName
+    slides: list[_Slide], device: torch.device, dtype: torch.dtype, backend: BackendName
 ) -> list[StrokeTrace]:
     """Strokes of one length, side by side."""
 
@@ -450,13 +438,13 @@ def _integrated(
         num_steps = every * (min(first + _SAMPLES_AT_ONCE, num) - first)
         arm, load = drive(stage_times_s(num_steps, step_s, first * every).numpy())
         with torch.no_grad():
-            trace, state = integrate(lanes, state, arm, load, step_s, every, engine)
+            trace, state = integrate(lanes, state, arm, load, step_s, every, backend)
         pieces.append(torch.stack(trace).double().cpu().numpy())
     whole = np.concatenate(pieces, axis=1)  # friction, inertia, slip: [3, num, L]
     start = np.stack([shear_n.double().cpu().numpy(), *np.zeros((2, len(shear_n)))])
     whole = np.concatenate([start[:, None], whole], axis=1)
     ends = np.cumsum([len(slide.shear) for slide in slides])[:-1]
-    by = integrator(engine, dtype, device)
+    by = integrator(backend, dtype, device)
     pieces = np.split(whole, ends, axis=2)
     return [_trace(slide, values, by) for slide, values in zip(slides, pieces, strict=True)]
 

@@ -65,8 +65,8 @@ PAPER = "paper"
 class Scene:
     """What is simulated. Equal scenes give equal bytes.
 
-    With bristles they do by one engine in one release: by numba's kernel or, without numba, by
-    torch, which round apart. Provenance and the keys of ``SimulatedRecordings`` name which.
+    With bristles they do by one backend in one release: by the native engine or by torch, which
+    round apart. Provenance and the keys of ``SimulatedRecordings`` name which.
 
     Args:
         material: id in ``MATERIALS``.

@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 
 from tactslip_torch.data.recording import Recording
+from tactslip_torch.native import BackendName
 from tactslip_torch.simulation._blocks import Array, Grid, generator
-from tactslip_torch.simulation._bristles import EngineName
 from tactslip_torch.simulation._contact import Contacts, StrokeTrace, scene_contact, traces_of
 from tactslip_torch.simulation._disturbances import (
     Handled,
@@ -133,17 +133,17 @@ def simulate_many(
     channels: Iterable[str] | None = None,
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float64,
-    engine: EngineName = "auto",
+    backend: BackendName = "auto",
     at_once: int = 32,
 ) -> Iterator[Recording]:
     """The recordings of several scenes, in their order, each when it is asked for.
 
-    Bristles of many recordings are integrated side by side, on any device. The compiled engine
+    Bristles of many recordings are integrated side by side, on any device. The native engine
     carries lanes by 16, which the elements of one recording nearly fill, so there this saves
-    little; the eager engine makes few large calls of what would be many small ones.
+    little; torch makes few large calls of what would be many small ones.
 
-    On the CPU in float64, engine ``"auto"``, each has the bytes that ``simulate`` gives it; by the
-    eager engine, in float32 or on a GPU what it differs by is the integration's rounding.
+    On the CPU in float64, backend ``"auto"``, each has the bytes that ``simulate`` gives it; by
+    torch, in float32 or on a GPU what it differs by is the integration's rounding.
 
     Args:
         scenes: of any fidelity; kinematic ones are simulated one by one.
@@ -151,7 +151,7 @@ def simulate_many(
         channels: names of the channels to compute, ``None`` for all.
         device: where bristles are integrated; sensors are simulated on the CPU.
         dtype: in which bristles are integrated, float32 or float64; samples are float32.
-        engine: ``"compiled"`` or ``"eager"``, ``"auto"`` for what there is.
+        backend: ``"native"`` or ``"torch"``, ``"auto"`` for what there is.
         at_once: how many recordings are integrated together.
 
     Raises:
@@ -176,7 +176,7 @@ def simulate_many(
         for start in range(0, len(scenes), at_once):
             some = scenes[start : start + at_once]
             distinct = list(dict.fromkeys(one for one in some if one.fidelity == "bristles"))
-            integrated = traces_of(distinct, device=device, dtype=dtype, engine=engine)
+            integrated = traces_of(distinct, device=device, dtype=dtype, backend=backend)
             traces = dict(zip(distinct, integrated, strict=True))
             for scene, intervals in zip(some, wanted[start : start + at_once], strict=True):
                 yield _recording(scene, traces.get(scene), intervals, channels)

@@ -31,8 +31,9 @@ from tactslip_torch.data.labels import (
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource, Timeline
 from tactslip_torch.data.splits import ROLES, Split
 from tactslip_torch.features.cache import FeatureCache, cache_key, source_digest
-from tactslip_torch.features.extractor import EngineName, FeatureExtractor
+from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.native import BackendName
 from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter, extended
 
@@ -92,10 +93,10 @@ class FeatureMaker:
         rule: where the bins lie and what they are.
         cache: where features are kept, if they are.
         dtype: in which features are computed; they are handed on in float32.
-        engine: what computes them.
+        backend: what computes them.
 
     Raises:
-        ValueError: if rate, channels or bin length of the parts disagree, or the engine is none
+        ValueError: if rate, channels or bin length of the parts disagree, or the backend is none
             that can be used.
     """
 
@@ -107,7 +108,7 @@ class FeatureMaker:
         rule: LabelRule,
         cache: FeatureCache | None = None,
         dtype: torch.dtype = torch.float64,
-        engine: EngineName = "auto",
+        backend: BackendName = "auto",
     ) -> None:
         if pool.hand != source.hand:
             raise ValueError(
@@ -128,7 +129,7 @@ class FeatureMaker:
             )
         self.source = source
         self.pool = pool
-        self.extractor = FeatureExtractor(pool, engine=engine)
+        self.extractor = FeatureExtractor(pool, backend=backend)
         self.channel_filter = channel_filter
         self.rule = rule
         self.cache = cache
@@ -281,7 +282,7 @@ class FeatureMaker:
             "spectrum": [pool.spectrum, pool.arithmetic],
             "filter": list(self.channel_filter.config().values()),
             "dtype": str(self.dtype),
-            "engine": self.extractor.engine,
+            "backend": self.extractor.backend,
             "code": self._code,
             "libraries": self._libraries,
         }

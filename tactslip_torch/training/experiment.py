@@ -30,7 +30,6 @@ from tactslip_torch.features.cache import (
     default_cache_folder,
     source_digest,
 )
-from tactslip_torch.features.extractor import EngineName, resolved
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import statistics_of
@@ -38,6 +37,7 @@ from tactslip_torch.graph.export import export_detector, sidecar_facts, worst_er
 from tactslip_torch.graph.facts import GraphKind
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.native import BackendName, backend_of
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
 from tactslip_torch.onset.decisions import Scorer
 from tactslip_torch.onset.events import RecordingEvents
@@ -135,11 +135,11 @@ def feature_parts(
     level: int | None,
     spectrum: SpectrumMethod,
     dtype: str,
-    engine: EngineName,
+    backend: BackendName,
     align: Align = "centred",
     pooling: str | Sequence[str] | None = None,
-) -> tuple[FeaturePool, ChannelFilter, torch.dtype, EngineName]:
-    """Pool, filter, dtype and engine from the ``features`` section; no recording is read for it.
+) -> tuple[FeaturePool, ChannelFilter, torch.dtype, BackendName]:
+    """Pool, filter, dtype and backend from the ``features`` section; no recording is read for it.
 
     Args:
         source: of the recordings, whose hand and rate they are for.
@@ -150,7 +150,7 @@ def feature_parts(
         level: number of levels; ``None``: as many as bin and wavelet allow, at most the paper's 4.
         spectrum: of the branches.
         dtype: in which features are computed.
-        engine: what computes them.
+        backend: what computes them.
         align: of the filter.
         pooling: statistics over channels; the recipe takes them, here they are only checked.
 
@@ -173,7 +173,7 @@ def feature_parts(
         spectrum=spectrum,
         arithmetic="native" if dtype == "float32" else "double",
     )
-    return pool, ChannelFilter(lengths, polyorder, align), DTYPES[dtype], resolved(engine)
+    return pool, ChannelFilter(lengths, polyorder, align), DTYPES[dtype], backend_of(backend)
 
 
 def frame_lengths(hand: HandLayout, frames: Mapping[str, int | None]) -> list[int]:

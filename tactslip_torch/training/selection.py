@@ -32,7 +32,6 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.bin_sample import SampledBins
-from tactslip_torch.features.extractor import EngineName
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
@@ -45,6 +44,7 @@ from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import best_threshold
+from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import Ticker, bar, for_each
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.recipe import (
@@ -156,7 +156,7 @@ class Plan:
         channel_filter: ChannelFilter,
         head: Head,
         info: Mapping[str, Any],
-        engine: EngineName = "auto",
+        backend: BackendName = "auto",
     ) -> SlipDetector:
         """The detector of this plan with a machine that was solved for it."""
         selection = self.selection
@@ -170,7 +170,7 @@ class Plan:
             self.imputation,
             self.gaussians,
             selection.pooling,
-            engine=engine,
+            backend=backend,
         )
 
     def to_dict(self) -> dict[str, Any]:

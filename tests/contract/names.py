@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 from tactslip_torch import (
     AlarmSettings,
-    FeatureExtractor,
     FeaturePool,
     HandLayout,
     Scene,
@@ -28,6 +27,12 @@ REPLACED_NEXT = ("features/", "graph/", "model/few_bins")
 """Of the package, what the issue behind this one replaces; not counted in ``modules.py``."""
 ENGINES = ("native",)
 """Of ``FeatureExtractor``, beside the reference, which is the pool itself."""
+
+
+def FeatureExtractor(pool, selected=None, *, engine="auto"):
+    from tactslip_torch import FeatureExtractor
+
+    return FeatureExtractor(pool, selected, backend=engine)
 
 
 def predict_raw(detector, samples, **options):
@@ -88,7 +93,7 @@ KEYS = {
     "deadline_ms": "deadline_ms",
     "draws": "draws",
     "dtype": "features.dtype",
-    "engine": "features.engine",
+    "engine": "features.backend",
     "every_decision": "decisions",
     "experiment": "+exp",
     "export": "export",

@@ -44,7 +44,7 @@ MISTAKES = {
     "share": ("train", files(train_share=1.5), "split.train_share 0 1 1.5"),
     "even frame": ("train", files(frames={"SG": 50, "PVDF": 11}), "features.frames.SG odd 50"),
     "dtype": ("train", files(dtype="float16"), "features.dtype float64 float32 'float16'"),
-    "engine": ("train", files(engine="cuda"), "engine 'cuda' compiled eager"),
+    "engine": ("train", files(engine="cuda"), "backend 'cuda' native torch"),
     "too many features": (
         "train",
         files(recipe="paper", num_features=9999),
