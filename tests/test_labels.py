@@ -1,3 +1,5 @@
+"""Which bins of a recording are slip, which are not, and which windows of time they need."""
+
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -27,10 +29,12 @@ RATE = 2000.0
 ONSETS = (2.0, 9.0, 13.5)  # REFERENCE.md section 1, with slides of 100 mm at 20, 40, 60 mm/s
 SLIDES = ((2.0, 7.0), (9.0, 11.5), (13.5, 13.5 + 100 / 60))
 DURATION = 15.5
+HALF = LabelRule(layout="half_second")
+both_layouts = pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
 
 
-def lay(rule=None, onsets=ONSETS, slides=SLIDES, duration_s=DURATION, rate=RATE, non_slip=()):
-    return label_bins(rule or LabelRule(), onsets, slides, duration_s, rate, non_slip)
+def lay(rule=None, onsets=ONSETS, slides=SLIDES, duration_s=DURATION, rate=RATE, **stretches):
+    return label_bins(rule or LabelRule(), onsets, slides, duration_s, rate, **stretches)
 
 
 def of_stroke(bins, stroke, is_slip):
@@ -40,68 +44,56 @@ def of_stroke(bins, stroke, is_slip):
 # Layouts -------------------------------------------------------------------------------------
 
 
-def test_whole_slide_has_the_published_counts():
-    bins = lay()
-    assert int((~bins.is_slip).sum()) == 60
-    assert int(bins.is_slip.sum()) == 183
-    for stroke, num_slip in enumerate((100, 50, 33)):
-        assert len(of_stroke(bins, stroke, False)) == 20
-        assert len(of_stroke(bins, stroke, True)) == num_slip
+@pytest.mark.parametrize(
+    ("rule", "lead", "shift", "counts"),
+    [(LabelRule(), 20, 0.010, (100, 50, 33)), (HALF, 10, 0.0, (10, 10, 10))],
+    ids=["whole_slide", "half_second"],
+)
+def test_bins_of_the_papers_protocol(rule, lead, shift, counts):
+    """The counts of the published confusion matrices, and the half seconds of the text."""
+    bins = lay(rule)
     assert bins.bin_samples == 100
-
-
-def test_whole_slide_moves_the_onset_ten_milliseconds_earlier():
-    bins = lay()
-    for stroke, (onset, (_, end)) in enumerate(zip(ONSETS, SLIDES, strict=True)):
+    assert bins.position.dtype == torch.int64
+    for stroke, (onset, num_slip) in enumerate(zip(ONSETS, counts, strict=True)):
         before, after = of_stroke(bins, stroke, False), of_stroke(bins, stroke, True)
-        edge = onset - 0.010
-        np.testing.assert_allclose(before, (edge - 1 + 0.05 * np.arange(20)) * RATE, atol=1e-6)
-        np.testing.assert_allclose(after, (edge + 0.05 * np.arange(len(after))) * RATE, atol=1e-6)
-        assert (after[-1] + 100) / RATE <= end < (after[-1] + 200) / RATE
-
-
-def test_half_second_has_ten_and_ten_without_a_shift():
-    bins = lay(LabelRule(layout="half_second"))
-    assert len(bins.starts) == 60
-    for stroke, onset in enumerate(ONSETS):
-        before, after = of_stroke(bins, stroke, False), of_stroke(bins, stroke, True)
-        np.testing.assert_allclose(before, (onset - 0.5 + 0.05 * np.arange(10)) * RATE, atol=1e-6)
-        np.testing.assert_allclose(after, (onset + 0.05 * np.arange(10)) * RATE, atol=1e-6)
-
-
-def test_half_second_does_not_follow_a_slide_that_goes_on():
+        edge = onset - shift
+        expected = (edge + 0.05 * np.arange(-lead, num_slip)) * RATE
+        np.testing.assert_allclose(before + after, expected, atol=1e-6)
+        position = bins.position[bins.stroke == stroke].tolist()
+        assert position == list(range(-lead, num_slip))
+        if rule.layout == "whole_slide":
+            assert (after[-1] + 100) / RATE <= SLIDES[stroke][1] < (after[-1] + 200) / RATE
     shorter = tuple((start, end - 1) for start, end in SLIDES)
-    rule = LabelRule(layout="half_second")
-    assert torch.equal(lay(rule).starts, lay(rule, slides=shorter).starts)
-    assert len(lay(slides=shorter).starts) == 60 + 80 + 30 + 13
+    num = 60 + 80 + 30 + 13 if rule.layout == "whole_slide" else 60
+    assert len(lay(rule, slides=shorter).starts) == num
 
 
-@pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
-def test_a_hop_of_half_a_bin_doubles_the_bins_but_one(layout):
+@both_layouts
+@pytest.mark.parametrize("hop_ms", [25.0, 100.0, 150.0])
+def test_hops_lay_bins_further_apart_or_over_each_other(layout, hop_ms):
     plain = lay(LabelRule(layout=layout))
-    dense = lay(LabelRule(layout=layout, hop_ms=25.0))
+    dense = lay(LabelRule(layout=layout, hop_ms=hop_ms))
     assert dense.bin_samples == 100
     for stroke in range(3):
         for is_slip in (False, True):
             every = of_stroke(dense, stroke, is_slip)
-            assert every[::2][: len(of_stroke(plain, stroke, is_slip))] == of_stroke(
-                plain, stroke, is_slip
-            )
-            assert set(np.diff(every)) == {50}
-    assert len(of_stroke(dense, 0, False)) == 2 * len(of_stroke(plain, 0, False)) - 1
+            assert set(np.diff(every)) <= {round(2 * hop_ms)}
+            assert every[0] == of_stroke(plain, stroke, is_slip)[0]
+        quiet, slip = ((dense.stroke == stroke) & (dense.is_slip == s) for s in (False, True))
+        assert (int(dense.position[quiet].max()), int(dense.position[slip].min())) == (-1, 0)
+        assert set(np.diff(dense.position[quiet | slip])) == {1}
+    if hop_ms == 25.0:
+        assert len(of_stroke(dense, 0, False)) == 2 * len(of_stroke(plain, 0, False)) - 1
 
 
-def test_a_hop_longer_than_a_bin_leaves_gaps():
-    bins = lay(LabelRule(hop_ms=100.0))
-    assert len(of_stroke(bins, 0, False)) == 10
-    assert set(np.diff(of_stroke(bins, 0, True))) == {200}
-
-
-def test_bin_length_and_rate_scale_together():
-    bins = lay(LabelRule(bin_ms=25.0), rate=1000.0)
-    assert bins.bin_samples == 25
-    assert len(of_stroke(bins, 0, False)) == 40
-    assert of_stroke(bins, 0, True)[0] == 1990
+@pytest.mark.parametrize(
+    ("bin_ms", "rate", "samples"), [(25, 1000, 25), (33, 2000, 66), (0.5, 2000, 1)]
+)
+def test_bin_length_and_rate_scale_together(bin_ms, rate, samples):
+    bins = lay(LabelRule(bin_ms=bin_ms), rate=float(rate))
+    assert bins.bin_samples == samples
+    assert len(of_stroke(bins, 0, False)) == int(1000 / bin_ms)
+    assert of_stroke(bins, 0, True)[0] == 1.99 * rate
 
 
 @given(
@@ -123,47 +115,24 @@ def test_no_bin_straddles_the_onset_or_the_end(onset, length, hop_ms):
     assert int(slip.sum()) == (fits // hop + 1 if fits >= 0 else 0)  # not one bin less
 
 
-def test_a_slide_shorter_than_a_bin_has_no_slip_bin():
-    bins = lay(onsets=(2.0,), slides=((2.0, 2.03),))
-    assert len(bins.starts) == 20
-    assert not bool(bins.is_slip.any())
+def test_short_slides_pauses_and_recordings():
+    short = lay(onsets=(2.0,), slides=((2.0, 2.03),))
+    assert (len(short.starts), bool(short.is_slip.any())) == (20, False)
+    half = lay(HALF, (2.0,), ((2.0, 2.23),), 5.0)
+    ends = (half.starts[half.is_slip] + half.bin_samples) / RATE
+    assert (len(ends), float(ends.max()) <= 2.23) == (4, True)
+    for rule in (LabelRule(), HALF):  # a pause of 0.3 s leaves less than the layout asks for
+        bins = lay(rule, (2.0, 3.3), ((2.0, 3.0), (3.3, 4.3)), 5.0)
+        quiet = ~bins.is_slip & (bins.stroke == 1)
+        assert float(bins.starts[quiet].min()) / RATE >= 3.0
+        num = int(quiet.sum())
+        assert bins.position[quiet].tolist() == list(range(-num, 0))
+        assert num in (5, 6)
+    whole = lay(HALF, (0.5,), ((0.5, 1.0),), 1.0)  # bins touch both ends
+    assert (int(whole.starts[0]), int(whole.starts[-1]) + 100) == (0, 2000)
 
 
-# Positions -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("layout", "lead"), [("whole_slide", 20), ("half_second", 10)])
-def test_positions_count_from_the_onset(layout, lead):
-    bins = lay(LabelRule(layout=layout))
-    assert bins.position.dtype == torch.int64
-    for stroke in range(3):
-        mine = bins.stroke == stroke
-        before, after = (bins.position[mine & (bins.is_slip == s)].tolist() for s in (False, True))
-        assert before == list(range(-lead, 0))
-        assert after == list(range(len(after)))
-    edges = torch.tensor([round((o - (0.01 if lead == 20 else 0)) * RATE) for o in ONSETS])
-    assert torch.equal(bins.starts, edges[bins.stroke] + 100 * bins.position)
-
-
-@pytest.mark.parametrize("hop_ms", [25.0, 150.0])
-def test_the_last_bin_before_an_onset_is_minus_one_at_any_hop(hop_ms):
-    bins = lay(LabelRule(hop_ms=hop_ms))
-    for stroke in range(3):
-        quiet, slip = (
-            (bins.stroke == stroke) & (bins.is_slip == is_slip) for is_slip in (False, True)
-        )
-        assert int(bins.position[quiet].max()) == -1
-        assert int(bins.position[slip].min()) == 0
-        assert set(np.diff(bins.position[quiet | slip])) == {1}
-
-
-def test_bins_cut_by_the_slide_before_keep_their_positions():
-    bins = lay(onsets=(2.0, 3.3), slides=((2.0, 3.0), (3.3, 4.3)), duration_s=5.0)
-    quiet = bins.position[~bins.is_slip & (bins.stroke == 1)].tolist()
-    assert quiet == list(range(-5, 0))  # 0.29 s hold five bins of 20
-
-
-# Stretches without slip ----------------------------------------------------------------------
+# Stretches -----------------------------------------------------------------------------------
 
 
 def by_hand(strokes, slides, stretches, bin_samples, hop, num_samples):
@@ -186,7 +155,7 @@ def by_hand(strokes, slides, stretches, bin_samples, hop, num_samples):
     return found
 
 
-@pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
+@both_layouts
 @pytest.mark.parametrize("hop_ms", [None, 25.0, 70.0])
 @given(
     stretches=st.lists(
@@ -201,7 +170,7 @@ def test_bins_of_stretches_meet_no_other_bin_and_no_slide(layout, hop_ms, stretc
     rule = LabelRule(layout=layout, hop_ms=hop_ms)
     annotated = tuple(onset + jitter for onset in ONSETS)
     seconds = tuple((start / RATE, end / RATE) for start, end in stretches)
-    plain, bins = lay(rule, annotated), lay(rule, annotated, non_slip=seconds)
+    plain, bins = lay(rule, annotated), lay(rule, annotated, non_slip_s=seconds)
     num = len(plain.starts)
     for name in ("starts", "is_slip", "stroke", "position"):  # strokes are laid as ever
         assert torch.equal(getattr(bins, name)[:num], getattr(plain, name)), name
@@ -218,15 +187,6 @@ def test_bins_of_stretches_meet_no_other_bin_and_no_slide(layout, hop_ms, stretc
     assert set(bins.position[num:].tolist()) <= {NO_POSITION}
 
 
-def test_a_slide_shorter_than_a_bin_is_still_no_place_for_a_non_slip_bin():
-    for onset in (2.0, 1.995, 2.02):  # as annotated; the contact slides from 2.0 on
-        bins = lay(onsets=(onset,), slides=((2.0, 2.03),), non_slip=((1.5, 3.0),))
-        own = bins.starts[bins.stroke == -1] / RATE
-        assert not bool(bins.is_slip.any())
-        assert len(own) > 10
-        assert bool(((own >= 2.03) | (own + 0.05 <= min(onset - 0.01, 2.0) + 1e-9)).all())
-
-
 @pytest.mark.parametrize(
     ("annotated", "stretch"),
     [(2.04, (1.98, 2.03)), (1.88, (1.93, 1.98))],
@@ -235,34 +195,45 @@ def test_a_slide_shorter_than_a_bin_is_still_no_place_for_a_non_slip_bin():
 def test_between_annotated_and_exact_onset_nothing_is_non_slip(annotated, stretch):
     """Where a long hop leaves room for a bin; moved away by a second there is one."""
     rule = LabelRule(hop_ms=150.0)
-    assert -1 not in lay(rule, (annotated,), ((2.0, 4.0),), non_slip=(stretch,)).stroke
+    assert -1 not in lay(rule, (annotated,), ((2.0, 4.0),), non_slip_s=(stretch,)).stroke
     moved = tuple(edge + 3.0 for edge in stretch)
-    assert -1 in lay(rule, (annotated,), ((2.0, 4.0),), non_slip=(moved,)).stroke
+    assert -1 in lay(rule, (annotated,), ((2.0, 4.0),), non_slip_s=(moved,)).stroke
 
 
-@pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
+@both_layouts
 def test_a_recording_without_onsets_has_the_bins_of_its_stretches(layout):
     rule = LabelRule(layout=layout)
-    bins = lay(rule, (), (), 3.0, non_slip=((0.0, 1.0), (1.2 + 0.1, 3.0)))
+    bins = lay(rule, (), (), 3.0, non_slip_s=((0.0, 1.0), (1.2 + 0.1, 3.0)))
     assert bins.starts.tolist() == [*range(0, 2000, 100), *range(2600, 6000, 100)]
     assert bins.starts.dtype == bins.stroke.dtype == bins.position.dtype == torch.int64
-    assert bins.is_slip.dtype == torch.bool
-    assert not bool(bins.is_slip.any())
+    assert (bins.is_slip.dtype, bool(bins.is_slip.any())) == (torch.bool, False)
     assert needed_windows(bins, 25, 3.0, RATE) == [(0.0, 2025 / RATE), (2575 / RATE, 3.0)]
+    nothing = lay(rule, (), ())
+    assert len(nothing.starts) == len(nothing.is_slip) == len(nothing.position) == 0
+    assert needed_windows(nothing, 25, DURATION, RATE) == []
 
 
-def test_a_recording_of_nothing_has_no_bins():
-    bins = lay(onsets=(), slides=())
-    assert [len(part) for part in (bins.starts, bins.is_slip, bins.stroke, bins.position)] == 4 * [
-        0
-    ]
-    assert needed_windows(bins, 25, DURATION, RATE) == []
+def test_stretches_of_slip_come_last_and_belong_to_no_stroke():
+    stretches = {"non_slip_s": ((0.0, 0.2),), "slip_s": ((1.0, 1.1),)}
+    bins = lay(LabelRule(hop_ms=25.0), (), (), 3.0, **stretches)
+    assert bins.is_slip.tolist() == [False] * 7 + [True] * 3
+    assert bins.starts[-3:].tolist() == [round(s * RATE) for s in (1.0, 1.025, 1.05)]
+    assert set(bins.stroke.tolist()) == {-1}
+    twice = lay(None, (), (), 3.0, non_slip_s=((0.0, 1.0),), slip_s=((0.0, 2.0),))
+    assert (twice.starts / RATE)[twice.is_slip].min() == 1.0  # said to be no slip, it stays so
 
 
-@pytest.mark.parametrize("stretch", [(15.0, 15.6), (-0.1, 1.0)])
-def test_a_stretch_that_leaves_the_recording_is_refused(stretch):
-    with pytest.raises(ValueError, match=r"the stretch from .* leaves the recording of"):
-        lay(non_slip=(stretch,))
+def test_bins_that_need_missing_samples_are_left_out():
+    bins = lay(None, (), (), 3.0, non_slip_s=((0.0, 3.0),))
+    gap = (1.0, 1.0 + 1 / RATE)
+    for before, after, expected in ((0, 0, [2000]), (25, 11, [1900, 2000])):
+        kept = clear_of(bins, [gap], before, after, RATE)
+        assert sorted(set(bins.starts.tolist()) - set(kept.starts.tolist())) == expected
+        assert len(kept.starts) == len(kept.is_slip) == len(kept.stroke) == len(kept.position)
+    assert 1900 in clear_of(bins, [(1.0 + 11 / RATE, 1.1)], 25, 11, RATE).starts.tolist()
+
+
+# Of a feature maker ----------------------------------------------------------------------------
 
 
 def test_a_feature_maker_lays_bins_in_stretches_and_gives_them_no_speed():
@@ -281,22 +252,10 @@ def test_a_feature_maker_lays_bins_in_stretches_and_gives_them_no_speed():
     assert small_maker(SmallSet()).key(recording) != small_maker(Handled()).key(recording)
 
 
-# Whose onsets --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("onsets", ["annotated", "exact"])
-def test_the_caller_chooses_the_onsets(onsets):
-    """``label_bins`` takes what it is given, whatever the rule says."""
-    moved = tuple(onset + 0.02 for onset in ONSETS)
-    rule = LabelRule(onsets=onsets)
-    assert torch.equal(lay(rule, moved).starts[:20], lay(rule).starts[:20] + 40)
-
-
 @pytest.mark.parametrize(("onsets", "expected_s"), [("annotated", 1.25), ("exact", 1.2)])
 def test_a_feature_maker_takes_the_onsets_its_rule_names(onsets, expected_s):
-    hand = HandLayout.from_rows(
-        [{"name": "film", "kind": "PVDF", "finger": "index", "segment": "distal"}]
-    )
+    row = {"name": "film", "kind": "PVDF", "finger": "index", "segment": "distal"}
+    hand = HandLayout.from_rows([row])
     noise = torch.randn(1, 6000, generator=torch.Generator().manual_seed(0))
     trial = Recording(noise, RATE, "M1", (20.0,), (1.2,), ((1.2, 2.5),), (1.25,))
     source = SimpleNamespace(
@@ -313,170 +272,56 @@ def test_a_feature_maker_takes_the_onsets_its_rule_names(onsets, expected_s):
     assert cut.shape == (len(bins.starts), 1, 100)
 
 
-# Errors --------------------------------------------------------------------------------------
+# Windows and shuffled labels -------------------------------------------------------------------
+
+CASES = {
+    "paper": lay(),
+    "half_second": lay(HALF),
+    "gaps": lay(LabelRule(hop_ms=150.0)),
+    "close to both ends": lay(HALF, (0.505, DURATION - 0.51), ((0.5, 1.0), (14.9, 15.4))),
+    "at both ends": lay(HALF, (0.5, DURATION - 0.5), ((0.5, 1.0), (15.0, 15.5))),
+}
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"layout": "nope"}, "labels.layout must be one of whole_slide, half_second, got 'nope'"),
-        ({"onsets": "guessed"}, "labels.onsets must be one of annotated, exact, got 'guessed'"),
-        ({"bin_ms": 0.0}, "labels.bin_ms must be positive, got 0.0"),
-        ({"hop_ms": -50.0}, "labels.hop_ms must be positive, got -50.0"),
-        ({"bin_ms": float("nan")}, "labels.bin_ms must be positive, got nan"),
-    ],
-)
-def test_a_bad_rule_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        LabelRule(**change)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"bin_ms": 50.2}, r"labels.bin_ms=50.2 is 100.4 samples at 2000 Hz; choose a whole"),
-        ({"hop_ms": 0.1}, r"labels.hop_ms=0.1 is 0.2 samples"),
-    ],
-)
-def test_no_whole_number_of_samples_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        lay(LabelRule(**change))
-
-
-@pytest.mark.parametrize("bin_ms", [33.0, 49.5, 0.5])
-def test_a_whole_number_of_samples_is_not(bin_ms):
-    assert lay(LabelRule(bin_ms=bin_ms)).bin_samples == round(2 * bin_ms)
-
-
-def test_a_bin_that_leaves_the_recording_is_refused_with_its_stroke():
-    with pytest.raises(ValueError, match=r"stroke 1 with its onset at 1.005 s needs samples from"):
-        lay(onsets=(1.005,), slides=((1.005, 3.0),))
-    with pytest.raises(ValueError, match=r"stroke 3 .* outside the recording of 15.100 s"):
-        lay(duration_s=15.1)
-    half = LabelRule(layout="half_second")
-    with pytest.raises(ValueError, match="stroke 1"):
-        lay(half, (0.4,), ((0.4, 3.0),))
-    with pytest.raises(ValueError, match=r"outside the recording of 2\.400 s"):
-        lay(half, (2.0,), ((2.0, 2.45),), 2.4)
-
-
-def test_no_bin_is_slip_behind_the_end_of_its_slide():
-    bins = lay(LabelRule(layout="half_second"), (2.0,), ((2.0, 2.23),), 5.0)
-    ends = (bins.starts[bins.is_slip] + bins.bin_samples) / 2000
-    assert len(ends) == 4
-    assert float(ends.max()) <= 2.23
-
-
-@pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
-def test_no_bin_is_non_slip_within_the_slide_before(layout):
-    """A pause of 0.3 s leaves less than the layout asks for."""
-    onsets, slides = (2.0, 3.3), ((2.0, 3.0), (3.3, 4.3))
-    bins = lay(LabelRule(layout=layout), onsets, slides, 5.0)
-    quiet = bins.starts[~bins.is_slip & (bins.stroke == 1)] / 2000
-    assert float(quiet.min()) >= 3.0
-    assert 0 < len(quiet) <= 6
-
-
-def test_bins_may_touch_both_ends_of_the_recording():
-    bins = lay(LabelRule(layout="half_second"), (0.5,), ((0.5, 1.0),), 1.0)
-    assert int(bins.starts[0]) == 0
-    assert int(bins.starts[-1]) + 100 == 2000
-
-
-def test_onsets_and_slides_must_go_together():
-    with pytest.raises(ValueError, match="zip"):
-        lay(onsets=ONSETS[:2])
-
-
-@pytest.mark.parametrize(
-    "rule",
-    [LabelRule(bin_ms=1100.0), LabelRule("half_second", bin_ms=600.0)],
-    ids=["whole_slide", "half_second"],
-)
-def test_a_bin_longer_than_the_stretch_before_the_onset_is_refused(rule):
-    with pytest.raises(ValueError, match=r"labels\.bin_ms"):
-        lay(rule)
-
-
-# Windows -------------------------------------------------------------------------------------
-
-
-def cases():
-    yield "paper", lay()
-    yield "half_second", lay(LabelRule(layout="half_second"))
-    yield "gaps", lay(LabelRule(hop_ms=150.0))
-    yield (
-        "close to both ends",
-        lay(LabelRule(layout="half_second"), (0.505, DURATION - 0.51), ((0.5, 1.0), (14.9, 15.4))),
-    )
-    yield (
-        "at both ends",
-        lay(LabelRule(layout="half_second"), (0.5, DURATION - 0.5), ((0.5, 1.0), (15.0, 15.5))),
-    )
-
-
-@pytest.mark.parametrize(("name", "bins"), list(cases()), ids=[name for name, _ in cases()])
-def test_windows_cover_every_bin_with_context_and_no_more(name, bins):
-    context, num_samples = 25, round(DURATION * RATE)
-    windows = [(low * RATE, high * RATE) for low, high in needed_windows(bins, 25, DURATION, RATE)]
-    np.testing.assert_allclose(windows, np.round(windows), atol=1e-6)
-    covered = np.zeros(num_samples, dtype=bool)
+@pytest.mark.parametrize("name", CASES)
+def test_windows_are_all_that_filtering_the_bins_needs(name, rng):
+    """Samples outside the windows are NaN; not one of them reaches a bin."""
+    bins, channel_filter = CASES[name], ChannelFilter([51, 11, 51])
+    context, num_samples = channel_filter.context, round(DURATION * RATE)
+    windows = needed_windows(bins, context, DURATION, RATE)
+    flat = [edge for window in windows for edge in window]
+    assert all(earlier < later for earlier, later in pairwise(flat))
+    np.testing.assert_allclose(np.array(flat) * RATE, np.round(np.array(flat) * RATE), atol=1e-6)
+    covered, needed = np.zeros((2, num_samples), dtype=bool)
+    samples = torch.from_numpy(rng.standard_normal((3, num_samples)))
+    partial = torch.full_like(samples, torch.nan)
     for low, high in windows:
-        covered[round(low) : round(high)] = True
-    needed = np.zeros(num_samples, dtype=bool)
+        window = slice(round(low * RATE), round(high * RATE))
+        covered[window] = True
+        partial[:, window] = samples[:, window]
     for start in bins.starts.tolist():
         needed[max(start - context, 0) : start + 100 + context] = True
     assert covered[needed].all()
     extra = np.flatnonzero(covered & ~needed)
     assert bool(np.all((extra < 2 * context) | (extra >= num_samples - 2 * context)))
-
-
-@pytest.mark.parametrize(("name", "bins"), list(cases()), ids=[name for name, _ in cases()])
-def test_windows_ascend_with_gaps_between_them(name, bins):
-    windows = needed_windows(bins, 25, DURATION, RATE)
-    flat = [edge for window in windows for edge in window]
-    assert all(earlier < later for earlier, later in pairwise(flat))
-    assert flat[0] >= 0
-    assert flat[-1] <= DURATION
-
-
-def test_windows_close_to_an_end_reach_it():
-    """Within two contexts, so that the filter sees the true edge."""
-    half = LabelRule(layout="half_second")
-    for start, reaches in ((0, True), (30, True), (49, True), (50, False)):
-        onset = 0.5 + start / RATE
-        windows = needed_windows(lay(half, (onset,), ((onset, 2.0),)), 25, DURATION, RATE)
-        assert (windows[0][0] == 0) == reaches
-        onset = DURATION - onset
-        windows = needed_windows(lay(half, (onset,), ((onset, DURATION),)), 25, DURATION, RATE)
-        assert (windows[-1][1] == DURATION) == reaches
-
-
-def test_windows_merge_where_they_touch():
-    assert len(needed_windows(lay(), 25, DURATION, RATE)) == 3  # one per stroke
-    apart = lay(LabelRule(hop_ms=150.0), (2.0,), ((2.0, 2.03),))
-    num_bins = len(apart.starts)
-    assert len(needed_windows(apart, 0, DURATION, RATE)) == num_bins
-    assert len(needed_windows(apart, 99, DURATION, RATE)) == num_bins  # 2 samples between them
-    assert len(needed_windows(apart, 100, DURATION, RATE)) == 1
-
-
-@pytest.mark.parametrize(("name", "bins"), list(cases()), ids=[name for name, _ in cases()])
-def test_filtering_the_windows_alone_gives_the_same_bins(name, bins, rng):
-    """Samples outside the windows are NaN; not one of them reaches a bin."""
-    channel_filter = ChannelFilter([51, 11, 51])
-    samples = torch.from_numpy(rng.standard_normal((3, round(DURATION * RATE))))
-    partial = torch.full_like(samples, torch.nan)
-    for low, high in needed_windows(bins, channel_filter.context, DURATION, RATE):
-        window = slice(round(low * RATE), round(high * RATE))
-        partial[:, window] = samples[:, window]
-    assert bool(partial.isnan().any())
     whole = bins_at(channel_filter(samples), bins.starts, bins.bin_samples)
     cut = bins_at(channel_filter(partial), bins.starts, bins.bin_samples)
     torch.testing.assert_close(cut, whole, rtol=0, atol=0)
 
 
-# Shuffled labels -----------------------------------------------------------------------------
+def test_windows_reach_an_end_that_is_close_and_merge_where_they_touch():
+    """Within two contexts of an end the filter sees the true edge."""
+    for start, reaches in ((0, True), (49, True), (50, False)):
+        onset = 0.5 + start / RATE
+        windows = needed_windows(lay(HALF, (onset,), ((onset, 2.0),)), 25, DURATION, RATE)
+        assert (windows[0][0] == 0) == reaches
+        onset = DURATION - onset
+        windows = needed_windows(lay(HALF, (onset,), ((onset, DURATION),)), 25, DURATION, RATE)
+        assert (windows[-1][1] == DURATION) == reaches
+    assert len(needed_windows(lay(), 25, DURATION, RATE)) == 3  # one per stroke
+    apart = lay(LabelRule(hop_ms=150.0), (2.0,), ((2.0, 2.03),))  # 200 samples between them
+    counts = [len(needed_windows(apart, context, DURATION, RATE)) for context in (0, 99, 100)]
+    assert counts == [len(apart.starts), len(apart.starts), 1]
 
 
 def test_shuffled_labels_keep_their_number_and_depend_on_seed_and_place():
@@ -484,36 +329,48 @@ def test_shuffled_labels_keep_their_number_and_depend_on_seed_and_place():
     once = shuffled(is_slip, 3, 5)
     assert torch.equal(once, shuffled(is_slip, 3, 5))
     assert int(once.sum()) == 183
-    assert not torch.equal(once, is_slip)
-    assert not torch.equal(once, shuffled(is_slip, 3, 6))
-    assert not torch.equal(once, shuffled(is_slip, 4, 5))
+    for other in (is_slip, shuffled(is_slip, 3, 6), shuffled(is_slip, 4, 5)):
+        assert not torch.equal(once, other)
 
 
-def test_stretches_of_slip_come_last_and_belong_to_no_stroke():
-    bins = label_bins(
-        LabelRule(hop_ms=25.0), (), (), 3.0, RATE, non_slip_s=((0.0, 0.2),), slip_s=((1.0, 1.1),)
-    )
-    assert bins.is_slip.tolist() == [False] * 7 + [True] * 3
-    assert bins.starts[-3:].tolist() == [round(s * RATE) for s in (1.0, 1.025, 1.05)]
-    assert set(bins.stroke.tolist()) == {-1}
-    told_twice = label_bins(
-        LabelRule(), (), (), 3.0, RATE, non_slip_s=((0.0, 1.0),), slip_s=((0.0, 2.0),)
-    )
-    starts = (told_twice.starts / RATE)[told_twice.is_slip]
-    assert starts.min() == 1.0  # what is said to be no slip stays so
-    with pytest.raises(ValueError, match=r"the stretch from .* leaves the recording of"):
-        label_bins(LabelRule(), (), (), 3.0, RATE, slip_s=((1.0, 3.5),))
+# Errors --------------------------------------------------------------------------------------
 
 
-def test_bins_that_need_missing_samples_are_left_out():
-    bins = label_bins(LabelRule(), (), (), 3.0, RATE, non_slip_s=((0.0, 3.0),))
-    gap = (1.0, 1.0 + 1 / RATE)
-    kept = clear_of(bins, [gap], 0, 0, RATE)
-    assert set(bins.starts.tolist()) - set(kept.starts.tolist()) == {round(RATE)}
-    before, after = 25, 11
-    kept = clear_of(bins, [gap], before, after, RATE)
-    lost = sorted(set(bins.starts.tolist()) - set(kept.starts.tolist()))
-    assert lost == [round(RATE) - bins.bin_samples, round(RATE)]
-    assert len(kept.starts) == len(kept.is_slip) == len(kept.stroke) == len(kept.position)
-    moved = clear_of(bins, [(1.0 + 11 / RATE, 1.1)], 25, 11, RATE)
-    assert round(RATE) - bins.bin_samples in moved.starts.tolist()
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"layout": "nope"}, "labels.layout must be one of whole_slide, half_second, got 'nope'"),
+        ({"onsets": "guessed"}, "labels.onsets must be one of annotated, exact, got 'guessed'"),
+        ({"bin_ms": 0.0}, "labels.bin_ms must be positive, got 0.0"),
+        ({"hop_ms": -50.0}, "labels.hop_ms must be positive, got -50.0"),
+        ({"bin_ms": float("nan")}, "labels.bin_ms must be positive, got nan"),
+        ({"bin_ms": 50.2}, r"labels.bin_ms=50.2 is 100.4 samples at 2000 Hz; choose a whole"),
+        ({"hop_ms": 0.1}, r"labels.hop_ms=0.1 is 0.2 samples"),
+        ({"bin_ms": 1100.0}, r"labels\.bin_ms=1100 is longer than the 1000 ms"),
+        ({"layout": "half_second", "bin_ms": 600.0}, r"labels\.bin_ms=600 is longer"),
+    ],
+)
+def test_a_bad_rule_is_refused(change, said):
+    with pytest.raises(ValueError, match=said):
+        lay(LabelRule(**change))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"onsets": (1.005,), "slides": ((1.005, 3.0),)}, r"stroke 1 with its onset at 1.005 s"),
+        ({"duration_s": 15.1}, r"stroke 3 .* outside the recording of 15.100 s"),
+        ({"rule": HALF, "onsets": (0.4,), "slides": ((0.4, 3.0),)}, "stroke 1"),
+        (
+            {"rule": HALF, "onsets": (2.0,), "slides": ((2.0, 2.45),), "duration_s": 2.4},
+            r"outside the recording of 2\.400 s",
+        ),
+        ({"onsets": ONSETS[:2]}, "zip"),
+        ({"non_slip_s": ((15.0, 15.6),)}, r"the stretch from .* leaves the recording of"),
+        ({"non_slip_s": ((-0.1, 1.0),)}, r"the stretch from .* leaves the recording of"),
+        ({"slip_s": ((1.0, 15.6),)}, r"the stretch from .* leaves the recording of"),
+    ],
+)
+def test_what_leaves_the_recording_is_refused(options, said):
+    with pytest.raises(ValueError, match=said):
+        lay(**options)
