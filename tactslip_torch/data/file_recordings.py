@@ -39,7 +39,6 @@ from tactslip_torch.data.clock import (
     snapped_rate,
 )
 from tactslip_torch.data.formats import (
-    Archived,
     Opened,
     Reading,
     Samples,
@@ -1145,18 +1144,6 @@ def _is_simulated(one: Surveyed) -> bool:
 _RATE_ERR = 0.001  # of a measured rate, as what is told in seconds errs; a stated one has none
 
 
-class HandFile(NamedTuple):
-    """A file that is open.
-
-    Args:
-        samples: of the hand's channels; NaN where timestamps show a gap.
-        archived: all else, if the file is one of ours.
-    """
-
-    samples: Samples
-    archived: Archived | None
-
-
 @contextmanager
 def hand_file(
     path: Path,
@@ -1165,8 +1152,10 @@ def hand_file(
     reading: Reading,
     units: str,
     tare_s: Sequence[float] | None = None,
-) -> Iterator[HandFile]:
+) -> Iterator[Opened]:
     """Open a recording of a hand, ours or another's, to watch it by stretches.
+
+    Its samples are those of the hand's channels; NaN where timestamps show a gap.
 
     Args:
         path: of the file.
@@ -1193,7 +1182,7 @@ def hand_file(
         except ValueError as error:
             raise ValueError(f"{path} {error}") from None
         samples = _of_hand(opened.samples, found, rows, sample_rate_hz, path, tare)
-        yield HandFile(samples, opened.archived)
+        yield opened._replace(samples=samples)
 
 
 def _refuse_other_channels(path: Path, opened: Opened, rows: Sequence[Mapping[str, str]]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import difflib
 import io
+import itertools
 import json
 import math
 import re
@@ -487,21 +488,8 @@ def read_manifest(path: Path, root: Path) -> Listing:
     return Listing(entries, tuple(problems), tuple(warnings))
 
 
-class _Draft(NamedTuple):
-    """A line that can be read, its trial not yet numbered if it was left empty."""
-
-    place: str
-    file: str
-    material: str
-    trial: int | None
-    scene: str
-    session: str
-    truth: Truth | None
-    rate: float | None
-
-
-def _draft(line: Line, root: Path) -> tuple[_Draft | None, list[str]]:
-    """A line as far as it can be read, and all that is wrong with it."""
+def _draft(line: Line, root: Path) -> tuple[Entry | None, list[str]]:
+    """A line, its trial -1 if it was left empty, and all that is wrong with it."""
     cells = {ALIASES.get(column, column): cell for column, cell in line.cells.items()}
     problems = []
     words = {}
@@ -528,13 +516,12 @@ def _draft(line: Line, root: Path) -> tuple[_Draft | None, list[str]]:
     problems += wrong
     if problems:
         return None, problems
-    return _Draft(
+    scene = words["scene"] or RecordingId.scene
+    number = int(trial) if trial else -1
+    return Entry(
         line.place,
         PurePosixPath(*PureWindowsPath(file).parts).as_posix(),
-        words["material"],
-        int(trial) if trial else None,
-        words["scene"] or RecordingId.scene,
-        words["session"],
+        RecordingId(words["material"], number, scene, words["session"]),
         truth,
         float(rate) if rate else None,
     ), []
@@ -563,18 +550,18 @@ def file_problem(root: Path, file: str) -> str | None:
     return f"no file {file[:200]!r} in the folder{hint}"
 
 
-def _numbered(drafts: list[_Draft]) -> Iterator[Entry]:
+def _numbered(drafts: Sequence[Entry]) -> Iterator[Entry]:
     """Entries; an empty trial gets the next number free for its material, scene and session."""
-    used: dict[tuple[str, str, str], set[int]] = {}
-    for draft in drafts:
-        own = used.setdefault((draft.material, draft.scene, draft.session), set())
-        own |= {draft.trial} if draft.trial is not None else set()
-    for place, file, material, trial, scene, session, truth, rate in drafts:
-        if trial is None:
-            own = used[material, scene, session]
-            trial = next(number for number in range(len(own) + 1) if number not in own)
-            own.add(trial)
-        yield Entry(place, file, RecordingId(material, trial, scene, session), truth, rate)
+    names = [replace(draft.recording, cycle=0) for draft in drafts]
+    used: dict[RecordingId, set[int]] = {name: set() for name in names}
+    for name, draft in zip(names, drafts, strict=True):
+        used[name].add(draft.recording.cycle)
+    for name, draft in zip(names, drafts, strict=True):
+        trial = draft.recording.cycle
+        if trial < 0:
+            trial = next(number for number in itertools.count() if number not in used[name])
+            used[name].add(trial)
+        yield replace(draft, recording=replace(name, cycle=trial))
 
 
 def _twice(entries: Iterable[Entry]) -> list[Problem]:
