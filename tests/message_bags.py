@@ -1,20 +1,17 @@
 """Bags as other people's programs write them: by the ``mcap`` and ``rosbags`` libraries."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from tactslip_torch import HandLayout, Recording
-
 STORE = get_typestore(Stores.ROS2_JAZZY)
-WRENCH, JOINTS = "geometry_msgs/msg/WrenchStamped", "sensor_msgs/msg/JointState"
+WRENCH = "geometry_msgs/msg/WrenchStamped"
 START_NS = 1_700_000_000_123_456_789
 STEP_NS = 500_000
 PACKINGS = {
@@ -48,8 +45,6 @@ class How:
     packing: str = "zstd"
     is_chunked: bool = True
     is_indexed: bool = True
-    chunk_size: int = 4096
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
 def write_mcap(path: Path, topics: list[Sent], how: How = How()) -> Path:  # noqa: B008
@@ -57,7 +52,7 @@ def write_mcap(path: Path, topics: list[Sent], how: How = How()) -> Path:  # noq
     with path.open("wb") as file:
         writer = Writer(
             file,
-            chunk_size=how.chunk_size,
+            chunk_size=4096,
             compression=PACKINGS[how.packing],
             use_chunking=how.is_chunked,
             index_types=IndexType.ALL if how.is_indexed else IndexType.NONE,
@@ -66,8 +61,6 @@ def write_mcap(path: Path, topics: list[Sent], how: How = How()) -> Path:  # noq
             repeat_schemas=how.is_indexed,
         )
         writer.start()
-        for name, content in how.metadata.items():
-            writer.add_metadata(name, content)
         channels = []
         for sent in topics:
             text = sent.definition() if sent.schema_encoding else ""
@@ -100,40 +93,22 @@ def times(count: int) -> list[int]:
     return [START_NS + STEP_NS * place for place in range(count)]
 
 
-def stamp(nanoseconds: int):
-    return STORE.types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 10**9))
-
-
-def header(nanoseconds: int, frame: str = "hand"):
-    return STORE.types["std_msgs/msg/Header"](stamp(nanoseconds), frame)
-
-
-def wrench(values, nanoseconds: int, frame: str = "hand", *, is_little: bool = True) -> bytes:
+def wrench(values, nanoseconds: int) -> bytes:
     vector = STORE.types["geometry_msgs/msg/Vector3"]
     whole = STORE.types["geometry_msgs/msg/Wrench"](vector(*values[:3]), vector(*values[3:]))
-    message = STORE.types[WRENCH](header(nanoseconds, frame), whole)
-    return bytes(STORE.serialize_cdr(message, WRENCH, little_endian=is_little))
+    stamp = STORE.types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 10**9))
+    header = STORE.types["std_msgs/msg/Header"](stamp, "hand")
+    message = STORE.types[WRENCH](header, whole)
+    return bytes(STORE.serialize_cdr(message, WRENCH, little_endian=True))
 
 
-def joints(values, nanoseconds: int, names=("a", "bcd")) -> bytes:
-    """Positions and velocities of two joints, no efforts."""
-    message = STORE.types[JOINTS](
-        header(nanoseconds),
-        list(names),
-        np.array(values[:2], float),
-        np.array(values[2:], float),
-        np.zeros(0),
-    )
-    return bytes(STORE.serialize_cdr(message, JOINTS))
-
-
-def array(values, labels=(), sizes=(), kind: str = "Float64MultiArray", skipped: int = 0) -> bytes:
+def array(values, labels=(), sizes=()) -> bytes:
     """An array of ``std_msgs`` with a layout."""
     dimension = STORE.types["std_msgs/msg/MultiArrayDimension"]
     layout = STORE.types["std_msgs/msg/MultiArrayLayout"]
-    name = f"std_msgs/msg/{kind}"
+    name = "std_msgs/msg/Float64MultiArray"
     dims = [dimension(label, size, 0) for label, size in zip(labels, sizes, strict=True)]
-    message = STORE.types[name](layout(dims, skipped), np.asarray(values))
+    message = STORE.types[name](layout(dims, 0), np.asarray(values))
     return bytes(STORE.serialize_cdr(message, name))
 
 
@@ -153,29 +128,3 @@ def wrenches(count: int, topic: str = "/ft", seed: int = 0) -> tuple[Sent, np.nd
         for time, row in zip(times(count), values, strict=True)
     ]
     return Sent(topic, WRENCH, messages), values.T
-
-
-def recording(samples=None, **changes) -> Recording:
-    """One of ours, of two channels unless samples say otherwise."""
-    if samples is None:
-        samples = torch.from_numpy(noise(2, 1234, seed=3))
-    values = {
-        "samples": samples,
-        "sample_rate_hz": 2000.0,
-        "material": "Stahl ü \u2028 'x: y' #",
-        "speeds_mm_s": (20.0,),
-        "onsets_s": (1 / 3,),
-        "sliding_s": ((0.1, 0.2 + 1e-9),),
-        "non_slip_s": ((0.01, 0.02),),
-        "slip_s": ((0.25, 0.3),),
-        "provenance": {"simulated": True, "note": 'a\nb: [c, {d}] & *e \\ "f" \''},
-        "units": "mV",
-    }
-    return Recording(**(values | changes))
-
-
-def hand_of(count: int) -> HandLayout:
-    return HandLayout.from_rows(
-        {"name": f"E{n}", "kind": "electrode", "finger": "tip", "segment": "s", "adapting": "slow"}
-        for n in range(count)
-    )

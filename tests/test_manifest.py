@@ -368,9 +368,13 @@ NEAR = st.sampled_from(
 )
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("any")
+
+
 @given(st.lists(st.one_of(NEAR, WORDS, st.binary(max_size=20)), max_size=30), st.booleans())
-def test_no_manifest_ends_in_another_error_than_one_line(tmp_path_factory, parts, is_yaml):
-    folder = tmp_path_factory.mktemp("any")
+def test_no_manifest_ends_in_another_error_than_one_line(folder, parts, is_yaml):
     path = folder / ("manifest.yaml" if is_yaml else "manifest.csv")
     head = [] if is_yaml else ["file", ",", "material", ",", "sliding_s", "\n"]
     path.write_bytes(b"".join(p if isinstance(p, bytes) else p.encode() for p in [*head, *parts]))
