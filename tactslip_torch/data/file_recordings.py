@@ -1248,18 +1248,36 @@ def inspected(source: FileRecordings, recording: RecordingId) -> Inspected:
         ValueError: if it is damaged.
     """
     path = source.root / source.entry(recording).file
-    missing_s = source.timeline(recording).missing_s
-    found = [_inspected(path, stream, part, missing_s) for stream, part in source.parts(recording)]
-    broken: dict[int, tuple[int, float]] = {}
-    place = 0
-    for one in found:
-        broken |= {place + row: what for row, what in one.broken.items()}
-        place += len(one.least)
-    return Inspected(
-        [value for one in found for value in one.least],
-        [value for one in found for value in one.greatest],
-        broken,
-    )
+    found = Inspected([], [], {})
+    for stream, part in source.parts(recording):
+        rate = part.rate_hz
+        missing = [(gap.start, gap.start + gap.missing) for gap in part.found.clock.gaps]
+        missing += [
+            (round(start * rate), round(end * rate))
+            for start, end in source.timeline(recording).missing_s
+        ]
+        low = torch.full((len(part.rows),), torch.inf, dtype=torch.float64)
+        high, count = -low, torch.zeros(len(low), dtype=torch.int64)
+        first = torch.full_like(count, -1)
+        with open_file(path, stream.reading) as opened:
+            samples = _of_hand(opened.samples, part.found, part.rows, rate, path)
+            for number, piece in enumerate(pieces(samples, PIECE)):
+                seen = number * PIECE
+                is_fine = piece.isfinite()
+                values = piece.double()
+                low = torch.minimum(low, values.where(is_fine, torch.inf).amin(-1))
+                high = torch.maximum(high, values.where(is_fine, -torch.inf).amax(-1))
+                is_bad = ~is_fine & ~_inside(missing, seen, piece.shape[-1])
+                is_first = (first < 0) & is_bad.any(-1)
+                first = torch.where(is_first, seen + is_bad.int().argmax(-1), first)
+                count += is_bad.sum(-1)
+        for row in count.nonzero().flatten().tolist():
+            place = len(found.least) + row
+            found.broken[place] = (int(count[row]), int(first[row]) / rate)
+        is_known = low <= high
+        found.least.extend(low.where(is_known, torch.nan).tolist())
+        found.greatest.extend(high.where(is_known, torch.nan).tolist())
+    return found
 
 
 def oddities(source: FileRecordings, found: Inspected) -> list[str]:
@@ -1278,38 +1296,6 @@ def oddities(source: FileRecordings, found: Inspected) -> list[str]:
     ]
     odd += [f"{name} never changes, it is {value:g} throughout" for name, value in still]
     return odd
-
-
-def _inspected(path: Path, stream: Stream, part: Part, missing_s: Sequence[Stretch]) -> Inspected:
-    """One stream of a file."""
-    missing = [(gap.start, gap.start + gap.missing) for gap in part.found.clock.gaps]
-    missing += [(round(a * part.rate_hz), round(b * part.rate_hz)) for a, b in missing_s]
-    num = len(part.rows)
-    low = torch.full((num,), torch.inf, dtype=torch.float64)
-    high, count = -low, torch.zeros(num, dtype=torch.int64)
-    first = torch.full((num,), -1, dtype=torch.int64)
-    seen = 0
-    with open_file(path, stream.reading) as opened:
-        samples = _of_hand(opened.samples, part.found, part.rows, part.rate_hz, path)
-        for piece in pieces(samples, PIECE):
-            values = piece.double()
-            is_fine = values.isfinite()
-            low = torch.minimum(low, values.where(is_fine, torch.inf).amin(-1))
-            high = torch.maximum(high, values.where(is_fine, -torch.inf).amax(-1))
-            is_bad = ~is_fine & ~_inside(missing, seen, piece.shape[-1])
-            is_first = (first < 0) & is_bad.any(-1)
-            first = torch.where(is_first, seen + is_bad.int().argmax(-1), first)
-            count += is_bad.sum(-1)
-            seen += piece.shape[-1]
-    is_known = low <= high
-    return Inspected(
-        low.where(is_known, torch.nan).tolist(),
-        high.where(is_known, torch.nan).tolist(),
-        {
-            row: (int(count[row]), int(first[row]) / part.rate_hz)
-            for row in count.nonzero().flatten().tolist()
-        },
-    )
 
 
 def _inside(stretches: Sequence[tuple[int, int]], first: int, num_samples: int) -> Tensor:
