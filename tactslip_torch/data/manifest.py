@@ -105,32 +105,23 @@ def _csv_lines(text: str, name: str) -> Lines:
     lines: list[Line] = []
     problems: list[Problem] = []
     last = 0
-    while True:
-        try:
-            row = next(rows, None)
-        except csv.Error as error:
-            problems.append(Problem(f"{name}:{last + 1}", f"cannot be read as CSV: {error}"))
-            break
-        if row is None:
-            break
-        place, last = f"{name}:{last + 1}", rows.line_num
-        if not any(cell.strip() for cell in row):
-            continue
-        if not columns:
-            columns = [_column(cell) for cell in row]
-            twice = {c for c in columns if c and columns.count(c) > 1}
-            problems += [Problem(place, f"column {c[:60]!r} is there twice") for c in sorted(twice)]
-        elif len(row) != len(columns):
-            problems.append(
-                Problem(
-                    place,
-                    f"has {len(row)} cells, the header {len(columns)}; put in quotes "
-                    f"what holds a {separator!r}",
-                )
-            )
-        else:
-            pairs = zip(columns, row, strict=True)
-            lines.append(Line(place, {column: cell.strip() for column, cell in pairs if column}))
+    try:
+        for row in rows:
+            place, last = f"{name}:{last + 1}", rows.line_num
+            if not any(cell.strip() for cell in row):
+                continue
+            if not columns:
+                columns = [_column(cell) for cell in row]
+                twice = sorted({c for c in columns if c and columns.count(c) > 1})
+                problems += [Problem(place, f"column {c[:60]!r} is there twice") for c in twice]
+            elif len(row) != len(columns):
+                what = f"has {len(row)} cells, the header {len(columns)}; put in quotes what holds"
+                problems.append(Problem(place, f"{what} a {separator!r}"))
+            else:
+                cells = zip(columns, map(str.strip, row), strict=True)
+                lines.append(Line(place, {column: cell for column, cell in cells if column}))
+    except csv.Error as error:
+        problems.append(Problem(f"{name}:{last + 1}", f"cannot be read as CSV: {error}"))
     return Lines(dict.fromkeys(filter(None, columns), f"{name}:1"), tuple(lines), tuple(problems))
 
 
