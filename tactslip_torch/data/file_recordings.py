@@ -163,9 +163,9 @@ def scaled(truth: Truth, factor: float) -> Truth:
     return replace(truth, **changes)
 
 
-NOWHERE = "unknown"
+_NOWHERE = "unknown"
 """The finger and segment of a channel of which nobody said them."""
-LABEL_NAMES = ("label", "labels", "slip", "is_slip", "contact", "trial", "material", "class")
+_LABEL_NAMES = ("label", "labels", "slip", "is_slip", "contact", "trial", "material", "class")
 """Names of columns, in small letters, that are no channel unless a person says so."""
 _TRUTH = (*MOMENTS, "sliding_s", "slip_s", "non_slip_s")
 _UNIT = re.compile(r"\s*(?:\([^()]*\)|\[[^\[\]]*\])$")
@@ -301,7 +301,7 @@ def _look_at(opened: Opened, path: Path, stream: Stream, stated_hz: float | None
     return Found(clock, stated is None, samples.num_channels, opened.names)
 
 
-def hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
+def _hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
     """The channels of a stream, and in which row of a file each of them is.
 
     Rows that a person gave are found by the names the file has, whatever their case and the unit
@@ -317,7 +317,7 @@ def hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
     every = list(range(found.num_channels))
     if found.hand is not None:
         return found.hand, every
-    told = [name for name in own if _bare(name) in LABEL_NAMES]
+    told = [name for name in own if _bare(name) in _LABEL_NAMES]
     if told and stream.reading.channels is None:
         raise ValueError(
             f"has a column {told[0]!r}, which may be what a detector is to find out; list the "
@@ -326,7 +326,7 @@ def hand_of(found: Found, stream: Stream) -> tuple[HandLayout, list[int]]:
     adapting = stream.adapting or KNOWN_KINDS.get(stream.kind, "slow")
     names: Sequence[str] = own or [f"ch{number + 1}" for number in every]
     before = f"{stream.name}_" if stream.name else ""
-    channels = [Channel(before + n, stream.kind, NOWHERE, NOWHERE, adapting) for n in names]
+    channels = [Channel(before + n, stream.kind, _NOWHERE, _NOWHERE, adapting) for n in names]
     return HandLayout(tuple(channels)), every
 
 
@@ -367,7 +367,7 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) < 7 else f"{', '.join(names[:5])} .. {names[-1]}"
 
 
-RATE_ERROR = 0.01
+_RATE_ERROR = 0.01
 """By so much a rate that timestamps tell may differ from that of the set."""
 _Value = TypeVar("_Value", bound=Hashable)
 
@@ -390,7 +390,7 @@ class Part(NamedTuple):
     units: str
 
 
-def agreed(
+def _agreed(
     stream: Stream, places: Sequence[str], founds: Sequence[Found], *, any_rate: bool
 ) -> list[Part | str]:
     """A stream of every file or, where it differs from most of the others, in what.
@@ -426,7 +426,7 @@ def agreed(
 
 def _part(found: Found, stream: Stream, rate_hz: float) -> Part | str:
     try:
-        hand, rows = hand_of(found, stream)
+        hand, rows = _hand_of(found, stream)
     except ValueError as error:
         return str(error)
     units = found.own["units"] if found.own else stream.units
@@ -441,12 +441,12 @@ def _rates(founds: Sequence[Found]) -> list[float]:
         return stated
     middle = median(measured)
     apart = [abs(own / middle - 1) for own in measured]
-    spread = max((share for share in apart if share <= RATE_ERROR), default=0.0)
+    spread = max((share for share in apart if share <= _RATE_ERROR), default=0.0)
     common = Counter(stated).most_common(1)[0][0] if stated else nominal_rate(middle, spread)
     rates = []
     for found in founds:
         own = found.clock.sample_rate_hz
-        is_near = found.is_measured and abs(own / common - 1) <= RATE_ERROR
+        is_near = found.is_measured and abs(own / common - 1) <= _RATE_ERROR
         rates.append(common if is_near else own)
     return rates
 
@@ -538,12 +538,12 @@ def _remembered(plain: list[Any]) -> Found:
 
 # Samples as they are wanted ----------------------------------------------------------------------
 
-REACH = 11
+_REACH = 11
 """Samples of the lower rate on either side that a resampled one may hang on."""
 
 
 @dataclass(frozen=True)
-class Treatment:
+class _Treatment:
     """What is done to the samples of every file of a set.
 
     Args:
@@ -571,7 +571,7 @@ class Treatment:
         rate = self.resample_hz
         if rate is not None and not (is_number(rate) and 0 < rate < math.inf):
             raise ValueError(f"data.resample_hz must be a positive number or null, got {rate!r}")
-        object.__setattr__(self, "tare_s", tare_of(self.tare_s, "data.tare_s"))
+        object.__setattr__(self, "tare_s", _tare_of(self.tare_s, "data.tare_s"))
 
     def num_recorded(self, part: Part) -> int:
         """How many samples of a stream the recording has."""
@@ -583,7 +583,7 @@ class Treatment:
     def missing_s(self, part: Part) -> list[Stretch]:
         """The stretches without samples, wider by what resampling draws from them."""
         rate_hz, most = part.rate_hz, self.most_bridged(part.rate_hz)
-        reach_s = REACH / min(rate_hz, self.resample_hz) if self.resample_hz else 0.0
+        reach_s = _REACH / min(rate_hz, self.resample_hz) if self.resample_hz else 0.0
         return [
             (max(gap.start / rate_hz - reach_s, 0.0), (gap.start + gap.missing) / rate_hz + reach_s)
             for gap in part.found.clock.gaps
@@ -595,7 +595,7 @@ class Treatment:
         return int(self.bridge_ms * rate_hz / 1000 + 1e-6) if self.gaps == "bridge" else 0
 
 
-def tare_of(value: object, name: str) -> Stretch | None:
+def _tare_of(value: object, name: str) -> Stretch | None:
     """The stretch that is tared on, as somebody said it.
 
     Raises:
@@ -667,11 +667,11 @@ def _of_hand(
     return _HandSamples(samples, rows, level)
 
 
-def recorded(
+def _recorded(
     path: Path,
     stream: Stream,
     part: Part,
-    how: Treatment,
+    how: _Treatment,
     windows: Sequence[Stretch] | None = None,
 ) -> Tensor:
     """The samples of a stream as the recording has them.
@@ -705,7 +705,7 @@ def recorded(
         return kept
 
 
-BEFORE_ONSET_S = 1.01
+_BEFORE_ONSET_S = 1.01
 """What ``labels=whole_slide`` takes as non-slip before an onset."""
 _PATIENCE_S = 2.0  # what takes longer is done by several processes, and not again
 _ROUNDING = 1e-9
@@ -713,7 +713,7 @@ _MOST_CUT_S = 0.1  # by so much may files that belong together end apart
 
 
 @dataclass(frozen=True)
-class Plan:
+class _Plan:
     """How all files of a set are read and labelled.
 
     Args:
@@ -726,12 +726,12 @@ class Plan:
 
     root: Path
     streams: tuple[Stream, ...]
-    treatment: Treatment
+    treatment: _Treatment
     skip_s: float = 0.0
     slide_s: float = 0.5
 
 
-class Surveyed(NamedTuple):
+class _Surveyed(NamedTuple):
     """A recording that can be read: each of its streams, and when things happen in it."""
 
     entry: Entry
@@ -739,7 +739,7 @@ class Surveyed(NamedTuple):
     times: FileTimeline
 
 
-class Survey(NamedTuple):
+class _Survey(NamedTuple):
     """What was found in a set.
 
     Args:
@@ -748,12 +748,12 @@ class Survey(NamedTuple):
         warnings: what is worth a look in the others.
     """
 
-    recordings: tuple[Surveyed, ...]
+    recordings: tuple[_Surveyed, ...]
     problems: tuple[Problem, ...]
     warnings: tuple[Problem, ...]
 
 
-def survey(plan: Plan, entries: Sequence[Entry]) -> Survey:
+def _survey(plan: _Plan, entries: Sequence[Entry]) -> _Survey:
     """Look at every file of a set.
 
     Raises:
@@ -769,10 +769,10 @@ def survey(plan: Plan, entries: Sequence[Entry]) -> Survey:
     places = [entry.place for entry, _ in seen]
     any_rate = plan.treatment.resample_hz is not None
     columns = [
-        agreed(stream, places, [found[number] for _, found in seen], any_rate=any_rate)
+        _agreed(stream, places, [found[number] for _, found in seen], any_rate=any_rate)
         for number, stream in enumerate(plan.streams)
     ]
-    recordings: list[Surveyed] = []
+    recordings: list[_Surveyed] = []
     warnings: list[Problem] = []
     for (entry, _), *parts in zip(seen, *columns, strict=True):
         whole = tuple(part for part in parts if isinstance(part, Part))
@@ -784,10 +784,10 @@ def survey(plan: Plan, entries: Sequence[Entry]) -> Survey:
                 warnings += [_at(entry, doubt) for doubt in _doubts(recording)]
         problems += [_at(entry, what) for what in wrong]
     _refuse_several_rates(plan, recordings)
-    return Survey(tuple(recordings), tuple(problems), tuple(warnings))
+    return _Survey(tuple(recordings), tuple(problems), tuple(warnings))
 
 
-def _look_at_all(plan: Plan, entries: Sequence[Entry]) -> Iterable[tuple[Found, ...] | str]:
+def _look_at_all(plan: _Plan, entries: Sequence[Entry]) -> Iterable[tuple[Found, ...] | str]:
     """What each file says, or why it cannot be read; by several processes if that takes long."""
 
     def look_at(entry: Entry) -> tuple[Found, ...] | str:
@@ -817,7 +817,7 @@ def _look_at_all(plan: Plan, entries: Sequence[Entry]) -> Iterable[tuple[Found, 
     return [(seen | known)[entry.file] for entry in entries]
 
 
-def _timed(plan: Plan, entry: Entry, parts: tuple[Part, ...]) -> tuple[Surveyed, list[str]]:
+def _timed(plan: _Plan, entry: Entry, parts: tuple[Part, ...]) -> tuple[_Surveyed, list[str]]:
     """A recording with its truth on its time, and what does not fit."""
     how = plan.treatment
     wrong = []
@@ -855,16 +855,16 @@ def _timed(plan: Plan, entry: Entry, parts: tuple[Part, ...]) -> tuple[Surveyed,
         slack_s=math.inf if entry.is_nominal else 1.0 / rate_hz,
         missing_s=missing_s,
     )
-    return Surveyed(entry, parts, times), [*wrong, *misfits]
+    return _Surveyed(entry, parts, times), [*wrong, *misfits]
 
 
-def _doubts(recording: Surveyed) -> list[str]:
+def _doubts(recording: _Surveyed) -> list[str]:
     """What is worth a look in a recording that can be read."""
     entry, parts, times = recording
     doubts = []
     if not (times.onsets_s or times.slip_s or times.non_slip_s):
         doubts.append("has no label, so no bin is taken from it")
-    early = [onset for onset in times.onsets_s if onset < BEFORE_ONSET_S]
+    early = [onset for onset in times.onsets_s if onset < _BEFORE_ONSET_S]
     if early:
         doubts.append(
             f"slips at {early[0]:g} s already; labels=whole_slide takes the second before an onset"
@@ -894,7 +894,7 @@ def _at(entry: Entry, what: str) -> Problem:
     return Problem(entry.place, said if entry.place == entry.file else f"{entry.file}: {said}")
 
 
-def _refuse_several_rates(plan: Plan, recordings: Sequence[Surveyed]) -> None:
+def _refuse_several_rates(plan: _Plan, recordings: Sequence[_Surveyed]) -> None:
     if plan.treatment.resample_hz is None and recordings:
         rates = [part.rate_hz for part in recordings[0].parts]
         if len(set(rates)) > 1:
@@ -927,7 +927,7 @@ class FileRecordings:
         adapting: of those; ``None`` as their kind does, if it is known, else slow.
         units: of samples of files that do not say it.
         reading: as ``Reading`` has it, of files that do not say it.
-        gaps: ``refuse``, ``missing`` or ``bridge``, as ``Treatment`` has it.
+        gaps: ``refuse``, ``missing`` or ``bridge``.
         bridge_ms: the longest gap that is bridged.
         resample_hz: the rate that all files are brought to; ``None`` for their own.
         tare_s: start and end of the stretch whose mean is taken off each channel.
@@ -982,19 +982,19 @@ class FileRecordings:
                 f"kind, adapting or units of its own, got {streams!r}"
             )
         shared = {"channels": channels, "kind": kind, "adapting": adapting, "units": units}
-        self._plan = Plan(
+        self._plan = _Plan(
             self.root,
             tuple(
                 stream_of(shared | dict(own) | {"reading": _joined(reading, own)}, name)
                 for name, own in (streams or {"": {}}).items()
             ),
-            Treatment(gaps, bridge_ms, resample_hz, tare_s),
+            _Treatment(gaps, bridge_ms, resample_hz, tare_s),
             skip_s,
             slide_s,
         )
         if not isinstance(manifest, Listing):
             manifest = read_manifest(manifest_of(self.root, manifest), self.root)
-        found = survey(self._plan, chosen(manifest.entries, materials, cycles))
+        found = _survey(self._plan, _chosen(manifest.entries, materials, cycles))
         self.problems = (*manifest.problems, *found.problems)
         self.warnings = (*manifest.warnings, *found.warnings)
         if strict:
@@ -1063,7 +1063,7 @@ class FileRecordings:
         one = self._recordings[recording]
         path, how, times = self.root / one.entry.file, self._plan.treatment, one.times
         parts = [
-            recorded(path, stream, part, how, windows)
+            _recorded(path, stream, part, how, windows)
             for stream, part in zip(self._plan.streams, one.parts, strict=True)
         ]
         num_samples = round(times.duration_s * self.sample_rate_hz)
@@ -1083,7 +1083,7 @@ class FileRecordings:
         )
 
     @property
-    def _any(self) -> Surveyed:
+    def _any(self) -> _Surveyed:
         for one in self._recordings.values():
             return one
         raise ValueError(f"no recording of {self.root} can be read: {self.problems[0]}")
@@ -1099,7 +1099,7 @@ class FileRecordings:
             )
 
 
-def chosen(
+def _chosen(
     entries: Sequence[Entry], materials: Sequence[str] | None, cycles: int | None
 ) -> list[Entry]:
     """The entries of some materials and, of each in each scene and session, the first trials.
@@ -1136,7 +1136,7 @@ def _is_of_mappings(value: object) -> bool:
     return isinstance(value, Mapping) and all(isinstance(one, Mapping) for one in value.values())
 
 
-def _is_simulated(one: Surveyed) -> bool:
+def _is_simulated(one: _Surveyed) -> bool:
     owns = [part.found.own for part in one.parts]
     return any(own["provenance"].get("simulated") for own in owns if own)
 
@@ -1170,7 +1170,7 @@ def hand_file(
         FileNotFoundError: if there is no such file.
         ValueError: if it is damaged, of another hand, rate or unit, or nobody says its rate.
     """
-    tare = tare_of(tare_s, "tare_s")
+    tare = _tare_of(tare_s, "tare_s")
     stream = Stream(reading=reading, channels=hand)
     with open_file(path, reading) as opened:
         if opened.archived is not None or (opened.names is None and reading.channels is None):
@@ -1178,7 +1178,7 @@ def hand_file(
         found = _look_at(opened, path, stream)
         _refuse_others(path, found, sample_rate_hz, units)
         try:
-            _, rows = hand_of(found, stream)
+            _, rows = _hand_of(found, stream)
         except ValueError as error:
             raise ValueError(f"{path} {error}") from None
         samples = _of_hand(opened.samples, found, rows, sample_rate_hz, path, tare)
@@ -1221,7 +1221,7 @@ def _refuse_others(path: Path, found: Found, sample_rate_hz: float, units: str) 
         )
 
 
-PIECE = 1 << 16
+_PIECE = 1 << 16
 """Samples that are looked at at a time."""
 
 
@@ -1261,8 +1261,8 @@ def inspected(source: FileRecordings, recording: RecordingId) -> Inspected:
         first = torch.full_like(count, -1)
         with open_file(path, stream.reading) as opened:
             samples = _of_hand(opened.samples, part.found, part.rows, rate, path)
-            for number, piece in enumerate(pieces(samples, PIECE)):
-                seen = number * PIECE
+            for number, piece in enumerate(pieces(samples, _PIECE)):
+                seen = number * _PIECE
                 is_fine = piece.isfinite()
                 values = piece.double()
                 low = torch.minimum(low, values.where(is_fine, torch.inf).amin(-1))

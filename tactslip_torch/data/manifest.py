@@ -25,13 +25,13 @@ from tactslip_torch.data.formats import endings, find_format
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.runtime import whole_file
 
-Cell = str | list["Cell"]
+_Cell = str | list["_Cell"]
 """What stands under a column: text or, in YAML, lists of text."""
 
-MOST_BYTES = 64 * 2**20
+_MOST_BYTES = 64 * 2**20
 """Of a manifest; a larger file is none."""
-MOST_YAML_BYTES = 4 * 2**20  # which takes a hundred times longer to read
-MOST_DEPTH = 16  # of lists and mappings in YAML; one in another takes a stack, and ever longer
+_MOST_YAML_BYTES = 4 * 2**20  # which takes a hundred times longer to read
+_MOST_DEPTH = 16  # of lists and mappings in YAML; one in another takes a stack, and ever longer
 _SEPARATORS = (",", ";", "\t")
 _YAML = (".yaml", ".yml")
 
@@ -51,14 +51,14 @@ class Problem(NamedTuple):
         return " ".join(f"{self.place}: {self.what}".split())
 
 
-class Line(NamedTuple):
+class _Line(NamedTuple):
     """One recording as it is written: the cells by column, and where they stand."""
 
     place: str
-    cells: dict[str, Cell]
+    cells: dict[str, _Cell]
 
 
-class Lines(NamedTuple):
+class _Lines(NamedTuple):
     """All of a manifest.
 
     Args:
@@ -68,11 +68,11 @@ class Lines(NamedTuple):
     """
 
     columns: dict[str, str]
-    lines: tuple[Line, ...]
+    lines: tuple[_Line, ...]
     problems: tuple[Problem, ...]
 
 
-def read_lines(path: Path) -> Lines:
+def read_lines(path: Path) -> _Lines:
     """The lines of a CSV or YAML file; what is wrong with it is among the problems.
 
     Raises:
@@ -83,9 +83,9 @@ def read_lines(path: Path) -> Lines:
         raise FileNotFoundError(f"no manifest at {path}")
     if path.suffix.lower() not in (".csv", *_YAML):
         raise ValueError(f"{path} must end in .csv, .yaml or .yml to be read as a manifest")
-    most = MOST_YAML_BYTES if path.suffix.lower() in _YAML else MOST_BYTES
+    most = _MOST_YAML_BYTES if path.suffix.lower() in _YAML else _MOST_BYTES
     if (size := path.stat().st_size) > most:
-        hint = "; write it as .csv" if most < size <= MOST_BYTES else ""
+        hint = "; write it as .csv" if most < size <= _MOST_BYTES else ""
         raise ValueError(f"{path} is no manifest: it has {size} bytes, at most {most} do{hint}")
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -96,13 +96,13 @@ def read_lines(path: Path) -> Lines:
     return read(text, path.name)
 
 
-def _csv_lines(text: str, name: str) -> Lines:
+def _csv_lines(text: str, name: str) -> _Lines:
     """Rows of a table with a header, its separator found from that."""
     head = text.partition("\n")[0]
     separator = max(_SEPARATORS, key=head.count)
     rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     columns: list[str] = []
-    lines: list[Line] = []
+    lines: list[_Line] = []
     problems: list[Problem] = []
     last = 0
     try:
@@ -119,22 +119,22 @@ def _csv_lines(text: str, name: str) -> Lines:
                 problems.append(Problem(place, f"{what} a {separator!r}"))
             else:
                 cells = zip(columns, map(str.strip, row), strict=True)
-                lines.append(Line(place, {column: cell for column, cell in cells if column}))
+                lines.append(_Line(place, {column: cell for column, cell in cells if column}))
     except csv.Error as error:
         problems.append(Problem(f"{name}:{last + 1}", f"cannot be read as CSV: {error}"))
-    return Lines(dict.fromkeys(filter(None, columns), f"{name}:1"), tuple(lines), tuple(problems))
+    return _Lines(dict.fromkeys(filter(None, columns), f"{name}:1"), tuple(lines), tuple(problems))
 
 
-def _yaml_lines(text: str, name: str) -> Lines:
+def _yaml_lines(text: str, name: str) -> _Lines:
     """A list of mappings, alone or under ``recordings``."""
-    found = Lines({}, (), ())
+    found = _Lines({}, (), ())
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     depth = 0
     try:
         for event in yaml.parse(text, Loader=loader):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
-            if depth > MOST_DEPTH:
+            if depth > _MOST_DEPTH:
                 return found._replace(problems=(Problem(name, "is nested too deeply"),))
             if isinstance(event, yaml.AliasEvent):  # a few stand for more than memory holds
                 what = "aliases, as *name, are not read"
@@ -154,14 +154,14 @@ def _yaml_lines(text: str, name: str) -> Lines:
         what = "must be a list of recordings, as - {file: a.csv, material: wood}"
         return found._replace(problems=(Problem(f"{name}:1", what),))
     columns: dict[str, str] = {}
-    lines: list[Line] = []
+    lines: list[_Line] = []
     problems: list[Problem] = []
     for item in node.value:
         place = f"{name}:{item.start_mark.line + 1}"
         if not isinstance(item, yaml.MappingNode):
             problems.append(Problem(place, "must be a mapping, as {file: a.csv, material: wood}"))
             continue
-        cells: dict[str, Cell] = {}
+        cells: dict[str, _Cell] = {}
         for key, value in item.value:
             here = f"{name}:{key.start_mark.line + 1}"
             column, cell = _column(str(key.value)), _cell(value)
@@ -171,11 +171,11 @@ def _yaml_lines(text: str, name: str) -> Lines:
             if cell is None:
                 problems.append(Problem(here, f"{column[:60]} must be a value or a list of values"))
             cells[column] = cell or ""
-        lines.append(Line(place, cells))
-    return Lines(columns, tuple(lines), tuple(problems))
+        lines.append(_Line(place, cells))
+    return _Lines(columns, tuple(lines), tuple(problems))
 
 
-def _cell(node: yaml.Node) -> Cell | None:
+def _cell(node: yaml.Node) -> _Cell | None:
     """Text or lists of text; ``None`` for what is neither."""
     if isinstance(node, yaml.ScalarNode):
         return "" if node.tag == "tag:yaml.org,2002:null" else str(node.value).strip()
@@ -230,7 +230,7 @@ class Truth:
         return bool(self.onsets_s or self.slip_s or self.non_slip_s or self.label)
 
 
-def truth_of(cells: Mapping[str, Cell]) -> tuple[Truth | None, list[str]]:
+def truth_of(cells: Mapping[str, _Cell]) -> tuple[Truth | None, list[str]]:
     """The truth that the cells of a line tell, ``None`` if they are all empty, and what is wrong.
 
     Example:
@@ -328,7 +328,7 @@ def _clashes(ones: Iterable[Stretch], others: Iterable[Stretch] | None = None) -
     ]
 
 
-def _label(cell: Cell) -> Label:
+def _label(cell: _Cell) -> Label:
     text = cell if isinstance(cell, str) else str(cell)
     known = _LABELS.get(re.sub(r"[\s_-]", "", text.lower()))
     if known is None:
@@ -336,11 +336,11 @@ def _label(cell: Cell) -> Label:
     return known
 
 
-def _moments(cell: Cell) -> tuple[float, ...]:
+def _moments(cell: _Cell) -> tuple[float, ...]:
     return tuple(_number(item) for item in _items(cell))
 
 
-def _stretches(cell: Cell) -> tuple[Stretch, ...]:
+def _stretches(cell: _Cell) -> tuple[Stretch, ...]:
     found = []
     for item in _items(cell):
         if isinstance(item, list) and len(item) == 2:
@@ -354,7 +354,7 @@ def _stretches(cell: Cell) -> tuple[Stretch, ...]:
     return tuple(found)
 
 
-def _items(cell: Cell) -> list[Cell]:
+def _items(cell: _Cell) -> list[_Cell]:
     """The parts of a cell; JSON is read to text, so that numbers are judged in one place."""
     if isinstance(cell, list):
         return cell
@@ -364,7 +364,7 @@ def _items(cell: Cell) -> list[Cell]:
         read = json.loads(cell, parse_float=str, parse_int=str, parse_constant=str)
     except (ValueError, RecursionError):
         raise ValueError(f"{cell[:40]!r} is no list; write [2.0, 9.0] or 2.0; 9.0") from None
-    return cast("list[Cell]", read)
+    return cast("list[_Cell]", read)
 
 
 def _number(item: object) -> float:
@@ -383,8 +383,8 @@ def _shown(values: Iterable[float]) -> str:
     return "; ".join(f"{value:g}" for value in values)
 
 
-NAMES = ("manifest.csv", "manifest.yaml", "manifest.yml")
-ALIASES = {"object": "material", "cycle": "trial"}
+_NAMES = ("manifest.csv", "manifest.yaml", "manifest.yml")
+_ALIASES = {"object": "material", "cycle": "trial"}
 COLUMNS = ("file", "material", "trial", "scene", "session", *TRUTH_COLUMNS, "sample_rate_hz")
 _IGNORED = ("simulated", "fidelity", "seed")
 """Further columns of what ``generate`` writes: files say this themselves."""
@@ -421,7 +421,7 @@ class Listing(NamedTuple):
 
 
 def manifest_of(root: Path, given: str | None = None) -> Path:
-    """The manifest of a set: the one given, relative to the root or not, or one of ``NAMES``.
+    """The manifest of a set: the one given, relative to the root or ``manifest.csv`` or ``.yaml``.
 
     Raises:
         FileNotFoundError: if there is no such folder or manifest.
@@ -431,13 +431,13 @@ def manifest_of(root: Path, given: str | None = None) -> Path:
         raise FileNotFoundError(f"no folder at {root}")
     if given is not None:
         return next((path for path in (root / given, Path(given)) if path.is_file()), root / given)
-    found = [root / name for name in NAMES if (root / name).is_file()]
+    found = [root / name for name in _NAMES if (root / name).is_file()]
     if len(found) > 1:
         names = " and ".join(path.name for path in found)
         raise ValueError(f"{root} has {names}; say which, as manifest={found[0].name}")
     if not found:
         raise FileNotFoundError(
-            f"no {' or '.join(NAMES)} in {root}; python -m tactslip_torch data "
+            f"no {' or '.join(_NAMES)} in {root}; python -m tactslip_torch data "
             f"action=label_template root={root} writes one to fill in"
         )
     return found[0]
@@ -457,9 +457,9 @@ def read_manifest(path: Path, root: Path) -> Listing:
     for column, place in columns.items():
         if wrong := _misspelt(column):
             problems.append(Problem(place, wrong))
-        elif ALIASES.get(column, column) not in (*COLUMNS, *_IGNORED):
+        elif _ALIASES.get(column, column) not in (*COLUMNS, *_IGNORED):
             warnings.append(Problem(place, f"column {column[:60]!r} is not read"))
-    known = {ALIASES.get(column, column) for column in columns}
+    known = {_ALIASES.get(column, column) for column in columns}
     if missing := [column for column in ("file", "material") if column not in known]:
         if columns:
             problems.append(Problem(f"{path.name}:1", f"no column {' and no '.join(missing)}"))
@@ -479,9 +479,9 @@ def read_manifest(path: Path, root: Path) -> Listing:
     return Listing(entries, tuple(problems), tuple(warnings))
 
 
-def _draft(line: Line, root: Path) -> tuple[Entry | None, list[str]]:
+def _draft(line: _Line, root: Path) -> tuple[Entry | None, list[str]]:
     """A line, its trial -1 if it was left empty, and all that is wrong with it."""
-    cells = {ALIASES.get(column, column): cell for column, cell in line.cells.items()}
+    cells = {_ALIASES.get(column, column): cell for column, cell in line.cells.items()}
     problems = []
     words = {}
     for column in ("file", "material", "trial", "scene", "session", "sample_rate_hz"):
@@ -491,7 +491,7 @@ def _draft(line: Line, root: Path) -> tuple[Entry | None, list[str]]:
             cell = ""
         words[column] = cell
     file = words["file"]
-    if problem := file_problem(root, file):
+    if problem := _file_problem(root, file):
         problems.append(problem)
     if not words["material"]:
         problems.append("no material")
@@ -518,7 +518,7 @@ def _draft(line: Line, root: Path) -> tuple[Entry | None, list[str]]:
     ), []
 
 
-def file_problem(root: Path, file: str) -> str | None:
+def _file_problem(root: Path, file: str) -> str | None:
     """Why a file that a manifest names cannot be taken: it is not there, or not inside the root."""
     if not file or "\0" in file:
         return "no file" if not file else f"file {file[:60]!r} holds a NUL"
@@ -586,7 +586,7 @@ def _alike(entries: Iterable[Entry]) -> list[Problem]:
 
 
 def _misspelt(column: str) -> str | None:
-    known = (*COLUMNS, *ALIASES)
+    known = (*COLUMNS, *_ALIASES)
     close = difflib.get_close_matches(column, known, 1, cutoff=0.8)
     if column in (*known, *_IGNORED) or not close:
         return None
@@ -620,16 +620,16 @@ def better_told(listing: Listing, told: Listing) -> Listing:
     )
 
 
-FIELDS = {"material": r"[^/]+?", "trial": r"\d+", "scene": r"[^/]+?", "label": r"[^/]+?"}
+_FIELDS = {"material": r"[^/]+?", "trial": r"\d+", "scene": r"[^/]+?", "label": r"[^/]+?"}
 """What a pattern may name, and what each stands for."""
-TEMPLATE_COLUMNS = (
+_TEMPLATE_COLUMNS = (
     *("file", "material", "trial", "scene"),
     *("onsets_s", "sliding_s", "slip_s", "non_slip_s", "label"),
 )
 _BETWEEN = "-_. "
 
 
-class Template(NamedTuple):
+class _Template(NamedTuple):
     """A manifest that was written.
 
     Args:
@@ -643,7 +643,7 @@ class Template(NamedTuple):
     num_guessed: int
 
 
-def found_files(root: Path) -> list[str]:
+def _found_files(root: Path) -> list[str]:
     """Every recording in a folder and its folders, relative to it; of a bag the folder.
 
     Raises:
@@ -656,7 +656,7 @@ def found_files(root: Path) -> list[str]:
     folders = [root]
     while folders:
         for path in sorted(folders.pop().iterdir()):
-            if path.name.startswith(".") or path.name in NAMES:
+            if path.name.startswith(".") or path.name in _NAMES:
                 continue
             if find_format(path) is not None:
                 found.append(path.relative_to(root).as_posix())
@@ -674,7 +674,7 @@ def guesser(pattern: str) -> re.Pattern[str]:
     Blanks, dots, strokes and underlines around a material or scene are no part of it.
 
     Raises:
-        ValueError: if it names what is none of ``FIELDS``, or one twice, or nothing.
+        ValueError: if it names something else than material, trial, scene or label, one twice, or nothing.
 
     Example:
         >>> guesser("{material}{trial}").fullmatch("oil paper-slip_07").groupdict()
@@ -682,16 +682,16 @@ def guesser(pattern: str) -> re.Pattern[str]:
     """
     parts = re.split(r"\{(\w*)\}", pattern)
     names = parts[1::2]
-    if not names or set(names) - set(FIELDS) or len(set(names)) < len(names):
+    if not names or set(names) - set(_FIELDS) or len(set(names)) < len(names):
         raise ValueError(
-            f"pattern must name each of {', '.join(f'{{{name}}}' for name in FIELDS)} at most "
+            f"pattern must name each of {', '.join(f'{{{name}}}' for name in _FIELDS)} at most "
             f"once, as {{material}}_{{trial}}, got {pattern!r}"
         )
     expression = ""
     for place, part in enumerate(parts):
         if place % 2:
             between = f"[{re.escape(_BETWEEN)}]*" if part in ("material", "scene") else ""
-            expression += f"(?P<{part}>{FIELDS[part]}){between}"
+            expression += f"(?P<{part}>{_FIELDS[part]}){between}"
         else:
             expression += "[^/]*".join(re.escape(piece) for piece in part.split("*"))
     return re.compile(expression)
@@ -705,7 +705,7 @@ def guessed(file: str, pattern: str) -> dict[str, str]:
     return found.groupdict() if found else {}
 
 
-def write_template(root: Path, pattern: str, path: Path | None = None) -> Template:
+def write_template(root: Path, pattern: str, path: Path | None = None) -> _Template:
     """Write a manifest of all recordings of a folder, its label columns empty.
 
     Args:
@@ -717,15 +717,15 @@ def write_template(root: Path, pattern: str, path: Path | None = None) -> Templa
         FileNotFoundError: if there is no such folder.
         ValueError: if there is a manifest already, no recording, or the pattern is none.
     """
-    there = [root / name for name in NAMES] if path is None else [path]
+    there = [root / name for name in _NAMES] if path is None else [path]
     for other in there:
         if other.exists():
             raise ValueError(f"{other} is there already; move it away, or give output=FILE")
-    path = root / NAMES[0] if path is None else path
-    guesses = {file: guessed(file, pattern) for file in found_files(root)}
-    rows = [dict.fromkeys(TEMPLATE_COLUMNS, "") | {"file": f, **own} for f, own in guesses.items()]
-    write_table(path, TEMPLATE_COLUMNS, rows)
-    return Template(path, len(guesses), sum(map(bool, guesses.values())))
+    path = root / _NAMES[0] if path is None else path
+    guesses = {file: guessed(file, pattern) for file in _found_files(root)}
+    rows = [dict.fromkeys(_TEMPLATE_COLUMNS, "") | {"file": f, **own} for f, own in guesses.items()]
+    write_table(path, _TEMPLATE_COLUMNS, rows)
+    return _Template(path, len(guesses), sum(map(bool, guesses.values())))
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> None:

@@ -77,7 +77,7 @@ def unseen4(
         raise ValueError(f"materials {', '.join(both)} are both seen and unseen; choose one side")
     roles = by_cycle(recordings, seen, train_share, seed)
     for material in unseen:
-        roles |= dict.fromkeys(cycles_of(recordings, material), "unseen")
+        roles |= dict.fromkeys(_cycles_of(recordings, material), "unseen")
     return [checked(Split("unseen4", roles), ("train", "test", "unseen"))]
 
 
@@ -114,7 +114,7 @@ def random_bins(
     """
     _check_share(train_share)
     roles = {
-        recording: "train" for material in seen for recording in cycles_of(recordings, material)
+        recording: "train" for material in seen for recording in _cycles_of(recordings, material)
     }
     return [checked(Split("random_bins", roles, 1 - train_share, seed), ("train",))]
 
@@ -148,8 +148,8 @@ def leave_one_material_out(
     for left_out in materials:
         others = [material for material in materials if material != left_out]
         if train_share == 1:
-            roles = {r: "train" for material in others for r in cycles_of(recordings, material)}
-            roles |= dict.fromkeys(cycles_of(recordings, left_out), "unseen")
+            roles = {r: "train" for material in others for r in _cycles_of(recordings, material)}
+            roles |= dict.fromkeys(_cycles_of(recordings, left_out), "unseen")
         else:
             sides = {"seen": others, "unseen": [left_out]}
             roles = dict(unseen4(recordings, **sides, train_share=train_share, seed=seed)[0].roles)
@@ -251,7 +251,7 @@ def by_cycle(
     roles: dict[RecordingId, str] = {}
     mountings: dict[str, dict[int, list[RecordingId]]] = {}
     for material in materials:
-        for recording in cycles_of(recordings, material):
+        for recording in _cycles_of(recordings, material):
             mounting = f"{material}@{recording.session}" if recording.session else material
             cycles = mountings.setdefault(mounting, {})
             cycles.setdefault(recording.cycle, []).append(recording)
@@ -271,7 +271,7 @@ def by_cycle(
     return roles
 
 
-def cycles_of(recordings: Sequence[RecordingId], material: str) -> list[RecordingId]:
+def _cycles_of(recordings: Sequence[RecordingId], material: str) -> list[RecordingId]:
     """The recordings of a material, sorted; an error if there are none."""
     cycles = sorted(recording for recording in recordings if recording.material == material)
     if not cycles:
@@ -320,7 +320,7 @@ def leave_one_session_out(
     Raises:
         ValueError: if the set has one session, a material is not in it, or a role stays empty.
     """
-    own = [r for material in seen for r in cycles_of(recordings, material)]
+    own = [r for material in seen for r in _cycles_of(recordings, material)]
     sessions = sorted({recording.session for recording in own})
     if len(sessions) < 2:
         raise ValueError(
