@@ -421,7 +421,8 @@ class Listing(NamedTuple):
 
 
 def manifest_of(root: Path, given: str | None = None) -> Path:
-    """The manifest of a set: the one given, relative to the root or ``manifest.csv`` or ``.yaml``.
+    """The manifest of a set: the one given, relative to the root or not, or ``manifest.csv`` or
+    ``manifest.yaml`` there.
 
     Raises:
         FileNotFoundError: if there is no such folder or manifest.
@@ -674,7 +675,8 @@ def guesser(pattern: str) -> re.Pattern[str]:
     Blanks, dots, strokes and underlines around a material or scene are no part of it.
 
     Raises:
-        ValueError: if it names something else than material, trial, scene or label, one twice, or nothing.
+        ValueError: if it names nothing, one twice, or something else than material, trial, scene
+            and label.
 
     Example:
         >>> guesser("{material}{trial}").fullmatch("oil paper-slip_07").groupdict()
