@@ -135,7 +135,8 @@ def _detect_in(
     rate, table = detector.pool.sample_rate_hz, context.folder / f"{name}_decisions.csv"
     given = hand_file(path, hand, rate, context.reading, context.units, config.tare_s)
     header = (*Decisions._fields, "answer")
-    with given as (samples, archived, *_), csv_writer(table, header, wanted=config.decisions) as write:
+    with given as opened, csv_writer(table, header, wanted=config.decisions) as write:
+        samples, archived = opened.samples, opened.archived
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
         masked = config.masked_channels or ()
         stream = StreamingDetector(

@@ -421,8 +421,7 @@ class Listing(NamedTuple):
 
 
 def manifest_of(root: Path, given: str | None = None) -> Path:
-    """The manifest of a set: the one given, relative to the root or not, or ``manifest.csv`` or
-    ``manifest.yaml`` there.
+    """The manifest of a set: the one given, relative to the root or not, or the one found there.
 
     Raises:
         FileNotFoundError: if there is no such folder or manifest.
