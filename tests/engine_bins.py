@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from tactslip_torch import FeaturePool, HandLayout
-from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.names import FeatureName
 
 PLAIN_KINDS = ("random", "tied", "near_constant")
@@ -132,7 +131,7 @@ def assert_equals_reference(
 
 def rows_of(pool: FeaturePool, bins: Tensor) -> dict[tuple[str, str, str], Tensor]:
     """The reference's gauges, branches and spectra, ``[N, n or L]``, by the parts of a name."""
-    rows, maps = {}, LinearMaps.of(pool)
+    rows, maps = {}, pool.maps
     for channel in pool.hand.channels:
         x = bins[:, pool.hand.names.index(channel.name)]
         if channel.adapting == "slow":

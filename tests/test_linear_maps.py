@@ -15,7 +15,7 @@ CASES = [(100, 4, "reference"), (100, 4, "clean"), (101, 4, "reference"), (50, 3
 
 def maps_of(num: int, level: int, spectrum: SpectrumMethod) -> LinearMaps:
     hand = HandLayout.paper24()
-    return LinearMaps.of(FeaturePool(hand, bin_samples=num, level=level, spectrum=spectrum))
+    return FeaturePool(hand, bin_samples=num, level=level, spectrum=spectrum).maps
 
 
 def branch_by_pywt(x: np.ndarray, name: str, level: int) -> np.ndarray:
@@ -31,9 +31,11 @@ def branch_by_pywt(x: np.ndarray, name: str, level: int) -> np.ndarray:
 def test_branches_equal_pywavelets(num: int, level: int, spectrum: SpectrumMethod) -> None:
     maps = maps_of(num, level, spectrum)
     x = np.random.default_rng(0).normal(size=num)
-    for name, into, out, dense in zip(maps.branches, maps.into, maps.out, maps.dense, strict=True):
-        expected = branch_by_pywt(x, name, level)
-        np.testing.assert_allclose(out @ (into @ torch.from_numpy(x)), expected, atol=1e-13)
+    for place, (name, dense) in enumerate(zip(maps.branches, maps.dense, strict=True)):
+        expected, block = branch_by_pywt(x, name, level), maps.block(place)
+        coordinates = torch.from_numpy(x) @ block.into
+        branch = coordinates[:-1] @ block.out + coordinates[-1] / num
+        np.testing.assert_allclose(branch, expected, atol=1e-13)
         np.testing.assert_allclose(dense @ torch.from_numpy(x), expected, atol=1e-13)
 
 
@@ -55,22 +57,20 @@ def test_lines_equal_numpys_transform(num: int, level: int, spectrum: SpectrumMe
         return lines.reshape(2, -1).square().sum(0).sqrt()
 
     x = np.random.default_rng(1).normal(size=num)
-    for name, into, lines in zip(maps.branches, maps.into, maps.lines, strict=True):
-        expected = amplitudes(branch_by_pywt(x, name, level))
-        np.testing.assert_allclose(
-            modulus(lines @ (into @ torch.from_numpy(x))), expected, atol=1e-13
-        )
+    for place, name in enumerate(maps.branches):
+        expected, block = amplitudes(branch_by_pywt(x, name, level)), maps.block(place)
+        lines = torch.from_numpy(x) @ block.into @ block.lines
+        np.testing.assert_allclose(modulus(lines), expected, atol=1e-13)
     np.testing.assert_allclose(
         modulus(maps.dense_lines @ torch.from_numpy(x)), amplitudes(x), atol=1e-13
     )
-    np.testing.assert_allclose(modulus(maps.ones_lines), amplitudes(np.ones(num)), atol=1e-13)
 
 
 def test_ranks_are_the_numbers_of_wavelet_coefficients() -> None:
     maps = maps_of(100, 4, "reference")
-    ranks = dict(zip(maps.branches, (len(into) for into in maps.into), strict=True))
+    ranks = {name: maps.block(place).rank for place, name in enumerate(maps.branches)}
     parts = [len(part) for part in pywt.wavedec(np.zeros(100), "rbio2.2", "symmetric", 4)]
-    assert ranks["A4"] == parts[0]
+    assert ranks["A4"] == parts[0] - 1  # its mean is a coordinate beside them
     # symmetric extension makes one coefficient of each detail follow from the others
     assert [ranks[f"D{m}"] for m in (4, 3, 2, 1)] == [num - 1 for num in parts[1:]]
 

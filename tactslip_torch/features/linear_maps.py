@@ -10,16 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names
-
-if TYPE_CHECKING:
-    from tactslip_torch.features.pool import FeaturePool
 
 RANK_TOLERANCE = 1e-12
 """Singular values below this part of the largest are rounding."""
@@ -79,30 +75,16 @@ class LinearMaps:
         branches: names of the branches, in their order everywhere.
         is_approximation: which of them keep a constant; details remove it.
         dense: each branch, ``[n, n]``: ``branch = dense @ bin``.
-        into: from a bin to the branch's few numbers, ``[r, n]``, orthonormal rows.
-        out: from those to the branch, ``[n, r]``.
-        lines: from those to the spectrum before its modulus, ``[2 L, r]``: L cosine rows, then
-            L sine rows.
-        dense_lines: from a branch (or any signal) to the same, ``[2 L, n]``.
-        ones_lines: of the constant 1, ``[2 L]``.
+        dense_lines: from a branch (or any signal) to its spectrum before the modulus, ``[2 L, n]``:
+            L cosine rows, then L sine rows.
         frequency_hz: of the lines, ``[L]``.
     """
 
     branches: tuple[str, ...]
     is_approximation: tuple[bool, ...]
     dense: tuple[Tensor, ...]
-    into: tuple[Tensor, ...]
-    out: tuple[Tensor, ...]
-    lines: tuple[Tensor, ...]
     dense_lines: Tensor
-    ones_lines: Tensor
     frequency_hz: Tensor
-
-    @classmethod
-    def of(cls, pool: FeaturePool) -> LinearMaps:
-        """The maps behind a pool's features; made once, so do not write into them."""
-        facts = (pool.bin_samples, pool.sample_rate_hz, pool.wavelet, pool.level, pool.spectrum)
-        return _made(*facts)
 
     @property
     def num_samples(self) -> int:
@@ -128,7 +110,7 @@ class LinearMaps:
             if branch < 0:
                 into, out = centred, identity
             else:
-                into, out = _low_rank(centred, is_out_orthonormal=True)
+                into, out = _low_rank(centred)
             lines = self.dense_lines @ torch.cat([out, out.new_full((num, 1), 1 / num)], dim=-1)
             blocks[branch] = Block(
                 into=torch.cat([into, dense.sum(0, keepdim=True)]).T.contiguous(),
@@ -140,32 +122,27 @@ class LinearMaps:
 
 
 @lru_cache(maxsize=16)
-def _made(
+def linear_maps(
     num: int, sample_rate_hz: float, wavelet: Wavelet, level: int, method: SpectrumMethod
 ) -> LinearMaps:
+    """The maps of bins of ``num`` samples; made once, so do not write into them.
+
+    Raises:
+        ValueError: if a bin is too short for the levels.
+    """
     spectrum = spectrum_matrix(num, method)
-    dense_lines = torch.cat([spectrum.real, spectrum.imag]).contiguous()
-    dense = branch_matrix(num, wavelet, level)
-    factors = [_low_rank(matrix) for matrix in dense]
     names = branch_names(level)
     return LinearMaps(
         branches=names,
         is_approximation=tuple(name[0] == "A" for name in names),
-        dense=tuple(dense),
-        into=tuple(into for into, _ in factors),
-        out=tuple(out for _, out in factors),
-        lines=tuple((dense_lines @ out).contiguous() for _, out in factors),
-        dense_lines=dense_lines,
-        ones_lines=dense_lines.sum(-1),
+        dense=tuple(branch_matrix(num, wavelet, level)),
+        dense_lines=torch.cat([spectrum.real, spectrum.imag]).contiguous(),
         frequency_hz=frequency_axis_hz(num, sample_rate_hz, method),
     )
 
 
-def _low_rank(matrix: Tensor, is_out_orthonormal: bool = False) -> tuple[Tensor, Tensor]:
-    """``into [r, n]`` and ``out [n, r]``, whose product is ``matrix``; one of them orthonormal."""
+def _low_rank(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """``into [r, n]`` and ``out [n, r]``, orthonormal, whose product is ``matrix``."""
     left, sizes, right = torch.linalg.svd(matrix)
     rank = max(1, int((sizes > RANK_TOLERANCE * sizes[0]).sum()))
-    left, sizes, right = left[:, :rank], sizes[:rank], right[:rank]
-    if is_out_orthonormal:
-        return (sizes[:, None] * right).contiguous(), left.contiguous()
-    return right.contiguous(), (left * sizes).contiguous()
+    return (sizes[:rank, None] * right[:rank]).contiguous(), left[:, :rank].contiguous()

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from tactslip_torch.features.bank import Bank, Frame
-from tactslip_torch.features.linear_maps import LinearMaps
+from tactslip_torch.features.linear_maps import LinearMaps, linear_maps
 from tactslip_torch.features.names import pool_names
 from tactslip_torch.features.ops import bounded_gradient, saturating
 from tactslip_torch.features.plan import Plan, make_plan
@@ -93,7 +93,14 @@ class FeaturePool(nn.Module):
         self._inverses: dict[torch.dtype, Tensor] = {}
         self._banks: dict[torch.dtype, Bank] = {}
         self.names = pool_names(hand, level)
-        LinearMaps.of(self)  # refuses a bin that is too short for the levels
+        _ = self.maps  # refuses a bin that is too short for the levels
+
+    @property
+    def maps(self) -> LinearMaps:
+        """The constant matrices behind the features."""
+        return linear_maps(
+            self.bin_samples, self.sample_rate_hz, self.wavelet, self.level, self.spectrum
+        )
 
     def facts(self) -> dict[str, Any]:
         """All arguments but the hand, as JSON-able values; ``FeaturePool(hand, **facts)``."""
@@ -132,7 +139,7 @@ class FeaturePool(nn.Module):
             for is_film, kind in ((False, self.hand.slow), (True, self.hand.fast))
             if (own := set(kind).intersection(plan.channels))
         ]
-        return Bank(LinearMaps.of(self), plan, frames, dtype)
+        return Bank(self.maps, plan, frames, dtype)
 
     def widen(self, x: Tensor) -> Tensor:
         """Samples in the dtype that features are computed in; filter after it, not before.

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.features.bank import Bank, Frame, Samples
-from tactslip_torch.features.linear_maps import LinearMaps
 from tactslip_torch.features.ops import TINY
 from tactslip_torch.features.pool import LARGEST_SAMPLE
 from tactslip_torch.graph.form import Form, Window
@@ -150,7 +149,7 @@ def described(graph: Graph, detector: SlipDetector, windows: Value, form: Form) 
     ]
     read = [_samples(graph, detector, windows, frame, form) for frame in frames]
     dtype = torch.float64 if form.dtype == F64 else torch.float32
-    bank = Bank(LinearMaps.of(detector.pool), detector.extractor.plan, frames, dtype)
+    bank = Bank(detector.pool.maps, detector.extractor.plan, frames, dtype)
     order = [channel for frame in frames for channel in frame.channels]
     places = [order.index(channel) for channel in used]
     is_missing, is_trusted = (
