@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
@@ -388,14 +386,3 @@ def test_a_detector_without_its_statistics_says_how_to_get_them(run, trained):
 def test_training_refuses_statistics_that_it_cannot_leave(tmp_path, overrides, message):
     with pytest.raises(ValueError, match=message):
         train(composed(*TRAINING, *overrides), tmp_path)
-
-
-@pytest.mark.slow
-def test_the_command_ends_with_status_2_and_one_line(run):
-    command = [sys.executable, "-m", "tactslip_torch", "adapt", f"model={run / 'nothing.pt'}"]
-    ended = subprocess.run(
-        [*command, f"hydra.run.dir={run / 'results'}"], capture_output=True, text=True, check=False
-    )
-    assert ended.returncode == 2
-    assert ended.stderr.startswith("error: no detector at ")
-    assert len(ended.stderr.splitlines()) == 1

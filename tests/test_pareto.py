@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy import signal
 from test_commands import TinyRecordings, composed
 
 import tactslip_torch.commands.pareto as command
@@ -137,7 +136,7 @@ def test_the_table_says_what_the_files_do(written, capsys):
     assert "look-ahead" in table
     assert f"{100 * found['chosen']['test']['balanced_accuracy']:.2f} %" in table
     assert "SIMULATED" in pareto_table(found | {"simulated": True})
-    assert "backend eager; p50" in table
+    assert f"backend {found['backend']}; p50" in table
     assert f"{found['tried']} tried there, {found['not_tried']} not tried" in table
     chosen = found["chosen"]
     assert f"p99 of all calls {chosen['p99_all_us']:.0f} us" in table
@@ -167,18 +166,13 @@ def fails(monkeypatch, capsys, tmp_path, *arguments):
             "least look-ahead 2.5 ms are 57.5 ms before any compute; give more, or a shorter",
         ),
         (["compute_us=0"], "compute_us must be a positive finite number, got 0"),
-        (["compute_us=-3"], "compute_us must be a positive finite number, got -3"),
         (["deadline_ms=soon"], "deadline_ms must be a positive finite number, got 'soon'"),
         (["deadline_ms=null"], "deadline_ms must be a positive finite number, got None"),
         (["deadline_ms=inf"], "deadline_ms must be a positive finite number, got inf"),
         (["headroom=abc"], "headroom must be a finite number of at least 1, got 'abc'"),
         (["tries=0"], "tries must be a positive whole number, got 0"),
         (["retime_calls=0"], "retime_calls must be a positive whole number, got 0"),
-        (["search.sizes=8"], "search.sizes must be a list in brackets, got 8"),
         (["search.hops_ms=[5.3]"], "search.hops_ms: 5.3 ms are 10.6 samples at 2000 Hz"),
-        (["search.channels=[toes]"], "search.channels: unknown 'toes', expected some of all"),
-        (["search.components=[cheap]"], "search.components: unknown 'cheap'"),
-        (["search.sizes=[]"], "search.sizes is empty, expected at least one value"),
         (["split=leave_one_material_out"], "split has 10 folds"),
         (["headroom=0.5"], "headroom must be a finite number of at least 1, got 0.5"),
         (["search.sizes=[5000]"], "an empty selection: no group of this hand"),
@@ -295,15 +289,6 @@ def test_what_is_missed_least_is_said():
     found = {"limits": {"deadline_ms": 80.0, "compute_us": 500.0}, "tries": []}
     found["front"] = [row(50.5, 900.0, 5.0), row(50.5, 421.0, 0.4), row(99.0, 100.0, 5.0)]
     assert none_meets(found).endswith(": the closest has compute 421 us not below the hop 0.4 ms")
-
-
-def test_an_error_has_a_line_of_its_own(monkeypatch, capsys, tmp_path):
-    def broken(self, *job):
-        raise ValueError("one bin is odd")
-
-    monkeypatch.setattr(command.Searcher, "_scored", broken)
-    status, line = fails(monkeypatch, capsys, tmp_path)
-    assert (status, line) == (2, "error: one bin is odd")
 
 
 def test_ctrl_c_is_one_line(monkeypatch, capsys, tmp_path):
@@ -482,32 +467,6 @@ def test_test_bins_come_with_the_context_of_their_filter(shop, monkeypatch, alig
         expected += [samples[:, start - before : start + 100 + after] for start in starts]
     assert torch.equal(torch.cat(given), torch.stack(expected))
     assert found["num_bins"] == len(expected)
-
-
-def test_arithmetic_is_the_pools(shop):
-    assert shop.make(candidate(), "native").pool.arithmetic == "native"
-    assert shop.make(candidate(), "double").pool.arithmetic == "double"
-
-
-# The causal filter in the experiment --------------------------------------------------------------
-
-
-def test_causal_features_are_of_causally_filtered_bins(shop):
-    centred, causal = (shop.makers[align] for align in ("centred", "causal"))
-    recording = shop.fold.having("train")[0]
-    assert centred.key(recording) != causal.key(recording)
-    samples = causal.source.load(recording).samples.double().numpy()
-    filtered = np.empty_like(samples)
-    for channel, window in enumerate((51, 51, 11, 11)):
-        taps = signal.savgol_coeffs(window, 1, pos=window - 1, use="dot")
-        frames = np.lib.stride_tricks.sliding_window_view(samples[channel], window)
-        filtered[channel, window - 1 :] = frames @ taps
-    bins = causal.lay_bins(causal.source.timeline(recording))
-    cut = bins_at(torch.from_numpy(filtered), bins.starts, 100)
-    expected = causal.pool(cut).float()
-    found = causal(recording, shop.fold).features
-    std = expected.std(0)
-    torch.testing.assert_close(found / std, expected / std, rtol=1e-4, atol=1e-4, equal_nan=True)
 
 
 class BrokenBefore(TinyRecordings):

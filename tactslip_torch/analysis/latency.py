@@ -10,7 +10,7 @@ slip earlier; nothing here counts on it.
 decision; ``python -m tactslip_torch.analysis.latency detector.pt [calls [backend]]`` prints a line
 of JSON, p50 and p99 in microseconds. Calls in which the system gave the processor to someone else
 (an involuntary context switch, where the system counts them) are left out, and their fraction is
-told, as is the p99 of all calls with them: what they took says how busy the machine was, and a
+reported, as is the p99 of all calls with them: what they took says how busy the machine was, and a
 robot keeps a processor for its loop. The bins are ordinary ones: one with a NaN goes another way,
 which takes longer.
 

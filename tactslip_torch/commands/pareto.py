@@ -9,8 +9,8 @@ last try kept for the one with most head-room; the first that meets both there i
 ``pareto.json``, ``pareto.png``, the resolved configuration and, last of all, ``detector.pt``. Exit
 status 1 if no detector meets the limits; all but the detector is written then.
 
-Only training recordings are searched on. The test cycles of the seen materials judge the detector
-once it is chosen; of unseen materials nothing is read.
+Only training recordings are searched on. The test cycles of the seen materials evaluate the
+detector once it is chosen; of unseen materials nothing is read.
 """
 
 from __future__ import annotations

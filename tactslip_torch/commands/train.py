@@ -1,4 +1,4 @@
-"""Train and judge a detector: ``python -m tactslip_torch.train +exp=unseen4``.
+"""Train and evaluate a detector: ``python -m tactslip_torch.train +exp=unseen4``.
 
 Simulates (or reads) the recordings, makes features, selects, solves, tests, and leaves
 ``metrics.json``, ``detector.pt``, ``model.onnx`` (and ``stream.onnx`` where an alarm was set),
@@ -53,8 +53,8 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
         folder: where results go.
 
     Returns:
-        Accuracy and balanced accuracy of each role, such as ``"unseen/accuracy"``; of rival folds
-        each its own, such as ``"protocol/unseen/accuracy"``.
+        Accuracy and balanced accuracy of each role, such as ``"unseen/accuracy"``; of folds that
+        share bins each its own, such as ``"protocol/unseen/accuracy"``.
 
     Raises:
         ValueError: for bad input, in one line.
