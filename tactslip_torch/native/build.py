@@ -26,7 +26,15 @@ REMEDY = (
 _HERE = Path(__file__).parent
 _SOURCES = ("engine.h", "vectors.h", "engine.cpp", "bristles.cpp", "door.cpp")
 _FLAGS = [
-    *("-O3", "-std=c++17", "-fPIC", "-fno-exceptions", "-fno-rtti", "-fno-math-errno"),
+    *(
+        "-O3",
+        "-funroll-loops",
+        "-std=c++17",
+        "-fPIC",
+        "-fno-exceptions",
+        "-fno-rtti",
+        "-fno-math-errno",
+    ),
     *("-fno-trapping-math", "-fno-strict-aliasing", "-ffp-contract=off", "-fvisibility=hidden"),
     "-Wno-psabi",
 ]

@@ -398,16 +398,16 @@ template <class T> struct Group : Describe<T> {
       half.other = get(&other, h);
       if (in_time)
         half.energy = half.span * half.span * half.second + half.n * half.centre * half.centre;
-      values[MEAN][h] = Base::mean(half);
-      values[RANGE][h] = Base::range(half);
-      values[MEAN_DEVIATION][h] = Base::mean_deviation(half);
-      values[STD][h] = Base::std(half);
-      values[CV][h] = Base::cv(half);
-      values[SKEWNESS][h] = Base::skewness(half);
-      values[KURTOSIS][h] = Base::kurtosis(half);
-      values[ENERGY][h] = Base::energy(half);
-      values[PEAK_FACTOR][h] = Base::peak_factor(half);
-      values[CORRELATION][h] = Base::correlation(half);
+      if (wanted & 1u << MEAN) values[MEAN][h] = Base::mean(half);
+      if (wanted & 1u << RANGE) values[RANGE][h] = Base::range(half);
+      if (wanted & 1u << MEAN_DEVIATION) values[MEAN_DEVIATION][h] = Base::mean_deviation(half);
+      if (wanted & 1u << STD) values[STD][h] = Base::std(half);
+      if (wanted & 1u << CV) values[CV][h] = Base::cv(half);
+      if (wanted & 1u << SKEWNESS) values[SKEWNESS][h] = Base::skewness(half);
+      if (wanted & 1u << KURTOSIS) values[KURTOSIS][h] = Base::kurtosis(half);
+      if (wanted & 1u << ENERGY) values[ENERGY][h] = Base::energy(half);
+      if (wanted & 1u << PEAK_FACTOR) values[PEAK_FACTOR][h] = Base::peak_factor(half);
+      if (wanted & 1u << CORRELATION) values[CORRELATION][h] = Base::correlation(half);
     }
     if (!(wanted & ORDERED)) return;
     sort(d, (int)count);
