@@ -13,22 +13,29 @@ import yaml
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-INGREDIENTS = ("pyproject.toml", "README.md", "LICENSE", "conf", "tactslip_torch")
+INGREDIENTS = ("hatch_build.py", "pyproject.toml", "README.md", "LICENSE", "conf", "tactslip_torch")
 
 
 @pytest.fixture(scope="module")
 def unpacked(tmp_path_factory):
     """What pip would install, in an empty folder; the checkout stays clean."""
+    return unpack(tmp_path_factory, {})
+
+
+def unpack(tmp_path_factory, variables):
     copy = tmp_path_factory.mktemp("copy")
     for name in INGREDIENTS:
         if (ROOT / name).is_dir():
-            ignore = shutil.ignore_patterns("__pycache__")
+            ignore = shutil.ignore_patterns("__pycache__", "library.*")
             shutil.copytree(ROOT / name, copy / name, ignore=ignore)
         else:
             shutil.copy(ROOT / name, copy / name)
     built = tmp_path_factory.mktemp("built")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(built)]
-    done = subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False)
+    environment = os.environ | variables
+    done = subprocess.run(
+        command, cwd=copy, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     (wheel,) = built.glob("*.whl")
     folder = tmp_path_factory.mktemp("site")
@@ -56,6 +63,28 @@ def test_the_wheel_holds_the_package_and_its_configuration(unpacked):
     assert code == {p.relative_to(ours) for p in ours.rglob("*.py")}
 
 
+def test_the_wheel_holds_the_engine_of_its_platform(unpacked, tmp_path):
+    (tag,) = tags(unpacked)
+    assert tag.startswith("py3-none-")
+    assert tag != "py3-none-any"
+    assert len(list((unpacked / "tactslip_torch" / "native").glob("library.*"))) == 1
+    code = "from tactslip_torch import native; print(native.why_not() or native._library_path())"
+    done = run(unpacked, tmp_path, "-c", code)
+    assert Path(done.stdout.strip()).parent == unpacked / "tactslip_torch" / "native"
+
+
+def test_the_switch_makes_a_pure_wheel(tmp_path_factory):
+    pure = unpack(tmp_path_factory, {"TACTSLIP_NATIVE": "0"})
+    assert tags(pure) == ["py3-none-any"]
+    assert not list((pure / "tactslip_torch" / "native").glob("library.*"))
+
+
+def tags(unpacked):
+    (path,) = unpacked.glob("*.dist-info/WHEEL")
+    lines = path.read_text().splitlines()
+    return [line.removeprefix("Tag: ") for line in lines if line.startswith("Tag: ")]
+
+
 def test_the_wheel_holds_nothing_else(unpacked):
     top = {path.name for path in unpacked.iterdir()}
     assert "tactslip_torch" in top
@@ -70,7 +99,7 @@ def test_the_wheel_comes_before_the_checkout(unpacked, tmp_path):
     done = run(unpacked, tmp_path, "-c", code)
     assert done.returncode == 0, done.stderr
     module, conf = done.stdout.split()
-    assert Path(module) == unpacked / "tactslip_torch" / "config.py"
+    assert Path(module) == unpacked / "tactslip_torch" / "commands" / "entry.py"
     assert Path(conf) == unpacked / "tactslip_torch" / "conf"
 
 

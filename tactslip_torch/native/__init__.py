@@ -8,6 +8,7 @@ no instruction set beyond AVX2, ``v2`` the one of any 64-bit processor.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import logging
 import os
@@ -309,9 +310,13 @@ def _library_path() -> Path:
             return folder / name
     _LOG.warning("building the native engine from its sources: under a minute, once")
     for folder in folders:
-        if os.access(folder if folder.exists() else folder.parent, os.W_OK) or folder is not here:
-            return build_library(folder)
-    raise OSError(f"no folder for the native engine can be written to; {REMEDY}")
+        with contextlib.suppress(OSError):  # a file in the way, or no leave to write: the next
+            folder.mkdir(parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK):
+                break
+    else:
+        raise OSError(f"no folder for the native engine can be written to; {REMEDY}")
+    return build_library(folder)
 
 
 def _user_cache() -> list[Path]:
