@@ -10,6 +10,8 @@ import torch
 from hypothesis import HealthCheck, is_hypothesis_test, seed, settings
 from matplotlib.figure import Figure
 
+from tactslip_torch.native import why_not
+
 settings.register_profile(
     "default",
     deadline=None,
@@ -34,6 +36,8 @@ def pytest_configure(config: pytest.Config) -> None:
         if config.option.dist == "load":  # the plugin's choice where the user made none
             config.option.dist = "loadfile"
         config.option.loadscopereorder = False  # the order is that of slow_files_first
+    if not hasattr(config, "workerinput"):
+        why_not()  # builds the native engine of a checkout, once, and not in the midst of a test
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -64,7 +64,6 @@ def test_a_right_bin_graph_passes_and_is_measured(detector):
     assert [found["valid"] for found in facts["dead"].values()] == [0, 0, 0]
     assert facts["degenerate"]["constant"]["valid"] == 0
     assert facts["degenerate"]["ramp"]["valid"] == facts["degenerate"]["ramp"]["bins"] == 16
-    assert facts["degenerate"]["ramp"]["decided_by_rounding"] == 16  # of the sign of a mean of 0
     assert facts["degenerate"]["plain"]["decided_by_rounding"] == 0
 
 
@@ -183,17 +182,15 @@ def detector_of(feature):
     return SlipDetector(pool, channel_filter, [place], scaler, head, {"simulated": True})
 
 
-@pytest.mark.parametrize("precision", [torch.float32, torch.float64])
-def test_where_engines_disagree_rounding_decides(precision):
-    """A mean of 0 has the sign of its rounding, which moves of the samples may not change."""
-    name = "float32" if precision == torch.float32 else "float64"
-    judged = Judged(None, detector_of("PVDF1 D3 time cv"), Form(name))
-    bins = degenerate_bins(HAND, "step", 200, judged.window.length, precision)
+def test_rounding_decides_where_it_moves_a_score():
+    """Of a vibration of 1e-12 of its offset few digits are left: levels of entropy change."""
+    judged = Judged(None, detector_of("PVDF1 D3 time entropy"), Form("float64"))
+    kind, precision = "offset 1e6, vibration 1e-6", torch.float64
+    bins = degenerate_bins(HAND, kind, 200, judged.window.length, precision)
     exact = judged.exact(bins).score.numpy()
-    others = [judged.exact(bins, other).score.numpy() for other in judged.others]
-    disagree = (np.abs(np.stack(others) - exact) > 1e-2).any(0)
+    other = judged.exact(bins, judged.others[0]).score.numpy()
     is_rounding = judged.is_rounding(bins, exact, 1e-2)
-    assert is_rounding.any()
-    assert is_rounding[disagree].all()
+    assert is_rounding.mean() > 0.5
+    assert is_rounding[np.abs(other - exact) > 1e-2].all()
     noise = noise_bins(HAND, 50, judged.window.length, 0, precision)
     assert not judged.is_rounding(noise, judged.exact(noise).score.numpy(), 1e-6).any()

@@ -149,7 +149,7 @@ def test_the_digest_of_a_detector_is_that_of_its_file(tmp_path):
 
 def test_of_a_certificate_stands_what_a_host_can_use():
     found = certified(small_detector())
-    facts = certificate_facts(found.facts())
+    facts = certificate_facts(found.content)
     assert (facts["holds"], facts["simulated"]) == (found.holds, True)
     margin = found.content["margin"]
     assert (facts["margin"], facts["margin_sd"]) == (margin["score"], margin["sd"])

@@ -69,7 +69,7 @@ def test_a_recipe_leaves_them_out():
     pool = pool_of("haar")
     mask = Recipe().allowed(pool)
     assert torch.equal(mask, ~is_rounding(pool))
-    among = Recipe(among={"component": "D1", "descriptor": ["mean", "std"]}).allowed(pool)
+    among = Recipe(feature_filter={"component": "D1", "descriptor": ["mean", "std"]}).allowed(pool)
     assert [str(pool.names[i]) for i in among.nonzero().flatten()] == [
         "PVDF0 D1 time std",
         "PVDF0 D1 freq mean",
@@ -78,8 +78,8 @@ def test_a_recipe_leaves_them_out():
         "PVDF1 D1 freq mean",
         "PVDF1 D1 freq std",
     ]
-    nothing = Recipe(among={"component": "D1", "domain": "time", "descriptor": "mean"})
-    with pytest.raises(ValueError, match="among: of haar, rounding decides all that match"):
+    nothing = Recipe(feature_filter={"component": "D1", "domain": "time", "descriptor": "mean"})
+    with pytest.raises(ValueError, match="feature_filter: of haar, rounding decides all that match"):
         nothing.allowed(pool)
 
 
