@@ -79,9 +79,7 @@ def test_a_recipe_leaves_them_out():
         "PVDF1 D1 freq std",
     ]
     nothing = Recipe(feature_filter={"component": "D1", "domain": "time", "descriptor": "mean"})
-    with pytest.raises(
-        ValueError, match="feature_filter: of haar, rounding decides all"
-    ):
+    with pytest.raises(ValueError, match="feature_filter: of haar, rounding decides all"):
         nothing.allowed(pool)
 
 
