@@ -29,7 +29,7 @@ def test_the_whole_way(tmp_path):
     for name in ("detector.pt", "model.onnx", "stream.onnx", "metrics.json"):
         assert (tmp_path / "trained" / name).is_file()
     assert (tmp_path / "summary.png").stat().st_size > 10_000
-    assert (tmp_path / "heard" / "onsets.csv").read_text().count("\n") >= 2
+    assert (tmp_path / "detected" / "onsets.csv").read_text().count("\n") >= 2
     assert "probability" in said[7]
     assert len(list((tmp_path / "converted").glob("*.h5"))) == 15
 
