@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import ascending, like, root
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.runtime import has_values
 
 STATISTICS = ("mean", "std", "min", "max", "median")
 SORTED = "sorted"
@@ -51,9 +52,11 @@ def signed_log(features: Tensor, knee: Tensor) -> Tensor:
     is_negative = features < 0
     size = torch.where(is_negative, -features, features)  # abs() has derivative 0 at 0
     ratio, facts = size / knee, torch.finfo(features.dtype)
-    far = torch.maximum(size, knee).log() - knee.log()
-    far = far.clamp(min=math.log(facts.max))  # no step back where log1p ends
-    bent = knee * torch.where(ratio.isinf(), far, ratio.log1p())
+    bent = knee * ratio.log1p()
+    if not has_values(features) or bool(ratio.isinf().any()):
+        far = torch.maximum(size, knee).log() - knee.log()
+        far = far.clamp(min=math.log(facts.max))  # no step back where log1p ends
+        bent = torch.where(ratio.isinf(), knee * far, bent)
     bent = torch.where(ratio < facts.tiny, size, bent)  # a denormal ratio has lost its digits
     return torch.where(is_negative, -bent, bent)
 
