@@ -69,14 +69,6 @@ class Plan:
     shares: tuple[Share, ...]
     num_features: int
 
-    def rows_of(self, kind: RowKind) -> tuple[Row, ...]:
-        """Rows of one kind, in order."""
-        return tuple(row for row in self.rows if row.kind == kind)
-
-    def rows_for(self, *descriptors: str) -> tuple[int, ...]:
-        """Which rows want any of these descriptors, ascending."""
-        return tuple(sorted({w.row for w in self.wanted if w.descriptor in descriptors}))
-
     @property
     def share_channels(self) -> tuple[int, ...]:
         """Films of which band energy ratios are wanted, ascending."""

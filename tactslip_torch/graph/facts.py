@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +14,7 @@ from tactslip_torch.graph.stream import Timing
 from tactslip_torch.model.abstention import abstention_of
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.settings import AlarmSettings, calibration_of
+from tactslip_torch.runtime import plain
 
 FORMAT = "tactslip_torch onnx 1"
 CERTIFICATE_FORMAT = "tactslip_torch certificate 1"
@@ -74,8 +74,8 @@ def model_facts(
     }
     if kind == "stream":
         facts |= _stream_facts(detector, AlarmSettings.of(detector))
-    plain: dict[str, Any] = _plain(facts)
-    return plain
+    metadata: dict[str, Any] = plain(facts)
+    return metadata
 
 
 def in_file(facts: Mapping[str, Any]) -> dict[str, str]:
@@ -152,12 +152,3 @@ def _stream_facts(detector: SlipDetector, settings: AlarmSettings) -> dict[str, 
         "target_false_alarms_per_hour": settings.target_per_hour,
         "threshold_curve": settings.facts.get("threshold_curve", []),
     }
-
-
-def _plain(value: Any) -> Any:
-    """The same with ``None`` for every number that JSON does not have."""
-    if isinstance(value, Mapping):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
