@@ -21,8 +21,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.harness import COLORS, LIGHT, Benchmark, Job, Report, Table, percent, say
-from benchmarks.subjects import SEEN_ROLE, FittedMachine, composed, small_recipe, surveyed
-from tactslip_torch.model.abstention import answers, thresholds
+from benchmarks.subjects import SEEN_ROLE, FittedMachine, composed, small_recipe, statistics_from
+from tactslip_torch.model.abstention import ABSTAIN, NON_SLIP, SLIP, Abstention
 from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.report.metrics import CLASSES, answer_counts, answer_metrics
@@ -97,8 +97,8 @@ class Abstaining(Benchmark[Sizes]):
         config = composed("crossval", [*sizes.overrides, *job.overrides])
         source = instantiate(config.data, _convert_="all")
         names = sorted({recording.material for recording in source.ids})
-        share, seed = config.train_share, config.seed
-        materials = surveyed(
+        share, seed = config.train_fraction, config.seed
+        materials = statistics_from(
             source, config, names, sizes.train_bins, sizes.judged_bins, share, seed
         )
         recipe = small_recipe(config, sizes.train_bins, sizes.num_features, sizes.penalties)
@@ -106,7 +106,7 @@ class Abstaining(Benchmark[Sizes]):
         for held_out in _choices(names, sizes):
             say(f"abstaining: without {', '.join(held_out)}")
             seen = [name for name in names if name not in held_out]
-            machine = FittedMachine.of(materials.survey_of(seen), recipe)
+            machine = FittedMachine.of(materials.statistics_of(seen), recipe)
             evaluated = {
                 "test": materials.bins_of(seen, ("test",)),
                 "unseen": materials.bins_of(held_out, ("train", "test")),
@@ -174,7 +174,7 @@ def _thresholds(
     machine: FittedMachine, coverages: Sequence[float]
 ) -> Iterator[tuple[str, float, float, float]]:
     """Way, coverage, and the scores below and above which a bin has an answer."""
-    sample = machine.survey.sample.bins()
+    sample = machine.statistics.sample.bins()
     every = torch.arange(len(sample.is_slip))
     groups = {"bin": every, "recording": sample.recording, "material": sample.group}
     bins = machine.plan.training_bins(sample)
@@ -189,8 +189,12 @@ def _thresholds(
             ("the same, material left out", "material", sample.recording),
             ("bins as units", "bin", every),
         ):
-            found = thresholds(held[left_out], sample.is_slip, unit, coverage)
-            yield way, coverage, found.low, found.high
+            try:
+                found = Abstention.fit(held[left_out], sample.is_slip, unit, coverage)
+            except ValueError:  # too few recordings for any answer
+                yield way, coverage, -math.inf, math.inf
+            else:
+                yield way, coverage, found.low, found.high
         reach = math.log(coverage / (1 - coverage))
         low, high = -math.inf, math.inf
         if platt.slope:
@@ -200,7 +204,8 @@ def _thresholds(
 
 
 def _evaluated(bins: _Scored, low: float, high: float, coverage: float) -> dict[str, Any]:
-    given = answers(bins.score, low, high)
+    given = torch.full_like(bins.score, ABSTAIN, dtype=torch.int8)
+    given = given.masked_fill(bins.score < low, NON_SLIP).masked_fill(bins.score >= high, SLIP)
     counts = {
         str(name): answer_counts(bins.is_slip[mine], given[mine])
         for name in bins.recording.unique().tolist()

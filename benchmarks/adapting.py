@@ -32,17 +32,19 @@ from benchmarks.harness import (
 )
 from benchmarks.subjects import FittedMachine, Trained
 from tactslip_torch.data.recording import RecordingId
-from tactslip_torch.features.survey import Survey
+from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.kernels import Head
 from tactslip_torch.training.adaptation import (
     FACTORS,
+    RecordingBins,
     Solved,
+    Statistics,
     add,
     mean_recall,
     recording_bins,
     solve,
+    statistics_of,
 )
-from tactslip_torch.training.statistics import RecordingBins, Statistics, statistics_of
 
 AUTO, SLIP_FREE, ONE, SHIFT, CEILING = "auto", "slip-free", "weight 1", "threshold", "ceiling"
 BinsByName = dict[str, RecordingBins]
@@ -56,7 +58,7 @@ class Sizes:
         training: overrides of ``tactslip_torch.train``; its held-out materials are the new ones.
         counts: recordings that are added.
         draws: of which recordings.
-        train_share: of a new material's recordings, from which they are drawn; everything is
+        train_fraction: of a new material's recordings, from which they are drawn; everything is
             evaluated on the others.
         limited: the count that limits are on.
         margin: that old materials may lose on average.
@@ -65,7 +67,7 @@ class Sizes:
     training: tuple[str, ...] = ("+exp=unseen4", "recipe=robust")
     counts: tuple[int, ...] = (1, 2, 5, 10)
     draws: int = 3
-    train_share: float = 0.8
+    train_fraction: float = 0.8
     limited: int = 5
     margin: float = 0.005
 
@@ -97,11 +99,11 @@ class Adapting(Benchmark[Sizes]):
             "data.cycles=4",
             "recipe.num_features=10",
             "recipe.penalties=[0.0003]",
-            "split.train_share=0.75",
+            "split.train_fraction=0.75",
         ),
         counts=(1, 2),
         draws=1,
-        train_share=0.6,
+        train_fraction=0.6,
         limited=2,
     )
 
@@ -118,7 +120,7 @@ class Adapting(Benchmark[Sizes]):
         for material in trained.materials("unseen"):
             say(f"adapting: {material} is new")
             order = _drawn(trained.recordings("unseen", material), 1000)
-            num = round(sizes.train_share * len(order))
+            num = round(sizes.train_fraction * len(order))
             pool, new = order[:num], subject.of(order[num:])
             row = {"material": material, "way": "before", "count": 0}
             rows.append(row | _scores(subject.before.head, new, old))
@@ -246,12 +248,12 @@ def _ceiling(
     trained: Trained, added: Sequence[RecordingId], new: Sequence[RecordingId]
 ) -> dict[str, float]:
     """Trained on these recordings of the new material too: ranked, scaled and chosen anew."""
-    survey = Survey(len(trained.maker.pool.names), trained.recipe.sample_bins)
+    statistics = TrainingStatistics(len(trained.maker.pool.names), trained.recipe.sample_bins)
     for recording in [*trained.recordings("train"), *added]:
         made = trained.maker(recording, trained.split)
-        survey.update(str(recording), recording.material, made.features, made.is_slip)
+        statistics.update(str(recording), recording.material, made.features, made.is_slip)
     num = len(trained.detector.selected)
-    machine = FittedMachine.of(survey, replace(trained.recipe, num_features=num))
+    machine = FittedMachine.of(statistics, replace(trained.recipe, num_features=num))
 
     def score(recordings: Sequence[RecordingId]) -> float:
         made = [trained.maker(recording, trained.split) for recording in recordings]

@@ -24,10 +24,11 @@ from tactslip_torch.model.calibration import (
     fit_platt,
     probability,
     reliability,
+    widened_llr,
 )
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.leave_one_group_out import HeldOut
-from tactslip_torch.model.missing_channels import MissingScores, channel_mask, widened_llr
+from tactslip_torch.model.missing_channels import ClassGaussians, channel_mask, missing_scores
 
 OURS, REFIT = "closed form", "refit"
 _CALIBRATED_ON = 3000  # training bins at most that a refitted machine is calibrated on
@@ -95,9 +96,10 @@ class DeadSensors(Benchmark[Sizes]):
             for role in SEEN_ROLE:
                 own = bins[role]
                 loss = {"kind": kind, "lost": name, "role": role}
-                for way, missing in _ways(trained).items():
-                    score, variance = missing(
-                        detector.head(own.z), own.z, dead.expand(len(own.z), -1)
+                for way, (gaussians, fill) in _ways(trained).items():
+                    whole, lost = detector.head(own.z), is_lost.expand(len(own.z), -1)
+                    score, variance = missing_scores(
+                        detector.head, gaussians, fill, whole, own.z, lost
                     )
                     stated = probability(widened_llr(calibration, score, variance), 0.5)
                     rows.append(loss | {"way": way} | _evaluated(own, score, stated))
@@ -168,9 +170,9 @@ def _losses(hand: HandLayout, halves: int) -> list[tuple[str, str, list[str]]]:
     return found
 
 
-def _ways(trained: Trained) -> dict[str, MissingScores]:
+def _ways(trained: Trained) -> dict[str, tuple[ClassGaussians | None, Tensor]]:
     detector = trained.detector
-    imputation, index = detector.imputation, detector.channel_index
+    imputation = detector.imputation
     assert imputation is not None  # as trained
     silent = torch.zeros(len(detector.pool.hand), detector.pool.bin_samples)
     features = detector.pool(detector.pool.widen(silent))[list(detector.selected)].double()
@@ -179,10 +181,9 @@ def _ways(trained: Trained) -> dict[str, MissingScores]:
         "zero-fill": torch.zeros_like(imputation),
         "0 V": detector.scaler(features),
     }
-    found = {OURS: MissingScores(detector.head, imputation, index, detector.gaussians)}
-    for name, fill in fills.items():
-        found[name] = MissingScores(detector.head, fill, index, None)
-    return found
+    return {OURS: (detector.gaussians, imputation)} | {
+        name: (None, fill) for name, fill in fills.items()
+    }
 
 
 def _refitted(training: _Bins, is_lost: Tensor, penalty: float) -> tuple[Any, Calibration]:

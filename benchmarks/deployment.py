@@ -47,7 +47,7 @@ from benchmarks.subjects import (
     stream_samples,
 )
 from tactslip_torch import SlipDetector, StreamingDetector
-from tactslip_torch.graph.export import export_detector
+from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.signals.filtering import ChannelFilter
 
 Precision = Literal["float32", "float64"]

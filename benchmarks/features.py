@@ -29,7 +29,7 @@ from benchmarks.harness import (
 )
 from benchmarks.peers import arrays, loop, others, rockets
 from benchmarks.subjects import FLOAT32, FLOAT64, labelled_bins
-from tactslip_torch import FeatureExtractor, FeaturePool, HandLayout
+from tactslip_torch import FeaturePool, HandLayout
 
 HAND = HandLayout.paper24()
 
@@ -73,9 +73,9 @@ class Features(Benchmark[Sizes]):
         names = [(n.channel, n.component, n.domain, n.descriptor) for n in FeaturePool(HAND).names]
         windows = bins.float().numpy()
         ways: dict[str, tuple[int, Callable[[], Any]]] = {
-            "tactslip_torch, float64": (len(bins), partial(_extractor(FLOAT64), bins)),
-            "tactslip_torch, float32": (len(bins), partial(_extractor(FLOAT32), bins.float())),
-            "reference, float64": (len(few), partial(FeaturePool(HAND), few)),
+            "tactslip_torch, float64": (len(bins), partial(_pool(FLOAT64), bins)),
+            "tactslip_torch, float32": (len(bins), partial(_pool(FLOAT32), bins.float())),
+            "reference, float64": (len(few), partial(FeaturePool(HAND, backend="torch"), few)),
             "NumPy and PyWavelets, batched": (
                 len(few),
                 partial(arrays.features, few.numpy(), 14),
@@ -145,9 +145,8 @@ def feature_error(found: Tensor, reference: Tensor) -> float:
     return float(max(relative[:, ~is_step].max(), relative[:, is_step].quantile(0.99)))
 
 
-def _extractor(dtype: torch.dtype) -> FeatureExtractor:
-    pool = FeaturePool(HAND, arithmetic="native" if dtype == FLOAT32 else "double")
-    return FeatureExtractor(pool)
+def _pool(dtype: torch.dtype) -> FeaturePool:
+    return FeaturePool(HAND, arithmetic="native" if dtype == FLOAT32 else "double")
 
 
 def _looped(bin_: Any, names: Any) -> Any:

@@ -202,40 +202,27 @@ def versions(more: Sequence[str] = ()) -> dict[str, str]:
 
 
 # ------------------------------------------------------------------------------------- trainings
-_MADE_BY = "made_by.txt"
-
-
 def trained(name: str, overrides: Sequence[str], folder: Path, cache: Path) -> dict[str, Any]:
-    """The metrics of a run, from its folder if this code finished it there, else trained now.
+    """The metrics of a training, from its folder if this code finished it there, else made now.
 
     Args:
         name: for messages.
-        overrides: of ``tactslip_torch.train``.
+        overrides: of ``tactslip train``.
         folder: of its results.
         cache: of features.
 
     Raises:
         RuntimeError: if the training fails.
     """
-    made_by = " ".join([code_digest(), *overrides])
-    note = folder / _MADE_BY
-    if not note.exists() or note.read_text(encoding="utf-8") != made_by:
-        note.unlink(missing_ok=True)
-        command = [sys.executable, "-m", "tactslip_torch.train", *overrides]
-        command += ["export=false", f"cache={cache}", f"hydra.run.dir={folder}"]
-        print(f"{name}: {' '.join(command[1:])}", file=sys.stderr, flush=True)
-        done = subprocess.run(command, check=False, stdout=subprocess.DEVNULL)
-        if done.returncode:
-            raise RuntimeError(f"{name} failed; see above")
-        with whole_file(note) as temporary:
-            temporary.write_text(made_by, encoding="utf-8")
-    metrics: dict[str, Any] = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    return metrics
+    say(name)
+    return result_of(
+        "train", [*overrides, "export=false", f"cache={cache}"], folder, "metrics.json"
+    )
 
 
 def code_digest() -> str:
     """Of everything that decides a result: sources, calibrated parameters, configuration."""
-    digest = hashlib.sha256(source_digest(ROOT / "tactslip_torch").encode())
+    digest = hashlib.sha256(source_digest().encode())
     others = [*(ROOT / "tactslip_torch").rglob("*.json"), *(ROOT / "conf").rglob("*.yaml")]
     for path in sorted(others):
         digest.update(path.relative_to(ROOT).as_posix().encode())
@@ -244,13 +231,14 @@ def code_digest() -> str:
 
 
 def result_of(command: str, overrides: Sequence[str], folder: Path, name: str) -> dict[str, Any]:
-    """The JSON file ``name`` that ``tactslip COMMAND`` leaves in the folder.
+    """The JSON file ``name`` that ``tactslip COMMAND`` leaves in the folder, made by this code.
 
     Raises:
         RuntimeError: if the command fails, which has said why.
     """
     made_by, note = " ".join([code_digest(), *overrides]), folder / "made_by.txt"
     if not note.exists() or note.read_text(encoding="utf-8") != made_by:
+        note.unlink(missing_ok=True)
         given = ["-m", "tactslip_torch", command, *overrides, f"hydra.run.dir='{folder}'"]
         say(" ".join(given))
         done = subprocess.run([sys.executable, *given], stdout=subprocess.DEVNULL, check=False)
@@ -311,13 +299,22 @@ class Table(NamedTuple):
     note: str = ""
 
     @classmethod
-    def of(cls, rows: Sequence[Sequence[str]], note: str = "") -> Table:
-        """Of rows of which the first is the header."""
-        return cls(rows[0], rows[1:], note)
+    def of(cls, rows: Sequence[Mapping[str, object]], note: str = "") -> Table:
+        """Of rows as the reports of the package have them, cells by column."""
+        header, *texts = style.cells(rows)
+        return cls(header, texts, note)
 
     def text(self) -> str:
         """Aligned columns."""
-        return "\n".join(filter(None, [style.table([self.header, *self.rows]), self.note]))
+        return "\n".join(
+            filter(
+                None,
+                [
+                    style.table([dict(zip(self.header, row, strict=True)) for row in self.rows]),
+                    self.note,
+                ],
+            )
+        )
 
     def markdown(self) -> str:
         """A table of Markdown, columns of numbers to the right and of words to the left."""

@@ -44,7 +44,7 @@ from benchmarks.subjects import (
     raw_bins,
 )
 from tactslip_torch import FeaturePool, HandLayout
-from tactslip_torch.graph.export import export_detector
+from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.signals.filtering import ChannelFilter
 
 OURS, REFERENCE, ORT = "tactslip_torch, float32", "reference, float64", "onnxruntime, float32"

@@ -55,19 +55,19 @@ QUICK_TRAINING = (
     "data.materials=[M1,M6,iron]",
     "split.seen=[M1,M6]",
     "split.unseen=[iron]",
-    "split.train_share=0.5",
-    "others.held.cycles=2",
-    "others.held.tail_s=2",
-    "others.knocked.cycles=2",
-    "others.knocked.tail_s=2",
-    "others.arm_motion.cycles=2",
+    "split.train_fraction=0.5",
+    "extra_scenes.held.cycles=2",
+    "extra_scenes.held.tail_s=2",
+    "extra_scenes.knocked.cycles=2",
+    "extra_scenes.knocked.tail_s=2",
+    "extra_scenes.arm_motion.cycles=2",
     "recipe.num_features=20",
     "recipe.penalties=[0.003]",
 )
 QUICK_STREAMS = (
     "onset.streams.cycles=4",
-    "onset.streams.others.held.cycles=4",
-    "onset.streams.others.held.tail_s=5",
+    "onset.streams.extra_scenes.held.cycles=4",
+    "onset.streams.extra_scenes.held.tail_s=5",
 )
 
 
@@ -89,12 +89,15 @@ class Sizes:
 
     training: tuple[str, ...] = (
         "data.cycles=8",
-        "others.held.cycles=2",
-        "others.knocked.cycles=2",
-        "others.arm_motion.cycles=4",
+        "extra_scenes.held.cycles=2",
+        "extra_scenes.knocked.cycles=2",
+        "extra_scenes.arm_motion.cycles=4",
         "recipe.penalties=[0.001,0.003,0.01]",
     )
-    streams: tuple[str, ...] = ("onset.streams.cycles=20", "onset.streams.others.held.cycles=14")
+    streams: tuple[str, ...] = (
+        "onset.streams.cycles=20",
+        "onset.streams.extra_scenes.held.cycles=14",
+    )
     aligns: tuple[str, ...] = ("centred", "causal", "trailing")
     hops_ms: tuple[float, ...] = (5.0, 10.0, 25.0, 50.0)
     hours: float = 0.5
@@ -213,7 +216,7 @@ def _stage(overrides: list[str], hop_ms: float, sizes: Sizes) -> CalibratedAlarm
     """The stage behind ``+exp=onset``: the protocol and its quiet alone, and the main rule."""
     onset: Any = OmegaConf.to_container(composed("train", overrides).onset, resolve=True)
     quiet, main = onset["slip_free"], onset["rule"]
-    onset["streams"]["others"] = {quiet: onset["streams"]["others"][quiet]}
+    onset["streams"]["extra_scenes"] = {quiet: onset["streams"]["extra_scenes"][quiet]}
     onset["rules"] = {main: onset["rules"][main]}
     onset |= {
         "hours": sizes.hours,

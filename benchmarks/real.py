@@ -61,14 +61,13 @@ from tactslip_torch.commands.entry import unknown_choice
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split
-from tactslip_torch.features.survey import Survey
+from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.runtime import bar, whole_file
 from tactslip_torch.training.alarm import DebouncedAlarm
 from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.experiment import feature_parts
-from tactslip_torch.training.fitting import TrainingPass
+from tactslip_torch.training.experiment import feature_maker
+from tactslip_torch.training.plan import TrainingPass, plan_detector
 from tactslip_torch.training.recipe import Recipe
-from tactslip_torch.training.selection import plan_detector
 
 Array = NDArray[Any]
 EXPERIMENT = "+exp=biotacsp_dos"
@@ -205,8 +204,7 @@ def read_windows(config: DictConfig, sizes: Sizes) -> tuple[Windows, list[Split]
     if source.is_simulated:
         raise ValueError("recordings of data.root say that they are simulated; give real ones")
     rule = instantiate(config.labels)
-    pool, channel_filter, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
-    maker = FeatureMaker(source, pool, channel_filter, rule, None, dtype, backend)
+    maker = feature_maker(source, rule, **config.features)
     recordings = _some_of(source.ids, sizes)
     folds: list[Split] = instantiate(config.split, _convert_="all")(recordings)
     samples, labels, places = [], [], []
@@ -318,10 +316,10 @@ def methods_of(windows: Windows, recipes: Sequence[Recipe], sizes: Sizes) -> lis
 def _ours(windows: Windows, recipe: Recipe, train: Array, _: SlipDetector | None) -> Fitted:
     """The detector that ``train`` makes of these windows."""
     pool = windows.maker.pool
-    survey = Survey(len(pool.names), recipe.sample_bins)
+    statistics = TrainingStatistics(len(pool.names), recipe.sample_bins)
     for recording, features, is_slip in windows.by_recording(train):
-        survey.update(str(recording), recipe.group(recording), features, is_slip)
-    plan = plan_detector(recipe, survey, pool, is_nested=False)
+        statistics.update(str(recording), recipe.group(recording), features, is_slip)
+    plan = plan_detector(recipe, statistics, pool, is_nested=False)
     second = TrainingPass(plan)
     for recording, features, is_slip in windows.by_recording(train):
         second.update(str(recording), features, is_slip)

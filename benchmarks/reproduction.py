@@ -37,9 +37,8 @@ from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.report import published
 from tactslip_torch.report.metrics import split_metrics, summed_metrics
-from tactslip_torch.report.pipeline import pipeline_figure
 from tactslip_torch.report.results import BASELINES
-from tactslip_torch.simulation.parameters import CALIBRATED_PATH, SEEN_MATERIALS
+from tactslip_torch.simulation.scene import CALIBRATED_PATH, SEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings
 
 GROUPS = ("per_material", "per_speed", "per_scene")
@@ -88,7 +87,7 @@ class Reproduction(Benchmark[Sizes]):
     quick = Sizes(
         1,
         ("random_bins", "unseen4", "confound"),
-        ("data.cycles=2", "split.train_share=0.5", "recipe.sample_bins=60"),
+        ("data.cycles=2", "split.train_fraction=0.5", "recipe.sample_bins=60"),
         1,
     )
 
@@ -101,8 +100,10 @@ class Reproduction(Benchmark[Sizes]):
                 overrides, seeds = EXPERIMENTS[name]
                 given = [*overrides, *job.sizes.overrides, *job.overrides]
                 if job.is_quick and name == "confound":
-                    others = OmegaConf.load(ROOT / "conf" / "others" / "confound.yaml")
-                    given += [f"others.{o}.cycles=2" for o in map(str, others) if o != "defaults"]
+                    extra = OmegaConf.load(ROOT / "conf" / "extra_scenes" / "confound.yaml")
+                    given += [
+                        f"extra_scenes.{o}.cycles=2" for o in map(str, extra) if o != "defaults"
+                    ]
                 commands[name] = " ".join(given)
                 if seed < seeds:
                     folder = job.folder / f"{name.replace(' ', '-')}-{seed}"
@@ -200,7 +201,6 @@ class Reproduction(Benchmark[Sizes]):
             panels[0].set_yticks(range(len(scenes)), scenes, fontsize=8)
             panels[0].legend(frameon=False, fontsize=8)
             finish(drawing, report, "Slip or the arm", path.with_stem(f"{path.stem}_confound"))
-        pipeline_figure(path.with_name("pipeline.png"))
 
 
 def _signal_checks(seed: int, cycles: int) -> list[dict[str, Any]]:

@@ -6,33 +6,31 @@ is read. The weights with the least mean error are taken, of equals those with t
 the protocol; the error is the mean of three: protocol bins decided wrongly (mean of both classes),
 bins of a moving arm without slip called slip, and slips beside a loud arm that are missed. All data
 are simulated.
-
-Writes ``benchmarks/results/scene_weights.json``; ``benchmarks.generalisation`` shows it.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import statistics
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from hydra.utils import instantiate
+from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.generalisation import SCENE_WEIGHTS, config_of, recordings
-from benchmarks.harness import code_digest
+from benchmarks.generalisation import recordings
+from benchmarks.harness import LIGHT, Benchmark, Job, Report, Table
+from benchmarks.subjects import composed
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import PAPER_SCENE, Split
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.runtime import whole_file
-from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.experiment import feature_maker
 from tactslip_torch.training.recipe import Recipe, sample_groups, sample_weight
 from tactslip_torch.training.selection import candidates, fitted_selection
 
@@ -44,15 +42,75 @@ WEIGHTS = {
 PENALTY = 1e-3  # what validation takes for every seed of +exp=unseen4
 
 
+@dataclass(frozen=True)
+class Sizes:
+    """Seeds, and overrides of the set of recordings."""
+
+    seeds: tuple[int, ...] = (0, 1, 2)
+    overrides: tuple[str, ...] = ()
+
+
+class SceneWeights(Benchmark[Sizes]):
+    """Every set of weights."""
+
+    name = "scene_weights"
+    title = "Weights of scenes in `+exp=deploy`"
+    about = "errors on training materials left out, by weights of scenes"
+    page = "docs/generalisation.md"
+    sizes = Sizes()
+    quick = Sizes((0,), ("data.cycles=5",))
+
+    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+        """Errors of each set of weights, the least mean error first."""
+        found: dict[tuple[float, ...], list[dict[str, float]]] = {}
+        small = [*job.sizes.overrides, *job.overrides]
+        for seed in job.sizes.seeds:
+            bins = training_bins(seed, job.folder / "cache", small)
+            for weights, errors in error_rows(*bins):
+                found.setdefault(weights, []).append(errors)
+        rows = []
+        for weights, of in found.items():
+            errors = {name: statistics.fmean(one[name] for one in of) for name in of[0]}
+            row = dict(zip(WEIGHTS, weights, strict=True)) | errors
+            rows.append(row | {"mean error": statistics.fmean(errors.values())})
+        rows.sort(key=lambda row: (round(row["mean error"], 6), row["protocol"]))
+        return {"seeds": list(job.sizes.seeds), "rows": rows}
+
+    def tables(self, numbers: Report) -> dict[str, Table]:
+        """All of them."""
+        rows = [{name: f"{of:.3g}" for name, of in row.items()} for row in numbers["rows"]]
+        return {self.title: Table.of(rows)}
+
+    def section(self, report: Report) -> str:
+        """How they were chosen, and the table."""
+        seeds = ", ".join(map(str, report["numbers"]["seeds"]))
+        about = (
+            "Chosen by leaving out each training material, of training bins alone (`python -m "
+            f"benchmarks.scene_weights`, seeds {seeds}, code {report['code']}). Errors in %, the "
+            "least mean error first:"
+        )
+        (table,) = self.tables(report["numbers"]).values()
+        return f"## {self.title}\n\n{about}\n\n{table.markdown()}"
+
+    def draw(self, numbers: Report, drawing: Figure) -> None:
+        """Each error by the place of the weights in the table."""
+        axes, rows = drawing.subplots(), numbers["rows"]
+        for name in (name for name in rows[0] if name not in WEIGHTS):
+            axes.plot(range(1, len(rows) + 1), [row[name] for row in rows], ".-", label=name)
+        axes.set_xlabel("sets of weights, the best first")
+        axes.set_ylabel("error, %")
+        axes.grid(color=LIGHT)
+        axes.legend(frameon=False)
+
+
 def training_bins(
     seed: int, cache: Path, small: Sequence[str]
 ) -> tuple[Recipe, FeaturePool, SampledBins]:
     """The recipe of ``+exp=deploy``, its pool, and a sample of its training bins."""
-    config = config_of(["+exp=deploy", f"seed={seed}", *small])
+    config = composed("train", ["+exp=deploy", f"seed={seed}", *small])
     recipe: Recipe = instantiate(config.recipe, _convert_="all")
-    pool = feature_parts(
-        instantiate(config.data, _convert_="all"), config.labels.bin_ms, **config.features
-    )[0]
+    source = instantiate(config.data, _convert_="all")
+    pool = feature_maker(source, instantiate(config.labels), **config.features).pool
     sample = BinSample(recipe.sample_bins)
 
     def keep(source: RecordingSource) -> list[RecordingId]:
@@ -67,7 +125,7 @@ def training_bins(
 
 def without(sample: SampledBins, is_out: Tensor) -> SampledBins:
     """The other bins of a sample."""
-    own = ("features", "is_slip", "group", "recording", "bin_index", "represents")
+    own = ("features", "is_slip", "group", "recording", "bin_index", "sample_weight")
     return replace(sample, **{name: getattr(sample, name)[~is_out] for name in own})
 
 
@@ -109,35 +167,5 @@ def error_rows(
             )
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--cache", type=Path, default=Path("outputs/generalisation/cache"))
-    parser.add_argument("--quick", action="store_true", help="few recordings; writes nothing")
-    options = parser.parse_args(arguments)
-    small = ["data.cycles=5"] if options.quick else []
-    found: dict[tuple[float, ...], list[dict[str, float]]] = {}
-    for seed in options.seeds:
-        for weights, errors in error_rows(*training_bins(seed, options.cache, small)):
-            found.setdefault(weights, []).append(errors)
-    rows = []
-    for weights, of in found.items():
-        errors = {name: statistics.fmean(one[name] for one in of) for name in of[0]}
-        rows.append(
-            dict(zip(WEIGHTS, weights, strict=True))
-            | errors
-            | {"mean error": statistics.fmean(errors.values())}
-        )
-    rows.sort(key=lambda row: (round(row["mean error"], 6), row["protocol"]))
-    for row in rows:
-        print("  ".join(f"{name} {value:.3g}" for name, value in row.items()))
-    if options.quick:
-        return
-    report = {"simulated": True, "code": code_digest(), "seeds": options.seeds, "rows": rows}
-    with whole_file(SCENE_WEIGHTS) as temporary:
-        temporary.write_text(json.dumps(report, indent=1) + "\n")
-
-
 if __name__ == "__main__":
-    main()
+    raise SystemExit(SceneWeights().run())

@@ -28,7 +28,7 @@ from benchmarks.harness import (
     percent,
     say,
 )
-from benchmarks.subjects import FittedMachine, composed, small_recipe, surveyed
+from benchmarks.subjects import FittedMachine, composed, small_recipe, statistics_from
 from tactslip_torch.simulation import (
     SEEN_MATERIALS,
     Dynamics,
@@ -184,17 +184,19 @@ def _accuracies(job: Job[Sizes]) -> dict[str, dict[str, float]]:
         source = SimulatedRecordings(
             cycles=sizes.cycles, materials=list(sizes.materials), fidelity=fidelity, scene=given
         )
-        kept[level] = surveyed(
-            source, config, sizes.materials, sizes.train_bins, 2000, config.train_share, 0
+        kept[level] = statistics_from(
+            source, config, sizes.materials, sizes.train_bins, 2000, config.train_fraction, 0
         )
     found: dict[str, dict[str, float]] = {}
     for level, materials in kept.items():
-        machine = FittedMachine.of(materials.survey_of(sizes.materials), recipe)
+        machine = FittedMachine.of(materials.statistics_of(sizes.materials), recipe)
         found[level] = {}
         for other, of in kept.items():
             bins = of.bins_of(sizes.materials, ("test",))
             is_right = machine.scores(bins.features) >= 0
-            found[level][other] = balanced_accuracy(is_right, bins.is_slip, bins.represents) or 0.0
+            found[level][other] = (
+                balanced_accuracy(is_right, bins.is_slip, bins.sample_weight) or 0.0
+            )
     return found
 
 

@@ -26,21 +26,20 @@ from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split, seen6
 from tactslip_torch.features.cache import FeatureCache
-from tactslip_torch.features.extractor import FeatureExtractor
-from tactslip_torch.features.survey import Survey
+from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import KernelSum, Polynomial, kernel_from_dict
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
+from tactslip_torch.onset.decisions import KEY
 from tactslip_torch.onset.rules import Cusum
-from tactslip_torch.onset.settings import KEY
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.simulation.source import SimulatedRecordings
 from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.experiment import feature_maker
+from tactslip_torch.training.plan import plan_detector
 from tactslip_torch.training.recipe import Recipe
-from tactslip_torch.training.selection import plan_detector
 
 Array = NDArray[Any]
 WINDOW_LENGTHS = (51,) * 14 + (11,) * 10
@@ -115,7 +114,7 @@ class MainJobDetector:
         place = {str(name): index for index, name in enumerate(pool.names)}
         selected = tuple(place[name] for name in selection["names"])
         bins, is_slip = labelled_bins(num_recordings)
-        features = FeatureExtractor(pool, selected)(bins)
+        features = pool.select(selected)(bins)
         scaler = FeatureScaler.fit(features, compress=True)
         kernel = kernel_from_dict(selection["trained"]["kernel"])
         assert isinstance(kernel, Polynomial)  # both recipes have one
@@ -184,9 +183,8 @@ class Trained:
         config = composed("train", overrides)
         source, rule = instantiate(config.data, _convert_="all"), instantiate(config.labels)
         (split,) = instantiate(config.split, _convert_="all")(source.ids)
-        pool, filters, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
-        cached = FeatureCache(cache_folder)
-        maker = FeatureMaker(source, pool, filters, rule, cached, dtype, backend)
+        maker = feature_maker(source, rule, **config.features)
+        maker.cache = FeatureCache(cache_folder)
         recipe = instantiate(config.recipe, _convert_="all")
         detector = SlipDetector.load(folder / "detector.pt")
         return cls(folder, detector, recipe, split, maker, metrics)
@@ -200,21 +198,20 @@ class Trained:
         return sorted({one.material for one in self.recordings(role)})
 
 
-def surveyed(
+def statistics_from(
     source: RecordingSource,
     config: DictConfig,
     seen: Sequence[str],
     train_bins: int,
     judged_bins: int,
-    train_share: float,
+    train_fraction: float,
     seed: int,
 ) -> Materials:
     """What one pass over all recordings keeps of each material, split by cycle."""
     rule = instantiate(config.labels)
-    by_cycle = seen6(source.ids, seen=list(seen), train_share=train_share, seed=seed)[0]
-    pool, filters, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
-    maker = FeatureMaker(source, pool, filters, rule, None, dtype, backend)
-    materials = Materials(pool, train_bins, judged_bins)
+    by_cycle = seen6(source.ids, seen=list(seen), train_fraction=train_fraction, seed=seed)[0]
+    maker = feature_maker(source, rule, **config.features)
+    materials = Materials(maker.pool, train_bins, judged_bins)
     for place, recording in enumerate(source.ids):
         if place % 20 == 0:
             say(f"features of recording {place} of {len(source.ids)}")
@@ -227,19 +224,21 @@ class FittedMachine:
     """A machine of sampled training bins, as a recipe makes it."""
 
     plan: Any
-    survey: Survey
+    statistics: TrainingStatistics
     recipe: Recipe
     weights: Tensor
     head: Any
 
     @classmethod
     @torch.no_grad()
-    def of(cls, survey: Survey, recipe: Recipe) -> FittedMachine:
+    def of(cls, statistics: TrainingStatistics, recipe: Recipe) -> FittedMachine:
         """Rank, scale, choose K and C, and fit."""
-        plan = plan_detector(recipe, survey)
-        training = plan.training_bins(survey.sample.bins())
+        plan = plan_detector(recipe, statistics)
+        training = plan.training_bins(statistics.sample.bins())
         weights = training.sample_weight
-        return cls(plan, survey, recipe, weights, fit_machine(training, plan.penalty, plan.kernel))
+        return cls(
+            plan, statistics, recipe, weights, fit_machine(training, plan.penalty, plan.kernel)
+        )
 
     @torch.no_grad()
     def scores(self, features: Tensor) -> Tensor:

@@ -21,6 +21,9 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from tqdm.auto import tqdm
 
+__version__ = "0.1.0"
+PACKAGE = Path(__file__).resolve().parent
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -157,7 +160,7 @@ def has_values(x: Tensor) -> bool:
         return False
     try:
         x.detach().flatten()[:0].cpu().numpy()  # of what is transformed not even nothing
-    except RuntimeError:
+    except (RuntimeError, TypeError):  # transformed, or NumPy has no such dtype
         return False
     return True
 
@@ -173,8 +176,24 @@ def is_concrete(x: Tensor) -> bool:
     try:
         x.detach().numpy()  # under vmap and other transforms there is no memory to look at
         return forward_ad.unpack_dual(x).tangent is None
-    except RuntimeError:
+    except (RuntimeError, TypeError):  # transformed, or NumPy has no such dtype
         return False
+
+
+def stamps_of(tensors: Iterable[Tensor]) -> list[tuple[Tensor, int | Tensor]]:
+    """What ``are_unchanged`` compares: tensors, and how often each was changed in place.
+
+    Inference tensors do not count that: of those a copy.
+    """
+    return [(x, x.clone() if x.is_inference() else x._version) for x in tensors]
+
+
+def are_unchanged(tensors: Sequence[Tensor], stamps: Sequence[tuple[Tensor, int | Tensor]]) -> bool:
+    """Whether tensors are those of the stamps, none of them replaced or changed since."""
+    return len(tensors) == len(stamps) and all(
+        x is same and (torch.equal(x, was) if isinstance(was, Tensor) else x._version == was)
+        for x, (same, was) in zip(tensors, stamps, strict=True)
+    )
 
 
 def check_number(name: str, value: Any, *, least: float | None = None, whole: bool = False) -> None:
@@ -255,7 +274,7 @@ def save_table(
 
     Args:
         path: of the file.
-        form: names format and version; ``load_table`` wants the same.
+        form: names the format and, last, its number; ``load_table`` wants the same.
         metadata: kept as JSON text.
         tensors: by name.
     """
@@ -279,6 +298,11 @@ def load_table(path: str | os.PathLike[str], form: str) -> tuple[dict[str, Any],
     """
     name = os.fspath(path)
     content = _read(path)
+    kind, number = form.rsplit(" ", 1)
+    if content["format"] in {f"{kind} {earlier}" for earlier in range(1, int(number))}:
+        raise ValueError(
+            f"{name} was made by version 0.1.0 or earlier; make it again, or use that version"
+        )
     if content["format"] != form:
         raise ValueError(f"{name} must be of format {form!r}, got {content['format']!r}")
     try:
@@ -289,16 +313,6 @@ def load_table(path: str | os.PathLike[str], form: str) -> tuple[dict[str, Any],
     if not is_whole:
         raise ValueError(f"{name} is damaged; make it again")
     return json.loads(metadata), tensors
-
-
-def table_form(path: str | os.PathLike[str]) -> str:
-    """The format that ``save_table`` named in a file.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged or no such file.
-    """
-    return str(_read(path)["format"])
 
 
 def _read(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -17,8 +17,8 @@ from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
+from tactslip_torch.onset.decisions import KEY, AlarmSettings
 from tactslip_torch.onset.rules import Cusum
-from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.wavelet import WaveletFilters, highest_level
 from tactslip_torch.training.experiment import frame_lengths

@@ -4,6 +4,7 @@ A host is a command, ``[*host, model, recording, *options]``. It is run, its JSO
 and what they say is held against ``StreamingDetector`` in float64.
 """
 
+import fcntl
 import json
 import shutil
 import subprocess
@@ -13,16 +14,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 import torch
 from test_detector import random_detector
 
 from tactslip_torch import Scene, SlipDetector, simulate
+from tactslip_torch.deploy import export
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.onset.decisions import score_stream
+from tactslip_torch.onset.decisions import KEY, AlarmSettings, score_stream
 from tactslip_torch.onset.rules import Cusum
-from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 
+EXPORT = Path(__file__).parents[1] / "export"
 RATE = 2000.0
 NUM_CHANNELS = 24
 HOP = 20
@@ -87,11 +90,11 @@ def exported(folder_factory: Any, precision: str = "float32") -> Path:
         folder_factory: pytest's ``tmp_path_factory``.
         precision: of the graphs.
     """
-    from tactslip_torch.graph.export import export_detector
-
     if precision not in _EXPORTED:
         folder: Path = folder_factory.mktemp(f"exported_{precision}")
-        export_detector(alarming_detector(), folder, graphs=("bin", "stream"), precision=precision)
+        with pytest.MonkeyPatch.context() as patch:  # the hosts are asked here, not the graph
+            patch.setattr(export, "check_model", lambda *given: {"worst_sd": 0.0})
+            export.export_detector(alarming_detector(), folder, precision=precision)
         _EXPORTED[precision] = folder
     return _EXPORTED[precision]
 
@@ -120,6 +123,24 @@ def altered(path: Path) -> Path:
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     return path
+
+
+def installed(folder: Path) -> None:
+    """Install a folder's packages where its lock file is newer than what is there.
+
+    Two test files may want the same folder in two processes: one of them waits.
+    """
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed: apt-get install nodejs npm")
+    wanted, done = folder / "package-lock.json", folder / "node_modules" / ".package-lock.json"
+    with wanted.open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if done.exists() and done.stat().st_mtime >= wanted.stat().st_mtime:
+            return
+        if shutil.which("npm") is None:
+            pytest.skip("npm is not installed: apt-get install npm")
+        ran = subprocess.run(["npm", "ci"], cwd=folder, capture_output=True, text=True, check=False)
+        assert ran.returncode == 0, ran.stderr
 
 
 # Running a host --------------------------------------------------------------------------------

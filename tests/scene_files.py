@@ -9,8 +9,7 @@ import yaml
 from tactslip_torch.commands.entry import conf_dir
 from tactslip_torch.simulation import Scene, paper_scenes, simulate, timeline
 from tactslip_torch.simulation._blocks import Grid
-from tactslip_torch.simulation._contact import ElementContact, scene_contact
-from tactslip_torch.simulation._grasp import draw_grasp
+from tactslip_torch.simulation._contact import ElementContact, draw_grasp, scene_contact
 from tactslip_torch.simulation.scene import Motion
 
 SCENE_FILES = sorted((conf_dir() / "scene").glob("*.yaml"))

@@ -17,16 +17,31 @@ from tactslip_torch.commands.adapt import adapt
 from tactslip_torch.commands.entry import conf_dir, one_line
 from tactslip_torch.commands.train import train
 from tactslip_torch.data.folder import RecordingFolder, write_manifest
-from tactslip_torch.model.abstention import answers, thresholds
+from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.onset.decisions import KEY, AlarmSettings
 from tactslip_torch.onset.rules import KOfN
-from tactslip_torch.onset.settings import KEY, AlarmSettings
-from tactslip_torch.training.adaptation import AccuracyChange, _class_scales, add
-from tactslip_torch.training.statistics import Statistics, detector_digest, locked
+from tactslip_torch.training.adaptation import (
+    AccuracyChange,
+    Statistics,
+    add,
+    class_scales,
+    detector_digest,
+    locked,
+)
 
-TRAINING = (*TINY, "recipe=robust", "data.seed=0", "statistics=true", "coverage=0.5", "cache=off")
+TRAINING = (
+    *TINY,
+    "recipe=robust",
+    "baselines=false",
+    "export=false",
+    "data.seed=0",
+    "statistics=true",
+    "coverage=0.5",
+    "cache=off",
+)
 SETTINGS = AlarmSettings(20, Platt(1.0, 0.0), KOfN(2, 3), 2.0, target_per_hour=1.0)
 
 
@@ -109,11 +124,10 @@ def test_a_material_comes_in_and_all_is_said(run, files, trained, capsys):
     assert entry["recordings"] == [f"C/{i}" for i in range(4)]
     alarm = AlarmSettings.of(new)
     assert (alarm.threshold, alarm.target_per_hour) == (SETTINGS.threshold, None)
-    assert "it stands for no rate; the calibration is made anew" in alarm.facts["adapted"]
+    assert "it stands for no rate; the calibration is made anew" in alarm.metadata["adapted"]
     assert alarm.calibration.to_dict() == new.info["calibration"] != SETTINGS.calibration.to_dict()
     assert new.info["calibration"] != old.info["calibration"]
     assert new.info["abstain"]["adapted"]
-    assert set(answers(torch.zeros(1), new.info["abstain"]["low"], 1.0).tolist()) <= {-1, 0, 1}
 
 
 def test_what_stands_in_for_a_sensor_is_of_old_and_new_bins(run, files, trained):
@@ -141,7 +155,7 @@ def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files,
     kept = SlipDetector.load(run / "detector.pt").info["abstain"]
     statistics = Statistics.load(run / "statistics.pt")
     known, machine = statistics.known(), statistics.machine
-    weights = _class_scales(statistics.sums, machine)[known.is_slip.long()] * known.sample_weight
+    weights = class_scales(statistics)[known.is_slip.long()] * known.sample_weight
     scores = torch.empty_like(weights)
     groups = known.recording if left_out == "recording" else known.material
     for group in groups.unique():
@@ -149,37 +163,56 @@ def test_thresholds_are_of_machines_that_never_met_what_was_left_out(run, files,
         bins = TrainingBins(known.z[rest], known.is_slip[rest], weights[rest])
         fitted = fit_machine(bins, machine.penalty, Polynomial(2, machine.offset), route="dual")
         scores[~rest] = fitted(known.z[~rest])
-    expected = thresholds(scores, known.is_slip, known.recording, 0.5)
+    expected = Abstention.fit(scores, known.is_slip, known.recording, 0.5)
     assert (kept["low"], kept["high"]) == pytest.approx((expected.low, expected.high), rel=1e-6)
     assert kept["left_out"] == left_out
     assert f"without its {left_out}" in kept["adapted"]
 
 
-def test_undo_restores_the_detector_to_the_bit_and_its_sums(run, files):
-    def state():
-        return (run / "detector.pt").read_bytes(), Statistics.load(run / "statistics.pt").sums
-
-    states = [state()]
+def test_steps_in_and_out_are_listed_and_taken_back_to_the_bit(run, files, trained, capsys):
+    """Graphs beside it are told to be of another detector while they are."""
+    adapt(settings(run, "action=list"), run / "results")
+    assert "no step since training" in capsys.readouterr().out
+    (run / "model.onnx").touch()
+    facts = {"detector_sha256": hashlib.sha256((run / "detector.pt").read_bytes()).hexdigest()}
+    (run / "model.onnx.json").write_text(json.dumps(facts))
     add_c(run, files, "weight=2")
-    states.append(state())
-    adapt(settings(run, "action=forget", "material=C"), run / "results")
-    assert states[0][0] != states[1][0] != (run / "detector.pt").read_bytes()
-    for detector, sums in (states[1], states[0]):
-        adapt(settings(run, "action=undo"), run / "results")
-        assert state()[0] == detector
-        torch.testing.assert_close(state()[1].sums, sums.sums, rtol=0, atol=1e-11)
-        assert state()[1].seen_batches == sums.seen_batches
-    with pytest.raises(ValueError, match="nothing to undo"):
-        adapt(settings(run, "action=undo"), run / "results")
-
-
-def test_what_is_forgotten_leaves_the_machine_it_came_to(run, files, trained):
-    add_c(run, files, "weight=3")
+    stale = "model.onnx beside it: of another detector; python -m tactslip_torch export model="
+    assert stale in capsys.readouterr().out
+    added = (run / "detector.pt").read_bytes()
+    assert len(adapt(settings(run, "action=list"), run / "results")["steps"]) == 1
     adapt(settings(run, "action=forget", "material=C"), run / "results")
     old, new = (SlipDetector.load(f / "detector.pt") for f in (trained, run))
     z = Statistics.load(run / "statistics.pt").rehearsal.z
     torch.testing.assert_close(new.head(z), old.head(z), rtol=1e-9, atol=1e-12)
     assert new.info["train_materials"] == ["A", "B"]
+    adapt(settings(run, "action=undo"), run / "results")
+    assert (run / "detector.pt").read_bytes() == added
+    # as where writing was cut off between the two files
+    (run / "detector.pt").write_bytes((trained / "detector.pt").read_bytes())
+    with pytest.raises(ValueError, match=r"one step ahead of .* action=undo"):
+        adapt(settings(run, "action=list"), run / "results")
+    capsys.readouterr()
+    adapt(settings(run, "action=undo"), run / "results")
+    assert stale not in capsys.readouterr().out
+    assert content(run)[0] == content(trained)[0]
+    sums, before = (Statistics.load(each / "statistics.pt").sums for each in (run, trained))
+    torch.testing.assert_close(sums.sums, before.sums, rtol=0, atol=1e-11)
+    assert sums.seen_batches == before.seen_batches
+    with pytest.raises(ValueError, match="nothing to undo"):
+        adapt(settings(run, "action=undo"), run / "results")
+
+
+def test_graphs_are_written_where_asked_for(run, files, monkeypatch):
+    written = []
+
+    def export(detector, folder, graphs, *, source):
+        written.append((folder, graphs, source.read_bytes()))
+
+    monkeypatch.setattr(module, "export_detector", export)
+    add_c(run, files, "weight=2", "export=true")
+    # an alarm is set
+    assert written == [(run, ["bin", "stream"], (run / "detector.pt").read_bytes())]
 
 
 def test_a_training_material_is_forgotten_from_its_files(run, files):
@@ -225,25 +258,6 @@ def test_bins_without_slip_alone_are_taken_where_asked_for(run, files):
     kept = Statistics.load(run / "statistics.pt")
     assert not any(bool(own.is_slip.any()) for own in kept.bins.values())
     assert found["num_bins"] == sum(len(own.z) for own in kept.bins.values())
-
-
-def test_steps_are_listed(run, files, capsys):
-    adapt(settings(run, "action=list"), run / "results")
-    assert "no step since training" in capsys.readouterr().out
-    add_c(run, files, "weight=2")
-    assert len(adapt(settings(run, "action=list"), run / "results")["steps"]) == 1
-    assert "add" in capsys.readouterr().out.splitlines()[-1]
-
-
-def test_a_step_cut_off_between_its_files_is_told_and_taken_back(run, files, trained):
-    add_c(run, files, "weight=2")
-    (run / "detector.pt").write_bytes((trained / "detector.pt").read_bytes())
-    with pytest.raises(ValueError, match=r"one step ahead of .* action=undo"):
-        adapt(settings(run, "action=list"), run / "results")
-    adapt(settings(run, "action=undo"), run / "results")
-    assert content(run)[0] == content(trained)[0]
-    sums, before = (Statistics.load(each / "statistics.pt").sums.sums for each in (run, trained))
-    torch.testing.assert_close(sums, before, rtol=0, atol=1e-11)
 
 
 @pytest.mark.slow
@@ -301,44 +315,6 @@ def test_two_programs_do_not_change_a_detector_at_once(run, files):
     adapt(settings(run, "action=list"), run / "results")
 
 
-def test_graphs_of_the_detector_before_are_told(run, files, capsys):
-    def of(content):
-        (run / "model.onnx").touch()
-        facts = {"detector_sha256": hashlib.sha256(content).hexdigest()}
-        (run / "model.onnx.json").write_text(json.dumps(facts))
-
-    before = content(run)[0]
-    of(before)
-    add_c(run, files, "weight=2")
-    told = "model.onnx beside it: of another detector; python -m tactslip_torch export model="
-    assert told in capsys.readouterr().out
-    adapt(settings(run, "action=undo"), run / "results")
-    assert told not in capsys.readouterr().out
-    (run / "model.onnx.json").unlink()
-    adapt(
-        settings(run, f"recordings={files}", "data.materials=[C]", "weight=2", "force=true"),
-        run / "results",
-    )
-    assert told in capsys.readouterr().out
-
-
-def test_graphs_are_written_anew_where_asked_for(run, files, monkeypatch):
-    written = []
-
-    def export(detector, folder, graphs, *, source):
-        written.append((detector, folder, graphs, source.read_bytes()))
-
-    monkeypatch.setattr(module, "export_detector", export)
-    add_c(run, files, "weight=2")
-    assert not written
-    adapt(settings(run, "action=forget", "material=C", "export=true"), run / "results")
-    ((detector, folder, graphs, content_of_source),) = written
-    assert folder == run
-    assert graphs == ["bin", "stream"]  # an alarm is set
-    assert content_of_source == (run / "detector.pt").read_bytes()
-    assert detector.info["adaptations"][-1]["action"] == "forget"
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -346,7 +322,9 @@ def test_graphs_are_written_anew_where_asked_for(run, files, monkeypatch):
         ([], "no value for recordings"),
         (["recordings=nowhere"], "no folder at nowhere"),
         (["weight=heavy"], "weight must be auto or a positive number, got 'heavy'"),
-        (["margin=5"], "margin must lie in"),
+        (["weight=true"], "weight must be auto or a positive number, got True"),
+        (["weight=null"], "weight must be auto or a positive number, got None"),
+        (["margin=5"], "margin must be below 1, such as 0.005 for half a point, got 5"),
         (["weight=nan"], "weight must be auto or a positive number below 8000, got nan"),
         (["weight=-1"], "weight must be auto or a positive number below 8000, got -1"),
         (["weight=0"], "weight must be auto or a positive number below 8000, got 0"),

@@ -15,15 +15,14 @@ from hypothesis import strategies as st
 from test_commands import composed
 
 from tactslip_torch.commands.train import train
-from tactslip_torch.features.extractor import FeatureExtractor
-from tactslip_torch.features.rounding import is_rounding
-from tactslip_torch.graph.export import export_detector
-from tactslip_torch.graph.form import Window
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.deploy.bins import RawBin
+from tactslip_torch.deploy.export import export_detector
+from tactslip_torch.features.pool import is_rounding
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decisions import score_stream
-from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.onset.decisions import AlarmSettings, score_stream
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.experiment import feature_maker
 from tactslip_torch.training.recipe import Recipe
 
 any_hand = pytest.mark.parametrize("name", HANDS)
@@ -54,7 +53,7 @@ def test_the_engine_gives_the_reference(name, kinds):
     pool, generator = HANDS[name].pool(), torch.Generator().manual_seed(0)
     bins = torch.cat([bins_of(kind, 6, pool.hand, pool.bin_samples, generator) for kind in kinds])
     firm = (~is_rounding(pool)).nonzero().flatten().tolist()
-    found = FeatureExtractor(pool, firm)(bins)
+    found = pool.select(firm)(bins)
     names = [pool.names[index] for index in firm]
     assert_equals_reference(found, pool(bins)[:, firm], names, mixed=False)
 
@@ -100,11 +99,11 @@ def test_a_stream_in_pieces_is_the_recording_scored_whole(name, data):
 @any_hand
 def test_exported_graphs_give_the_detectors_scores(name, tmp_path):
     hand, detector = HANDS[name], detector_of(name)
-    bin_path, stream_path = export_detector(detector, tmp_path, alone=False)  # checks itself, too
+    bin_path, stream_path = export_detector(detector, tmp_path)  # checks itself, too
     facts = json.loads((tmp_path / "model.onnx.json").read_text())
     assert facts["kinds"] == [channel.kind for channel in hand.layout().channels]
     assert (facts["sample_rate_hz"], facts["bin_samples"]) == (hand.rate_hz, hand.bin_samples)
-    window, context = Window.of(detector), detector.channel_filter.context
+    window, context = RawBin.of(detector), detector.channel_filter.context
     samples, _ = hand.noise(50, hand.bin_samples + 2 * context, seed=4)
     samples = samples.float()
     expected = detector.score_raw(samples.double())
@@ -188,7 +187,9 @@ def parts_of(bin_ms=50.0, **changes):
     """Pool and filter from the ``features`` section, which no recording is read for."""
     source = SimpleNamespace(hand=HANDS["five slow"].layout(), sample_rate_hz=1000.0)
     features = {"frames": {"SG": 5, "PVDF": 5, "force": None}, **changes}
-    return feature_parts(source, bin_ms, **{**composed().features, **features})[:2]
+    rule = LabelRule(bin_ms=bin_ms)
+    maker = feature_maker(source, rule, **{**composed().features, **features})
+    return maker.pool, maker.channel_filter
 
 
 @pytest.mark.parametrize(

@@ -21,19 +21,16 @@ ARROWS = {
     "report": (),
 }
 """Importer: what it may import beside itself and ``runtime``; what is not named may import all."""
-PART = {"deploy": ("graph",)}
-"""Modules and folders that stand for a part until they are in its folder."""
 KNOWN = (
     ("analysis.certificate", "simulation."),
     ("data.file_recordings", "signals.resampling"),
-    ("graph.trials", "simulation."),
+    ("deploy.check", "simulation."),
 )
 """Importer and imported, by how they begin: arrows that are still to be turned."""
 
 
 def part_of(module: str) -> str:
-    name = module.split(".")[0]
-    return next((part for part, own in PART.items() if name in own), name)
+    return module.split(".")[0]
 
 
 def test_parts_import_along_the_arrows() -> None:

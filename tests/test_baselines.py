@@ -8,7 +8,7 @@ import pytest
 import torch
 from small_detector import HAND
 from small_set import SmallSet, small_maker
-from test_learning import learn, unseen_c
+from test_learner import learn, unseen_c
 
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.pool import FeaturePool
@@ -131,7 +131,7 @@ def test_logistic_regression_is_scikit_learns():
     found = LogisticRegression.fit(torch.from_numpy(columns), sample)
     scaler = scaling.StandardScaler().fit(columns)
     made = linear.LogisticRegression(C=found.penalty, class_weight="balanced", tol=1e-10)
-    made.fit(scaler.transform(columns), sample.is_slip, sample.represents)
+    made.fit(scaler.transform(columns), sample.is_slip, sample.sample_weight)
     wanted = made.decision_function(scaler.transform(columns))
     score = torch.from_numpy(columns) @ found.weights + found.constant
     np.testing.assert_allclose(score, wanted, atol=1e-3)
@@ -143,7 +143,7 @@ def test_the_forest_votes_as_scikit_learns_does():
     rng = np.random.default_rng(4)
     columns = torch.from_numpy(rng.standard_normal((len(sample.is_slip), 6)))
     made = ensemble.RandomForestClassifier(100, class_weight="balanced", random_state=0)
-    made.fit(columns.numpy(), sample.is_slip, sample_weight=sample.represents)
+    made.fit(columns.numpy(), sample.is_slip, sample_weight=sample.sample_weight)
     others = torch.from_numpy(rng.standard_normal((400, 6)))
     found = RandomForest(columns, sample)(others)
     right = found.numpy() == made.predict(others.numpy())
@@ -189,7 +189,7 @@ def test_a_learner_evaluates_them_and_a_saved_detector_those_it_keeps(tmp_path):
     from tactslip_torch.training.learner import SlipLearner
 
     source = SmallSet()
-    learner = learn(source, unseen_c(source))
+    learner = learn(source, unseen_c(source), with_baselines=True)
     metrics = learner.metrics
     assert list(metrics["baselines"]) == NAMES
     for found in metrics["baselines"].values():

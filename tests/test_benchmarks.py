@@ -19,11 +19,6 @@ SUBJECTS = [
     if "(Benchmark[Sizes])" in path.read_text(encoding="utf-8")
 ]
 """Benchmarks of the harness, one a file; ``crossval_general`` is another's."""
-OTHERS = {
-    "generalisation": "--runs --cache",
-    "scene_weights": "--cache",
-}
-"""Options that take a folder, where results of a quick run go."""
 
 
 @pytest.mark.slow
@@ -37,15 +32,6 @@ def test_a_subject_runs_in_its_smallest_form(name: str, tmp_path: Path) -> None:
     assert (tmp_path / f"{name}.md").read_text().count("|") > 10
     assert (tmp_path / f"{name}.png").stat().st_size > 10_000
     _run(name, "--render", *arguments)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", OTHERS)
-def test_a_benchmark_runs_in_its_smallest_form(name: str, tmp_path: Path) -> None:
-    arguments = ["--quick"]
-    for option in OTHERS[name].split():
-        arguments += [option, str(tmp_path / option.strip("-"))]
-    _run(name, *arguments)
 
 
 @pytest.mark.parametrize("name", SUBJECTS)

@@ -61,7 +61,7 @@ def rows_of(bins):
             bins.features[i].tolist(),
             bins.group_names[bins.group[i]],
             bool(bins.is_slip[i]),
-            float(bins.represents[i]),
+            float(bins.sample_weight[i]),
         )
         for i in range(len(bins.features))
     ]
@@ -94,7 +94,7 @@ def test_a_sample_equals_sorting_all_keys_at_once(recordings, most):
     assert bins.features.dtype == torch.float32
     assert bins.is_slip.dtype == torch.bool
     assert bins.group.dtype == bins.recording.dtype == bins.bin_index.dtype == torch.int64
-    assert bins.represents.dtype == torch.float64
+    assert bins.sample_weight.dtype == torch.float64
 
 
 @given(
@@ -157,7 +157,7 @@ def test_a_sample_of_none_counts():
     assert sum(sample.num_seen.values()) == 18
     bins = sample.bins()
     assert bins.features.shape == (0, NUM)
-    assert len(bins.represents) == 0
+    assert len(bins.sample_weight) == 0
     assert BinSample(3).bins().features.shape == (0, 0)
     assert BinSample(3).bins().group_names == ()
     assert_same(BinSample.from_state_dict(BinSample(3).state_dict()), BinSample(3))

@@ -137,7 +137,6 @@ def backend(request: pytest.FixtureRequest) -> BackendName:
 
 CASES = {
     "smooth 20 mm/s": (SMOOTH, 0.02),
-    "smooth 60 mm/s": (SMOOTH, 0.06),
     "tacky 40 mm/s": (TACKY, 0.04),
     "patch 20 mm/s": (PATCH, 0.02),
 }
@@ -168,20 +167,6 @@ def test_friction_and_breakaway_are_radaus(case, step_us, most, late_s):
     assert abs(let_go_s - crossing_s(TIMES, found["slip"], arm_m_s / 2)) <= late_s
 
 
-def test_state_and_slip_are_radaus():
-    found, step_s = solution("patch 20 mm/s"), 62.5e-6
-    lanes = PATCH.lanes()
-    for until_s in (0.03, 0.06):  # sticking, and in the first slip
-        trace, state = carry(
-            lanes, at_rest(lanes), driven(ramped(0.02)), round(until_s / step_s), step_s
-        )
-        at = round(until_s / 50e-6) - 1
-        exact = np.r_[found["u"][at], found["q"][at], found["z"][:, at]]
-        ours = torch.cat([state.stretch_m, state.relaxing_n, state.bristle_m[0]])
-        np.testing.assert_allclose(ours, exact, rtol=3e-3, atol=1e-9)
-        np.testing.assert_allclose(trace.slip_m_s[-1, 0], found["slip"][at], rtol=0.02, atol=1e-6)
-
-
 def test_order_is_two_where_nothing_lets_go():
     def arm(t):
         return 0.06 + 0.01 * math.sin(60.0 * t)
@@ -200,28 +185,6 @@ def test_order_is_two_where_nothing_lets_go():
     assert ((orders > 1.8) & (orders < 2.3)).all(), orders
 
 
-@pytest.mark.parametrize("swing", [0.0, 0.2])
-def test_drift_under_vibration_is_radaus(swing):
-    """Pulled with half of what holds at rest, trembling: the model creeps, and we as it does."""
-    force, until_s, turn = 0.4, 0.12, 2.0 * math.pi * 50.0
-    element = replace(SMOOTH, k1=0.0, k=50.0, c=0.1)  # soft: pulls on as the patch creeps
-
-    def arm(t):
-        return 4e-3 * turn * math.cos(turn * t)
-
-    def load(t):
-        return 1.0 + swing * math.sin(turn * t + 1.0)
-
-    found = element.radau(arm, load, np.array([until_s]), force)
-    drift = force / element.k - found["u"][0]  # the arm is back where it was
-    assert drift > 1e-5
-    lanes = element.lanes()
-    for step_s, most in ((125e-6, 1e-3), (250e-6, 4e-3)):
-        start = at_rest(lanes, force)
-        _, state = carry(lanes, start, driven(arm, load), round(until_s / step_s), step_s)
-        assert abs(float(start.stretch_m - state.stretch_m) - drift) <= most * drift
-
-
 # --- what the model does ------------------------------------------------------------------------
 
 
@@ -237,7 +200,7 @@ def test_balance_of_forces_holds_in_the_trace(backend):
         assert abs(float(trace.inertia_n) - pulled) < 1e-8
 
 
-@pytest.mark.parametrize("stage_s", [1e-7, 1e-4, 1e-2])
+@pytest.mark.parametrize("stage_s", [1e-7, 1e-2])
 def test_friction_is_passive_bounded_and_has_the_slope_it_states(stage_s, rng):
     num = 300
 
@@ -268,40 +231,11 @@ def test_friction_is_passive_bounded_and_has_the_slope_it_states(stage_s, rng):
     torch.testing.assert_close(at.bristle, bent + stage_s * at.rate, rtol=1e-9, atol=1e-20)
 
 
-@pytest.mark.parametrize("n", [1, 2, 5, 64])
+@pytest.mark.parametrize("n", [1, 5])
 def test_hertz_pressure(n):
     place = np.linspace(-1 + 1 / n, 1 - 1 / n, n)
     wanted = np.sqrt(1 - place**2) / np.sqrt(1 - place**2).sum()
     np.testing.assert_allclose(hertz_pressure(n), wanted, rtol=1e-12)
-
-
-@pytest.mark.parametrize("arm_m_s", [0.02, 0.04, 0.06])
-def test_stick_slip_is_the_tacky_materials(arm_m_s):
-    for element in (SMOOTH, TACKY):
-        lanes = replace(element, c=2.0).lanes(m=[2e-3, 5e-3, 1e-2])
-        trace, _ = carry(lanes, at_rest(lanes), driven(ramped(arm_m_s)), 4000, 250e-6)
-        late = trace.friction_n[2000:]
-        swing = (late.amax(0) - late.amin(0)) / late.mean(0)
-        sticks = (trace.slip_m_s[2000:] < 0.1 * arm_m_s).any(0)
-        if element is TACKY:
-            assert (sticks & (swing > 0.1) & (swing < 0.7)).all()
-        else:
-            assert (~sticks & (swing < 1e-3)).all()
-
-
-def test_the_edge_of_a_patch_lets_go_before_the_whole():
-    lanes = replace(SMOOTH, sigma=3e3, d0=1.0).lanes(pressure=hertz_pressure(32))
-    state, num_bent = at_rest(lanes), []
-    for number in range(60):
-        trace, state = carry(lanes, state, driven(ramped(0.02)), 10, 250e-6, 1, 10 * number)
-        held = (
-            SMOOTH.mu_s * lanes.pressure / (3e3 / 32)
-        )  # deflection that each bristle's load holds
-        num_bent.append(int((state.bristle_m[0] > 0.85 * held).sum()))
-        if trace.slip_m_s.max() > 0.01:
-            break
-    assert 0 < num_bent[-4] < 32
-    assert num_bent == sorted(num_bent)
 
 
 # --- engines ------------------------------------------------------------------------------------
@@ -457,11 +391,10 @@ def largest_force(lanes: Lanes, speed: torch.Tensor, load: torch.Tensor) -> torc
     return 1.5 * (1.5 * lanes.mu_s * load + 2.0 * drag * speed)  # 1.5 N, and turning round
 
 
-@pytest.mark.parametrize("step_s", [1e-6, 250e-6, 5e-3])
+@pytest.mark.parametrize("step_s", [1e-6, 5e-3])
 @pytest.mark.parametrize(
     ("n", "dtype", "backend", "num"),
     [
-        (1, torch.float64, "native", 60),
         (4, torch.float64, "native", 60),
         (2, torch.float32, "torch", 15),
     ],
@@ -486,7 +419,7 @@ def test_bounded_and_within_the_cone(step_s, n, dtype, backend, num):
         torch.testing.assert_close(trace.slip_m_s[0][free], state.speed_m_s[free])
 
 
-@pytest.mark.parametrize("step_s", [1e-6, 250e-6, 5e-3])
+@pytest.mark.parametrize("step_s", [1e-6, 5e-3])
 def test_no_stage_is_left_unsolved_and_engines_agree(step_s, monkeypatch):
     """Every lane's equation holds to rounding, or turns its sign within 3e-8 of the speed."""
     root, eps, num, solved = _bristles._Stage.root, torch.finfo(torch.float64).eps, 12, []

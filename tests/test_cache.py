@@ -165,7 +165,9 @@ def test_the_digest_follows_names_and_content_wherever_the_package_lies(tmp_path
     (package / "b" / "c.py").rename(package / "b" / "d.py")
     renamed = source_digest(package)
     (package / "b" / "e.py").write_text("")
-    assert len({digests[0], changed, renamed, source_digest(package)}) == 4
+    added = source_digest(package)
+    (package / "engine.cpp").write_text("")  # makes features too
+    assert len({digests[0], changed, renamed, added, source_digest(package)}) == 5
 
 
 def test_the_users_cache_folder(monkeypatch, tmp_path):

@@ -11,8 +11,8 @@ from tactslip_torch.commands.calibrate import best_point, calibrate, parameters_
 from tactslip_torch.commands.train import train
 from tactslip_torch.report import published
 from tactslip_torch.report.calibration import calibration_table
-from tactslip_torch.simulation import Contact, Disturbances, paper_scenes, parameters
-from tactslip_torch.simulation.parameters import CALIBRATED_PATH, PRIORS, read_calibrated
+from tactslip_torch.simulation import Contact, Disturbances, paper_scenes, scene
+from tactslip_torch.simulation.scene import CALIBRATED_PATH, PRIORS, read_calibrated
 
 SMALL = (
     "data.cycles=1",
@@ -177,9 +177,9 @@ def test_a_point_is_the_mean_over_its_seeds(found):
 @pytest.mark.slow
 def test_unseen_materials_and_their_results_are_used_nowhere(tmp_path, found, monkeypatch):
     monkeypatch.setattr(published, "SPLITS", MappingProxyType({"test": published.SPLITS["test"]}))
-    monkeypatch.setattr(parameters, "UNSEEN_MATERIALS", ())
+    monkeypatch.setattr(scene, "UNSEEN_MATERIALS", ())
     for name in ("wood", "copper", "cloth", "iron"):  # they come back in the table's order
-        monkeypatch.delitem(parameters.MATERIALS, name)
+        monkeypatch.delitem(scene.MATERIALS, name)
     with pytest.raises(ValueError, match="unknown material 'iron'"):
         paper_scenes(cycles=1, materials=["iron"])  # they are gone indeed
     calibrate(tiny(), tmp_path)
@@ -242,12 +242,12 @@ def test_checks_that_fail_at_the_start_freeze_nothing(tmp_path, put_in):
     [
         ("labels=half_second", "labels"),
         ("split=seen6", "split"),
-        ("split.train_share=0.5", "split"),
+        ("split.train_fraction=0.5", "split"),
         ("recipe=robust", "recipe"),
         ("+scene.mains_mv=300", "scene"),
         ("features.align=causal", "features"),
         ("data.fidelity=bristles", "data"),
-        ("others=confound", "others"),
+        ("extra_scenes=confound", "extra_scenes"),
     ],
 )
 def test_another_protocol_is_not_frozen(tmp_path, put_in, override, section):
@@ -270,9 +270,9 @@ def test_another_protocol_is_not_frozen(tmp_path, put_in, override, section):
         ("bounds=[-1,a]", r"bounds must be two numbers, .* got \[-1, 'a'\]"),
         ("bounds=[1,2]", r"bounds must hold 0, .* got \[1, 2\]"),
         ("bounds=[nan,1]", r"bounds must hold 0"),
-        ("tolerance=0", "tolerance must be a positive number, got 0"),
-        ("tolerance=nan", "tolerance must be a positive number, got nan"),
-        ("step=null", "step must be a positive number, got None"),
+        ("tolerance=0", "tolerance must be a positive finite number, got 0"),
+        ("tolerance=nan", "tolerance must be a positive finite number, got nan"),
+        ("step=null", "step must be a positive finite number, got None"),
         ("most_points=1.5", "most_points must be a positive whole number, got 1.5"),
         ("fact_cycles=true", "fact_cycles must be a positive whole number, got True"),
     ],

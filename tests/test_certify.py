@@ -26,7 +26,7 @@ TINY = (
     "data.cycles=4",
     "split.seen=[A,B]",
     "split.unseen=[C]",
-    "split.train_share=0.5",
+    "split.train_fraction=0.5",
     "bins=60",
     "scored_bins=40",
     "extremes=3",
@@ -138,7 +138,7 @@ def test_drawn_bins_are_those_of_the_role_with_their_context(number, num_recordi
 
 
 def test_bins_of_one_recording_may_have_two_roles():
-    fold = Split("random_bins", dict.fromkeys(source().ids[:2], "train"), test_share_of_bins=0.5)
+    fold = Split("random_bins", dict.fromkeys(source().ids[:2], "train"), test_fraction=0.5)
     train, test = (set(keys_of(drawn(20, role, fold=fold)[0])) for role in ("train", "test"))
     assert not train & test
     with pytest.raises(ValueError, match="no recording has the role 'unseen' in random_bins; cho"):

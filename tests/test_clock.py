@@ -1,28 +1,18 @@
 """An even clock through timestamps: what is late, what is missing, and what cannot be."""
 
-from typing import NamedTuple
-
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactslip_torch.data import clock as module
-from tactslip_torch.data.clock import EvenSamples, Gap, even_clock, nominal_rate, refuse_gaps
+from tactslip_torch.data.clock import Gap, even_clock, nominal_rate, snapped_rate
+from tactslip_torch.data.file_recordings import EvenSamples
 
 RATE = 2000.0
 RATES = (92.31, 98.0, 101.0, 700.0, 900.0, 1000.0, 1024.0, 1300.0, 2000.0)
 UNITS = (0.0, 1e-6, 1e-3, 1e-2)
 ROUNDED = [(r, u) for r in RATES for u in UNITS if u * r <= (2.2 if u < 1e-2 else 1.2)]
-
-
-class KeptTimes(NamedTuple):
-    """Times in memory."""
-
-    seconds: torch.Tensor
-
-    def read(self, first, stop):
-        return self.seconds[first:stop]
 
 
 class Kept:
@@ -38,7 +28,7 @@ class Kept:
 
 
 def clock_of(seconds, stated_hz=None, name="a.csv"):
-    return even_clock(KeptTimes(seconds), len(seconds), stated_hz, name)
+    return even_clock(np.asarray(seconds, np.float64), stated_hz, name)
 
 
 def ticks(num, dropped=(), rate=RATE):
@@ -64,15 +54,13 @@ drops = st.lists(
 
 
 @settings(max_examples=40)
-@given(drops, st.sampled_from([0.0, 0.05, 0.2]), st.integers(0, 99), st.sampled_from([700, 10**6]))
-def test_what_was_dropped_is_found_and_filled(gaps, jitter, seed, block):
+@given(drops, st.sampled_from([0.0, 0.05, 0.2]), st.integers(0, 99))
+def test_what_was_dropped_is_found_and_filled(gaps, jitter, seed):
     dropped = {tick for start, count in gaps for tick in range(start, start + count)}
     seconds, left = ticks(1000, dropped)
     generator = torch.Generator().manual_seed(seed)
     late = torch.rand(len(seconds), generator=generator).double() * jitter / RATE
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_BLOCK", block)
-        found = clock_of(seconds + late - late[0], RATE)
+    found = clock_of(seconds + late - late[0], RATE)
     assert (found.num_samples, missing_ticks(found)) == (1000, sorted(dropped))
     assert found.jitter_s <= jitter / RATE + 1e-12
     values = torch.stack([left.double(), -left.double()])
@@ -94,11 +82,6 @@ def test_long_gaps_are_not_bridged():
     read = EvenSamples(Kept(left.double()[None]), found, most_bridged=1).read(0, 100)[0]
     assert read[60] == 60
     assert read[30:32].isnan().all()
-    with pytest.raises(
-        ValueError, match=r"a\.csv: 3 samples are missing in 2 gaps, first 2 at 0\."
-    ):
-        refuse_gaps(found, "a.csv")
-    refuse_gaps(clock_of(ticks(100)[0]), "a.csv")
 
 
 @pytest.mark.parametrize(("rate", "unit"), ROUNDED)
@@ -113,10 +96,9 @@ def test_stamps_neither_round_the_rate_nor_lose_or_invent_samples(rate, unit):
         assert found.sample_rate_hz == pytest.approx(rate, rel=error)
 
 
-@pytest.mark.parametrize("rate", [92.3, 1000.0, 12345.6])
-def test_the_rate_is_measured_across_gaps(rate):
-    found = clock_of(ticks(3000, {500, 501, 1500}, rate)[0])
-    assert found.sample_rate_hz == pytest.approx(rate, rel=1e-9)
+def test_the_rate_is_measured_across_gaps():
+    found = clock_of(ticks(3000, {500, 501, 1500}, 12345.6)[0])
+    assert found.sample_rate_hz == pytest.approx(12345.6, rel=1e-9)
 
 
 def test_stamps_that_slip_slowly_against_the_samples_lose_none():
@@ -133,7 +115,7 @@ def test_a_pause_between_coarse_stamps():
     assert abs(found.gaps[0].start - 7000) <= 1
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     st.sampled_from([(r, u) for r, u in ROUNDED if u * r < 0.45]),
     st.sampled_from([0.005, 0.02, 0.05]),
@@ -141,10 +123,10 @@ def test_a_pause_between_coarse_stamps():
     st.booleans(),
     st.integers(0, 999),
 )
-def test_random_losses_are_all_found(kind, share, longest, stated, seed):
+def test_random_losses_are_all_found(kind, fraction, longest, stated, seed):
     rate, unit = kind
     generator = torch.Generator().manual_seed(seed)
-    is_left = torch.rand(3000, generator=generator) > share / longest
+    is_left = torch.rand(3000, generator=generator) > fraction / longest
     for place in (~is_left).nonzero().flatten().tolist():
         length = int(torch.randint(1, longest + 1, (1,), generator=generator))
         is_left[place : place + length] = False
@@ -224,3 +206,4 @@ def test_a_rate_is_called_by_its_round_number_only_if_it_may_be_that():
     said = [2000.0, 92.31, 0.25, 1024.0, 2048.0, 1017.25, 999.0, 48_000.0]
     assert [nominal_rate(rate) for rate in measured] == said
     assert [nominal_rate(199.6, 0.003), nominal_rate(1023.0, 0.004)] == [200.0, 1024.0]
+    assert [snapped_rate(rate) for rate in (24.00000322, 92.31)] == [24.0, 92.31]

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 from torch.utils.data import DataLoader
 
-import tactslip_torch
+from tactslip_torch.commands import entry
 from tactslip_torch.commands.entry import (
     conf_dir,
     entry_point,
@@ -32,14 +32,14 @@ def test_conf_inside_the_package_comes_first(monkeypatch, tmp_path):
     for folder in (package / "conf", package.parent / "conf"):
         folder.mkdir(parents=True)
         (folder / "train.yaml").write_text("")
-    monkeypatch.setattr(tactslip_torch, "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr(entry, "PACKAGE", package)
     assert conf_dir() == package / "conf"
     (package / "conf" / "train.yaml").unlink()
     assert conf_dir() == package.parent / "conf"
 
 
 def test_no_conf_is_an_error_that_says_where(monkeypatch, tmp_path):
-    monkeypatch.setattr(tactslip_torch, "__file__", str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(entry, "PACKAGE", tmp_path)
     with pytest.raises(FileNotFoundError, match=r"no conf folder with train\.yaml.*reinstall"):
         conf_dir()
 
@@ -73,7 +73,7 @@ def test_a_choice_that_does_not_exist_is_one_line(arguments, message):
         ["+exp=unseen4"],
         ["+exp=unseen4,seen6", "-m"],
         ["split=seen6", "labels=half_second"],
-        ["split.train_share=0.5", "data.cycles=2"],
+        ["split.train_fraction=0.5", "data.cycles=2"],
         ["--cfg", "job", "--help"],
         ["model=out/a=b.pt"],
         ["--config-dir=nowhere"],

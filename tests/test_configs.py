@@ -13,7 +13,7 @@ from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.splits import ROLES, Split
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.simulation.source import SimulatedRecordings
-from tactslip_torch.training.experiment import feature_parts
+from tactslip_torch.training.experiment import feature_maker
 from tactslip_torch.training.recipe import Recipe
 
 RECORDED = {"biotacsp_dos"}
@@ -67,9 +67,9 @@ def test_an_experiment_composes_and_everything_it_names_exists(name, layouts):
     assert isinstance(source, SimulatedRecordings) == (name not in RECORDED)
     assert isinstance(rule, LabelRule)
     assert isinstance(instantiate(config.recipe, _convert_="all"), Recipe)
-    pool, channel_filter, *_ = feature_parts(source, rule.bin_ms, **config.features)
-    assert isinstance(pool, FeaturePool)
-    assert len(channel_filter.window_lengths) == len(source.hand)
+    maker = feature_maker(source, rule, **config.features)
+    assert isinstance(maker.pool, FeaturePool)
+    assert len(maker.channel_filter.window_lengths) == len(source.hand)
     assert folds
     for fold in folds:
         assert isinstance(fold, Split)
@@ -99,7 +99,7 @@ def test_an_experiment_adds_no_key(name):
     if name in RECORDED:
         known |= {"features.frames.electrode"}  # kinds of channels are the data's
     if weights := content.get("recipe", {}).get("scene_weights"):
-        assert set(weights) == set(composed(f"+exp={name}").others)  # kinds of scenes too
+        assert set(weights) == set(composed(f"+exp={name}").extra_scenes)  # kinds of scenes too
         known |= {f"recipe.scene_weights.{scene}" for scene in weights}
         known -= {"recipe.scene_weights"}
     assert set(keys_of(content)) <= known
@@ -107,20 +107,22 @@ def test_an_experiment_adds_no_key(name):
 
 
 def test_a_misspelt_knob_of_a_further_scene_is_refused():
-    config = composed("+exp=confound", "+others.taps.taps_per_sec=3.0")
+    config = composed("+exp=confound", "+extra_scenes.taps.taps_per_sec=3.0")
     with pytest.raises(InstantiationException, match="unknown override taps_per_sec"):
         instantiate(config.data, _convert_="all")
 
 
 def test_further_scenes_are_those_of_their_files_and_any_knob_can_be_set():
-    config = composed("others=confound", "others.taps.cycles=2", "+others.grips.machine_mv=3.0")
-    for name, knobs in config.others.items():
+    config = composed(
+        "extra_scenes=confound", "extra_scenes.taps.cycles=2", "+extra_scenes.grips.machine_mv=3.0"
+    )
+    for name, knobs in config.extra_scenes.items():
         of_file = yaml.safe_load((conf_dir() / "scene" / f"{name}.yaml").read_text())
         added = {"machine_mv": 3.0} if name == "grips" else {}
         assert knobs == of_file | added | {"cycles": 2 if name == "taps" else 8}
     source = instantiate(config.data, cycles=9, materials=["M1"], _convert_="all")
-    counts = {name: sum(r.scene == name for r in source.ids) for name in config.others}
-    assert counts == dict.fromkeys(config.others, 8) | {"taps": 2}
+    counts = {name: sum(r.scene == name for r in source.ids) for name in config.extra_scenes}
+    assert counts == dict.fromkeys(config.extra_scenes, 8) | {"taps": 2}
     assert sum(r.scene == "paper" for r in source.ids) == 9
 
 
@@ -128,10 +130,10 @@ def test_further_scenes_are_those_of_their_files_and_any_knob_can_be_set():
     "name", ["train", "evaluate", "generate", "certify", "crossval", "pareto", "calibrate"]
 )
 def test_every_entry_point_on_recordings_takes_further_scenes(name):
-    assert not composed(name=name).data.others
-    config = composed("others=confound", name=name)
-    assert config.data.others == config.others
-    assert "arm_motion" in config.others
+    assert not composed(name=name).data.extra_scenes
+    config = composed("extra_scenes=confound", name=name)
+    assert config.data.extra_scenes == config.extra_scenes
+    assert "arm_motion" in config.extra_scenes
 
 
 def test_confound_trains_on_scenes_it_has_and_judges_some_it_never_met():
@@ -178,8 +180,8 @@ def test_seen6_and_random_bins_have_the_seen_materials_alone():
     _, (grouped,) = folds_of(composed("+exp=seen6"))
     _, (by_bin,) = folds_of(composed("+exp=random_bins"))
     assert {r.material for r in grouped.roles} == {r.material for r in by_bin.roles} == set(SEEN)
-    assert grouped.test_share_of_bins is None
-    assert by_bin.test_share_of_bins == pytest.approx(0.2)
+    assert grouped.test_fraction is None
+    assert by_bin.test_fraction == pytest.approx(0.2)
 
 
 def test_leave_one_material_out_leaves_each_out_once():
@@ -204,11 +206,11 @@ def test_deploy_trains_on_slips_and_motion_beside_an_arm_of_any_loudness():
     config = composed("+exp=deploy")
     _, (fold,) = folds_of(config)
     trained = {r.scene for r in fold.having("train")}
-    assert trained == {"paper", *config.others}
+    assert trained == {"paper", *config.extra_scenes}
     for role in ("test", "unseen"):
         assert {r.scene for r in fold.having(role)} >= {"paper", "arm_motion", "paper_loud"}
     for name in ("arm_motion", "paper_loud"):
-        assert config.others[name].motor_vibration_mv == [1.0, 40.0]
+        assert config.extra_scenes[name].motor_vibration_mv == [1.0, 40.0]
 
 
 def test_hard_is_unseen4_on_another_hand():
@@ -232,14 +234,14 @@ def test_every_option_composes(group, option):
     name = "pareto" if group == "search" else "train"
     config = composed(f"{group}={option}", name=name)
     section = config[group]
-    assert section or (option == "none" and group in ("others", "onset", "tuning"))
-    if group == "others":
-        assert config.data.others == section
+    assert section or (option == "none" and group in ("extra_scenes", "onset", "tuning"))
+    if group == "extra_scenes":
+        assert config.data.extra_scenes == section
     elif group == "scene":  # knobs, for the recordings
         assert section.name == option
         source = instantiate(config.data, cycles=1, materials=["M3", "wood"], _convert_="all")
         assert [str(r.scene) for r in source.ids] == [option, option]
-    elif section and group != "features":  # plain values, for ``feature_parts``
+    elif section and group != "features":  # plain values, for ``feature_maker``
         assert callable(get_object(section._target_))
 
 
@@ -290,4 +292,4 @@ def test_a_misspelt_feature_key_is_refused():
     config = composed("+features.misspelt=1", "data.cycles=1")
     source = instantiate(config.data, _convert_="all")
     with pytest.raises(TypeError, match="misspelt"):
-        feature_parts(source, 50.0, **config.features)
+        feature_maker(source, LabelRule(), **config.features)

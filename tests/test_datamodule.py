@@ -83,6 +83,28 @@ def test_a_sample_that_is_not_finite_is_named():
         small_maker(source)(broken, split_of(source))
 
 
+class BrokenBefore(SmallSet):
+    """One sample is missing 30 before the first bin."""
+
+    def load(self, recording, windows=None):
+        loaded = super().load(recording, windows)
+        loaded.samples[0, 150] = torch.nan
+        return loaded
+
+
+@pytest.mark.parametrize("align", ["centred", "causal"])
+def test_a_broken_sample_before_a_causal_bin_is_named(align):
+    """A centred frame does not reach it."""
+    source, layer = BrokenBefore(), ChannelFilter([51, 11], align=align)
+    maker = FeatureMaker(source, FeaturePool(source.hand), layer, LabelRule())
+    assert int(maker.lay_bins(source.timeline(source.ids[0])).starts[0]) == 180
+    if align == "centred":
+        assert maker(source.ids[0], split_of(source)).features.isfinite().all()
+        return
+    with pytest.raises(ValueError, match=r"^a/0: channel SG1, sample 150 \(0\.0750 s\) is nan"):
+        maker(source.ids[0], split_of(source))
+
+
 @pytest.mark.parametrize(
     ("pool", "message"),
     [

@@ -5,24 +5,20 @@ import hashlib
 import logging
 import os
 import pickle
-import re
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
+from test_commands import composed
 
-from tactslip_torch.data import file_recordings as module
 from tactslip_torch.data.file_recordings import FileRecordings, file_digest
 from tactslip_torch.data.formats import named_format
-from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.manifest import Truth
+from tactslip_torch.data.public_sets import STEMS, authors_raw, named_recordings, nominal
 from tactslip_torch.data.recording import Recording, RecordingId
-from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import Channel, HandLayout
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.datamodule import FeatureMaker
 
 HAND = HandLayout(
     (
@@ -35,6 +31,7 @@ RATE_HZ = 200.0
 ROWS = HAND.to_rows()
 TRUTH = ("onsets_s", "sliding_s", "annotated_onsets_s", "non_slip_s", "speeds_mm_s", "duration_s")
 IRON = [RecordingId("iron", cycle) for cycle in (0, 1)]
+UNTOLD = dict.fromkeys(("onsets_s", "annotated_onsets_s", "sliding_s", "speeds_mm_s"), ())
 
 
 def samples(seed=0, num_samples=600, channels=3, dtype=torch.float64):
@@ -62,6 +59,7 @@ def ours(path, content=None, hand=HAND, **changes):
 
 def table(path, content, rate_hz=RATE_HZ, names=("t", "a", "b", "c"), times=None):
     """A table of anybody's: times and channels, with a header."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     times = np.arange(content.shape[1]) / rate_hz if times is None else times
     with path.open("w", newline="") as file:
         rows = csv.writer(file)
@@ -80,15 +78,19 @@ def lines_of(source):
     return [str(problem) for problem in source.problems]
 
 
+def first(source, windows=None):
+    return source.load(source.ids[0], windows).samples
+
+
 def rows_named(*names):
     """Rows of the hand's first channels under other names."""
     return [row | {"name": name} for row, name in zip(ROWS, names, strict=False)]
 
 
-def refused(said, root, **options):
-    """``FileRecordings`` says that, in one line."""
+def refused(said, root, make=FileRecordings, **options):
+    """The source says that, in one line."""
     with pytest.raises((ValueError, FileNotFoundError), match=said) as caught:
-        FileRecordings(root, **options)
+        make(root, **options)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -111,8 +113,7 @@ def tables(tmp_path):
 # What is read --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ending", ["npz", "csv"])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("ending", "dtype"), [("npz", torch.float64), ("csv", torch.float32)])
 def test_files_of_ours_are_read_with_all_they_say(tmp_path, ending, dtype):
     made = ours(tmp_path / f"a.{ending}", samples(dtype=dtype))
     manifest(tmp_path, f"a.{ending},wood,4,,,")
@@ -120,31 +121,33 @@ def test_files_of_ours_are_read_with_all_they_say(tmp_path, ending, dtype):
     (name,) = source.ids
     assert name == RecordingId("wood", 4)
     assert (source.hand, source.sample_rate_hz, source.units) == (HAND, RATE_HZ, "V")
-    assert source.is_simulated is False
     read, times = source.load(name), source.timeline(name)
     assert read.samples.dtype == dtype
     assert torch.equal(read.samples, made.samples)
     for truth in TRUTH:
         assert getattr(read, truth) == getattr(times, truth) == getattr(made, truth)
     assert (read.provenance, read.units) == (made.provenance, made.units)
-
-
-def test_the_manifest_has_the_word_over_the_file(tmp_path):
-    ours(tmp_path / "a.npz")
-    manifest(tmp_path, "a.npz,steel,0,2.0,2.0-2.75,")
+    manifest(tmp_path, f"a.{ending},steel,0,2.0,2.0-2.75,")  # has the word over the file
     source = FileRecordings(tmp_path)
     times = source.timeline(source.ids[0])
-    assert (times.onsets_s, times.annotated_onsets_s) == ((2.0,), (2.0,))
-    assert (times.sliding_s, times.non_slip_s) == (((2.0, 2.75),), ())
-    (warning,) = source.warnings
-    assert str(warning) == "manifest.csv:2: a.npz: itself says 'wood', not 'steel'"
+    assert (times.onsets_s, times.annotated_onsets_s, times.non_slip_s) == ((2.0,), (2.0,), ())
+    said = f"manifest.csv:2: a.{ending}: itself says 'wood', not 'steel'"
+    assert [str(warning) for warning in source.warnings] == [said]
+
+
+def test_one_simulated_file_makes_the_set_simulated(tmp_path):
+    ours(tmp_path / "a.npz")
+    ours(tmp_path / "b.npz", provenance={"simulated": True})
+    manifest(tmp_path, "a.npz,wood,0,,,", "b.npz,wood,1,,,")
+    assert FileRecordings(tmp_path).is_simulated is True
+    assert FileRecordings(tmp_path, cycles=1).is_simulated is False
 
 
 def test_tables_of_anybody_are_channels_of_a_stated_kind(tables):
     source = FileRecordings(tables, kind="taxel", units="counts")
     assert source.hand.names == ("a", "b", "c")
     assert {(c.kind, c.adapting) for c in source.hand.channels} == {("taxel", "slow")}
-    assert source.sample_rate_hz == RATE_HZ
+    assert (source.sample_rate_hz, source.is_simulated) == (RATE_HZ, False)
     assert [str(name) for name in source.ids] == ["wood/0", "wood/1", "iron/0", "iron/1"]
     for place, name in enumerate(source.ids):
         read = source.load(name)
@@ -157,15 +160,17 @@ def test_tables_of_anybody_are_channels_of_a_stated_kind(tables):
     late = FileRecordings(tables, kind="PVDF", skip_s=0.5)
     assert late.hand.fast == (0, 1, 2)
     assert late.timeline(IRON[0]).slip_s == late.load(IRON[0]).slip_s == ((0.5, 3.0),)
+    assert FileRecordings(tables, materials=["iron"]).ids == tuple(IRON)
+    assert [str(r) for r in FileRecordings(tables, cycles=1).ids] == ["wood/0", "iron/0"]
 
 
 def test_rows_of_channels_find_their_columns_by_name_or_by_place(tables):
     source = FileRecordings(tables, channels=rows_named("c", "a"))
     assert source.hand.names == ("c", "a")
-    assert torch.equal(source.load(source.ids[0]).samples, samples(0)[[2, 0]])
+    assert torch.equal(first(source), samples(0)[[2, 0]])
     placed = FileRecordings(tables, channels=ROWS, reading={"channels": ["a", "b", "c"]})
     assert placed.hand == HAND
-    assert torch.equal(placed.load(placed.ids[0]).samples, samples(0))
+    assert torch.equal(first(placed), samples(0))
     refused(r"has the channels a, b, c, not the 2 of data\.channels", tables, channels=ROWS[:2])
     half = [*rows_named("c"), *ROWS[1:]]  # as many, but who knows which is which
     refused(r"has no channel PVDF1, PVDF2 of .*; it has a, b, c", tables, channels=half)
@@ -173,18 +178,18 @@ def test_rows_of_channels_find_their_columns_by_name_or_by_place(tables):
     refused(said, tables, channels=ROWS)
     said = r"has the channels a, b, not the 3 of data\.channels"
     refused(said, tables, channels=ROWS, reading={"channels": ["a", "b"]})
+    manifest(tables, "0.csv,wood,0,,,slip")  # case and a unit make no other name
+    table(tables / "0.csv", samples(0), names=("t", "pvdf1 (mV)", "PVDF2[mV]", " Sg1 (a.u.)"))
+    assert torch.equal(first(FileRecordings(tables, channels=ROWS)), samples(0)[[2, 0, 1]])
+    table(tables / "0.csv", samples(0), names=("t", "sg1 (V)", "sg1 (mV)", "PVDF1"))
+    refused(r"has no channel SG1, PVDF2 of data\.channels", tables, channels=ROWS)
+    rows = np.column_stack([np.arange(600) / RATE_HZ, samples(0).numpy().T])
+    np.savetxt(tables / "0.csv", rows, delimiter=",", fmt="%.17g")
+    assert torch.equal(first(FileRecordings(tables, channels=ROWS)), samples(0))
+    refused(r"has the channels 3 without names, not the 2 of", tables, channels=ROWS[:2])
 
 
-def test_case_and_a_unit_make_no_other_name(tmp_path):
-    table(tmp_path / "a.csv", samples(0), names=("t", "pvdf1 (mV)", "PVDF2[mV]", " Sg1 (a.u.)"))
-    manifest(tmp_path, "a.csv,wood,0,,,slip")
-    source = FileRecordings(tmp_path, channels=ROWS)
-    assert torch.equal(source.load(source.ids[0]).samples, samples(0)[[2, 0, 1]])
-    table(tmp_path / "a.csv", samples(0), names=("t", "sg1 (V)", "sg1 (mV)", "PVDF1"))
-    refused(r"has no channel SG1, PVDF2 of data\.channels", tmp_path, channels=ROWS)
-
-
-@pytest.mark.parametrize("name", ["slip", "is_slip", "Label", "material", "contact [0/1]"])
+@pytest.mark.parametrize("name", ["slip", "Label", "contact [0/1]"])
 def test_a_column_that_may_be_the_label_is_no_channel_unless_said(tmp_path, name):
     table(tmp_path / "a.csv", samples(0), names=("t", "a", "b", name))
     manifest(tmp_path, "a.csv,wood,0,,,slip")
@@ -195,38 +200,21 @@ def test_a_column_that_may_be_the_label_is_no_channel_unless_said(tmp_path, name
     assert FileRecordings(tmp_path, channels=rows_named("b", "a")).hand.names == ("b", "a")
 
 
-def test_columns_without_names_go_by_their_place(tmp_path):
-    rows = np.column_stack([np.arange(600) / RATE_HZ, samples(0).numpy().T])
-    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", fmt="%.17g")
-    manifest(tmp_path, "a.csv,wood,0,,,slip")
-    source = FileRecordings(tmp_path, channels=ROWS)
-    assert torch.equal(source.load(source.ids[0]).samples, samples(0))
-    refused(r"has the channels 3 without names, not the 2 of", tmp_path, channels=ROWS[:2])
-
-
 def test_samples_outside_the_windows_are_not_read(tables):
-    source = FileRecordings(tables)
-    read = source.load(source.ids[0], [(0.5, 1.0), (2.5, 3.0)]).samples
+    read = first(FileRecordings(tables), [(0.5, 1.0), (2.5, 3.0)])
     wanted = torch.zeros(600, dtype=torch.bool)
     wanted[100:200] = wanted[500:600] = True
     assert torch.equal(read[:, wanted], samples(0)[:, wanted])
     assert read[:, ~wanted].isnan().all()
 
 
-def test_materials_and_trials_can_be_chosen(tables):
-    assert FileRecordings(tables, materials=["iron"]).ids == tuple(IRON)
-    assert [str(r) for r in FileRecordings(tables, cycles=1).ids] == ["wood/0", "iron/0"]
-    said = r"data\.materials steel; the set has wood, iron"
-    refused(said, tables, materials=["steel", "iron"])
-    refused(r"data\.cycles must be a number of trials or null, got 0", tables, cycles=0)
-
-
-def test_one_simulated_file_makes_the_set_simulated(tmp_path):
-    ours(tmp_path / "a.npz")
-    ours(tmp_path / "b.npz", provenance={"simulated": True})
-    manifest(tmp_path, "a.npz,wood,0,,,", "b.npz,wood,1,,,")
-    assert FileRecordings(tmp_path).is_simulated is True
-    assert FileRecordings(tmp_path, cycles=1).is_simulated is False
+def test_many_files_are_looked_at_in_processes(tmp_path, capfd):
+    for place in range(18):
+        table(tmp_path / f"{place}.csv", samples(place, 20))
+    manifest(tmp_path, *(f"{place}.csv,wood,{place},,,slip" for place in range(18)))
+    source = FileRecordings(tmp_path)
+    assert [source.entry(name).file for name in source.ids] == [f"{n}.csv" for n in range(18)]
+    assert "looking at files" in capfd.readouterr().err
 
 
 # Keys ----------------------------------------------------------------------------------------
@@ -260,7 +248,9 @@ def test_a_key_is_of_what_a_file_holds_and_how_it_is_read(tables):
     assert key() != keys[0]
 
 
-def test_a_file_is_hashed_once_until_it_changes(tables, monkeypatch):
+def test_a_file_is_hashed_once_until_it_changes_and_a_folder_by_all_its_files(
+    tmp_path, monkeypatch
+):
     hashed, whole = [], hashlib.file_digest
 
     def counted(file, how):
@@ -268,23 +258,17 @@ def test_a_file_is_hashed_once_until_it_changes(tables, monkeypatch):
         return whole(file, how)
 
     monkeypatch.setattr(hashlib, "file_digest", counted)
-    source = FileRecordings(tables)
-    for _ in range(3):
-        for name in source.ids:
-            source.key(name)
-    assert len(hashed) == 4
-    os.utime(tables / "2.csv", ns=(1, 1))
-    assert [source.key(name) for name in source.ids]
-    assert hashed[4:] == [str(tables / "2.csv")]
-
-
-def test_a_folder_has_a_digest_of_all_its_files(tmp_path):
     for place in ("one", "two", "three"):
         (tmp_path / place / "inner").mkdir(parents=True)
         (tmp_path / place / "a").write_text("a")
         (tmp_path / place / "inner" / "b").write_text("b" if place != "three" else "c")
-    one, two, three = (file_digest(tmp_path / p) for p in ("one", "two", "three"))
+    for _ in range(2):
+        one, two, three = (file_digest(tmp_path / p) for p in ("one", "two", "three"))
     assert one == two != three
+    assert len(hashed) == 6
+    os.utime(tmp_path / "two" / "a", ns=(1, 1))
+    assert file_digest(tmp_path / "two") == two
+    assert hashed[6:] == [str(tmp_path / "two" / "a")]
     (tmp_path / "two" / "a").rename(tmp_path / "two" / "c")
     assert file_digest(tmp_path / "two") != one
 
@@ -296,8 +280,8 @@ def gappy(root, lost=((100, 104), (300, 360)), num_samples=600):
     """A table from which a logger lost samples; what it was."""
     content = samples(5, num_samples)
     kept = np.ones(num_samples, dtype=bool)
-    for first, stop in lost:
-        kept[first:stop] = False
+    for start, stop in lost:
+        kept[start:stop] = False
     times = np.arange(num_samples) / RATE_HZ
     table(root / "gaps.csv", content[:, torch.from_numpy(kept)], times=times[kept])
     manifest(root, "gaps.csv,wood,0,,,non-slip")
@@ -308,49 +292,35 @@ def test_gaps_are_refused_missing_or_bridged(tmp_path):
     content, kept = gappy(tmp_path)
     refused(r"64 samples are missing in 2 gaps, first 4 at 0\.5", tmp_path)
     source = FileRecordings(tmp_path, gaps="missing")
-    (name,) = source.ids
-    times = source.timeline(name)
+    times = source.timeline(source.ids[0])
     assert (times.duration_s, times.missing_s) == (3.0, ((0.5, 0.52), (1.5, 1.8)))
-    read = source.load(name).samples
-    assert torch.equal(read[:, kept], content[:, kept])
-    assert read[:, ~kept].isnan().all()
+    assert torch.equal(first(source)[:, kept], content[:, kept])
+    assert first(source)[:, ~kept].isnan().all()
     assert "gaps.csv: lacks 64 samples in 2 gaps, first at 0.5 s" in str(source.warnings[0])
     bridged = FileRecordings(tmp_path, gaps="bridge", bridge_ms=25.0)
-    assert bridged.timeline(name).missing_s == ((1.5, 1.8),)
-    read = bridged.load(name).samples
+    assert bridged.timeline(source.ids[0]).missing_s == ((1.5, 1.8),)
+    read = first(bridged)
     assert torch.equal(read[:, kept], content[:, kept])
     line = torch.from_numpy(np.linspace(content[:, 99].numpy(), content[:, 104].numpy(), 6)).T
     assert torch.allclose(read[:, 99:105], line, atol=1e-12, rtol=0)
     assert read[:, 300:360].isnan().all()
-
-
-def test_bins_that_need_missing_samples_are_left_out(tmp_path):
-    gappy(tmp_path)
-    reading = {"channels": ["a", "b", "c"]}
-    source = FileRecordings(tmp_path, channels=ROWS, reading=reading, gaps="missing")
-    pool = FeaturePool(HAND, RATE_HZ, bin_samples=20, level=2)
-    maker = FeatureMaker(source, pool, ChannelFilter([5, 5, 5]), LabelRule(bin_ms=100.0))
-    cut, bins = maker.filtered_bins(source.ids[0])
-    assert cut.isfinite().all()
-    assert 0 < len(bins.starts) < 30
-    assert not bins.is_slip.any()
+    part = first(bridged, [(0.4, 0.51), (1.7, 2.0)])
+    assert torch.equal(part[:, 80:102], read[:, 80:102])
+    assert torch.equal(part[:, 360:400], read[:, 360:400])
 
 
 def test_the_mean_of_a_stretch_is_taken_off(tables):
-    plain, tared = FileRecordings(tables), FileRecordings(tables, tare_s=[0.5, 1.5])
-    name = plain.ids[0]
-    whole, less = plain.load(name).samples, tared.load(name).samples
-    assert torch.equal(less, whole - whole[:, 100:300].mean(-1, keepdim=True))
-    part = tared.load(name, [(2.0, 2.5)]).samples
-    assert torch.equal(part[:, 400:500], less[:, 400:500])
+    whole = first(FileRecordings(tables))
+    tared = FileRecordings(tables, tare_s=[0.5, 1.5])
+    assert torch.equal(first(tared), whole - whole[:, 100:300].mean(-1, keepdim=True))
+    assert torch.equal(first(tared, [(2.0, 2.5)])[:, 400:500], first(tared)[:, 400:500])
     refused(r"0\.csv: lasts 3 s, tare_s wants 4 s", tables, tare_s=[1.0, 4.0])
 
 
 def test_what_is_missing_or_not_finite_is_no_part_of_a_tare(tmp_path):
     content, kept = gappy(tmp_path)
-    source = FileRecordings(tmp_path, gaps="missing", tare_s=[1.4, 1.6])
+    read = first(FileRecordings(tmp_path, gaps="missing", tare_s=[1.4, 1.6]))
     level = content[:, 280:300].mean(-1, keepdim=True)
-    read = source.load(source.ids[0]).samples
     assert torch.allclose(read[:, kept], content[:, kept] - level, atol=1e-12, rtol=0)
     lost = FileRecordings(tmp_path, gaps="missing", tare_s=[1.55, 1.75], strict=False)
     assert "nothing is there to tare on" in lines_of(lost)[0]
@@ -359,13 +329,10 @@ def test_what_is_missing_or_not_finite_is_no_part_of_a_tare(tmp_path):
     content[2, 110:190] = torch.inf
     table(tmp_path / "a.csv", content)
     manifest(tmp_path, "a.csv,wood,0,,,slip")
-    source = FileRecordings(tmp_path, tare_s=[0.5, 1.0])
-    said = r"a\.csv has nothing finite in its column 2 .* 0\.5 to 1 s"
-    with pytest.raises(ValueError, match=said):
-        source.load(source.ids[0])
-    part = FileRecordings(tmp_path, tare_s=[0.25, 0.6])
+    with pytest.raises(ValueError, match=r"a\.csv has nothing finite in its column 2 .* 0\.5 to 1"):
+        first(FileRecordings(tmp_path, tare_s=[0.5, 1.0]))
+    read = first(FileRecordings(tmp_path, tare_s=[0.25, 0.6]))
     level = [content[0, 50:120].mean(), content[1, 50:100].mean(), content[2, 50:110].mean()]
-    read = part.load(part.ids[0]).samples
     assert torch.allclose(read[:, 300:], content[:, 300:] - torch.tensor(level)[:, None].double())
 
 
@@ -410,18 +377,17 @@ def test_streams_of_a_file_are_channels_of_one_hand(tables):
     source = FileRecordings(tables, streams=streams)
     assert source.hand.names == ("one_a", "two_c", "two_b")
     assert (source.hand.slow, source.hand.fast) == ((0,), (1, 2))
-    assert torch.equal(source.load(source.ids[0]).samples, samples(0)[[0, 2, 1]])
+    assert torch.equal(first(source), samples(0)[[0, 2, 1]])
     rates = {
         name: {"reading": {"time": None, "channels": [column], "sample_rate_hz": rate}}
         for name, column, rate in (("one", "a", 200.0), ("two", "b", 198.0))
     }
     refused(r"one has 200 Hz, two has 198 Hz: resample_hz=", tables, streams=rates)
     both = FileRecordings(tables, streams=rates, resample_hz=50.0)
-    assert both.load(both.ids[0]).samples.shape == (2, 150)  # as long as the shorter one
+    assert first(both).shape == (2, 150)  # as long as the shorter one
     rates["two"]["reading"]["sample_rate_hz"] = 100.0
     apart = FileRecordings(tables, streams=rates, resample_hz=50.0, strict=False)
     assert "its streams last 3 to 6 s; cut the longer" in lines_of(apart)[0]
-    refused(r"a stream has reading, .* got colour", tables, streams={"one": {"colour": "red"}})
 
 
 # What is wrong -------------------------------------------------------------------------------
@@ -449,12 +415,12 @@ def broken(root):
         "words.csv,iron,6,,,",
     )
     return [
-        ("manifest.csv:9: empty.csv", ""),
-        ("manifest.csv:10: words.csv", ""),
         ("manifest.csv:3: 1.csv", "sliding_s: 1.5-4 s leaves the recording of 3 s"),
         ("manifest.csv:6: narrow.csv", "has 2 channels, not 3 as in manifest.csv:2"),
         ("manifest.csv:7: renamed.csv", "has x as channel 2, not b as in manifest.csv:2"),
         ("manifest.csv:8: slow.csv", "is of 50 Hz, manifest.csv:2 and most others of 200 Hz"),
+        ("manifest.csv:9: empty.csv", ""),
+        ("manifest.csv:10: words.csv", ""),
     ]
 
 
@@ -494,8 +460,7 @@ def test_units_kinds_and_rates_must_agree(tmp_path):
     ours(tmp_path / "c.npz", units="mV")
     others = (replace(HAND.channels[0], finger="thumb"), *HAND.channels[1:])
     ours(tmp_path / "d.npz", hand=HandLayout(others))
-    none = dict.fromkeys(("onsets_s", "annotated_onsets_s", "sliding_s", "speeds_mm_s"), ())
-    ours(tmp_path / "e.npz", sample_rate_hz=400.0, **none)
+    ours(tmp_path / "e.npz", sample_rate_hz=400.0, **UNTOLD)
     manifest(tmp_path, *(f"{name}.npz,wood,{place},,," for place, name in enumerate("abcde")))
     in_mv, of_another, at_400 = lines_of(FileRecordings(tmp_path, strict=False))
     assert "c.npz: is in mV, manifest.csv:2 and most others in V" in in_mv
@@ -528,30 +493,38 @@ def test_a_rate_that_nobody_says_is_asked_for(tmp_path):
 @pytest.mark.parametrize(
     ("options", "line"),
     [
+        ({"materials": ["steel", "iron"]}, r"data\.materials steel; the set has wood, iron"),
+        ({"cycles": 0}, r"data\.cycles must be a number of trials or null, got 0"),
         ({"gaps": "ignore"}, r"data\.gaps must be one of refuse, missing, bridge"),
         ({"tare_s": [1.0, 0.5]}, r"data\.tare_s must be \[start, end\] in seconds"),
-        ({"skip_s": -1.0}, r"data\.skip_s must be seconds from 0, got -1"),
-        ({"slide_s": "long"}, r"data\.slide_s must be seconds from 0, got 'long'"),
-        ({"bridge_ms": 0.0, "gaps": "bridge"}, r"data\.bridge_ms must be a positive number, got 0"),
-        ({"bridge_ms": "abc"}, r"data\.bridge_ms must be a positive number, got 'abc'"),
+        ({"skip_s": -1.0}, r"data\.skip_s must be a finite number of at least 0, got -1"),
+        ({"slide_s": "long"}, r"data\.slide_s must be a finite number .*, got 'long'"),
+        ({"bridge_ms": 0.0, "gaps": "bridge"}, r"data\.bridge_ms must be a positive finite .* 0"),
+        ({"bridge_ms": "abc"}, r"data\.bridge_ms must be a positive .* 'abc'"),
         ({"tare_s": [0, "a"]}, r"data\.tare_s must be \[start, end\] in seconds, got \[0, 'a'\]"),
         ({"tare_s": 0.5}, r"data\.tare_s must be \[start, end\] in seconds, got 0\.5"),
         ({"tare_s": "ab"}, r"data\.tare_s must be \[start, end\] in seconds, got 'ab'"),
         ({"streams": 3}, r"data\.streams must be sets of channels by name, .* got 3"),
         ({"streams": {"a": 3}}, r"data\.streams must be sets of channels by name, .* got {'a': 3}"),
+        ({"streams": {"one": {"colour": "red"}}}, r"a stream has reading, .* got colour"),
         ({"channels": 3}, r"data\.channels must be a list of rows of name, .* got 3"),
         ({"channels": ["a"]}, r"data\.channels must be a list of rows of name, .* got \['a'\]"),
         ({"reading": 3}, r"data\.reading must be what is said of files, got 3"),
+        ({"reading": {"rate": 5}}, "reading must be of sample_rate_hz, time"),
         ({"reading": {"channels": 3}}, r"reading\.channels must be a list of columns, .* got 3"),
         ({"reading": {"channels": [[1]]}}, r"reading\.channels must be a list of columns"),
+        ({"reading": {"channels": ["a", "a"]}}, r"reading\.channels names a column twice"),
         ({"reading": {"time": [1]}}, r"reading\.time must be a name, a number or null, got \[1\]"),
-        ({"reading": {"delimiter": 3}}, r"reading\.delimiter must be one character, got 3"),
-        ({"reading": {"samples": 3}}, r"reading\.samples must be the name of a dataset"),
-        ({"reading": {"time_first": "abc"}}, r"reading\.time_first must be true, false or null"),
-        ({"resample_hz": 199.9999}, "is no ratio of whole numbers up to 50000"),
-        ({"resample_hz": -5}, r"data\.resample_hz must be a positive number or null"),
-        ({"reading": {"rate": 5}}, "reading must be of sample_rate_hz, time"),
         ({"reading": {"time_unit": "h"}}, r"reading\.time_unit must be one of s, ms, us, ns"),
+        ({"reading": {"delimiter": 3}}, r"reading\.delimiter must be one character, got 3"),
+        ({"reading": {"samples": 3}}, r"reading\.samples must be the name of an array"),
+        ({"reading": {"time_first": "abc"}}, r"reading\.time_first must be true, false or null"),
+        (
+            {"reading": {"isolate_s": 0}},
+            r"reading\.isolate_s must be a positive finite .* 0",
+        ),
+        ({"resample_hz": 199.9999}, "is no ratio of whole numbers up to 50000"),
+        ({"resample_hz": -5}, r"data\.resample_hz must be a positive finite"),
         ({"adapting": "quick"}, "adapting must be slow or fast, got 'quick'"),
         ({"kind": "two words"}, "kind must be one word"),
         ({"channels": [{"name": "a"}]}, "channel row 1: expected name, kind, finger, segment"),
@@ -572,71 +545,153 @@ def test_a_file_that_changed_since_is_refused(tables):
         source.load(source.ids[1])
 
 
-# Slow files ----------------------------------------------------------------------------------
+# Files whose names say what they are -------------------------------------------------------------
+
+NAMED = {
+    "pattern": r"(?P<scene>[nt])/(?P<material>[a-z]+)(?P<trial>\d+)\.csv",
+    "labels": {"n": "slip", "t": "non-slip"},
+    "rename": {"caze": "case"},
+    "reading": {"sample_rate_hz": 100.0, "time": None},
+    "skip_s": 0.5,
+}
 
 
 @pytest.fixture
-def impatient(tmp_path_factory, monkeypatch):
-    """Every file counts as slow; what they said is kept in a folder of the test's own."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-    monkeypatch.setattr(module, "_PATIENCE_S", 0.0)
-    looked = []
-
-    def counted(path, *rest):
-        looked.append(path.name)
-        return look(path, *rest)
-
-    look = module.look
-    monkeypatch.setattr(module, "look", counted)
-    monkeypatch.setattr(module, "in_processes", lambda function, items, *_: map(function, items))
-    return looked
+def folder(tmp_path):
+    for seed, name in enumerate(
+        ("n/pen0", "n/pen7", "n/caze1", "t/pen0", "t/case1", ".old/n/pen3")
+    ):
+        table(tmp_path / f"{name}.csv", samples(seed, 150))
+    (tmp_path / "README.md").write_text("not one of them")
+    return tmp_path
 
 
-def of_set(source):
-    return [(source.parts(name)[0][1], source.timeline(name)) for name in source.ids]
+def test_paths_say_what_recordings_are(folder):
+    found = named_recordings(folder, **NAMED)
+    slips = [RecordingId("case", 1, "n"), RecordingId("pen", 0, "n"), RecordingId("pen", 7, "n")]
+    touches = [RecordingId("case", 1, "t"), RecordingId("pen", 0, "t")]
+    assert set(found.ids) == {*slips, *touches}
+    assert found.entry(slips[0]).file == "n/caze1.csv"
+    assert {found.timeline(name).slip_s for name in slips} == {((0.5, 1.5),)}
+    assert {found.timeline(name).non_slip_s for name in touches} == {((0.5, 1.5),)}
+    lines = ["file,material,trial,onsets_s", "n/pen0.csv,pen,0,0.75"]  # tells what names do not
+    (folder / "onsets.csv").write_text("\n".join(lines))
+    found = named_recordings(folder, **NAMED, manifest="onsets.csv", slide_s=0.5)
+    told, other = map(found.timeline, slips[1:])
+    assert (told.onsets_s, told.slip_s) == ((0.75,), ())
+    assert (other.onsets_s, other.slip_s) == ((), ((0.5, 1.5),))
 
 
-def test_many_slow_files_are_looked_at_in_processes(tables, monkeypatch, tmp_path, capfd):
-    whole = FileRecordings(tables)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(module, "_PATIENCE_S", 0.0)
-    assert of_set(FileRecordings(tables)) == of_set(whole)
-    assert re.search(r"looking at files .* 2/2", capfd.readouterr().err)
+def test_labels_stand_in_names_themselves(tmp_path):
+    for name in ("slip/pen_a", "slip/pen_b", "non-slip/pen_a", "unsure/pen_a"):
+        table(tmp_path / f"{name}.csv", samples(0, 150))
+    found = named_recordings(tmp_path, pattern=r"(?P<label>[^/]+)/(?P<material>[a-z]+)_.\.csv")
+    told = [(found.entry(r).file, r.cycle, found.entry(r).truth) for r in found.ids]
+    assert told == [
+        ("non-slip/pen_a.csv", 0, Truth(label="non-slip")),
+        ("slip/pen_a.csv", 1, Truth(label="slip")),
+        ("slip/pen_b.csv", 2, Truth(label="slip")),
+        ("unsure/pen_a.csv", 3, None),
+    ]
 
 
-def test_slow_files_are_looked_at_once_until_they_change(tables, impatient):
-    first = FileRecordings(tables)
-    assert impatient == ["0.csv", "1.csv", "2.csv", "3.csv"]
-    assert of_set(FileRecordings(tables)) == of_set(first)
-    assert len(impatient) == 4
-    FileRecordings(tables, reading={"channels": ["a"]})  # another way to read them
-    assert len(impatient) == 8
-    table(tables / "2.csv", samples(2, 400))
-    changed = FileRecordings(tables)
-    assert impatient[8:] == ["2.csv"]
-    assert changed.timeline(RecordingId("iron", 0)).duration_s == 2.0
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"pattern": "("}, r"data.pattern='\(' is no regular expression"),
+        ({"pattern": "(?P<object>.*)"}, r"must have a group \(\?P<material>...\)"),
+        ({"pattern": "(?P<material>x+)"}, "no file in .* has a path that matches"),
+        ({"labels": {"n": "slips"}}, "data.labels must be of slip and non-slip, got 'slips'"),
+        ({"labels": {"n": "slip"}}, r"2 problems in .*t/case1.csv: scene 't' is none of data.labe"),
+        ({"pattern": r"./(?P<material>pe)(?P<trial>.+)\.csv"}, "trial 'n0' is no num"),
+        (
+            {"pattern": r"[nt]/(?P<material>[a-z]+)(?P<trial>\d+)\.csv", "labels": None},
+            "is pen/0, as n/pen0.csv is",
+        ),
+    ],
+)
+def test_what_names_do_not_say_is_said_in_a_line(folder, options, said):
+    refused(said, folder, named_recordings, **NAMED | options)
 
 
-def test_what_files_of_ours_and_gaps_said_is_kept_to_the_bit(tmp_path, impatient):
-    content, _ = gappy(tmp_path)
-    ours(tmp_path / "a.npz", samples(3), provenance={"simulated": True, "seeds": [1, 2]})
-    ours(tmp_path / "b.npz")
-    manifest(tmp_path, "gaps.csv,wood,0,,,non-slip", "a.npz,wood,1,,,", "b.npz,wood,2,,,")
-    options = {"gaps": "missing", "strict": False}
-    first = FileRecordings(tmp_path, **options)
-    again = FileRecordings(tmp_path, **options)
-    assert len(impatient) == 3
-    assert of_set(again) == of_set(first)
-    assert [str(p) for p in again.problems] == [str(p) for p in first.problems]
-    assert content.shape[1] == 600
+def test_no_folder_and_links_out_of_it(folder, tmp_path_factory):
+    refused("no folder at", folder / "nowhere", named_recordings, **NAMED)
+    outside = tmp_path_factory.mktemp("outside") / "pen9.csv"
+    outside.write_text("1\n")
+    (folder / "n" / "pen9.csv").symlink_to(outside)
+    refused(r"n/pen9.csv: is a link out of the folder", folder, named_recordings, **NAMED)
 
 
-def test_a_damaged_memory_is_none(tables, impatient):
-    first = FileRecordings(tables)
-    (memory,) = Path(os.environ["XDG_CACHE_HOME"]).rglob("*.json")
-    for text in ("", "[1]", '{"0.csv": 5}', '{"0.csv": [[], []]}', "{" * 9, '"a"'):
-        memory.write_text(text)
-        assert of_set(FileRecordings(tables)) == of_set(first)
-    shutil.rmtree(memory.parent)
-    memory.parent.write_text("no folder")
-    assert of_set(FileRecordings(tables)) == of_set(first)
+# The authors' own files --------------------------------------------------------------------------
+
+SHORT = {"speeds_mm_s": [100.0, 200.0], "distance_mm": 100.0, "pause_s": 1.2}
+"""Strokes at 1.2 s and 3.4 s, of a second and of half a second."""
+
+
+def authors(path, seed=0, duration_s=4.0, num_channels=24):
+    """A table as the authors' is said to be: times and channels, no header, tabs; what it holds."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    time_s = np.arange(round(duration_s * 200)) / 200
+    volts = np.round(np.random.default_rng(seed).normal(0.0, 0.05, (len(time_s), num_channels)), 6)
+    np.savetxt(path, np.column_stack([time_s, volts]), fmt="%.6f", delimiter="\t")
+    return volts.T
+
+
+def test_the_authors_files_are_the_papers_hand_and_protocol(tmp_path):
+    for seed, stem in enumerate(STEMS):
+        volts = authors(tmp_path / f"{stem}-slip{seed + 1}.txt", seed)
+    authors(tmp_path / "more" / "ABS-Slip12.TXT")
+    for name in ("notes.txt", "abs-slip.txt", "abs-slip3.mat", ".abs-slip4.txt", "abs_slip5.txt"):
+        (tmp_path / name).write_text("")
+    short = [f"data.{name}={value}" for name, value in SHORT.items()]
+    source = instantiate(composed("data=authors_raw", f"data.root={tmp_path}", *short).data)
+    named = [(recording.material, recording.cycle) for recording in source.ids]
+    first_two, *rest = [*zip(STEMS.values(), range(1, 11), strict=True)][:1], *named[2:]
+    assert named[:2] == [*first_two, ("M1", 12)]
+    assert list(rest) == [*zip(STEMS.values(), range(1, 11), strict=True)][1:]
+    assert (source.hand, source.sample_rate_hz) == (HandLayout.paper24(), 200.0)
+    assert source.is_simulated is False
+    read = source.load(source.ids[-1])
+    assert np.array_equal(read.samples.double().numpy(), volts)
+    assert read.onsets_s == pytest.approx((1.2, 3.4))
+    assert np.array(read.sliding_s) == pytest.approx(np.array([(1.2, 2.2), (3.4, 3.9)]))
+    assert read.speeds_mm_s == (100.0, 200.0)
+    paper = nominal((20.0, 40.0, 60.0), 100.0, 2.0)
+    assert (paper.onsets_s, paper.speeds_mm_s) == ((2.0, 9.0, 13.5), (20.0, 40.0, 60.0))
+    assert [end - start for start, end in paper.sliding_s] == pytest.approx([5, 2.5, 5 / 3])
+
+
+def test_a_manifest_can_say_onsets_better_and_a_long_slide_is_cut(tmp_path):
+    authors(tmp_path / "abs-slip1.txt", duration_s=3.6)
+    authors(tmp_path / "abs-slip2.txt")
+    authors(tmp_path / "abs-slip3.txt", duration_s=3.0)
+    (tmp_path / "other.txt").write_text("")
+    marked = "file,material,trial,onsets_s,sliding_s\nabs-slip2.txt,M1,2,2.1,2.1-3.9\n"
+    (tmp_path / "marked.csv").write_text(f"{marked}abs-slip1.txt,M1,1,,\nother.txt,M2,2,,\n")
+    source = authors_raw(tmp_path, **SHORT, manifest="marked.csv", strict=False)
+    assert lines_of(source) == [
+        "marked.csv:4: file 'other.txt' has no name that says what it is",
+        "abs-slip3.txt: sliding_s: 3.4-3.9 s leaves the recording of 3 s",
+        "abs-slip3.txt: onsets_s: 3.4 s is behind the end, 3 s",
+    ]
+    cut, told = map(source.timeline, source.ids)
+    assert cut.sliding_s[1] == pytest.approx((3.4, 3.6))
+    assert told.onsets_s == pytest.approx((2.1,))
+
+
+def test_what_is_wrong_with_the_authors_names(tmp_path):
+    said = r"named as the authors' are, such as abs-slip1\.txt"
+    refused(said, tmp_path, authors_raw)
+    refused(r"data\.speeds_mm_s, .* must be positive", tmp_path, authors_raw, speeds_mm_s=[20, 0])
+    for name in ("a/abs-slip1.txt", "b/abs-slip01.txt", "wod-slip1.txt", "glass-slip1.txt"):
+        authors(tmp_path / name)
+    begins = ", ".join(STEMS)
+    assert sorted(lines_of(authors_raw(tmp_path, **SHORT, strict=False))) == [
+        "b/abs-slip01.txt: is abs/1, as a/abs-slip1.txt is",
+        f"glass-slip1.txt: its name begins with none of {begins}; data.stems names more",
+        f"wod-slip1.txt: its name begins with none of {begins}; did you mean 'wood'?; data.stems "
+        "names more",
+    ]
+    (tmp_path / "one").mkdir()
+    authors(tmp_path / "one" / "abs-slip1.txt", num_channels=23)
+    refused(r"not the 24 of data\.channels", tmp_path / "one", authors_raw, **SHORT)

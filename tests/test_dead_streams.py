@@ -4,11 +4,10 @@ import pytest
 import torch
 from small_detector import HAND, alarming_detector, raw_bins
 
-from tactslip_torch.graph.trials import simulated_stream
-from tactslip_torch.model.calibration import Isotonic, Platt
-from tactslip_torch.model.missing_channels import ClassGaussians, widened_llr
-from tactslip_torch.onset.decisions import Decider, score_stream
-from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.deploy.check import simulated_stream
+from tactslip_torch.model.calibration import widened_llr
+from tactslip_torch.model.missing_channels import ClassGaussians
+from tactslip_torch.onset.decisions import AlarmSettings, score_stream
 from tactslip_torch.onset.streaming import StreamingDetector
 
 
@@ -92,24 +91,3 @@ def test_a_hand_that_is_wholly_dead_tells_nothing(detector, samples):
     )
     assert torch.equal(found.probability, torch.full_like(found.score, 0.5))
     assert not found.alarms
-
-
-def test_another_hands_channel_is_refused_and_nothing_changes(detector):
-    live = StreamingDetector(detector, masked_channels=["SG1"])
-    with pytest.raises(ValueError, match=r"^masked_channels names the channel 'SG7'"):
-        live.masked_channels = ["SG7"]
-    assert live.masked_channels == ("SG1",)
-    with pytest.raises(ValueError, match=r"^masked_channels names the channel 'SG7'"):
-        StreamingDetector(detector, masked_channels=["SG7"])
-
-
-@pytest.mark.parametrize("calibration", [Platt(2.0, 0.3), Isotonic((-2.0, 2.0), (-5.0, 5.0))])
-def test_certain_scores_are_decided_to_the_bit_as_ever(calibration, detector):
-    settings = AlarmSettings.of(detector)
-    settings = AlarmSettings(20, calibration, settings.rule, 1.0, None)
-    score = torch.linspace(-3, 3, 40, dtype=torch.float64)
-    valid = torch.ones(40).bool()
-    plain = Decider(settings, 2000.0, 100, 25).decide(score, valid)
-    certain = Decider(settings, 2000.0, 100, 25).decide(score, valid, valid, torch.zeros(40))
-    for one, other in zip(plain, certain, strict=True):
-        assert torch.equal(one, other)

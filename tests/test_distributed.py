@@ -13,7 +13,7 @@ from test_commands import TINY, assert_same_detector, run_train
 from tactslip_torch import SlipDetector
 
 HERE = Path(__file__).parent
-MANY = ("data.cycles=8", "split.train_share=0.75")
+MANY = ("data.cycles=8", "split.train_fraction=0.75")
 SUMS = ("recipe.num_features=10",)  # 66 monomials: more bins than that, so sums are made
 BINS = ("recipe.num_features=40",)  # 861 monomials: fewer bins, so bins are kept
 pytestmark = pytest.mark.slow
@@ -82,7 +82,7 @@ def test_torchrun_without_its_strategy_is_refused(cache, tmp_path):
 
 def test_folds_with_uneven_shares_under_several_processes(cache, tmp_path):
     folds = ("split=leave_one_material_out", "split.materials=[A,B,C]")
-    folds += ("data.cycles=5", "split.train_share=0.6")
+    folds += ("data.cycles=5", "split.train_fraction=0.6")
     plain = [o for o in TINY if not o.startswith("split.")]
     _, alone = run_train(tmp_path / "alone", *plain, *folds, cache)
     command = [sys.executable, "-m", "tactslip_torch.train", *plain, *folds]
@@ -100,7 +100,7 @@ def test_more_processes_than_recordings_is_one_line(cache, tmp_path):
         tmp_path / "ddp",
         cache,
         "data.cycles=2",
-        "split.train_share=0.5",
+        "split.train_fraction=0.5",
         "trainer.strategy=ddp",
         "trainer.devices=3",
     )

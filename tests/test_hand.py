@@ -18,16 +18,6 @@ def test_the_papers_hand_is_in_file_order():
     assert hand.indices("PVDF") == tuple(range(14, 24))
 
 
-def test_the_papers_channels_sit_in_the_papers_fingers():
-    hand = HandLayout.paper24()
-    numbers = {"little": (1, 3, 1, 2), "ring": (4, 6, 3, 4), "middle": (7, 9, 5, 6)}
-    numbers |= {"index": (10, 12, 7, 8), "thumb": (13, 14, 9, 10)}
-    for finger, (first_gauge, last_gauge, first_film, last_film) in numbers.items():
-        expected = [f"SG{i}" for i in range(first_gauge, last_gauge + 1)]
-        expected += [f"PVDF{i}" for i in range(first_film, last_film + 1)]
-        assert [c.name for c in hand.channels if c.finger == finger] == expected
-
-
 def test_fingers_carry_films_on_two_segments_and_the_thumb_on_both():
     hand = HandLayout.paper24()
     for finger in FINGERS:
@@ -47,20 +37,6 @@ def test_rows_go_round():
     paper = HandLayout.paper24()
     assert HandLayout.from_rows(paper.to_rows()) == paper
     assert hash(HandLayout.from_rows(paper.to_rows())) == hash(paper)
-
-
-def test_channels_may_come_in_any_order_of_kinds():
-    hand = HandLayout.from_rows([ROWS[1], ROWS[0]])
-    assert hand.indices("PVDF") == (0,)
-    assert hand.indices("SG") == (1,)
-    assert hand != HandLayout.from_rows(ROWS)
-
-
-def test_a_list_of_channels_becomes_a_tuple():
-    channels = list(HandLayout.from_rows(ROWS).channels)
-    hand = HandLayout(channels)
-    channels.clear()
-    assert len(hand) == 2
 
 
 def test_a_channel_is_found_by_name():
@@ -96,15 +72,6 @@ def test_slow_and_fast_part_a_hand_whatever_its_kinds():
     assert (hand.indices("SG"), hand.indices("IMU")) == ((1, 4), ())
     paper = HandLayout.paper24()
     assert (paper.slow, paper.fast) == (paper.indices("SG"), paper.indices("PVDF"))
-
-
-def test_rows_say_how_a_channel_adapts_only_where_its_kind_does_not():
-    own = [ROWS[0] | {"adapting": "fast"}, ROWS[1] | {"kind": "electrode", "adapting": "slow"}]
-    hand = HandLayout.from_rows([own[0], own[1] | {"name": "e"}])
-    assert hand.to_rows() == [own[0], own[1] | {"name": "e"}]
-    assert HandLayout.from_rows(hand.to_rows()) == hand
-    assert HandLayout.from_rows([ROWS[0] | {"adapting": "slow"}]).to_rows() == [ROWS[0]]
-    assert HandLayout.from_rows([ROWS[0] | {"adapting": None}]).to_rows() == [ROWS[0]]
 
 
 @pytest.mark.parametrize(

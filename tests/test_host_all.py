@@ -12,17 +12,18 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 from hosts import (
+    EXPORT,
     RATE,
     Ran,
     assert_same,
     copied,
     exported,
+    installed,
     saved,
     slipping_stream,
     truth,
 )
 from PIL import Image
-from test_host_node import EXPORT, installed
 from test_host_web import BROWSER
 
 from tactslip_torch import Scene, simulate

@@ -9,21 +9,22 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from hosts import (
+    EXPORT,
     Ran,
     alarming_detector,
     altered,
     assert_same,
     copied,
     exported,
+    installed,
     saved,
     sidecar_of,
     slipping_stream,
     truncated,
     truth,
 )
-from test_host_node import EXPORT, installed
 
-from tactslip_torch.onset.settings import KEY
+from tactslip_torch.onset.decisions import KEY
 
 WEB = EXPORT / "web"
 BROWSER = Path(os.environ.get("CHROMIUM", "/usr/bin/chromium"))

@@ -1,11 +1,20 @@
-"""Which sensors matter: sets whose answer is known, and machines refitted by the slow way."""
+"""Which sensors matter: sets whose answer is known, machines refitted the slow way, the command."""
 
+import csv
+import json
+import shutil
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from drawing import assert_png
+from hydra import compose, initialize_config_dir
 from small_detector import HAND, raw_bins, small_detector
+from test_commands import TINY
+from test_commands import composed as composed_train
 
 from tactslip_torch.analysis.importance import (
     HELD_OUT,
@@ -15,19 +24,24 @@ from tactslip_torch.analysis.importance import (
     best_first,
     count_right,
     difference,
+    draw_raw_bins,
     first_order,
     score_gradients,
     units_of,
     without,
 )
+from tactslip_torch.commands.entry import conf_dir
+from tactslip_torch.commands.importance import _trained, main, sensors
+from tactslip_torch.commands.train import train
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.selection import ClassMoments, t_scores
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import PAPER_KERNEL
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.report.importance import best_table, sensors_csv, sensors_figure, sensors_table
 
-CHANNELS = ["a", "a", "b", "b", "c", "c"]  # of each feature
+OF_FEATURE = ["a", "a", "b", "b", "c", "c"]  # of each feature
 UNITS = {name: frozenset(name) for name in "abc"}
 PENALTIES = (0.01, 0.1, 1.0)
 
@@ -39,8 +53,8 @@ def sampled(seed, tells, groups="MNO", recordings=4, bins=12):
     for group in groups:
         for number in range(recordings):
             is_slip = torch.arange(bins) % 2 == 0
-            noise = torch.from_numpy(rng.standard_normal((bins, len(CHANNELS)))).float()
-            signal = torch.tensor([tells.get(i, 0.0) for i in range(len(CHANNELS))])
+            noise = torch.from_numpy(rng.standard_normal((bins, len(OF_FEATURE)))).float()
+            signal = torch.tensor([tells.get(i, 0.0) for i in range(len(OF_FEATURE))])
             features = noise + torch.where(is_slip, 1.0, -1.0)[:, None] * signal
             sample.update(f"{group}/{seed}/{number}", group, features, is_slip)
     return sample.bins()
@@ -55,10 +69,10 @@ def refit_of(tells):
 
 
 def ranking_of(refit, num_features=6, allowed=None, most_correlation=1.0):
-    moments = ClassMoments(len(CHANNELS))
+    moments = ClassMoments(len(OF_FEATURE))
     moments.update(refit.train.features, refit.train.is_slip)
     scores = t_scores(moments, "pooled")
-    return Ranking(scores, CHANNELS, allowed, refit.train, num_features, most_correlation)
+    return Ranking(scores, OF_FEATURE, allowed, refit.train, num_features, most_correlation)
 
 
 # Accuracy and its draws --------------------------------------------------------------------------
@@ -200,7 +214,7 @@ def test_a_ranking_takes_the_largest_scores_of_the_channels_it_may():
     allowed = torch.tensor([True] * 4 + [False] * 2)
     assert ranking_of(refit, 6, allowed)(frozenset("c")) == []
     assert ranking_of(refit, 6, allowed)(frozenset("bc"))[0] == 3
-    assert without([5, 3, 1, 0], {"a", "c"}, CHANNELS) == [3]
+    assert without([5, 3, 1, 0], {"a", "c"}, OF_FEATURE) == [3]
 
 
 def test_a_ranking_passes_over_what_repeats():
@@ -297,3 +311,239 @@ def test_what_no_first_order_can_be_told_of_is_refused(change, words):
     }
     with pytest.raises(ValueError, match=words):
         first_order(**(given | change))
+
+
+# The command -----------------------------------------------------------------------------------
+SMALL = ("bins=20", "scored_bins=30", "gradient_bins=8", "draws=20", "num_workers=0")
+CHANNELS = ["SG1", "SG2", "PVDF1", "PVDF2"]
+
+
+def composed(*overrides):
+    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+        return compose("importance", [*SMALL, *overrides])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    train(composed_train(*TINY, "recipe=robust", "cache=off"), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sensors")
+    content = sensors(composed(f"model={run / 'detector.pt'}", "cache=off"), folder)
+    assert json.loads((folder / "sensors.json").read_text()) == content
+    return folder, content
+
+
+# What it leaves ----------------------------------------------------------------------------------
+
+
+def test_the_files_of_a_run(found):
+    folder, _ = found
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"config.yaml", "sensors.json", "sensors.csv", "sensors.png"}
+    assert_png(folder / "sensors.png")
+
+
+def test_every_channel_finger_and_kind_has_its_row(found):
+    _, content = found
+    named = [(row["unit"], row["name"]) for row in content["units"]]
+    assert named == [
+        *(("channel", name) for name in CHANNELS),
+        *(("finger", name) for name in ("index", "thumb")),
+        *(("kind", name) for name in ("SG", "PVDF")),
+    ]
+    roles = ["held_out", "test", "unseen"]
+    in_use = {row["name"]: row["features_in_use"] for row in content["units"]}
+    assert sum(in_use[name] for name in CHANNELS) == content["detector"]["features"] == 10
+    for row in content["units"]:
+        assert list(row["lost"]) == list(row["lost_reselected"]) == list(row["alone"]) == roles
+        if row["unit"] == "channel":
+            assert (row["gradient"]["slip"] > 0) is (row["features_in_use"] > 0)
+        if not row["features_in_use"]:
+            assert row["lost"]["unseen"] == {"lost": 0.0, "low": 0.0, "high": 0.0}
+    assert content["groups"] == {"held_out": ["A", "B"], "test": ["A", "B"], "unseen": ["C"]}
+    assert content["num_bins"]["held_out"] == 2 * 2 * 20
+    assert content["simulated"] is False
+
+
+def test_what_is_lost_is_the_difference_of_accuracies(found):
+    _, content = found
+    whole = content["with_all"]["reselected"]["balanced_accuracy"]
+    for steps in content["best"].values():
+        for step in steps:
+            for role, accuracy in step["balanced_accuracy"].items():
+                assert step["lost"][role]["lost"] == pytest.approx(whole[role] - accuracy)
+        assert steps[-1]["lost"]["unseen"]["lost"] == 0  # all of them are the whole hand
+    fingers = {row["name"]: row["alone"] for row in content["units"] if row["unit"] == "finger"}
+    first = content["best"]["finger"][0]
+    assert fingers[first["joins"]] == first["balanced_accuracy"]
+    assert first["balanced_accuracy"]["held_out"] == max(f["held_out"] for f in fingers.values())
+    # two fingers: what is left without one is the other
+    other = next(name for name in fingers if name != first["joins"])
+    row = next(row for row in content["units"] if row["name"] == other)
+    assert row["lost_reselected"]["test"]["lost"] == pytest.approx(
+        whole["test"] - first["balanced_accuracy"]["test"]
+    )
+
+
+def test_tables_and_csv_have_the_numbers_of_json(found, tmp_path):
+    folder, content = found
+    with (folder / "sensors.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for row, of_json in zip(rows, content["units"], strict=True):
+        assert row["name"] == of_json["name"]
+        lost = of_json["lost_reselected"]["unseen"]
+        assert float(row["lost_reselected_unseen_high"]) == lost["high"]
+    joins = {row["name"]: row["joins_as"] for row in rows if row["unit"] == "channel"}
+    assert joins[content["best"]["channel"][0]["joins"]] == "1"
+    assert all(f"\n{name} " in sensors_table(content) for name in [*CHANNELS, "index", "thumb"])
+    lines = [line.split() for line in best_table(content).splitlines() if line[:1].isdigit()]
+    assert [line[1] for line in lines][:4] == [s["joins"] for s in content["best"]["channel"]]
+    simulated = content | {"simulated": True}
+    assert "SIMULATED" in sensors_table(simulated)
+    assert "SIMULATED" not in sensors_table(content)
+    sensors_csv(simulated, tmp_path / "sensors.csv")
+    assert (tmp_path / "sensors.csv").read_text().endswith("True\n")
+
+
+# Bins that are differentiated at -----------------------------------------------------------------
+
+
+def test_raw_bins_are_training_bins_of_both_classes_with_their_context(run):
+    trained = _trained(run / "detector.pt", None)
+    raw, is_slip = draw_raw_bins(trained.maker, trained.fold, 24)
+    assert raw.shape == (len(is_slip), 4, trained.detector.context_before + 125)
+    assert int(is_slip.sum()) == len(is_slip) // 2 >= 12
+    of_train = torch.cat(
+        [trained.source.load(recording).samples for recording in trained.fold.having("train")], 1
+    )
+    starts = set(of_train[0].tolist())
+    assert all(float(bin_[0, 0]) in starts for bin_ in raw)
+    again, _ = draw_raw_bins(trained.maker, trained.fold, 24)
+    assert torch.equal(raw, again)
+    filtered = trained.detector.channel_filter.valid(raw.double())
+    score = trained.detector(filtered)
+    torch.testing.assert_close(trained.detector.score_raw(raw.double()), score)
+
+
+# The figure --------------------------------------------------------------------------------------
+
+
+def content_of(hand):
+    generator = torch.Generator().manual_seed(0)
+
+    def some():
+        return float(torch.rand(1, generator=generator))
+
+    def lost():
+        middle = some() - 0.5
+        return {"lost": middle, "low": middle - 0.1, "high": middle + 0.1}
+
+    roles = ("held_out", "unseen")
+    units = [
+        {
+            "unit": "channel",
+            "name": name,
+            "features_in_use": 2,
+            "gradient": {"non_slip": some(), "slip": some()},
+            "lost": {role: lost() for role in roles},
+            "alone": {role: 0.5 + some() / 2 for role in roles},
+        }
+        for name in hand.names
+    ]
+    steps = [
+        {
+            "joins": name,
+            "lost": {role: lost() for role in roles},
+            "balanced_accuracy": {role: 0.5 + some() / 2 for role in roles},
+        }
+        for name in hand.names[:5]
+    ]
+    return {
+        "simulated": True,
+        "settings": {"reselect": "ranked"},
+        "num_bins": dict.fromkeys(roles, 10),
+        "channels": hand.to_rows(),
+        "units": units,
+        "with_all": {"reselected": {"balanced_accuracy": dict.fromkeys(roles, 0.9)}},
+        "best": {"channel": steps},
+    }
+
+
+def biotac_like():
+    return HandLayout.from_rows(
+        [
+            {"name": f"{f}{i}", "kind": kind, "finger": f, "segment": "pad", "adapting": adapting}
+            for f in ("left", "right")
+            for i, (kind, adapting) in enumerate(
+                [("electrode", "slow")] * 19 + [("pressure", "slow"), ("vibration", "fast")]
+            )
+        ]
+    )
+
+
+@pytest.mark.parametrize("hand", [HandLayout.paper24(), biotac_like()])
+def test_any_hand_can_be_drawn(drawn, hand, tmp_path):
+    sensors_figure(content_of(hand), tmp_path / "a.png")
+    assert_png(tmp_path / "a.png")
+    assert "SIMULATED" in drawn[0].get_suptitle()
+    shown = drawn[0].axes[0]
+    fingers = list(dict.fromkeys(channel.finger for channel in hand.channels))
+    words = [text.get_text() for text in shown.texts]
+    assert [word for word in words if word in fingers] == fingers
+    assert sum(len(marks.get_offsets()) for marks in shown.collections) == len(hand)
+
+
+# The command -------------------------------------------------------------------------------------
+
+
+def refused(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["importance", *SMALL, "cache=off", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    errors = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error")]
+    assert len(errors) == 1
+    return errors[0]
+
+
+def test_bad_input_is_one_line(monkeypatch, capsys, run, tmp_path):
+    here = f"hydra.run.dir={tmp_path / 'out'}"
+    model = f"model={run / 'detector.pt'}"
+    assert "no value for model" in refused(monkeypatch, capsys, here)
+    assert "nothing.pt" in refused(monkeypatch, capsys, here, "model=nothing.pt")
+    wrong = refused(monkeypatch, capsys, here, model, "bins=1")
+    assert "bins must be a whole number of at least 2, got 1" in wrong
+    wrong = refused(monkeypatch, capsys, here, model, "num_features=0")
+    assert "num_features must be a positive whole number, got 0" in wrong
+    wrong = refused(monkeypatch, capsys, here, model, "reselect=equal")
+    assert "reselect must be ranked or shared, got 'equal'" in wrong
+
+
+def moved(run, folder, *, change=None):
+    """The detector of a run with its configuration beside it, changed; or none."""
+    folder.mkdir(parents=True)
+    shutil.copy(run / "detector.pt", folder)
+    if change is not None:
+        text = (run / "config.yaml").read_text()
+        assert change[0] in text
+        (folder / "config.yaml").write_text(text.replace(*change))
+    return f"model={folder / 'detector.pt'}"
+
+
+def test_a_detector_without_its_run_is_refused(monkeypatch, capsys, run, tmp_path):
+    here = f"hydra.run.dir={tmp_path / 'out'}"
+    alone = moved(run, tmp_path / "far" / "away")
+    assert "no config.yaml beside" in refused(monkeypatch, capsys, here, alone)
+    other = moved(run, tmp_path / "other", change=("seed: 0", "seed: 1"))
+    wrong = refused(monkeypatch, capsys, here, other)
+    assert "are not those that detector.pt was trained on" in wrong
+    bare = moved(run, tmp_path / "bare", change=("recipe:", "recept:"))
+    assert "has no recipe; give the config.yaml of a training" in refused(
+        monkeypatch, capsys, here, bare
+    )
+    assert not Path(tmp_path / "out" / "sensors.json").exists()

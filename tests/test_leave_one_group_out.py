@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model import leave_one_group_out
-from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.kernels import PAPER_KERNEL, Kernel, Polynomial, RadialBasis
 from tactslip_torch.model.leave_one_group_out import HeldOut, held_out_scores
 
@@ -71,7 +71,7 @@ def assert_refits(
 
 
 @pytest.mark.parametrize("chunk", [256, 11])
-@pytest.mark.parametrize("penalty", [1e-3, 1e3])
+@pytest.mark.parametrize("penalty", [1e3])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("kind", GROUPS)
 @pytest.mark.parametrize(
@@ -91,34 +91,6 @@ def test_scores_are_those_of_refits(
     monkeypatch.setattr(leave_one_group_out, "_CHUNK", chunk)
     bins = draw(rng, num_bins, num_features, weighted)
     assert_refits(bins, grouped(rng, num_bins, kind), penalty, kernel)
-
-
-@pytest.mark.parametrize("route", ["primal", "dual"])
-@pytest.mark.parametrize("kind", ["bins", "materials"])
-def test_labels_of_a_group_do_not_move_its_scores(kind, route, rng):
-    bins, groups = draw(rng, 60, 3), grouped(rng, 60, kind)
-    own = groups == groups[7]
-    flipped = TrainingBins(bins.features, bins.is_slip ^ own)
-    before = HeldOut(bins, groups, route=route).at(0.7).scores
-    after = HeldOut(flipped, groups, route=route).at(0.7).scores
-    torch.testing.assert_close(after[own], before[own], rtol=0, atol=1e-9)
-    assert float((after - before)[~own].abs().max()) > 1e-3  # they do move the others'
-
-
-@pytest.mark.parametrize("num_bins", [12, 60])
-def test_one_matrix_serves_every_penalty_and_tensors_are_kept(num_bins, rng):
-    bins, groups = draw(rng, num_bins, 4, weighted=True), torch.arange(num_bins) % 3
-    tensors = [bins.features, bins.is_slip, bins.weights, groups]
-    before = [tensor.clone() for tensor in tensors]
-    machine = HeldOut(bins, groups)
-    found = [machine.at(penalty) for penalty in (0.1, 10.0, 0.1)]
-    assert torch.equal(found[0].scores, found[2].scores)
-    assert not torch.equal(found[0].scores, found[1].scores)
-    assert all(map(torch.equal, tensors, before))
-    new = torch.from_numpy(rng.uniform(-1, 1, (30, 4)))
-    head, expected = found[1].head, fit_machine(bins, 10.0)
-    torch.testing.assert_close(head(new), expected(new), rtol=0, atol=1e-9)
-    assert head.solved.size == (12 if num_bins == 12 else 15)
 
 
 # Gradients ------------------------------------------------------------------------------------
@@ -169,15 +141,6 @@ def test_derivatives_are_right_once_and_twice(num_features, rng):
 
     assert torch.autograd.gradcheck(scores, (z, *numbers))
     assert torch.autograd.gradgradcheck(scores, (z, *numbers))
-
-
-def test_float32_features_get_their_gradient_in_float32(rng):
-    z, is_slip, groups, *_ = inputs_of(rng, 30, 3, "cycles")
-    single = z.detach().float().requires_grad_()
-    scores = held_out_scores(single, is_slip, groups, 0.7)
-    assert scores.dtype == torch.float64
-    (slope,) = torch.autograd.grad(scores.sum(), single)
-    assert slope.dtype == torch.float32
 
 
 # Refusals -------------------------------------------------------------------------------------

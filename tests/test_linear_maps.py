@@ -5,7 +5,7 @@ import pytest
 import pywt
 import torch
 
-from tactslip_torch.features.linear_maps import LinearMaps
+from tactslip_torch.features.bank import LinearMaps
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.signals.spectrum import SpectrumMethod

@@ -2,6 +2,7 @@
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,19 +11,16 @@ from scipy.integrate import quad
 from scipy.special import expit
 from scipy.stats import multivariate_normal
 
-from tactslip_torch.model import missing_channels
-from tactslip_torch.model.calibration import Isotonic, Platt
+from tactslip_torch.model.calibration import Isotonic, Platt, widened_llr
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.missing_channels import (
-    MOST_OFF,
     RESOLUTION,
     ClassGaussians,
-    ExpectedScore,
-    shrinkage,
-    widened_llr,
+    expected_score,
 )
 
 NUM = 7
+MOST_OFF = 0.02  # by which a probability may be off the integral's, of equal priors
 
 
 def head_of(rng, num=NUM):
@@ -69,16 +67,17 @@ def test_mean_and_variance_are_those_of_the_mixture(lost, rng):
     z = torch.from_numpy(rng.uniform(-1, 1, (5, NUM)))
     is_missing = torch.zeros(5, NUM, dtype=torch.bool)
     is_missing[:, lost] = True
-    mean, variance = ExpectedScore(head, gaussians)(z, is_missing)
+    mean, variance = expected_score(head, gaussians, z, is_missing)
     for row in range(5):
         expected = by_quadrature(head, gaussians, z[row].numpy(), lost)
         np.testing.assert_allclose([mean[row], variance[row]], expected, rtol=1e-9)
 
 
 def test_bins_that_miss_other_features_are_judged_each_by_their_own(rng):
-    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    expected = partial(expected_score, head_of(rng), gaussians_of(rng))
     z = torch.from_numpy(rng.uniform(-1, 1, (40, NUM)))
     is_missing = torch.from_numpy(rng.integers(0, 4, (40, 1)) == np.arange(NUM) % 4)
+    z[is_missing] = torch.nan  # what stands there does not matter
     together = expected(z, is_missing)
     alone = [expected(z[i : i + 1], is_missing[i : i + 1]) for i in range(40)]
     for found, each in zip(together, zip(*alone, strict=True), strict=True):
@@ -86,43 +85,19 @@ def test_bins_that_miss_other_features_are_judged_each_by_their_own(rng):
 
 
 def test_each_bin_alone_where_patterns_cannot_be_looked_at(rng):
-    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    expected = partial(expected_score, head_of(rng), gaussians_of(rng))
     z = torch.from_numpy(rng.uniform(-1, 1, (30, NUM)))
     is_missing = torch.from_numpy(rng.integers(0, 4, (30, 1)) == np.arange(NUM) % 4)
-    is_missing[0], is_missing[1] = False, True
+    is_missing[0], is_missing[1] = False, True  # nothing missing is the score itself
+    torch.testing.assert_close(expected(z, is_missing)[0][0], expected.args[0](z[0]))
     for found, each in zip(
         torch.vmap(expected)(z, is_missing), expected(z, is_missing), strict=True
     ):
         torch.testing.assert_close(found, each, rtol=1e-12, atol=1e-12)
 
 
-def test_no_bins_have_no_scores(rng):
-    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
-    mean, variance = expected(torch.zeros(0, NUM), torch.zeros(0, NUM).bool())
-    assert mean.shape == variance.shape == (0,)
-
-
-def test_nothing_missing_is_the_score_itself_and_certain(rng):
-    head = head_of(rng)
-    z = torch.from_numpy(rng.uniform(-1, 1, (4, NUM)))
-    mean, variance = ExpectedScore(head, gaussians_of(rng))(z, torch.zeros(4, NUM).bool())
-    torch.testing.assert_close(mean, head(z), rtol=1e-13, atol=1e-13)
-    assert torch.equal(variance, torch.zeros(4, dtype=torch.float64))
-
-
-def test_what_stands_in_a_missing_feature_does_not_matter(rng):
-    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
-    z = torch.from_numpy(rng.uniform(-1, 1, (3, NUM)))
-    is_missing = torch.zeros(3, NUM).bool()
-    is_missing[:, 4] = True
-    first = expected(z, is_missing)
-    z[:, 4] = torch.tensor([torch.nan, torch.inf, 1e30])
-    for found, other in zip(first, expected(z, is_missing), strict=True):
-        assert torch.equal(found, other)
-
-
 def test_gradients_in_what_is_observed(rng):
-    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    expected = partial(expected_score, head_of(rng), gaussians_of(rng))
     is_missing = torch.zeros(3, NUM).bool()
     is_missing[:2, [1, 5]] = True
     z = torch.from_numpy(rng.uniform(-1, 1, (3, NUM))).requires_grad_()
@@ -132,22 +107,9 @@ def test_gradients_in_what_is_observed(rng):
     assert torch.equal(slope[:2, [1, 5]], torch.zeros(2, 2, dtype=torch.float64))
 
 
-def test_masks_are_made_once_and_the_oldest_forgotten(rng, monkeypatch):
-    made = []
-    whole = missing_channels.sweep
-    monkeypatch.setattr(missing_channels, "MOST_KEPT", 2)
-    monkeypatch.setattr(missing_channels, "sweep", lambda *a: made.append(a[1]) or whole(*a))
-    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
-    z = torch.zeros(1, NUM, dtype=torch.float64)
-    for feature in (0, 1, 0, 2, 0, 1):
-        expected(z, torch.arange(NUM)[None] == feature)
-    assert [int(mask.nonzero()) for mask in made] == [0, 1, 2, 1]
-
-
-def test_threads_may_share_what_is_kept(rng, monkeypatch):
+def test_threads_may_share_what_is_kept(rng):
     """Once a KeyError, where one thread forgot what another had just found."""
-    monkeypatch.setattr(missing_channels, "MOST_KEPT", 1)
-    expected = ExpectedScore(head_of(rng), gaussians_of(rng))
+    expected = partial(expected_score, head_of(rng), gaussians_of(rng))
     masks = torch.eye(3, NUM, dtype=torch.bool)
     z = torch.zeros(1, NUM, dtype=torch.float64)
     alone = [float(expected(z, mask[None])[0]) for mask in masks]
@@ -155,8 +117,8 @@ def test_threads_may_share_what_is_kept(rng, monkeypatch):
     sys.setswitchinterval(1e-6)
     try:
         with ThreadPoolExecutor(8) as pool:
-            found = pool.map(lambda i: float(expected(z, masks[i % 3][None])[0]), range(900))
-            assert list(found) == alone * 300
+            found = pool.map(lambda i: float(expected(z, masks[i % 3][None])[0]), range(300))
+            assert list(found) == alone * 100
     finally:
         sys.setswitchinterval(before)
 
@@ -164,13 +126,13 @@ def test_threads_may_share_what_is_kept(rng, monkeypatch):
 def test_gaussians_of_many_bins_are_those_they_were_drawn_from(rng):
     true = gaussians_of(rng, 4)
     factor = torch.linalg.cholesky(true.covariance)
-    is_slip = torch.from_numpy(rng.integers(0, 2, 200_000) == 1)
-    drawn = torch.from_numpy(rng.standard_normal((200_000, 4)))
+    is_slip = torch.from_numpy(rng.integers(0, 2, 50_000) == 1)
+    drawn = torch.from_numpy(rng.standard_normal((50_000, 4)))
     index = is_slip.long()
     z = true.mean[index] + (factor[index] @ drawn[..., None]).squeeze(-1)
     found = ClassGaussians.fit(z, is_slip)
-    torch.testing.assert_close(found.mean, true.mean, atol=0.02, rtol=0)
-    torch.testing.assert_close(found.covariance, true.covariance, atol=0.02, rtol=0)
+    torch.testing.assert_close(found.mean, true.mean, atol=0.03, rtol=0)
+    torch.testing.assert_close(found.covariance, true.covariance, atol=0.03, rtol=0)
 
 
 def test_a_bin_of_weight_two_counts_as_two(rng):
@@ -196,14 +158,6 @@ def test_few_bins_constant_and_repeated_features_still_give_gaussians(rng):
     assert float(found.covariance[0, 3, 3]) == RESOLUTION
 
 
-def test_shrinkage_vanishes_with_bins_and_is_whole_of_one():
-    correlated = torch.tensor([[1.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
-    assert shrinkage(correlated, 1) == 1.0
-    # (1 - .25)^2 / 99 over .25
-    assert shrinkage(correlated, 100) == pytest.approx(0.5625 / 99 / 0.25)
-    assert shrinkage(torch.eye(2, dtype=torch.float64), 1e6) == 1.0
-
-
 @pytest.mark.parametrize(
     ("mean", "covariance", "said"),
     [
@@ -216,11 +170,6 @@ def test_shrinkage_vanishes_with_bins_and_is_whole_of_one():
 def test_what_are_no_gaussians_is_refused(mean, covariance, said):
     with pytest.raises(ValueError, match=said):
         ClassGaussians(mean, covariance)
-
-
-def test_a_class_without_bins_is_refused():
-    with pytest.raises(ValueError, match="got no slip"):
-        ClassGaussians.fit(torch.zeros(4, 2), torch.zeros(4).bool())
 
 
 # Log likelihood ratios of uncertain scores -----------------------------------------------------

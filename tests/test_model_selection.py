@@ -153,7 +153,7 @@ def test_scenes_have_the_weight_that_is_asked_for(rng):
     names = ("M1|arm_motion", "M1|paper", "M2|arm_motion", "M2|paper")
     sample = sample_of(rng, names)
     is_quiet = ~(sample.is_slip & torch.isin(sample.group, torch.tensor([0, 2])))
-    per_bin = ("features", "is_slip", "group", "recording", "bin_index", "represents")
+    per_bin = ("features", "is_slip", "group", "recording", "bin_index", "sample_weight")
     kept = {name: getattr(sample, name)[is_quiet] for name in per_bin}
     quiet_arm = replace(sample, **kept)  # an arm that moves without slip
     how = recipe(scene_weights={"arm_motion": 0.5})

@@ -1,16 +1,323 @@
-"""Where the native engine comes from: built, found again, and done without in words."""
+"""The native engine: values of the reference, limits, manners; built, found, and done without."""
 
+import copy
+import multiprocessing
 import os
+import pickle
 import stat
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
+import numpy as np
 import pytest
 import torch
+from engine_bins import (
+    KINDS,
+    assert_equals_reference,
+    assert_modes_are_fair,
+    bins_of,
+    some_hand,
+)
+from small_detector import raw_bins, small_detector
 
 from tactslip_torch import FeaturePool, HandLayout, native
-from tactslip_torch.features.extractor import FeatureExtractor
+from tactslip_torch.features.pooling import ChannelPooling
+from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import build
+
+HAND = some_hand("GFF")
+POOL = FeaturePool(HAND, backend="torch")
+NAMES = POOL.names
+DESCRIPTORS = sorted({name.descriptor for name in NAMES})
+LEVELS = ("v2", "v3", "v4") if not native.why_not() and native.instruction_set() != "v1" else ()
+needs_engine = pytest.mark.skipif(bool(native.why_not()), reason=native.why_not())
+
+
+def made(pool, selected=None, backend="auto"):
+    """The pool, or some of it, by another backend."""
+    return pool.select(range(len(pool.names)) if selected is None else selected, backend)
+
+
+def generator(seed=5):
+    return torch.Generator().manual_seed(seed)
+
+
+def noise(num, hand=HAND, dtype=torch.float64, seed=5):
+    return bins_of("random", num, hand, 100, generator(seed)).to(dtype)
+
+
+def assert_is_reference(bins, pool=POOL, selected=None, kinds=(False, True)):
+    """Features in float64 and, mixed, by statistics in float32 of bins that float32 holds."""
+    for mixed in kinds:
+        arithmetic = "native" if mixed else "double"
+        maker = FeaturePool(pool.hand, **pool.facts() | {"arithmetic": arithmetic})
+        given = bins.float() if mixed else bins
+        found = made(maker, selected, "native")(given, torch.float64)
+        expected = made(pool, selected, "torch")
+        assert_equals_reference(found, expected(given.double()), expected.names, mixed)
+
+
+# Values --------------------------------------------------------------------------------------
+
+
+@needs_engine
+@pytest.mark.parametrize("kind", KINDS)
+def test_whole_pool_on_bins_of_every_kind(kind):
+    spectrum = "reference" if KINDS.index(kind) % 2 else "clean"
+    pool = FeaturePool(HAND, spectrum=spectrum)
+    bins = bins_of(kind, 20, HAND, 100, generator(0))
+    # float32 does not hold the vibration of what is nearly constant
+    assert_is_reference(bins, pool, kinds=(False,) if kind == "near_constant" else (False, True))
+    if kind in ("tied", "rails"):
+        mixed = FeaturePool(HAND, spectrum=spectrum, arithmetic="native")
+        few = bins[:4].float()
+        assert_modes_are_fair(mixed(few, torch.float64), few.double(), pool, NAMES)
+
+
+@needs_engine
+@pytest.mark.parametrize("kind", ["tap", "step"])
+@pytest.mark.parametrize(("num", "noise"), [(100, 1e-3), (65, 1e-5)])
+def test_quiet_but_for_a_tap_or_a_step(num, kind, noise):
+    """Where float32 crowds about the median and the quartiles."""
+    made_by, shape = generator(3), (40, len(HAND), num)
+    place, time = torch.randint(1, num - 1, (*shape[:2], 1), generator=made_by), torch.arange(num)
+    form = time == place if kind == "tap" else time >= place
+    size = torch.randn(*shape[:2], 1, generator=made_by, dtype=torch.float64)
+    bins = size * (form + noise * torch.randn(shape, generator=made_by, dtype=torch.float64))
+    assert_is_reference(bins, FeaturePool(HAND, bin_samples=num, level=3), kinds=(True,))
+
+
+@needs_engine
+@pytest.mark.parametrize(
+    ("kinds", "num", "level", "spectrum"),
+    [("FG", 50, 3, "clean"), ("FGFGF", 64, 3, "reference"), ("F", 101, 4, "reference"),
+     ("FG", 20, 1, "clean"), ("GG", 300, 5, "clean"), ("FF", 300, 5, "reference")],
+)  # fmt: skip
+def test_other_hands_lengths_and_levels(kinds, num, level, spectrum):
+    pool = FeaturePool(some_hand(kinds), bin_samples=num, level=level, spectrum=spectrum)
+    for kind in ("random", "tied", "impulses"):
+        assert_is_reference(bins_of(kind, 8, pool.hand, num, generator()), pool)
+
+
+@needs_engine
+@pytest.mark.parametrize("level", LEVELS)
+def test_instruction_sets_agree_on_the_papers_hand(level, monkeypatch):
+    pool, best = FeaturePool(HandLayout.paper24()), native.instruction_set()
+    bins = bins_of("tied", 20, pool.hand, 100, generator())
+    plain = pool(bins)
+    monkeypatch.setenv("TACTSLIP_NATIVE", level)
+    assert native.instruction_set() == min(level, best)
+    fresh = made(pool)
+    for num in (1, 20):
+        torch.testing.assert_close(fresh(bins[:num]), plain[:num], rtol=1e-12, atol=1e-12)
+    assert_equals_reference(plain, made(pool, backend="torch")(bins), pool.names, mixed=False)
+
+
+@needs_engine
+@pytest.mark.parametrize("descriptor", DESCRIPTORS)
+def test_each_descriptor_alone(descriptor):
+    selected = [i for i, name in enumerate(NAMES) if name.descriptor == descriptor]
+    for kind in ("random", "tied", "zeros", "constants"):
+        assert_is_reference(bins_of(kind, 10, HAND, 100, generator()), selected=selected)
+
+
+@needs_engine
+@pytest.mark.parametrize("seed", range(3))
+def test_random_parts_in_any_order_and_repeated(seed, rng):
+    pool = FeaturePool(some_hand("GFFF"))
+    for size, kind in zip((1, 5, 60), ("random", "dead_channel", "near_constant"), strict=True):
+        selected = rng.integers(len(pool.names), size=size).tolist()
+        bins = bins_of(kind, 20, pool.hand, 100, generator(seed))
+        assert_is_reference(bins, pool, selected, kinds=(False,))
+
+
+@needs_engine
+def test_spectra_alone_know_which_branches_are_rounding():
+    size = 10.0 ** -torch.arange(30)[:, None, None]  # of vibration; branches go one by one
+    bins = 1 + size * noise(30)
+    in_frequency = [i for i, name in enumerate(NAMES) if name.domain == "freq"]
+    alone, among = made(POOL, in_frequency)(bins), made(POOL)(bins)[:, in_frequency]
+    torch.testing.assert_close(alone, among, rtol=1e-9, atol=1e-9)
+
+
+@needs_engine
+@pytest.mark.parametrize(("exponent", "arithmetic"), [(-300, "double"), (400, "native")])
+def test_magnitudes_in_range_need_no_reference(exponent, arithmetic):
+    bins = torch.ldexp(noise(20), torch.tensor(exponent))
+    found = FeaturePool(HAND, arithmetic=arithmetic)(bins)
+    assert_equals_reference(found, POOL(bins), NAMES, mixed=False)
+
+
+@needs_engine
+def test_float32_bins_in_float64_are_rounded_once_and_saturate():
+    pool, bins = made(POOL), noise(8, dtype=torch.float32)
+    assert torch.equal(pool(bins), pool(bins.double()).float())
+    of_energy = torch.tensor([name.descriptor == "energy" for name in NAMES])
+    huge = pool(1e30 * bins)
+    assert (huge[:, of_energy] == torch.finfo(torch.float32).max).all()
+    assert huge.isfinite().all()
+
+
+@needs_engine
+def test_statistics_in_float32_resolve_a_vibration_on_an_offset():
+    """Which float32 throughout cannot; near 1e3 many values are nearly equal, so no mode."""
+    bins = 1e3 + noise(12, dtype=torch.float32)
+    kept = [i for i, name in enumerate(NAMES) if name.descriptor != "mode"]
+    assert_is_reference(bins.double(), selected=kept, kinds=(True,))
+
+
+# The reference steps in ----------------------------------------------------------------------
+
+
+@needs_engine
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, 1e300, 1e-200])
+def test_strange_bins_are_the_references_and_change_no_other(bad):
+    bins = noise(40)
+    bins[[2, 35], 1, 17] = bad
+    bins[35, 2, :] = bad
+    if bad == 1e-200:
+        bins[2, 1] = bad
+    before = bins.clone()
+    extractor = made(POOL)
+    found, expected = extractor(bins), torch.stack([POOL(bins[2]), POOL(bins[35])])
+    torch.testing.assert_close(bins, before, rtol=0, atol=0, equal_nan=True)
+    strange = torch.zeros(40, dtype=torch.bool)
+    strange[[2, 35]] = True
+    torch.testing.assert_close(found[strange], expected, rtol=1e-9, atol=1e-9,
+                               equal_nan=True)  # fmt: skip
+    bins[strange] = 1.0
+    assert torch.equal(found[~strange], extractor(bins)[~strange])
+
+
+def test_a_channel_that_is_not_read_may_hold_anything():
+    selected = [i for i, name in enumerate(NAMES) if name.channel == "PVDF2"]
+    bins = noise(6)
+    broken = torch.full_like(bins, torch.nan)
+    broken[:, 2] = bins[:, 2]
+    extractor = made(POOL, selected)
+    assert torch.equal(extractor(broken), extractor(bins))
+
+
+def test_gradients_tangents_and_vmap_are_the_references():
+    extractor, bins = made(POOL, [3, 70]), noise(2).requires_grad_()
+    extractor(bins).sum().backward()
+    expected = bins.detach().clone().requires_grad_()
+    POOL(expected)[:, [3, 70]].sum().backward()
+    torch.testing.assert_close(bins.grad, expected.grad)
+    with torch.no_grad():
+        assert not extractor(bins).requires_grad
+    bins = bins.detach()
+    torch.testing.assert_close(torch.func.vmap(extractor)(bins), POOL(bins)[:, [3, 70]])
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script. is deprecated")  # torch's own, in jvp
+def test_forward_mode_is_the_references():
+    pool = FeaturePool(some_hand("F"), bin_samples=20, level=1, backend="torch")
+    bins, direction = torch.randn(2, 2, 1, 20, generator=generator()).double()
+    _, slope = torch.func.jvp(made(pool), (bins,), (direction,))
+    _, expected = torch.func.jvp(pool, (bins,), (direction,))
+    torch.testing.assert_close(slope, expected)
+
+
+# Manners -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("backend", "num"), [("torch", 3), *(("auto", n) for n in (0, 1, 131))])
+def test_threads_and_number_of_bins_change_nothing(backend, num):
+    extractor, bins = made(POOL, backend=backend), noise(num)
+    before, found = torch.get_num_threads(), {}
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found[threads] = extractor(bins)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(found[1], found[2])
+    assert found[1].shape == (num, len(NAMES))
+    if num:
+        torch.testing.assert_close(found[1][:1], extractor(bins[:1]), rtol=1e-11, atol=1e-11)
+
+
+def scores_of(seed):
+    """By a detector of its own, in this thread or process."""
+    samples = raw_bins(40, seed)
+    return small_detector().score_raw(samples).numpy()
+
+
+@pytest.mark.parametrize("how", ["threads", "fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_detectors_in_threads_and_processes_score_alike(how):
+    expected = [scores_of(seed) for seed in range(4)]
+    if how == "threads":
+        pool = ThreadPoolExecutor(2)
+    else:
+        pool = ProcessPoolExecutor(2, multiprocessing.get_context(how))
+    with pool:
+        for found, one in zip(pool.map(scores_of, range(4)), expected, strict=True):
+            np.testing.assert_allclose(found, one, rtol=1e-12, atol=1e-12)
+
+
+def test_copies_of_a_detector_score_alike_and_one_that_is_changed_anew():
+    detector, samples = small_detector(), raw_bins(3)
+    expected = detector.score_raw(samples)
+    for other in (copy.deepcopy(detector), pickle.loads(pickle.dumps(detector))):
+        assert torch.equal(other.score_raw(samples), expected)
+        other.head.constant += 1.0
+        torch.testing.assert_close(other.score_raw(samples), expected + 1.0)
+        other.scaler.maximum = other.scaler.maximum + 1e6
+        assert (other.score_raw(samples) != expected + 1.0).any()
+    assert torch.equal(detector.score_raw(samples), expected)
+
+
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+def test_leading_axes_strides_copies_and_modes(backend):
+    extractor, bins = made(POOL, [5, 90, 17], backend), noise(6, dtype=torch.float32)
+    flat = extractor(bins)
+    assert flat.dtype == torch.float32
+    torch.testing.assert_close(extractor(bins.reshape(2, 3, *bins.shape[1:])).flatten(0, 1), flat)
+    torch.testing.assert_close(extractor(bins[0]), flat[0])
+    strided = bins.transpose(1, 2).contiguous().transpose(1, 2)
+    for other in (extractor, copy.deepcopy(extractor), pickle.loads(pickle.dumps(extractor))):
+        assert torch.equal(other(strided), flat)
+    with torch.inference_mode():
+        inside = made(POOL, [5, 90, 17], backend)
+        assert torch.equal(inside(bins), flat)
+    assert torch.equal(inside(bins), flat)
+    with torch.device("meta"):
+        assert torch.equal(made(POOL, [5, 90, 17])(bins), flat)
+
+
+@pytest.mark.parametrize("kind", [torch.tensor, np.array, tuple])
+def test_a_selection_is_any_sequence_of_whole_numbers(kind):
+    assert POOL.select(kind([7, 3])).selected == (7, 3)
+    with pytest.raises(TypeError):
+        made(POOL, [3.7])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"selected": []}, "empty selection"),
+        ({"selected": [len(NAMES)]}, rf"must lie in 0..{len(NAMES) - 1}, the pool's {len(NAMES)}"),
+        ({"backend": "fast"}, "backend must be one of auto, native, torch, got 'fast'"),
+    ],
+)
+def test_what_is_refused_is_one_line(arguments, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        made(POOL, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+def test_wrong_bins_are_refused_as_the_pool_does(backend):
+    extractor = made(POOL, backend=backend)
+    with pytest.raises(ValueError, match=r"expected bins \[\*, 3, 100\]"):
+        extractor(torch.zeros(2, 4, 100))
+    with pytest.raises(ValueError, match="expected float32 or float64 bins"):
+        extractor(torch.zeros(2, 3, 100, dtype=torch.int32))
+
+
+# Built and found ---------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -31,7 +338,7 @@ def script(path, text):
 def test_switched_off_torch_carries_on_and_says_so(anew, caplog):
     anew.setenv(build.SWITCH, "0")
     pool = FeaturePool(HandLayout.paper24())
-    extractor = FeatureExtractor(pool, [7])
+    extractor = pool.select([7])
     assert extractor.backend == "torch"
     assert extractor(torch.ones(2, 24, 100)).shape == (2, 1)
     assert caplog.messages == [
@@ -39,7 +346,7 @@ def test_switched_off_torch_carries_on_and_says_so(anew, caplog):
         "the native engine is switched off by TACTSLIP_NATIVE=0"
     ]
     with pytest.raises(ValueError, match=r'backend "native" cannot be used: .* TACTSLIP_NATIVE=0'):
-        FeatureExtractor(pool, [7], "native")
+        pool.select([7], "native")
 
 
 def test_without_a_compiler_the_remedy_is_named(monkeypatch, tmp_path):
@@ -87,3 +394,65 @@ def test_a_first_use_builds_into_the_users_cache_once(tmp_path):
     assert "building" not in said[1]
     kept = list((tmp_path / "tactslip_torch" / "native").iterdir())
     assert [path.name for path in kept] == [build.library_name()]
+
+
+# Changes and kinds of tensors that the engine must notice ---------------------------------------
+
+
+class _HalfScaler(FeatureScaler):
+    def forward(self, features):
+        return super().forward(features) / 2
+
+
+def _half_scaler(detector):
+    scaler = detector.scaler
+    detector.scaler = _HalfScaler(scaler.minimum, scaler.maximum, scaler.knee)
+
+
+CHANGES = {
+    "shared memory": lambda detector: detector.share_memory(),
+    "bfloat16": lambda detector: detector.bfloat16(),
+    "scaler of its own": _half_scaler,
+    "forward of its own": lambda detector: setattr(detector.head, "forward", lambda z: z.sum(-1)),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_detector_that_is_changed_after_use_scores_as_torch_does(change):
+    found, bins = [], raw_bins(6)
+    for backend in ("auto", "torch"):
+        detector = small_detector(backend=backend)
+        detector.score_raw(bins)
+        CHANGES[change](detector)
+        _ = [np.full(12, 7.0) for _ in range(500)]  # takes memory that was given back
+        found.append(detector.score_raw(bins))
+    torch.testing.assert_close(*found, rtol=1e-9, atol=1e-9)
+
+
+def test_a_gradient_asked_for_after_use_is_given():
+    detector, bins = small_detector(), raw_bins(2)
+    detector.score_raw(bins)
+    detector.head.linear.requires_grad_()
+    detector.score_raw(bins).sum().backward()
+    assert detector.head.linear.grad.abs().max() > 0
+
+
+def test_pooling_follows_masks_of_any_shape_and_gradients_of_its_constants():
+    layer = ChannelPooling.fit(HAND, POOL.names, POOL(noise(50)), ["mean", "std"])
+    place = {name: index for index, name in enumerate(POOL.names)}
+    features = POOL(noise(7))[:, [place[name] for name in layer.inputs]]
+    mask = torch.arange(len(HAND)) == 0
+    each = layer(features, mask.expand(7, -1))
+    for backend in ("auto", "torch"):
+        torch.testing.assert_close(layer(features, mask[None], backend), each)
+        torch.testing.assert_close(layer(features[0], mask, backend), each[0])
+        with pytest.raises(ValueError, match=f"expected {len(layer.inputs)} features, got 5"):
+            layer(features[:, :5], backend=backend)
+    layer.knee.requires_grad_()
+    assert layer(features).requires_grad
+
+
+def test_half_precision_is_torchs():
+    bins = noise(3)
+    expected = POOL(bins, torch.float16)
+    torch.testing.assert_close(made(POOL)(bins, torch.float16), expected, rtol=1e-3, atol=1e-3)

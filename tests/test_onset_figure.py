@@ -278,15 +278,13 @@ def test_dead_films_and_few_decisions_are_drawn_without_a_warning(draw, level):
     draw(view=(0.0, 0.05), channels=films, probability=one, is_slip=one, is_valid=one, alarms=[])
 
 
-@pytest.mark.parametrize(("num", "bottom"), [(200, 0.0), (300, 0.97), (20_000, 0.97)])
-def test_many_marks_are_fine_and_too_many_short(draw, rng, num, bottom):
+def test_of_many_marks_each_is_fine(draw, rng):
     few, many = (
         next(part for part in draw(alarms=alarms).axes[0].collections if part.get_gid() == "alarm")
-        for alarms in ([(1.0, 1.0)], [(time, time) for time in rng.uniform(0, 2, num)])
+        for alarms in ([(1.0, 1.0)], [(time, time) for time in rng.uniform(0, 2, 300)])
     )
     assert many.get_linewidth()[0] < few.get_linewidth()[0] / 2
-    assert len(many.get_paths()) == num
-    assert {float(path.vertices[0, 1]) for path in many.get_paths()} == {bottom}
+    assert len(many.get_paths()) == 300
 
 
 # Tables ----------------------------------------------------------------------------------------

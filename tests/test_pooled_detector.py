@@ -17,9 +17,9 @@ from tactslip_torch.analysis.certificate import certify
 from tactslip_torch.analysis.importance import Refit, without
 from tactslip_torch.commands.importance import sensors
 from tactslip_torch.commands.train import train
+from tactslip_torch.deploy.check import simulated_bins
+from tactslip_torch.deploy.export import export_detector
 from tactslip_torch.features.bin_sample import SampledBins
-from tactslip_torch.graph.export import export_detector
-from tactslip_torch.graph.trials import simulated_bins
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.onset.decisions import score_stream
 from tactslip_torch.onset.streaming import StreamingDetector

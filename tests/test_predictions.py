@@ -7,10 +7,8 @@ import torch
 from small_detector import HAND, raw_bins, small_detector
 from test_detector import noise, random_detector
 
-from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import ClassGaussians, ExpectedScore
-from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.model.missing_channels import ClassGaussians, expected_score
 from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 
 BAD = [float("nan"), float("inf"), -float("inf"), 1e308]
@@ -135,7 +133,8 @@ def test_every_extreme_gives_a_finite_score_or_a_flag(kind, detector):
         assert found.is_valid.float().mean() > 0.9
     single = copy.deepcopy(detector).float()  # as in float64 but for the head
     z = scaled_of(detector, samples.double())
-    assert torch.equal(single.score_raw(samples), single.head(z.float()))
+    expected = single.head(z.float())
+    torch.testing.assert_close(single.score_raw(samples), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_all_channels_missing_gives_the_score_of_what_is_known_beforehand(detector):
@@ -183,21 +182,6 @@ def test_a_head_that_overflows_is_not_valid():
     assert not found.is_valid[~found.score.isfinite()].any()
 
 
-def test_a_feature_far_from_zero_keeps_its_digits_in_a_float32_detector():
-    """A mean of 1e3 V that moves by 1e-2 V."""
-    detector = random_detector()
-    means = [i for i, n in enumerate(detector.pool.names) if str(n).endswith("raw time mean")][:12]
-    generator = torch.Generator().manual_seed(6)
-    bins = 1e3 + 1e-2 * torch.randn(200, 24, 1, generator=generator, dtype=torch.float64)
-    bins = bins + 1e-2 * torch.randn(200, 24, 100, generator=generator, dtype=torch.float64)
-    scaler = FeatureScaler.fit(detector.pool(bins)[:, means])
-    parts = (detector.pool, detector.channel_filter, means, scaler, detector.head)
-    samples = bins[:, :, :1] + torch.zeros(200, 24, 150)
-    exact = SlipDetector(*parts).score_raw(samples.float().double())
-    single = SlipDetector(*parts).float().score_raw(samples.float())
-    assert float((single - exact).abs().max() / exact.std()) < 1e-5
-
-
 @pytest.mark.parametrize("policy", ["mask", "raise"])
 @pytest.mark.parametrize(
     ("samples", "message"),
@@ -214,11 +198,6 @@ def test_what_are_no_samples_of_this_hand_is_refused_in_words(samples, message, 
         detector.predict(samples[..., :100], nonfinite=policy)
 
 
-def test_an_unknown_arithmetic_is_refused():
-    with pytest.raises(ValueError, match="arithmetic must be one of double, native, got 'half'"):
-        FeaturePool(HAND, arithmetic="half")
-
-
 # Masked channels -------------------------------------------------------------------------------
 
 
@@ -226,7 +205,7 @@ def test_an_unknown_arithmetic_is_refused():
 def test_a_masked_channel_leaves_the_expected_score_and_its_variance(num, small):
     samples, channel = raw_bins(num), int(small.channel_index[0])
     is_lost = (small.channel_index == channel).expand(num, -1)
-    expected = ExpectedScore(small.head, small.gaussians)(scaled_of(small, samples), is_lost)
+    expected = expected_score(small.head, small.gaussians, scaled_of(small, samples), is_lost)
     mask = torch.arange(len(HAND)) == channel
     broken = samples.clone()
     broken[:, channel] = torch.nan
@@ -256,14 +235,6 @@ def test_whole_bins_among_broken_ones_keep_their_score_and_are_certain(small):
     assert torch.equal(found.score[kept], whole.score[kept])
     assert torch.equal(found.variance > 0, ~kept)
     assert torch.equal(found.is_valid, kept & whole.is_valid)
-
-
-def test_gradients_pass_by_a_masked_channel(small):
-    bins = small.channel_filter.valid(raw_bins(20)).requires_grad_()
-    small.predict(bins, masked_channels=["PVDF2"]).score.sum().backward()
-    assert bins.grad.isfinite().all()
-    assert torch.equal(bins.grad[:, 3], torch.zeros_like(bins.grad[:, 3]))
-    assert bins.grad[:, 2].abs().max() > 0
 
 
 @pytest.mark.parametrize("num", [2, 30])

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.features import ranking
-from tactslip_torch.features.ranking import rank_per_cost, rank_weighted
-from tactslip_torch.features.selection import rank_features
+from tactslip_torch.features import selection
+from tactslip_torch.features.selection import rank_features, rank_per_cost, rank_weighted
 
 
 def related(rng, num_bins=80, num_features=30):
@@ -62,7 +61,7 @@ def test_weighted_does_not_depend_on_threads_or_units(rng, monkeypatch):
         torch.set_num_threads(1)
     assert torch.equal(rank_weighted(scores, 2.0**20 * features, 60), one)
     assert torch.equal(rank_weighted(scores, features.flip(0), 60), one)
-    monkeypatch.setattr(ranking, "_MOST_AT_ONCE", 59)
+    monkeypatch.setattr(selection, "_MOST_AT_ONCE", 59)
     assert torch.equal(rank_weighted(scores, features, 60), one)
 
 

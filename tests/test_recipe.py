@@ -8,18 +8,18 @@ import torch
 from scipy.stats import ttest_ind
 from small_set import SMALL_HAND, SmallSet, small_maker, small_recipe
 
-from tactslip_torch.analysis.pareto import Workshop
+from tactslip_torch.analysis.pareto import ParetoSearch
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.features.groups import matching
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.survey import Survey
+from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import calibration_from_dict, fit_platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.missing_channels import RESOLUTION
-from tactslip_torch.training import selection
-from tactslip_torch.training.fitting import TrainingPass
+from tactslip_torch.training import plan as planning
 from tactslip_torch.training.learner import SlipLearner
+from tactslip_torch.training.plan import TrainingPass, plan_detector
 from tactslip_torch.training.recipe import (
     Recipe,
     balanced_accuracy,
@@ -27,7 +27,6 @@ from tactslip_torch.training.recipe import (
     sample_weight,
     select_features,
 )
-from tactslip_torch.training.selection import Plan, plan_detector
 
 NUM = 30
 FEW = {"num_features": 4, "penalties": (0.1, 3.0), "sample_bins": 500}
@@ -46,19 +45,19 @@ def make_parts(rng, materials="abc", cycles=2, bins=40, share=0.5):
     return parts
 
 
-def surveyed(recipe, parts):
-    survey = Survey(NUM, recipe.sample_bins)
+def statistics_from(recipe, parts):
+    statistics = TrainingStatistics(NUM, recipe.sample_bins)
     for recording, features, is_slip in parts:
-        survey.update(str(recording), recipe.group(recording), features, is_slip)
-    return survey
+        statistics.update(str(recording), recipe.group(recording), features, is_slip)
+    return statistics
 
 
 def selected(recipe, parts):
-    return select_features(recipe, surveyed(recipe, parts))
+    return select_features(recipe, statistics_from(recipe, parts))
 
 
 def planned(recipe, parts):
-    return plan_detector(recipe, surveyed(recipe, parts))
+    return plan_detector(recipe, statistics_from(recipe, parts))
 
 
 def passed(plan, parts):
@@ -120,7 +119,7 @@ def test_near_duplicates_are_passed_over(rng):
 @pytest.mark.parametrize("balance", ["undersample", "weights"])
 def test_a_sample_stands_for_all_bins_with_both_classes_of_one_weight(balance, rng):
     recipe, parts = Recipe(sample_bins=7, balance=balance), make_parts(rng, share=0.8)
-    sample = surveyed(recipe, parts).sample.bins()
+    sample = statistics_from(recipe, parts).sample.bins()
     assert len(sample.is_slip) == 3 * 2 * 7
     weights, num_rest = sample_weight(recipe, sample), int((~together(parts)[1]).sum())
     totals = [float(weights[mine].sum()) for mine in (sample.is_slip, ~sample.is_slip)]
@@ -242,19 +241,6 @@ def test_what_stands_for_missing_channels_is_of_the_selected_features(rng):
     assert planned(Recipe(**FEW, degree=3), parts).gaussians is None
 
 
-def test_a_plan_survives_a_checkpoint(rng, tmp_path):
-    recipe, parts = Recipe(**FEW, compress=True), make_parts(rng)
-    plan = planned(recipe, parts)
-    torch.save(plan.to_dict(), tmp_path / "plan.pt")
-    again = Plan.from_dict(torch.load(tmp_path / "plan.pt", weights_only=True), recipe, POOL)
-    assert again.validation == plan.validation
-    z = together(parts)[0]
-    torch.testing.assert_close(again.selection(z), plan.selection(z), rtol=0, atol=0)
-    torch.testing.assert_close(again.gaussians.mean, plan.gaussians.mean, rtol=0, atol=0)
-    heads = [passed(each, parts).solve() for each in (plan, again)]
-    torch.testing.assert_close(heads[0].state_dict(), heads[1].state_dict(), rtol=0, atol=0)
-
-
 # Passes ----------------------------------------------------------------------------------------
 
 
@@ -288,8 +274,11 @@ def test_undersampling_keeps_about_as_many_slips_as_non_slips(rng):
     assert plan.num_bins == 2 * num_rest
 
 
-@pytest.mark.parametrize("change", [{"degree": 3}, {"kernel": "rbf", "gamma": 0.3}], ids=str)
-@pytest.mark.parametrize("balance", ["undersample", "weights"])
+@pytest.mark.parametrize(
+    ("change", "balance"),
+    [({"degree": 3}, "undersample"), ({"kernel": "rbf", "gamma": 0.3}, "weights")],
+    ids=str,
+)
 def test_a_kernel_that_does_not_fold_keeps_some_bins_that_stand_for_all(
     change, balance, rng, monkeypatch, caplog
 ):
@@ -297,7 +286,7 @@ def test_a_kernel_that_does_not_fold_keeps_some_bins_that_stand_for_all(
     recipe = Recipe(**FEW | {"penalties": 0.01}, balance=balance, **change)
     whole = planned(recipe, parts)
     assert not whole.adds_up
-    monkeypatch.setattr(selection, "MOST_KEPT_BINS", 300)
+    monkeypatch.setattr(planning, "MOST_KEPT_BINS", 300)
     thinned = planned(recipe, parts)
     assert (whole.bin_weight, thinned.num_bins) == (1.0, 300)
     assert thinned.bin_weight == pytest.approx(whole.num_bins / 300, rel=1e-3)
@@ -316,13 +305,13 @@ def test_a_kernel_that_does_not_fold_keeps_some_bins_that_stand_for_all(
 
 def told_apart(rng, pool):
     """Statistics of bins of a pool's features, some of which tell the classes apart."""
-    survey = Survey(len(pool.names), 50)
+    statistics = TrainingStatistics(len(pool.names), 50)
     for group in "ab":
         is_slip = torch.arange(60) % 2 == 0
         features = torch.from_numpy(rng.standard_normal((60, len(pool.names))))
         features += torch.from_numpy(rng.random(len(pool.names))) * is_slip[:, None]
-        survey.update(group, group, features.float(), is_slip)
-    return survey
+        statistics.update(group, group, features.float(), is_slip)
+    return statistics
 
 
 @pytest.mark.parametrize(
@@ -345,11 +334,11 @@ def test_what_matches_has_every_attribute_that_is_asked_for(wanted, does, num):
 
 @pytest.mark.parametrize("most_correlation", [1.0, 0.995])
 def test_only_what_matches_is_ranked_and_in_the_order_of_the_whole_ranking(most_correlation, rng):
-    survey, wanted = told_apart(rng, SMALL_POOL), {"domain": "freq"}
+    statistics, wanted = told_apart(rng, SMALL_POOL), {"domain": "freq"}
     options = {"most_correlation": most_correlation, "penalties": 0.1}
     recipe = Recipe(num_features=9, feature_filter=wanted, **options)
-    plan = plan_detector(recipe, survey, SMALL_POOL)
-    every = select_features(Recipe(num_features=len(SMALL_POOL.names)), survey).selected
+    plan = plan_detector(recipe, statistics, SMALL_POOL)
+    every = select_features(Recipe(num_features=len(SMALL_POOL.names)), statistics).selected
     of_spectra = [index for index in every if SMALL_POOL.names[index].domain == "freq"]
     assert list(plan.selection.selected) == of_spectra[:9]
     numbers = {"matching": len(of_spectra), "num_features": [9]}
@@ -358,8 +347,8 @@ def test_only_what_matches_is_ranked_and_in_the_order_of_the_whole_ranking(most_
 
 def test_more_features_than_match_are_cut_and_that_is_said(rng, caplog):
     options = {"feature_filter": {"kind": "SG"}, "penalties": (0.1, 1.0)}
-    recipe, survey = Recipe(num_features=[2, 60, 120], **options), told_apart(rng, SMALL_POOL)
-    plan = plan_detector(recipe, survey, SMALL_POOL)
+    recipe, statistics = Recipe(num_features=[2, 60, 120], **options), told_apart(rng, SMALL_POOL)
+    plan = plan_detector(recipe, statistics, SMALL_POOL)
     numbers = {"matching": 13, "num_features": [2, 13]}
     assert plan.feature_filter == {"wanted": {"kind": ["SG"]}, **numbers}
     assert [row["num_features"] for row in plan.validation] == [2, 2, 13, 13]
@@ -372,7 +361,7 @@ def test_a_filter_is_never_silently_ignored(rng):
     with pytest.raises(ValueError, match=r"needs the names of features; hand over the pool"):
         plan_detector(recipe, told_apart(rng, SMALL_POOL))
     with pytest.raises(ValueError, match=r"recipe.feature_filter is not for a search"):
-        Workshop({}, None, None, recipe)
+        ParetoSearch({}, None, None, recipe)
     maker = small_maker(SmallSet())
     for wanted, message in (
         ({"descriptor": "meen"}, "no feature has descriptor='meen', expected some of mean, median"),

@@ -14,10 +14,10 @@ from tactslip_torch.onset.events import (
     EventRules,
     LatencyParts,
     Watched,
-    event_metrics,
     pooled_metrics,
+    recording_events,
 )
-from tactslip_torch.report import pipeline_figure, published
+from tactslip_torch.report import published
 from tactslip_torch.report.metrics import answer_metrics, bin_metrics, split_metrics
 from tactslip_torch.report.results import (
     PAPER_LINE,
@@ -93,7 +93,9 @@ def events_of(seed=0, *, quiet_s=60.0, compute_s=None, num=20):
             )
         )
     latency = LatencyParts(0.0125, 0.05, compute_s)
-    return event_metrics(many, EventRules(settle_s=0.1), latency, num_resamples=50)
+    rules = EventRules(settle_s=0.1)
+    events = [recording_events(one, rules, latency) for one in many]
+    return pooled_metrics(events, num_resamples=50)
 
 
 def no_events():
@@ -163,8 +165,10 @@ def tuning():
 
 
 def test_cells_are_text_and_repeated_labels_are_left_blank():
-    rows = [["a", "b", "c"], ["x", 1, None], ["x", 2, True], ["y", 2, False]]
-    assert table(rows, merged=2).splitlines() == [
+    rows = [("x", 1, None), ("x", 2, True), ("y", 2, False)]
+    shown = [dict(zip("abc", row, strict=True)) for row in rows]
+    assert table([]) == ""
+    assert table(shown, merged=2).splitlines() == [
         "a  b    c",
         "x  1    -",
         "   2  yes",
@@ -254,7 +258,7 @@ def test_selected_features_are_counted_beside_the_papers():
 
 
 def test_choices_mark_the_best_and_name_the_worst_group():
-    lines = validation_table(CHOICES, simulated=True).splitlines()
+    lines = validation_table(metrics_of(validation=CHOICES)).splitlines()
     assert lines[0].startswith("SIMULATED")
     cells = [line.split() for line in lines[2:]]
     assert cells[0] == ["60", "degree", "2,", "c", "0.5", "0.1", "80.00", "70.00", "M2"]
@@ -265,8 +269,8 @@ def test_choices_mark_the_best_and_name_the_worst_group():
         for use in ("channel", "pooled")
     ]
     nested = {"mean": 0.8, "balanced_accuracy": {"M1": 0.7, "M2": 0.9}}
-    lines = validation_table(more, simulated=False, nested=nested).splitlines()
-    assert len(lines) == 1 + 3 + 1  # the best of each structure, and the one that was chosen
+    lines = validation_table(metrics_of(validation=more, nested_validation=nested)).splitlines()
+    assert len(lines) == 2 + 3 + 1  # the best of each structure, and the one that was chosen
     assert lines[-1].endswith("evaluated on it: 80.00 % (M1 70.00, M2 90.00)")
 
 
@@ -280,7 +284,7 @@ def test_tuning_says_what_was_learned():
 
 
 def test_reliability_and_prediction_sets_have_a_row_for_each_role():
-    lines = reliability_table(BY_ROLE, simulated=True).splitlines()
+    lines = reliability_table(metrics_of(alarm={"reliability": BY_ROLE})).splitlines()
     rows = [line.split() for line in lines[2:]]
     assert rows[0] == ["test", "all", "4000", "1.25", "2.50", "0.0625", "0.2500"]
     assert rows[1] == ["M1", "800", "2.00", "4.00", "0.0625", "0.2500"]
@@ -337,8 +341,12 @@ FIGURES = {
         path,
     ),
     "selected": lambda path, of: selected_features_figure(features(), path, simulated=of),
-    "validation": lambda path, of: validation_figure([*CHOICES, RBF], path, simulated=of),
-    "reliability": lambda path, of: reliability_figure(BY_ROLE, path, simulated=of),
+    "validation": lambda path, of: validation_figure(
+        metrics_of(simulated=of, validation=[*CHOICES, RBF]), path
+    ),
+    "reliability": lambda path, of: reliability_figure(
+        metrics_of(simulated=of, alarm={"reliability": BY_ROLE}), path
+    ),
     "tuning": lambda path, of: tuning_figure(tuning(), path, simulated=of),
     "answers": lambda path, of: answers_figure(metrics_of(simulated=of, answers=ANSWERS), path),
     "events": lambda path, of: events_figure(
@@ -362,18 +370,13 @@ def test_a_figure_is_written_whole_and_says_what_is_simulated(drawn, tmp_path, n
     assert ["SIMULATED" in figure.get_suptitle() for figure in drawn] == [True, False]
 
 
-def test_the_pipeline_is_drawn(drawn, tmp_path):
-    pipeline_figure(tmp_path / "pipeline.png")
-    assert_png(tmp_path / "pipeline.png")
-
-
 @pytest.mark.parametrize("kinds", [("SG",), ("IMU", "SG"), tuple("abcdefghi")])
 def test_selected_features_of_another_hand_stand_alone(drawn, tmp_path, kinds):
     row = {"channel": "X1", "component": "D6", "domain": "freq", "descriptor": "mean"}
     rows = [row | {"name": "X1", "kind": kind, "finger": "palm"} for kind in kinds]
     selected_features_figure(rows, tmp_path / "selected.png", simulated=False)
     bars = drawn[0].axes[0]
-    heights = {layer.get_label(): sum(b.get_height() for b in layer) for layer in bars.containers}
+    heights = {layer.get_label(): sum(b.get_width() for b in layer) for layer in bars.containers}
     assert {kind: heights[kind] for kind in kinds} == dict.fromkeys(kinds, 1)
     words = [text.get_text() for axes in drawn[0].axes for text in axes.findobj(Text)]
     assert not any("paper" in word or "[" in word for word in words)
@@ -388,27 +391,8 @@ def test_a_rule_has_one_line_in_the_legend_however_it_is_written(drawn, tmp_path
     assert labels[:3] == ["k of n", "cusum", "median"]
 
 
-@pytest.mark.parametrize(
-    ("draw", "message"),
-    [
-        (lambda path: confusion_figure({"simulated": True, "splits": {}}, path), "no split"),
-        (lambda path: selected_features_figure([], path, simulated=True), "no selected feature"),
-        (lambda path: reliability_figure({}, path, simulated=True), "no role"),
-        (lambda path: events_figure(metrics_of(), path), "no events to draw"),
-        (
-            lambda path: events_figure(metrics_of(events={"test": {"a": no_events()}}), path),
-            "no events to draw",
-        ),
-    ],
-)
-def test_nothing_to_draw_is_an_error_and_leaves_no_file(tmp_path, draw, message):
-    with pytest.raises(ValueError, match=message):
-        draw(tmp_path / "figure.png")
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_failed_write_keeps_the_older_figure(tmp_path, monkeypatch):
-    path = tmp_path / "pipeline.png"
+    path = tmp_path / "figure.png"
     path.write_bytes(b"an older figure")
 
     def full_disk(self, target, **_):
@@ -417,7 +401,7 @@ def test_a_failed_write_keeps_the_older_figure(tmp_path, monkeypatch):
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", full_disk)
     with pytest.raises(OSError, match="no space left"):
-        pipeline_figure(path)
+        confusion_figure(metrics_of(), path)
     assert path.read_bytes() == b"an older figure"
     assert list(tmp_path.iterdir()) == [path]
 

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from tactslip_torch.model.kernels import QuadraticForm, collapse
-from tactslip_torch.model.rounding import gamma, rounding_bound, worst_error
+from tactslip_torch.model.rounding import rounding_bound, worst_error
 
-U = Fraction(1, 2**24)
 KINDS = ["plain", "cancelling", "huge", "tiny", "mixed", "low rank", "flat", "fitted"]
 
 
@@ -53,7 +52,7 @@ def exact_score(head, z):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("num", [1, 5, 120])
+@pytest.mark.parametrize("num", [1, 120])
 def test_the_bound_is_above_the_worst_seen_and_not_far(kind, num, rng):
     head = head_of(kind, num, rng)
     bound, seen = rounding_bound(head), worst_error(head, seed=num)
@@ -75,33 +74,6 @@ def test_the_bound_holds_against_exact_arithmetic(kind, num, rng):
         for dtype, bound in bounds.items():
             error = abs(Fraction(float(stored(head, dtype)(z.to(dtype)))) - exact)
             assert error <= Fraction(bound.error)
-
-
-def test_the_bound_is_of_no_order_of_summation(rng):
-    """Plain float32 loops in NumPy, terms in another order each time."""
-    num = 20
-    head = head_of("plain", num, rng)
-    single = stored(head, torch.float32)
-    quadratic, linear = single.quadratic.numpy(), single.linear.numpy()
-    for _ in range(40):
-        z = rng.choice(np.float32([-1, 1]), num)
-        order, total = rng.permutation(num), np.float32(0)
-        for i in order:
-            row = np.float32(0)
-            for j in rng.permutation(num):
-                row = np.float32(row + np.float32(quadratic[i, j] * z[j]))
-            total = np.float32(total + np.float32(np.float32(row + linear[i]) * z[i]))
-        error = abs(
-            Fraction(float(total + single.constant.numpy())) - exact_score(head, z.tolist())
-        )
-        assert error <= Fraction(rounding_bound(head).error)
-
-
-def test_gamma_is_rounded_up_and_ends():
-    for count in (1, 3, 1000):
-        expected = count * U / (1 - count * U)
-        assert expected <= Fraction(gamma(count, torch.float32)) <= expected * (1 + U * U)
-    assert gamma(2**24, torch.float32) == math.inf
 
 
 def test_what_overflows_and_what_is_nan():

@@ -5,9 +5,7 @@ import pytest
 import torch
 from any_hands import AnyHand
 
-from tactslip_torch.features.extractor import FeatureExtractor
-from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.rounding import is_rounding
+from tactslip_torch.features.pool import FeaturePool, is_rounding
 from tactslip_torch.hand import Channel, HandLayout
 from tactslip_torch.training.recipe import Recipe
 
@@ -57,7 +55,7 @@ def test_what_is_not_rounding_is_the_same_in_every_engine():
     firm = (~is_rounding(pool)).nonzero().flatten().tolist()
     bins = torch.randn(60, 3, 64, generator=torch.Generator().manual_seed(2)).double()
     reference = pool(bins)[:, firm]
-    found = FeatureExtractor(pool, firm, backend="auto")(bins)
+    found = pool.select(firm, backend="auto")(bins)
     error = (found - reference).abs() / reference.std(0).clamp(min=1e-12)
     is_off = np.asarray(error > 1e-6).mean(0)  # a mode or an entropy may step in some bins
     assert is_off.max() < 0.1

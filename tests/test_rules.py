@@ -22,7 +22,6 @@ from tactslip_torch.onset.rules import (
     KOfN,
     Latch,
     Rule,
-    count_alarms,
     latch,
     latch_start,
     rule_from_dict,
@@ -30,9 +29,7 @@ from tactslip_torch.onset.rules import (
 
 LIST = (
     KOfN(1, 1),
-    KOfN(1, 4),
     KOfN(2, 3),
-    KOfN(5, 5),
     KOfN(7, 20),
     Cusum(),
     Cusum(drift=0.3, evidence=0.2, ceiling=3.0),
@@ -76,14 +73,14 @@ ORACLES: dict[str, Callable[..., list[float]]] = {
 
 @RULE
 @pytest.mark.parametrize(("dtype", "tol"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
-@pytest.mark.parametrize("num", [1, 2, 200])
+@pytest.mark.parametrize("num", [0, 1, 200])
 def test_equals_the_definition(rule: Rule, dtype, tol, num, rng: np.random.Generator) -> None:
     llr = torch.from_numpy(3 * rng.standard_normal((3, num))).to(dtype)
     expected = [ORACLES[rule.name](rule, row) for row in llr.tolist()]
     got = scan(rule, llr)
     torch.testing.assert_close(
         got,
-        torch.tensor(expected, dtype=dtype),
+        torch.tensor(expected, dtype=dtype).view(3, num),
         rtol=tol,
         atol=tol * (num if dtype.itemsize == 4 else 1),
     )
@@ -125,17 +122,6 @@ def test_a_state_holds_nothing_but_itself(rule: Rule) -> None:
         assert state.untyped_storage().nbytes() == state.numel() * state.element_size()
 
 
-@RULE
-@DTYPE
-def test_no_decision_at_all(rule: Rule, dtype: torch.dtype) -> None:
-    for shape in [(), (3,), (2, 3)]:
-        state = rule.start(torch.zeros(shape, dtype=dtype))
-        statistic, after = rule.scan(torch.zeros(*shape, 0, dtype=dtype), state)
-        assert (statistic.shape, statistic.dtype) == ((*shape, 0), dtype)
-        assert torch.equal(after, state)
-        assert after.dtype == dtype
-
-
 # ------------------------------------------------------------------------------------- gradients
 @RULE
 def test_gradients(rule: Rule, rng: np.random.Generator) -> None:
@@ -168,35 +154,6 @@ def test_finite_at_extremes_and_ties(rule: Rule, dtype: torch.dtype, kind: str) 
     statistic.sum().backward()
     assert llr.grad is not None
     assert bool(llr.grad.isfinite().all())
-
-
-# ----------------------------------------------------------------------------------------- k of n
-@given(data=st.data())
-def test_k_of_n_reaches_a_threshold_if_k_of_the_last_n_do(data: st.DataObject) -> None:
-    n = data.draw(st.integers(1, 8))
-    k = data.draw(st.integers(1, n))
-    llrs = data.draw(st.lists(st.integers(-3, 3), min_size=1, max_size=30))
-    threshold = data.draw(st.integers(-3, 3))
-    got = scan(KOfN(k, n), torch.tensor(llrs, dtype=torch.float64)) >= threshold
-    hits = [llr >= threshold for llr in llrs]
-    assert got.tolist() == [sum(hits[max(0, t - n + 1) : t + 1]) >= k for t in range(len(hits))]
-
-
-# ---------------------------------------------------------------------------------------- CUSUM
-@given(llrs=st.lists(st.floats(-50, 50), min_size=1, max_size=60), drift=st.floats(-2, 2))
-def test_cusum_without_ceiling_is_the_sum_above_its_minimum(llrs: list[float], drift) -> None:
-    steps = np.array(llrs) - drift
-    sums = np.cumsum(steps)
-    least = np.minimum.accumulate(np.minimum(sums, 0))
-    got = scan(Cusum(drift=drift), torch.tensor(llrs, dtype=torch.float64))
-    np.testing.assert_allclose(got.numpy(), sums - least, atol=1e-9)
-
-
-def test_ceiling_bounds_how_long_the_sum_takes_to_come_down() -> None:
-    rule = Cusum(drift=0.5, evidence=0.5, ceiling=10.0)
-    statistic = scan(rule, torch.cat([torch.full((200,), 5.0), torch.zeros(60)]))
-    assert float(statistic.max()) == 10.0
-    assert int((statistic[200:] > 0).sum()) == 39  # 10 / 0.25, and the last of them is 0
 
 
 # ----------------------------------------------------------------------------------- as plain data
@@ -297,21 +254,19 @@ drawn_times = st.fixed_dictionaries(
 
 # --------------------------------------------------------------------------------- the definition
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("copies", [1, 30])  # plain numbers and tensors
 @given(values=drawn_values, threshold=st.integers(-3, 4), how=drawn_times)
-def test_the_latch_equals_its_definition(dtype, copies, values, threshold, how) -> None:
-    statistic = torch.tensor(values, dtype=dtype).expand(copies, -1)
+def test_the_latch_equals_its_definition(dtype, values, threshold, how) -> None:
+    statistic = torch.tensor(values, dtype=dtype).expand(2, -1)
     state = latch_start(statistic[:, 0])
     is_alarm, is_on, _ = latch(statistic, float(threshold), **how, state=state)
     alarms, standing = by_hand(values, threshold, **how)
-    assert is_alarm.tolist() == [alarms] * copies
-    assert is_on.tolist() == [standing] * copies
-    assert count_alarms(statistic, threshold, **how).tolist() == [sum(alarms)] * copies
+    assert is_alarm.tolist() == [alarms] * 2
+    assert is_on.tolist() == [standing] * 2
 
 
-@pytest.mark.parametrize("num_rows", [1, 3, 12])
 @given(seed=st.integers(0, 2**20), cuts=st.lists(st.integers(0, 50), max_size=10), how=drawn_times)
-def test_any_cut_gives_the_same_alarms(num_rows, seed, cuts, how) -> None:
+def test_any_cut_gives_the_same_alarms(seed, cuts, how) -> None:
+    num_rows = 3
     source = torch.Generator().manual_seed(seed)
     statistic = torch.randint(-4, 5, (num_rows, 50), generator=source).float()
     state = latch_start(statistic[:, 0])
@@ -332,23 +287,12 @@ def test_any_cut_gives_the_same_alarms(num_rows, seed, cuts, how) -> None:
 # ----------------------------------------------------------------------------------- one by one
 
 
-def test_what_is_remembered() -> None:
-    statistic = torch.tensor([2.0, 0, 0, 0])
-    start = latch_start(statistic[0])
-    assert not start.is_on
-    state = latch(statistic, 1.0, rearm=9, refractory=0, state=start)[2]
-    assert (bool(state.is_on), int(state.below), int(state.since)) == (True, 3, 3)
-
-
-@pytest.mark.parametrize("copies", [1, 30])
-def test_what_is_no_number_is_neither_above_nor_below(copies: int) -> None:
-    statistic = torch.tensor([2, 0, math.nan, 0, 2, 0, 0, 2]).expand(copies, -1)
+def test_what_is_no_number_is_neither_above_nor_below() -> None:
+    statistic = torch.tensor([2, 0, math.nan, 0, 2, 0, 0, 2]).expand(2, -1)
     state = latch_start(statistic[:, 0])
     is_alarm = latch(statistic, 1.0, rearm=2, refractory=0, state=state)[0]
     assert is_alarm[0].nonzero()[:, 0].tolist() == [0, 7]
-    infinite = torch.tensor([-math.inf, math.inf, -math.inf, math.inf]).expand(copies, -1)
-    assert count_alarms(infinite, 1e30, **PLAIN).tolist() == [2] * copies
-    assert count_alarms(infinite, math.inf, **PLAIN).tolist() == [2] * copies
+    assert raised([-math.inf, math.inf, -math.inf, math.inf], math.inf) == [1, 3]
 
 
 # ------------------------------------------------------------------------------------- shapes
@@ -369,54 +313,20 @@ def test_thresholds_broadcast_against_streams(rng: np.random.Generator) -> None:
             assert torch.equal(alone, is_alarm[g, r])
             assert torch.equal(on, is_on[g, r])
             assert [int(part) for part in after] == [int(part[g, r]) for part in end]
-    counts = count_alarms(statistic, levels[:, None], **how)
-    assert torch.equal(counts, is_alarm.sum(-1))
 
 
-@pytest.mark.parametrize("shape", [(), (3,), (2, 0), (2, 30)])
+@pytest.mark.parametrize("shape", [(), (2, 0), (2, 3)])
 def test_no_decision_leaves_the_state(shape: tuple[int, ...]) -> None:
     state = Latch(torch.ones(shape, dtype=torch.bool), torch.full(shape, 3), torch.full(shape, 5))
     is_alarm, is_on, after = latch(torch.zeros(*shape, 0), 1.0, **PLAIN, state=state)
     assert is_alarm.shape == is_on.shape == (*shape, 0)
     assert is_alarm.dtype == is_on.dtype == torch.bool
     assert all(torch.equal(a, b) for a, b in zip(state, after, strict=True))
-    assert (
-        count_alarms(torch.zeros(*shape, 0), 1.0, **PLAIN).tolist() == torch.zeros(shape).tolist()
-    )
-
-
-def test_no_stream_is_no_trouble() -> None:
-    statistic = torch.zeros(0, 7)
-    is_alarm, is_on, state = latch(statistic, 1.0, **PLAIN, state=latch_start(statistic[:, 0]))
-    assert is_alarm.shape == is_on.shape == (0, 7)
-    assert state.since.shape == (0,)
-
-
-@pytest.mark.parametrize("num_rows", [2, 40])
-def test_inputs_stay_as_they_are(num_rows: int) -> None:
-    statistic = torch.randn(num_rows, 20, generator=torch.Generator().manual_seed(1))
-    statistic.requires_grad_()
-    state = latch_start(statistic[:, 0])
-    before = [part.clone() for part in (statistic, *state)]
-    is_alarm, _, _ = latch(statistic, 0.0, rearm=2, refractory=3, state=state)
-    assert all(torch.equal(a, b) for a, b in zip(before, (statistic, *state), strict=True))
-    assert not is_alarm.requires_grad
-    strided = torch.stack([statistic, statistic + 1], dim=-1)[..., 0]
-    again = latch(strided, 0.0, rearm=2, refractory=3, state=state)[0]
-    assert torch.equal(again, is_alarm)
 
 
 def test_threshold_counts_in_the_dtype_of_the_statistic() -> None:
     # 0.1 in float32 is above 0.1; the statistic is that very number
     assert raised([0.1], threshold=0.1) == [0]
-
-
-def test_on_the_device_of_the_statistic(device: torch.device) -> None:
-    statistic = torch.tensor([0.0, 2, 0, 2], device=device).expand(12, -1)
-    for rows in (statistic, statistic[:2]):
-        state = latch_start(rows[:, 0])
-        is_alarm, is_on, state = latch(rows, 1.0, **PLAIN, state=state)
-        assert {x.device.type for x in (is_alarm, is_on, *state)} == {device.type}
 
 
 @pytest.mark.parametrize("wrong", [{"rearm": -1}, {"refractory": -2}])
@@ -425,15 +335,3 @@ def test_negative_settings_are_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match="must not be negative") as error:
         latch(statistic, 1.0, **{**PLAIN, **wrong}, state=latch_start(statistic[0]))
     assert "\n" not in str(error.value)
-    with pytest.raises(ValueError, match="must not be negative"):
-        count_alarms(statistic, 1.0, **{**PLAIN, **wrong})
-
-
-def test_skipped_decisions_count_as_low_ones() -> None:
-    values = [2.0, 0, 0, 0, 2, 0, 2, 2]
-    kept, skipped = torch.tensor([2.0, 2, 2, 2]), torch.tensor([0, 3, 1, 0])
-    for rearm in range(6):
-        for refractory in range(9):
-            how = {"rearm": rearm, "refractory": refractory}
-            expected = sum(by_hand(values, 1.0, **how)[0])
-            assert int(count_alarms(kept, 1.0, **how, skipped=skipped)) == expected

@@ -4,7 +4,6 @@ import hashlib
 import os
 import pickle
 import random
-import threading
 import time
 
 import numpy as np
@@ -19,7 +18,6 @@ from tactslip_torch.runtime import (
     in_processes,
     load_table,
     save_table,
-    table_form,
     whole_file,
 )
 
@@ -46,22 +44,6 @@ def test_every_item_is_worked_on_once_with_one_thread_inside(number):
     starts = range(0, 30, 4)
     expected = [sum(range(start, min(start + 4, 30))) for start in starts]
     assert in_parts(lambda part: int(part.sum()), torch.arange(30).split(4)) == expected
-
-
-def test_as_many_threads_as_asked_work_at_once():
-    torch.set_num_threads(3)
-    together = threading.Barrier(3, timeout=60)  # breaks, and raises, if fewer come
-    for_each(lambda _: together.wait(), range(3))
-
-
-def test_making_the_threads_leaves_the_number_for_others():
-    torch.set_num_threads(5)  # of no other test, so the pool is made here
-    for_each(lambda _: None, range(5))
-    numbers = [torch.get_num_threads()]
-    thread = threading.Thread(target=lambda: numbers.append(torch.get_num_threads()))
-    thread.start()
-    thread.join()
-    assert numbers == [5, 5]  # a thread that has not computed yet takes the process's number
 
 
 @pytest.mark.parametrize("number", [2, 3])
@@ -199,17 +181,6 @@ def test_a_failure_leaves_the_old_content_and_no_temporary_file(tmp_path, old):
         assert path.read_text() == old
 
 
-def test_two_writers_of_one_file_do_not_meet(tmp_path):
-    """Process ids do not tell them apart: threads share one, and so may two containers."""
-    path = tmp_path / "a.txt"
-    with whole_file(path) as first, whole_file(path) as second:
-        assert first != second
-        first.write_text("first")
-        second.write_text("second")
-    assert path.read_text() == "first"  # left last
-    assert names_in(tmp_path) == ["a.txt"]
-
-
 # --- tables -------------------------------------------------------------------------------------
 
 FORM = "test table 1"
@@ -249,7 +220,6 @@ def saved(tmp_path):
 
 def test_a_table_comes_back_and_the_same_content_gives_the_same_bytes(tmp_path, saved):
     assert refusal(saved) is None
-    assert table_form(str(saved)) == FORM
     backwards = dict(reversed(tables().items()))
     backwards["float"] = torch.nn.Parameter(backwards["float"].T.contiguous().T)
     backwards["long"] = torch.cat([backwards["long"], backwards["long"]])[:2]
@@ -263,7 +233,7 @@ def test_a_flipped_byte_is_refused_in_one_line_wherever_it_counts(saved):
     """Some bytes of an archive carry nothing (padding, times); the content stands then."""
     whole, draw, num_refused = saved.read_bytes(), random.Random(0), 0
     content = tables()["float"].numpy().tobytes()
-    places = [draw.randrange(len(whole)) for _ in range(150)]
+    places = [draw.randrange(len(whole)) for _ in range(40)]
     certain = range(whole.index(content), whole.index(content) + len(content), 5)
     for place in (*places, *certain):
         saved.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
@@ -273,14 +243,7 @@ def test_a_flipped_byte_is_refused_in_one_line_wherever_it_counts(saved):
             assert str(saved) in line
             assert "make it again" in line or "must be of format" in line
         assert line is not None or place not in certain
-    assert num_refused > 30
-
-
-@pytest.mark.parametrize("kept", [0.0, 0.5, 0.999])
-def test_a_cut_file_is_refused(saved, kept):
-    whole = saved.read_bytes()
-    saved.write_bytes(whole[: int(kept * len(whole))])
-    assert refusal(saved) == f"{saved} is damaged or no file of ours; make it again"
+    assert num_refused > len(certain)
 
 
 @pytest.mark.parametrize(
@@ -324,24 +287,16 @@ def test_other_files_are_refused_and_nothing_in_them_is_executed(tmp_path):
         assert refusal(path) == f"{path} is damaged or no file of ours; make it again"
     path.write_bytes(pickle.dumps(Trap(mark)))
     with pytest.raises(ValueError, match="no file of ours"):
-        table_form(path)
+        load_table(path, FORM)
     assert not mark.exists()
     pickle.loads(path.read_bytes())
     assert mark.exists(), "the trap is none"
     save_table(path, "test table 2", VALUES, tables())
     assert refusal(path) == f"{path} must be of format 'test table 1', got 'test table 2'"
-    for read in (lambda path: load_table(path, FORM), table_form):
-        with pytest.raises(FileNotFoundError, match=r"no file at .*nowhere\.pt"):
-            read(tmp_path / "nowhere.pt")
-
-
-def test_a_failed_save_leaves_the_old_table(tmp_path, saved):
-    with pytest.raises(TypeError, match="JSON"):
-        save_table(saved, FORM, {"a": object()}, {})
-    with pytest.raises(AttributeError):
-        save_table(saved, FORM, {}, {"a": 3})
-    assert refusal(saved) is None
-    assert names_in(tmp_path) == ["a.pt"]
+    with pytest.raises(ValueError, match=r"made by version 0\.1\.0 or earlier; make it"):
+        load_table(path, "test table 3")
+    with pytest.raises(FileNotFoundError, match=r"no file at .*nowhere\.pt"):
+        load_table(tmp_path / "nowhere.pt", FORM)
 
 
 # --- batches seen and digests -------------------------------------------------------------------
@@ -378,18 +333,3 @@ def test_a_digest_is_of_dtype_shape_and_bytes():
     digests = {content_digest(tensor) for tensor in tensors}
     digests |= {content_digest(tensors[0], tensors[1]), content_digest(tensors[1], tensors[0])}
     assert len(digests) == len(tensors) + 2
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.bool, torch.int64])
-def test_a_digest_does_not_see_layout_gradients_or_device(dtype, device):
-    tensor = torch.arange(12).reshape(3, 4).to(dtype)
-    digest = content_digest(tensor)
-    for same in (
-        tensor.T.contiguous().T,
-        torch.stack([tensor, tensor], dim=-1)[..., 0],
-        tensor.to(device),
-        tensor.requires_grad_() if dtype.is_floating_point else tensor,
-    ):
-        assert content_digest(same) == digest
-    odd = torch.zeros(1).as_strided((1,), (3,))  # a lone value may have any stride
-    assert content_digest(odd) == content_digest(torch.zeros(1))

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from tactslip_torch.model.scaling import signed_log
+from tactslip_torch.features.ops import signed_log
 
 
 def test_a_value_far_below_its_knee_is_itself():

@@ -6,14 +6,12 @@ import logging
 
 import mpmath
 import numpy as np
-import oracles
 import pytest
 import torch
-from sklearn.kernel_ridge import KernelRidge
 
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import PAPER_KERNEL, RadialBasis
-from tactslip_torch.model.solve import solve_kernel_elm, solve_symmetric
+from tactslip_torch.model.solve import solve_symmetric
 
 EPS = 2.0**-52
 
@@ -42,7 +40,7 @@ def close(actual, expected, tolerance):
 # Cholesky -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("num", "decades"), [(1, 0), (2, 9), (40, 0), (40, 6), (390, 9)])
+@pytest.mark.parametrize(("num", "decades"), [(1, 0), (2, 9), (40, 6), (200, 9)])
 @pytest.mark.parametrize("weighted", [False, True])
 def test_a_well_posed_system_is_solved_to_the_stated_error(num, decades, weighted, rng):
     matrix = with_spectrum(rng, np.geomspace(10.0**-decades, 1, num))
@@ -74,9 +72,9 @@ def test_units_of_the_unknowns_cost_nothing(rng):
 # Eigenvectors ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("penalty", [1e13, 1e20, 1e308, np.inf])
+@pytest.mark.parametrize("penalty", [1e13, 1e308, np.inf])
 @pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("num", [12, 300])
+@pytest.mark.parametrize("num", [12, 120])
 def test_what_is_null_is_left_out(num, weighted, penalty, rng, caplog):
     """Targets outside the span would fill the solution with rounding times C."""
     matrix, right = singular(rng, num, num // 3), rng.choice([-1.0, 1.0], num)
@@ -164,7 +162,7 @@ def exact_scores(z, targets, weights, penalty):
         return np.array([float(x) for x in gram * beta])
 
 
-@pytest.mark.parametrize("penalty", [1e-12, 1e-6, 1.0, 1e3, 1e6, 1e9, 1e12])
+@pytest.mark.parametrize("penalty", [1e-6, 1e3, 1e6, 1e9, 1e12])
 @pytest.mark.parametrize("spread", [0, 4])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_stated_error_is_true_or_the_system_refused(kind, spread, penalty):
@@ -239,16 +237,15 @@ def test_what_cannot_be_solved_is_refused_in_one_line(rng):
         solve_symmetric(*tensors(known, right), **limited, most_condition=1e4)
 
 
-@pytest.mark.parametrize("solve", [solve_kernel_elm, lambda *a: solve_symmetric(*a).x])
-def test_a_light_bin_is_no_noise(solve):
+def test_a_light_bin_is_no_noise():
     """Of weight 1e-20, beside one it has nothing to do with; in a singular system it is refused."""
     eye, targets = torch.eye(2).double(), torch.tensor([1.0, -1.0]).double()
     weights = torch.tensor([1e-20, 1.0]).double()
-    assert solve(eye, targets, np.inf, weights).tolist() == [1.0, -1.0]
+    assert solve_symmetric(eye, targets, np.inf, weights).x.tolist() == [1.0, -1.0]
     twice = torch.block_diag(eye[:1, :1], torch.ones(2, 2).double())
     weights = torch.tensor([1e-20, 1.0, 1.0]).double()
     with pytest.raises(ValueError, match=r"weights from 1\.0e-20 to 1\.0e\+00 too far apart"):
-        solve(twice, torch.tensor([1.0, -1.0, 1.0]).double(), np.inf, weights)
+        solve_symmetric(twice, torch.tensor([1.0, -1.0, 1.0]).double(), np.inf, weights)
 
 
 def test_single_precision_is_solved_in_double_or_refused(rng):
@@ -264,71 +261,6 @@ def test_single_precision_is_solved_in_double_or_refused(rng):
         with pytest.raises(ValueError, match=r"condition|semi-definite"):
             solve_symmetric(*tensors(steep, right), penalty)
     with pytest.raises(ValueError, match=r"solution for gram leaves float32: an entry is 1e\+44;"):
-        solve_kernel_elm(1e-39 * torch.eye(2), torch.tensor([1e5, -1e5]), np.inf)
+        solve_symmetric(1e-39 * torch.eye(2), torch.tensor([1e5, -1e5]), np.inf, name="gram")
     with pytest.raises(ValueError, match=r"too much for a matrix in float32; make it in float64"):
         solve_symmetric(torch.ones(2, 2), torch.ones(2), 1e9)
-
-
-# The kernel machine ---------------------------------------------------------------------------
-
-
-def draw(rng, num_bins=40, num_features=5):
-    z = rng.uniform(-1, 1, (num_bins, num_features))
-    targets = np.where(rng.uniform(size=num_bins) < 0.4, 1.0, -1.0)
-    return z, targets, rng.uniform(0.2, 3, num_bins)
-
-
-@pytest.mark.parametrize("penalty", [0.05, 3.0, 1000.0])
-@pytest.mark.parametrize("weighted", [False, True])
-def test_the_kernel_machine_equals_scikit_learn(penalty, weighted, rng):
-    z, targets, weights = draw(rng)
-    ridge = KernelRidge(kernel="poly", degree=2, gamma=1, coef0=0.5, alpha=1 / penalty)
-    ridge.fit(z, targets, sample_weight=weights if weighted else None)
-    zt, tt, wt = tensors(z, targets, weights)
-    beta = solve_kernel_elm(PAPER_KERNEL(zt, zt), tt, penalty, wt if weighted else None)
-    close(beta, ridge.dual_coef_, 1e-8)
-
-
-@pytest.mark.parametrize("penalty", [0.3, np.inf])
-def test_systems_are_solved_in_batches_and_one_may_be_singular(penalty, rng):
-    problems = [draw(rng, 10, 4) for _ in range(4)]
-    problems[2][0][5:] = problems[2][0][:5]
-    grams = np.stack([oracles.kernel(z, z) for z, _, _ in problems]).reshape(2, 2, 10, 10)
-    targets, weights = (np.stack([p[i] for p in problems]).reshape(2, 2, 10) for i in (1, 2))
-    together = solve_kernel_elm(*tensors(grams, targets), penalty, *tensors(weights))
-    for i in np.ndindex(2, 2):
-        alone = solve_kernel_elm(*tensors(grams[i], targets[i]), penalty, *tensors(weights[i]))
-        assert torch.equal(together[i], alone)
-        if np.isfinite(penalty):
-            close(alone, oracles.kernel_elm(grams[i], targets[i], penalty, weights[i]), 1e-9)
-
-
-@pytest.mark.parametrize(("penalty", "num_bins"), [(0.3, 8), (np.inf, 8), (np.inf, 14)])
-def test_derivatives_through_the_features(penalty, num_bins, rng):
-    """With 14 bins of 10 monomials the matrix is singular: derivatives at constant rank."""
-    new = torch.from_numpy(rng.uniform(-1, 1, (4, 3)))
-
-    def scores(z, targets, weights):
-        beta = solve_kernel_elm(PAPER_KERNEL(z, z), targets, penalty, weights)
-        return PAPER_KERNEL(new, z) @ beta
-
-    inputs = [t.requires_grad_() for t in tensors(*draw(rng, num_bins, 3))]
-    assert torch.autograd.gradcheck(scores, inputs, atol=1e-4)
-    if np.isfinite(penalty):
-        assert torch.autograd.gradgradcheck(scores, inputs)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((torch.eye(2), torch.ones(3), 1.0), r"\(2, 2\).*\(3,\)"),
-        ((torch.ones(2, 2).long(), torch.ones(2), 1.0), r"gram must .* floating, got 2 of torch.i"),
-        ((torch.ones(0, 0), torch.ones(0), 1.0), r"gram must have bins .* got 0"),
-        ((torch.eye(2), torch.ones(2), 1.0, torch.ones(3)), "one entry per bin"),
-        ((torch.eye(2), torch.ones(2), 1.0, torch.tensor([1.0, 0.0])), "weights must be positive"),
-        ((torch.eye(2), torch.ones(2), 0.0), "must be positive"),
-    ],
-)
-def test_what_does_not_fit_together_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        solve_kernel_elm(*arguments)

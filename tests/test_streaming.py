@@ -13,9 +13,15 @@ from hypothesis import strategies as st
 from streams import detector_of, signal
 
 from tactslip_torch.model.calibration import Platt
-from tactslip_torch.onset.decisions import Decider, Decisions, is_usable, score_stream
+from tactslip_torch.onset.decisions import (
+    KEY,
+    AlarmSettings,
+    Decider,
+    Decisions,
+    is_usable,
+    score_stream,
+)
 from tactslip_torch.onset.rules import Cusum, KOfN
-from tactslip_torch.onset.settings import KEY, AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -522,4 +528,3 @@ def test_single_samples_are_not_hoarded():
         stream.push(np.zeros((1, 4)))
         most = max(most, stream.state_bytes)
     assert most <= 4 * 8 * (51 + 2 * 125)
-    assert len(stream._pending) <= HOP

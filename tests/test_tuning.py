@@ -1,29 +1,32 @@
-"""Settings learned through the fit: the loss, what is learned, descents, and the second fit."""
+"""Settings learned through the fit: loss and gradients, where descents stop, what is refused."""
 
+import json
 from dataclasses import replace
 
 import pytest
 import torch
 from small_set import SmallSet, small_maker
+from test_commands import TINY, composed
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from tactslip_torch import SlipDetector
+from tactslip_torch.commands.train import train
 from tactslip_torch.data.splits import unseen4
-from tactslip_torch.features.survey import Survey
+from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.leave_one_group_out import held_out_scores
-from tactslip_torch.training.recipe import Recipe
-from tactslip_torch.training.selection import plan_detector
+from tactslip_torch.training.plan import plan_detector
+from tactslip_torch.training.recipe import Recipe, sample_weight
 from tactslip_torch.training.tuning import (
     SETTINGS,
+    GridPoint,
     LearnedSettings,
     Tuning,
     grid_points,
     grouped_loss,
     least_loss,
-    most_accurate,
-    settled_learner,
     tuning_bins,
 )
 
@@ -34,104 +37,75 @@ RECIPE = Recipe(
 
 @pytest.fixture(scope="module")
 def small():
-    """A maker, the sample and the plan of its training recordings, and these."""
+    """A maker, the sample and the plan of its training recordings, and their split."""
     maker = small_maker(SmallSet(materials=("a", "b", "c", "d"), cycles=3))
-    split = unseen4(maker.source.ids, seen=["a", "b", "c"], unseen=["d"], train_share=0.7)[0]
-    survey = Survey(len(maker.pool.names), 60)
+    split = unseen4(maker.source.ids, seen=["a", "b", "c"], unseen=["d"], train_fraction=0.7)[0]
+    statistics = TrainingStatistics(len(maker.pool.names), 60)
     for recording in split.having("train"):
         made = maker(recording, split)
-        survey.update(str(recording), recording.material, made.features, made.is_slip)
-    plan = plan_detector(RECIPE, survey)
-    return maker, survey.sample.bins(), plan, split
+        statistics.update(str(recording), recording.material, made.features, made.is_slip)
+    return maker, statistics.sample.bins(), plan_detector(RECIPE, statistics), split
 
 
-def settings_of(small, learn=SETTINGS, penalty=0.1, offset=0.5):
-    return LearnedSettings(learn, penalty, offset, small[2].selection.scaler)
-
-
-def bins_of(small, most=12):
+@pytest.fixture(scope="module")
+def bins(small):
     _, sample, plan, _ = small
-    return tuning_bins(sample, plan.selection.selected, weights_of(sample), most)
+    return tuning_bins(sample, plan.selection.selected, sample_weight(RECIPE, sample), 12)
 
 
-def weights_of(sample):
-    return torch.where(sample.is_slip, 3.0, 2.0).double()
+@pytest.fixture
+def settings(small):
+    return LearnedSettings(SETTINGS, GridPoint(0.1, 0.5, 0.0, 0.0), small[2].selection.scaler)
 
 
-def test_loss_is_the_mean_over_groups_and_classes(rng):
-    scores = torch.from_numpy(rng.standard_normal(40))
-    is_slip = torch.arange(40) % 2 == 0
-    groups = torch.arange(40) // 14  # of unlike size
-    calibration = Platt(1.7, -0.3)
-    found = grouped_loss(scores, is_slip, groups, calibration)
-    logits = 1.7 * scores - 0.3
+def tuned_by(small, sample, tuning):
+    maker, _, plan, _ = small
+    return tuning(plan, sample, [str(name) for name in maker.pool.names])
+
+
+def test_loss_is_the_mean_over_groups_and_classes_by_the_slope_of_least_loss(rng):
+    is_slip, groups = torch.arange(600) % 3 == 0, torch.arange(600) // 250
+    scores = torch.where(is_slip, 0.5, -0.5) + torch.from_numpy(rng.standard_normal(600)) + 0.3
+    found = grouped_loss(scores, is_slip, groups, Platt(1.7, -0.3))
     losses, recalls = [], []
     for group in range(3):
         for kind in (True, False):
             own = (groups == group) & (is_slip == kind)
             truth = torch.full_like(scores[own], float(kind))
-            losses.append(binary_cross_entropy_with_logits(logits[own], truth))
+            losses.append(binary_cross_entropy_with_logits(1.7 * scores[own] - 0.3, truth))
             recalls.append(float(((scores[own] >= 0) == kind).double().mean()))
     assert float(found.loss) == pytest.approx(float(torch.stack(losses).mean()), rel=1e-12)
     assert found.balanced_accuracy == pytest.approx(sum(recalls) / 6)
+    fitted = grouped_loss(scores, is_slip, groups)
+    assert fitted.calibration.offset == 0
+    for factor in (0.9, 1.1):
+        other = Platt(factor * fitted.calibration.slope, 0.0)
+        assert grouped_loss(scores, is_slip, groups, other).loss > fitted.loss
+    assert grouped_loss(scores + 1.0, is_slip, groups).loss > fitted.loss + 0.05  # decides at 0
 
 
-def test_the_slope_is_of_least_loss_and_nothing_is_offset(rng):
-    is_slip = torch.arange(600) % 3 == 0
-    groups = torch.arange(600) // 250
-    noise = torch.from_numpy(rng.standard_normal(600))
-    scores = torch.where(is_slip, 0.5, -0.5) + noise + 0.3
-    found = grouped_loss(scores, is_slip, groups)
-    assert found.calibration.offset == 0
-    slope = found.calibration.slope
-    for other in (0.9 * slope, 1.1 * slope):
-        assert grouped_loss(scores, is_slip, groups, Platt(other, 0.0)).loss > found.loss
-    leaning = grouped_loss(scores + 1.0, is_slip, groups)
-    assert leaning.loss > found.loss + 0.05  # it decides at 0
-    assert leaning.balanced_accuracy < found.balanced_accuracy
-
-
-def test_tuning_bins_are_sampled_training_bins(small):
+def test_few_bins_of_each_group_and_class_keep_the_weight_of_their_class(small, bins):
     _, sample, plan, _ = small
-    bins = bins_of(small)
-    counts = torch.stack(
-        [torch.bincount(bins.group[bins.is_slip == kind]) for kind in (True, False)]
-    )
-    assert (counts == 12).all()
+    for kind in (True, False):
+        own = bins.is_slip == kind
+        assert bins.group[own].bincount().tolist() == [12] * 3
+        total = sample_weight(RECIPE, sample)[sample.is_slip == kind].sum()
+        assert float(bins.weights[own].sum()) == pytest.approx(float(total))
     sampled = sample.features[:, list(plan.selection.selected)].double()
     assert set(map(tuple, bins.features.tolist())) <= set(map(tuple, sampled.tolist()))
-    assert bins.of(1).group.unique().tolist() == [1]
-    assert bins.without(1).group.unique().tolist() == [0, 2]
-    for kind in (True, False):  # few bins stand for all of their class
-        total = weights_of(sample)[sample.is_slip == kind].sum()
-        assert float(bins.weights[bins.is_slip == kind].sum()) == pytest.approx(float(total))
 
 
-def test_settings_start_where_the_plan_is(small):
-    _, _, plan, _ = small
-    settings, bins = settings_of(small).requires_grad_(False), bins_of(small)
-    z = settings.scaled(bins.features)
-    torch.testing.assert_close(z, plan.selection.scaler(bins.features), rtol=0, atol=1e-12)
-    assert float(settings.penalty) == pytest.approx(0.1, rel=1e-12)
-    assert float(settings.offset) == pytest.approx(0.5, rel=1e-12)
-    scaler = settings.scaler()
-    torch.testing.assert_close(
-        scaler.minimum, plan.selection.scaler.minimum, rtol=1e-12, atol=1e-300
-    )
-
-
-def test_a_scaler_holds_what_scales_do(small):
-    settings, bins = settings_of(small).requires_grad_(False), bins_of(small)
-    with torch.no_grad():
-        settings.logs["scales"].copy_(torch.linspace(0.5, -2, 6))
-    assert float(settings.scales.max()) > 1.6
-    assert float(settings.scales.min()) < 0.14
+def test_a_scaler_holds_what_scales_do(settings, bins, small):
+    settings.requires_grad_(False)
+    expected = small[2].selection.scaler(bins.features)
+    torch.testing.assert_close(settings.scaled(bins.features), expected, rtol=0, atol=1e-12)
+    assert (float(settings.penalty), float(settings.offset)) == pytest.approx((0.1, 0.5))
+    settings.logs["scales"].copy_(torch.linspace(0.5, -2, 6))
     z = settings.scaled(bins.features)
     torch.testing.assert_close(settings.scaler()(bins.features), z, rtol=0, atol=1e-12)
 
 
-def test_gradients_of_every_setting_are_those_of_differences(small):
-    settings, bins = settings_of(small), bins_of(small, most=6)
+def test_gradients_of_every_setting_are_those_of_differences(settings, bins):
     with torch.no_grad():  # away from the start, where clipped values lie on the edge
         settings.logs["scales"] -= 0.1
 
@@ -144,13 +118,11 @@ def test_gradients_of_every_setting_are_those_of_differences(small):
 
     found = loss()
     found.loss.backward()
-
     checked = 0
     for name, parameter in settings.named_parameters():
         flat, slope = parameter.data.view(-1), parameter.grad.reshape(-1)
-        for place in (0, len(flat) // 2):
-            kept, step = float(flat[place]), 1e-5
-            values = []
+        for place in {0, len(flat) // 2}:
+            kept, step, values = float(flat[place]), 1e-5, []
             for sign in (1, -1):
                 flat[place] = kept + sign * step
                 with torch.no_grad():
@@ -162,85 +134,64 @@ def test_gradients_of_every_setting_are_those_of_differences(small):
     assert checked >= 3
 
 
-def test_grid_is_of_refits_without_the_group(small):
-    bins, scaler = bins_of(small), small[2].selection.scaler
-    points = grid_points(scaler, bins, (0.1, 1.0), (0.5, 2.0))
-    z = scaler(bins.features)
-    assert [(point.penalty, point.offset) for point in points] == [
-        (0.1, 0.5), (1.0, 0.5), (0.1, 2.0), (1.0, 2.0)
-    ]  # fmt: skip
-    scores = torch.empty(len(z), dtype=torch.float64)
+def test_grid_is_of_refits_without_the_group(small, bins):
+    recipe = replace(RECIPE, penalties=(0.1, 1.0), offsets=(0.5, 2.0))
+    scaler = small[2].selection.scaler
+    points = grid_points(scaler, bins, recipe)
+    assert [point[:2] for point in points] == [(0.1, 0.5), (1.0, 0.5), (0.1, 2.0), (1.0, 2.0)]
+    z, scores = scaler(bins.features), torch.empty(len(bins.group), dtype=torch.float64)
     for group in range(3):
         own = bins.group == group
         others = TrainingBins(z[~own], bins.is_slip[~own], bins.weights[~own])
-        machine = fit_machine(others, 1.0, Polynomial(2, 2.0))
-        scores[own] = machine(z[own])
+        scores[own] = fit_machine(others, 1.0, Polynomial(2, 2.0))(z[own])
     expected = grouped_loss(scores, bins.is_slip, bins.group)
     assert points[3].loss == pytest.approx(float(expected.loss), rel=1e-6)
     assert least_loss(points).loss == min(point.loss for point in points)
-    assert most_accurate(points).balanced_accuracy == max(p.balanced_accuracy for p in points)
+    two = bins.without(2)
+    backwards = replace(two, is_slip=two.is_slip ^ (two.group == 1))  # wrong of the other group
+    with pytest.raises(ValueError, match="tuning has no place to start: at every C and c"):
+        grid_points(scaler, backwards, recipe)
 
 
-@pytest.fixture(scope="module")
-def tuned(small):
-    return tuned_by(small, small[1], Tuning(bins=10, steps=4, patience=2))
-
-
-def tuned_by(small, sample, tuning):
-    maker, _, plan, _ = small
-    names = [str(name) for name in maker.pool.names]
-    return tuning(plan, RECIPE, sample, weights_of(sample), names)
-
-
-def test_the_step_taken_is_that_of_least_mean_loss_of_held_groups(tuned):
-    facts = tuned.facts
-    held = torch.tensor([[row["held_loss"] for row in group["history"]] for group in facts["held"]])
-    assert facts["steps"] == int(held.mean(0).argmin())
-    assert len(facts["history"]) == held.shape[1]
-    for place, group in enumerate(facts["held"]):
+def test_the_step_taken_is_that_of_least_mean_loss_of_held_out_groups(small):
+    tuned = tuned_by(small, small[1], Tuning(bins=10, steps=4, patience=2))
+    found = tuned.metadata
+    held = torch.tensor([[row["held_loss"] for row in group["history"]] for group in found["held"]])
+    assert found["steps"] == int(held.mean(0).argmin())
+    assert len(found["history"]) == held.shape[1]
+    for place, group in enumerate(found["held"]):
         losses = [row["loss"] for row in group["history"]]
-        assert min(losses) < losses[0]  # of what is learned on
-        others = torch.cat([held[:place], held[place + 1 :]]).mean(0)
-        assert group["tuned"]["steps"] == int(others.argmin())
-        assert group["tuned"]["loss"] == group["history"][int(others.argmin())]["held_loss"]
+        assert min(losses) < losses[0]
+        steps = int(torch.cat([held[:place], held[place + 1 :]]).mean(0).argmin())
+        assert group["tuned"]["steps"] == steps
+        assert group["tuned"]["loss"] == group["history"][steps]["held_loss"]
         assert group["grid"]["loss"] == group["history"][0]["held_loss"]
-    assert {group["held"] for group in facts["held"]} == {"a", "b", "c"}
+    assert {group["held"] for group in found["held"]} == {"a", "b", "c"}
+    assert (found["penalty"], found["offset"]) == (tuned.penalty, tuned.offset)
 
 
-def test_a_held_group_has_no_say_in_its_descent(small):
+def test_a_held_out_group_does_not_change_its_descent(small):
     sample = small[1]
     features = sample.features.clone()
     features[sample.group == 2] *= 1.03
-    other = replace(sample, features=features)
-    tuning = Tuning(learn=["penalty", "scales"], bins=10, steps=3, patience=3)
-    first, second = (tuned_by(small, one, tuning).facts["held"][2] for one in (sample, other))
+    tuning = Tuning(learn=["penalty", "scales"], bins=8, steps=2, patience=3)
+    first, second = (
+        tuned_by(small, replace(sample, features=x), tuning).metadata["held"][2]
+        for x in (sample.features, features)
+    )
     assert [row["loss"] for row in first["history"]] == [row["loss"] for row in second["history"]]
     assert first["history"][0]["held_loss"] != second["history"][0]["held_loss"]
-
-
-def test_second_fit_is_of_what_was_learned(small, tuned):
-    maker, _, plan, _ = small
-
-    class First:
-        recipe, abstaining, with_baselines = RECIPE, None, False
-
-    learner = settled_learner(First(), maker, tuned.selection, tuned.penalty, tuned.offset)
-    assert learner.recipe.penalties_ascending == (tuned.penalty,)
-    assert learner.recipe.kernels == (Polynomial(2, tuned.offset),)
-    assert learner.recipe.sizes == (len(plan.selection.selected),)
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
         ({"learn": ["bias"]}, "tuning.learn must be a list of some of penalty, offset"),
-        ({"learn": []}, "tuning.learn must be a list of some of penalty, offset"),
-        ({"learn": "penalty"}, "tuning.learn must be a list of some of penalty, offset"),
-        ({"learn": None}, "tuning.learn must be a list of some of penalty, offset"),
+        ({"learn": []}, "tuning.learn must be a list"),
+        ({"learn": "penalty"}, "tuning.learn must be a list"),
         ({"steps": 0}, "tuning.steps must be a positive whole number, got 0"),
-        ({"bins": 1.5}, "tuning.bins must be a positive whole number, got 1.5"),
         ({"bins": "abc"}, "tuning.bins must be a positive whole number, got 'abc'"),
-        ({"rate": float("nan")}, "tuning.rate must be a positive number, got nan"),
+        ({"rate": float("nan")}, "tuning.rate must be a positive finite number, got nan"),
     ],
 )
 def test_bad_tuning_is_refused(values, message):
@@ -251,32 +202,39 @@ def test_bad_tuning_is_refused(values, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"group_by": "cycle"}, None),
         ({"degree": 3}, "needs a polynomial kernel of degree 2"),
         ({"kernel": "rbf", "gamma": 0.1}, "needs a polynomial kernel of degree 2"),
+        ({"validation": "nested"}, "tuning needs a machine of degree 2"),
         ({"offsets": 0.0}, r"needs recipe\.offsets above 0"),
         ({"penalties": float("inf")}, r"needs finite recipe\.penalties"),
+        ({}, "needs three groups to hold some out, got a, b"),
     ],
+    ids=str,
 )
 def test_what_could_not_be_tuned_is_refused_beforehand(small, changes, message):
-    _, _, _, split = small
-    recipe = replace(RECIPE, **changes)
-    if message is None:
-        Tuning().check(recipe, split)
-        return
+    split = small[3]
+    if not changes:
+        roles = {r: role for r, role in split.roles.items() if r.material != "c"}
+        split = replace(split, roles=roles)
     with pytest.raises(ValueError, match=message):
-        Tuning().check(recipe, split)
+        Tuning().check(replace(RECIPE, **changes), split)
+    Tuning().check(replace(RECIPE, group_by="cycle"), small[3])
 
 
-def test_two_groups_leave_none_to_hold_out(small):
-    _, _, _, split = small
-    roles = {r: role for r, role in split.roles.items() if r.material != "c"}
-    with pytest.raises(ValueError, match="needs three groups to hold some out, got a, b"):
-        Tuning().check(RECIPE, replace(split, roles=roles))
-
-
-def test_a_grid_that_tells_slip_backwards_everywhere_is_no_start(small):
-    two = bins_of(small).without(2)
-    flipped = replace(two, is_slip=two.is_slip ^ (two.group == 1))  # wrong of the other group
-    with pytest.raises(ValueError, match="tuning has no place to start: at every C and c"):
-        grid_points(small[2].selection.scaler, flipped, (0.1, 1.0), (0.5,))
+@pytest.mark.slow
+def test_training_tunes_and_keeps_the_detectors_that_it_began_with(tmp_path):
+    options = ("recipe=robust", "recipe.num_features=6", "recipe.group_by=cycle", "data.seed=0")
+    quick = ("baselines=false", "export=false", "cache=off", "coverage=null")
+    tuning = ("tuning=gradient", "tuning.bins=6", "tuning.steps=2", "tuning.learn=[penalty]")
+    train(composed(*TINY, *options, *quick, *tuning), tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    found = metrics["tuning"]
+    assert found["learned"] == ["penalty"]
+    assert metrics["penalty"] == pytest.approx(found["penalty"])
+    assert set(found["splits"]) == {"recipe", "grid"}
+    for name, penalty in (("start", found["start"]["penalty"]), ("detector", found["penalty"])):
+        detector = SlipDetector.load(tmp_path / f"{name}.pt")
+        assert detector.info["penalty"] == pytest.approx(penalty)
+    assert detector.info["tuned"]["steps"] == found["steps"]
+    assert (tmp_path / "grid.pt").exists()
+    assert (tmp_path / "tuning.png").stat().st_size > 10_000

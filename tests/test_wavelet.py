@@ -27,9 +27,9 @@ def assert_branches_close(actual, expected):
     np.testing.assert_allclose(actual.numpy(), expected, rtol=1e-10, atol=1e-13 * scale)
 
 
-@pytest.mark.parametrize("wavelet", ["haar", "db4", "bior2.4", "sym5", "rbio2.2"])
+@pytest.mark.parametrize("wavelet", ["haar", "bior2.4", "sym5"])
 @pytest.mark.parametrize("mode", ["symmetric", "reflect", "zero", "periodic", "constant"])
-@pytest.mark.parametrize(("num_samples", "level"), [(72, 1), (75, 2), (75, 3)])
+@pytest.mark.parametrize(("num_samples", "level"), [(72, 1), (75, 3)])
 def test_every_option_equals_pywavelets(wavelet, mode, level, num_samples, rng):
     x = rng.standard_normal((2, num_samples))
     options = {"wavelet": wavelet, "mode": mode, "level": level}
@@ -40,7 +40,7 @@ def test_every_option_equals_pywavelets(wavelet, mode, level, num_samples, rng):
     assert_branches_close(matrix @ torch.from_numpy(x[0]), expected[0])
 
 
-@pytest.mark.parametrize("num_samples", [80, 99, 100, 101, 128])
+@pytest.mark.parametrize("num_samples", [80, 101])
 @pytest.mark.parametrize("make", [oracles.random_bins, oracles.integer_bins])
 def test_the_papers_branches_equal_pywavelets_and_add_up(num_samples, make, rng):
     x = make(rng, 3, num_samples)
@@ -51,15 +51,6 @@ def test_the_papers_branches_equal_pywavelets_and_add_up(num_samples, make, rng)
         a, d = branches[:, 2 * m], branches[:, 2 * m + 1]
         torch.testing.assert_close(a + d, parent, rtol=0, atol=1e-13 * float(parent.abs().max()))
         parent = a
-
-
-def test_manners(rng, device):
-    x = torch.from_numpy(oracles.random_bins(rng, 4, 100)).to(device)
-    oracles.assert_manners(wavelet_branches, x)
-    single = wavelet_branches(x.float()).double()
-    torch.testing.assert_close(single, wavelet_branches(x), rtol=1e-5, atol=1e-5)
-    small = torch.from_numpy(rng.standard_normal((2, 17))).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: wavelet_branches(x, level=1), small)
 
 
 @pytest.mark.parametrize(("frequency_hz", "branch"), [(950, "D1"), (375, "D2"), (180, "D3")])
@@ -82,7 +73,7 @@ def test_a_constant_has_no_detail_and_a_nan_stays_where_its_filters_reach():
     assert branches[1].isfinite().all()
 
 
-@pytest.mark.parametrize("wavelet", ["haar", "db3", "rbio2.2", "sym8", "dmey"])
+@pytest.mark.parametrize("wavelet", ["haar", "rbio2.2", "dmey"])
 def test_the_highest_level_is_pywavelets(wavelet):
     length = pywt.Wavelet(wavelet).dec_len
     shortest = 2 * (length - 1)
@@ -117,7 +108,7 @@ def filters_of(name):
     return WaveletFilters(f"as {name}", *(tuple(taps) for taps in pywt.Wavelet(name).filter_bank))
 
 
-@pytest.mark.parametrize("name", ["rbio2.2", "haar", "db3", "bior2.4"])
+@pytest.mark.parametrize("name", ["rbio2.2", "db3"])
 def test_the_filters_of_a_named_wavelet_are_that_wavelet(name, rng):
     filters = filters_of(name)
     level = highest_level(100, filters)
@@ -166,18 +157,3 @@ def test_what_is_no_wavelet_is_refused_in_one_line(values, message):
         assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match=r"as dmey do not reconstruct: off by"):
         filters_of("dmey")  # an approximation of PyWavelets
-
-
-def test_a_constant_must_have_no_detail():
-    def taken(low, high):
-        """With filters that put together again what these take apart."""
-        determinant = low[0] * high[1] - low[1] * high[0]
-        rec_lo, rec_hi = np.array([-high[0], high[1]]), np.array([low[0], -low[1]])
-        return low, high, rec_lo / determinant, rec_hi / determinant
-
-    low, high = np.array([0.5, 1.0]), np.array([-1.0, 1.0])
-    x = torch.arange(10.0, dtype=torch.float64)
-    branches = wavelet_branches(x, WaveletFilters("lopsided", *taken(low, high)), 1)
-    torch.testing.assert_close(branches.sum(-2), x)
-    with pytest.raises(ValueError, match=r"dec_hi of tilted sums to 1\.5e-01.* have no detail"):
-        WaveletFilters("tilted", *taken(low, high + 0.1 * low))

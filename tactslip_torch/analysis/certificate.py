@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,98 +20,53 @@ from torch import Tensor
 from tactslip_torch.features.pool import VALIDITY
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.rounding import error_facts, gradient_facts, head_facts, score_sd
+from tactslip_torch.runtime import bar
 from tactslip_torch.signals.binning import refuse_nonfinite
 from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 
-
-class Coverage(NamedTuple):
-    """Ranges of the channels of bins.
-
-    Attributes:
-        low_v: ``[*, C]``, least raw sample, volts.
-        high_v: ``[*, C]``, greatest.
-        span_v: ``[*, C]``, span of the filtered bin.
-        relative_span: ``[*, C]``, that over its magnitude; 0 for a zero one.
-    """
-
-    low_v: Tensor
-    high_v: Tensor
-    span_v: Tensor
-    relative_span: Tensor
+_COVERED = ("low_v", "high_v", "span_v", "relative_span")
 
 
-def coverage(samples: Tensor, filtered: Tensor) -> Coverage:
-    """What each bin covers.
+def coverage(samples: Tensor, filtered: Tensor) -> Tensor:
+    """What each bin covers of the input.
+
+    Returns the least raw sample and minus the greatest, in volts, the span of the filtered bin, and
+    that over its magnitude (0 for a zero one): bins reach beyond others where one of them is less.
 
     Shape:
         - samples: ``[*, C, T]``, raw, volts; filtered: ``[*, C, n]``
-        - output: ``[*, C]`` each
+        - output: ``[*, C, 4]``, dtype of ``filtered``
     """
     span, magnitude = filtered.amax(-1) - filtered.amin(-1), filtered.abs().amax(-1)
-    is_zero = magnitude == 0
-    relative = torch.where(is_zero, 0.0, span / torch.where(is_zero, 1.0, magnitude))
+    relative = torch.where(magnitude == 0, 0.0, span / magnitude)
     low, high = samples.amin(-1).to(relative), samples.amax(-1).to(relative)
-    return Coverage(low, high, span, relative)
+    return torch.stack([low, -high, span, relative], -1)
 
 
-class KnownInputs:
-    """The inputs that bins cover together; channels of a kind share a range.
+def _least_by_kind(covers: Tensor, detector: SlipDetector) -> Tensor:
+    """What bins ``[N, C, 4]`` cover together, ``[C, 4]``; channels of a kind share a range."""
+    kinds = [channel.kind for channel in detector.pool.hand.channels]
+    least = covers.amin(0)
+    for kind in set(kinds):
+        alike = torch.tensor([own == kind for own in kinds])
+        least[alike] = least[alike].amin(0)
+    return least
 
-    Args:
-        bins: ``[N, C]`` each, those that are known.
-        kinds: of the channels by name, in the order of the bins.
-        used: names of the channels that matter; default all.
 
-    Example:
-        >>> bins = coverage(torch.tensor([[[-1.0, 1.0], [-2.0, 2.0]]]), torch.ones(1, 2, 1))
-        >>> new = coverage(torch.tensor([[[1.5, 1.5], [0.0, 0.0]]]), torch.ones(1, 2, 1))
-        >>> KnownInputs(bins, {"SG1": "SG", "SG2": "SG"}).cover(new)
-        tensor([True])
-        >>> KnownInputs(bins, {"SG1": "SG", "PVDF1": "PVDF"}).cover(new)
-        tensor([False])
-    """
+def _ranges(covers: Tensor, detector: SlipDetector) -> dict[str, Any]:
+    """Least and greatest samples and least spans, by kind and by channel."""
+    channels = detector.pool.hand.channels
 
-    def __init__(
-        self, bins: Coverage, kinds: Mapping[str, str], used: Iterable[str] | None = None
-    ) -> None:
-        self._names = tuple(kinds)
-        self._kinds = {
-            kind: [place for place, name in enumerate(kinds) if kinds[name] == kind]
-            for kind in dict.fromkeys(kinds.values())
-        }
-        self._used = {self._names.index(name) for name in (kinds if used is None else used)}
-        low, high, span, relative = bins
-        self._covered = Coverage(low.amin(0), high.amax(0), span.amin(0), relative.amin(0))
+    def named(least: Tensor) -> dict[str, float]:
+        return dict(zip(_COVERED, (least * torch.tensor([1, -1, 1, 1])).tolist(), strict=True))
 
-    def cover(self, bins: Coverage) -> Tensor:
-        """Whether every channel that matters lies within the range of its kind.
-
-        Shape:
-            - bins: ``[N, C]`` each; output: ``[N]``, bool
-        """
-        inside = torch.ones(len(bins.low_v), dtype=torch.bool, device=bins.low_v.device)
-        for places in self._kinds.values():
-            known = self._range(places)
-            own = Coverage(*(part[:, [i for i in places if i in self._used]] for part in bins))
-            inside &= ((own.low_v >= known.low_v) & (own.high_v <= known.high_v)).all(-1)
-            inside &= (own.span_v >= known.span_v).all(-1)
-            inside &= (own.relative_span >= known.relative_span).all(-1)
-        return inside
-
-    def to_dict(self) -> dict[str, Any]:
-        """Least and greatest samples and least spans, by kind and by channel."""
-
-        def of(places: list[int]) -> dict[str, float]:
-            return {name: float(x) for name, x in self._range(places)._asdict().items()}
-
-        return {
-            "kinds": {kind: of(places) for kind, places in self._kinds.items()},
-            "channels": {name: of([place]) for place, name in enumerate(self._names)},
-        }
-
-    def _range(self, places: list[int]) -> Coverage:
-        low, high, span, relative = (part[places] for part in self._covered)
-        return Coverage(low.min(), high.max(), span.min(), relative.min())
+    by_kind, by_channel = _least_by_kind(covers, detector), covers.amin(0)
+    kinds = zip(channels, by_kind, strict=True)
+    return {
+        "kinds": {channel.kind: named(least) for channel, least in kinds},
+        "channels": {c.name: named(own) for c, own in zip(channels, by_channel, strict=True)},
+        "validity": VALIDITY,
+    }
 
 
 FACTOR = 4
@@ -120,9 +75,6 @@ INSIDE_SHARE = 0.01  # fewer of the held-out bins may lie inside the margin
 LARGEST_RATIO = 1e4  # a bound further above the worst error seen says too little
 _RULE = f"{FACTOR} x the worst error on calibration bins, plus the bound of the head if it has one"
 _CHUNK_BINS, _GRADIENT_BINS = 16, 128
-
-_Watch = Callable[[Iterable[Any], str, str], Iterable[Any]]
-"""Shows how far a loop is: takes its items, what it does, and what an item is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +89,7 @@ class Comparison:
         scaled: ``[N, K]``, scaled features in float64.
         scaled_error: ``[N, K]``, how far those in float32 are off.
         is_valid: ``[N]``, bool, as the float32 pipeline flags it.
-        covers: what each bin covers of the input.
+        covers: ``[N, C, 4]``, what each bin covers of the input (``coverage``).
     """
 
     exact: Tensor
@@ -146,7 +98,7 @@ class Comparison:
     scaled: Tensor
     scaled_error: Tensor
     is_valid: Tensor
-    covers: Coverage
+    covers: Tensor
 
     @property
     def error(self) -> Tensor:
@@ -159,13 +111,7 @@ class Comparison:
         return (self.rounded >= 0) != (self.exact >= 0)
 
 
-def _quietly(items: Iterable[Any], what: str, unit: str) -> Iterable[Any]:
-    return items
-
-
-def compare(
-    detector: SlipDetector, samples: Tensor, what: str = "bins", watch: _Watch = _quietly
-) -> Comparison:
+def compare(detector: SlipDetector, samples: Tensor, what: str = "bins") -> Comparison:
     """Score bins in float32 and in float64, stage by stage.
 
     Shape:
@@ -178,21 +124,21 @@ def compare(
         raise ValueError(f"expected {what} [N, C, n], at least one, got {tuple(samples.shape)}")
     refuse_nonfinite(samples, detector.pool.hand.names, "leave the recording out, or repair it")
     double, single = copy.deepcopy(detector).double(), copy.deepcopy(detector).float()
-    chunks = watch(samples.split(_CHUNK_BINS), what, f"x{_CHUNK_BINS} bins")
+    chunks = bar(samples.split(_CHUNK_BINS), what, f"x{_CHUNK_BINS} bins")
     with torch.no_grad():
         parts = [_compared(double, single, chunk) for chunk in chunks]
     whole = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     stages = {name: whole.pop(name) for name in ("features", "scaler", "head")}
-    covers = Coverage(*(whole.pop(name) for name in Coverage._fields))
-    return Comparison(stages=stages, covers=covers, **whole)
+    return Comparison(stages=stages, **whole)
 
 
 def _compared(double: SlipDetector, single: SlipDetector, samples: Tensor) -> dict[str, Tensor]:
-    features, scaled, exact, _ = _tapped(double, samples.double())
-    features32, scaled32, rounded, is_valid = _tapped(single, samples.float())
+    exact = double.predict_raw(samples.double()).score  # as a program calls them
+    rounded, is_valid, *_ = single.predict_raw(samples.float())
+    features, scaled = _tapped(double, samples.double())
+    features32, scaled32 = _tapped(single, samples.float())
     by_features = double.head(double.scaler(features32.double()))
     by_scaler = double.head(scaled32.double())
-    covers = coverage(samples, double.channel_filter.valid(samples.double()))
     return {
         "exact": exact,
         "rounded": rounded.double(),
@@ -202,21 +148,21 @@ def _compared(double: SlipDetector, single: SlipDetector, samples: Tensor) -> di
         "scaled": scaled,
         "scaled_error": (scaled32.double() - scaled).abs(),
         "is_valid": is_valid,
-        **covers._asdict(),
+        "covers": coverage(samples, double.channel_filter.valid(samples.double())),
     }
 
 
-def _tapped(detector: SlipDetector, samples: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What the scaler was given, what the head was given, score and validity."""
+def _tapped(detector: SlipDetector, samples: Tensor) -> tuple[Tensor, Tensor]:
+    """What the scaler was given, and what the head was given."""
     taken: list[Tensor] = []
     stages = (detector.scaler, detector.head)
     hooks = [m.register_forward_pre_hook(lambda _, given: taken.extend(given)) for m in stages]
     try:
-        score, is_valid, *_ = detector.predict_raw(samples)
+        detector.predict_raw(samples)
     finally:
         for hook in hooks:
             hook.remove()
-    return taken[0], taken[1], score, is_valid
+    return taken[0], taken[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +202,6 @@ def certify(
     simulated: bool,
     extremes: int = 100,
     seed: int = 0,
-    watch: _Watch = _quietly,
 ) -> Certificate:
     """Measure what float32 does to a detector, and within which margin its decisions stand.
 
@@ -267,7 +212,6 @@ def certify(
         simulated: whether the bins come from a simulation.
         extremes: generated bins of each kind of ``EXTREMES``.
         seed: of the extremes and of the search for the worst error of the head.
-        watch: shows how far it is.
 
     Shape:
         - calibration, held_out: ``[N, C, n + 2 * context]``, volts, finite
@@ -279,20 +223,19 @@ def certify(
     given = {"calibration": calibration} | dict(held_out or {})
     if taken := sorted({"calibration", *EXTREMES} & {*(held_out or {})}):
         raise ValueError(f"a held-out set may not be named {taken[0]!r}, a name of our own; rename")
-    sets = {name: compare(detector, bins, name, watch) for name, bins in given.items()}
+    sets = {name: compare(detector, bins, name) for name, bins in given.items()}
     base = sets["calibration"]
     sd = score_sd(base.exact)
     generator = torch.Generator().manual_seed(seed)
     size = (extremes, *calibration.shape[1:])
     kinds = {
         kind: compare(detector, extreme_bins(kind, size, generator, torch.float32), kind)
-        for kind in watch(EXTREMES, "extremes", "kinds")
+        for kind in EXTREMES
     }
     head = head_facts(detector.head, base.scaled, seed)
     worst = float(base.error.max())
     margin = (head["bound"] or 0.0) + FACTOR * worst
-    kinds_of = {channel.name: channel.kind for channel in detector.pool.hand.channels}
-    known = KnownInputs(base.covers, kinds_of, {n.channel for n in detector.extractor.names})
+    known = _least_by_kind(base.covers, detector)
     double = copy.deepcopy(detector).double()
     thinned = calibration[:: -(-len(calibration) // _GRADIENT_BINS)].double()
     content: dict[str, Any] = {
@@ -317,7 +260,7 @@ def certify(
                 "per_volt": gradient_facts(double.score_raw, thinned),
             },
         },
-        "range": known.to_dict() | {"validity": VALIDITY},
+        "range": _ranges(base.covers, detector),
     }
     content["conditions"] = _conditions(content)
     content["holds"] = all(row["holds"] is not False for row in content["conditions"])
@@ -325,16 +268,18 @@ def certify(
 
 
 def _set_facts(
-    compared: Comparison, detector: SlipDetector, margin: float, sd: float, known: KnownInputs
+    compared: Comparison, detector: SlipDetector, margin: float, sd: float, known: Tensor
 ) -> dict[str, Any]:
     inside = compared.exact.abs() <= margin
     flips, outside = compared.flips & inside, compared.flips & ~inside
+    used = {name.channel for name in detector.extractor.names}
+    is_used = torch.tensor([name in used for name in detector.pool.hand.names])
     by_feature = compared.scaled_error.amax(0)
     worst = by_feature.argmax()
     return {
         "bins": len(inside),
         "invalid": int((~compared.is_valid).sum()),
-        "outside_range": int((~known.cover(compared.covers)).sum()),
+        "outside_range": int((compared.covers < known)[:, is_used].flatten(1).any(1).sum()),
         "not_finite": int((~compared.rounded.isfinite()).sum()),
         "error": error_facts(compared.error, sd),
         "error_of_valid": error_facts(compared.error[compared.is_valid], sd),

@@ -14,24 +14,22 @@ reported, as is the p99 of all calls with them: what they took says how busy the
 robot keeps a processor for its loop. The bins are ordinary ones: one with a NaN goes another way,
 which takes longer.
 
-*A cost model* prunes searches. A feature needs parts: a film that is read, a branch that is formed,
-its spectrum, a sort, a column. What a selection costs is the sum over the parts it needs, each
-counted once, and over the groups of parts it needs at all: a group has a price of its own, for
-calls that happen once however many rows there are. Pooling over channels has a price, and one more
-for each feature it reads. Prices are fitted to timings of ``FeatureExtractor`` with one bin and one
-thread; what is stated of a detector is timed as a whole.
+*A cost model* prunes searches. A detector needs parts: a film that is read, a branch that is
+formed, its spectrum, a sort, a number that the machine takes. It costs the sum over the parts it
+needs, each counted once, and a price for each group of which it needs any part, for calls that
+happen once however many rows there are. Prices are fitted to timings of whole detectors with one
+bin and one thread; what is stated of a detector is timed by itself.
 """
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -42,8 +40,8 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from tactslip_torch.features.extractor import FeatureExtractor
-from tactslip_torch.features.plan import ORDERED, Plan, make_plan
+from tactslip_torch.features.bank import Plan, make_plan
+from tactslip_torch.features.descriptors import ORDERED
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling, pooled_names
 from tactslip_torch.model.detector import SlipDetector
@@ -136,6 +134,20 @@ class Limits:
         check_number("deadline_ms", self.deadline_ms)
         check_number("compute_us", self.compute_us)
 
+    def check_hops(self, sample_rate_hz: float) -> None:
+        """Refuse hops that are no whole number of samples.
+
+        Raises:
+            ValueError: that names the first.
+        """
+        for hop in self.hops_ms:
+            samples = hop * sample_rate_hz / 1000
+            if not math.isclose(samples, round(samples), rel_tol=1e-9):
+                raise ValueError(
+                    f"search.hops_ms: {hop:g} ms are {samples:g} samples at {sample_rate_hz:g} Hz, "
+                    f"expected a whole number; give a multiple of {1000 / sample_rate_hz:g} ms"
+                )
+
     def latency(self, parts: Latency, compute_us: float, headroom: float = 1.0) -> Latency:
         """The same parts with another compute, and the longest hop that keeps the limits.
 
@@ -172,41 +184,6 @@ class Limits:
         """How many times its compute a detector could take; less than 1 if it misses a limit."""
         left_us = 1000 * min(self.deadline_ms - latency.samples_ms, latency.hop_ms)
         return min(self.compute_us, left_us) / latency.compute_us
-
-
-def check_hops(hops_ms: Sequence[float], sample_rate_hz: float) -> None:
-    """Refuse hops that are no whole number of samples.
-
-    Raises:
-        ValueError: that names the first.
-    """
-    for hop in hops_ms:
-        samples = hop * sample_rate_hz / 1000
-        if not math.isclose(samples, round(samples), rel_tol=1e-9):
-            raise ValueError(
-                f"search.hops_ms: {hop:g} ms are {samples:g} samples at {sample_rate_hz:g} Hz, "
-                f"expected a whole number; give a multiple of {1000 / sample_rate_hz:g} ms"
-            )
-
-
-def look_ahead_samples(channel_filter: ChannelFilter, channels: Iterable[int]) -> int:
-    """Samples behind a bin that must be there before the channels in use can be filtered.
-
-    Args:
-        channel_filter: of the whole hand.
-        channels: indices of those in use.
-
-    Raises:
-        ValueError: if there is no channel.
-
-    Example:
-        >>> look_ahead_samples(ChannelFilter([51, 11]), [1])
-        5
-    """
-    used = list(channels)
-    if not used:
-        raise ValueError("no channel is in use, expected at least one; select a feature")
-    return max(channel_filter.reaches[channel][1] for channel in used)
 
 
 try:
@@ -311,71 +288,52 @@ GROUPS: Mapping[str, str] = {
     "spectra": "a spectrum of a branch formed",
     "energies": "energies of all branches of a film",
     "moments": "mean, spread, shape and extremes of a row",
-    "sorts": "a row sorted, for median, mode and iqr",
+    "sorts": "a row sorted, for order statistics",
     "histograms": "entropy of a row",
     "correlations": "correlation of a branch with its film",
     "lines": "centroid and spread of a spectrum",
-    "columns": "a column written",
+    "pooled": "a feature pooled over channels",
+    "columns": "a number that the machine takes",
 }
 """Groups of work, and what one part of each is."""
 _OF_ROW = {"gauge": "gauges", "time": "branches", "freq": "spectra"}
-_OF_DESCRIPTOR = dict.fromkeys(ORDERED, "sorts") | {
+_OF_DESCRIPTOR = {
     "entropy": "histograms",
     "correlation": "correlations",
     "spectral_centroid": "lines",
     "spectral_spread": "lines",
 }
 
-_Part = tuple[str, tuple[object, ...]]  # a group, and which of it; none of it: the group as such
+Part = tuple[str, tuple[object, ...]]
+"""A group, and which of it; none of it: the group as such."""
 
 
 @dataclass(frozen=True)
 class CostModel:
-    """What a call with one bin costs, by what it needs.
+    """What a call with one bin costs, by what it needs; all prices in microseconds.
 
     Args:
-        base_us: of a call that does nothing.
+        base_us: of every call.
         group_us: by group, once if any of its parts is needed.
         part_us: by group, of each of its parts.
-        rest_us: what filter, scaling, head and checks add.
-        rest_of_one_us: and more for each number that the machine takes.
         tail: p99 over p50, usually.
         error: median relative error on the timings it was fitted to.
-        pooling_us: what pooling over channels adds.
-        pooling_of_one_us: and more for each feature that is pooled.
     """
 
     base_us: float
     group_us: Mapping[str, float]
     part_us: Mapping[str, float]
-    rest_us: float
-    rest_of_one_us: float
-    tail: float
-    error: float
-    pooling_us: float = 0.0
-    pooling_of_one_us: float = 0.0
+    tail: float = 1.0
+    error: float = 0.0
 
-    def features_us(self, parts: set[_Part]) -> float:
-        """Median time of the features that need these parts."""
-        return self.base_us + sum(self._price(part) for part in parts)
+    def compute_us(self, parts: set[Part]) -> float:
+        """p99 of a call of a detector that needs these parts, from raw samples to the decision."""
+        return self.tail * (self.base_us + sum(map(self._price, parts)))
 
-    def compute_us(self, parts: set[_Part], num_columns: int, num_pooled: int = 0) -> float:
-        """p99 of a whole call, from raw samples to the decision.
-
-        Args:
-            parts: that the features need.
-            num_columns: numbers that the machine takes.
-            num_pooled: features that they are pooled of; 0 if they are features themselves.
-        """
-        rest_us = self.rest_us + num_columns * self.rest_of_one_us
-        if num_pooled:
-            rest_us += self.pooling_us + num_pooled * self.pooling_of_one_us
-        return self.tail * (self.features_us(parts) + rest_us)
-
-    def bill(self, needed: Sequence[set[_Part]]) -> tuple[Tensor, Tensor]:
+    def bill(self, needed: Sequence[set[Part]]) -> tuple[Tensor, Tensor]:
         """What ``rank_per_cost`` takes: which parts each feature needs, and their prices.
 
-        A column's price holds its part of the rest, and is never nothing.
+        No column is free: of features that cost nothing else the one of higher score comes first.
 
         Shape:
             - first output: ``[F, P]``, bool
@@ -387,45 +345,62 @@ class CostModel:
         for row, own in enumerate(needed):
             needs[row, [place[part] for part in own]] = True
         prices = [round(1000 * self._price(part)) for part in parts]
-        for index, (group, which) in enumerate(parts):
-            if group == "columns" and which:
-                prices[index] += max(round(1000 * self.rest_of_one_us), 1)
-        return needs, torch.tensor(prices)
+        least = [int(group == "columns" and which != ()) for group, which in parts]
+        return needs, torch.tensor(list(map(max, prices, least)))
 
     def to_dict(self) -> dict[str, Any]:
         """All prices, JSON-able."""
+        groups = {
+            name: {"group_us": self.group_us[name], "part_us": self.part_us[name], "part": what}
+            for name, what in GROUPS.items()
+        }
         return {
             "base_us": self.base_us,
-            "groups": {
-                name: {"group_us": self.group_us[name], "part_us": self.part_us[name], "part": what}
-                for name, what in GROUPS.items()
-            },
-            "rest_us": self.rest_us,
-            "rest_of_one_us": self.rest_of_one_us,
-            "pooling_us": self.pooling_us,
-            "pooling_of_one_us": self.pooling_of_one_us,
+            "groups": groups,
             "p99_over_p50": self.tail,
             "median_relative_error": self.error,
         }
 
-    def _price(self, part: _Part) -> float:
+    def _price(self, part: Part) -> float:
         group, which = part
         return self.part_us[group] if which else self.group_us[group]
 
 
-def parts_of(plan: Plan) -> list[set[_Part]]:
-    """The parts that each column of a plan needs; those of several features are the union."""
-    needed: list[set[_Part]] = [{("columns", (place,))} for place in range(plan.num_features)]
+def parts_of(plan: Plan) -> list[set[Part]]:
+    """The parts that each feature of a plan needs; those of several features are the union."""
+    needed: list[set[Part]] = [{("columns", (place,))} for place in range(plan.num_features)]
     for wanted in plan.wanted:
         row = plan.rows[wanted.row]
         own = needed[wanted.place]
         own.add((_OF_ROW[row.kind], (row.channel, row.branch)))
         if row.kind != "gauge":
             own.add(("films", (row.channel,)))
-        own.add((_OF_DESCRIPTOR.get(wanted.descriptor, "moments"), tuple(row)))
+        is_ordered = wanted.descriptor in ORDERED
+        if is_ordered:
+            own.add(("sorts", tuple(row)))
+        if not is_ordered or wanted.descriptor in _OF_DESCRIPTOR:
+            own.add((_OF_DESCRIPTOR.get(wanted.descriptor, "moments"), tuple(row)))
     for share in plan.shares:
         needed[share.place] |= {("films", (share.channel,)), ("energies", (share.channel,))}
     return [own | {(group, ()) for group, _ in own} for own in needed]
+
+
+def detector_parts(
+    needed: Sequence[set[Part]], selected: Sequence[int], num_pooled: int | None = None
+) -> set[Part]:
+    """The parts that a detector needs.
+
+    Args:
+        needed: by each feature of the pool, as ``parts_of`` has it.
+        selected: pool indices of the features that it reads.
+        num_pooled: how many numbers it pools them into; ``None`` if it takes them as they are.
+    """
+    parts = set().union(*(needed[index] for index in selected))
+    if num_pooled is None:
+        return parts
+    parts = {part for part in parts if part[0] != "columns"}
+    parts |= {("columns", (place,)) for place in range(num_pooled)} | {("columns", ())}
+    return parts | {("pooled", (index,)) for index in selected} | {("pooled", ())}
 
 
 def measure_costs(
@@ -437,60 +412,41 @@ def measure_costs(
     *,
     calls: int = 100,
 ) -> CostModel:
-    """Fit the model to timings on this machine.
+    """Fit the model to timings of detectors that nobody trained, on this machine.
 
     Args:
         pool: what features there are.
         channel_filter: of the hand.
-        sizes: numbers of features for which the rest is timed.
+        sizes: numbers of features that are timed beside selections of one group of work each.
         backend: what computes features.
         statistics: over channels, whose pooling is timed; none: it is not.
-        calls: of each selection, in each of three runs.
+        calls: of each detector, in each of three runs.
     """
     needed = parts_of(make_plan(pool.hand, pool.level, pool.names))
-    bins = single_bins(pool, pool.bin_samples)
-    timings, sizes = [], sorted(set(sizes))
-    layers = list(_layers(pool, statistics)) if statistics else []
-    designs = list(_designs(needed, sizes))
+    designs: list[tuple[list[int], ChannelPooling | None]]
+    designs = [(selected, None) for selected in _designs(needed, sorted(set(sizes)))]
+    for layer in _layers(pool, statistics) if statistics else ():
+        designs.append(([pool.names.index(name) for name in layer.inputs], layer))
+    timings, rows = [], []
     with one_thread():
-        for selected in bar(designs, "cost of feature groups"):
-            extractor = FeatureExtractor(pool, selected, backend)
-            timings.append(time_calls(extractor, bins, calls))
-
-        def whole(selected: Sequence[int], layer: ChannelPooling | None = None) -> Timing:
-            return time_detector(_stand_in(pool, channel_filter, selected, backend, layer), calls)
-
-        rest, tails, pooling = [], [], []
-        for size in sizes:
-            some = _spread(range(len(pool.names)), size)
-            of_features = time_calls(FeatureExtractor(pool, some, backend), bins, calls)
-            of_all = whole(some)
-            tails.append(of_all.p99_us / of_all.p50_us)
-            rest.append(of_all.p50_us - of_features.p50_us)
-        rest_us, rest_of_one_us = _line(sizes, rest)
-        for layer in layers:
-            some = [pool.names.index(name) for name in layer.inputs]
-            of_features = time_calls(FeatureExtractor(pool, some, backend), bins, calls)
-            of_head_us = rest_us + len(layer.names) * rest_of_one_us
-            pooling.append(whole(some, layer).p50_us - of_features.p50_us - of_head_us)
-    lengths = [len(layer.inputs) for layer in layers]
-    pooling_us, pooling_of_one_us = _line(lengths, pooling) if layers else (0.0, 0.0)
-    taken = torch.tensor([timing.p50_us for timing in timings], dtype=torch.float64)
-    counts = torch.stack([_counted(set().union(*(needed[i] for i in s))) for s in designs])
-    rows = (counts / taken[:, None]).numpy()
-    solution, _ = nnls(rows, np.ones(len(rows)), maxiter=10_000)  # relative errors count
-    prices = torch.from_numpy(solution)
-    names = list(GROUPS)
+        for selected, layer in bar(designs, "cost of feature groups"):
+            detector = _stand_in(pool, channel_filter, selected, backend, layer)
+            timings.append(time_detector(detector, calls))
+            num_pooled = None if layer is None else len(layer.names)
+            parts = detector_parts(needed, selected, num_pooled)
+            numbers = [sum(part[0] == group for part in parts) for group in GROUPS]
+            # of each group one entry is the group as such
+            rows.append([1, *map(bool, numbers), *(max(num - 1, 0) for num in numbers)])
+    taken = np.array([timing.p50_us for timing in timings])
+    counts = np.array(rows, dtype=float)
+    prices, _ = nnls(counts / taken[:, None], np.ones(len(taken)), maxiter=10_000)  # relative
+    base_us, *others = prices.tolist()
     return CostModel(
-        base_us=float(prices[0]),
-        group_us=dict(zip(names, prices[1 : 1 + len(names)].tolist(), strict=True)),
-        part_us=dict(zip(names, prices[1 + len(names) :].tolist(), strict=True)),
-        rest_us=rest_us,
-        rest_of_one_us=rest_of_one_us,
-        tail=median(tails),
-        error=float(((counts @ prices) / taken - 1).abs().median()),
-        pooling_us=pooling_us,
-        pooling_of_one_us=pooling_of_one_us,
+        base_us,
+        dict(zip(GROUPS, others[: len(GROUPS)], strict=True)),
+        dict(zip(GROUPS, others[len(GROUPS) :], strict=True)),
+        tail=median(timing.p99_us / timing.p50_us for timing in timings),
+        error=float(np.median(np.abs(counts @ prices / taken - 1))),
     )
 
 
@@ -498,8 +454,8 @@ def _stand_in(
     pool: FeaturePool,
     channel_filter: ChannelFilter,
     selected: Sequence[int],
-    backend: BackendName = "auto",
-    layer: ChannelPooling | None = None,
+    backend: BackendName,
+    layer: ChannelPooling | None,
 ) -> SlipDetector:
     """A detector that nobody trained, which takes as long as one that somebody did."""
     num = len(selected) if layer is None else len(layer.names)
@@ -516,19 +472,18 @@ def _stand_in(
 def _layers(pool: FeaturePool, statistics: Sequence[str]) -> Iterator[ChannelPooling]:
     """Layers that nobody fitted, of few to many columns."""
     names = pooled_names(pool.hand, pool.names, statistics)
-    kinds = len(pool.hand.kinds)
     for number in (8, 60, 240):
-        some = [names[index] for index in _spread(range(len(names)), max(number, kinds))]
+        some = _spread(names, max(number, len(pool.hand.kinds)))
         families = {(n.channel, n.component, n.domain, n.descriptor) for n in some}
         used = {name.channel for name in some}
         zeros = torch.zeros(len(some)), torch.zeros(len(used))
         yield ChannelPooling(pool.hand, some, torch.ones(len(families)), *zeros)
 
 
-def _designs(needed: Sequence[set[_Part]], sizes: Sequence[int]) -> Iterator[list[int]]:
+def _designs(needed: Sequence[set[Part]], sizes: Sequence[int]) -> Iterator[list[int]]:
     """Selections that tell the groups apart: each group with one, some and all of its parts."""
     for group in GROUPS:
-        first: dict[_Part, int] = {}  # of each part of the group, the feature that needs fewest
+        first: dict[Part, int] = {}  # of each part of the group, the feature that needs fewest
         for index, own in enumerate(needed):
             for part in own:
                 if part[0] == group and part[1]:
@@ -545,29 +500,10 @@ def _designs(needed: Sequence[set[_Part]], sizes: Sequence[int]) -> Iterator[lis
             yield order[:size].sort().values.tolist()
 
 
-def _spread(places: Sequence[int], number: int) -> list[int]:
-    """So many of the places, evenly."""
-    return [places[index * len(places) // number] for index in range(min(number, len(places)))]
-
-
-def _counted(parts: set[_Part]) -> Tensor:
-    """How many of each group there are, behind a 1 for the call and 0 or 1 for each group."""
-    counts = [1.0]
-    counts += [float((group, ()) in parts) for group in GROUPS]
-    counts += [float(sum(p[0] == group and p[1] != () for p in parts)) for group in GROUPS]
-    return torch.tensor(counts, dtype=torch.float64)
-
-
-def _line(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
-    """Height at 0 and slope, neither negative: medians, which one bad timing does not move.
-
-    Reference:
-        Sen (1968), Journal of the American Statistical Association 63, 1379-1389.
-    """
-    points = list(zip(x, y, strict=True))
-    slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.combinations(points, 2)]
-    slope = max(median(slopes), 0.0) if slopes else 0.0
-    return max(median(height - slope * place for place, height in points), 0.0), slope
+def _spread(items: Sequence[Any], number: int) -> list[Any]:
+    """So many of the items, evenly."""
+    number = min(number, len(items))
+    return [items[place * len(items) // number] for place in range(number)]
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -25,7 +25,7 @@ from tactslip_torch.analysis.latency import (
     Latency,
     Limits,
     Timing,
-    look_ahead_samples,
+    detector_parts,
     measure_costs,
     parts_of,
     single_bins,
@@ -34,26 +34,30 @@ from tactslip_torch.analysis.latency import (
 )
 from tactslip_torch.analysis.raw_bins import bins_inside
 from tactslip_torch.data.splits import Split
+from tactslip_torch.deploy.bins import bin_graph
+from tactslip_torch.deploy.check import session_of
+from tactslip_torch.features.bank import make_plan
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.groups import Channels, Components, allowed, of_fingers
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.plan import make_plan
 from tactslip_torch.features.pool import Arithmetic, FeaturePool
 from tactslip_torch.features.pooling import STATISTICS
-from tactslip_torch.features.ranking import rank_per_cost, rank_weighted
-from tactslip_torch.features.selection import rank_distinct, rank_features, t_scores
-from tactslip_torch.features.survey import Survey
-from tactslip_torch.graph.bins import bin_graph
-from tactslip_torch.graph.form import Form
-from tactslip_torch.graph.runs import session_of
+from tactslip_torch.features.selection import (
+    rank_distinct,
+    rank_features,
+    rank_per_cost,
+    rank_weighted,
+    t_scores,
+)
+from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.runtime import Ticker, bar, check_number, in_parts, one_thread
-from tactslip_torch.signals.filtering import Align, ChannelFilter
+from tactslip_torch.signals.filtering import Align
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
-from tactslip_torch.training.fitting import TrainingPass, solve_metadata
+from tactslip_torch.training.plan import TrainingPass, plan_detector, solve_metadata
 from tactslip_torch.training.recipe import (
     FeatureSelection,
     Recipe,
@@ -65,7 +69,6 @@ from tactslip_torch.training.selection import (
     Structure,
     choose_model,
     fitted_selection,
-    plan_detector,
     validate,
 )
 
@@ -75,13 +78,28 @@ _LESS_ACCURATE = 0.01
 _LESS_COMPUTE = 1 / 3
 
 
-class Candidate(NamedTuple):
-    """A detector that might be made.
+class Group(NamedTuple):
+    """Which features candidates may be of.
 
     Attributes:
         align: of the filter.
-        channels: which channels features may be of, in words.
+        channels: which channels, in words.
         components: which components and descriptors.
+        mask: ``[F]``, bool, the features of the pool.
+    """
+
+    align: Align
+    channels: str
+    components: str
+    mask: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A detector that might be made.
+
+    Args:
+        group: which features it may be of.
         columns: what the machine takes: ``"channel"`` features, or statistics over channels, such
             as ``"pooled mean, std"``.
         ranking: how they were ranked; ``"none"`` if all are taken.
@@ -95,9 +113,7 @@ class Candidate(NamedTuple):
         latency: worst case with the shortest hop, compute modelled until timed.
     """
 
-    align: Align
-    channels: str
-    components: str
+    group: Group
     columns: str
     ranking: str
     degree: int
@@ -122,9 +138,40 @@ class Candidate(NamedTuple):
         """What its detector is made of, however its features were found."""
         layer = self.selection.pooling
         columns = self.selected if layer is None else layer.names
-        return self.align, self.degree, self.penalty, frozenset(columns)
+        return self.group.align, self.degree, self.penalty, frozenset(columns)
 
 
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """A candidate by the clock.
+
+    Args:
+        candidate: what it is.
+        arithmetic: of its pool.
+        timing: of a call with one raw bin.
+        latency: with the shortest hop that compute at p99 fits into.
+        graph_us: median of its ONNX graph in onnxruntime, of samples in float32; of the pool in
+            float64.
+    """
+
+    candidate: Candidate
+    arithmetic: Arithmetic
+    timing: Timing
+    latency: Latency
+    graph_us: float
+
+    @property
+    def accuracy(self) -> float:
+        """Balanced accuracy in validation."""
+        return self.candidate.balanced_accuracy
+
+    @property
+    def point(self) -> tuple[float, float, float]:
+        """What is traded, smaller is better: latency, compute, errors."""
+        return self.latency.worst_ms, self.timing.p99_us, -self.accuracy
+
+
+# Which candidates are worth more -----------------------------------------------------------------
 def distinct(candidates: Iterable[Candidate]) -> list[Candidate]:
     """One candidate a detector, the first: two groups of features may have the same best ones."""
     first: dict[object, Candidate] = {}
@@ -141,8 +188,7 @@ def nondominated(points: Sequence[Sequence[float]]) -> list[int]:
         [0, 1, 3]
     """
     kept: list[int] = []
-    order = sorted(range(len(points)), key=lambda index: (tuple(points[index]), index))
-    for index in order:
+    for index in sorted(range(len(points)), key=lambda index: (tuple(points[index]), index)):
         own = points[index]
         if not any(all(a <= b for a, b in zip(points[k], own, strict=True)) for k in kept):
             kept.append(index)
@@ -156,16 +202,17 @@ def landmarks(timed: Sequence[Timed]) -> dict[str, Timed | None]:
         ``"most_accurate"``; ``"cheap"``, at most 1 point worse, with at most a third of its
         compute as a graph; ``"few"``, of at most 20 numbers. ``None`` where there is none.
     """
-
-    def best(some: Iterable[Timed]) -> Timed | None:
-        return min(some, key=lambda each: (-each.accuracy, each.graph_us), default=None)
-
-    if (top := best(timed)) is None:
-        return dict.fromkeys(("most_accurate", "cheap", "few"))
-    most, least = _LESS_COMPUTE * top.graph_us, top.accuracy - _LESS_ACCURATE
-    cheap = (each for each in timed if each.graph_us <= most and each.accuracy >= least)
-    few = (each for each in timed if each.candidate.selection.size <= _FEW_NUMBERS)
-    return {"most_accurate": top, "cheap": best(cheap), "few": best(few)}
+    best_first = sorted(timed, key=lambda each: (-each.accuracy, each.graph_us))
+    top = next(iter(best_first), None)
+    cheap = (
+        each
+        for each in best_first
+        if top is not None
+        and each.graph_us <= _LESS_COMPUTE * top.graph_us
+        and each.accuracy >= top.accuracy - _LESS_ACCURATE
+    )
+    few = (each for each in best_first if each.candidate.selection.size <= _FEW_NUMBERS)
+    return {"most_accurate": top, "cheap": next(cheap, None), "few": next(few, None)}
 
 
 def worth_naming(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -174,15 +221,11 @@ def worth_naming(candidates: Sequence[Candidate]) -> list[Candidate]:
     What compute a graph takes is not modelled; it depends on the descriptors first.
     """
     best: dict[object, Candidate] = {}
-    for each in candidates:
-        groups: list[object] = [(each.columns == "channel", each.components)]
+    for each in sorted(candidates, key=lambda each: -each.balanced_accuracy):
+        best.setdefault((each.columns == "channel", each.group.components), each)
         if each.selection.size <= _FEW_NUMBERS:
-            groups.append(_FEW_NUMBERS)
-        for group in groups:
-            other = best.setdefault(group, each)
-            if each.balanced_accuracy > other.balanced_accuracy:
-                best[group] = each
-    return list(best.values())
+            best.setdefault(_FEW_NUMBERS, each)
+    return list(dict.fromkeys(best.values()))
 
 
 def worth_timing(candidates: Sequence[Candidate], most: int, limits: Limits) -> list[Candidate]:
@@ -195,45 +238,43 @@ def worth_timing(candidates: Sequence[Candidate], most: int, limits: Limits) -> 
     """
     chosen: list[Candidate] = []
     left = list(candidates)
-    while left and len(chosen) < most:
-        places = nondominated([each.point for each in left])
-        layer = [left[place] for place in places]
-        room = most - len(chosen)
+    while left and (room := most - len(chosen)) > 0:
+        places = set(nondominated([each.point for each in left]))
+        layer = [left[place] for place in sorted(places)]
         chosen += layer if len(layer) <= room else _thinned(layer, room, limits)
-        left = [each for place, each in enumerate(left) if place not in set(places)]
+        left = [each for place, each in enumerate(left) if place not in places]
     return chosen
 
 
 def _thinned(layer: Sequence[Candidate], room: int, limits: Limits) -> list[Candidate]:
     """So many of a layer: the most accurate, those close to the limits, and a spread."""
+
+    def keeps(each: Candidate, factor: float) -> bool:
+        return not limits.misses(limits.latency(each.latency, each.latency.compute_us / factor))
+
     best_first = sorted(layer, key=lambda each: (-each.balanced_accuracy, each.point))
-    taken = best_first[:1]
-    near = [[each for each in best_first if _keeps(each, limits, factor)] for factor in _MODEL_ERRS]
-    for number in range(len(layer)):
-        for some in near:
-            if number < len(some) and some[number] not in taken and len(taken) < (room + 1) // 2:
-                taken.append(some[number])
+    near = [[each for each in best_first if keeps(each, factor)] for factor in _MODEL_ERRS]
+    in_turn = [each for row in itertools.zip_longest(*near) for each in row if each is not None]
+    taken = list(dict.fromkeys([best_first[0], *in_turn]))[: (room + 1) // 2]
     rest = sorted((each for each in layer if each not in taken), key=lambda each: each.point[1])
     room -= len(taken)
     steps = max(room - 1, 1)
     return taken + [rest[number * (len(rest) - 1) // steps] for number in range(room)]
 
 
-def _keeps(candidate: Candidate, limits: Limits, factor: float) -> bool:
-    """Whether it keeps the limits if its compute is modelled so many times too long."""
-    compute_us = candidate.latency.compute_us / factor
-    return not limits.misses(limits.latency(candidate.latency, compute_us))
-
-
+# What is searched --------------------------------------------------------------------------------
 Ranking = Literal["t", "ccweighting", "per_cost"]
-_NAMES = {
-    "channels": Channels,
-    "components": Components,
-    "pooled_components": Components,
-    "rankings": Ranking,
-    "aligns": Align,
-    "arithmetics": Arithmetic,
+_WORDS: Mapping[str, tuple[str, ...]] = {
+    "channels": get_args(Channels),
+    "components": get_args(Components),
+    "pooled_components": get_args(Components),
+    "rankings": get_args(Ranking),
+    "aligns": get_args(Align),
+    "arithmetics": get_args(Arithmetic),
 }
+_IS_WHOLE = {
+    "sizes": True, "degrees": True, "pooled_sizes": True, "hops_ms": False, "penalties": False
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -289,25 +330,18 @@ class Search:
     pooled_sizes: Sequence[int | None] = (None,)
 
     def __post_init__(self) -> None:
-        lists = (*_NAMES, "sizes", "degrees", "hops_ms", "penalties", "statistics", "pooled_sizes")
-        for name in lists:
+        for name in (*_WORDS, *_IS_WHOLE, "statistics"):
             given = getattr(self, name)
             if isinstance(given, str) or not isinstance(given, Sequence):
                 raise ValueError(f"search.{name} must be a list in brackets, got {given!r}")
             if not given and name != "statistics":
                 raise ValueError(f"search.{name} is empty, expected at least one value")
-            known = get_args(_NAMES[name]) if name in _NAMES else given
-            unknown = [value for value in given if value not in known]
-            if unknown:
-                raise ValueError(
-                    f"search.{name}: unknown {unknown[0]!r}, expected some of {', '.join(known)}"
-                )
-        for name in ("sizes", "degrees", "hops_ms", "penalties"):
-            for value in getattr(self, name):
-                check_number(f"search.{name}", value, whole=name in ("sizes", "degrees"))
-        for size in self.pooled_sizes:
-            if size is not None:
-                check_number("search.pooled_sizes", size, whole=True)
+            for value in given:
+                if name in _WORDS and value not in _WORDS[name]:
+                    known = ", ".join(_WORDS[name])
+                    raise ValueError(f"search.{name}: unknown {value!r}, expected some of {known}")
+                if name in _IS_WHOLE and not (name == "pooled_sizes" and value is None):
+                    check_number(f"search.{name}", value, whole=_IS_WHOLE[name])
         for some in self.statistics:
             if isinstance(some, str) or not some or set(some) - set(STATISTICS):
                 raise ValueError(
@@ -322,306 +356,54 @@ class Search:
             raise ValueError(f"search.alpha must be at most 1, got {self.alpha}")
         if max(self.degrees) > 2:
             raise ValueError(f"search.degrees must be of 1 and 2, got {list(self.degrees)}")
-        if not isinstance(self.drop_fingers, bool):
-            raise ValueError(f"search.drop_fingers must be true or false, got {self.drop_fingers}")
 
-    def groups(self, pool: FeaturePool) -> list[tuple[str, str, Tensor]]:
-        """Groups of channels and components that differ and are large enough, with their masks.
+    def groups(self, pool: FeaturePool, components: Sequence[str]) -> list[Group]:
+        """Groups of channels and of components that differ and are not empty."""
+        found: list[Group] = []
+        for channels, some in itertools.product(self.channels, components):
+            mask = allowed(pool.hand, pool.names, channels, some)
+            is_new = not any(torch.equal(mask, other.mask) for other in found)
+            if is_new and bool(mask.any()):
+                found.append(Group(self.aligns[0], channels, some, mask))
+        return [group._replace(align=align) for align in self.aligns for group in found]
+
+    def channel_groups(self, pool: FeaturePool) -> list[Group]:
+        """Groups of channel features that are large enough.
 
         Raises:
             ValueError: if there is none.
         """
-        found = [
-            group
-            for group in self._masks(pool, self.components)
-            if int(group[2].sum()) >= min(self.sizes)
-        ]
-        if not found:
-            raise ValueError(
-                "an empty selection: no group of this hand, search.channels="
-                f"{list(self.channels)} by search.components={list(self.components)}, has "
-                f"{min(self.sizes)} features, the least of search.sizes; add a group or a size"
-            )
-        return found
-
-    def pooled_groups(self, pool: FeaturePool) -> list[tuple[str, str, Tensor]]:
-        """Groups of channels and components that are pooled, with their masks."""
-        return self._masks(pool, self.pooled_components) if self.statistics else []
-
-    def _masks(
-        self, pool: FeaturePool, groups: Sequence[Components]
-    ) -> list[tuple[str, str, Tensor]]:
-        """Those that differ and are not empty."""
-        found: list[tuple[str, str, Tensor]] = []
-        for channels, components in itertools.product(self.channels, groups):
-            mask = allowed(pool.hand, pool.names, channels, components)
-            is_new = not any(torch.equal(mask, other) for _, _, other in found)
-            if is_new and bool(mask.any()):
-                found.append((channels, components, mask))
-        return found
-
-
-class Searcher:
-    """Scores candidates on surveys of the training recordings.
-
-    Args:
-        search: what is searched.
-        recipe: how features are scaled, classes balanced, and ``"t"`` ranks.
-        pool: what features there are.
-        costs: of features on this machine.
-        surveys: of the training recordings, by alignment of the filter.
-        filters: by alignment.
-    """
-
-    def __init__(
-        self,
-        search: Search,
-        recipe: Recipe,
-        pool: FeaturePool,
-        costs: CostModel,
-        surveys: Mapping[Align, Survey],
-        filters: Mapping[Align, ChannelFilter],
-    ) -> None:
-        self.search, self.recipe, self.pool, self.costs = search, recipe, pool, costs
-        self.surveys, self.filters = surveys, filters
-        self._samples = {align: survey.sample.bins() for align, survey in surveys.items()}
-        self._needed = parts_of(make_plan(pool.hand, pool.level, pool.names))
-        self._needs, self._prices = costs.bill(self._needed)
-        self._channel_of = [pool.hand.names.index(name.channel) for name in pool.names]
-
-    def candidates(self) -> list[Candidate]:
-        """All candidates, in an order that does not depend on the number of threads.
-
-        Raises:
-            ValueError: if training bins do not allow validation.
-        """
-        search, jobs = self.search, []
-        for align in search.aligns:
-            jobs += [
-                partial(self._scored, align, *group, ranking, search.degrees)
-                for group in search.groups(self.pool)
-                for ranking in search.rankings
-            ]
-            jobs += [
-                partial(self._pooled, align, *group, statistics)
-                for group in search.pooled_groups(self.pool)
-                for statistics in search.statistics
-            ]
-        return [each for scored in self._all(jobs) for each in scored]
-
-    def without_fingers(self, best: Candidate) -> list[Candidate]:
-        """Candidates like the best with one finger after the other left out, greedily."""
-        hand = self.pool.hand
-        found: list[Candidate] = []
-        used = {self._channel_of[index] for index in best.selected}
-        fingers = sorted({hand.channels[channel].finger for channel in used})
-        kept = allowed(hand, self.pool.names, best.channels, best.components)
-        dropped: list[str] = []
-        while len(dropped) < len(fingers) - 1:
-            others = sorted(set(fingers) - set(dropped))
-            jobs = []
-            for finger in others:
-                mask = kept & ~of_fingers(hand, self.pool.names, [*dropped, finger])
-                label = f"{best.channels} without {' and '.join([*dropped, finger])}"
-                as_best = (best.components, mask, best.ranking, [best.degree])
-                jobs.append(partial(self._scored, best.align, label, *as_best))
-            trials = self._all(jobs)
-            tops = [max((each.balanced_accuracy for each in own), default=-1.0) for own in trials]
-            if max(tops) < 0:  # too few features are left for any size
-                break
-            dropped.append(others[tops.index(max(tops))])
-            found += [each for own in trials for each in own]
-        return found
-
-    def _all(self, jobs: Sequence[Callable[[], list[Candidate]]]) -> list[list[Candidate]]:
-        """What each job finds, in their order; every job is done by one thread."""
-        with Ticker("search, groups", "step", len(jobs)) as ticker:
-
-            def work(job: Callable[[], list[Candidate]]) -> list[Candidate]:
-                found = job()
-                ticker.tick()
-                return found
-
-            return in_parts(work, jobs)
-
-    def _scored(
-        self,
-        align: Align,
-        channels: str,
-        components: str,
-        mask: Tensor,
-        ranking: str,
-        degrees: Sequence[int],
-    ) -> list[Candidate]:
-        """The candidates of one ranking: of each degree and size the best C."""
-        places = mask.nonzero().flatten()
-        sizes = [size for size in sorted(self.search.sizes) if size <= len(places)]
-        if not sizes:
-            return []
-        sample, survey = self._samples[align], self.surveys[align]
-        order = places[self._ranked(ranking, survey, sample, places, sizes[-1])].tolist()
-        weights = sample_weight(self.recipe, sample)
-        selection = scaled_selection(self.recipe, survey, order)
-        bins = TrainingBins(selection(sample.features), sample.is_slip, weights)
-        found = []
-        for degree, size in itertools.product(degrees, sizes):
-            kernel = Polynomial(degree, _offset_of(self.recipe))
-            choices = [(size, kernel, penalty) for penalty in self.search.penalties]
-            rows = validate(bins, sample.group, sample.group_names, choices)
-            best = max(rows, key=lambda row: float(row["mean"]))
-            said = align, channels, components, "channel", ranking
-            found.append(self._candidate(*said, best, selection.first(size)))
-        return found
-
-    def _pooled(
-        self,
-        align: Align,
-        channels: str,
-        components: str,
-        mask: Tensor,
-        statistics: Sequence[str],
-    ) -> list[Candidate]:
-        """The candidates of a pooled group, by degree and size.
-
-        Of the C within the recipe's tolerance of the best, the strongest penalty.
-        """
-        recipe = replace(
-            self.recipe,
-            validation="nested",
-            use="pooled",
-            pooling=tuple(statistics),
-            kernel="polynomial",
-            num_features=tuple(self.search.pooled_sizes),
-            degree=tuple(self.search.degrees),
-            offsets=_offset_of(self.recipe),
-            penalties=tuple(self.search.penalties),
-        )
-        sample = self._samples[align]
-        rows = choose_model(recipe, self.pool, sample, mask, is_nested=False).rows
-        everything = Structure("pooled", len(self.pool.names) * len(STATISTICS), Polynomial(1))
-        selection = fitted_selection(recipe, self.pool, sample, everything, mask)  # ranked
-        found = []
-        for (size, _), own in itertools.groupby(
-            rows, lambda row: (row["num_features"], row["kernel"]["degree"])
-        ):
-            alike = list(own)
-            least = max(row["mean"] for row in alike) - recipe.tolerance
-            best = min(
-                (row for row in alike if row["mean"] >= least), key=lambda row: row["penalty"]
-            )
-            first = selection if size is None else selection.first(min(size, selection.size))
-            columns, ranking = f"pooled {', '.join(statistics)}", "none" if size is None else "gd"
-            said = align, channels, components, columns, ranking
-            found.append(self._candidate(*said, best, first))
-        return found
-
-    def _candidate(
-        self,
-        align: Align,
-        channels: str,
-        components: str,
-        columns: str,
-        ranking: str,
-        chosen: Mapping[str, Any],
-        selection: FeatureSelection,
-    ) -> Candidate:
-        """The candidate of a row of validation, its latency modelled."""
-        selected = selection.selected
-        parts = set().union(*(self._needed[index] for index in selected))
-        num_pooled = 0 if selection.pooling is None else len(selected)
-        used = {self._channel_of[index] for index in selected}
-        rate = self.pool.sample_rate_hz / 1000
-        latency = Latency(
-            look_ahead_ms=look_ahead_samples(self.filters[align], used) / rate,
-            bin_ms=self.pool.bin_samples / rate,
-            hop_ms=self.search.hops_ms[0],
-            compute_us=self.costs.compute_us(parts, selection.size, num_pooled),
-        )
-        return Candidate(
-            align=align,
-            channels=channels,
-            components=components,
-            columns=columns,
-            ranking=ranking,
-            degree=chosen["kernel"]["degree"],
-            penalty=chosen["penalty"],
-            selection=selection,
-            balanced_accuracy=chosen["mean"],
-            by_group=chosen["balanced_accuracy"],
-            latency=latency.with_shortest_hop(self.search.hops_ms),
+        groups = self.groups(pool, self.components)
+        if found := [group for group in groups if int(group.mask.sum()) >= min(self.sizes)]:
+            return found
+        raise ValueError(
+            "an empty selection: no group of this hand, search.channels="
+            f"{list(self.channels)} by search.components={list(self.components)}, has "
+            f"{min(self.sizes)} features, the least of search.sizes; add a group or a size"
         )
 
-    def _ranked(
-        self, ranking: str, survey: Survey, sample: SampledBins, places: Tensor, num: int
-    ) -> Tensor:
-        """The best of these features, as places among them."""
-        scores = t_scores(survey.moments, self.recipe.score_variance)[places]
-        if ranking == "per_cost":
-            return rank_per_cost(
-                scores, self._needs[places], self._prices, num, self.search.cost_power
-            )
-        features = sample.features[:, places]
-        if ranking == "ccweighting":
-            return rank_weighted(scores, features, num, self.search.alpha)
-        if self.recipe.most_correlation < 1:
-            most = self.recipe.most_correlation
-            return rank_distinct(scores, features, sample.is_slip, num, most)
-        return rank_features(scores, num)
 
-
-def _offset_of(recipe: Recipe) -> float:
-    """The polynomial's c: the first of the recipe's."""
-    offsets = recipe.offsets
-    return float(offsets[0] if isinstance(offsets, Sequence) else offsets)
-
-
-@dataclass(frozen=True)
-class Timed:
-    """A candidate by the clock.
-
-    Args:
-        candidate: what it is.
-        arithmetic: of its pool.
-        timing: of a call with one raw bin.
-        latency: with the shortest hop that compute at p99 fits into.
-        graph_us: median of its ONNX graph in onnxruntime, of samples in float32; of the pool in
-            float64.
-    """
-
-    candidate: Candidate
-    arithmetic: Arithmetic
-    timing: Timing
-    latency: Latency
-    graph_us: float
-
-    @property
-    def accuracy(self) -> float:
-        """Balanced accuracy in validation."""
-        return self.candidate.balanced_accuracy
-
-    @property
-    def point(self) -> tuple[float, float, float]:
-        """What is traded, smaller is better: latency, compute, errors."""
-        return self.latency.worst_ms, self.timing.p99_us, -self.accuracy
-
-
-class Workshop:
-    """Makes, times and evaluates detectors of candidates.
+class ParetoSearch:
+    """Scores candidates on training recordings; makes, times and evaluates their detectors.
 
     Args:
         makers: of features, by alignment of the filter; one source, pool and backend.
         fold: who is trained on.
         search: what is searched.
-        recipe: how features are scaled and classes balanced.
+        recipe: how features are scaled, classes balanced, and ``"t"`` ranks.
         most_summed: features up to which a quadratic head is fitted to all training bins.
         num_workers: processes that make features.
 
     Raises:
-        ValueError: if the recipe restricts its features, as the search does in its own way.
+        ValueError: if the recipe restricts its features, as the search does in its own way, or no
+            group of features is large enough.
 
     Attributes:
-        surveys: of the training recordings, by alignment, once ``look`` has been called.
+        training_statistics: by alignment of the filter, once ``read`` has been called.
+        costs: of groups of features on this machine, once ``read`` has been called.
     """
+
+    costs: CostModel
 
     def __init__(
         self,
@@ -638,51 +420,212 @@ class Workshop:
                 "search.components"
             )
         self.makers, self.fold, self.search = makers, fold, search
-        self.recipe = replace(recipe, sample_bins=search.bins)
+        offset = recipe.offsets[0] if isinstance(recipe.offsets, Sequence) else recipe.offsets
+        self._offset = float(offset)
+        self.recipe = replace(
+            recipe, sample_bins=search.bins, kernel="polynomial", offsets=self._offset
+        )
         self.most_summed = most_summed
-        self.surveys: dict[Align, Survey] = {}
+        self.training_statistics: dict[Align, TrainingStatistics] = {}
+        self._samples: dict[Align, SampledBins] = {}
         self._data = {
             align: SlipDataModule(maker, fold, num_workers) for align, maker in makers.items()
         }
+        first = next(iter(makers.values()))
+        self.pool, self.source, self.backend = first.pool, first.source, first.extractor.backend
+        self._needed = parts_of(make_plan(self.pool.hand, self.pool.level, self.pool.names))
+        self._channel_of = [self.pool.hand.names.index(name.channel) for name in self.pool.names]
+        search.channel_groups(self.pool)  # refuses an empty selection before any work
 
-    @property
-    def pool(self) -> FeaturePool:
-        """What features there are."""
-        return next(iter(self.makers.values())).pool
-
-    def look(self) -> None:
-        """One pass over the training recordings for each alignment."""
+    def read(self) -> None:
+        """One pass over the training recordings for each alignment; then measure costs."""
         for align, data in self._data.items():
-            survey = Survey(len(self.pool.names), self.search.bins)
+            statistics = TrainingStatistics(len(self.pool.names), self.search.bins)
             with one_thread():  # the processors belong to those who make features
                 for batch in bar(data.loader(["train"]), f"features, {align}", "recording"):
                     mask, group = batch.roles["train"], self.recipe.group(batch.recording)
                     name = str(batch.recording)
-                    survey.update(name, group, batch.features[mask], batch.is_slip[mask])
-            self.surveys[align] = survey
-
-    def costs(self) -> CostModel:
-        """Of groups of features, on this machine."""
-        maker = next(iter(self.makers.values()))
-        sizes = [size for size in self.search.sizes if size <= len(self.pool.names)]
-        calls = max(self.search.calls // 4, 10)
-        return measure_costs(
+                    statistics.update(name, group, batch.features[mask], batch.is_slip[mask])
+            self.training_statistics[align], self._samples[align] = (
+                statistics,
+                statistics.sample.bins(),
+            )
+        self.costs = measure_costs(
             self.pool,
-            maker.channel_filter,
-            sizes,
-            maker.extractor.backend,
+            next(iter(self.makers.values())).channel_filter,
+            [size for size in self.search.sizes if size <= len(self.pool.names)],
+            self.backend,
             max(self.search.statistics, key=len, default=()),
-            calls=calls,
+            calls=max(self.search.calls // 4, 10),
         )
+        self._bill = self.costs.bill(self._needed)
+
+    def candidates(self) -> list[Candidate]:
+        """All candidates, in an order that does not depend on the number of threads.
+
+        Raises:
+            ValueError: if training bins do not allow validation.
+        """
+        search = self.search
+        jobs = [
+            partial(self._of_channels, group, ranking, search.degrees)
+            for group in search.channel_groups(self.pool)
+            for ranking in search.rankings
+        ]
+        if search.statistics:
+            pooled = search.groups(self.pool, search.pooled_components)
+            jobs += [
+                partial(self._pooled, *job) for job in itertools.product(pooled, search.statistics)
+            ]
+        return list(itertools.chain(*self._all(jobs)))
+
+    def without_fingers(self, best: Candidate) -> list[Candidate]:
+        """Candidates like the best with one finger after the other left out, greedily."""
+        hand, names, group = self.pool.hand, self.pool.names, best.group
+        found: list[Candidate] = []
+        left = sorted({hand.channels[self._channel_of[index]].finger for index in best.selected})
+        mask = allowed(hand, names, group.channels, group.components)
+        dropped: list[str] = []
+        while len(left) > 1:
+            jobs = []
+            for finger in left:
+                without = [*dropped, finger]
+                fewer = group._replace(
+                    channels=f"{group.channels} without {' and '.join(without)}",
+                    mask=mask & ~of_fingers(hand, names, without),
+                )
+                jobs.append(partial(self._of_channels, fewer, best.ranking, [best.degree]))
+            trials = self._all(jobs)
+            tops = [max((each.balanced_accuracy for each in own), default=-1.0) for own in trials]
+            if max(tops) < 0:  # too few features are left for any size
+                break
+            dropped.append(left.pop(tops.index(max(tops))))
+            found += itertools.chain(*trials)
+        return found
+
+    def _all(self, jobs: Sequence[Callable[[], list[Candidate]]]) -> list[list[Candidate]]:
+        """What each job finds, in their order; every job is done by one thread."""
+        with Ticker("search, groups", "step", len(jobs)) as ticker:
+
+            def work(job: Callable[[], list[Candidate]]) -> list[Candidate]:
+                found = job()
+                ticker.tick()
+                return found
+
+            return in_parts(work, jobs)
+
+    def _of_channels(self, group: Group, ranking: str, degrees: Sequence[int]) -> list[Candidate]:
+        """The candidates of one ranking: of each degree and size the best C."""
+        places = group.mask.nonzero().flatten()
+        sizes = [size for size in sorted(self.search.sizes) if size <= len(places)]
+        if not sizes:
+            return []
+        sample, statistics = self._samples[group.align], self.training_statistics[group.align]
+        order = places[self._ranked(ranking, statistics, sample, places, sizes[-1])].tolist()
+        selection = scaled_selection(self.recipe, statistics, order)
+        weights = sample_weight(self.recipe, sample)
+        bins = TrainingBins(selection(sample.features), sample.is_slip, weights)
+        found = []
+        for degree, size in itertools.product(degrees, sizes):
+            kernel = Polynomial(degree, self._offset)
+            choices = [(size, kernel, penalty) for penalty in self.search.penalties]
+            rows = validate(bins, sample.group, sample.group_names, choices)
+            best = max(rows, key=lambda row: float(row["mean"]))
+            found.append(self._candidate(group, "channel", ranking, best, selection.first(size)))
+        return found
+
+    def _pooled(self, group: Group, statistics: Sequence[str]) -> list[Candidate]:
+        """The candidates of a pooled group, by degree and size.
+
+        Of the C within the recipe's tolerance of the best, the strongest penalty.
+        """
+        recipe = replace(
+            self.recipe,
+            validation="nested",
+            use="pooled",
+            pooling=tuple(statistics),
+            num_features=tuple(self.search.pooled_sizes),
+            degree=tuple(self.search.degrees),
+            penalties=tuple(self.search.penalties),
+        )
+        sample, mask = self._samples[group.align], group.mask
+        rows = choose_model(recipe, self.pool, sample, mask, is_nested=False).rows
+        everything = Structure("pooled", len(self.pool.names) * len(STATISTICS), Polynomial(1))
+        ranked = fitted_selection(recipe, self.pool, sample, everything, mask)
+        found = []
+        for (size, _), own in itertools.groupby(
+            rows, lambda row: (row["num_features"], row["kernel"]["degree"])
+        ):
+            alike = list(own)
+            least = max(row["mean"] for row in alike) - recipe.tolerance
+            best = min(
+                (row for row in alike if row["mean"] >= least), key=lambda row: row["penalty"]
+            )
+            first = ranked if size is None else ranked.first(min(size, ranked.size))
+            columns, ranking = f"pooled {', '.join(statistics)}", "none" if size is None else "gd"
+            found.append(self._candidate(group, columns, ranking, best, first))
+        return found
+
+    def _candidate(
+        self,
+        group: Group,
+        columns: str,
+        ranking: str,
+        chosen: Mapping[str, Any],
+        selection: FeatureSelection,
+    ) -> Candidate:
+        """The candidate of a row of validation, its latency modelled."""
+        selected = selection.selected
+        num_pooled = None if selection.pooling is None else selection.size
+        parts = detector_parts(self._needed, selected, num_pooled)
+        reaches = self.makers[group.align].channel_filter.reaches
+        rate = self.pool.sample_rate_hz / 1000
+        latency = Latency(
+            look_ahead_ms=max(reaches[self._channel_of[index]][1] for index in selected) / rate,
+            bin_ms=self.pool.bin_samples / rate,
+            hop_ms=self.search.hops_ms[0],
+            compute_us=self.costs.compute_us(parts),
+        )
+        return Candidate(
+            group=group,
+            columns=columns,
+            ranking=ranking,
+            degree=chosen["kernel"]["degree"],
+            penalty=chosen["penalty"],
+            selection=selection,
+            balanced_accuracy=chosen["mean"],
+            by_group=chosen["balanced_accuracy"],
+            latency=latency.with_shortest_hop(self.search.hops_ms),
+        )
+
+    def _ranked(
+        self,
+        ranking: str,
+        statistics: TrainingStatistics,
+        sample: SampledBins,
+        places: Tensor,
+        num: int,
+    ) -> Tensor:
+        """The best of these features, as places among them."""
+        scores = t_scores(statistics.moments, self.recipe.score_variance)[places]
+        if ranking == "per_cost":
+            needs, prices = self._bill
+            return rank_per_cost(scores, needs[places], prices, num, self.search.cost_power)
+        features, most = sample.features[:, places], self.recipe.most_correlation
+        if ranking == "ccweighting":
+            return rank_weighted(scores, features, num, self.search.alpha)
+        if most < 1:
+            return rank_distinct(scores, features, sample.is_slip, num, most)
+        return rank_features(scores, num)
 
     def timed(self, candidates: Sequence[Candidate]) -> list[Timed]:
         """Detectors of the candidates, fitted to the sample, in every arithmetic, by the clock."""
-        found = []
+        found, calls = [], self.search.calls
         for candidate in bar(candidates, "timing the front", "detector"):
-            graph_us = _time_graph(self.make(candidate, "double"), self.search.calls).p50_us
+            graph_us = _time_graph(self.make(candidate, "double"), calls).p50_us
             for arithmetic in self.search.arithmetics:
                 with one_thread():
-                    timing = time_detector(self.make(candidate, arithmetic), self.search.calls)
+                    timing = time_detector(self.make(candidate, arithmetic), calls)
                 latency = replace(candidate.latency, compute_us=timing.p99_us)
                 latency = latency.with_shortest_hop(self.search.hops_ms)
                 found.append(Timed(candidate, arithmetic, timing, latency, graph_us))
@@ -692,18 +635,18 @@ class Workshop:
         self, candidate: Candidate, arithmetic: Arithmetic, *, from_all: bool = False
     ) -> SlipDetector:
         """The detector of a candidate, fitted to the sample or to all training bins."""
-        survey, data = self.surveys[candidate.align], self._data[candidate.align]
+        statistics, data = (
+            self.training_statistics[candidate.group.align],
+            self._data[candidate.group.align],
+        )
         recipe = replace(
             self.recipe,
             num_features=candidate.selection.size,
-            kernel="polynomial",
             degree=candidate.degree,
-            offsets=_offset_of(self.recipe),
             penalties=candidate.penalty,
         )
-        plan = plan_detector(recipe, survey, self.pool, candidate.selection)
-        is_bounded = candidate.degree == 2 and plan.selection.size > self.most_summed
-        if from_all and not is_bounded:
+        plan = plan_detector(recipe, statistics, self.pool, candidate.selection)
+        if from_all and not (candidate.degree == 2 and plan.selection.size > self.most_summed):
             gathered = TrainingPass(plan)
             with one_thread():
                 for batch in bar(data.loader(["train"]), "the machine, all bins", "recording"):
@@ -711,22 +654,21 @@ class Workshop:
                     gathered.update(name, batch.features[mask], batch.is_slip[mask])
             head, bins = gathered.solve(), "all training bins"
         else:
-            training = plan.training_bins(survey.sample.bins())
+            training = plan.training_bins(statistics.sample.bins())
             head = fit_machine(training, plan.penalty, plan.kernel)
             bins = f"{self.search.bins} training bins of each material and class"
-        trained, source = self.fold.having("train"), data.maker.source
+        trained = self.fold.having("train")
         info = plan.metadata | {
             "fitted_to": bins,
             "solve": solve_metadata(head),
-            "simulated": source.is_simulated,
+            "simulated": self.source.is_simulated,
             "split": self.fold.name,
             "features_dtype": "float32" if arithmetic == "native" else "float64",
             "train_materials": sorted({recording.material for recording in trained}),
-            "train_recordings": {str(r): cache_key(source.key(r)) for r in trained},
+            "train_recordings": {str(r): cache_key(self.source.key(r)) for r in trained},
         }
         pool = FeaturePool(self.pool.hand, **self.pool.facts() | {"arithmetic": arithmetic})
-        backend = data.maker.extractor.backend
-        return plan.detector(pool, data.maker.channel_filter, head, info, backend)
+        return plan.detector(pool, data.maker.channel_filter, head, info, self.backend)
 
     def evaluated(self, detector: SlipDetector) -> dict[str, Any]:
         """Balanced accuracy on raw bins of the test cycles, scored as a live loop would."""
@@ -747,11 +689,7 @@ class Workshop:
 
 def _time_graph(detector: SlipDetector, calls: int) -> Timing:
     """Time the ONNX graph of a detector in onnxruntime, one ordinary bin and one thread."""
-    session = session_of(bin_graph(detector, Form()).model({}))
+    session = session_of(bin_graph(detector).model())
     samples = next(each for each in session.get_inputs() if each.name == "samples")
     bins = single_bins(detector.pool, samples.shape[-1])
-
-    def call(given: Tensor) -> object:
-        return session.run(None, {"samples": given.numpy()})
-
-    return time_calls(call, bins, calls)
+    return time_calls(lambda given: session.run(None, {"samples": given.numpy()}), bins, calls)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,34 +23,28 @@ from omegaconf import DictConfig, OmegaConf
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.graph.export import export_detector, stale_graphs
+from tactslip_torch.deploy.export import export_detector, stale_graphs
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.settings import KEY as ALARM
+from tactslip_torch.onset.decisions import KEY as ALARM
 from tactslip_torch.report.adaptation import adaptation_figure, adaptation_table, journal_table
-from tactslip_torch.runtime import whole_file, write_json
+from tactslip_torch.runtime import check_number, whole_file, write_json
 from tactslip_torch.training.adaptation import (
+    FILE,
     Change,
-    accepted,
+    RecordingBins,
+    Statistics,
     add,
-    check_once,
     check_weight,
+    detector_digest,
     forget,
-    known_names,
+    locked,
     recording_bins,
     refitted,
     solve,
-    undo,
+    statistics_of,
 )
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.experiment import DTYPES, feature_cache, save_config, versions
-from tactslip_torch.training.statistics import (
-    FILE,
-    RecordingBins,
-    Statistics,
-    detector_digest,
-    locked,
-    statistics_of,
-)
 
 FORMAT = "tactslip_torch adaptation 1"
 
@@ -97,7 +92,16 @@ def _stepped(
 ) -> dict[str, Any]:
     """Add or forget, and write what came of it."""
     started = time.perf_counter()
-    margin, weight = _margin(config.margin), _weight(config.weight)
+    margin, weight = config.margin, config.weight
+    check_number("margin", margin, least=0)
+    if margin >= 1:
+        raise ValueError(f"margin must be below 1, such as 0.005 for half a point, got {margin:g}")
+    if weight == "auto":
+        weight = None
+    elif isinstance(weight, bool) or not isinstance(weight, int | float):
+        raise ValueError(f"weight must be auto or a positive number, got {weight!r}")
+    else:
+        check_weight(weight)
     bins = _bins(config, detector, statistics)
     read = time.perf_counter()
     before = solve(statistics)
@@ -150,7 +154,7 @@ def _undone(model: Path, detector: SlipDetector) -> dict[str, Any]:
         last = statistics.steps[-1].detector if statistics.steps else None
         if last != detector_digest(detector):  # else writing was cut off behind the statistics
             raise
-    back, file = undo(statistics)
+    back, file = statistics.undo()
     with ExitStack() as files:
         at_statistics = files.enter_context(whole_file(model.with_name(FILE)))
         at_model = files.enter_context(whole_file(model))
@@ -172,7 +176,7 @@ def _write(
 ) -> None:
     """Detector, statistics and, if wanted, graphs: all of them or none."""
     file = torch.frombuffer(bytearray(model.read_bytes()), dtype=torch.uint8)
-    after = accepted(before, change, entry, file, detector_digest(new))
+    after = before.with_step(change.statistics, entry, file, detector_digest(new))
     with ExitStack() as files:  # the last takes its place first: it holds the detector before
         at_model = files.enter_context(whole_file(model))
         at_statistics = files.enter_context(whole_file(model.with_name(FILE)))
@@ -203,24 +207,14 @@ def _bins(
     dtype = DTYPES[detector.info.get("features_dtype", "float64")]
     with feature_cache(config.cache) as cache:
         maker = FeatureMaker(source, detector.pool, detector.channel_filter, rule, cache, dtype)
-        keys = detector.info.get("train_recordings", {})
-        names_in = known_names(statistics, keys, is_in=True)
-        names, taken_names = names_in, set()
-        if is_new:  # one that was forgotten gets its name again, others what they are to be called
-            ever = known_names(statistics, keys, is_in=False)
-            names = {key: name for key, name in ever.items() if name[1] == material}
-            taken_names = set(statistics.materials)
-        found = recording_bins(
+        return recording_bins(
             detector,
             maker,
+            statistics,
             material=material,
             slip_free=bool(config.slip_free),
-            names=names,
-            taken=taken_names,
+            is_new=is_new,
         )
-    if is_new:
-        check_once(found, names_in)
-    return found
 
 
 def _remembered(material: str | None, statistics: Statistics) -> dict[str, RecordingBins]:
@@ -251,27 +245,10 @@ def _entry(config: DictConfig, bins: Mapping[str, RecordingBins], change: Change
         "weight": change.weight,
         "factor": change.factor,
         "tried": [[factor, fall] for factor, fall in change.tried.items()],
-        "old": change.old.to_dict(),
-        "since_training": change.since_training.to_dict(),
+        "old": asdict(change.old),
+        "since_training": asdict(change.since_training),
         "new": dict(change.new),
     }
-
-
-def _margin(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
-        raise ValueError(
-            f"margin must lie in [0, 1), such as 0.005 for half a point, got {value!r}"
-        )
-    return float(value)
-
-
-def _weight(value: Any) -> float | None:
-    if value == "auto":
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"weight must be auto or a positive number, got {value!r}")
-    check_weight(float(value))
-    return float(value)
 
 
 main = entry_point("adapt", adapt)

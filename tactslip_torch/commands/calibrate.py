@@ -1,6 +1,6 @@
 """Calibrate the simulated hand: ``python -m tactslip_torch calibrate``.
 
-Three parameters move together along one line of difficulty (``simulation.parameters``) until the
+Three parameters move together along one line of difficulty (``simulation.scene``) until the
 test accuracy on seen materials is the published one, but no further than the signal checks hold.
 Every point that was tried is written down; with ``write=true`` the values are frozen into the
 package. Unseen materials are not simulated here.
@@ -8,8 +8,6 @@ package. Unseen materials are not simulated here.
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -20,26 +18,24 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-import tactslip_torch
 from tactslip_torch.analysis.signal_checks import Signals, check_signals, filtered
-from tactslip_torch.commands.entry import conf_dir, entry_point
+from tactslip_torch.commands.entry import conf_dir, entry_point, leave_results
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.features.survey import Survey
+from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.report import published
 from tactslip_torch.report.calibration import calibration_figure, calibration_table, point_line
-from tactslip_torch.runtime import bar, whole_file
-from tactslip_torch.simulation.parameters import (
+from tactslip_torch.runtime import __version__, bar, check_number, one_thread, plain, write_json
+from tactslip_torch.simulation.scene import (
     CALIBRATED_PATH,
     PRIORS,
     SEEN_MATERIALS,
+    SIMULATION_VERSION,
 )
-from tactslip_torch.simulation.scene import SIMULATION_VERSION
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
-from tactslip_torch.training.experiment import feature_parts, save_config
-from tactslip_torch.training.fitting import TrainingPass
+from tactslip_torch.training.experiment import feature_maker, save_config
+from tactslip_torch.training.plan import TrainingPass, plan_detector
 from tactslip_torch.training.recipe import Recipe
-from tactslip_torch.training.selection import plan_detector
 
 _RESOLUTION = 0.02  # of difficulty, to which a target is bracketed
 _CHECKS_RESOLUTION = 0.1  # of difficulty, to which the place is where the checks begin to fail
@@ -71,9 +67,8 @@ def search(
     """Points on the line of difficulty, each closer to a target accuracy.
 
     Begins at 0 and steps towards the target until it is crossed, a check fails or the bound is
-    reached; then narrows the bracket, by a secant kept off its ends if it crosses the target, by
-    halves if checks alone fail at its far end. Places are whole hundredths, except a bound that is
-    none; a step is ``.02`` or more.
+    reached; then halves the bracket. Places are whole hundredths, except a bound that is none; a
+    step is ``.02`` or more.
 
     Args:
         evaluate: a difficulty; accuracy falls with it, roughly.
@@ -97,30 +92,20 @@ def search(
     while near["holds"] and len(points) < most_points and not is_met(points[-1]):
         at = sign * near["difficulty"]
         if far is None:
-            place: float | None = min(round(at + max(step, _RESOLUTION), 2), bound)
+            place = min(round(at + max(step, _RESOLUTION), 2), bound)
+            if place <= at:
+                break
         else:
-            place = _between(at, sign * far["difficulty"], near, far, sign * target, sign)
-        if place is None or place <= at:
-            break
+            high, crosses = sign * far["difficulty"], sign * (far["accuracy"] - target) <= 0
+            if high - at <= (_RESOLUTION if crosses else _CHECKS_RESOLUTION):
+                break
+            place = round((at + high) / 2, 2)
         points.append(evaluate(sign * place))
         if points[-1]["holds"] and sign * (points[-1]["accuracy"] - target) > 0:
             near = points[-1]
         else:
             far = points[-1]
     return points
-
-
-def _between(
-    low: float, high: float, near: Point, far: Point, target: float, sign: int
-) -> float | None:
-    """A place within the bracket, or ``None`` if it is too narrow."""
-    above, below = sign * near["accuracy"] - target, sign * far["accuracy"] - target
-    crosses = below <= 0
-    if high - low <= (_RESOLUTION if crosses else _CHECKS_RESOLUTION):
-        return None
-    fraction = min(max(above / (above - below), 0.1), 0.9) if crosses else 0.5
-    place = low + fraction * (high - low)
-    return round(min(max(place, low + _RESOLUTION / 2), high - _RESOLUTION / 2), 2)
 
 
 def best_point(points: Sequence[Point], target: float) -> Point | None:
@@ -134,22 +119,20 @@ def best_point(points: Sequence[Point], target: float) -> Point | None:
 def seen_accuracy(maker: FeatureMaker, data: SlipDataModule, recipe: Recipe, what: str) -> float:
     """Accuracy on the test bins of a split, as ``train`` reports it: the same passes in memory."""
     kept = []
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the processors belong to those who make features
-    for batch in bar(data.loader(["train", "test"]), what, "recording"):
-        roles = data.split.bin_roles(batch.recording, len(batch.is_slip))
-        # copies: what workers hand over holds a file open
-        kept.append((batch.recording, batch.features.clone(), batch.is_slip.clone(), roles))
-    torch.set_num_threads(num_threads)
-    survey = Survey(len(maker.pool.names), recipe.sample_bins)
+    with one_thread():  # the processors belong to those who make features
+        for batch in bar(data.loader(["train", "test"]), what, "recording"):
+            roles = data.split.bin_roles(batch.recording, len(batch.is_slip))
+            # copies: what workers hand over holds a file open
+            kept.append((batch.recording, batch.features.clone(), batch.is_slip.clone(), roles))
+    statistics = TrainingStatistics(len(maker.pool.names), recipe.sample_bins)
     training = [
         (recording, features[roles["train"]], is_slip[roles["train"]])
         for recording, features, is_slip, roles in kept
         if bool(roles["train"].any())
     ]
     for recording, features, is_slip in training:
-        survey.update(str(recording), recipe.group(recording), features, is_slip)
-    plan = plan_detector(recipe, survey, maker.pool)
+        statistics.update(str(recording), recipe.group(recording), features, is_slip)
+    plan = plan_detector(recipe, statistics, maker.pool)
     gathered = TrainingPass(plan)
     for recording, features, is_slip in training:
         gathered.update(str(recording), features, is_slip)
@@ -173,11 +156,8 @@ def evaluate_point(config: DictConfig, difficulty: float) -> dict[str, Any]:
         rule: LabelRule = instantiate(of_seed.labels)
         recipe: Recipe = instantiate(of_seed.recipe, _convert_="all")
         (split,) = instantiate(of_seed.split, _convert_="all")(source.ids)
-        pool, channel_filter, dtype, backend = feature_parts(
-            source, rule.bin_ms, **of_seed.features
-        )
-        recipe.check_pool(len(pool.names))
-        maker = FeatureMaker(source, pool, channel_filter, rule, None, dtype, backend)
+        maker = feature_maker(source, rule, **of_seed.features)
+        recipe.check_pool(len(maker.pool.names))
         data = SlipDataModule(maker, split, of_seed.num_workers)
         accuracies.append(seen_accuracy(maker, data, recipe, f"d {difficulty:+.2f}, seed {seed}"))
         for recording in source.ids:
@@ -227,14 +207,11 @@ def calibrate(config: DictConfig, folder: Path) -> dict[str, Any]:
             f"the signal checks {', '.join(failed)} do not hold at the starting values, so there "
             "is no point to calibrate from; raise fact_cycles, or mend the simulation"
         )
-    text = json.dumps(_content(config, points, kept, target), indent=1, allow_nan=False) + "\n"
-    content: dict[str, Any] = json.loads(text)
-    for path in [folder / "calibration.json"] + ([CALIBRATED_PATH] if config.write else []):
-        with whole_file(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    calibration_figure(content, folder / "calibration.png")
-    print("\n" + calibration_table(content))
-    print(f"\nresults in {folder}" + (f", frozen in {CALIBRATED_PATH}" if config.write else ""))
+    content: dict[str, Any] = plain(_content(config, points, kept, target))
+    leave_results(folder, "calibration", content, calibration_figure, calibration_table(content))
+    if config.write:
+        write_json(CALIBRATED_PATH, content)
+        print(f"frozen in {CALIBRATED_PATH}")
     return content
 
 
@@ -260,11 +237,9 @@ def _check(config: DictConfig) -> None:
     if not bounds[0] <= 0 <= bounds[1]:
         raise ValueError(f"bounds must hold 0, the starting values; got {bounds}")
     for name in ("tolerance", "step"):
-        if type(config[name]) not in (int, float) or not 0 < config[name] < math.inf:
-            raise ValueError(f"{name} must be a positive number, got {config[name]}")
+        check_number(name, config[name])
     for name in ("most_points", "fact_cycles"):
-        if type(config[name]) is not int or config[name] < 1:
-            raise ValueError(f"{name} must be a positive whole number, got {config[name]}")
+        check_number(name, config[name], whole=True)
     if config.write and (changed := _changed_sections(config)):
         raise ValueError(
             f"write=true freezes what the protocol of conf/calibrate.yaml finds, and "
@@ -310,7 +285,7 @@ def _content(
         "points": points,
         "protocol": {name: protocol[name] for name in groups + numbers},
         "versions": {
-            "tactslip_torch": tactslip_torch.__version__,
+            "tactslip_torch": __version__,
             "simulation": SIMULATION_VERSION,
             "torch": torch.__version__,
             "numpy": np.__version__,

@@ -24,8 +24,8 @@ from tactslip_torch.analysis.raw_bins import bins_inside, in_turn
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import ROLES, Split
+from tactslip_torch.deploy.export import CERTIFICATE_FORMAT
 from tactslip_torch.features.cache import cache_key
-from tactslip_torch.graph.facts import CERTIFICATE_FORMAT
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report.certificate import certificate_figure, conclusion
 from tactslip_torch.runtime import bar, check_number, plain, write_json
@@ -81,7 +81,6 @@ def certify(config: DictConfig) -> dict[str, Any]:
         simulated=source.is_simulated,
         extremes=config.extremes,
         seed=config.seed,
-        watch=bar,
     )
     content: dict[str, Any] = plain(found.content) | {
         "format": CERTIFICATE_FORMAT,

@@ -26,14 +26,14 @@ from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import seen6
 from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.survey import Survey
+from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.fit import fit_machine
 from tactslip_torch.report.crossval import crossval_figure, crossval_table
 from tactslip_torch.runtime import bar, in_processes, one_thread
-from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
-from tactslip_torch.training.experiment import feature_cache, feature_parts, save_config
+from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.experiment import feature_cache, feature_maker, save_config
+from tactslip_torch.training.plan import plan_detector
 from tactslip_torch.training.recipe import Recipe, balanced_accuracy
-from tactslip_torch.training.selection import plan_detector
 
 
 class Materials:
@@ -45,12 +45,12 @@ class Materials:
         scored_bins: and to evaluate on.
 
     Attributes:
-        surveys: of the training cycles, by material.
+        training_statistics: of the training cycles, by material.
     """
 
     def __init__(self, pool: FeaturePool, train_bins: int, scored_bins: int) -> None:
         self.pool = pool
-        self.surveys: dict[str, Survey] = {}
+        self.training_statistics: dict[str, TrainingStatistics] = {}
         self._train_bins, self._scored_bins = train_bins, scored_bins
         self._samples: dict[tuple[str, str], BinSample] = {}  # by material and role
 
@@ -58,16 +58,16 @@ class Materials:
         """Add a recording whose cycle is for ``"train"`` or for ``"test"``."""
         name, material = str(batch.recording), batch.recording.material
         if role == "train":
-            survey = self.surveys.setdefault(material, self._survey())
-            survey.update(name, material, batch.features, batch.is_slip)
+            statistics = self.training_statistics.setdefault(material, self._statistics())
+            statistics.update(name, material, batch.features, batch.is_slip)
         sample = self._samples.setdefault((material, role), BinSample(self._scored_bins))
         sample.update(name, material, batch.features, batch.is_slip)
 
-    def survey_of(self, materials: Iterable[str]) -> Survey:
-        """One survey of the training cycles of several materials."""
-        merged = self._survey()
+    def statistics_of(self, materials: Iterable[str]) -> TrainingStatistics:
+        """One statistics of the training cycles of several materials."""
+        merged = self._statistics()
         for material in sorted(materials):
-            merged.merge(self.surveys[material])
+            merged.merge(self.training_statistics[material])
         return merged
 
     def bins_of(self, materials: Iterable[str], roles: Sequence[str]) -> SampledBins:
@@ -78,8 +78,8 @@ class Materials:
                 merged.merge(self._samples[key])
         return merged.bins()
 
-    def _survey(self) -> Survey:
-        return Survey(len(self.pool.names), self._train_bins)
+    def _statistics(self) -> TrainingStatistics:
+        return TrainingStatistics(len(self.pool.names), self._train_bins)
 
 
 def evaluate_split(materials: Materials, recipe: Recipe, unseen: Sequence[str]) -> dict[str, Any]:
@@ -89,21 +89,21 @@ def evaluate_split(materials: Materials, recipe: Recipe, unseen: Sequence[str]) 
         ``unseen``, ``test`` (balanced accuracies), ``per_material`` (of the unseen ones),
         ``num_features``, ``penalty``, and ``materials``, the unseen ones.
     """
-    seen = sorted(set(materials.surveys) - set(unseen))
-    survey = materials.survey_of(seen)
-    plan = plan_detector(recipe, survey, materials.pool, is_nested=False)
-    training = plan.training_bins(survey.sample.bins())
+    seen = sorted(set(materials.training_statistics) - set(unseen))
+    statistics = materials.statistics_of(seen)
+    plan = plan_detector(recipe, statistics, materials.pool, is_nested=False)
+    training = plan.training_bins(statistics.sample.bins())
     head = fit_machine(training, plan.penalty, plan.kernel)
 
     def score(names: Sequence[str], roles: Sequence[str]) -> tuple[float | None, dict[str, Any]]:
         bins = materials.bins_of(names, roles)
         says_slip = head(plan.selection(bins.features)) >= 0
         by_material = {
-            name: balanced_accuracy(says_slip[mine], bins.is_slip[mine], bins.represents[mine])
+            name: balanced_accuracy(says_slip[mine], bins.is_slip[mine], bins.sample_weight[mine])
             for index, name in enumerate(bins.group_names)
             for mine in [bins.group == index]
         }
-        return balanced_accuracy(says_slip, bins.is_slip, bins.represents), by_material
+        return balanced_accuracy(says_slip, bins.is_slip, bins.sample_weight), by_material
 
     of_unseen, by_material = score(unseen, ("train", "test"))
     return {
@@ -171,14 +171,13 @@ def _read(
 ) -> Materials:
     """One pass over all recordings."""
     rule = instantiate(config.labels)
-    share = config.train_share
-    by_cycle = seen6(source.ids, seen=names, train_share=share, seed=config.seed)[0]
-    pool, channel_filter, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
+    fraction = config.train_fraction
+    by_cycle = seen6(source.ids, seen=names, train_fraction=fraction, seed=config.seed)[0]
+    maker = feature_maker(source, rule, **config.features)
     for recipe in recipes:
-        recipe.allowed(pool)  # refuses before any work
-    materials = Materials(pool, config.train_bins, config.scored_bins)
-    with feature_cache(config.cache) as cache, one_thread():  # workers need the processors
-        maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, backend)
+        recipe.allowed(maker.pool)  # refuses before any work
+    materials = Materials(maker.pool, config.train_bins, config.scored_bins)
+    with feature_cache(config.cache) as maker.cache, one_thread():  # workers need the processors
         data = SlipDataModule(maker, by_cycle, config.num_workers)
         for batch in bar(data.loader(["train", "test"]), "features of all materials", "recording"):
             materials.update(batch, by_cycle.roles[batch.recording])

@@ -16,11 +16,10 @@ import numpy as np
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig
 
-import tactslip_torch
 from tactslip_torch.commands.entry import entry_point, fail, one_line
-from tactslip_torch.data.file_recordings import FileRecordings, Inspected, inspected, oddities
-from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest
-from tactslip_torch.data.manifest import Problem, write_template
+from tactslip_torch.data.file_recordings import FileRecordings, Inspected
+from tactslip_torch.data.folder import RecordingFolder, Written, write_manifest, write_template
+from tactslip_torch.data.manifest import Problem
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.report.recordings import (
     DrawnRecording,
@@ -28,9 +27,10 @@ from tactslip_torch.report.recordings import (
     dataset_figure,
     ranges_table,
     trials_table,
+    written_table,
 )
-from tactslip_torch.report.style import SIMULATED_LINE, table
-from tactslip_torch.runtime import in_processes
+from tactslip_torch.report.style import SIMULATED_LINE
+from tactslip_torch.runtime import __version__, in_processes
 
 FIGURE = Path("outputs/data_tool.png")
 
@@ -50,7 +50,7 @@ def check(config: DictConfig) -> int:
             if isinstance(found, str):
                 problems.append(Problem(entry.place, f"{entry.file}: {found}"))
             else:
-                odd = oddities(source, found)
+                odd = found.oddities(source.hand.names)
                 warnings += [Problem(entry.place, f"{entry.file}: {what}") for what in odd]
     for line in (*(f"problem: {p}" for p in problems), *(f"warning: {w}" for w in warnings)):
         print(line)
@@ -103,8 +103,12 @@ def convert(config: DictConfig) -> list[Written]:
         if config[name] is None:
             raise ValueError(f"no value for {name}; give to=FORMAT and output=FOLDER")
     source = _source(config, skip_failed=bool(config.skip_failed or config.data.skip_failed))
-    made_by = {"made_by": tactslip_torch.__version__}
-    job = RecordingFolder(source, Path(str(config.output)), str(config.to), made_by, "output")
+    output = Path(str(config.output))
+    if output.resolve() == source.root.resolve():
+        raise ValueError("output must be another folder than root, which stays as it is")
+    made_by = {"made_by": __version__, "units": source.units}
+    files = {recording: source.entry(recording).file for recording in source.ids}
+    job = RecordingFolder(source, output, str(config.to), made_by, "output", files)
     job.check()
 
     def one(recording: RecordingId) -> Written | str:
@@ -128,7 +132,7 @@ def convert(config: DictConfig) -> list[Written]:
     if not done:
         raise ValueError(f"no recording could be converted, first: {failed[0]}")
     write_manifest(job.folder, done)
-    print("\n" + _converted_table(done, failed, time.perf_counter() - started))
+    print("\n" + written_table([one._asdict() for one in done], time.perf_counter() - started))
     print(f"\nrecordings in {job.folder}")
     return done
 
@@ -168,7 +172,7 @@ def _inspect_all(
 
     def one(recording: RecordingId) -> Inspected | str:
         try:
-            return inspected(source, recording)
+            return source.inspect(recording)
         except (ValueError, OSError) as error:
             return one_line(error)
 
@@ -227,18 +231,6 @@ def _example(source: FileRecordings) -> DrawnRecording:
         content.non_slip_s,
         content.units,
     )
-
-
-def _converted_table(done: Sequence[Written], failed: Sequence[str], seconds: float) -> str:
-    cells = [
-        str(len(done)),
-        str(sum(one.made for one in done)),
-        str(len(failed)),
-        f"{sum(one.duration_s for one in done):.1f}",
-        f"{sum(one.num_bytes for one in done) / 1e6:.1f}",
-    ]
-    header = ["recordings", "made now", "left out", "seconds of signal", "MB"]
-    return f"{table([header, cells])}\ntook {seconds:.1f} s"
 
 
 def _act(config: DictConfig, _: Path) -> None:

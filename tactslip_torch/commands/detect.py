@@ -19,13 +19,13 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, one_line
-from tactslip_torch.data.file_recordings import hand_file, stream_of
+from tactslip_torch.data.file_recordings import hand_file
 from tactslip_torch.data.folder import file_facts, has_truth, recording_files
 from tactslip_torch.data.formats import Reading, open_file, pieces
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import masked_names
-from tactslip_torch.onset.decisions import Decisions, answer_of
+from tactslip_torch.onset.decisions import AlarmSettings, Decisions, answer_of
 from tactslip_torch.onset.events import (
     EventRules,
     LatencyParts,
@@ -34,7 +34,6 @@ from tactslip_torch.onset.events import (
     pooled_metrics,
     recording_events,
 )
-from tactslip_torch.onset.settings import AlarmSettings
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.report.onset import (
     DecisionCounts,
@@ -94,7 +93,7 @@ def detect(config: DictConfig, folder: Path) -> dict[str, Any]:
     detector = SlipDetector.load(config.model, backend=config.backend)
     said = config.reading
     said = OmegaConf.to_container(said, resolve=True) if OmegaConf.is_config(said) else said
-    reading = stream_of({"reading": said}).reading
+    reading = Reading.of(said)
     context = _DetectionContext(detector, _settings(config, detector), reading, config, folder)
     paths = recording_files(Path(str(config.input)))
     save_config(config, folder)

@@ -18,8 +18,7 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-import tactslip_torch
-from tactslip_torch.runtime import is_first_process, process_number, write_json
+from tactslip_torch.runtime import PACKAGE, is_first_process, process_number, write_json
 
 CONF_HINT = "train.yaml"
 EXIT_BAD_INPUT = 2
@@ -40,11 +39,10 @@ def conf_dir() -> Path:
     Raises:
         FileNotFoundError: if there is none.
     """
-    here = Path(tactslip_torch.__file__).resolve().parent
-    for folder in (here / "conf", here.parent / "conf"):
+    for folder in (PACKAGE / "conf", PACKAGE.parent / "conf"):
         if (folder / CONF_HINT).is_file():
             return folder
-    raise FileNotFoundError(f"no conf folder with {CONF_HINT} in or beside {here}; reinstall")
+    raise FileNotFoundError(f"no conf folder with {CONF_HINT} in or beside {PACKAGE}; reinstall")
 
 
 def unknown_choice(arguments: Sequence[str]) -> str | None:

@@ -25,7 +25,7 @@ from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.experiment import (
     DTYPES,
-    common_facts,
+    common_metadata,
     feature_cache,
     feature_rows,
     make_trainer,
@@ -72,7 +72,7 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             data = SlipDataModule(maker, fold, config.num_workers)
             trainer.test(learner, datamodule=data, verbose=False)
             results[fold.name] = learner.metrics | {"recording_events": learner.events}
-    metrics = common_facts(source, detector.pool, config) | merged_results(results)
+    metrics = common_metadata(source, detector.pool, config) | merged_results(results)
     metrics |= {
         "selected": [str(name) for name in detector.selected_names],
         "timing_s": {"total": time.perf_counter() - started},

@@ -7,7 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from tactslip_torch.commands.entry import entry_point
-from tactslip_torch.graph.export import export_detector, summary, wanted_graphs
+from tactslip_torch.deploy.export import export_detector, summary, wanted_graphs
 from tactslip_torch.model.detector import SlipDetector
 
 

@@ -19,13 +19,11 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig
 
-import tactslip_torch
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.folder import MANIFEST, RecordingFolder, Written, write_manifest
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.features.cache import source_digest
-from tactslip_torch.report.recordings import DrawnRecording, signals_figure
-from tactslip_torch.report.style import marked, table
+from tactslip_torch.report.recordings import DrawnRecording, signals_figure, written_table
 from tactslip_torch.runtime import bar, in_processes
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.experiment import frame_lengths, save_config
@@ -54,7 +52,7 @@ def generate(config: DictConfig, folder: Path) -> list[Written]:
         raise ValueError(f"num_workers must be null or a number of processes, got {count!r}")
     source: RecordingSource = instantiate(config.data, _convert_="all")
     made_by = {
-        "code": source_digest(Path(tactslip_torch.__file__).parent),
+        "code": source_digest(),
         "libraries": {"numpy": np.__version__, "torch": torch.__version__},
     }
     files = RecordingFolder(source, folder, config.format, made_by)
@@ -68,30 +66,9 @@ def generate(config: DictConfig, folder: Path) -> list[Written]:
     seconds = time.perf_counter() - started
     for scene in bar(shown, "figures", "scene") if shown else ():
         _draw(files, shown[scene], smooth, scene, config.stroke)
-    print("\n" + written_table(written, seconds))
+    print("\n" + written_table([one._asdict() for one in written], seconds))
     print(f"\nrecordings in {folder}")
     return written
-
-
-def written_table(written: Sequence[Written], seconds: float) -> str:
-    """How many recordings of each scene there are, how long, how large, and how many were made."""
-    scenes = list(dict.fromkeys(one.line["scene"] for one in written))
-    groups = {scene: [one for one in written if one.line["scene"] == scene] for scene in scenes}
-    if len(groups) > 1:
-        groups["all"] = list(written)
-    cells = [
-        [
-            scene,
-            str(len(own)),
-            str(sum(one.made for one in own)),
-            f"{sum(one.duration_s for one in own):.1f}",
-            f"{sum(one.num_bytes for one in own) / 1e6:.1f}",
-        ]
-        for scene, own in groups.items()
-    ]
-    header = ["scene", "recordings", "made now", "seconds of signal", "MB"]
-    simulated = any(one.line["simulated"] == "true" for one in written)
-    return marked(simulated, table([header, *cells]), f"took {seconds:.1f} s")
 
 
 def _shown(config: DictConfig, source: RecordingSource) -> dict[str, list[RecordingId]]:

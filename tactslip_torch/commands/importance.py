@@ -33,7 +33,7 @@ from tactslip_torch.data.splits import ROLES, Split
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.features.selection import t_scores
-from tactslip_torch.features.survey import Survey
+from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import kernel_from_dict
 from tactslip_torch.report.importance import best_table, sensors_csv, sensors_figure, sensors_table
@@ -150,7 +150,7 @@ def _trained(model: Path, cache: Any) -> Trained:
 def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
     """One pass over all recordings: statistics and samples of the bins of every role."""
     pool, recipe = trained.detector.pool, trained.recipe
-    survey = Survey(len(pool.names), config.bins)
+    statistics = TrainingStatistics(len(pool.names), config.bins)
     others = {role: BinSample(config.scored_bins) for role in ROLES if role != "train"}
     data = SlipDataModule(trained.maker, trained.fold, config.num_workers)
     with one_thread():  # workers need the processors
@@ -158,11 +158,11 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
             name, recording = str(batch.recording), batch.recording
             if bool((mask := batch.roles["train"]).any()):
                 stratum = recipe.stratum(recording)
-                survey.update(name, stratum, batch.features[mask], batch.is_slip[mask])
+                statistics.update(name, stratum, batch.features[mask], batch.is_slip[mask])
             for role, other in others.items():
                 mask = batch.roles[role]
                 other.update(name, recording.material, batch.features[mask], batch.is_slip[mask])
-    sample, detector = survey.sample.bins(), trained.detector
+    sample, detector = statistics.sample.bins(), trained.detector
     weights = sample_weight(recipe, sample)
     group, group_names = sample_groups(sample)
     sample = replace(sample, group=group, group_names=group_names)
@@ -178,7 +178,7 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
         scaler=(
             detector.scaler
             if is_pooled
-            else scaled_selection(recipe, survey, range(len(pool.names))).scaler
+            else scaled_selection(recipe, statistics, range(len(pool.names))).scaler
         ),
         kernel=kernel_from_dict(detector.info["kernel"]),
         penalties=sorted({*recipe.penalties_ascending, float(detector.info["penalty"])}),
@@ -186,7 +186,7 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
         inputs=selected,
     )
     ranking = Ranking(
-        scores=t_scores(survey.moments, recipe.score_variance),
+        scores=t_scores(statistics.moments, recipe.score_variance),
         channels=[name.channel for name in pool.names],
         allowed=allowed,
         sample=sample,

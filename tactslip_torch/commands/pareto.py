@@ -28,19 +28,16 @@ from omegaconf import DictConfig
 
 from tactslip_torch.analysis.latency import (
     DEFINITION,
-    CostModel,
     Latency,
     Limits,
     Timing,
-    check_hops,
     time_in_fresh_process,
 )
 from tactslip_torch.analysis.pareto import (
     Candidate,
+    ParetoSearch,
     Search,
-    Searcher,
     Timed,
-    Workshop,
     distinct,
     landmarks,
     nondominated,
@@ -57,12 +54,11 @@ from tactslip_torch.runtime import bar, check_number, write_json
 from tactslip_torch.signals.filtering import Align
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.experiment import (
-    common_facts,
+    common_metadata,
     feature_cache,
-    feature_parts,
+    feature_maker,
     save_config,
 )
-from tactslip_torch.training.recipe import Recipe
 
 _EXIT_NONE_MEETS = 1
 _EXIT_INTERRUPTED = 130
@@ -88,27 +84,26 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
     """
     started = time.perf_counter()
     with feature_cache(config.cache) as cache:
-        limits, shop = _prepared(config, cache)
+        limits, search = _prepared(config, cache)
         for name in ("pareto.json", "pareto.png", "detector.pt"):
             (folder / name).unlink(missing_ok=True)  # of an earlier run
         save_config(config, folder)
-        shop.look()
-        costs = shop.costs()
-        recipe, filters = shop.recipe, {a: m.channel_filter for a, m in shop.makers.items()}
-        searcher = Searcher(shop.search, recipe, shop.pool, costs, shop.surveys, filters)
-        candidates = searcher.candidates()
-        if shop.search.drop_fingers:
+        search.read()
+        candidates = search.candidates()
+        if search.search.drop_fingers:
             keeping = [each for each in candidates if not limits.misses(each.latency)]
             of_channels = [each for each in keeping or candidates if each.columns == "channel"]
             best = max(of_channels or candidates, key=lambda each: each.balanced_accuracy)
-            candidates += searcher.without_fingers(best)
+            candidates += search.without_fingers(best)
         candidates = distinct(candidates)
-        worth = worth_timing(candidates, shop.search.most_timed, limits)
-        timed = shop.timed(distinct([*worth, *worth_naming(candidates)]))
+        worth = worth_timing(candidates, search.search.most_timed, limits)
+        timed = search.timed(distinct([*worth, *worth_naming(candidates)]))
+        timed.sort(key=_preference)
         trial = folder / "trial.pt"
         try:
-            found = _chosen(config, limits, shop, timed, trial)
-            found = _facts(config, limits, shop, costs, candidates, timed) | found
+            found = common_metadata(search.source, search.pool, config)
+            found |= _searched(limits, search, candidates, timed)
+            found |= {"headroom": config.headroom} | _chosen(config, limits, search, timed, trial)
             found["seconds"] = time.perf_counter() - started
             write_json(folder / "pareto.json", found)
             pareto_figure(found, folder / "pareto.png")
@@ -116,84 +111,75 @@ def pareto(config: DictConfig, folder: Path) -> dict[str, Any]:
                 trial.replace(folder / "detector.pt")
         finally:
             trial.unlink(missing_ok=True)
-    print("\n" + pareto_table(found))
-    print(f"\nresults in {folder}")
+    print(f"\n{pareto_table(found)}\n\nresults in {folder}")
     return found
 
 
-def _facts(
-    config: DictConfig,
-    limits: Limits,
-    shop: Workshop,
-    costs: CostModel,
-    candidates: Sequence[Candidate],
-    timed: Sequence[Timed],
-) -> dict[str, Any]:
-    """What was searched and timed, JSON-able."""
-    front = [timed[place] for place in nondominated([each.point for each in timed])]
-    named = landmarks(sorted(timed, key=_preferred))
-    scale = median(each.timing.p99_us / each.candidate.latency.compute_us for each in timed)
-    source = next(iter(shop.makers.values())).source
-    return common_facts(source, shop.pool, config) | {
-        "definition": DEFINITION,
-        "limits": {"deadline_ms": limits.deadline_ms, "compute_us": limits.compute_us},
-        "headroom": config.headroom,
-        "validation": _VALIDATION,
-        "backend": next(iter(shop.makers.values())).extractor.backend,
-        "front": [row_of(shop, each, limits, each.latency, each.timing) for each in front],
-        "named": {
-            name: each and row_of(shop, each, limits, each.latency, each.timing)
-            for name, each in named.items()
-        },
-        "timed": len(timed),
-        "searched": len(candidates),
-        "measured_over_modelled": scale,
-        "modelled": [_modelled(each, scale, limits) for each in candidates],
-        "costs": costs.to_dict(),
-    }
-
-
-def _prepared(config: DictConfig, cache: FeatureCache) -> tuple[Limits, Workshop]:
-    """The parts of the configuration; refuses limits that nothing can keep."""
-    search: Search = instantiate(config.search, _convert_="all")
-    limits = Limits(config.deadline_ms, config.compute_us, search.hops_ms)
+def _prepared(config: DictConfig, cache: FeatureCache) -> tuple[Limits, ParetoSearch]:
+    """What the configuration describes; refuses limits that nothing can keep."""
+    settings: Search = instantiate(config.search, _convert_="all")
+    limits = Limits(config.deadline_ms, config.compute_us, settings.hops_ms)
     check_number("headroom", config.headroom, least=1)
     for name in ("retime_calls", "tries"):
         check_number(name, config[name], whole=True)
     check_number("most_summed", config.most_summed, least=0, whole=True)
     rule: LabelRule = instantiate(config.labels)
-    recipe: Recipe = instantiate(config.recipe, _convert_="all")
+    recipe = instantiate(config.recipe, _convert_="all")
     source: RecordingSource = instantiate(config.data, _convert_="all")
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
     if len(folds) > 1:
         raise ValueError(f"pareto makes one detector, split has {len(folds)} folds; take another")
-    check_hops(search.hops_ms, source.sample_rate_hz)
+    limits.check_hops(source.sample_rate_hz)
     makers: dict[Align, FeatureMaker] = {}
-    for align in search.aligns:
+    for align in settings.aligns:
         features = {**config.features, "align": align}
-        pool, channel_filter, dtype, backend = feature_parts(source, rule.bin_ms, **features)
-        makers[align] = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, backend)
-    search.groups(pool)  # refuses an empty selection before any work
-    _check_physics(limits, rule.bin_ms, makers)
-    shop = Workshop(makers, folds[0], search, recipe, config.most_summed, config.num_workers)
-    return limits, shop
-
-
-def _check_physics(limits: Limits, bin_ms: float, makers: dict[Align, FeatureMaker]) -> None:
-    """Refuse a deadline that passes before the last sample has come."""
+        makers[align] = feature_maker(source, rule, **features)
+        makers[align].cache = cache
     ahead = min(after for maker in makers.values() for _, after in maker.channel_filter.reaches)
-    rate = next(iter(makers.values())).source.sample_rate_hz / 1000
-    least = Latency(ahead / rate, bin_ms, min(limits.hops_ms), 0.0).worst_ms
+    ahead_ms, hop_ms = 1000 * ahead / source.sample_rate_hz, min(limits.hops_ms)
+    least = Latency(ahead_ms, rule.bin_ms, hop_ms, 0.0).worst_ms
     if limits.deadline_ms <= least:
         raise ValueError(
-            f"deadline_ms={limits.deadline_ms:g} cannot be met: bin {bin_ms:g} ms, shortest hop "
-            f"{min(limits.hops_ms):g} ms and least look-ahead {ahead / rate:g} ms are {least:g} ms "
-            "before any compute; give more, or a shorter labels.bin_ms or search.hops_ms"
+            f"deadline_ms={limits.deadline_ms:g} cannot be met: bin {rule.bin_ms:g} ms, shortest "
+            f"hop {hop_ms:g} ms and least look-ahead {ahead_ms:g} ms are {least:g} ms before any "
+            "compute; give more, or a shorter labels.bin_ms or search.hops_ms"
         )
+    return limits, ParetoSearch(
+        makers, folds[0], settings, recipe, config.most_summed, config.num_workers
+    )
+
+
+def _searched(
+    limits: Limits, search: ParetoSearch, candidates: Sequence[Candidate], timed: Sequence[Timed]
+) -> dict[str, Any]:
+    """What was searched and timed, JSON-able."""
+
+    def row(each: Timed) -> dict[str, Any]:
+        return _row(search, each, limits, each.latency, each.timing)
+
+    scale = median(each.timing.p99_us / each.candidate.latency.compute_us for each in timed)
+    modelled = []  # brought to what was measured
+    for each in candidates:
+        latency = replace(each.latency, compute_us=scale * each.latency.compute_us)
+        latency = latency.with_shortest_hop(limits.hops_ms)
+        modelled.append([latency.worst_ms, latency.compute_us, each.balanced_accuracy])
+    return {
+        "definition": DEFINITION,
+        "limits": {"deadline_ms": limits.deadline_ms, "compute_us": limits.compute_us},
+        "validation": _VALIDATION,
+        "backend": search.backend,
+        "front": [row(timed[place]) for place in nondominated([each.point for each in timed])],
+        "named": {name: each and row(each) for name, each in landmarks(timed).items()},
+        "timed": len(timed),
+        "searched": len(candidates),
+        "measured_over_modelled": scale,
+        "modelled": modelled,
+        "costs": search.costs.to_dict(),
+    }
 
 
 def _chosen(
-    config: DictConfig, limits: Limits, shop: Workshop, timed: Sequence[Timed], trial: Path
+    config: DictConfig, limits: Limits, search: ParetoSearch, timed: Sequence[Timed], trial: Path
 ) -> dict[str, Any]:
     """The first that meets the limits in a fresh process too, or none; and all tries.
 
@@ -205,63 +191,56 @@ def _chosen(
         for each in timed
         if not limits.misses(limits.latency(each.latency, each.timing.p99_us))
     ]
-    tries: list[dict[str, Any]] = []
-    chosen, tried = None, 0
-    for each in bar(_in_turn(able, limits, config.tries), "again, in a fresh process", "detector"):
-        tried += 1
+    rows: list[dict[str, Any]] = []
+    tries = _tries(able, limits, config.tries)
+    for tried, each in enumerate(bar(tries, "again, in a fresh process", "detector"), 1):
         for from_all in (False, True):
-            detector = shop.make(each.candidate, each.arithmetic, from_all=from_all)
+            detector = search.make(each.candidate, each.arithmetic, from_all=from_all)
             detector.info |= {"experiment": config.name, "seed": config.seed}
             detector.save(trial)
             backend = detector.extractor.backend
             timing = time_in_fresh_process(trial, config.retime_calls, backend)
             latency = limits.latency(each.latency, timing.p99_us, config.headroom)
             about = {"fitted_to": detector.info["fitted_to"], "backend": backend}
-            tries.append(row_of(shop, each, limits, latency, timing) | about)
-            if tries[-1]["misses"]:
+            rows.append(_row(search, each, limits, latency, timing) | about)
+            if rows[-1]["misses"]:
                 break
         else:
-            chosen = tries[-1] | {"test": shop.evaluated(detector)}
-            break
-    return {"chosen": chosen, "tries": tries, "tried": tried, "not_tried": len(able) - tried}
+            chosen = rows[-1] | {"test": search.evaluated(detector)}
+            counts = {"tried": tried, "not_tried": len(able) - tried}
+            return {"chosen": chosen, "tries": rows} | counts
+    counts = {"tried": len(tries), "not_tried": len(able) - len(tries)}
+    return {"chosen": None, "tries": rows} | counts
 
 
-def _in_turn(able: Sequence[Timed], limits: Limits, tries: int) -> list[Timed]:
-    """Those to try: by accuracy, the last of several the one with most head-room of those left."""
-    ordered = sorted(able, key=_preferred)
-    first = ordered[: tries - 1 if tries > 1 else 1]
-    left = ordered[len(first) :]
-    if tries > 1 and left:
+def _tries(able: Sequence[Timed], limits: Limits, most: int) -> list[Timed]:
+    """The first of those to try; the last of several is the one with most head-room of the rest."""
+    first, left = list(able[: max(most - 1, 1)]), able[max(most - 1, 1) :]
+    if most > 1 and left:
         first.append(max(left, key=lambda each: limits.headroom(each.latency)))
     return first
 
 
-def _modelled(candidate: Candidate, scale: float, limits: Limits) -> list[float]:
-    """Latency, compute and accuracy as modelled, brought to what was measured."""
-    latency = replace(candidate.latency, compute_us=scale * candidate.latency.compute_us)
-    latency = latency.with_shortest_hop(limits.hops_ms)
-    return [latency.worst_ms, latency.compute_us, candidate.balanced_accuracy]
-
-
-def _preferred(timed: Timed) -> tuple[float, bool, float]:
+def _preference(timed: Timed) -> tuple[float, bool, float]:
     """The most accurate first; float32 only where it is needed; then the fastest."""
-    accuracy = timed.candidate.balanced_accuracy
-    return -accuracy, timed.arithmetic != "double", timed.timing.p99_us
+    return -timed.accuracy, timed.arithmetic != "double", timed.timing.p99_us
 
 
-def row_of(
-    shop: Workshop, timed: Timed, limits: Limits, latency: Latency, timing: Timing
+def _row(
+    search: ParetoSearch, timed: Timed, limits: Limits, latency: Latency, timing: Timing
 ) -> dict[str, Any]:
-    """A detector as JSON-able facts."""
-    candidate, names = timed.candidate, shop.pool.names
+    """A detector, JSON-able."""
+    candidate, names = timed.candidate, search.pool.names
     read, layer = [names[index] for index in candidate.selected], candidate.selection.pooling
     return {
         "num_features": candidate.selection.size,
         "features_read": len(read),
-        "align": candidate.align,
-        "channels": candidate.channels,
-        "channels_read": sorted({name.channel for name in read}, key=shop.pool.hand.names.index),
-        "components": candidate.components,
+        "align": candidate.group.align,
+        "channels": candidate.group.channels,
+        "channels_read": sorted(
+            {name.channel for name in read}, key=search.source.hand.names.index
+        ),
+        "components": candidate.group.components,
         "columns": candidate.columns,
         "ranking": candidate.ranking,
         "degree": candidate.degree,

@@ -20,25 +20,25 @@ from omegaconf import DictConfig
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
-from tactslip_torch.data.splits import Split, are_rivals
+from tactslip_torch.data.splits import Split, have_same_bins
 from tactslip_torch.features.pooling import pooled_names
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process
-from tactslip_torch.training.abstention import Abstaining
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
-from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.experiment import (
     check_statistics,
     combined,
-    common_facts,
+    common_metadata,
     feature_cache,
-    feature_parts,
+    feature_maker,
     feature_rows,
     run_fold,
     save_config,
     tune_fold,
 )
 from tactslip_torch.training.learner import SlipLearner
+from tactslip_torch.training.plan import Abstaining
 from tactslip_torch.training.recipe import Recipe
 from tactslip_torch.training.tuning import Tuning
 
@@ -67,7 +67,8 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     rule: LabelRule = instantiate(config.labels)
     recipe: Recipe = instantiate(config.recipe, _convert_="all")
     folds: list[Split] = instantiate(config.split, _convert_="all")(source.ids)
-    pool, channel_filter, dtype, backend = feature_parts(source, rule.bin_ms, **config.features)
+    maker = feature_maker(source, rule, **config.features)
+    pool = maker.pool
     recipe.check_pool(len(pool.names))
     if config.statistics:
         check_statistics(config, recipe)
@@ -93,14 +94,13 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     if is_first:
         save_config(config, folder)
     fold_metrics: dict[str, dict[str, Any]] = {}
-    with feature_cache(config.cache) as cache:
-        maker = FeatureMaker(source, pool, channel_filter, rule, cache, dtype, backend)
+    with feature_cache(config.cache) as maker.cache:
         for fold in folds:
             place = folder if len(folds) == 1 else folder / fold.name
             data = SlipDataModule(maker, fold, config.num_workers)
             learner = SlipLearner(
                 pool,
-                channel_filter,
+                maker.channel_filter,
                 recipe,
                 abstaining=abstaining,
                 with_baselines=config.baselines,
@@ -109,7 +109,9 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
             if tuning is not None:
                 learner, found = tune_fold(config, place, data, learner, tuning)
             fold_metrics[fold.name] = run_fold(config, place, data, learner, alarming, found)
-    metrics = common_facts(source, pool, config) | combined(fold_metrics, by_fold=are_rivals(folds))
+    metrics = common_metadata(source, pool, config) | combined(
+        fold_metrics, by_fold=have_same_bins(folds)
+    )
     metrics["timing_s"]["total"] = time.perf_counter() - started
     names = list(pool.names)
     if recipe.pooling is not None:

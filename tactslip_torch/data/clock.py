@@ -8,23 +8,18 @@ unit, even one as long as a step or two, as milliseconds are at 2 kHz.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import grey_closing, grey_opening
-from torch import Tensor
-
-from tactslip_torch.data.formats import Samples, Times
 
 GapRule = Literal["refuse", "missing", "bridge"]
 GAP_RULES: tuple[str, ...] = get_args(GapRule)
 
 _Numbers = NDArray[np.float64]
-_BLOCK = 1 << 18  # times at a time
+_MOST_FOR_STEP = 1 << 18  # times that the step is found from
 _PHASE_BLOCK = 1024  # samples of which one phase is kept, to see a drift
 _MAKES_UP = 8  # so many samples may pass until a late one must have been made up for
 _WINDOW = 64  # samples over which neighbours are compared
@@ -36,6 +31,7 @@ _RATE_ERR = 0.01
 _OSCILLATOR_ERR = 1e-4  # of three digits at most are what people mean
 _FIT_ERR = 2e-6
 _SAID_ERR = 1e-5
+_STATE = "state the rate and go without the times: reading.sample_rate_hz=..., reading.time=null"
 
 
 class Gap(NamedTuple):
@@ -69,14 +65,11 @@ class Clock(NamedTuple):
     jitter_s: float = 0.0
 
 
-def even_clock(
-    times: Times, num_samples: int, stated_hz: float | None = None, name: str = "times"
-) -> Clock:
-    """The clock of a file's samples, from their timestamps read by stretches.
+def even_clock(times: _Numbers, stated_hz: float | None = None, name: str = "times") -> Clock:
+    """The clock of samples, from their time stamps.
 
     Args:
-        times: of the samples.
-        num_samples: how many there are, at least 3.
+        times: of the samples, in seconds, ``[T]``, at least 3.
         stated_hz: the rate they are said to have; ``None``: as measured.
         name: of the file, for errors.
 
@@ -84,45 +77,91 @@ def even_clock(
         ValueError: if times are not finite, go back, come in bursts, contradict the rate, or are
             too coarse to tell it.
     """
-    if num_samples < 3:
-        raise ValueError(f"{name} has {num_samples} times, too few to tell a rate")
-    start = _checked(times, 0, min(num_samples, _BLOCK), name)
+    if len(times) < 3:
+        raise ValueError(f"{name} has {len(times)} times, too few to tell a rate")
+    if not np.isfinite(times).all():
+        place = int(np.argmin(np.isfinite(times)))
+        raise ValueError(f"{name}: the time of sample {place} is {times[place]}")
+    if (is_back := np.diff(times) < 0).any():
+        place = int(np.argmax(is_back))
+        raise ValueError(
+            f"{name}: time goes back at sample {place + 1}, from {times[place]:g} to "
+            f"{times[place + 1]:g} s; sort the file, or go without: reading.time=null"
+        )
+    seconds = times - times[0]
+    start = seconds[:_MOST_FOR_STEP]
     _refuse_bursts(np.diff(start), name)
-    step_s, unit_s = _step_of(start - start[0], name)
+    step_s, unit_s = _step_of(start, name)
     if stated_hz is not None and abs(stated_hz * step_s - 1) > _RATE_ERR:
         raise ValueError(
             f"{name}: its times are {1 / step_s:.6g} Hz, but {stated_hz:g} Hz is stated; "
             f"{_unit_hint(stated_hz * step_s)}"
             "correct it, or go without the times: reading.time=null"
         )
-    ticks = _Ticks(step_s, unit_s, name)
-    for first in range(0, num_samples, _BLOCK):
-        low, stop = max(first - 2 * _MAKES_UP, 0), min(first + _BLOCK, num_samples)
-        seconds = _checked(times, low, min(stop + 2 * _MAKES_UP, num_samples), name) - start[0]
-        ticks.add(seconds, low, first, stop)
-    step_s, jitter_s = ticks.fitted()
-    rate = stated_hz if stated_hz is not None else 1 / step_s
-    return Clock(rate, num_samples + ticks.missing, tuple(ticks.gaps), jitter_s)
+    late = seconds / step_s - np.arange(len(seconds))
+    gaps, jitter = _gaps_in(late, step_s, unit_s / step_s, name)
+    missing = np.zeros(len(late))
+    missing[[gap.place for gap in gaps]] = [gap.missing for gap in gaps]
+    missing = missing.cumsum()
+    ticks = np.arange(len(late)) + missing
+    slope = float(np.polyfit(ticks, late - missing, 1)[0])
+    rest = late - missing - slope * ticks
+    blocks = range(0, len(rest) - _PHASE_BLOCK // 2, _PHASE_BLOCK)
+    phases = np.array([rest[place : place + _PHASE_BLOCK].mean() for place in blocks])
+    drift = float(np.abs(phases - np.median(phases)).max()) if len(phases) else 0.0
+    step_s *= 1 + slope
+    rate_hz = stated_hz if stated_hz is not None else 1 / step_s
+    num_samples = len(times) + sum(gap.missing for gap in gaps)
+    return Clock(rate_hz, num_samples, gaps, step_s * max(jitter, drift if drift > 1 else 0.0))
 
 
-def _checked(times: Times, first: int, stop: int, name: str) -> _Numbers:
-    """Times in that range.
+def _gaps_in(
+    late: _Numbers, step_s: float, unit: float, name: str
+) -> tuple[tuple[Gap, ...], float]:
+    """Where samples are missing, and by how many steps one came late that was made up for.
+
+    Where lateness changes and stays so, samples are missing: as many as its mean behind that place
+    is above the mean before it.
+
+    Args:
+        late: how many steps each time is behind its number.
+        step_s: from a sample to the next.
+        unit: that stamps are rounded to, in steps.
+        name: of the file, for errors.
 
     Raises:
-        ValueError: if one is not finite, or is before the last.
+        ValueError: if late samples cannot be told from missing ones, or samples are there twice.
     """
-    seconds = times.read(first, stop).double().numpy()
-    if not np.isfinite(seconds).all():
-        place = int(np.argmin(np.isfinite(seconds)))
-        raise ValueError(f"{name}: the time of sample {first + place} is {seconds[place]}")
-    steps = np.diff(seconds)
-    if (steps < 0).any():
-        place = int(np.argmax(steps < 0))
+    padded = np.pad(late, _MAKES_UP + 1, mode="edge")
+    calm = grey_closing(grey_opening(padded, _MAKES_UP + 1), _MAKES_UP + 1)
+    calm = calm[_MAKES_UP + 1 : -_MAKES_UP - 1]
+    spread = _width_of(calm)
+    if spread > 1 + unit:
         raise ValueError(
-            f"{name}: time goes back at sample {first + place + 1}, from {seconds[place]:g} "
-            f"to {seconds[place + 1]:g} s; sort the file, or go without: reading.time=null"
+            f"{name}: its times come so unevenly, by up to {spread * step_s:.3g} s, that missing "
+            f"samples cannot be told from late ones; {_STATE}"
         )
-    return seconds
+    slip = abs(unit - round(unit))
+    beat = 1 / slip if slip > 2 / _MOST_FOR_STEP else 0.0  # samples until rounding repeats
+    reach = max(_WINDOW, round(2 * beat))
+    is_change = np.abs(np.diff(calm, prepend=calm[0])) > 0.5 + spread + unit
+    gaps: list[Gap] = []
+    total = 0
+    level = calm.copy()  # missing samples taken off
+    for place, until in pairwise([*is_change.nonzero()[0].tolist(), len(late)]):
+        before = level[max(place - reach, 0) : place].mean()
+        behind = calm[place : min(until, place + reach)].mean()
+        missing = math.floor(behind - before + 0.4)
+        if missing < total:
+            raise ValueError(
+                f"{name}: samples {place} and before come {total - missing} steps closer than "
+                f"{1 / step_s:.6g} Hz; remove what is there twice, or {_STATE}"
+            )
+        if missing > total:
+            gaps.append(Gap(place + total, missing - total, place))
+            total = missing
+        level[place:until] -= total
+    return tuple(gaps), float(np.abs(late - calm).max())
 
 
 def _refuse_bursts(steps: _Numbers, name: str) -> None:
@@ -132,9 +171,7 @@ def _refuse_bursts(steps: _Numbers, name: str) -> None:
     longest = max((edges == -1).nonzero()[0] - (edges == 1).nonzero()[0], default=0)
     if longest >= _MOST_TOGETHER or not len(forward):
         raise ValueError(
-            f"{name}: {longest + 1} samples share a time, as if they came in "
-            "bursts; state the rate and go without the times: reading.sample_rate_hz=..., "
-            "reading.time=null"
+            f"{name}: {longest + 1} samples share a time, as if they came in bursts; {_STATE}"
         )
 
 
@@ -185,8 +222,7 @@ def _step_of(seconds: _Numbers, name: str) -> tuple[float, float]:
         if _is_regular(steps, unit):
             raise ValueError(
                 f"{name}: its times are rounded so coarsely that they do not tell which samples "
-                "are missing; state the rate and go without the times: "
-                "reading.sample_rate_hz=..., reading.time=null"
+                f"are missing; {_STATE}"
             )
         step = unit  # losses come at random, and stamps are not rounded
     for _ in range(3):
@@ -245,102 +281,7 @@ def _width_of(late: _Numbers) -> float:
     return float(np.ptp(windows, axis=-1).min())
 
 
-# Ticks and gaps ----------------------------------------------------------------------------------
-
-
-class _Ticks:
-    """Which tick each sample belongs to, block after block.
-
-    Lateness is how many steps a time is behind its number. Where it changes and stays so, samples
-    are missing: as many as the mean behind that place is above the mean before it.
-    """
-
-    def __init__(self, step_s: float, unit_s: float, name: str) -> None:
-        self.gaps: list[Gap] = []
-        self.missing = 0
-        self._step_s, self._name = step_s, name
-        self._unit = unit_s / step_s
-        slip = abs(self._unit - round(self._unit))
-        beat = 1 / slip if slip > 2 / _BLOCK else 0.0  # samples until rounding repeats
-        self._reach = max(_WINDOW, round(2 * beat))
-        self._before = np.empty(0)  # lateness of the samples before, missing ones taken off
-        self._jitter, self._sums = 0.0, np.zeros(5)
-        self._phases: list[tuple[float, float]] = []
-
-    def add(self, seconds: _Numbers, low: int, first: int, stop: int) -> None:
-        """Go on with samples ``first`` to before ``stop``.
-
-        Args:
-            seconds: from sample ``low``, with a margin on both sides where there are any.
-            low: number of the first of them.
-            first: the first sample that is new.
-            stop: the first that is left for later.
-        """
-        late = seconds / self._step_s - np.arange(low, low + len(seconds))
-        padded = np.pad(late, _MAKES_UP + 1, mode="edge")
-        calm = grey_closing(grey_opening(padded, _MAKES_UP + 1), _MAKES_UP + 1)
-        calm = calm[_MAKES_UP + 1 : -_MAKES_UP - 1]
-        spread = _width_of(calm)
-        if spread > 1 + self._unit:
-            raise ValueError(
-                f"{self._name}: its times come so unevenly, by up to "
-                f"{spread * self._step_s:.3g} s, that missing samples cannot be told from late "
-                "ones; state the rate and go without the times: reading.sample_rate_hz=..., "
-                "reading.time=null"
-            )
-        is_change = np.abs(np.diff(calm, prepend=calm[0])) > 0.5 + spread + self._unit
-        late, calm, is_change = (x[first - low : stop - low] for x in (late, calm, is_change))
-        self._jitter = max(self._jitter, float(np.abs(late - calm).max()))
-        missing = np.zeros(len(late))
-        corrected = np.append(self._before, calm)
-        num_before = len(self._before)
-        edges = [0, *is_change.nonzero()[0].tolist(), len(late)]
-        for place, until in pairwise(edges):
-            at = num_before + place
-            if at and is_change[place]:
-                level = corrected[max(at - self._reach, 0) : at].mean()
-                behind = calm[place : min(until, place + self._reach)].mean()
-                self._change(first + place, math.floor(behind - level + 0.4))
-            missing[place:until] = self.missing
-            corrected[at : num_before + until] -= self.missing
-        self._before = corrected[-self._reach :]
-        rest, tick = late - missing, np.arange(first, stop) + missing
-        self._sums += len(tick), tick.sum(), rest.sum(), (tick * tick).sum(), (tick * rest).sum()
-        for place in range(0, len(tick) - _PHASE_BLOCK // 2, _PHASE_BLOCK):
-            part = slice(place, place + _PHASE_BLOCK)
-            self._phases.append((float(tick[part].mean()), float(rest[part].mean())))
-
-    def _change(self, place: int, missing: int) -> None:
-        """From that sample on so many are missing in all.
-
-        Raises:
-            ValueError: if these are fewer than before.
-        """
-        if missing < self.missing:
-            raise ValueError(
-                f"{self._name}: samples {place} and before come {self.missing - missing} steps "
-                f"closer than {1 / self._step_s:.6g} Hz; remove what is there twice, or "
-                "state the rate and go without the times: reading.sample_rate_hz=..., "
-                "reading.time=null"
-            )
-        if missing > self.missing:
-            self.gaps.append(Gap(place + self.missing, missing - self.missing, place))
-            self.missing = missing
-
-    def fitted(self) -> tuple[float, float]:
-        """The step by least squares of all times against their ticks, and the jitter, seconds."""
-        num, tick, late, tick2, both = self._sums.tolist()
-        slope = (both - tick * late / num) / (tick2 - tick * tick / num)
-        drift = 0.0
-        if self._phases:
-            at, phase = np.array(self._phases).T
-            rest = phase - slope * at
-            drift = float(np.abs(rest - np.median(rest)).max())
-        jitter = max(self._jitter, drift if drift > 1 else 0.0)
-        return self._step_s * (1 + slope), self._step_s * jitter
-
-
-# Rates and samples -------------------------------------------------------------------------------
+# Rates -------------------------------------------------------------------------------------------
 
 
 def nominal_rate(measured_hz: float, spread: float = 0.0) -> float:
@@ -348,7 +289,7 @@ def nominal_rate(measured_hz: float, spread: float = 0.0) -> float:
 
     Args:
         measured_hz: the rate.
-        spread: by what share the rates of files that are of one rate differ from it.
+        spread: by what fraction the rates of files that are of one rate differ from it.
 
     Example:
         >>> nominal_rate(1999.97), nominal_rate(1024.0), nominal_rate(92.31), nominal_rate(1017.25)
@@ -373,63 +314,3 @@ def snapped_rate(rate_hz: float) -> float:
     """
     plain = float(f"{rate_hz:.4g}")
     return plain if abs(plain / rate_hz - 1) < _SAID_ERR else rate_hz
-
-
-class EvenSamples:
-    """Samples of a file on an even clock; a ``Samples`` itself.
-
-    Args:
-        samples: of the file.
-        clock: of its times.
-        most_bridged: gaps of at most so many samples are crossed by a straight line; others are
-            NaN.
-    """
-
-    def __init__(self, samples: Samples, clock: Clock, most_bridged: int = 0) -> None:
-        self.num_channels, self.num_samples = samples.num_channels, clock.num_samples
-        self.dtype = samples.dtype
-        self._samples, self._most = samples, most_bridged
-        self._gaps = (Gap(0, 0, 0), *clock.gaps)
-        self._starts = [gap.start for gap in self._gaps]
-
-    def read(self, first: int, stop: int) -> Tensor:
-        """Samples from ``first`` to before ``stop`` on the clock, ``[C, n]``."""
-        first, stop = max(first, 0), min(stop, self.num_samples)
-        found = torch.full((self.num_channels, max(stop - first, 0)), torch.nan, dtype=self.dtype)
-        for place in range(bisect_right(self._starts, first) - 1, len(self._gaps)):
-            gap = self._gaps[place]
-            behind = gap.start + gap.missing  # the first sample that is there again
-            following = [*self._starts, self.num_samples][place + 1]
-            low, high = max(gap.start, first), min(behind, stop)
-            if low < high and gap.missing <= self._most:
-                found[:, low - first : high - first] = self._line(gap, low, high)
-            low, high = max(behind, first), min(following, stop)
-            if low < high:
-                shift = gap.place - behind  # file's number less the clock's
-                read = self._samples.read(low + shift, high + shift)
-                found[:, low - first : high - first] = read
-            if following >= stop:
-                break
-        return found
-
-    def _line(self, gap: Gap, low: int, high: int) -> Tensor:
-        """The straight line across a gap, at samples ``low`` to before ``high``."""
-        ends = self._samples.read(gap.place - 1, gap.place + 1).double()
-        share = torch.arange(low, high, dtype=torch.float64) - (gap.start - 1)
-        share /= gap.missing + 1
-        return (ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * share).to(self.dtype)
-
-
-def refuse_gaps(clock: Clock, name: str) -> None:
-    """Raise if samples are missing.
-
-    Raises:
-        ValueError: naming the first gap and the rules that take it.
-    """
-    if clock.gaps:
-        gap, rate = clock.gaps[0], clock.sample_rate_hz
-        missing = sum(each.missing for each in clock.gaps)
-        raise ValueError(
-            f"{name}: {missing} samples are missing in {len(clock.gaps)} gaps, first {gap.missing} "
-            f"at {gap.start / rate:.4f} s; give gaps=missing, or gaps=bridge with bridge_ms"
-        )

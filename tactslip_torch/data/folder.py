@@ -1,4 +1,4 @@
-"""Folders of recordings that are written: one file each, found again by its key, and a manifest."""
+"""Folders of recordings: their files, one each and found again by its key, and their manifest."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.formats import (
     Archived,
     Format,
@@ -18,27 +17,40 @@ from tactslip_torch.data.formats import (
     format_of,
     named_format,
 )
-from tactslip_torch.data.manifest import MOMENTS, STRETCHES, write_table
+from tactslip_torch.data.manifest import MOMENTS, NAMES, STRETCHES, write_table
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource
 
-MANIFEST = "manifest.csv"
+MANIFEST = NAMES[0]
 
 
-def recording_files(place: Path) -> list[Path]:
-    """The file, or those of a folder that are of a known format, by name.
+def recording_files(place: Path, *, in_folders: bool = False) -> list[Path]:
+    """The file or bag, or those of a folder that are of a known format, by name.
+
+    Args:
+        place: a recording, or a folder.
+        in_folders: whether to look in the folders of a folder as well.
 
     Raises:
         FileNotFoundError: if there is no such file or folder.
         ValueError: if the ending is unknown, or the folder holds no such file.
     """
-    if place.is_dir() and find_format(place) is None:
-        found = [p for p in sorted(place.iterdir()) if p.name != MANIFEST and find_format(p)]
-        if not found:
-            known = " or ".join(f".{ending}" for ending in endings())
-            raise ValueError(f"no recording in {place}; give a folder of {known} files")
-        return found
-    format_of(place)
-    return [place]
+    if not place.is_dir() or find_format(place) is not None:
+        format_of(place)
+        return [place]
+    found: list[Path] = []
+    folders = [place]
+    while folders:
+        for path in sorted(folders.pop().iterdir()):
+            if path.name.startswith(".") or path.name in NAMES:
+                continue
+            if find_format(path) is not None:
+                found.append(path)
+            elif in_folders and path.is_dir() and not path.is_symlink():
+                folders.append(path)
+    if not found:
+        known = " or ".join(f".{ending}" for ending in endings())
+        raise ValueError(f"no recording in {place}; give a folder of {known} files")
+    return found
 
 
 def file_facts(path: Path, archived: Archived | None) -> dict[str, Any]:
@@ -89,6 +101,8 @@ class RecordingFolder:
         ending: of the files, or the name of a format.
         made_by: what determines the samples beside the source's keys: code and libraries.
         given: what could be given in place of the folder, for messages.
+        files: the file each recording was read from, relative to its set; its new one is called so
+            but for the ending. ``None``: called by material, scene, cycle and session.
 
     Raises:
         ValueError: if there is no such format.
@@ -99,6 +113,7 @@ class RecordingFolder:
     ending: str
     made_by: Mapping[str, Any]
     given: str = "folder"
+    files: Mapping[RecordingId, str] | None = None
 
     def __post_init__(self) -> None:
         _ = self.format  # refuses an unknown one
@@ -109,10 +124,10 @@ class RecordingFolder:
         return named_format(self.ending)
 
     def path(self, recording: RecordingId) -> Path:
-        """The recording's file: beside the others as the one it was read from, if there is one."""
+        """The recording's file."""
         ending = self.ending if self.ending in self.format.endings else self.format.endings[0]
-        if isinstance(self.source, FileRecordings):
-            return (self.folder / self.source.entry(recording).file).with_suffix(f".{ending}")
+        if self.files is not None:
+            return (self.folder / self.files[recording]).with_suffix(f".{ending}")
         session = f"_session{recording.session}" if recording.session else ""
         name = f"{recording.material}_{recording.scene}_{recording.cycle:02d}{session}"
         return self.folder / f"{name}.{ending}"
@@ -123,13 +138,14 @@ class RecordingFolder:
             "recording": {"name": recording.scene, **self.source.key(recording)},
             "material": recording.material,
             **self.made_by,
+            "truth": self._truth(recording),
         }
-        times = self.source.timeline(recording)
-        facts["truth"] = {name: getattr(times, name) for name in (*MOMENTS, *STRETCHES)}
-        if isinstance(self.source, FileRecordings):
-            facts["units"] = self.source.units
         plain: dict[str, Any] = json.loads(json.dumps(facts, allow_nan=False))
         return plain
+
+    def _truth(self, recording: RecordingId) -> dict[str, Any]:
+        times = self.source.timeline(recording)
+        return {name: getattr(times, name) for name in (*MOMENTS, *STRETCHES)}
 
     def check(self) -> None:
         """Refuse names that files cannot have, and to replace a file that is not ours.
@@ -139,26 +155,19 @@ class RecordingFolder:
         """
         if not self.source.ids:
             raise ValueError("no recording to write; give at least one of materials=[M1,...]")
-        root = self.source.root if isinstance(self.source, FileRecordings) else None
-        if root is not None and self.folder.resolve() == root.resolve():
-            raise ValueError("output must be another folder than root, which stays as it is")
         first: dict[Path, RecordingId] = {}
         for recording in self.source.ids:
             path = self.path(recording)
             is_name = path.parent == self.folder and re.fullmatch(r"[\w.+-]+", path.name)
-            if root is None and not is_name:
+            if self.files is None and not is_name:
                 raise ValueError(f"{path.name!r} cannot name a file; give the scene another name")
-            if path in first:
+            if (other := first.setdefault(path, recording)) is not recording:
                 raise ValueError(
-                    f"{first[path]} and {recording} would both become {path.name}; rename one"
+                    f"{other} and {recording} would both become {path.name}; rename one"
                 )
-            first[path] = recording
-            if path.exists():
-                try:
-                    self.format.key(path)
-                except ValueError as error:
-                    what = f"move it away, or give another {self.given}"
-                    raise ValueError(f"{error}; {what}") from error
+            if path.exists() and not self.format.is_ours(path):
+                what = f"move it away, or give another {self.given}"
+                raise ValueError(f"{path} is no recording of ours; {what}")
 
     def load(self, recording: RecordingId) -> Archived:
         """What the recording's file holds.
@@ -187,14 +196,14 @@ class RecordingFolder:
             path.parent.mkdir(parents=True, exist_ok=True)
             self.format.save(path, content, self.source.hand, key)
         inner = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
-        times, origin = self.source.timeline(recording), content.provenance
+        origin = content.provenance
         line = {
             "file": path.relative_to(self.folder).as_posix(),
             "material": recording.material,
             "trial": recording.cycle,
             "scene": recording.scene,
             "session": recording.session,
-            **{name: json.dumps(getattr(times, name)) for name in (*MOMENTS, *STRETCHES)},
+            **{name: json.dumps(value) for name, value in self._truth(recording).items()},
             "sample_rate_hz": content.sample_rate_hz,
             "simulated": str(bool(origin.get("simulated"))).lower(),
             "fidelity": origin.get("fidelity", ""),
@@ -207,3 +216,89 @@ class RecordingFolder:
 def write_manifest(folder: Path, written: Sequence[Written]) -> None:
     """Write the lines of recordings to ``manifest.csv``, whole or not at all."""
     write_table(folder / MANIFEST, list(written[0].line), [one.line for one in written])
+
+
+# Manifests to fill in ---------------------------------------------------------------------------
+
+_FIELDS = {"material": r"[^/]+?", "trial": r"\d+", "scene": r"[^/]+?", "label": r"[^/]+?"}
+"""What a pattern may name, and what each stands for."""
+_TEMPLATE_COLUMNS = (
+    *("file", "material", "trial", "scene"),
+    *("onsets_s", "sliding_s", "slip_s", "non_slip_s", "label"),
+)
+_BETWEEN = "-_. "
+
+
+class _Template(NamedTuple):
+    """A manifest that was written.
+
+    Args:
+        path: of it.
+        num_files: it lists.
+        num_guessed: of which the pattern told anything.
+    """
+
+    path: Path
+    num_files: int
+    num_guessed: int
+
+
+def guessed(file: str, pattern: str) -> dict[str, str]:
+    """What a pattern tells of a file by its name, or by its path if the pattern has a stroke.
+
+    A ``*`` stands for any text, and the ending is no part of a name. Blanks, dots, strokes and
+    underlines around a material or scene are no part of it.
+
+    Raises:
+        ValueError: if the pattern names nothing, one twice, or something else than material,
+            trial, scene and label.
+
+    Example:
+        >>> guessed("oil paper-slip_07.csv", "{material}{trial}")
+        {'material': 'oil paper-slip', 'trial': '07'}
+    """
+    parts = re.split(r"\{(\w*)\}", pattern)
+    names = parts[1::2]
+    if not names or set(names) - set(_FIELDS) or len(set(names)) < len(names):
+        raise ValueError(
+            f"pattern must name each of {', '.join(f'{{{name}}}' for name in _FIELDS)} at most "
+            f"once, as {{material}}_{{trial}}, got {pattern!r}"
+        )
+    expression = ""
+    for place, part in enumerate(parts):
+        if place % 2:
+            between = f"[{re.escape(_BETWEEN)}]*" if part in ("material", "scene") else ""
+            expression += f"(?P<{part}>{_FIELDS[part]}){between}"
+        else:
+            expression += "[^/]*".join(re.escape(piece) for piece in part.split("*"))
+    path = Path(file)
+    name = path.with_suffix("").as_posix() if "/" in pattern else path.stem
+    found = re.fullmatch(expression, name)
+    return found.groupdict() if found else {}
+
+
+def write_template(root: Path, pattern: str, path: Path | None = None) -> _Template:
+    """Write a manifest of all recordings of a folder, its label columns empty.
+
+    Args:
+        root: the folder.
+        pattern: of names.
+        path: of the manifest; ``None`` for ``manifest.csv`` in the folder.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if there is a manifest already, no recording, or the pattern is none.
+    """
+    there = [root / name for name in NAMES] if path is None else [path]
+    for other in there:
+        if other.exists():
+            raise ValueError(f"{other} is there already; move it away, or give output=FILE")
+    path = root / NAMES[0] if path is None else path
+    if not root.is_dir():
+        raise FileNotFoundError(f"no folder at {root}")
+    found = recording_files(root, in_folders=True)
+    files = sorted(one.relative_to(root).as_posix() for one in found)
+    guesses = {file: guessed(file, pattern) for file in files}
+    rows = [dict.fromkeys(_TEMPLATE_COLUMNS, "") | {"file": f, **own} for f, own in guesses.items()]
+    write_table(path, _TEMPLATE_COLUMNS, rows)
+    return _Template(path, len(guesses), sum(map(bool, guesses.values())))

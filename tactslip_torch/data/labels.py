@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -114,8 +114,9 @@ def label_bins(
     if rule.hop_ms is not None:
         hop = whole_samples(rule.hop_ms, sample_rate_hz, "labels.hop_ms")
     lead_s, shift_s = (1.0, 0.010) if rule.layout == "whole_slide" else (0.5, 0.0)
-    parts: list[_Part] = []
-    is_taken = torch.zeros(round(duration_s * sample_rate_hz), dtype=torch.bool)  # by bin or slide
+    num_samples = round(duration_s * sample_rate_hz)
+    is_taken = torch.zeros(num_samples, dtype=torch.bool)  # by a bin or a slide
+    parts = [_laid(torch.zeros(0, dtype=torch.int64), is_slip=False)]
     previous_end = 0
     for stroke, (onset_s, (start_s, end_s)) in enumerate(zip(onsets_s, sliding_s, strict=True)):
         edge = round((onset_s - shift_s) * sample_rate_hz)
@@ -123,7 +124,7 @@ def label_bins(
         last = int(end_s * sample_rate_hz)
         if rule.layout == "half_second":
             last = min(last, edge + round(lead_s * sample_rate_hz))
-        if first < 0 or last > round(duration_s * sample_rate_hz):
+        if first < 0 or last > num_samples:
             raise ValueError(
                 f"stroke {stroke + 1} with its onset at {onset_s:.3f} s needs samples from "
                 f"{first} to {last}, outside the recording of {duration_s:.3f} s"
@@ -136,45 +137,32 @@ def label_bins(
         before = torch.arange(first, edge - bin_samples + 1, hop)
         before = before[before >= previous_end]
         after = torch.arange(edge, max(last - bin_samples + 1, edge), hop)
-        parts.append(_Part(before, torch.arange(-len(before), 0), stroke, is_slip=False))
-        parts.append(_Part(after, torch.arange(len(after)), stroke, is_slip=True))
+        position = torch.arange(-len(before), len(after))
+        parts.append(_laid(before, False, stroke, position[: len(before)]))
+        parts.append(_laid(after, True, stroke, position[len(before) :]))
         previous_end = math.ceil(end_s * sample_rate_hz)
         is_taken[min(edge, int(start_s * sample_rate_hz)) : previous_end] = True
     within = torch.arange(bin_samples)
-    for part in parts:
-        is_taken[part.starts[:, None] + within] = True
+    for starts, *_ in parts:
+        is_taken[starts[:, None] + within] = True
     told = [(stretch, False) for stretch in non_slip_s] + [(stretch, True) for stretch in slip_s]
     for stretch, is_slip in told:
         starts = _starts_inside(stretch, bin_samples, hop, duration_s, sample_rate_hz)
         free = starts[~is_taken[starts[:, None] + within].any(-1)]
         is_taken[free[:, None] + within] = True
-        parts.append(_Part(free, torch.full_like(free, NO_POSITION), -1, is_slip))
-    return _joined(parts, bin_samples)
+        parts.append(_laid(free, is_slip))
+    starts, is_slips, strokes, positions = map(torch.cat, zip(*parts, strict=True))
+    return LabelledBins(starts, is_slips, strokes, positions, bin_samples)
 
 
-class _Part(NamedTuple):
-    """Bins of one stroke or stretch and one kind."""
-
-    starts: Tensor
-    position: Tensor
-    stroke: int
-    is_slip: bool
-
-
-def _joined(parts: Sequence[_Part], bin_samples: int) -> LabelledBins:
-    lengths = torch.tensor([len(part.starts) for part in parts], dtype=torch.int64)
-    nothing = torch.zeros(0, dtype=torch.int64)
-
-    def of_bins(values: Sequence[int]) -> Tensor:
-        return torch.tensor(values, dtype=torch.int64).repeat_interleave(lengths)
-
-    return LabelledBins(
-        torch.cat([nothing, *(part.starts for part in parts)]),
-        of_bins([part.is_slip for part in parts]).bool(),
-        of_bins([part.stroke for part in parts]),
-        torch.cat([nothing, *(part.position for part in parts)]),
-        bin_samples,
-    )
+def _laid(
+    starts: Tensor, is_slip: bool, stroke: int = -1, position: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The columns of ``LabelledBins`` for bins of one stroke or stretch and one kind."""
+    if position is None:
+        position = torch.full_like(starts, NO_POSITION)
+    is_slip_each = torch.full_like(starts, is_slip, dtype=torch.bool)
+    return starts, is_slip_each, torch.full_like(starts, stroke), position
 
 
 def _starts_inside(
@@ -217,13 +205,8 @@ def clear_of(
     for start_s, end_s in missing_s:
         start, end = round(start_s * sample_rate_hz), round(end_s * sample_rate_hz)
         is_whole &= (stop <= start) | (first >= end)
-    return LabelledBins(
-        bins.starts[is_whole],
-        bins.is_slip[is_whole],
-        bins.stroke[is_whole],
-        bins.position[is_whole],
-        bins.bin_samples,
-    )
+    names = ("starts", "is_slip", "stroke", "position")
+    return replace(bins, **{name: getattr(bins, name)[is_whole] for name in names})
 
 
 def needed_windows(

@@ -14,14 +14,13 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import yaml  # type: ignore[import-untyped]
 
-from tactslip_torch.data.formats import endings, find_format
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.runtime import whole_file
 
@@ -51,28 +50,29 @@ class Problem(NamedTuple):
         return " ".join(f"{self.place}: {self.what}".split())
 
 
-class _Line(NamedTuple):
-    """One recording as it is written: the cells by column, and where they stand."""
-
-    place: str
-    cells: dict[str, _Cell]
-
-
-class _Lines(NamedTuple):
-    """All of a manifest.
+@dataclass
+class _Lines:
+    """All of a manifest as it is written.
 
     Args:
+        name: of the file.
         columns: every column, small letters, with where it was met first.
-        lines: of recordings, in order.
+        lines: of recordings, in order: where each stands, and its cells by column.
         problems: of what could not be read at all.
     """
 
-    columns: dict[str, str]
-    lines: tuple[_Line, ...]
-    problems: tuple[Problem, ...]
+    name: str
+    columns: dict[str, str] = field(default_factory=dict)
+    lines: list[tuple[str, dict[str, _Cell]]] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
+
+    def wrong(self, what: str, line: int | None = None) -> None:
+        """Note a problem of the file or, counted from 0, of one of its lines."""
+        place = self.name if line is None else f"{self.name}:{line + 1}"
+        self.problems.append(Problem(place, what))
 
 
-def read_lines(path: Path) -> _Lines:
+def _read_lines(path: Path) -> _Lines:
     """The lines of a CSV or YAML file; what is wrong with it is among the problems.
 
     Raises:
@@ -81,9 +81,10 @@ def read_lines(path: Path) -> _Lines:
     """
     if not path.is_file():
         raise FileNotFoundError(f"no manifest at {path}")
-    if path.suffix.lower() not in (".csv", *_YAML):
+    is_yaml = path.suffix.lower() in _YAML
+    if not is_yaml and path.suffix.lower() != ".csv":
         raise ValueError(f"{path} must end in .csv, .yaml or .yml to be read as a manifest")
-    most = _MOST_YAML_BYTES if path.suffix.lower() in _YAML else _MOST_BYTES
+    most = _MOST_YAML_BYTES if is_yaml else _MOST_BYTES
     if (size := path.stat().st_size) > most:
         hint = "; write it as .csv" if most < size <= _MOST_BYTES else ""
         raise ValueError(f"{path} is no manifest: it has {size} bytes, at most {most} do{hint}")
@@ -92,42 +93,41 @@ def read_lines(path: Path) -> _Lines:
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise ValueError(f"{path.name}:{line}: no UTF-8 text; save it as UTF-8") from None
-    read = _yaml_lines if path.suffix.lower() in _YAML else _csv_lines
-    return read(text, path.name)
+    found = _Lines(path.name)
+    (_read_yaml if is_yaml else _read_csv)(text, found)
+    return found
 
 
-def _csv_lines(text: str, name: str) -> _Lines:
+def _read_csv(text: str, found: _Lines) -> None:
     """Rows of a table with a header, its separator found from that."""
     head = text.partition("\n")[0]
     separator = max(_SEPARATORS, key=head.count)
     rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     columns: list[str] = []
-    lines: list[_Line] = []
-    problems: list[Problem] = []
     last = 0
     try:
         for row in rows:
-            place, last = f"{name}:{last + 1}", rows.line_num
+            line, last = last, rows.line_num
             if not any(cell.strip() for cell in row):
                 continue
             if not columns:
                 columns = [_column(cell) for cell in row]
-                twice = sorted({c for c in columns if c and columns.count(c) > 1})
-                problems += [Problem(place, f"column {c[:60]!r} is there twice") for c in twice]
+                for twice in sorted({c for c in columns if c and columns.count(c) > 1}):
+                    found.wrong(f"column {twice[:60]!r} is there twice", line)
             elif len(row) != len(columns):
                 what = f"has {len(row)} cells, the header {len(columns)}; put in quotes what holds"
-                problems.append(Problem(place, f"{what} a {separator!r}"))
+                found.wrong(f"{what} a {separator!r}", line)
             else:
                 cells = zip(columns, map(str.strip, row), strict=True)
-                lines.append(_Line(place, {column: cell for column, cell in cells if column}))
+                own: dict[str, _Cell] = {column: cell for column, cell in cells if column}
+                found.lines.append((f"{found.name}:{line + 1}", own))
     except csv.Error as error:
-        problems.append(Problem(f"{name}:{last + 1}", f"cannot be read as CSV: {error}"))
-    return _Lines(dict.fromkeys(filter(None, columns), f"{name}:1"), tuple(lines), tuple(problems))
+        found.wrong(f"cannot be read as CSV: {error}", last)
+    found.columns.update(dict.fromkeys(filter(None, columns), f"{found.name}:1"))
 
 
-def _yaml_lines(text: str, name: str) -> _Lines:
+def _read_yaml(text: str, found: _Lines) -> None:
     """A list of mappings, alone or under ``recordings``."""
-    found = _Lines({}, (), ())
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     depth = 0
     try:
@@ -135,44 +135,36 @@ def _yaml_lines(text: str, name: str) -> _Lines:
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
             if depth > _MOST_DEPTH:
-                return found._replace(problems=(Problem(name, "is nested too deeply"),))
+                return found.wrong("is nested too deeply")
             if isinstance(event, yaml.AliasEvent):  # a few stand for more than memory holds
-                what = "aliases, as *name, are not read"
-                return found._replace(
-                    problems=(Problem(f"{name}:{event.start_mark.line + 1}", what),)
-                )
+                return found.wrong("aliases, as *name, are not read", event.start_mark.line)
         node = yaml.compose(text, Loader=loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         what = getattr(error, "problem", None) or error
-        place = f"{name}:{mark.line + 1}" if mark else name
-        return found._replace(problems=(Problem(place, f"cannot be read as YAML: {what}"),))
+        return found.wrong(f"cannot be read as YAML: {what}", mark and mark.line)
     if isinstance(node, yaml.MappingNode) and len(node.value) == 1:
         key, inner = node.value[0]
         node = inner if key.value == "recordings" else node
     if not isinstance(node, yaml.SequenceNode):
-        what = "must be a list of recordings, as - {file: a.csv, material: wood}"
-        return found._replace(problems=(Problem(f"{name}:1", what),))
-    columns: dict[str, str] = {}
-    lines: list[_Line] = []
-    problems: list[Problem] = []
+        return found.wrong("must be a list of recordings, as - {file: a.csv, material: wood}", 0)
     for item in node.value:
-        place = f"{name}:{item.start_mark.line + 1}"
+        line = item.start_mark.line
         if not isinstance(item, yaml.MappingNode):
-            problems.append(Problem(place, "must be a mapping, as {file: a.csv, material: wood}"))
+            found.wrong("must be a mapping, as {file: a.csv, material: wood}", line)
             continue
         cells: dict[str, _Cell] = {}
         for key, value in item.value:
-            here = f"{name}:{key.start_mark.line + 1}"
+            here = key.start_mark.line
             column, cell = _column(str(key.value)), _cell(value)
-            columns.setdefault(column, here)
+            found.columns.setdefault(column, f"{found.name}:{here + 1}")
             if column in cells:
-                problems.append(Problem(here, f"{column[:60]!r} is there twice"))
+                found.wrong(f"{column[:60]!r} is there twice", here)
             if cell is None:
-                problems.append(Problem(here, f"{column[:60]} must be a value or a list of values"))
+                found.wrong(f"{column[:60]} must be a value or a list of values", here)
             cells[column] = cell or ""
-        lines.append(_Line(place, cells))
-    return _Lines(columns, tuple(lines), tuple(problems))
+        found.lines.append((f"{found.name}:{line + 1}", cells))
+    return None
 
 
 def _cell(node: yaml.Node) -> _Cell | None:
@@ -193,7 +185,7 @@ Stretch = tuple[float, float]
 Label = Literal["slip", "non-slip"]
 MOMENTS = ("onsets_s", "annotated_onsets_s", "speeds_mm_s")
 STRETCHES = ("sliding_s", "slip_s", "non_slip_s", "missing_s")
-TRUTH_COLUMNS = (*MOMENTS, *STRETCHES, "label")
+_TRUTH_COLUMNS = (*MOMENTS, *STRETCHES, "label")
 _LABELS: dict[str, Label] = {"slip": "slip", "nonslip": "non-slip", "noslip": "non-slip"}
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _SPAN = re.compile(rf"({_NUMBER})\s*(?:-|\N{{EN DASH}}|\.\.|to)\s*({_NUMBER}|end)")
@@ -224,11 +216,6 @@ class Truth:
     missing_s: tuple[Stretch, ...] = ()
     label: Label | None = None
 
-    @property
-    def is_labelled(self) -> bool:
-        """Whether any bin follows from it."""
-        return bool(self.onsets_s or self.slip_s or self.non_slip_s or self.label)
-
 
 def truth_of(cells: Mapping[str, _Cell]) -> tuple[Truth | None, list[str]]:
     """The truth that the cells of a line tell, ``None`` if they are all empty, and what is wrong.
@@ -239,34 +226,26 @@ def truth_of(cells: Mapping[str, _Cell]) -> tuple[Truth | None, list[str]]:
         >>> truth_of({"onsets_s": "2,5"})[1]
         ["onsets_s: '2,5' is no number; write decimals with a point, and 2.0; 9.0 for several"]
     """
-    given = {name: cells[name] for name in TRUTH_COLUMNS if cells.get(name)}
+    given = {name: cells[name] for name in _TRUTH_COLUMNS if cells.get(name)}
     if not given:
         return None, []
-    parts: dict[str, object] = {}
+    told: dict[str, Any] = {}
     problems: list[str] = []
     for name, cell in given.items():
+        parse = _label if name == "label" else _moments if name in MOMENTS else _stretches
         try:
-            if name == "label":
-                parts[name] = _label(cell)
-            elif name in MOMENTS:
-                parts[name] = _moments(cell)
-            else:
-                parts[name] = _stretches(cell)
+            told[name] = parse(cell)
         except ValueError as error:
             problems.append(f"{name}: {error}")
     if problems:
         return None, problems
-    truth = _completed(Truth(**parts))  # type: ignore[arg-type]  # by name
-    return truth, _contradictions(truth)
-
-
-def _completed(truth: Truth) -> Truth:
-    """Onsets where only slides or annotations are known, and a speed for every onset."""
-    onsets = truth.onsets_s or truth.annotated_onsets_s
+    truth = Truth(**told)
+    onsets = truth.onsets_s or truth.annotated_onsets_s  # or the starts of slides
     onsets = onsets or tuple(start for start, _ in truth.sliding_s)
     speeds = truth.speeds_mm_s
-    speeds = speeds * len(onsets) if len(speeds) == 1 else speeds
-    return Truth(**{**vars(truth), "onsets_s": onsets, "speeds_mm_s": speeds})
+    speeds = speeds * len(onsets) if len(speeds) == 1 else speeds  # one for all
+    truth = replace(truth, onsets_s=onsets, speeds_mm_s=speeds)
+    return truth, _contradictions(truth)
 
 
 def _contradictions(truth: Truth) -> list[str]:
@@ -383,9 +362,9 @@ def _shown(values: Iterable[float]) -> str:
     return "; ".join(f"{value:g}" for value in values)
 
 
-_NAMES = ("manifest.csv", "manifest.yaml", "manifest.yml")
+NAMES = ("manifest.csv", "manifest.yaml", "manifest.yml")
 _ALIASES = {"object": "material", "cycle": "trial"}
-COLUMNS = ("file", "material", "trial", "scene", "session", *TRUTH_COLUMNS, "sample_rate_hz")
+_COLUMNS = ("file", "material", "trial", "scene", "session", *_TRUTH_COLUMNS, "sample_rate_hz")
 _IGNORED = ("simulated", "fidelity", "seed")
 """Further columns of what ``generate`` writes: files say this themselves."""
 
@@ -431,13 +410,13 @@ def manifest_of(root: Path, given: str | None = None) -> Path:
         raise FileNotFoundError(f"no folder at {root}")
     if given is not None:
         return next((path for path in (root / given, Path(given)) if path.is_file()), root / given)
-    found = [root / name for name in _NAMES if (root / name).is_file()]
+    found = [root / name for name in NAMES if (root / name).is_file()]
     if len(found) > 1:
         names = " and ".join(path.name for path in found)
         raise ValueError(f"{root} has {names}; say which, as manifest={found[0].name}")
     if not found:
         raise FileNotFoundError(
-            f"no {' or '.join(_NAMES)} in {root}; python -m tactslip_torch data "
+            f"no {' or '.join(NAMES)} in {root}; python -m tactslip_torch data "
             f"action=label_template root={root} writes one to fill in"
         )
     return found[0]
@@ -452,36 +431,46 @@ def read_manifest(path: Path, root: Path) -> Listing:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no text.
     """
-    columns, lines, unreadable = read_lines(path)
-    problems, warnings = list(unreadable), []
-    for column, place in columns.items():
-        if wrong := _misspelt(column):
-            problems.append(Problem(place, wrong))
-        elif _ALIASES.get(column, column) not in (*COLUMNS, *_IGNORED):
+    found = _read_lines(path)
+    problems, warnings = found.problems, []
+    known = (*_COLUMNS, *_ALIASES)
+    for column, place in found.columns.items():
+        if column in known or column in _IGNORED:
+            continue
+        if close := difflib.get_close_matches(column, known, 1, cutoff=0.8):
+            what = f"unknown column {column[:60]!r}; did you mean {close[0]!r}?"
+            problems.append(Problem(place, what))
+        else:
             warnings.append(Problem(place, f"column {column[:60]!r} is not read"))
-    known = {_ALIASES.get(column, column) for column in columns}
-    if missing := [column for column in ("file", "material") if column not in known]:
-        if columns:
+    there = {_ALIASES.get(column, column) for column in found.columns}
+    if missing := [column for column in ("file", "material") if column not in there]:
+        if found.columns:
             problems.append(Problem(f"{path.name}:1", f"no column {' and no '.join(missing)}"))
         elif not problems:
-            problems.append(Problem(path.name, "is empty; it must list file and material"))
+            found.wrong("is empty; it must list file and material")
         return Listing((), tuple(problems), tuple(warnings))
-    if not lines and not problems:
-        problems.append(Problem(path.name, "lists no recording"))
+    if not found.lines and not problems:
+        found.wrong("lists no recording")
     drafts = []
-    for line in lines:
-        draft, wrong_here = _draft(line, root)
-        problems += [Problem(line.place, wrong) for wrong in wrong_here]
+    for place, cells in found.lines:
+        plain = {_ALIASES.get(column, column): cell for column, cell in cells.items()}
+        draft, wrong_here = _draft(place, plain, root)
+        problems += [Problem(place, wrong) for wrong in wrong_here]
         drafts += [draft] if draft else []
     entries = tuple(_numbered(drafts))
     problems += _twice(entries)
-    warnings += _alike(entries)
+    first: dict[str, Entry] = {}
+    for entry in entries:
+        material = entry.recording.material
+        other = first.setdefault("".join(material.lower().split()), entry)
+        if other.recording.material != material:
+            what = f"material {material!r} is not the {other.recording.material!r} of {other.place}"
+            warnings.append(Problem(entry.place, what))
     return Listing(entries, tuple(problems), tuple(warnings))
 
 
-def _draft(line: _Line, root: Path) -> tuple[Entry | None, list[str]]:
+def _draft(place: str, cells: Mapping[str, _Cell], root: Path) -> tuple[Entry | None, list[str]]:
     """A line, its trial -1 if it was left empty, and all that is wrong with it."""
-    cells = {_ALIASES.get(column, column): cell for column, cell in line.cells.items()}
     problems = []
     words = {}
     for column in ("file", "material", "trial", "scene", "session", "sample_rate_hz"):
@@ -490,29 +479,31 @@ def _draft(line: _Line, root: Path) -> tuple[Entry | None, list[str]]:
             problems.append(f"{column} must be one value, got a list")
             cell = ""
         words[column] = cell
-    file = words["file"]
+    file, trial, rate = words["file"], words["trial"], words["sample_rate_hz"]
     if problem := _file_problem(root, file):
         problems.append(problem)
     if not words["material"]:
         problems.append("no material")
-    trial, rate = words["trial"], words["sample_rate_hz"]
     if trial and not (trial.isascii() and trial.isdigit() and len(trial) < 10):
         problems.append(
             f"trial must be a whole number from 0, got {trial[:40]!r}; empty ones are numbered in "
             "their order"
         )
-    if rate and not _is_rate(rate):
+    if rate and not (re.fullmatch(_NUMBER, rate) and 0 < float(rate) < math.inf):
         problems.append(f"sample_rate_hz must be a positive number, got {rate[:40]!r}")
     truth, wrong = truth_of(cells)
     problems += wrong
     if problems:
         return None, problems
-    scene = words["scene"] or RecordingId.scene
-    number = int(trial) if trial else -1
     return Entry(
-        line.place,
+        place,
         PurePosixPath(*PureWindowsPath(file).parts).as_posix(),
-        RecordingId(words["material"], number, scene, words["session"]),
+        RecordingId(
+            words["material"],
+            int(trial) if trial else -1,
+            words["scene"] or RecordingId.scene,
+            words["session"],
+        ),
         truth,
         float(rate) if rate else None,
     ), []
@@ -572,34 +563,6 @@ def _twice(entries: Iterable[Entry]) -> list[Problem]:
     return found
 
 
-def _alike(entries: Iterable[Entry]) -> list[Problem]:
-    """Materials that differ in case or blanks alone."""
-    found: dict[str, Entry] = {}
-    doubts = []
-    for entry in entries:
-        material = entry.recording.material
-        other = found.setdefault("".join(material.lower().split()), entry)
-        if other.recording.material != material:
-            what = f"material {material!r} is not the {other.recording.material!r} of {other.place}"
-            doubts.append(Problem(entry.place, what))
-    return doubts
-
-
-def _misspelt(column: str) -> str | None:
-    known = (*COLUMNS, *_ALIASES)
-    close = difflib.get_close_matches(column, known, 1, cutoff=0.8)
-    if column in (*known, *_IGNORED) or not close:
-        return None
-    return f"unknown column {column[:60]!r}; did you mean {close[0]!r}?"
-
-
-def _is_rate(text: str) -> bool:
-    try:
-        return 0 < float(text) < math.inf
-    except ValueError:
-        return False
-
-
 def better_told(listing: Listing, told: Listing) -> Listing:
     """A listing in which files that another tells of have its truth; the others keep theirs."""
     by_file = {entry.file: entry for entry in told.entries}
@@ -618,115 +581,6 @@ def better_told(listing: Listing, told: Listing) -> Listing:
         (*listing.problems, *told.problems, *strangers),
         (*listing.warnings, *told.warnings),
     )
-
-
-_FIELDS = {"material": r"[^/]+?", "trial": r"\d+", "scene": r"[^/]+?", "label": r"[^/]+?"}
-"""What a pattern may name, and what each stands for."""
-_TEMPLATE_COLUMNS = (
-    *("file", "material", "trial", "scene"),
-    *("onsets_s", "sliding_s", "slip_s", "non_slip_s", "label"),
-)
-_BETWEEN = "-_. "
-
-
-class _Template(NamedTuple):
-    """A manifest that was written.
-
-    Args:
-        path: of it.
-        num_files: it lists.
-        num_guessed: of which the pattern told anything.
-    """
-
-    path: Path
-    num_files: int
-    num_guessed: int
-
-
-def _found_files(root: Path) -> list[str]:
-    """Every recording in a folder and its folders, relative to it; of a bag the folder.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if there is no recording in it.
-    """
-    if not root.is_dir():
-        raise FileNotFoundError(f"no folder at {root}")
-    found: list[str] = []
-    folders = [root]
-    while folders:
-        for path in sorted(folders.pop().iterdir()):
-            if path.name.startswith(".") or path.name in _NAMES:
-                continue
-            if find_format(path) is not None:
-                found.append(path.relative_to(root).as_posix())
-            elif path.is_dir() and not path.is_symlink():
-                folders.append(path)
-    if not found:
-        known = ", ".join(f".{ending}" for ending in endings())
-        raise ValueError(f"no recording in {root}; files that can be read end in {known}")
-    return sorted(found)
-
-
-def guesser(pattern: str) -> re.Pattern[str]:
-    """A pattern as an expression for names without their ending.
-
-    Blanks, dots, strokes and underlines around a material or scene are no part of it.
-
-    Raises:
-        ValueError: if it names nothing, one twice, or something else than material, trial, scene
-            and label.
-
-    Example:
-        >>> guesser("{material}{trial}").fullmatch("oil paper-slip_07").groupdict()
-        {'material': 'oil paper-slip', 'trial': '07'}
-    """
-    parts = re.split(r"\{(\w*)\}", pattern)
-    names = parts[1::2]
-    if not names or set(names) - set(_FIELDS) or len(set(names)) < len(names):
-        raise ValueError(
-            f"pattern must name each of {', '.join(f'{{{name}}}' for name in _FIELDS)} at most "
-            f"once, as {{material}}_{{trial}}, got {pattern!r}"
-        )
-    expression = ""
-    for place, part in enumerate(parts):
-        if place % 2:
-            between = f"[{re.escape(_BETWEEN)}]*" if part in ("material", "scene") else ""
-            expression += f"(?P<{part}>{_FIELDS[part]}){between}"
-        else:
-            expression += "[^/]*".join(re.escape(piece) for piece in part.split("*"))
-    return re.compile(expression)
-
-
-def guessed(file: str, pattern: str) -> dict[str, str]:
-    """What a pattern tells of a file by its name, or by its path if the pattern has a stroke."""
-    path = Path(file)
-    name = path.with_suffix("").as_posix() if "/" in pattern else path.stem
-    found = guesser(pattern).fullmatch(name)
-    return found.groupdict() if found else {}
-
-
-def write_template(root: Path, pattern: str, path: Path | None = None) -> _Template:
-    """Write a manifest of all recordings of a folder, its label columns empty.
-
-    Args:
-        root: the folder.
-        pattern: of names.
-        path: of the manifest; ``None`` for ``manifest.csv`` in the folder.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if there is a manifest already, no recording, or the pattern is none.
-    """
-    there = [root / name for name in _NAMES] if path is None else [path]
-    for other in there:
-        if other.exists():
-            raise ValueError(f"{other} is there already; move it away, or give output=FILE")
-    path = root / _NAMES[0] if path is None else path
-    guesses = {file: guessed(file, pattern) for file in _found_files(root)}
-    rows = [dict.fromkeys(_TEMPLATE_COLUMNS, "") | {"file": f, **own} for f, own in guesses.items()]
-    write_table(path, _TEMPLATE_COLUMNS, rows)
-    return _Template(path, len(guesses), sum(map(bool, guesses.values())))
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> None:

@@ -30,31 +30,31 @@ class Split:
     Args:
         name: of the split or fold, for folders and tables.
         roles: recording to ``"train"``, ``"test"`` or ``"unseen"``; others are not used.
-        test_share_of_bins: if given, bins of ``train`` recordings are sent to ``test`` at
-            random with this share (``random_bins``).
+        test_fraction: if given, bins of ``train`` recordings are sent to ``test`` at
+            random with this fraction (``random_bins``).
         seed: of that draw.
     """
 
     name: str
     roles: Mapping[RecordingId, str]
-    test_share_of_bins: float | None = None
+    test_fraction: float | None = None
     seed: int = 0
 
     def bin_roles(self, recording: RecordingId, num_bins: int) -> dict[str, Tensor]:
         """For each role, which bins of a recording have it: ``[num_bins]``, bool."""
         role = self.roles.get(recording)
         masks = {name: torch.full((num_bins,), name == role) for name in ROLES}
-        if role == "train" and self.test_share_of_bins is not None:
+        if role == "train" and self.test_fraction is not None:
             place = sorted(self.roles).index(recording)
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + place)
-            to_test = torch.rand(num_bins, generator=generator) < self.test_share_of_bins
+            to_test = torch.rand(num_bins, generator=generator) < self.test_fraction
             masks["train"], masks["test"] = ~to_test, to_test
         return masks
 
     def having(self, *roles: str) -> list[RecordingId]:
         """Recordings with any of the roles, sorted; those split by bin have train and test."""
         wanted = set(roles)
-        if self.test_share_of_bins is not None and "test" in wanted:
+        if self.test_fraction is not None and "test" in wanted:
             wanted.add("train")
         return sorted(recording for recording, role in self.roles.items() if role in wanted)
 
@@ -64,7 +64,7 @@ def unseen4(
     *,
     seen: Sequence[str],
     unseen: Sequence[str],
-    train_share: float = 0.8,
+    train_fraction: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
     """Train and test on cycles of the seen materials, judge on all cycles of the unseen ones.
@@ -75,17 +75,17 @@ def unseen4(
     both = sorted(set(seen) & set(unseen))
     if both:
         raise ValueError(f"materials {', '.join(both)} are both seen and unseen; choose one side")
-    roles = by_cycle(recordings, seen, train_share, seed)
+    roles = _by_cycle(recordings, seen, train_fraction, seed)
     for material in unseen:
         roles |= dict.fromkeys(_cycles_of(recordings, material), "unseen")
-    return [checked(Split("unseen4", roles), ("train", "test", "unseen"))]
+    return [_checked(Split("unseen4", roles), ("train", "test", "unseen"))]
 
 
 def seen6(
     recordings: Sequence[RecordingId],
     *,
     seen: Sequence[str],
-    train_share: float = 0.8,
+    train_fraction: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
     """Train and test on cycles of the seen materials only.
@@ -93,15 +93,15 @@ def seen6(
     Raises:
         ValueError: if a material is not in the set or a role stays empty.
     """
-    roles = by_cycle(recordings, seen, train_share, seed)
-    return [checked(Split("seen6", roles), ("train", "test"))]
+    roles = _by_cycle(recordings, seen, train_fraction, seed)
+    return [_checked(Split("seen6", roles), ("train", "test"))]
 
 
 def random_bins(
     recordings: Sequence[RecordingId],
     *,
     seen: Sequence[str],
-    train_share: float = 0.8,
+    train_fraction: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
     """The authors' split: bins of the seen materials at random, which leaks.
@@ -110,20 +110,20 @@ def random_bins(
     recordings that were never seen; the difference to ``seen6`` is the leak.
 
     Raises:
-        ValueError: if a material is not in the set or the share is not in (0, 1).
+        ValueError: if a material is not in the set or the fraction is not in (0, 1).
     """
-    _check_share(train_share)
+    _check_fraction(train_fraction)
     roles = {
         recording: "train" for material in seen for recording in _cycles_of(recordings, material)
     }
-    return [checked(Split("random_bins", roles, 1 - train_share, seed), ("train",))]
+    return [_checked(Split("random_bins", roles, 1 - train_fraction, seed), ("train",))]
 
 
 def leave_one_material_out(
     recordings: Sequence[RecordingId],
     *,
     materials: Sequence[str] | None = None,
-    train_share: float = 0.8,
+    train_fraction: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
     """One fold per material: train and test on the others' cycles, judge on its own.
@@ -131,7 +131,7 @@ def leave_one_material_out(
     Args:
         recordings: of the set.
         materials: to leave out and train on; ``None`` for all of the set, in its order.
-        train_share: of the others' cycles; 1 trains on all of them, and no role is ``test``.
+        train_fraction: of the others' cycles; 1 trains on all of them, and no role is ``test``.
         seed: of the draw.
 
     Raises:
@@ -147,12 +147,14 @@ def leave_one_material_out(
     folds = []
     for left_out in materials:
         others = [material for material in materials if material != left_out]
-        if train_share == 1:
+        if train_fraction == 1:
             roles = {r: "train" for material in others for r in _cycles_of(recordings, material)}
             roles |= dict.fromkeys(_cycles_of(recordings, left_out), "unseen")
         else:
             sides = {"seen": others, "unseen": [left_out]}
-            roles = dict(unseen4(recordings, **sides, train_share=train_share, seed=seed)[0].roles)
+            roles = dict(
+                unseen4(recordings, **sides, train_fraction=train_fraction, seed=seed)[0].roles
+            )
         folds.append(Split(f"without_{left_out}", roles))
     return folds
 
@@ -163,7 +165,7 @@ def confound(
     seen: Sequence[str],
     unseen: Sequence[str],
     trained_scenes: Sequence[str],
-    train_share: float = 0.8,
+    train_fraction: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
     """Two folds that differ in the scenes trained on, and are judged on the same recordings.
@@ -177,14 +179,16 @@ def confound(
         seen: materials to train and test on, by cycle.
         unseen: materials to judge on only.
         trained_scenes: kinds of scenes that ``with_scenes`` trains on beside the paper's.
-        train_share: of the cycles.
+        train_fraction: of the cycles.
         seed: of the draw.
 
     Raises:
         ValueError: as ``unseen4``; or if the set lacks the paper's scene or a trained one, or no
             scene is to be trained on.
     """
-    grouped = unseen4(recordings, seen=seen, unseen=unseen, train_share=train_share, seed=seed)[0]
+    grouped = unseen4(
+        recordings, seen=seen, unseen=unseen, train_fraction=train_fraction, seed=seed
+    )[0]
     there = list(dict.fromkeys(recording.scene for recording in recordings))
     added = [scene for scene in trained_scenes if scene != PAPER_SCENE]
     if not added:
@@ -196,7 +200,7 @@ def confound(
     if missing:
         raise ValueError(
             f"split confound needs recordings of scene {', '.join(missing)}; the set has "
-            f"{', '.join(there)}: add them, as others=confound does"
+            f"{', '.join(there)}: add them, as extra_scenes=confound does"
         )
     folds = []
     for name, scenes in (("protocol", [PAPER_SCENE]), ("with_scenes", [PAPER_SCENE, *added])):
@@ -205,14 +209,14 @@ def confound(
             for recording, role in grouped.roles.items()
             if role != "train" or recording.scene in scenes
         }
-        folds.append(checked(Split(name, roles), ROLES))
+        folds.append(_checked(Split(name, roles), ROLES))
     return folds
 
 
-def are_rivals(folds: Sequence[Split]) -> bool:
+def have_same_bins(folds: Sequence[Split]) -> bool:
     """Whether any two folds hold out the same recordings, or leave one out that both call unseen.
 
-    Each then judges a detector of its own on the same bins, and a sum over them is neither's score.
+    Each then evaluates its own detector on the same bins, and a sum over them is neither's score.
     """
     held_out = [tuple(fold.having("test", "unseen")) for fold in folds]
     unseen = [recording for fold in folds for recording in fold.having("unseen")]
@@ -229,7 +233,7 @@ def judged_once(folds: Sequence[Split]) -> list[Split]:
     kept = []
     for fold in folds:
         roles = dict(fold.roles)
-        if fold.test_share_of_bins is None:
+        if fold.test_fraction is None:
             roles = {r: role for r, role in roles.items() if (r, role) not in known}
             known |= roles.items()
         if roles:
@@ -237,17 +241,17 @@ def judged_once(folds: Sequence[Split]) -> list[Split]:
     return kept
 
 
-def by_cycle(
-    recordings: Sequence[RecordingId], materials: Sequence[str], train_share: float, seed: int
+def _by_cycle(
+    recordings: Sequence[RecordingId], materials: Sequence[str], train_fraction: float, seed: int
 ) -> dict[RecordingId, str]:
     """``train`` and ``test`` drawn within each material and session, at least one cycle each.
 
     The draw of a session depends on the seed and its place among its own cycles alone, so leaving
     another session or material out does not change it. A cycle is on one side in all its scenes;
     cycles that are there in different scenes are drawn apart, each kind as above, so that each
-    scene has its share. A session's only cycle falls by the share alone.
+    scene has its part. A session's only cycle falls by the fraction alone.
     """
-    _check_share(train_share)
+    _check_fraction(train_fraction)
     roles: dict[RecordingId, str] = {}
     mountings: dict[str, dict[int, list[RecordingId]]] = {}
     for material in materials:
@@ -261,7 +265,7 @@ def by_cycle(
             alike.setdefault(tuple(member.scene for member in members), []).append(cycle)
         generator = torch.Generator().manual_seed(seed * 1_000_003 + zlib.crc32(mounting.encode()))
         for numbers in alike.values():
-            num_train = round(train_share * len(numbers))
+            num_train = round(train_fraction * len(numbers))
             if len(numbers) > 1:
                 num_train = min(max(num_train, 1), len(numbers) - 1)
             order = torch.randperm(len(numbers), generator=generator).tolist()
@@ -280,18 +284,18 @@ def _cycles_of(recordings: Sequence[RecordingId], material: str) -> list[Recordi
     return cycles
 
 
-def _check_share(train_share: float) -> None:
-    if not 0 < train_share < 1:
-        raise ValueError(f"split.train_share must lie between 0 and 1, got {train_share}")
+def _check_fraction(train_fraction: float) -> None:
+    if not 0 < train_fraction < 1:
+        raise ValueError(f"split.train_fraction must lie between 0 and 1, got {train_fraction}")
 
 
-def checked(split: Split, needed: Sequence[str]) -> Split:
+def _checked(split: Split, needed: Sequence[str]) -> Split:
     """The split itself; an error if no recording has one of the roles."""
     for role in needed:
         if role not in split.roles.values():
             raise ValueError(
                 f"split {split.name}: no recording has the role {role!r}; "
-                "use more cycles or another train_share"
+                "use more cycles or another train_fraction"
             )
     return split
 
@@ -301,7 +305,7 @@ def leave_one_session_out(
     *,
     seen: Sequence[str],
     first_alone: bool = False,
-    train_share: float = 0.8,
+    train_fraction: float = 0.8,
     seed: int = 0,
 ) -> list[Split]:
     """One fold per session: train on the others, judge the same materials in the one left out.
@@ -314,7 +318,7 @@ def leave_one_session_out(
         seen: materials to train on and to judge.
         first_alone: put a fold before them that trains on the first session alone and judges the
             same materials in all others: what a user gets who trains on one day's recordings.
-        train_share: of the cycles of each session trained on.
+        train_fraction: of the cycles of each session trained on.
         seed: of the draw.
 
     Raises:
@@ -334,7 +338,7 @@ def leave_one_session_out(
     for name, left_out in folds:
         trained = [recording for recording in own if recording.session not in left_out]
         known = [material for material in seen if material in {r.material for r in trained}]
-        roles = by_cycle(trained, known, train_share, seed)
+        roles = _by_cycle(trained, known, train_fraction, seed)
         away = [r for r in own if r.session in left_out and r.material in known]
-        splits.append(checked(Split(name, roles | dict.fromkeys(away, "unseen")), ROLES))
+        splits.append(_checked(Split(name, roles | dict.fromkeys(away, "unseen")), ROLES))
     return splits

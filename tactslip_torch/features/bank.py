@@ -1,10 +1,14 @@
 """The features of a plan: rows are formed by linear maps, brought to order one, and described.
 
+``make_plan`` tells by names and places alone which channels, branches and spectra some features
+need; what none of them needs is not read, formed or sorted. ``Bank`` carries a plan out.
+
 A channel's samples go to a few coordinates of each row (51, 27, 15 or 9 of a branch of 100 samples)
 and to its mean, in float64; filter and wavelet are one matrix by then. Here what is rounding beside
 its bin becomes exactly constant, and every row gets the length one. From these coordinates rows go
 on to branches and spectra, which are then good to rounding in any precision, and which
-``descriptors.py`` describes without a thought of extremes.
+``descriptors.py`` describes without a thought of extremes. All constants are float64, made from
+``branch_matrix`` and ``spectrum_matrix``, so from ptwt and torch.fft evaluated on an identity.
 
 Everything is written in operations that tensors and values of an ONNX graph share: on tensors it is
 the reference, on values it writes the graph.
@@ -14,14 +18,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.descriptors import DESCRIPTORS, ORDERED, Rows, band_energy_ratios
-from tactslip_torch.features.linear_maps import LinearMaps
+from tactslip_torch.features.descriptors import DESCRIPTORS, STEPPED, Rows, band_energy_ratios
+from tactslip_torch.features.names import FeatureName, pool_names
 from tactslip_torch.features.ops import (
     TINY,
     bounded_gradient,
@@ -30,14 +35,254 @@ from tactslip_torch.features.ops import (
     root,
     taken,
 )
-from tactslip_torch.features.plan import Plan, Row, RowKind
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.signals.spectrum import SpectrumMethod, frequency_axis_hz, spectrum_matrix
+from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names
+
+RowKind = Literal["gauge", "time", "freq"]
+ROW_KINDS: tuple[RowKind, ...] = ("gauge", "time", "freq")
+
+
+class Row(NamedTuple):
+    """Values that are described together: a gauge's bin, a film's branch, or its spectrum.
+
+    Attributes:
+        kind: which of the three.
+        channel: index in the hand.
+        branch: index in ``branch_names``; -1 for a gauge.
+    """
+
+    kind: RowKind
+    channel: int
+    branch: int
+
+
+class Wanted(NamedTuple):
+    """A descriptor of a row, and the column it goes to."""
+
+    row: int
+    descriptor: str
+    place: int
+
+
+class Share(NamedTuple):
+    """A band energy ratio of a film, and the column it goes to."""
+
+    channel: int
+    branch: int
+    place: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What has to be done for a set of features.
+
+    Args:
+        channels: indices in the hand of the channels that are read, ascending.
+        rows: what is formed and described: gauges, branches, spectra, each by channel and branch.
+        wanted: descriptors, in the order of their columns.
+        shares: band energy ratios, in the order of their columns. Their energies are of all
+            branches of the film, whether or not those are rows.
+        num_features: number of columns.
+    """
+
+    channels: tuple[int, ...]
+    rows: tuple[Row, ...]
+    wanted: tuple[Wanted, ...]
+    shares: tuple[Share, ...]
+    num_features: int
+
+    @property
+    def share_channels(self) -> tuple[int, ...]:
+        """Films of which band energy ratios are wanted, ascending."""
+        return tuple(sorted({share.channel for share in self.shares}))
+
+
+def make_plan(hand: HandLayout, level: int, names: Sequence[FeatureName | str]) -> Plan:
+    """The least work for these features, which come out in this order.
+
+    Args:
+        hand: the channels, in the order in which bins hold them.
+        level: number of wavelet levels.
+        names: any features of the pool, as names or as their text; repeats are allowed.
+
+    Raises:
+        ValueError: if there is no name, or one is none of the pool.
+
+    Example:
+        >>> make_plan(HandLayout.paper24(), 4, ["PVDF3 A2 freq kurtosis"]).rows
+        (Row(kind='freq', channel=16, branch=2),)
+    """
+    known = {str(name): name for name in pool_names(hand, level)}
+    if not names:
+        raise ValueError("an empty selection, expected at least one feature; name some of the pool")
+    unknown = [str(name) for name in names if str(name) not in known]
+    if unknown:
+        example = next(iter(known))
+        raise ValueError(
+            f"unknown feature {unknown[0]!r}, expected one of the pool's {len(known)} names, such "
+            f"as {example!r}; pool.names lists them"
+        )
+    branches = {name: index for index, name in enumerate(branch_names(level))} | {"raw": -1}
+    channel_of = {name: index for index, name in enumerate(hand.names)}
+    found: list[tuple[Row, str]] = []
+    for name in (known[str(name)] for name in names):
+        branch = branches[name.component]
+        kind: RowKind = "gauge" if branch < 0 else "time" if name.domain == "time" else "freq"
+        found.append((Row(kind, channel_of[name.channel], branch), name.descriptor))
+    is_share = [descriptor == "band_energy_ratio" for _, descriptor in found]
+    rows = sorted(
+        {row for (row, _), shared in zip(found, is_share, strict=True) if not shared},
+        key=lambda row: (ROW_KINDS.index(row.kind), row.channel, row.branch),
+    )
+    place_of = {row: index for index, row in enumerate(rows)}
+    wanted, shares = [], []
+    for place, ((row, descriptor), shared) in enumerate(zip(found, is_share, strict=True)):
+        if shared:
+            shares.append(Share(row.channel, row.branch, place))
+        else:
+            wanted.append(Wanted(place_of[row], descriptor, place))
+    channels = tuple(sorted({row.channel for row, _ in found}))
+    return Plan(channels, tuple(rows), tuple(wanted), tuple(shares), len(found))
+
+
+RANK_TOLERANCE = 1e-12
+"""Singular values below this part of the largest are rounding."""
+
 
 _LEAST_LENGTH = 16 * torch.finfo(torch.float64).eps / 0.35
 """Of a row less its mean, as a part of its bin's magnitude; below it is rounding. A span of 16 eps:
 that of 100 centred values of length 1 lies between .2 (two levels) and 1.41."""
 _CHUNK_BINS = 32  # what fits the cache of a processor
-_OWN_ROWS = ("mode", "entropy", "correlation", "spectral_spread")
+_OWN_ROWS = ("median", "mode", "iqr", "entropy", "correlation", "spectral_spread")
 """Descriptors of so much work that they are taken of the rows that want them alone."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """The coordinates of one branch, or of a slow channel's bin, and what is made of them.
+
+    There are ``r`` of the branch less its mean, of the same length as it, and then its sum: the sum
+    of whole numbers is exact.
+
+    Args:
+        into: from a bin to all coordinates, ``[n, r + 1]``.
+        out: from the first r to the branch less its mean, ``[r, n]``; None if they are that.
+        lines: from all to the spectrum before its modulus, ``[r + 1, 2 L]``: L real parts, then L
+            imaginary ones.
+        is_detail: whether its mean vanishes with the rest.
+    """
+
+    into: Tensor
+    out: Tensor | None
+    lines: Tensor
+    is_detail: bool
+
+    @property
+    def rank(self) -> int:
+        """Number of coordinates but the mean."""
+        return self.into.shape[1] - 1
+
+    def of_window(self, smooth: Tensor | None) -> Tensor:
+        """From ``[x - first, first]`` to all coordinates, ``[W + 1, r + 1]``.
+
+        ``first`` is the first sample of the bin: a small vibration keeps its digits on any offset,
+        and details of a constant are exactly 0.
+
+        Args:
+            smooth: the filter, ``[n, W]``; None: ``x`` is filtered.
+        """
+        into = self.into if smooth is None else smooth.T @ self.into
+        of_first = into.new_zeros(1, into.shape[1])
+        of_first[0, -1] = 0.0 if self.is_detail else len(self.into)
+        return torch.cat([into, of_first])
+
+    @cached_property
+    def energy_root(self) -> Tensor:
+        """From coordinates to numbers whose squares add up to the energy of the spectrum."""
+        triangle: Tensor = torch.linalg.qr(self.lines.T, mode="r").R
+        return triangle.T
+
+
+@dataclass(frozen=True)
+class LinearMaps:
+    """Constant matrices of one kind of bin; ``n`` samples, ``L`` lines, ``r`` the branch's rank.
+
+    Args:
+        branches: names of the branches, in their order everywhere.
+        is_approximation: which of them keep a constant; details remove it.
+        dense: each branch, ``[n, n]``: ``branch = dense @ bin``.
+        dense_lines: from a branch (or any signal) to its spectrum before the modulus, ``[2 L, n]``:
+            L cosine rows, then L sine rows.
+        frequency_hz: of the lines, ``[L]``.
+    """
+
+    branches: tuple[str, ...]
+    is_approximation: tuple[bool, ...]
+    dense: tuple[Tensor, ...]
+    dense_lines: Tensor
+    frequency_hz: Tensor
+
+    @property
+    def num_samples(self) -> int:
+        """Samples of a bin."""
+        return self.dense_lines.shape[1]
+
+    @property
+    def num_lines(self) -> int:
+        """Lines of a spectrum."""
+        return len(self.frequency_hz)
+
+    def block(self, branch: int) -> Block:
+        """The coordinates of a branch by its index; of a slow channel's bin for -1."""
+        return self._blocks[branch]
+
+    @cached_property
+    def _blocks(self) -> dict[int, Block]:
+        num = self.num_samples
+        identity = torch.eye(num, dtype=torch.float64)
+        blocks = {}
+        for branch, dense in enumerate((identity, *self.dense), -1):
+            centred = dense - dense.mean(0)
+            if branch < 0:
+                into, out = centred, identity
+            else:
+                into, out = _low_rank(centred)
+            lines = self.dense_lines @ torch.cat([out, out.new_full((num, 1), 1 / num)], dim=-1)
+            blocks[branch] = Block(
+                into=torch.cat([into, dense.sum(0, keepdim=True)]).T.contiguous(),
+                out=None if branch < 0 else out.T.contiguous(),
+                lines=lines.T.contiguous(),
+                is_detail=branch >= 0 and not self.is_approximation[branch],
+            )
+        return blocks
+
+
+@lru_cache(maxsize=16)
+def linear_maps(
+    num: int, sample_rate_hz: float, wavelet: Wavelet, level: int, method: SpectrumMethod
+) -> LinearMaps:
+    """The maps of bins of ``num`` samples; made once, so do not write into them.
+
+    Raises:
+        ValueError: if a bin is too short for the levels.
+    """
+    spectrum = spectrum_matrix(num, method)
+    names = branch_names(level)
+    return LinearMaps(
+        branches=names,
+        is_approximation=tuple(name[0] == "A" for name in names),
+        dense=tuple(branch_matrix(num, wavelet, level)),
+        dense_lines=torch.cat([spectrum.real, spectrum.imag]).contiguous(),
+        frequency_hz=frequency_axis_hz(num, sample_rate_hz, method),
+    )
+
+
+def _low_rank(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """``into [r, n]`` and ``out [n, r]``, orthonormal, whose product is ``matrix``."""
+    left, sizes, right = torch.linalg.svd(matrix)
+    rank = max(1, int((sizes > RANK_TOLERANCE * sizes[0]).sum()))
+    return (sizes[:rank, None] * right[:rank]).contiguous(), left[:, :rank].contiguous()
 
 
 class Frame(NamedTuple):
@@ -79,7 +324,7 @@ class Bank:
         maps: branches and spectra.
         plan: the features.
         frames: which hold every channel of the plan.
-        dtype: of all that there is one of per sample, but for ``ORDERED`` descriptors, which step.
+        dtype: of all that there is one of per sample, but for ``STEPPED`` descriptors.
             Samples, coordinates and what there is one of per row are float64.
     """
 
@@ -101,8 +346,8 @@ class Bank:
         self._sets: list[_RowSet] = []
         for is_freq in (False, True):
             own = {row: names for row, names in wanted.items() if (row.kind == "freq") == is_freq}
-            steps = {row: names.intersection(ORDERED) for row, names in own.items()}
-            rest = {row: names.difference(ORDERED) for row, names in own.items()}
+            steps = {row: names.intersection(STEPPED) for row, names in own.items()}
+            rest = {row: names.difference(STEPPED) for row, names in own.items()}
             sets = [(own, dtype)]
             if dtype != torch.float64:
                 sets = [(steps, torch.float64), (rest, dtype)]
@@ -305,37 +550,26 @@ class _RowSet:
                 num_owners += len(family.channels)
         self._cells, self._owners = torch.tensor(cells), torch.tensor(owners)
         names = {name for own in wanted.values() for name in own}
-        self._plain, self._ordered = [], []
-        ordered = [i for i, row in enumerate(rows) if wanted[row].intersection(ORDERED)]
-        self._ordered_rows = _index(ordered, len(rows))
         self.made: list[tuple[Row, str]] = []
-        for name in (n for n in DESCRIPTORS if n in names and n not in ORDERED):
-            self._plain.append((name, self._chosen(name, rows, wanted)))
-        for name in (n for n in ORDERED if n in names):
-            self._ordered.append((name, self._chosen(name, [rows[i] for i in ordered], wanted)))
+        self._chosen: list[tuple[str, Tensor | None]] = []
+        for name in (n for n in DESCRIPTORS if n in names):
+            chosen = [
+                i for i, row in enumerate(rows) if name not in _OWN_ROWS or name in wanted[row]
+            ]
+            self.made += [(rows[i], name) for i in chosen]
+            self._chosen.append((name, _index(chosen, len(rows))))
         of_film = families[-1].channels
         correlated = [row.channel for row in rows if "correlation" in wanted[row]]
         self._film = torch.tensor([of_film.index(channel) for channel in correlated])
 
-    def _chosen(
-        self, name: str, rows: Sequence[Row], wanted: Mapping[Row, set[str]]
-    ) -> Tensor | None:
-        """Of which rows a descriptor is made."""
-        chosen = [i for i, row in enumerate(rows) if name not in _OWN_ROWS or name in wanted[row]]
-        self.made += [(rows[i], name) for i in chosen]
-        return _index(chosen, len(rows))
-
     def __call__(self, families: Sequence[_Coordinates]) -> list[Tensor]:
         rows = self._rows(families)
         made = []
-        for name, index in self._plain:
+        for name, index in self._chosen:
             own = rows.take(index)
             if name == "correlation":
                 own = replace(own, film=taken(families[-1].films(self._dtype), self._film, -2))
             made.append(DESCRIPTORS[name](own))
-        if self._ordered:
-            ordered = rows.take(self._ordered_rows).ordered(dict(self._ordered))
-            made += [DESCRIPTORS[name](ordered.take(index)) for name, index in self._ordered]
         return made
 
     def _rows(self, families: Sequence[_Coordinates]) -> Rows:

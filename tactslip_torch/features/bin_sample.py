@@ -39,7 +39,7 @@ class SampledBins:
         recording: ``[n]``, index into ``recording_names``.
         recording_names: of the sampled bins, ascending.
         bin_index: ``[n]``, number of the bin among those its recording was handed with.
-        represents: ``[n]``, float64, for how many bins of its group and class each stands.
+        sample_weight: ``[n]``, float64, for how many bins of its group and class each stands.
     """
 
     features: Tensor
@@ -49,7 +49,7 @@ class SampledBins:
     recording: Tensor
     recording_names: tuple[str, ...]
     bin_index: Tensor
-    represents: Tensor
+    sample_weight: Tensor
 
 
 @dataclass
@@ -140,7 +140,7 @@ class BinSample:
             recording=tensors["recording"][order],
             recording_names=tuple(facts["recordings"]),
             bin_index=tensors["bin_index"][order],
-            represents=(seen / kept)[stratum],
+            sample_weight=(seen / kept)[stratum],
         )
 
     def state_dict(self) -> dict[str, Any]:

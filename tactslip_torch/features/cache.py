@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.runtime import whole_file
+from tactslip_torch.runtime import PACKAGE, whole_file
 
 log = logging.getLogger(__name__)
 
@@ -38,10 +38,10 @@ def cache_key(facts: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def source_digest(package: Path) -> str:
-    """A digest of every Python file below a folder, so that changed code is never served old."""
+def source_digest(package: Path = PACKAGE) -> str:
+    """A digest of every source below a folder, so that features of changed code are not served."""
     digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
+    for path in sorted(p for p in package.rglob("*") if p.suffix in (".py", ".cpp", ".h")):
         digest.update(path.relative_to(package).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

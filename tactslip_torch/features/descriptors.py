@@ -3,8 +3,8 @@
 A descriptor is a short function of ``Rows``: bins, wavelet branches or spectra that were brought to
 order one before (``bank.py``), so that no definition has to know of extremes. It is written in
 ordinary tensor operations, which ``torch.Tensor`` and the values of an ONNX graph
-(``graph/value.py``) both offer: the same functions are the reference on any device, with gradients,
-and write the graph.
+(``deploy/value.py``) both offer: the same functions are the reference on any device, with
+gradients, and write the graph.
 
 Constants (our rules): a row that is constant is given as exact zeros around its mean. It then has
 std, cv, skewness, correlation and entropy 0 and kurtosis 3. A zero row has peak factor 0; a zero
@@ -17,14 +17,14 @@ the same row may have different ones. ``entropy`` is a step function: no gradien
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
 
-from tactslip_torch.features.ops import ascending, like, looked_up, root, taken
+from tactslip_torch.features.ops import ascending, counted, like, looked_up, root, taken
 
 ENTROPY_LEVELS = 255
 RUN_TOLERANCE = {torch.float64: 1e-12, torch.float32: 2.0**-20}
@@ -41,7 +41,7 @@ class Rows:
     There is one number a sample in the dtype of ``values``, and one number a row in float64.
 
     Args:
-        values: less their mean; of ``ORDERED`` descriptors in ascending order.
+        values: less their mean.
         mean: in the unit of the row.
         unit: by which values and mean are multiplied to be volts; no gradient.
         num: values in a row.
@@ -79,13 +79,19 @@ class Rows:
             amplitude=None if self.amplitude is None else taken(self.amplitude, index, -2),
         )
 
-    def ordered(self, names: Collection[str]) -> Rows:
-        """The same rows, values in ascending order, as many as these descriptors look at."""
-        count = self.num
-        if not {"mode", "entropy"}.intersection(names):
-            count = int(0.75 * self.num - 0.5) + 2 if "iqr" in names else self.num // 2 + 1
-        values = ascending(self.values, min(count, self.num))
-        return replace(self, values=values, film=None, amplitude=None)
+    @cached_property
+    def ascending(self) -> Tensor:
+        """Values in ascending order, ``[*, R, n]``."""
+        return ascending(self.values, self.num)
+
+    def ranked(self, first: int, count: int) -> Tensor:
+        """Values at ``count`` places of the ascending order, from ``first`` on, ``[*, R, count]``.
+
+        A graph has no sort, and selects quicker than it sorts.
+        """
+        if isinstance(self.values, Tensor):
+            return self.ascending[..., first : first + count]
+        return self.values.ranked(first, count)
 
     @cached_property
     def squares(self) -> Tensor:
@@ -123,8 +129,7 @@ def mean(x: Rows) -> Tensor:
 
 def median(x: Rows) -> Tensor:
     """Middle value, or the mean of the two middle values for even ``n``."""
-    low, high = (x.num - 1) // 2, x.num // 2
-    middle = (x.values[..., low] + x.values[..., high]) * 0.5
+    middle = x.ranked((x.num - 1) // 2, 2 - x.num % 2).mean(-1)
     return (middle.double() + x.mean) * x.unit
 
 
@@ -136,10 +141,11 @@ def mode(x: Rows) -> Tensor:
     longest run.
     """
     tolerance = RUN_TOLERANCE[torch.float64] * x.scale
-    run = _run_numbers(x.values - _before(x.values) > tolerance[..., None])
-    longest = _counts(run).argmax(-1, keepdim=True)  # the first of equals
+    before = torch.cat([x.ascending[..., :1], x.ascending[..., :-1]], dim=-1)
+    run = (x.ascending - before > tolerance[..., None]).long().cumsum(-1)
+    longest = counted(run, x.num).argmax(-1, keepdim=True)  # the first of equals
     start = (run < longest).long().sum(-1, keepdim=True)
-    return (x.values.gather(-1, start).squeeze(-1).double() + x.mean) * x.unit
+    return (x.ascending.gather(-1, start).squeeze(-1).double() + x.mean) * x.unit
 
 
 def range_(x: Rows) -> Tensor:
@@ -174,10 +180,10 @@ def iqr(x: Rows) -> Tensor:
     def at(quantile: float) -> Tensor:
         position = min(max(quantile * x.num - 0.5, 0.0), x.num - 1.0)
         below, fraction = int(position), position % 1
-        near = x.values[..., below]
+        near = x.ascending[..., below]
         if fraction == 0:
             return near
-        return near * (1 - fraction) + x.values[..., below + 1] * fraction
+        return near * (1 - fraction) + x.ascending[..., below + 1] * fraction
 
     return (at(0.75) - at(0.25)).double() * x.unit
 
@@ -208,13 +214,14 @@ def entropy(x: Rows) -> Tensor:
     share one cell.
     """
     values = x.values.detach()
-    least = values[..., :1]
-    span = values[..., -1:] - least
+    least = values.amin(-1, keepdim=True)
+    span = values.amax(-1, keepdim=True) - least
     levels = ENTROPY_LEVELS / span.clamp(min=_NEXT_TO_NOTHING)
     level = ((values - least) * levels + (0.5 + HALF_SLACK[torch.float64])).floor()
-    # the maximum always has the top level, so the second highest level joins it
-    is_new = (level > _before(level)) & (level < float(ENTROPY_LEVELS))
-    bits = looked_up(_entropy_terms(x.num), _counts(_run_numbers(is_new))).sum(-1)
+    # the maximum always has the top level, which joins the second highest
+    second = torch.where(level < float(ENTROPY_LEVELS), level, 0.0).amax(-1, keepdim=True)
+    cell = torch.where(level < second, level, second)
+    bits = looked_up(_entropy_terms(x.num), counted(cell.long(), ENTROPY_LEVELS)).sum(-1)
     return bits * (span.squeeze(-1) > 0.0).double()
 
 
@@ -265,21 +272,6 @@ def _spectrum(x: Rows) -> tuple[Tensor, Tensor]:
     return x.amplitude, like(x.frequency_hz, x.amplitude)
 
 
-def _before(x: Tensor) -> Tensor:
-    """The value before each along the last axis; the first is its own."""
-    return torch.cat([x[..., :1], x[..., :-1]], dim=-1)
-
-
-def _run_numbers(is_new: Tensor) -> Tensor:
-    """Which run each value belongs to, from 0; a new one starts where this holds. ``[*, n]``."""
-    return is_new.long().cumsum(-1)
-
-
-def _counts(run: Tensor) -> Tensor:
-    """How many values each run has, ``[*, n]``; 0 behind the last run."""
-    return torch.zeros_like(run).scatter_add(-1, run, torch.ones_like(run))
-
-
 @lru_cache
 def _entropy_terms(num: int) -> Tensor:
     """``-p log2(p + eps)`` of cells that hold 0 to ``num`` of ``num`` values, float64."""
@@ -305,9 +297,14 @@ DESCRIPTORS: dict[str, Callable[[Rows], Tensor]] = {
     "spectral_centroid": spectral_centroid,
     "spectral_spread": spectral_spread,
 }
-"""Every descriptor by its name."""
+"""Every descriptor by its name, in the order of ``enum Descriptor`` (``native/engine.h``).
+
+Of every signal those up to the peak factor; correlation of branches; the others of spectra.
+"""
 COMMON_DESCRIPTORS = tuple(DESCRIPTORS)[:13]
 TIME_DESCRIPTORS = (*COMMON_DESCRIPTORS, "correlation")
-SPECTRUM_DESCRIPTORS = (*COMMON_DESCRIPTORS, "spectral_centroid", "spectral_spread")
+SPECTRUM_DESCRIPTORS = (*COMMON_DESCRIPTORS, *tuple(DESCRIPTORS)[14:])
 ORDERED = ("median", "mode", "iqr", "entropy")
-"""Descriptors of rows in ascending order, in float64 whatever the dtype of the others."""
+"""Descriptors of the distribution of the values of a row."""
+STEPPED = ("mode", "entropy")
+"""Descriptors that step where a value moves; of float64 values, whatever the dtype of others."""

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from tactslip_torch.features.descriptors import ORDERED
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.hand import HandLayout
 
@@ -15,7 +16,6 @@ Channels = Literal["all", "films", "gauges"]
 Components = Literal[
     "all", "unsorted", "deep_spectra", "time", "steady", "moments", "time_moments", "spreads"
 ]
-_SORTED_OR_COUNTED = frozenset({"median", "mode", "iqr", "entropy"})
 _JUMPING = frozenset({"mode", "cv", "entropy"})  # by several deviations at 1 nV of noise
 _SPREADS = frozenset({"std", "range"})
 ATTRIBUTES = ("kind", "finger", "channel", "component", "domain", "descriptor")
@@ -112,13 +112,13 @@ def _attribute(hand: HandLayout, name: FeatureName, attribute: str) -> str:
 
 def _is_of(name: FeatureName, components: str) -> bool:
     if components == "unsorted":
-        return name.descriptor not in _SORTED_OR_COUNTED
+        return name.descriptor not in ORDERED
     if components == "deep_spectra":
         return name.domain == "time" or int(name.component[1:]) >= _DEEP
     if components in ("steady", "moments", "time_moments"):
         is_left_out = name.descriptor in _JUMPING
         if components != "steady":
-            is_left_out |= name.descriptor in _SORTED_OR_COUNTED
+            is_left_out |= name.descriptor in ORDERED
         return not is_left_out and (components != "time_moments" or name.domain == "time")
     if components == "spreads":
         return name.domain == "time" and name.descriptor in _SPREADS

@@ -1,11 +1,13 @@
 """Operations of the definitions that ``torch`` has not under one name, or not as they need them.
 
 All else that ``descriptors.py`` and ``bank.py`` are written in are functions and methods of torch
-that ``graph.value.Value`` takes part in (``__torch_function__``). So each function here asks once
+that ``deploy.value.Value`` takes part in (``__torch_function__``). So each function here asks once
 whether it has a tensor before it, or a value of a graph.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import torch
@@ -51,6 +53,19 @@ def looked_up(table: Tensor, index: Tensor) -> Tensor:
     return table.to(index.device)[index] if isinstance(index, Tensor) else index.entries_of(table)
 
 
+def counted(index: Tensor, num: int) -> Tensor:
+    """How often each of the numbers 0 to ``num - 1`` occurs along the last axis.
+
+    Shape:
+        - index: ``[*, n]``, whole numbers in that range
+        - output: ``[*, num]``
+    """
+    if not isinstance(index, Tensor):
+        return index.counted(num)
+    none = index.new_zeros(*index.shape[:-1], num)
+    return none.scatter_add(-1, index, torch.ones_like(index))
+
+
 def like(constant: Tensor, x: Tensor) -> Tensor:
     """A constant with the dtype and the device of what it meets; a value of a graph asks itself."""
     return constant.to(x) if isinstance(x, Tensor) else constant
@@ -94,3 +109,33 @@ def saturating(x: Tensor, dtype: torch.dtype) -> Tensor:
     if torch.finfo(x.dtype).max <= most:
         return x.to(dtype)
     return x.clamp(-most, most).to(dtype)
+
+
+def signed_log(features: Tensor, knee: Tensor) -> Tensor:
+    """``sign(f) * knee * log1p(|f| / knee)``: nearly ``f`` below the knee, logarithmic above.
+
+    Monotone, odd, with derivative ``knee / (knee + |f|)``, 1 at 0. Finite for every finite ``f``,
+    also where ``|f| / knee`` passes the largest float; NaN stays NaN.
+
+    Shape:
+        - features, output: ``[*, K]``
+        - knee: broadcasts with ``features``, positive
+    """
+    facts = torch.finfo(features.dtype)
+    if is_concrete(features) and is_concrete(knee):  # the same in fewer passes
+        ratio = features.abs() / knee
+        if ratio.numel() and bool(ratio.amax().isfinite()):
+            bent, is_tiny = ratio.log1p().mul_(knee), ratio < facts.tiny
+            if bool(is_tiny.any()):
+                bent = torch.where(is_tiny, features.abs(), bent)
+            return bent.copysign_(features)
+    is_negative = features < 0
+    size = torch.where(is_negative, -features, features)  # abs() has derivative 0 at 0
+    ratio = size / knee
+    bent = knee * ratio.log1p()
+    if not has_values(features) or bool(ratio.isinf().any()):
+        far = torch.maximum(size, knee).log() - knee.log()
+        far = far.clamp(min=math.log(facts.max))  # no step back where log1p ends
+        bent = torch.where(ratio.isinf(), knee * far, bent)
+    bent = torch.where(ratio < facts.tiny, size, bent)  # a denormal ratio has lost its digits
+    return torch.where(is_negative, -bent, bent)

@@ -3,25 +3,40 @@
 For the paper's hand 14 gauges x 13 descriptors + 10 films x (8 branches x (14 time + 15 frequency)
 + 8 band energy ratios) = 2582 features of a 50 ms bin. Of any hand, a gauge is a channel that
 adapts slowly, a film one that adapts fast.
+
+Two backends make the same features. ``"torch"`` is the definitions (``bank.py``): differentiable,
+on any device. ``"native"`` is ``native/engine.cpp``, for values on the CPU. float64 agrees to 1e-9
+of the larger of a value and the median of its column; where a value is all rounding (the sign of cv
+at a mean of 0, the mode of values equal but for rounding) they may differ.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import operator
+from collections.abc import Mapping, Sequence
+from functools import cached_property, lru_cache
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.bank import Bank, Frame
-from tactslip_torch.features.linear_maps import LinearMaps, linear_maps
+from tactslip_torch import native
+from tactslip_torch.features.bank import Bank, Frame, LinearMaps, Plan, linear_maps, make_plan
+from tactslip_torch.features.descriptors import DESCRIPTORS
 from tactslip_torch.features.names import pool_names
 from tactslip_torch.features.ops import bounded_gradient, saturating
-from tactslip_torch.features.plan import Plan, make_plan
-from tactslip_torch.hand import HandLayout
-from tactslip_torch.runtime import is_traced
-from tactslip_torch.signals.spectrum import SpectrumMethod
-from tactslip_torch.signals.wavelet import WaveletFilters, as_wavelet, wavelet_fact
+from tactslip_torch.hand import Channel, HandLayout
+from tactslip_torch.native import BackendName
+from tactslip_torch.runtime import for_each, is_concrete, is_traced
+from tactslip_torch.signals.spectrum import SpectrumMethod, spectrum_matrix
+from tactslip_torch.signals.wavelet import (
+    Wavelet,
+    WaveletFilters,
+    as_wavelet,
+    wavelet_fact,
+    wavelet_steps,
+)
 
 Arithmetic = Literal["double", "native"]
 NATIVE_SPAN = 2.0**-10
@@ -33,14 +48,21 @@ VALIDITY = (
 """``FeaturePool.validity`` of the channels in use, in words for people."""
 LARGEST_SAMPLE = torch.finfo(torch.float64).max / 64
 """Volts; what is larger counts as Inf, because its branches and spectra may leave float64."""
+_FEW_BINS = 4  # so few are done here: another thread would take longer to start
+_CHUNK = {"native": 32, "torch": 16}  # bins of a thread at a time, whose memory fits the cache
 
 
 class FeaturePool(nn.Module):
-    """All features of filtered bins, in the paper's order.
+    """Features of filtered bins: all of a hand, in the paper's order, or a selection of them.
 
-    Follows the dtype and the device of its input. Gradients flow wherever the descriptor is
-    differentiable; they are finite up to 1e288 V. The linear maps (wavelet branches and spectrum)
-    are evaluated on an identity in float64 through ptwt and torch.fft.
+    Follows the dtype of its input. Gradients flow wherever the descriptor is differentiable; they
+    are finite up to 1e288 V. The linear maps (wavelet branches and spectrum) are evaluated on an
+    identity in float64 through ptwt and torch.fft.
+
+    Where only values are asked for, on the CPU, the native engine makes them. The definitions on
+    torch do where a gradient is asked for, a graph is recorded (``torch.compile``, ONNX), bins are
+    transformed (vmap) or on another device; for a bin with magnitudes beyond 2^-320 to 2^448; and
+    everywhere with ``backend="torch"``.
 
     float32 bins are computed in float64 and rounded once at the end. If ``arithmetic`` is
     ``"native"``, their branches and order statistics are still float64, all other statistics
@@ -54,15 +76,23 @@ class FeaturePool(nn.Module):
         level: number of wavelet levels.
         spectrum: ``"reference"`` (the authors') or ``"clean"`` (ours).
         arithmetic: ``"double"``, or ``"native"`` to compute in the dtype of the bins.
+        backend: ``"auto"`` takes the native one where it can be used (``native.why_not``).
+
+    Attributes:
+        names: of the features, in the order of the output.
+        selected: their places in the whole pool.
+        backend: the one in use, never ``"auto"``.
 
     Raises:
-        ValueError: if the rate is not positive, the bin is too short for the levels, or the
-            arithmetic none of those there are.
+        ValueError: if the rate is not positive, the bin is too short for the levels, the arithmetic
+            or backend none of those there are, or ``"native"`` cannot be used.
 
     Example:
         >>> pool = FeaturePool(HandLayout.paper24())
         >>> pool(torch.randn(5, 24, 100)).shape, str(pool.names[0])
         (torch.Size([5, 2582]), 'SG1 raw time mean')
+        >>> pool.select([200, 7])(torch.randn(5, 24, 100)).shape
+        torch.Size([5, 2])
     """
 
     def __init__(
@@ -75,6 +105,7 @@ class FeaturePool(nn.Module):
         level: int = 4,
         spectrum: SpectrumMethod = "reference",
         arithmetic: Arithmetic = "double",
+        backend: BackendName = "auto",
     ) -> None:
         super().__init__()
         if not sample_rate_hz > 0:
@@ -90,10 +121,34 @@ class FeaturePool(nn.Module):
         self.level = level
         self.spectrum: SpectrumMethod = spectrum
         self.arithmetic: Arithmetic = arithmetic
+        self.backend = native.backend_of(backend)
+        self.names = pool_names(hand, level)
+        self.selected = tuple(range(len(self.names)))
         self._inverses: dict[torch.dtype, Tensor] = {}
         self._banks: dict[torch.dtype, Bank] = {}
-        self.names = pool_names(hand, level)
+        self._engines: dict[torch.dtype, native.FeatureEngine] = {}
         _ = self.maps  # refuses a bin that is too short for the levels
+
+    def select(self, index: Sequence[int], backend: BackendName | None = None) -> FeaturePool:
+        """The pool of some of these features, which does the least work for them.
+
+        Args:
+            index: places in ``names``, in the order of the output; repeats are allowed.
+            backend: another one; default: the same.
+
+        Raises:
+            ValueError: for no feature, an index outside the pool, or as the constructor.
+        """
+        num, chosen = len(self.names), [operator.index(i) for i in index]
+        if outside := [i for i in chosen if not 0 <= i < num]:
+            raise ValueError(
+                f"selected features must lie in 0..{num - 1}, the pool's {num}, got {outside[0]}"
+            )
+        pool = FeaturePool(self.hand, **self.facts(), backend=backend or self.backend)
+        pool.names = tuple(self.names[i] for i in chosen)
+        pool.selected = tuple(self.selected[i] for i in chosen)
+        _ = pool.plan  # refuses an empty one
+        return pool
 
     @property
     def maps(self) -> LinearMaps:
@@ -102,8 +157,16 @@ class FeaturePool(nn.Module):
             self.bin_samples, self.sample_rate_hz, self.wavelet, self.level, self.spectrum
         )
 
+    @cached_property
+    def plan(self) -> Plan:
+        """The least work for the features."""
+        return make_plan(self.hand, self.level, self.names)
+
     def facts(self) -> dict[str, Any]:
-        """All arguments but the hand, as JSON-able values; ``FeaturePool(hand, **facts)``."""
+        """All arguments but hand and backend, as JSON-able values: ``FeaturePool(hand, **facts)``.
+
+        Of a selection, those of the whole pool.
+        """
         return {
             "sample_rate_hz": self.sample_rate_hz,
             "bin_samples": self.bin_samples,
@@ -113,33 +176,91 @@ class FeaturePool(nn.Module):
             "arithmetic": self.arithmetic,
         }
 
-    def forward(self, bins: Tensor) -> Tensor:
+    def forward(self, bins: Tensor, dtype: torch.dtype | None = None) -> Tensor:
         """Features of filtered bins.
 
         Shape:
-            - bins: ``[*, C, n]``
-            - output: ``[*, F]``, dtype of ``bins``, every value finite where the bins are; NaN for
-              every feature of a channel that holds a NaN or Inf. What is beyond the dtype, an
-              energy or a gradient, saturates at its largest finite number.
+            - bins: ``[*, C, n]``, float32 or float64, volts
+            - output: ``[*, F]`` in ``dtype``, by default that of ``bins``, every value finite where
+              the bins are; NaN for every feature of a channel that holds a NaN or Inf. What is
+              beyond the dtype, an energy or a gradient, saturates at its largest finite number.
 
         Raises:
             ValueError: if the number of channels or samples is another, or bins are neither float32
                 nor float64.
         """
         self.check(bins)
+        dtype = dtype or bins.dtype
+        if not is_concrete(bins) or dtype not in (torch.float32, torch.float64):
+            return self._by_torch(bins, dtype)
+        with torch.inference_mode(False), torch.no_grad():  # what is kept outlives the mode
+            flat = bins.detach().reshape(-1, *bins.shape[-2:])
+            features = torch.empty(len(flat), len(self.names), dtype=dtype, device="cpu")
+            size = _CHUNK[self.backend]
+
+            def work(start: int) -> None:
+                some, out = flat[start : start + size], features[start : start + size]
+                if self.backend == "native":
+                    self._by_native(some, out)
+                else:
+                    out.copy_(self._by_torch(some, dtype))
+
+            if len(flat) <= _FEW_BINS:
+                for start in range(0, len(flat), size):
+                    work(start)
+            else:
+                for_each(work, range(0, len(flat), size))
+            return features.reshape(*bins.shape[:-2], len(self.names))
+
+    def _by_native(self, bins: Tensor, features: Tensor) -> None:
+        is_odd = self.engine(bins.dtype)(bins.contiguous().numpy(), features.numpy())
+        for index in is_odd.nonzero()[0]:  # one by one: a product's bits depend on its size
+            features[index] = self._by_torch(bins[index], features.dtype)
+
+    def _by_torch(self, bins: Tensor, dtype: torch.dtype) -> Tensor:
         x = self.widen(bins)
         if x.dtype not in self._banks:
-            self._banks[x.dtype] = self.bank(make_plan(self.hand, self.level, self.names), x.dtype)
-        return saturating(self._banks[x.dtype].of_bins(x), bins.dtype)
+            frames = [
+                Frame(tuple(sorted(own)), is_film)
+                for is_film, kind in ((False, self.hand.slow), (True, self.hand.fast))
+                if (own := set(kind).intersection(self.plan.channels))
+            ]
+            self._banks[x.dtype] = Bank(self.maps, self.plan, frames, x.dtype)
+        return saturating(self._banks[x.dtype].of_bins(x), dtype)
 
-    def bank(self, plan: Plan, dtype: torch.dtype) -> Bank:
-        """What makes a part of the features of bins that ``widen`` has brought to this dtype."""
-        frames = [
-            Frame(tuple(sorted(own)), is_film)
-            for is_film, kind in ((False, self.hand.slow), (True, self.hand.fast))
-            if (own := set(kind).intersection(plan.channels))
-        ]
-        return Bank(self.maps, plan, frames, dtype)
+    def engine(self, dtype: torch.dtype) -> native.FeatureEngine:
+        """The native engine for bins of a dtype; two threads may make one each, to the same end."""
+        statistics = dtype if self.arithmetic == "native" else torch.float64
+        if statistics not in self._engines:
+            with torch.inference_mode(False), torch.device("cpu"):
+                self._engines[statistics] = self._make_engine(statistics)
+        return self._engines[statistics]
+
+    def _make_engine(self, statistics: torch.dtype) -> native.FeatureEngine:
+        plan, steps = self.plan, wavelet_steps(self.bin_samples, self.wavelet, self.level)
+        spectrum = spectrum_matrix(self.bin_samples, self.spectrum)
+        num_branches = len(steps.out)
+        offset = {"gauge": 1, "time": 0, "freq": num_branches}  # a gauge is row 0 of its channel
+        rows = [(row.channel, offset[row.kind] + row.branch) for row in plan.rows]
+        wanted = [(*rows[w.row], tuple(DESCRIPTORS).index(w.descriptor), w.place)
+                  for w in plan.wanted]  # fmt: skip
+        wanted += [(s.channel, 2 * num_branches, s.branch, s.place) for s in plan.shares]
+        return native.FeatureEngine(
+            dtype=np.float32 if statistics == torch.float32 else np.float64,
+            num_channels=len(self.hand),
+            slow=[channel for channel in plan.channels if channel in self.hand.slow],
+            fast=[channel for channel in plan.channels if channel in self.hand.fast],
+            wanted=wanted,
+            low=[matrix.numpy() for matrix in steps.low],
+            high=[matrix.numpy() for matrix in steps.high],
+            out=[matrix.numpy() for matrix in steps.out],
+            spectrum=torch.cat([spectrum.real, spectrum.imag]).numpy(),
+            frequency_hz=self.maps.frequency_hz.numpy(),
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without engines, which hold addresses, and banks, which are soon made."""
+        return {**self.__dict__, "_engines": {}, "_banks": {}}
 
     def widen(self, x: Tensor) -> Tensor:
         """Samples in the dtype that features are computed in; filter after it, not before.
@@ -187,7 +308,9 @@ class FeaturePool(nn.Module):
                 for film in self.hand.fast:
                     least[film] = NATIVE_SPAN
             with torch.inference_mode(False):  # it may be needed for a gradient later
-                self._inverses[like.dtype] = torch.tensor(least, dtype=like.dtype).reciprocal()
+                self._inverses[like.dtype] = torch.tensor(
+                    least, dtype=like.dtype, device="cpu"
+                ).reciprocal()
         return self._inverses[like.dtype].to(like.device)
 
     def is_missing(self, bins: Tensor) -> Tensor:
@@ -215,3 +338,42 @@ class FeaturePool(nn.Module):
             )
         if bins.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"expected float32 or float64 bins in volts, got {bins.dtype}")
+
+
+_NOISE_BINS = 128
+_MOVE = 1e-13  # of its size, by which each sample of noise is moved
+_LARGE = 1e-3  # of its spread, by which a feature may move with that
+_NONE = 1e-12  # a spread that is none
+_SHARE = 1 / 16  # of bins, in which it may move further: a value may lie at an edge by chance
+
+
+def is_rounding(pool: FeaturePool) -> Tensor:
+    """Which features of a whole pool rounding decides, ``[F]``, bool; none of the paper's wavelet.
+
+    The details of Haar's, for one, come in pairs of opposite sign, so that their mean, median and
+    skewness are zero but for rounding, and two backends differ in them altogether. Found on noise
+    of size one: such a feature has no spread to speak of, or moves by much of it where samples move
+    by ``1e-13``.
+    """
+    of_fast = _of_fast_channel(pool.bin_samples, pool.wavelet, pool.level, pool.spectrum)
+    num_slow = len(pool.names) - len(pool.hand.fast) * len(of_fast)
+    slow = torch.zeros(num_slow, dtype=torch.bool)
+    return torch.cat([slow, of_fast.repeat(len(pool.hand.fast))])
+
+
+@lru_cache(maxsize=16)
+def _of_fast_channel(
+    bin_samples: int, wavelet: Wavelet, level: int, spectrum: SpectrumMethod
+) -> Tensor:
+    """The same of the features of one channel that adapts fast."""
+    hand = HandLayout((Channel("noise", "noise", "none", "none", "fast"),))
+    options = {"bin_samples": bin_samples, "wavelet": wavelet, "level": level}
+    pool = FeaturePool(hand, spectrum=spectrum, backend="torch", **options)  # type: ignore[arg-type]
+    generator = torch.Generator().manual_seed(0)
+    with torch.inference_mode(False), torch.no_grad():
+        bins, move = torch.randn(2, _NOISE_BINS, 1, bin_samples, generator=generator).double()
+        before, after = pool(bins), pool(bins + _MOVE * move)
+    spread = before.std(0)
+    is_large = (after - before).abs() > _LARGE * spread
+    found: Tensor = (is_large.double().mean(0) > _SHARE) | (spread < _NONE)
+    return found

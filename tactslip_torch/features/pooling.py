@@ -16,16 +16,17 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
-from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tactslip_torch import native
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.ops import ascending, like, root
+from tactslip_torch.features.ops import ascending, like, root, signed_log
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.runtime import has_values
+from tactslip_torch.runtime import are_unchanged, for_each, is_concrete, stamps_of
 
 STATISTICS = ("mean", "std", "min", "max", "median")
 SORTED = "sorted"
@@ -37,28 +38,6 @@ QUIET_QUANTILE = 0.01
 CHUNK_BINS = 2048  # whose features are pooled at a time
 _RANGE_OF = {"slow": "raw", "fast": "A1"}  # the component whose range tells that a channel lives
 _RANK = re.compile(r"rank([1-9]\d*)")
-
-
-def signed_log(features: Tensor, knee: Tensor) -> Tensor:
-    """``sign(f) * knee * log1p(|f| / knee)``: nearly ``f`` below the knee, logarithmic above.
-
-    Monotone, odd, with derivative ``knee / (knee + |f|)``, 1 at 0. Finite for every finite ``f``,
-    also where ``|f| / knee`` passes the largest float; NaN stays NaN.
-
-    Shape:
-        - features, output: ``[*, K]``
-        - knee: broadcasts with ``features``, positive
-    """
-    is_negative = features < 0
-    size = torch.where(is_negative, -features, features)  # abs() has derivative 0 at 0
-    ratio, facts = size / knee, torch.finfo(features.dtype)
-    bent = knee * ratio.log1p()
-    if not has_values(features) or bool(ratio.isinf().any()):
-        far = torch.maximum(size, knee).log() - knee.log()
-        far = far.clamp(min=math.log(facts.max))  # no step back where log1p ends
-        bent = torch.where(ratio.isinf(), knee * far, bent)
-    bent = torch.where(ratio < facts.tiny, size, bent)  # a denormal ratio has lost its digits
-    return torch.where(is_negative, -bent, bent)
 
 
 def over_channels(
@@ -197,6 +176,8 @@ class ChannelPooling(nn.Module):
         self.kinds = tuple(kind for kind in by_kind if any(n.channel == kind for n in pooled))
         if strangers := {name.channel for name in pooled} - set(self.kinds):
             raise ValueError(f"no channel of this hand is of kind {sorted(strangers)[0]!r}")
+        if len(set(self.names)) < len(self.names):
+            raise ValueError("a column is named twice; name each once")
         for name in pooled:
             if not (name.statistic in STATISTICS or _RANK.fullmatch(name.statistic)):
                 raise ValueError(f"unknown statistic over channels in {str(name)!r}")
@@ -244,13 +225,11 @@ class ChannelPooling(nn.Module):
         self.singles = tuple(place[name] for name in singles)
         column = {name: index for index, name in enumerate(made)}
         self.order = tuple(column[name] for name in self.names)
-        kind_of = [
+        self.kind_of = tuple(
             self.kinds.index(name.channel) if name.is_pooled else len(self.kinds)
             for name in self.names
-        ]
-        self.kind_of = tuple(kind_of)
-        index = {"singles": self.singles, "order": self.order, "kind_of": self.kind_of}
-        self._index = {name: torch.tensor(places).long() for name, places in index.items()}
+        )
+        self._engine: tuple[native.Machine, Any] | None = None
 
     @classmethod
     def fit(
@@ -297,7 +276,7 @@ class ChannelPooling(nn.Module):
         )
         inputs = torch.tensor([place[name] for name in layer.inputs])
         for kind, group in zip(layer.kinds, layer.groups, strict=True):
-            values = features[:, inputs[group.index]].double().abs()
+            values = features[:, inputs[list(group.columns)]].double().abs()
             values = values.unflatten(1, (-1, len(group.channels)))
             values = values.masked_fill(~in_use[kind][:, None, :], torch.nan).transpose(0, 1)
             layer.knee[list(group.families)] = _knees(values.flatten(1))
@@ -305,35 +284,98 @@ class ChannelPooling(nn.Module):
         layer.fill.copy_(torch.cat(columns).median(0).values)
         return layer
 
-    def forward(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
+    def forward(
+        self,
+        features: Tensor,
+        is_missing: Tensor | None = None,
+        backend: native.BackendName = "auto",
+    ) -> Tensor:
         """Columns of bins.
 
-        Differentiable; a channel that is left out has no gradient.
+        Differentiable; a channel that is left out has no gradient. By the native engine where only
+        values are asked for, as ``FeaturePool`` has it; the two agree to 1e-13.
 
         Shape:
-            - features: ``[*, M]``, of ``inputs``, floating
+            - features: ``[*, M]``, of ``inputs``, float32 or float64
             - is_missing: ``[*, C]``, bool, channels that are left out beside those that are stuck
             - output: ``[*, K]``; NaN where a feature of a channel in use is NaN
         """
-        parts = [features.index_select(-1, self._index["singles"].to(features.device))]
-        is_some = []
+        if features.shape[-1] != len(self.inputs):
+            raise ValueError(f"expected {len(self.inputs)} features, got {features.shape[-1]}")
+        given = [x for x in (features, is_missing, *self.buffers()) if x is not None]
+        if all(map(is_concrete, given)) and native.backend_of(backend) == "native":
+            return self._by_native(features.detach(), is_missing)
+        parts, is_some = [features[..., list(self.singles)]], []
         for index, group in enumerate(self.groups):
-            ranges = features.index_select(-1, group.range_index.to(features.device))
-            in_use = ~(ranges < self.least_range[index].to(features))
+            in_use = ~(features[..., list(group.ranges)] < self.least_range[index].to(features))
             if is_missing is not None:
                 in_use = in_use & ~is_missing[..., list(group.channels)]
             is_some.append(in_use.any(-1))
             num_channels = len(group.channels)
-            values = features.index_select(-1, group.index.to(features.device))
-            values = values.unflatten(-1, (-1, num_channels))
+            values = features[..., list(group.columns)].unflatten(-1, (-1, num_channels))
             knee = self.knee[list(group.families), None].to(features)
             in_rows = in_use[..., None, :]
             values = signed_log(values, knee)
             parts += over_channels(values, in_rows, group.statistics, num_channels)
-        order, kind_of = (self._index[n].to(features.device) for n in ("order", "kind_of"))
-        columns = torch.cat(parts, dim=-1).index_select(-1, order)
-        known = torch.stack([*is_some, torch.ones_like(is_some[0])], -1).index_select(-1, kind_of)
+        columns = torch.cat(parts, dim=-1)[..., list(self.order)]
+        known = torch.stack([*is_some, torch.ones_like(is_some[0])], -1)[..., list(self.kind_of)]
         return torch.where(known, columns, self.fill.to(features))
+
+    def _by_native(self, features: Tensor, is_missing: Tensor | None) -> Tensor:
+        with torch.inference_mode(False), torch.no_grad():
+            buffers = [self.knee, self.fill, self.least_range]
+            if self._engine is None or not are_unchanged(buffers, self._engine[1]):
+                self._engine = self.machine(), stamps_of(buffers)
+            machine = self._engine[0]
+            flat = features.reshape(-1, features.shape[-1]).contiguous().numpy()
+            found = torch.empty(len(flat), len(self.names), dtype=features.dtype, device="cpu")
+            masks = None
+            if is_missing is not None:
+                shape = (*features.shape[:-1], len(self.hand))
+                masks = is_missing.bool().expand(shape).reshape(-1, shape[-1]).numpy()
+
+            def work(start: int) -> None:
+                some = slice(start, start + CHUNK_BINS)
+                columns = machine.columns(flat[some], None if masks is None else masks[some])
+                found[some] = torch.from_numpy(columns)
+
+            for_each(work, range(0, len(flat), CHUNK_BINS))
+            return found.reshape(*features.shape[:-1], len(self.names))
+
+    def machine(self, **more: Any) -> native.Machine:
+        """The native engine of the layer and of what follows it, ``scaling`` and ``head``."""
+        column = {made: index for index, made in enumerate(self.order)}
+        pools, first = [], len(self.singles)
+        for index, group in enumerate(self.groups):
+            num, shape = len(group.channels), (len(group.statistics), len(group.families))
+            own = range(first, first := first + shape[0] * shape[1])
+            pools.append(
+                native.Pool(
+                    channels=group.channels,
+                    ranges=group.ranges,
+                    inputs=np.reshape(group.columns, (-1, num)),
+                    statistics=[
+                        _fraction(s, num) if s == "median" or _RANK.fullmatch(s) else s
+                        for s in group.statistics
+                    ],
+                    columns=np.reshape([column.get(made, -1) for made in own], shape),
+                    knees=self.knee[list(group.families)].cpu().numpy(),
+                    least_range=float(self.least_range[index]),
+                )
+            )
+        return native.Machine(
+            num_channels=len(self.hand),
+            num_inputs=len(self.inputs),
+            num_columns=len(self.names),
+            singles=[(place, column[made]) for made, place in enumerate(self.singles)],
+            pools=pools,
+            fill=self.fill.cpu().numpy(),
+            **more,
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the engine, which holds addresses."""
+        return {**self.__dict__, "_engine": None}
 
     def select(self, index: Sequence[int]) -> ChannelPooling:
         """The layer of some of its columns, in that order; it takes no more than they need."""
@@ -382,16 +424,6 @@ class PooledKind:
     columns: tuple[int, ...]
     ranges: tuple[int, ...]
     statistics: tuple[str, ...]
-
-    @cached_property
-    def index(self) -> Tensor:
-        """``columns`` as a tensor."""
-        return torch.tensor(self.columns)
-
-    @cached_property
-    def range_index(self) -> Tensor:
-        """``ranges`` as a tensor."""
-        return torch.tensor(self.ranges)
 
 
 def _channels_by_kind(hand: HandLayout) -> dict[str, tuple[int, ...]]:

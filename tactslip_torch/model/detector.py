@@ -9,31 +9,35 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.ops import is_nowhere, saturating
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.hand import HandLayout
-from tactslip_torch.model.few_bins import FEW_BINS, FEW_FILTERED, FewBins
 from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_from_dict
 from tactslip_torch.model.missing_channels import (
     ChannelMask,
     ClassGaussians,
-    MissingScores,
+    missing_scores,
     without,
 )
 from tactslip_torch.model.prediction import Nonfinite, Prediction, check_nonfinite, predict_in_parts
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.native import BackendName, backend_of
-from tactslip_torch.runtime import is_concrete, load_table, save_table, table_form
+from tactslip_torch.native import BackendName, Filters, Machine, Scores, backend_of
+from tactslip_torch.runtime import (
+    are_unchanged,
+    is_concrete,
+    load_table,
+    save_table,
+    stamps_of,
+)
 from tactslip_torch.signals.filtering import ChannelFilter
 
 FORMAT = "tactslip_torch detector 3"
-_EARLIER_FORMATS = ("tactslip_torch detector 1", "tactslip_torch detector 2")
 
 
 class SlipDetector(nn.Module):
@@ -41,6 +45,9 @@ class SlipDetector(nn.Module):
 
     Features are computed and scaled in float64, of float32 bins too (``FeaturePool.arithmetic``);
     the head works in the dtype of the detector, float64 as fitted.
+
+    The native engine copies the tensors of the detector and notices when they change, but for a
+    change through ``.data``, which torch does not count: change them under ``torch.no_grad``.
 
     Args:
         pool: what features there are, F of C channels.
@@ -52,9 +59,9 @@ class SlipDetector(nn.Module):
         info: JSON-able facts about the training, kept in the file.
         imputation: scaled features in place of those of a missing channel, ``[K]``; default 0.
         gaussians: of the scaled features; with them, what is missing leaves the expected score and
-            its variance (``ExpectedScore``), instead of the score of ``imputation`` values.
+            its variance (``expected_score``), instead of the score of ``imputation`` values.
         pooling: from the features that are read to the columns; ``None``: they are the columns.
-        backend: what features are made by where no gradient is asked for (``FeatureExtractor``).
+        backend: what features are made by where no gradient is asked for (``FeaturePool``).
 
     Shape:
         - bins: ``[*, C, n]``, filtered, in volts; ``n = pool.bin_samples``
@@ -89,12 +96,11 @@ class SlipDetector(nn.Module):
         if imputation is None:
             imputation = torch.zeros(len(scaler.minimum))
         self.pool, self.channel_filter = pool, channel_filter
-        self.extractor = FeatureExtractor(pool, selected, backend)
+        self.extractor = pool.select(selected, backend)
         self.selected = self.extractor.selected
         self.pooling, self.scaler, self.head, self.gaussians = pooling, scaler, head, gaussians
         self.info = dict(info or {})
-        self._few: FewBins | None = None
-        self._missing: MissingScores | None = None
+        self._engine: _Engine | None = None
         self._check_parts(imputation)
         self.register_buffer("imputation", imputation.to(next(head.buffers()), copy=True))
         place = {name: index for index, name in enumerate(pool.hand.names)}
@@ -140,7 +146,7 @@ class SlipDetector(nn.Module):
             ValueError: if the number of channels or samples is another.
         """
         self.pool.check(bins)
-        return predict_in_parts(lambda part: self._score(part, FEW_FILTERED), bins)
+        return predict_in_parts(lambda part: self._score(part, False), bins)
 
     def score_raw(self, samples: Tensor) -> Tensor:
         """Filter and score raw bins that come with their context.
@@ -152,8 +158,8 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: if the number of channels or samples is another.
         """
-        self.channel_filter.check(samples)
-        return predict_in_parts(self._score_raw, samples)
+        self._check_raw(samples)
+        return predict_in_parts(lambda part: self._score(part, True), samples)
 
     def predict(
         self,
@@ -183,12 +189,13 @@ class SlipDetector(nn.Module):
         check_nonfinite(nonfinite, bins, self.pool.hand.names)
         bins = without(bins, masked_channels, self.pool.hand.names)
         dtype = given or bins.dtype
-        return predict_in_parts(lambda part: self._predict(part, dtype, FEW_FILTERED), bins)
+        return predict_in_parts(lambda part: self._predict(part, False, dtype), bins)
 
     def predict_raw(
         self,
         samples: Tensor,
         nonfinite: Nonfinite = "mask",
+        given: torch.dtype | None = None,
         masked_channels: ChannelMask | None = None,
     ) -> Prediction:
         """``predict`` for raw bins with their context, where NaN and Inf count as filters reach it.
@@ -199,10 +206,11 @@ class SlipDetector(nn.Module):
         Raises:
             ValueError: as ``predict``.
         """
-        self.channel_filter.check(samples)
+        self._check_raw(samples)
         check_nonfinite(nonfinite, samples, self.pool.hand.names)
         samples = without(samples, masked_channels, self.pool.hand.names)
-        return predict_in_parts(self._predict_raw, samples)
+        dtype = given or samples.dtype
+        return predict_in_parts(lambda part: self._predict(part, True, dtype), samples)
 
     def validity(self, bins: Tensor) -> Tensor:
         """Whether every channel in use can be trusted (``FeaturePool.validity``), as ``predict``.
@@ -233,7 +241,7 @@ class SlipDetector(nn.Module):
         """
         if self.pooling is None:
             return features
-        columns: Tensor = self.pooling(features, is_missing)
+        columns: Tensor = self.pooling(features, is_missing, self.extractor.backend)
         return columns
 
     def scaled(self, features: Tensor, is_missing: Tensor | None = None) -> Tensor:
@@ -242,22 +250,35 @@ class SlipDetector(nn.Module):
         scaled: Tensor = self.scaler(columns)
         return scaled.to(self.imputation.dtype)
 
-    def _score(self, bins: Tensor, most: int = FEW_BINS) -> Tensor:
-        if (few := self._few_bins(bins, most)) is not None:
-            return few.score(self._features(bins.detach()), bins.dtype)
-        return saturating(self.score_features(self._features(bins)), bins.dtype)
+    def _check_raw(self, samples: Tensor) -> None:
+        self.channel_filter.check(samples)
+        if samples.dtype not in _DTYPES:
+            raise ValueError(f"expected float32 or float64 samples in volts, got {samples.dtype}")
+        wanted = self.context_before + self.pool.bin_samples + self.context_after
+        if samples.shape[-1] != wanted:
+            raise ValueError(
+                f"expected bins of {wanted} samples, {self.context_before} of context before and "
+                f"{self.context_after} behind, got {samples.shape[-1]}"
+            )
 
-    def _score_raw(self, samples: Tensor) -> Tensor:
-        return saturating(self._score(self._filter(samples)), samples.dtype)
+    def _score(self, x: Tensor, is_raw: bool) -> Tensor:
+        """Scores of filtered bins, or of raw ones with their context."""
+        if (engine := self._engine_of(x)) is not None:
+            return engine.scores(x, is_raw)
+        return self._score_by_torch(x, is_raw)
 
-    def _predict_raw(self, samples: Tensor) -> Prediction:
-        return self._predict(self._filter(samples), samples.dtype)
+    def _score_by_torch(self, x: Tensor, is_raw: bool) -> Tensor:
+        features = self._features(self._filter(x) if is_raw else x)
+        return saturating(self.score_features(features), x.dtype)
 
-    def _predict(self, bins: Tensor, given: torch.dtype, most: int = FEW_BINS) -> Prediction:
-        """Scores of filtered bins, valid by the dtype they were given in, which is the score's."""
-        if (few := self._few_bins(bins, most)) is not None:
-            wide = self.pool.widen(bins.detach())
-            return few.predict(self._features, wide, given, self._without)
+    def _predict(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
+        """The same, valid by the dtype they were given in, which is the score's."""
+        if (engine := self._engine_of(x)) is not None:
+            return engine.predict(x, is_raw, given)
+        return self._predict_by_torch(x, is_raw, given)
+
+    def _predict_by_torch(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
+        bins = self._filter(x) if is_raw else x
         is_alive = self.pool.is_alive(bins.to(given))  # sensors resolve no more than they give
         bins = self.pool.widen(bins)
         is_missing = self.pool.is_missing(bins)
@@ -272,31 +293,43 @@ class SlipDetector(nn.Module):
         is_valid = self._needed(is_alive & ~is_missing) & score.isfinite()
         return Prediction(score, is_valid, is_missing, variance)
 
-    def _without(self, score: Tensor, *missing: Tensor) -> tuple[Tensor, Tensor]:
-        """Scores and variances where channels are missing (``MissingScores``)."""
-        parts = self.head, self.imputation, self.channel_index, self.gaussians
-        if self._missing is None or not self._missing.is_of(*parts):
-            self._missing = MissingScores(*parts)
-        return self._missing(score, *missing)
+    def _without(self, score: Tensor, scaled: Tensor, is_missing: Tensor) -> tuple[Tensor, Tensor]:
+        """Scores ``[*]`` and variances where channels ``[*, C]`` are missing."""
+        pooled = torch.zeros_like(is_missing[..., :1])  # never lost: it is of the other channels
+        is_lost = torch.cat([is_missing, pooled], -1).index_select(-1, self.channel_index)
+        return missing_scores(self.head, self.gaussians, self.imputation, score, scaled, is_lost)
 
-    def _few_bins(self, bins: Tensor, most: int) -> FewBins | None:
-        """The way for few bins and values alone, if this is one for it."""
-        is_watched = any(m._forward_hooks or m._forward_pre_hooks for m in (self.scaler, self.head))
-        if is_watched or not is_concrete(bins) or bins.shape[:-2].numel() > most:
+    def _engine_of(self, x: Tensor) -> _Engine | None:
+        """The native engine of the whole detector, where only values are asked for."""
+        if self.extractor.backend != "native" or not is_concrete(x):
             return None
-        if self._few is None or not self._few.is_of(self):
-            self._few = FewBins(self) if FewBins.suits(self.scaler, self.head) else None
-        return self._few
+        names = ("pooling", "scaler", "head", "channel_filter", "extractor")
+        modules = [m for name in names if (m := self._modules.get(name)) is not None]
+        if any(m._forward_hooks or m._forward_pre_hooks or "forward" in vars(m) for m in modules):
+            return None
+        tensors = [x for m in modules for x in m._buffers.values() if x is not None]
+        if torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
+            return None
+        engine = self._engine
+        if engine is None or modules != engine.modules or not are_unchanged(tensors, engine.stamps):
+            if not all(is_concrete(each) for each in tensors):
+                return None
+            if any(type(m) not in _KNOWN_TO_ENGINE for m in modules if m is not self.head):
+                return None
+            with torch.inference_mode(False), torch.no_grad():
+                engine = self._engine = _Engine(self, modules, tensors)
+        return engine
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without views of tensors, which in a copy would be of others."""
-        return self.__dict__ | {"_few": None, "_missing": None}
+        """Without the engine, which holds addresses."""
+        return self.__dict__ | {"_engine": None}
 
     def _filter(self, samples: Tensor) -> Tensor:
         return self.channel_filter.valid(self.pool.widen(samples), self.extractor.plan.channels)
 
     def _features(self, bins: Tensor) -> Tensor:
-        return self.extractor(bins, self.scaler.minimum.dtype)
+        features: Tensor = self.extractor(bins, self.scaler.minimum.dtype)
+        return features
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SlipDetector:
         """``float()`` and ``to()``: what is known of features stays float64, as offsets cancel."""
@@ -366,11 +399,6 @@ class SlipDetector(nn.Module):
         backend_of(backend)
         name = os.fspath(path)
         try:
-            if table_form(path) in _EARLIER_FORMATS:
-                raise ValueError(
-                    f"{name} was made by version 0.1.0 or earlier; train again, or use it with "
-                    "that version"
-                )
             metadata, state = load_table(path, FORMAT)
         except FileNotFoundError:
             raise FileNotFoundError(f"no detector at {name}") from None
@@ -415,3 +443,105 @@ class SlipDetector(nn.Module):
             pooling and ChannelPooling.from_dict(hand, pooling, part("pooling")),
             backend=backend,
         )
+
+
+class _Engine:
+    """A detector's filter, features, pooling, scaling and head in one call of the native engine.
+
+    Args:
+        detector: as it stands; another engine is made when a part of it changes.
+        modules: that it is of.
+        tensors: of these.
+    """
+
+    def __init__(
+        self, detector: SlipDetector, modules: list[nn.Module], tensors: Sequence[Tensor]
+    ) -> None:
+        self.modules, self.stamps = modules, stamps_of(tensors)
+        self._of = detector
+        scaler, head, channel_filter = detector.scaler, detector.head, detector.channel_filter
+        more: dict[str, Any] = {
+            "scaling": tuple(
+                None if each is None else each.double().numpy()
+                for each in (scaler.minimum, scaler.maximum, scaler.knee)
+            )
+        }
+        if type(head) is QuadraticForm:
+            quadratic, linear = head.quadratic.double(), head.linear.double()
+            more["head"] = (quadratic.numpy(), linear.numpy(), float(head.constant))
+        if detector.pooling is not None:
+            self._machine = detector.pooling.machine(**more)
+        else:
+            num = len(detector.selected)
+            self._machine = Machine(
+                num_channels=len(detector.pool.hand),
+                num_inputs=num,
+                num_columns=num,
+                singles=[(i, i) for i in range(num)],
+                **more,
+            )
+        channels = range(len(detector.pool.hand))
+        self._filters = Filters(
+            [channel_filter.kernel(c).numpy() for c in channels],
+            [channel_filter.context_before - channel_filter.reaches[c][0] for c in channels],
+        )
+
+        # by dtypes of bins, and of samples they were filtered from
+        self._engines = {dtype: detector.extractor.engine(dtype) for dtype in _DTYPES}
+        self._inverse = {
+            dtype: detector.pool.inverse_span(torch.empty(0, dtype=dtype, device="cpu"))
+            .double()
+            .numpy()
+            for dtype in _DTYPES
+        }
+
+    def scores(self, x: Tensor, is_raw: bool) -> Tensor:
+        """As ``SlipDetector._score``."""
+        flat, filters = _rows(x), self._filters if is_raw else None
+        found = self._engines[x.dtype].score(self._machine, flat, filters)
+        score = self._score(found, x.dtype)
+        for row in found.is_odd.nonzero()[0].tolist():  # torch has no limits
+            score[row] = self._of._score_by_torch(torch.from_numpy(flat[row : row + 1]), is_raw)[0]
+        return torch.from_numpy(score.reshape(x.shape[:-2]))
+
+    def predict(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
+        """As ``SlipDetector._predict``."""
+        flat, filters = _rows(x), self._filters if is_raw else None
+        engine, of_numpy = self._engines[x.dtype], _DTYPES[given]
+        found = engine.score(self._machine, flat, filters, self._inverse[given], of_numpy)
+        score = self._score(found, given)
+        variance = np.zeros_like(score)
+        is_valid = found.is_valid & np.isfinite(score)
+        arrays = (score, is_valid, found.is_missing, variance)
+        parts = Prediction(*map(torch.from_numpy, arrays))
+        if found.is_missing.any():
+            scaled = torch.from_numpy(found.scaled).to(self._of.imputation)
+            of_whole, of_lost = self._of._without(parts.score, scaled, parts.is_missing)
+            parts = parts._replace(score=of_whole, variance=of_lost)
+            parts = parts._replace(is_valid=parts.is_valid & of_whole.isfinite())
+        for row in found.is_odd.nonzero()[0].tolist():
+            one = torch.from_numpy(flat[row : row + 1])
+            own = self._of._predict_by_torch(one, is_raw, given)
+            for whole, part in zip(parts, own, strict=True):
+                whole[row] = part[0]
+        if x.ndim == 3:
+            return parts
+        return Prediction(*(each.reshape((*x.shape[:-2], *each.shape[1:])) for each in parts))
+
+    def _score(self, found: Scores, given: torch.dtype) -> Any:
+        if found.score is None:
+            score = self._of.head(torch.from_numpy(found.scaled).to(self._of.imputation)).numpy()
+        else:
+            score = found.score
+        most = np.finfo(_DTYPES[given]).max
+        return score.clip(-most, most).astype(_DTYPES[given], copy=False)
+
+
+_KNOWN_TO_ENGINE = (ChannelPooling, FeatureScaler, ChannelFilter, FeaturePool)
+_DTYPES: dict[torch.dtype, Any] = {torch.float32: np.float32, torch.float64: np.float64}
+
+
+def _rows(x: Tensor) -> Any:
+    """``[*, C, n]`` as an array ``[M, C, n]``, samples of a channel side by side."""
+    rows = x.detach().numpy().reshape(-1, *x.shape[-2:])
+    return rows if rows.strides[-1] == rows.itemsize else np.ascontiguousarray(rows)

@@ -125,7 +125,12 @@ def fit_machine(
         beta, report, _ = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
         machine = machine_of(bins.features, beta, kernel)
         if isinstance(machine, KernelSum):
-            log.info(machine.cost_note)
+            log.info(
+                "%s does not fold into a quadratic form: all %d training bins are kept, %s",
+                kernel,
+                len(bins.features),
+                machine.cost,
+            )
     machine.solved = report
     return machine
 

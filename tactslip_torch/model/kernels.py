@@ -182,11 +182,6 @@ def _pairs(num_features: int) -> tuple[Tensor, Tensor]:
 Kernel = Polynomial | RadialBasis
 PAPER_KERNEL = Polynomial(degree=2, offset=0.5)
 
-_KINDS: dict[str, type[Polynomial] | type[RadialBasis]] = {
-    "polynomial": Polynomial,
-    "radial basis": RadialBasis,
-}
-
 
 def kernel_from_dict(values: Mapping[str, Any]) -> Kernel:
     """The kernel that ``to_dict`` described.
@@ -199,13 +194,16 @@ def kernel_from_dict(values: Mapping[str, Any]) -> Kernel:
         Polynomial(degree=3, offset=1.0)
     """
     numbers = {name: value for name, value in values.items() if name != "kind"}
-    kind = _KINDS.get(str(values.get("kind")))
-    if kind is None:
-        raise ValueError(
-            f"kind of the kernel must be one of {', '.join(_KINDS)}, got {values.get('kind')!r}"
-        )
     try:
-        return kind(**numbers)
+        match values.get("kind"):
+            case "polynomial":
+                return Polynomial(**numbers)
+            case "radial basis":
+                return RadialBasis(**numbers)
+            case kind:
+                raise ValueError(
+                    f"kind of the kernel must be one of polynomial, radial basis, got {kind!r}"
+                )
     except TypeError as error:
         raise ValueError(f"{numbers} does not describe a {values['kind']} kernel") from error
 
@@ -355,14 +353,6 @@ class KernelSum(nn.Module):
         num_bins, num_features = self.support.shape
         num_values = num_bins * (num_features + 1)
         return Cost(num_values, num_values * self.support.element_size())
-
-    @property
-    def cost_note(self) -> str:
-        """What keeping the sum costs, in a sentence for logs."""
-        return (
-            f"{self.kernel} does not fold into a quadratic form: the machine keeps all "
-            f"{len(self.support)} training bins, {self.cost}"
-        )
 
     def forward(self, z: Tensor) -> Tensor:
         """The score; holds a kernel matrix of all bins given by all training bins.

@@ -128,9 +128,14 @@ class SufficientStats:
             ValueError: if a batch is in both, or if the two differ in what they are about, in
                 degree or in the number of features.
         """
-        for name in ("num_features", "degree", "about"):
-            if found := _first_difference(getattr(self, name), getattr(other, name), name):
-                raise ValueError(f"cannot merge sums that differ in {found}")
+        ours = {"num_features": self.num_features, "degree": self.degree, **self.about}
+        theirs = {"num_features": other.num_features, "degree": other.degree, **other.about}
+        for key in ours | theirs:
+            if ours.get(key) != theirs.get(key):
+                raise ValueError(
+                    f"cannot merge sums that differ in {key}: "
+                    f"{ours.get(key)!s:.60} and {theirs.get(key)!s:.60}"
+                )
         self.seen_batches.merge(other.seen_batches)
         self.sums += other.sums
         self.count += other.count
@@ -398,28 +403,3 @@ class ProductSums:
 
 def _triangle(num: int) -> int:
     return num * (num + 1) // 2
-
-
-def _first_difference(ours: Any, theirs: Any, name: str = "") -> str:
-    """The path of the first differing key of nested mappings and lists, with both values."""
-    if ours == theirs:
-        return ""
-    if type(ours) is type(theirs) is list:
-        ours, theirs = dict(enumerate(ours)), dict(enumerate(theirs))
-    if type(ours) is type(theirs) is dict:
-        for key in sorted(ours.keys() | theirs.keys()):
-            ours_there = ours.get(key, _ABSENT)
-            found = _first_difference(ours_there, theirs.get(key, _ABSENT), f"{name}.{key}")
-            if found:
-                return found
-    return f"{name.removeprefix('.')}: {_shown(ours)} and {_shown(theirs)}"
-
-
-_ABSENT = object()
-
-
-def _shown(value: Any) -> str:
-    if value is _ABSENT:
-        return "nothing"
-    text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

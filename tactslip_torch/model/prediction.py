@@ -52,7 +52,7 @@ def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
 
 def predict_in_parts(predict: Callable[[Tensor], Said], x: Tensor) -> Said:
     """What ``predict`` says of bins ``[*, C, n]``: of many in parts that stay in a cache."""
-    if not is_concrete(x) or x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS:
+    if x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS or not is_concrete(x):
         return predict(x)
 
     def joined(parts: Sequence[Tensor]) -> Tensor:

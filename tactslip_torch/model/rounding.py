@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from tactslip_torch.model.kernels import QuadraticForm
 
+_CHUNK = 16  # points that are differentiated together
 _WIDE = 2.0**-52  # twice the unit roundoff of the float64 sums below
 
 
@@ -166,31 +167,29 @@ def head_facts(head: nn.Module, also: Tensor | None = None, seed: int = 0) -> di
     }
 
 
-def gradient_norms(function: Callable[[Tensor], Tensor], points: Tensor, chunk: int = 16) -> Tensor:
-    """Euclidean norm of the gradient at each point: by how much a small error there is magnified.
+def gradient_facts(function: Callable[[Tensor], Tensor], points: Tensor) -> dict[str, float | int]:
+    """By how much a small error in a point is magnified: Euclidean norms of the gradients.
 
-    Shape:
-        - function: ``[M, *] -> [M]``, one value for each point alone
-        - points: ``[N, *]``; output: ``[N]``
+    Args:
+        function: of points, one value for each point alone.
+        points: where, ``[N, *]``.
+
+    Returns:
+        The ``largest`` norm, the ``median`` one, and how many ``bins``.
 
     Example:
-        >>> gradient_norms(lambda z: z[:, 0] * 3 + z[:, 1] * 4, torch.zeros(2, 2))
-        tensor([5., 5.])
+        >>> gradient_facts(lambda z: z[:, 0] * 3 + z[:, 1] * 4, torch.zeros(2, 2))
+        {'largest': 5.0, 'median': 5.0, 'bins': 2}
     """
     norms = []
-    for part in points.split(chunk):
+    for part in points.split(_CHUNK):
         given = part.detach().clone().requires_grad_()
         with torch.enable_grad():  # the caller may have turned it off
             value = function(given).sum()
         (slope,) = torch.autograd.grad(value, given)
         norms.append(torch.linalg.vector_norm(slope.flatten(1), dim=-1))
-    return torch.cat(norms)
-
-
-def gradient_facts(function: Callable[[Tensor], Tensor], points: Tensor) -> dict[str, float | int]:
-    """Largest and median of ``gradient_norms``, and over how many bins."""
-    norms = gradient_norms(function, points)
-    return {"largest": float(norms.max()), "median": float(norms.median()), "bins": len(norms)}
+    found = torch.cat(norms)
+    return {"largest": float(found.max()), "median": float(found.median()), "bins": len(found)}
 
 
 def error_facts(error: Tensor, sd: float) -> dict[str, float | None]:

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.pooling import signed_log as signed_log
+from tactslip_torch.features.ops import signed_log
 from tactslip_torch.runtime import is_concrete
 
 _COLUMNS = 128  # sorted at a time, which keeps memory small

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -139,7 +139,12 @@ def solve_symmetric(
     given, eps = matrix.dtype, torch.finfo(matrix.dtype).eps
     matrix, right = matrix.detach().double(), right.detach().double()
     weights = torch.ones_like(right) if weights is None else weights.detach().double()
-    ridge = _ridge(penalty, weights)
+    ridge = 1 / (penalty * weights)
+    if not (penalty > 0 and bool(ridge.isfinite().all())):
+        raise ValueError(
+            f"penalty (the paper's C) must be positive, and so large that 1 / (C w) is finite, "
+            f"got {penalty}"
+        )
     system = matrix.clone()
     system.diagonal().add_(ridge)
     whole = system.diagonal().clone()
@@ -153,8 +158,12 @@ def solve_symmetric(
     bound = norm / least if least > 0 else math.inf
     size, dtype = len(right), str(given).removeprefix("torch.")
     known = bound if math.isfinite(bound) else None
-    is_light = bool(_light_bins(matrix.diagonal(), weights, eps).any())
-    if not math.isinf(penalty) or is_light:
+    report = SolveReport("cholesky", dtype, size, penalty, math.inf, known, size, math.inf)
+    # bins that a cut at rounding would lose for their weights
+    own, cutoff = matrix.diagonal() * weights, size * eps
+    is_faint = matrix.diagonal() <= cutoff * matrix.diagonal().max()
+    is_light = (own <= cutoff * own.max()) & ~is_faint
+    if not math.isinf(penalty) or bool(is_light.any()):
         factor = system.mT  # column-major, so that LAPACK works within the copy
         info = torch.empty((), dtype=torch.int32, device=matrix.device)
         torch.linalg.cholesky_ex(factor, out=(factor, info))
@@ -165,7 +174,7 @@ def solve_symmetric(
             factor.mul_(scale[:, None])
             x = torch.cholesky_solve(right[:, None], factor)[:, 0]
             error = math.sqrt(size) * eps * condition
-            report = SolveReport("cholesky", dtype, size, penalty, condition, known, size, error)
+            report = replace(report, condition=condition, error=error)
             return Solution(_in_dtype(x, given, name), report, factor)
         reason = f"{name} + I/C at penalty={penalty:g} has condition {condition:.1e}"
         if eps > _EPS:
@@ -175,83 +184,16 @@ def solve_symmetric(
             raise ValueError(f"{reason}, wanted up to {most_condition:.0e}; lower the penalty")
         log.warning("%s, too much for Cholesky in float64", reason)
     del system
-    _check_light(matrix.diagonal(), weights, penalty, eps, name)
-    kept = _truncated(matrix, right, penalty, weights.sqrt(), eps, in_span=in_span, name=name)
-    error = max(kept.error, kept.left_out)
-    report = SolveReport(
-        "eigen", dtype, size, penalty, kept.condition, known, kept.rank, error, kept.left_out
-    )
-    if not math.isinf(penalty) or kept.left_out > _LARGEST_UNSAID:
+    if bool((is_light & (own > 1e-2 * (own + 1 / penalty))).any()):  # a hundredth of its score
+        raise ValueError(
+            f"{name} at penalty={penalty:g} is singular, with weights from "
+            f"{float(weights.min()):.1e} to {float(weights.max()):.1e} too far apart to leave only "
+            "noise out; bring them closer, or lower the penalty"
+        )
+    x, report = _truncated(matrix, right, report, weights.sqrt(), eps, in_span, name)
+    if not math.isinf(penalty) or (report.left_out or 0.0) > _LARGEST_UNSAID:
         log.warning("%s: solved by %s", name, report)
-    return Solution(_in_dtype(kept.x, given, name), report, None)
-
-
-def solve_kernel_elm(
-    gram: Tensor, targets: Tensor, penalty: float, weights: Tensor | None = None
-) -> Tensor:
-    """Output weights of the kernel machine: ``(gram + diag(1 / (penalty * weights)))^-1 targets``.
-
-    ``solve_symmetric`` for any number of systems, differentiable any number of times in ``gram``,
-    ``targets`` and ``weights``. Where components are left out, derivatives are those at constant
-    rank; with ``penalty=inf`` this is the Moore-Penrose pseudo-inverse, the paper's wording. Solved
-    in float64, and handed out in the dtype of ``gram``.
-
-    Args:
-        gram: kernel matrix of the training bins, symmetric, positive semi-definite.
-        targets: +1 for slip and -1 for non-slip.
-        penalty: the paper's ``C``, positive; larger fits the training bins more closely.
-        weights: positive weight of each bin; default 1.
-
-    Shape:
-        - gram: ``[*, N, N]``; targets, weights, output: ``[*, N]``
-
-    Raises:
-        ValueError: if shapes disagree, ``penalty`` is not positive, a number is not finite,
-            ``gram`` is not positive semi-definite, or float32 is not enough.
-
-    Reference:
-        Huang, Zhou, Ding and Zhang (2012), IEEE Trans. SMC-B 42(2), 513-529; with weights Zong,
-        Huang and Chen (2013), Neurocomputing 101, 229-242. Equals ``dual_coef_`` of
-        ``sklearn.kernel_ridge.KernelRidge(alpha=1 / penalty)``.
-
-    Example:
-        >>> solve_kernel_elm(torch.eye(2), torch.tensor([1.0, -1.0]), penalty=1.0)
-        tensor([ 0.5000, -0.5000])
-    """
-    num_bins = gram.shape[-1]
-    if gram.shape[-2] != num_bins or targets.shape[-1] != num_bins:
-        raise ValueError(
-            f"expected gram [*, N, N] and targets [*, N] with one N, got {tuple(gram.shape)} "
-            f"and {tuple(targets.shape)}"
-        )
-    if num_bins == 0 or not gram.is_floating_point():
-        raise ValueError(f"gram must have bins and be floating, got {num_bins} of {gram.dtype}")
-    weights = torch.ones_like(targets) if weights is None else weights
-    if weights.shape != targets.shape:
-        raise ValueError(
-            f"weights must have one entry per bin, {tuple(targets.shape)}, "
-            f"got {tuple(weights.shape)}"
-        )
-    check_weights(weights)
-    if gram.ndim > 2:
-        systems = zip(
-            gram.flatten(0, -3), targets.flatten(0, -2), weights.flatten(0, -2), strict=True
-        )
-        solved = [solve_kernel_elm(own, t, penalty, w) for own, t, w in systems]
-        return torch.stack(solved).view(targets.shape)
-    x, report, _ = solve_symmetric(gram, targets, penalty, weights, name="gram")
-    if not torch.is_grad_enabled() or not any(t.requires_grad for t in (gram, targets, weights)):
-        return x
-    right, weights = targets.double(), weights.double()
-    system = (gram.double() + gram.double().mT) / 2
-    if report.method == "cholesky":
-        ridged = system + (1 / (penalty * weights)).diag()
-        return solve_by_autograd(ridged, right).to(gram.dtype)
-    # (M + I/C)^-1 on the span of M is (I + M^+/C)^-1 M^+: one is well-posed, one has derivatives
-    roots, noise = weights.sqrt(), num_bins * torch.finfo(gram.dtype).eps
-    inverse: Tensor = torch.linalg.pinv(roots[:, None] * system * roots, rtol=noise, hermitian=True)
-    ridged = torch.eye(num_bins).to(inverse) + inverse / penalty
-    return (roots * solve_by_autograd(ridged, inverse @ (roots * right))).to(gram.dtype)
+    return Solution(_in_dtype(x, given, name), report, None)
 
 
 def solve_by_autograd(system: Tensor, right: Tensor) -> Tensor:
@@ -274,32 +216,22 @@ def check_weights(weights: Tensor) -> None:
         raise ValueError(f"weights must be positive and finite, got {float(wrong[0]):g}")
 
 
-class _Kept(NamedTuple):
-    """Of a system without what is rounding noise; fields as in ``SolveReport``."""
-
-    x: Tensor
-    condition: float
-    error: float
-    left_out: float
-    rank: int
-
-
 def _truncated(
     matrix: Tensor,
     right: Tensor,
-    penalty: float,
+    report: SolveReport,
     roots: Tensor,
     eps: float,
-    *,
     in_span: bool,
     name: str,
-) -> _Kept:
+) -> tuple[Tensor, SolveReport]:
     """The solution on what is above rounding; ``roots`` are those of the weights.
 
     Raises:
         ValueError: if the matrix is not positive semi-definite, its rounding drowns what is kept,
             or what is left out is above rounding and adds a hundredth to a score.
     """
+    penalty = report.penalty
     values, vectors = torch.linalg.eigh(roots * matrix * roots[:, None])
     top, low, num = float(values[-1]), float(values[0]), len(values)
     rounding, cutoff = eps * max(top, -low), num * eps * top
@@ -344,43 +276,17 @@ def _truncated(
     unseen = dropped.clamp(min=0) + rounding
     if in_span:
         unseen = unseen.clamp(max=max(ridge, _TINY))  # where it would add most
-    return _Kept(roots * (vectors @ solved), condition, error, added(unseen), rank)
-
-
-def _ridge(penalty: float, weights: Tensor) -> Tensor:
-    """``1 / (C w)``, which must be finite."""
-    ridge = 1 / (penalty * weights)
-    if not (penalty > 0 and bool(ridge.isfinite().all())):
-        raise ValueError(
-            f"penalty (the paper's C) must be positive, and so large that 1 / (C w) is finite, "
-            f"got {penalty}"
-        )
-    return ridge
+    left_out = added(unseen)
+    error = max(error, left_out)
+    return roots * (vectors @ solved), replace(
+        report, method="eigen", condition=condition, rank=rank, error=error, left_out=left_out
+    )
 
 
 def _condition(factor: Tensor, norm: float) -> float:
     """Estimate from a lower Cholesky factor, column-major, and the 1-norm of the matrix."""
     reciprocal, _ = dpocon(factor.cpu().numpy(), norm, uplo="L")
     return 1 / reciprocal if reciprocal > 0 else math.inf
-
-
-def _light_bins(diagonal: Tensor, weights: Tensor, eps: float) -> Tensor:
-    """Which bins a cut at rounding would lose for their weights: ``[n]``, bool."""
-    own, least = diagonal * weights, len(diagonal) * eps
-    lost, faint = ((x <= least * x.max()) for x in (own, diagonal))
-    return lost & ~faint
-
-
-def _check_light(diagonal: Tensor, weights: Tensor, penalty: float, eps: float, name: str) -> None:
-    """Refuse to lose a bin of which C makes a hundredth of its score."""
-    own = diagonal * weights
-    lost = _light_bins(diagonal, weights, eps) & (own > 1e-2 * (own + 1 / penalty))
-    if bool(lost.any()):
-        raise ValueError(
-            f"{name} at penalty={penalty:g} is singular, with weights from "
-            f"{float(weights.min()):.1e} to {float(weights.max()):.1e} too far apart to leave only "
-            "noise out; bring them closer, or lower the penalty"
-        )
 
 
 def _check_finite(matrix: Tensor, right: Tensor, name: str) -> None:

@@ -14,9 +14,10 @@ import logging
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -25,12 +26,6 @@ from tactslip_torch.native.build import REMEDY, SWITCH, build_library, is_off, l
 Array = np.ndarray[Any, Any]
 BackendName = Literal["auto", "native", "torch"]
 _LOG = logging.getLogger(__name__)
-DESCRIPTORS = (
-    "mean", "median", "mode", "range", "mean_deviation", "std", "cv", "iqr", "skewness",
-    "kurtosis", "energy", "entropy", "peak_factor", "correlation", "spectral_centroid",
-    "spectral_spread",
-)  # fmt: skip
-"""In the order of ``enum Descriptor``."""
 MAX_BRANCHES = 32
 
 
@@ -47,16 +42,58 @@ class _Matrix(ctypes.Structure):
 class _Plan(ctypes.Structure):
     _numbers = (
         *("is_float", "num_channels", "num_samples", "num_lines", "num_branches"),
-        *("num_features", "num_coefficients", "num_slow", "num_fast"),
+        *("num_features", "num_coefficients", "num_slow", "num_fast", "num_unused"),
     )
     _pointers = (
-        *("slow", "fast", "first", "descriptor", "column", "need"),
+        *("slow", "fast", "unused", "first", "descriptor", "column", "need"),
         *("low", "high", "out", "lines", "ones", "frequency_hz", "gain_time", "gain_lines"),
     )
     _fields_ = tuple(
         [(name, ctypes.c_int64) for name in _numbers]
         + [(name, ctypes.c_void_p) for name in _pointers]
     )
+
+
+class _Filter(ctypes.Structure):
+    _fields_ = (
+        ("weights", ctypes.c_void_p),
+        ("length", ctypes.c_int64),
+        ("start", ctypes.c_int64),
+    )
+
+
+class _Bins(ctypes.Structure):
+    _fields_ = (
+        ("samples", ctypes.c_void_p),
+        *((name, ctypes.c_int64) for name in (
+            "is_float", "num_bins", "bin_stride", "channel_stride")),
+        *((name, ctypes.c_void_p) for name in ("filters", "features")),
+        ("features_are_float", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in (
+            "is_odd", "scaled", "score", "is_missing", "is_valid", "inverse_span")),
+        ("given_as_float", ctypes.c_int64),
+    )  # fmt: skip
+
+
+class _Pool(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("num_channels", "num_families", "num_statistics")),
+        *((name, ctypes.c_void_p) for name in (
+            "channels", "ranges", "inputs", "statistics", "columns", "fractions", "knees")),
+        ("least_range", ctypes.c_double),
+    )  # fmt: skip
+
+
+class _Machine(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in (
+            "num_channels", "num_inputs", "num_columns", "num_singles", "num_pools",
+            "most_channels")),
+        *((name, ctypes.c_void_p) for name in (
+            "single_inputs", "single_columns", "pools", "fill", "minimum", "maximum", "knee",
+            "quadratic", "linear")),
+        ("constant", ctypes.c_double),
+    )  # fmt: skip
 
 
 class _BristleRun(ctypes.Structure):
@@ -70,7 +107,26 @@ class _BristleRun(ctypes.Structure):
     )  # fmt: skip
 
 
-class FeatureEngine:
+class _Kept:
+    """The library, and the arrays that its structures point to."""
+
+    def __init__(self) -> None:
+        self._library = _library()
+        self._level = _level(self._library)
+        self._held: list[object] = []
+
+    def _array(self, values: Any, dtype: Any) -> int:
+        array = np.array(values, dtype, order="C")  # a copy: tensors may move their memory
+        self._held.append(array)
+        return array.ctypes.data
+
+    def _run(self, plan: Any, machine: Any, bins: _Bins) -> None:
+        pointers = (each if each is None else ctypes.byref(each) for each in (plan, machine, bins))
+        if self._library.tactslip_features(self._level, *pointers):
+            raise MemoryError("the native engine found no memory to work in")
+
+
+class FeatureEngine(_Kept):
     """Features of bins by the native engine; called from several threads at once.
 
     Args:
@@ -80,7 +136,7 @@ class FeatureEngine:
         fast: indices of the channels whose branches and spectra are described.
         wanted: channel, row, descriptor and column of every feature. Rows are the branches (0 for a
             slow channel), their spectra, and one for band energy ratios, whose descriptor is the
-            number of the branch.
+            number of the branch. Descriptors are numbered as ``enum Descriptor``.
         low: from a bin, or the approximation's coefficients of one level, to those of the next.
         high: from the same to the coefficients of details.
         out: from coefficients to branches A1, D1, A2, D2 and so on.
@@ -108,11 +164,15 @@ class FeatureEngine:
         spectrum: Array,
         frequency_hz: Array,
     ) -> None:
-        self._library = _library()
-        self._level = _level(self._library)
+        super().__init__()
         num_branches = len(out)
+        if num_branches > MAX_BRANCHES:
+            raise ValueError(
+                f"the native engine has {MAX_BRANCHES // 2} levels at most, got {num_branches // 2}"
+                '; use backend="torch"'
+            )
+        unused = [c for c in range(num_channels) if c not in slow and c not in fast]
         self._num_rows = 2 * num_branches + 1
-        self._kept: list[object] = []  # what the plan points to
         bands = [self._matrices(group, 4, np.float64) for group in (low, high, out)]
         lines = [spectrum @ matrix for matrix in out]
         wanted = sorted(wanted)
@@ -121,7 +181,7 @@ class FeatureEngine:
         descriptor = np.array([w[2] for w in wanted], np.int64)
         need = np.zeros(num_channels * self._num_rows, np.uint32)
         np.bitwise_or.at(need, place, np.uint32(1) << descriptor.astype(np.uint32))
-        self.num_features = len(wanted)
+        self.num_channels, self.num_features = num_channels, len(wanted)
         self._plan = _Plan(
             dtype is np.float32,
             num_channels,
@@ -130,10 +190,10 @@ class FeatureEngine:
             num_branches,
             len(wanted),
             sum(len(matrix) + 8 for matrix in low) + 8,
-            len(slow),
-            len(fast),
+            *map(len, (slow, fast, unused)),
             self._array(slow, np.int64),
             self._array(fast, np.int64),
+            self._array(unused, np.int64),
             self._array(first, np.int64),
             self._array(descriptor, np.int64),
             self._array([w[3] for w in wanted], np.int64),
@@ -152,25 +212,59 @@ class FeatureEngine:
         Features of those are of no meaning. A channel with a NaN or Inf has features NaN.
 
         Shape:
-            - bins: ``[M, C, n]``, float32 or float64, contiguous
+            - bins: ``[M, C, n]``, float32 or float64; samples of a channel lie side by side
             - out: ``[M, K]``, float32 or float64, contiguous, written
             - output: ``[M]``, bool
         """
         is_odd = np.zeros(len(bins), np.bool_)
-        is_single = (bins.dtype == np.float32, out.dtype == np.float32)
-        status = self._library.tactslip_features(
-            self._level, ctypes.byref(self._plan),
-            bins.ctypes.data, is_single[0], len(bins), out.ctypes.data, is_single[1],
-            is_odd.ctypes.data,
-        )  # fmt: skip
-        if status:
-            raise MemoryError("the native engine found no memory to work in")
+        _check_floats(out)
+        call = _bins_of(bins, is_odd)
+        call.features, call.features_are_float = out.ctypes.data, out.dtype == np.float32
+        self._run(self._plan, None, call)
         return is_odd
 
-    def _array(self, values: Any, dtype: Any) -> int:
-        array = np.ascontiguousarray(values, dtype)
-        self._kept.append(array)
-        return array.ctypes.data
+    def score(
+        self,
+        machine: Machine,
+        bins: Array,
+        filters: Filters | None = None,
+        inverse_span: Array | None = None,
+        given: Any = np.float64,
+    ) -> Scores:
+        """Scores of bins, all in one call.
+
+        Args:
+            machine: from features to the score.
+            bins: with the context that the filters need.
+            filters: of the channels; None: bins are filtered.
+            inverse_span: one over the least span of a channel that can be trusted, as a part of its
+                magnitude; channels with a NaN or Inf are then left out (``Scores.is_missing``).
+                Without, they make a score NaN.
+            given: dtype in which extremes are compared for that.
+
+        Shape:
+            - bins: ``[M, C, n + context]``, float32 or float64; samples of a channel lie side by
+              side; inverse_span: ``[C]``, float64
+        """
+        num, leaves_out = len(bins), inverse_span is not None
+        found = Scores(
+            np.zeros(num, np.bool_),
+            np.empty((num, machine.num_columns if leaves_out or not machine.has_head else 0)),
+            np.empty(num) if machine.has_head else None,
+            np.ones(num, np.bool_),
+            np.zeros((num, self.num_channels), np.bool_),
+        )
+        call = _bins_of(bins, found.is_odd)
+        call.filters = None if filters is None else filters.address
+        call.scaled = found.scaled.ctypes.data if found.scaled.size else None
+        call.score = None if found.score is None else found.score.ctypes.data
+        if inverse_span is not None:
+            call.is_missing = found.is_missing.ctypes.data
+            call.is_valid = found.is_valid.ctypes.data
+            call.inverse_span = inverse_span.ctypes.data
+            call.given_as_float = given == np.float32
+        self._run(self._plan, machine.of, call)
+        return found
 
     def _matrices(self, matrices: Sequence[Array], rows: int, dtype: Any) -> int:
         """Matrices in blocks of rows, each with the columns that are not zero in it."""
@@ -188,8 +282,162 @@ class FeatureEngine:
             values = blocks[np.arange(num)[:, None], :, columns]  # [num, width, rows]
             to.values, to.first = self._array(values, dtype), self._array(start, np.int64)
             to.num_blocks, to.num_columns, to.width = num, matrix.shape[1], width
-        self._kept.append(made)
+        self._held.append(made)
         return ctypes.addressof(made)
+
+
+class Filters(_Kept):
+    """Filters of channels: weights, and where the frame of a bin's first sample begins."""
+
+    def __init__(self, weights: Sequence[Array], starts: Sequence[int]) -> None:
+        super().__init__()
+        made = (_Filter * len(weights))()
+        for to, own, start in zip(made, weights, starts, strict=True):
+            to.weights, to.length, to.start = self._array(own, np.float64), len(own), start
+        self._held.append(made)
+        self.address = ctypes.addressof(made)
+
+
+@dataclass(frozen=True)
+class Pool:
+    """What is pooled over the channels of one kind.
+
+    Attributes:
+        channels: in the hand, m of them.
+        ranges: inputs that tell whether a channel moves, ``[m]``.
+        inputs: each descriptor of all channels, ``[R, m]``.
+        statistics: mean, std, min, max, or the place of an order statistic, from 0 to 1.
+        columns: that they are, ``[statistics, R]``; -1: not wanted.
+        knees: of the descriptors, ``[R]``.
+        least_range: below which a channel counts as stuck.
+    """
+
+    channels: Sequence[int]
+    ranges: Sequence[int]
+    inputs: Array
+    statistics: Sequence[str | float]
+    columns: Array
+    knees: Array
+    least_range: float
+
+
+class Machine(_Kept):
+    """From inputs, the features that are read, to columns, scaled columns and a score; float64.
+
+    Args:
+        num_channels: of the hand.
+        num_inputs: features that go in.
+        singles: input and column of what is not pooled.
+        pools: what is; their columns and the singles' are all there are.
+        fill: columns where no channel of their kind is in use.
+        scaling: minimum, maximum and, if columns are compressed, knee; None: nothing is scaled.
+        head: quadratic part ``[K, K]`` (or empty), linear part and constant; None: no score.
+    """
+
+    def __init__(
+        self,
+        *,
+        num_channels: int,
+        num_inputs: int,
+        num_columns: int,
+        singles: Sequence[tuple[int, int]],
+        pools: Sequence[Pool] = (),
+        fill: Array | None = None,
+        scaling: tuple[Array, Array, Array | None] | None = None,
+        head: tuple[Array, Array, float] | None = None,
+    ) -> None:
+        super().__init__()
+        self.num_columns, self.has_head = num_columns, head is not None
+        made = (_Pool * max(1, len(pools)))()
+        for to, pool in zip(made, pools, strict=False):
+            kinds = ("mean", "std", "min", "max")
+            codes = [kinds.index(s) if isinstance(s, str) else len(kinds) for s in pool.statistics]
+            fractions = [0.0 if isinstance(s, str) else s for s in pool.statistics]
+            to.num_channels, to.num_families = len(pool.channels), len(pool.knees)
+            to.num_statistics, to.least_range = len(codes), pool.least_range
+            for name, values in (
+                ("channels", pool.channels),
+                ("ranges", pool.ranges),
+                ("inputs", pool.inputs),
+                ("statistics", codes),
+                ("columns", pool.columns),
+            ):
+                setattr(to, name, self._array(values, np.int64))
+            to.fractions = self._array(fractions, np.float64)
+            to.knees = self._array(pool.knees, np.float64)
+        self._held.append(made)
+        pairs = np.array(singles, np.int64).reshape(-1, 2)
+        self.of = _Machine(
+            num_channels, num_inputs, num_columns, len(pairs), len(pools),
+            max((len(pool.channels) for pool in pools), default=0),
+            self._array(pairs[:, 0], np.int64), self._array(pairs[:, 1], np.int64),
+            ctypes.addressof(made),
+        )  # fmt: skip
+        if fill is not None:
+            self.of.fill = self._array(fill, np.float64)
+        for name, array in zip(("minimum", "maximum", "knee"), scaling or (), strict=False):
+            setattr(self.of, name, None if array is None else self._array(array, np.float64))
+        if head is not None:
+            quadratic, linear, constant = head
+            self.of.linear, self.of.constant = self._array(linear, np.float64), constant
+            if quadratic.size:
+                lower = np.tril(quadratic + quadratic.T)
+                lower[np.diag_indices_from(lower)] /= 2
+                rows = np.zeros((-(-num_columns // 4) * 4, num_columns))  # read by fours
+                rows[:num_columns] = lower
+                self.of.quadratic = self._array(rows, np.float64)
+
+    def columns(self, inputs: Array, is_missing: Array | None = None) -> Array:
+        """Columns of bins, scaled if there is a scaling, ``[M, K]``.
+
+        Shape:
+            - inputs: ``[M, inputs]``, float32 or float64, values of a bin side by side
+            - is_missing: ``[M, C]``, bool, channels that are left out of their pools
+        """
+        found = np.empty((len(inputs), self.num_columns))
+        call = _bins_of(inputs, None)
+        call.scaled = found.ctypes.data
+        if is_missing is not None:
+            is_missing = np.ascontiguousarray(is_missing)
+            call.is_missing = is_missing.ctypes.data
+        self._run(None, self.of, call)
+        return found
+
+
+class Scores(NamedTuple):
+    """What ``FeatureEngine.score`` finds of ``M`` bins.
+
+    Attributes:
+        is_odd: magnitudes are out of range, and all else is of no meaning, ``[M]``.
+        scaled: columns, ``[M, K]``; of no bin where there is a score and nothing is left out.
+        score: ``[M]``; None without a head.
+        is_valid: every channel that is read can be trusted, ``[M]``.
+        is_missing: channels that were left out, ``[M, C]``.
+    """
+
+    is_odd: Array
+    scaled: Array
+    score: Array | None
+    is_valid: Array
+    is_missing: Array
+
+
+def _bins_of(array: Array, is_odd: Array | None) -> _Bins:
+    """A call on an array, whose last axis must be contiguous."""
+    _check_floats(array)
+    size = array.itemsize
+    if array.size and array.shape[-1] > 1 and array.strides[-1] != size:
+        raise ValueError(f"expected an array whose last axis is contiguous, got {array.strides}")
+    call = _Bins(array.ctypes.data, array.dtype == np.float32, len(array))
+    call.bin_stride = array.strides[0] // size
+    call.channel_stride = array.strides[1] // size
+    call.is_odd = None if is_odd is None else is_odd.ctypes.data
+    return call
+
+
+def _check_floats(array: Array) -> None:
+    if array.dtype not in (np.float32, np.float64):
+        raise ValueError(f"the native engine takes float32 and float64, got {array.dtype}")
 
 
 def carry_bristles(
@@ -287,9 +535,7 @@ def _loaded() -> ctypes.CDLL | str:
         _LOG.warning("features and simulation are made by torch, which is slower: %s", error)
         return str(error)
     pointer, number = ctypes.c_void_p, ctypes.c_int
-    library.tactslip_features.argtypes = (
-        number, pointer, pointer, number, ctypes.c_int64, pointer, number, pointer,
-    )  # fmt: skip
+    library.tactslip_features.argtypes = (number, pointer, pointer, pointer)
     library.tactslip_bristles.argtypes = (number, pointer)
     return library
 

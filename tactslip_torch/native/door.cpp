@@ -9,13 +9,14 @@
 #endif
 
 typedef int Bristles(const BristleRun*);
-typedef int Features(const Plan*, const void*, int, int64_t, void*, int, uint8_t*);
+typedef int Features(const Plan*, const Machine*, const Bins*);
 
 #if defined(__x86_64__)
 #include <cpuid.h>
 
-extern "C" Features features_v2, features_v3, features_v4;
 extern "C" Bristles bristles_v2, bristles_v3, bristles_v4;
+extern "C" Features features_v2, features_v3, features_v4;
+#define OF_LEVEL(name) (level >= 4 ? name##_v4 : level == 3 ? name##_v3 : name##_v2)
 
 static bool has(unsigned bits, unsigned wanted) { return (bits & wanted) == wanted; }
 
@@ -32,25 +33,15 @@ EXPORT int tactslip_level() {
   return has(low, 0xe6) && has(b, 1u << 16 | 1u << 17 | 1u << 28 | 1u << 30 | 1u << 31) ? 4 : 3;
 }
 
-EXPORT int tactslip_features(int level, const Plan* plan, const void* bins, int bins_are_float,
-                             int64_t num_bins, void* out, int out_is_float, uint8_t* is_odd) {
-  Features* engine = level >= 4 ? features_v4 : level == 3 ? features_v3 : features_v2;
-  return engine(plan, bins, bins_are_float, num_bins, out, out_is_float, is_odd);
-}
-
-EXPORT int tactslip_bristles(int level, const BristleRun* run) {
-  return (level >= 4 ? bristles_v4 : level == 3 ? bristles_v3 : bristles_v2)(run);
-}
 #else
-extern "C" Features features_v1;
 extern "C" Bristles bristles_v1;
+extern "C" Features features_v1;
+#define OF_LEVEL(name) (level, name##_v1)
 
 EXPORT int tactslip_level() { return 1; }
-
-EXPORT int tactslip_features(int, const Plan* plan, const void* bins, int bins_are_float,
-                             int64_t num_bins, void* out, int out_is_float, uint8_t* is_odd) {
-  return features_v1(plan, bins, bins_are_float, num_bins, out, out_is_float, is_odd);
-}
-
-EXPORT int tactslip_bristles(int, const BristleRun* run) { return bristles_v1(run); }
 #endif
+
+EXPORT int tactslip_features(int level, const Plan* plan, const Machine* machine, const Bins* bins) {
+  return OF_LEVEL(features)(plan, machine, bins);
+}
+EXPORT int tactslip_bristles(int level, const BristleRun* run) { return OF_LEVEL(bristles)(run); }

@@ -22,7 +22,9 @@ constexpr double CV_ZERO = 1e-12;       // part of it within which a mean has no
 constexpr double CROWDED = 2e-3;        // part of a row's span; float rounds to 3e-8 of it
 constexpr double LEVELS = 255;          // of entropy's histogram, less one
 constexpr double SMALLEST = 0x1p-320, LARGEST = 0x1p448;  // between them squares are in range
+constexpr double LARGEST_SAMPLE = 0x1.fffffffffffffp1017;  // volts; beyond it a channel is missing
 constexpr int USUAL = 100;              // values of a row whose sort is straight-line code
+constexpr int CHUNK = 32;               // bins whose features are made before they are scored
 
 constexpr uint32_t ORDERED = 1u << MEDIAN | 1u << MODE | 1u << IQR | 1u << ENTROPY;
 constexpr uint32_t WEIGHTED = 1u << SPECTRAL_CENTROID | 1u << SPECTRAL_SPREAD;
@@ -299,11 +301,13 @@ template <class T> struct Group : Describe<T> {
   static constexpr int W = Base::W, H = Base::H;
 
   const Plan& plan;
-  int64_t n, num_lines, num_branches;
-  int64_t bin[W], channel[W];
+  const Bins& bins;
+  int64_t n, num_lines, num_branches, most_taps;
+  int64_t bin[W], channel[W], first_bin;  // the bin whose features come first in memory
   int num;             // pairs in it; the other lanes repeat the first
   bool is_broken[W];   // holds NaN or Inf
-  D first[H], scale[H], unit[H];
+  D first[H], scale[H], unit[H], high[H], low[H];
+  D *window[H], *weights[H];  // samples that the filter takes in, and its weights
   D *y[H], *approximation[H], *coefficients[H], *row[H];
   V *raw, *d, *few, *lines, *total;
   uint8_t* levels;
@@ -312,11 +316,15 @@ template <class T> struct Group : Describe<T> {
   D values[MAX_BRANCHES][H];
   uint32_t need[2 * MAX_BRANCHES + 1];
   double limit;
-  void* out;
+  void* out;  // features of the first of these bins
   bool out_is_float;
 
-  explicit Group(const Plan& plan)
-      : plan(plan), n(plan.num_samples), num_lines(plan.num_lines), num_branches(plan.num_branches) {}
+  Group(const Plan& plan, const Bins& bins)
+      : plan(plan), bins(bins), n(plan.num_samples), num_lines(plan.num_lines),
+        num_branches(plan.num_branches), most_taps(1) {
+    for (int64_t c = 0; bins.filters && c < plan.num_channels; ++c)
+      if (bins.filters[c].length > most_taps) most_taps = bins.filters[c].length;
+  }
 
   // Bytes of memory wanted; with a place, where everything lies in it.
   size_t place(char* at) {
@@ -328,6 +336,8 @@ template <class T> struct Group : Describe<T> {
     };
     size_t samples = n + 8, spectrum = 2 * num_lines + 16, most = samples + spectrum;
     for (int h = 0; h < H; ++h) {
+      window[h] = (D*)take((samples + most_taps) * sizeof(D));
+      weights[h] = (D*)take(most_taps * sizeof(D));
       y[h] = (D*)take(samples * sizeof(D));
       row[h] = (D*)take(samples * sizeof(D));
       approximation[h] = (D*)take(plan.num_coefficients * sizeof(D));
@@ -342,27 +352,73 @@ template <class T> struct Group : Describe<T> {
     return at - start;
   }
 
-  // Samples less the first of each pair, and its magnitude. What is broken or odd is read as zeros.
-  template <class X> void read(const X* bins, uint8_t* is_odd) {
+  // Filtered samples less the first of each pair, and its magnitude. What is broken or odd is read
+  // as zeros.
+  template <class X> void read() {
+    const Filter none = {nullptr, 1, 0};
+    int64_t taps = 1;
     for (int k = 0; k < W; ++k) {
-      const X* from = bins + (bin[k] * plan.num_channels + channel[k]) * n;
+      const Filter& filter = bins.filters ? bins.filters[channel[k]] : none;
+      const X* from = (const X*)bins.samples + bin[k] * bins.bin_stride +
+                      channel[k] * bins.channel_stride + filter.start;
+      int64_t span = n + filter.length - 1;
       double most = 0;
       bool finite = true;
-      for (int64_t i = 0; i < n; ++i) {
+      for (int64_t i = 0; i < span; ++i) {
         double size = fabs((double)from[i]);
         finite &= size <= 1.7976931348623157e308;
         most = size > most ? size : most;
       }
       bool usual = most == 0 || (SMALLEST <= most && most <= LARGEST);
       is_broken[k] = !finite;
-      is_odd[bin[k]] |= finite && !usual;
+      bins.is_odd[bin[k]] |= finite && !usual;
       bool is_read = finite && usual;
-      double start = is_read ? (double)from[0] : 0;
-      double* to = (double*)y[k / DL] + k % DL;
-      for (int64_t i = 0; i < n; ++i) to[i * DL] = is_read ? (double)from[i] - start : 0;
-      ((double*)first)[k] = start;
-      ((double*)scale)[k] = is_read ? most : 0;
-      ((double*)unit)[k] = is_read && most > 0 ? 1 / most : 0;
+      double* to = (double*)window[k / DL] + k % DL;
+      for (int64_t i = 0; i < span; ++i) to[i * DL] = is_read ? (double)from[i] : 0;
+      for (int64_t i = span; i < n + most_taps - 1; ++i) to[i * DL] = 0;
+      to = (double*)weights[k / DL] + k % DL;
+      for (int64_t i = 0; i < most_taps; ++i)
+        to[i * DL] = i >= filter.length ? 0 : filter.weights ? filter.weights[i] : 1;
+      taps = filter.length > taps ? filter.length : taps;
+    }
+    for (int h = 0; h < H; ++h) {
+      convolve(window[h], weights[h], y[h], taps);
+      Extent e = extent(y[h], n);
+      high[h] = e.high;
+      low[h] = e.low;
+      scale[h] = larger(high[h], -low[h]);
+      D inverse = 1 / scale[h];
+      unit[h] = scale[h] > 0 ? inverse : D{};
+      first[h] = y[h][0];
+      for (int64_t i = 0; i < n; ++i) y[h][i] -= first[h];
+    }
+    if (bins.is_missing) note_channels();
+  }
+
+  void convolve(const D* x, const D* weight, D* out, int64_t taps) {
+    for (int64_t i = 0; i < n; i += 4) {  // memory is there for some samples more
+      D sums[4] = {};
+      for (int64_t k = 0; k < taps; ++k)
+#pragma GCC unroll 4
+        for (int r = 0; r < 4; ++r) sums[r] += x[i + k + r] * weight[k];
+#pragma GCC unroll 4
+      for (int r = 0; r < 4; ++r) out[i + r] = sums[r];
+    }
+  }
+
+  // Which channels are missing; bins with one, or with one whose span cannot be trusted, are not
+  // valid.
+  void note_channels() {
+    for (int k = 0; k < num; ++k) {
+      double above = ((double*)high)[k], below = ((double*)low)[k];
+      double inverse = bins.inverse_span[channel[k]];
+      bool is_alive = (above - below) * inverse > (above > -below ? above : -below);
+      if (bins.given_as_float) {
+        float a = (float)above, b = (float)below;
+        is_alive = (a - b) * (float)inverse > (a > -b ? a : -b);
+      }
+      bins.is_missing[bin[k] * plan.num_channels + channel[k]] = is_broken[k];
+      bins.is_valid[bin[k]] &= is_alive && !is_broken[k];
     }
   }
 
@@ -370,11 +426,11 @@ template <class T> struct Group : Describe<T> {
   void write(int64_t row_number) {
     for (int k = 0; k < num; ++k) {
       int64_t at = channel[k] * (2 * num_branches + 1) + row_number;
-      int64_t base = bin[k] * plan.num_features;
+      int64_t base = (bin[k] - first_bin) * plan.num_features;
       for (int64_t w = plan.first[at]; w < plan.first[at + 1]; ++w) {
         double v = ((const double*)values[plan.descriptor[w]])[k];
         v = v > limit ? limit : v < -limit ? -limit : v;
-        v = is_broken[k] ? (double)NAN : v;
+        v = is_broken[k] && !bins.is_missing ? (double)NAN : v;
         if (out_is_float)
           ((float*)out)[base + plan.column[w]] = (float)v;
         else
@@ -625,51 +681,239 @@ template <class T> struct Group : Describe<T> {
   }
 };
 
-template <class T>
-int run(const Plan& plan, const void* bins, bool bins_are_float, int64_t num_bins, void* out,
-        bool out_is_float, uint8_t* is_odd) {
+// -- Pooling over channels, scaling and head: lanes run across bins ----------------------------------
+
+// log(1 + x) for x >= 0, as fdlibm has it: an error below 1 ulp.
+INLINE D log1p_of(D x) {
+  typedef uint64_t Bits __attribute__((vector_size(VECTOR_BYTES)));
+  constexpr double ln2_hi = 6.93147180369123816490e-01, ln2_lo = 1.90821492927058770002e-10;
+  D u = 1 + x, lost = x < 1 ? x - (u - 1) : 1 - (u - x);
+  Bits bits = (Bits)u + (0x3ff0000000000000 - 0x3fe6a09e00000000);  // mantissas from sqrt(1/2)
+  D k = (D)((bits >> 52) + (0x4338000000000000 - 0x3ff)) - 0x1.8p52;
+  D f = (D)((bits & 0x000fffffffffffff) + 0x3fe6a09e00000000) - 1;
+  D s = f / (2 + f), z = s * s, half = 0.5 * f * f;
+  D r = z * (6.666666666666735130e-01 + z * (3.999999999940941908e-01 +
+        z * (2.857142874366239149e-01 + z * (2.222219843214978396e-01 +
+        z * (1.818357216161805012e-01 + z * (1.531383769920937332e-01 +
+        z * 1.479819860511658591e-01))))));
+  return k * ln2_hi - ((half - (s * (half + r) + (k * ln2_lo + lost / u))) - f);
+}
+
+// sign(x) knee log(1 + |x| / knee)
+INLINE D signed_log(D x, D knee) {
+  D size = x < 0 ? -x : x, ratio = size / knee, bent = knee * log1p_of(ratio);
+  auto is_far = ratio > 1.7976931348623157e308;
+  if (any(is_far))
+    for (int k = 0; k < DL; ++k)
+      if (is_far[k]) bent[k] = knee[k] * fmax(log(fmax(size[k], knee[k])) - log(knee[k]), 0x1.62e42fefa39efp9);
+  bent = ratio < 0x1p-1022 ? size : bent;  // a denormal ratio has lost its digits
+  return x < 0 ? -bent : bent;
+}
+
+struct Judge {
+  const Machine& machine;
+  D *x, *z, *values, *sorted, *in_use;  // [inputs], [columns], three times [channels]
+  int64_t at;  // the first of a few bins
+  int few;
+  const uint8_t* is_missing;  // of these bins
+
+  explicit Judge(const Machine& machine) : machine(machine) {}
+
+  size_t place(char* at) {
+    int64_t inputs = machine.num_inputs, most = machine.most_channels;
+    x = (D*)at;
+    z = x + inputs;
+    values = z + machine.num_columns + 4;
+    sorted = values + most;
+    in_use = sorted + most;
+    return (inputs + machine.num_columns + 4 + 3 * most) * sizeof(D);
+  }
+
+  // Of inputs of bins from `start` on.
+  template <class X>
+  void judge(const X* inputs, int64_t stride, int64_t start, int64_t num, const Bins& bins) {
+    for (int64_t b = 0; b < num; b += DL) {
+      at = start + b;
+      few = (int)(num - b < DL ? num - b : DL);
+      is_missing = bins.is_missing ? bins.is_missing + at * machine.num_channels : nullptr;
+      judge_few(inputs + b * stride, stride, bins.scaled, bins.score);
+    }
+  }
+
+  template <class X>
+  void judge_few(const X* inputs, int64_t stride, double* scaled, double* score) {
+    const Machine& m = machine;
+    for (int64_t i = 0; i < m.num_inputs; ++i)
+      for (int k = 0; k < DL; ++k) x[i][k] = (double)inputs[(k < few ? k : 0) * stride + i];
+    for (int64_t i = 0; i < m.num_singles; ++i) z[m.single_columns[i]] = x[m.single_inputs[i]];
+    for (int64_t p = 0; p < m.num_pools; ++p) pool(m.pools[p]);
+    if (m.minimum)
+      for (int64_t i = 0; i < m.num_columns; ++i) z[i] = scale(i, z[i]);
+    for (int k = 0; scaled && k < few; ++k)
+      for (int64_t i = 0; i < m.num_columns; ++i) scaled[(at + k) * m.num_columns + i] = z[i][k];
+    D sums = score ? head() : D{};
+    for (int k = 0; score && k < few; ++k) score[at + k] = sums[k];
+  }
+
+  void pool(const Pool& p) {
+    D count = {};
+    for (int64_t c = 0; c < p.num_channels; ++c) {
+      in_use[c] = x[p.ranges[c]] < p.least_range ? D{} : D{} + 1;  // a NaN is in use
+      for (int k = 0; is_missing && k < few; ++k)
+        if (is_missing[k * machine.num_channels + p.channels[c]]) in_use[c][k] = 0;
+      count += in_use[c];
+    }
+    for (int64_t r = 0; r < p.num_families; ++r) {
+      D mean = {}, square = {}, low = {}, high = {}, last = {}, knee = D{} + p.knees[r];
+      for (int64_t c = 0; c < p.num_channels; ++c) {
+        D value = signed_log(x[p.inputs[r * p.num_channels + c]], knee);
+        values[c] = in_use[c] > 0 ? value : D{};
+        mean += values[c];
+        last = larger(last, values[c]);
+      }
+      mean /= larger(count, D{} + 1);
+      for (int64_t c = 0; c < p.num_channels; ++c) {
+        D away = (values[c] - mean) * in_use[c];  // a channel that is not in use stands at the mean
+        square += away * away;
+        low = smaller(low, away);
+        high = larger(high, away);
+      }
+      bool is_sorted = false;
+      for (int64_t s = 0; s < p.num_statistics; ++s) {
+        int64_t column = p.columns[s * p.num_families + r];
+        if (column < 0) continue;
+        D found = mean;
+        if (p.statistics[s] == POOLED_STD) found = root(square / larger(count - 1, D{} + 1));
+        if (p.statistics[s] == POOLED_MIN) found = low + mean;
+        if (p.statistics[s] == POOLED_MAX) found = high + mean;
+        if (p.statistics[s] == POOLED_ORDER) {
+          if (!is_sorted)  // those not in use come last
+            for (int64_t c = 0; c < p.num_channels; ++c)
+              sorted[c] = in_use[c] > 0 ? values[c] : last;
+          if (!is_sorted) sort_looped(sorted, (int)p.num_channels);
+          is_sorted = true;
+          found = mean - mean;  // NaN stays NaN
+          for (int64_t c = 0; c < p.num_channels; ++c) {
+            D weight = 1 - magnitude((count - 1) * p.fractions[s] - (double)c);
+            found += weight > 0 ? sorted[c] * weight : D{};  // linear interpolation
+          }
+        }
+        z[column] = count > 0 ? found : D{} + machine.fill[column];
+      }
+    }
+  }
+
+  D scale(int64_t i, D value) {
+    if (machine.knee) value = signed_log(value, D{} + machine.knee[i]);
+    double width = machine.maximum[i] - machine.minimum[i];
+    if (!(width > 0)) return value - value;  // 0; NaN stays NaN
+    value = 2 * ((value - machine.minimum[i]) / width) - 1;
+    return value < -1 ? D{} - 1 : value > 1 ? D{} + 1 : value;
+  }
+
+  D head() {
+    const Machine& m = machine;
+    D sums = D{} + m.constant;
+    for (int r = 0; r < 4; ++r) z[m.num_columns + r] = D{};
+    for (int64_t i = 0; i < m.num_columns; i += 4) {  // rows of four, filled up with zeros
+      D pull[4] = {};
+      for (int r = 0; r < 4 && i + r < m.num_columns; ++r) pull[r] += m.linear[i + r];
+      for (int64_t j = 0; m.quadratic && j < i + 4 && j < m.num_columns; ++j)
+#pragma GCC unroll 4
+        for (int r = 0; r < 4; ++r) pull[r] += z[j] * m.quadratic[(i + r) * m.num_columns + j];
+      for (int r = 0; r < 4; ++r) sums += pull[r] * z[i + r];
+    }
+    return sums;
+  }
+};
+
+// -- What the door calls -----------------------------------------------------------------------------
+
+char* aligned(char* memory) {
+  return (char*)(((uintptr_t)memory + VECTOR_BYTES - 1) / VECTOR_BYTES * VECTOR_BYTES);
+}
+
+template <class T> int run(const Plan& plan, const Machine* machine, const Bins& bins) {
   constexpr int W = Group<T>::W;
-  Group<T> sizes(plan);
-  size_t bytes = sizes.place(nullptr) + sizeof(Group<T>) + 2 * VECTOR_BYTES;
-  char* memory = (char*)malloc(bytes);
+  alignas(VECTOR_BYTES) Group<T> group(plan, bins);
+  const Machine nothing = {};
+  Judge judge(machine ? *machine : nothing);
+  size_t of_group = group.place(nullptr), of_judge = judge.place(nullptr) + VECTOR_BYTES;
+  size_t of_features = machine ? CHUNK * plan.num_features * sizeof(double) : 0;
+  char* memory = (char*)malloc(of_group + of_judge + of_features + 2 * VECTOR_BYTES);
   if (!memory) return 1;
-  uintptr_t aligned = ((uintptr_t)memory + VECTOR_BYTES - 1) / VECTOR_BYTES * VECTOR_BYTES;
-  alignas(VECTOR_BYTES) Group<T> group(plan);
-  group.place((char*)aligned);
-  group.out = out;
-  group.out_is_float = out_is_float;
-  group.limit = out_is_float ? 3.4028234663852886e38 : 1.7976931348623157e308;
+  char* at = aligned(memory);
+  group.place(at);
+  judge.place(at += of_group);
+  double* features = (double*)(at + of_judge);
+  group.out_is_float = !machine && bins.features_are_float;
+  group.limit = group.out_is_float ? 3.4028234663852886e38 : 1.7976931348623157e308;
   const int64_t* channels[2] = {plan.slow, plan.fast};
   const int64_t counts[2] = {plan.num_slow, plan.num_fast};
-  for (int kind = 0; kind < 2; ++kind) {
-    int64_t num_pairs = counts[kind] * num_bins;
-    for (int64_t from = 0; from < num_pairs; from += W) {
-      group.num = (int)(num_pairs - from < W ? num_pairs - from : W);
-      for (int k = 0; k < W; ++k) {
-        int64_t pair = from + (k < group.num ? k : 0);
-        group.bin[k] = pair % num_bins;
-        group.channel[k] = channels[kind][pair / num_bins];
+  for (int64_t start = 0; start < bins.num_bins; start += CHUNK) {
+    int64_t num_bins = bins.num_bins - start < CHUNK ? bins.num_bins - start : CHUNK;
+    group.first_bin = machine ? start : 0;
+    group.out = machine ? features : bins.features;
+    for (int kind = 0; kind < 2; ++kind) {
+      int64_t num_pairs = counts[kind] * num_bins;
+      for (int64_t from = 0; from < num_pairs; from += W) {
+        group.num = (int)(num_pairs - from < W ? num_pairs - from : W);
+        for (int k = 0; k < W; ++k) {
+          int64_t pair = from + (k < group.num ? k : 0);
+          group.bin[k] = start + pair % num_bins;
+          group.channel[k] = channels[kind][pair / num_bins];
+        }
+        group.gather_needs();
+        if (bins.is_float)
+          group.template read<float>();
+        else
+          group.template read<double>();
+        if (kind == 0)
+          group.describe_slow();
+        else
+          group.describe_fast();
       }
-      group.gather_needs();
-      if (bins_are_float)
-        group.read((const float*)bins, is_odd);
-      else
-        group.read((const double*)bins, is_odd);
-      if (kind == 0)
-        group.describe_slow();
-      else
-        group.describe_fast();
     }
+    if (machine) judge.judge(features, plan.num_features, start, num_bins, bins);
   }
   free(memory);
   return 0;
 }
 
+// Which channels that are not described are missing.
+template <class X> void note_unused(const Plan& plan, const Bins& bins) {
+  for (int64_t b = 0; b < bins.num_bins; ++b)
+    for (int64_t u = 0; u < plan.num_unused; ++u) {
+      int64_t c = plan.unused[u], length = bins.filters ? bins.filters[c].length : 1;
+      const X* from = (const X*)bins.samples + b * bins.bin_stride + c * bins.channel_stride +
+                      (bins.filters ? bins.filters[c].start : 0);
+      bool is_there = true;
+      for (int64_t i = 0; i < plan.num_samples + length - 1; ++i)
+        is_there &= fabs((double)from[i]) <= LARGEST_SAMPLE;
+      bins.is_missing[b * plan.num_channels + c] = !is_there;
+    }
+}
+
 }  // namespace
 
-extern "C" int FEATURES_ENTRY(const Plan* plan, const void* bins, int bins_are_float, int64_t num_bins,
-                     void* out, int out_is_float, uint8_t* is_odd) {
-  return plan->is_float
-             ? run<float>(*plan, bins, bins_are_float, num_bins, out, out_is_float, is_odd)
-             : run<double>(*plan, bins, bins_are_float, num_bins, out, out_is_float, is_odd);
+// Without a plan, samples are the machine's inputs.
+extern "C" int FEATURES_ENTRY(const Plan* plan, const Machine* machine, const Bins* bins) {
+  if (plan && bins->is_missing) {
+    if (bins->is_float)
+      note_unused<float>(*plan, *bins);
+    else
+      note_unused<double>(*plan, *bins);
+  }
+  if (plan)
+    return plan->is_float ? run<float>(*plan, machine, *bins) : run<double>(*plan, machine, *bins);
+  Judge judge(*machine);
+  char* memory = (char*)malloc(judge.place(nullptr) + 2 * VECTOR_BYTES);
+  if (!memory) return 1;
+  judge.place(aligned(memory));
+  if (bins->is_float)
+    judge.judge((const float*)bins->samples, bins->bin_stride, 0, bins->num_bins, *bins);
+  else
+    judge.judge((const double*)bins->samples, bins->bin_stride, 0, bins->num_bins, *bins);
+  free(memory);
+  return 0;
 }

@@ -34,7 +34,7 @@ Neuroscience 10, 345-359.
 FLOOR_V = 1e-6
 """Amplitudes below it count as it, so that a dead hand has a score (ours; 16 bits at +-5 V resolve
 150 times as much)."""
-_CHUNK_BINS = 256
+_NO_FILM = "a film's score needs a film; give positions of fast adapting channels"
 
 
 def film_band_power(
@@ -126,7 +126,8 @@ class BaselineDetector:
             raise ValueError(
                 f"no baseline {self.name!r}; take one of {', '.join(get_args(BaselineName))}"
             )
-        _places(self.needed_index, len(self.channel_filter.window_lengths))
+        if not self.pool.hand.fast:
+            raise ValueError(_NO_FILM)
 
     @property
     def needed_index(self) -> Tensor:
@@ -171,41 +172,20 @@ class BaselineDetector:
 def _log_of_largest(
     bins: Tensor, films: Sequence[int] | Tensor, amplitude: Callable[[Tensor], Tensor]
 ) -> Tensor:
-    """Log of the largest amplitude among films, chunk by chunk so that a product stays in a cache.
+    """Log of the largest amplitude among films.
 
     Amplitudes pass over a constant and are in proportion to the signal, which is brought to where
     squares neither overflow nor vanish.
     """
-    places = _places(films, bins.shape[-2])
-
-    def of_chunk(chunk: Tensor) -> Tensor:
-        x = _taken(chunk, places)
-        magnitude = torch.maximum(x.amax(-1), -x.amin(-1)).detach()
-        unit = power_of_two_below(magnitude)
-        x = x / unit[..., None]
-        largest = amplitude(x - x[..., :1].detach()) * unit  # exact on a large constant
-        largest = torch.where(magnitude.isfinite(), largest, torch.nan)
-        return largest.amax(-1).clamp(min=FLOOR_V).log()
-
-    flat = bins.reshape(-1, *bins.shape[-2:])
-    scores = [of_chunk(chunk) for chunk in flat.split(_CHUNK_BINS)]
-    return torch.cat(scores).reshape(bins.shape[:-2])
-
-
-def _places(films: Sequence[int] | Tensor, num_channels: int) -> list[int]:
-    """Positions of the films, from positions or a mask."""
-    index = torch.as_tensor(films)
-    places: list[int] = torch.arange(num_channels)[index.cpu()].tolist() if index.numel() else []
-    if not places:
-        raise ValueError("a film's score needs a film; give positions of fast adapting channels")
-    return places
-
-
-def _taken(bins: Tensor, places: Sequence[int]) -> Tensor:
-    """The channels of these places; neighbours without a copy."""
-    if list(places) == list(range(places[0], places[0] + len(places))):
-        return bins.narrow(-2, places[0], len(places))
-    return bins[..., list(places), :]
+    x = bins[..., torch.as_tensor(films, device=bins.device), :] if len(films) else bins[..., :0, :]
+    if not x.shape[-2]:
+        raise ValueError(_NO_FILM)
+    magnitude = torch.maximum(x.amax(-1), -x.amin(-1)).detach()
+    unit = power_of_two_below(magnitude)
+    x = x / unit[..., None]
+    largest = amplitude(x - x[..., :1].detach()) * unit  # exact on a large constant
+    largest = torch.where(magnitude.isfinite(), largest, torch.nan)
+    return largest.amax(-1).clamp(min=FLOOR_V).log()
 
 
 @lru_cache(maxsize=16)

@@ -1,27 +1,147 @@
 """From recordings to scores, and from scores to decisions and alarms.
 
-``score_stream`` scores a whole recording, one bin every hop; ``Decider`` makes decisions and alarms
-of scores, piece by piece, for streams and whole recordings alike; ``answer_of`` is what a bin says
-alone; ``stream_statistic`` is all of it with gradients, from raw volts to the statistic.
+``AlarmSettings`` are what makes alarms of scores, kept in the detector's file. ``score_stream``
+scores a whole recording, one bin every hop; ``Decider`` makes decisions and alarms of scores, piece
+by piece, for streams and whole recordings alike; ``answer_of`` is what a bin says alone;
+``stream_statistic`` is all of it with gradients, from raw volts to the statistic.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.abstention import ABSTAIN, abstention_of, answers
-from tactslip_torch.model.calibration import probability
+from tactslip_torch.model.abstention import ABSTAIN, Abstention
+from tactslip_torch.model.calibration import (
+    Calibration,
+    calibration_from_dict,
+    probability,
+    widened_llr,
+)
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import widened_llr
 from tactslip_torch.model.prediction import Prediction
-from tactslip_torch.onset.rules import NEUTRAL, Latch, latch, latch_start
-from tactslip_torch.onset.settings import AlarmSettings
+from tactslip_torch.onset.rules import NEUTRAL, Rule, latch, latch_row, latch_start, rule_from_dict
 from tactslip_torch.signals.filtering import ChannelFilter
+
+KEY = "alarm"
+"""Under which ``SlipDetector.info`` keeps the settings."""
+
+
+@dataclass(frozen=True)
+class AlarmSettings:
+    """How a stream of scores becomes alarms, and the rate it was set for.
+
+    Args:
+        hop_samples: distance of two decisions.
+        calibration: from a score to a log likelihood ratio.
+        rule: from these to a statistic.
+        threshold: at which the statistic raises an alarm.
+        target_per_hour: false alarms an hour that the threshold was set for; ``None``: for no rate,
+            of false alarms.
+        slip_share: how much of a stream is slip; the balance that probabilities are stated for.
+        rearm_s: how long the statistic must stay low before the next alarm.
+        refractory_s: shortest time between two alarms.
+        lead_s: from an onset to the first decision that speaks for slip, in the middle; the
+            estimate of an onset goes back by it.
+        metadata: on what the threshold was set, JSON-able: recordings, hours, achieved rate.
+
+    Raises:
+        ValueError: if a time or the hop is negative, the share lies outside 0 to 1, or the
+            statistic cannot reach the threshold.
+    """
+
+    hop_samples: int
+    calibration: Calibration
+    rule: Rule
+    threshold: float
+    target_per_hour: float | None
+    slip_share: float = 0.5
+    rearm_s: float = 0.1
+    refractory_s: float = 0.2
+    lead_s: float = 0.0
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.hop_samples < 1:
+            raise ValueError(f"hop_samples must be at least 1, got {self.hop_samples}")
+        if not 0 < self.slip_share < 1:
+            raise ValueError(f"slip_share must lie between 0 and 1, got {self.slip_share}")
+        if self.target_per_hour is not None and not self.target_per_hour > 0:
+            raise ValueError(f"target_per_hour must be positive, got {self.target_per_hour}")
+        if math.isfinite(self.threshold) and self.threshold > self.rule.ceiling:
+            raise ValueError(
+                f"threshold {self.threshold:g} lies above {self.rule.ceiling:g}, the most that the "
+                f"statistic of {self.rule.name} can be: no alarm would ever come; lower it"
+            )
+        for name in ("rearm_s", "refractory_s"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+
+    def decisions(self, seconds: float, sample_rate_hz: float) -> int:
+        """A length of time in decisions, rounded up."""
+        return -(-round(seconds * sample_rate_hz) // self.hop_samples)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as plain JSON types."""
+        plain = dict(self.__dict__)
+        plain["calibration"] = self.calibration.to_dict()
+        plain["rule"] = self.rule.to_dict()
+        plain["metadata"] = dict(self.metadata)
+        return plain
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> AlarmSettings:
+        """The settings that ``to_dict`` wrote.
+
+        Raises:
+            ValueError: if one is missing, unknown or no such value.
+        """
+        try:
+            values = dict(plain)
+            values["calibration"] = calibration_from_dict(values["calibration"])
+            values["rule"] = rule_from_dict(values["rule"])
+            return cls(**values)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"no alarm settings of this version: {error}") from error
+
+    @classmethod
+    def of(cls, detector: SlipDetector) -> AlarmSettings:
+        """The settings in a detector's file.
+
+        Raises:
+            ValueError: if there are none.
+        """
+        if KEY not in detector.info:
+            raise ValueError(
+                "this detector has no alarm threshold; train with +exp=onset, which sets one, or "
+                "with onset=debounced, which is set for no rate"
+            )
+        return cls.from_dict(detector.info[KEY])
+
+
+def calibration_of(detector: SlipDetector) -> tuple[Calibration, float] | None:
+    """What makes a probability of a detector's score, and the share of slip it is stated for.
+
+    That of its alarm settings; else that of the held-out scores its training chose by, at equal
+    shares; else None.
+    """
+    if KEY in detector.info:
+        settings = AlarmSettings.of(detector)
+        return settings.calibration, settings.slip_share
+    if plain := detector.info.get("calibration"):
+        return calibration_from_dict(plain), 0.5
+    return None
+
+
+Array = NDArray[Any]
 
 
 class Scorer(Protocol):
@@ -203,7 +323,8 @@ class Decider:
     def reset(self) -> None:
         """Forget everything; the next decision is number 0 of a stream that begins at 0."""
         self._number = 0  # Python's integers do not end
-        self._state: tuple[Tensor, Latch, Tensor] | None = None
+        # of the rule; of the latch, plain numbers if there is one stream; where the run began
+        self._state: tuple[Tensor, Any, Array] | None = None
 
     def decide(
         self,
@@ -227,33 +348,46 @@ class Decider:
         settings = self.settings
         if self._state is None:
             like = score.new_zeros(score.shape[:-1])
-            none = torch.zeros(like.shape, dtype=torch.int64)
-            self._state = settings.rule.start(like), latch_start(like), none
+            none = np.zeros(like.shape, np.int64)
+            armed: Any = latch_start(like) if like.ndim else ()
+            self._state = settings.rule.start(like), armed, none
         of_rule, of_latch, run = self._state
         if variance is None:
             llr = settings.calibration.llr(score)
         else:
             llr = widened_llr(settings.calibration, score, variance)
         tells = is_valid if is_usable is None else is_usable
-        llr = torch.where(tells & llr.isfinite(), llr, NEUTRAL)
+        ratios = llr.detach().numpy()
+        ratios = np.where(tells.numpy() & np.isfinite(ratios), ratios, ratios.dtype.type(NEUTRAL))
+        llr = torch.from_numpy(ratios)
         statistic, of_rule = settings.rule.scan(llr, of_rule)
-        is_alarm, is_on, of_latch = latch(
-            statistic,
-            settings.threshold,
-            rearm=self._rearm,
-            refractory=self._refractory,
-            state=of_latch,
-        )
-        number = torch.arange(self._number, self._number + score.shape[-1])
-        runs = _run_starts(llr, number, run)
+        if score.ndim == 1:
+            least = float(ratios.dtype.type(settings.threshold))
+            alarms, stands, of_latch = latch_row(
+                statistic.tolist(), least, self._rearm, self._refractory, *of_latch
+            )
+            is_alarm, is_on = (torch.tensor(x, dtype=torch.bool) for x in (alarms, stands))
+        else:
+            is_alarm, is_on, of_latch = latch(
+                statistic,
+                settings.threshold,
+                rearm=self._rearm,
+                refractory=self._refractory,
+                state=of_latch,
+            )
+        number = np.arange(self._number, self._number + score.shape[-1])
+        # where the unbroken run of positive ratios up to each decision began: behind one that is
+        # not positive the next one would begin it
+        runs = np.where(ratios > 0, run[..., None], number + 1)
+        runs = np.maximum.accumulate(runs, -1)
         self._state = of_rule, of_latch, runs[..., -1] if len(number) else run
         self._number += len(number)
         available_s = self._available_s(number)
-        began_s = self._available_s(torch.minimum(runs, number)) - settings.lead_s
+        began_s = self._available_s(np.minimum(runs, number)) - settings.lead_s
         return Decisions(
-            number,
-            available_s,
-            torch.minimum(began_s, available_s),
+            torch.from_numpy(number),
+            torch.from_numpy(available_s),
+            torch.from_numpy(np.minimum(began_s, available_s)),
             score,
             llr,
             probability(llr, settings.slip_share),
@@ -263,18 +397,10 @@ class Decider:
             is_on,
         )
 
-    def _available_s(self, number: Tensor) -> Tensor:
+    def _available_s(self, number: Array) -> Array:
         samples = number * self.settings.hop_samples + self._first
-        return samples.double() / self._rate
-
-
-def _run_starts(llr: Tensor, number: Tensor, before: Tensor) -> Tensor:
-    """Where the unbroken run of positive ratios up to each decision began, ``[*, m]``.
-
-    Behind a decision that is not positive the next one would begin it: its own number and 1.
-    """
-    starts = torch.where(llr > 0, before[..., None], number + 1)
-    return starts.cummax(-1).values if len(number) else starts
+        times_s: Array = samples / self._rate
+        return times_s
 
 
 def is_usable(score: Tensor, is_missing: Tensor, needed_index: Tensor) -> Tensor:
@@ -301,8 +427,8 @@ def answer_of(detector: SlipDetector, decisions: Decisions) -> Tensor:
     Shape:
         - output: ``[*, m]`` as the decisions, int8
     """
-    found = abstention_of(detector)
-    given = found.answer(decisions.score) if found else answers(decisions.score, 0.0, 0.0)
+    abstention = Abstention.of(detector) or Abstention(0.5, 0.0, 0.0)
+    given = abstention.answer(decisions.score)
     return given.masked_fill(~decisions.is_valid, ABSTAIN)
 
 

@@ -8,20 +8,25 @@ replacement, since what happens within one hangs together.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-_OUTCOMES = ("found", "early", "missed")
-"""What becomes of an onset: exactly one of these."""
+_OUTCOMES = ("found", "early", "missed")  # what becomes of an onset
+_STEPS = 20  # between the quantiles that are kept
 
 _FOREVER_S = 1e9
+
+PAPER_SCENE = "paper"
+"""The scene of recordings that are the paper's protocol."""
+
+Number = dict[str, float | None]
+"""A ``value`` and the ends of its interval, ``low`` and ``high``; these are None where one
+recording alone says nothing of them."""
 
 
 @dataclass(frozen=True)
@@ -167,152 +172,98 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
     Reference:
         REFERENCE.md section 7.
     """
-    windows = _Windows.of(watched, rules, latency)
-    stretches = [(_ns(start), _ns(end)) for start, end in watched.watched_s]
+    settle_s = rules.settle_s
+    if settle_s is None:
+        settle_s = latency.bin_s + latency.look_ahead_s + 0.05
+    look_ahead, settle, early = (_ns(x) for x in (latency.look_ahead_s, settle_s, rules.early_s))
+    onsets = [_ns(time) for time in watched.onsets_s]
+    windows = [
+        (onset - early, max(onset, _ns(end)) + settle)
+        for onset, (_, end) in zip(onsets, watched.sliding_s, strict=True)
+    ]
+    spans = [(_ns(start), _ns(end)) for start, end in watched.watched_s]
 
     def is_watched(time: int) -> bool:
-        return not stretches or any(start <= time <= end for start, end in stretches)
+        return not spans or any(start <= time <= end for start, end in spans)
+
+    def window_of(time: int) -> int | None:
+        held = [place for place, (first, last) in enumerate(windows) if first <= time <= last]
+        return held[-1] if held else None
 
     ends = watched.alarm_ends_s or (math.inf,) * len(watched.alarms_s)
-    raised = (
-        _Alarm(at, _ns(end), number)
+    raised = [
+        _Alarm(at, _ns(end), number, window_of(at))
         for number, (at, end) in enumerate(zip(map(_ns, watched.alarms_s), ends, strict=True))
-    )
-    alarms = [alarm for alarm in raised if is_watched(alarm.at)]
-    belongs = [windows.holding(alarm.at) for alarm in alarms]
-    num_alarms = Counter(belongs)
-    onsets = tuple(
-        _onset_event(watched, place, alarms, windows, latency)._replace(
-            num_alarms=num_alarms[place]
-        )
-        for place, onset in enumerate(windows.onset)
-        if is_watched(onset)
-    )
-    false = [a.number for a, place in zip(alarms, belongs, strict=True) if place is None]
-    whole = stretches or [(0, _ns(watched.duration_s))]
+        if is_watched(at)
+    ]
+    events = []
+    for place, onset in enumerate(onsets):
+        if not is_watched(onset):
+            continue
+        num_alarms = sum(alarm.window == place for alarm in raised)
+        speed = watched.speeds_mm_s[place]
+        event = OnsetEvent(watched.onsets_s[place], speed, "missed", num_alarms, *(math.nan,) * 4)
+        before = [alarm for alarm in raised if alarm.at < onset]
+        after = [alarm for alarm in raised if alarm.at >= onset]
+        first, last = windows[place]
+        until = min(onset + _ns(rules.found_within_s), last, *(t - 1 for t in onsets[place + 1 :]))
+        if before and before[-1].at >= first and before[-1].end > onset:
+            event = event._replace(outcome="early")
+        elif after and after[0].at <= until:
+            alarm = after[0]
+            positive = watched.first_positive_s[place] if watched.first_positive_s else math.nan
+            spoke = alarm.at if math.isnan(positive) else min(_ns(positive), alarm.at)
+            fill = max(0, spoke - onset - look_ahead)  # one that spoke before had no need of it
+            estimates = watched.onset_estimates_s
+            event = event._replace(
+                outcome="found",
+                delay_s=(alarm.at - onset) / 1e9,
+                bin_fill_s=fill / 1e9,
+                decision_s=(alarm.at - onset - look_ahead - fill) / 1e9,
+                error_s=(_ns(estimates[alarm.number]) - onset) / 1e9 if estimates else math.nan,
+            )
+        events.append(event)
+    quiet = 0
+    for start, end in spans or [(0, _ns(watched.duration_s))]:
+        for first, last in windows:
+            quiet += max(0, min(first, end) - start)
+            start = max(start, last)
+        quiet += max(0, end - start)
     return RecordingEvents(
         watched.recording,
         watched.material,
         watched.scene,
-        onsets,
-        tuple(watched.alarms_s[number] for number in false),
-        sum(end - start - windows.inside(start, end) for start, end in whole) / 1e9,
+        tuple(events),
+        tuple(watched.alarms_s[alarm.number] for alarm in raised if alarm.window is None),
+        quiet / 1e9,
         latency,
     )
 
 
 class _Alarm(NamedTuple):
-    """When it was raised, when its status ended, and which one it is."""
+    """When it was raised, when its status ended, which one it is, and in whose slip's window."""
 
     at: int
     end: int
     number: int
-
-
-class _Windows(NamedTuple):
-    """Onsets and the windows of their slips, ascending; ``until`` is how long each can be found."""
-
-    onset: list[int]
-    first: list[int]
-    last: list[int]
-    until: list[int]
-
-    @classmethod
-    def of(cls, watched: Watched, rules: EventRules, latency: LatencyParts) -> _Windows:
-        settle_s = rules.settle_s
-        if settle_s is None:
-            settle_s = latency.bin_s + latency.look_ahead_s + 0.05
-        onset = [_ns(time) for time in watched.onsets_s]
-        ends = [_ns(end) for _, end in watched.sliding_s]
-        last = [max(time, end) + _ns(settle_s) for time, end in zip(onset, ends, strict=True)]
-        following = [time - 1 for time in onset[1:]] + [_ns(_FOREVER_S)]
-        until = [
-            min(time + _ns(rules.found_within_s), stop, before_next)
-            for time, stop, before_next in zip(onset, last, following, strict=False)
-        ]
-        return cls(onset, [time - _ns(rules.early_s) for time in onset], last, until)
-
-    def holding(self, time: int) -> int | None:
-        """The last window that holds an instant."""
-        place = bisect_right(self.first, time) - 1
-        return place if place >= 0 and time <= self.last[place] else None
-
-    def inside(self, start: int, end: int) -> int:
-        """How much of a stretch lies inside windows, which may overlap."""
-        inside, reached = 0, start
-        for first, last in zip(self.first, self.last, strict=True):
-            inside += max(0, min(last, end) - max(first, reached))
-            reached = max(reached, last)
-        return inside
-
-
-def _onset_event(
-    watched: Watched,
-    place: int,
-    alarms: Sequence[_Alarm],
-    windows: _Windows,
-    latency: LatencyParts,
-) -> OnsetEvent:
-    """What became of one onset; alarms are not counted yet."""
-    onset = windows.onset[place]
-    event = OnsetEvent(
-        watched.onsets_s[place], watched.speeds_mm_s[place], "missed", 0, *(math.nan,) * 4
-    )
-    after = bisect_left(alarms, onset, key=lambda alarm: alarm.at)
-    if after and alarms[after - 1].at >= windows.first[place] and alarms[after - 1].end > onset:
-        return event._replace(outcome="early")
-    if after == len(alarms) or alarms[after].at > windows.until[place]:
-        return event
-    alarm = alarms[after]
-    positive = watched.first_positive_s[place] if watched.first_positive_s else math.nan
-    spoke = alarm.at if math.isnan(positive) else min(_ns(positive), alarm.at)
-    look_ahead = _ns(latency.look_ahead_s)
-    bin_fill = max(0, spoke - onset - look_ahead)  # one that spoke before had no need of it
-    estimates = watched.onset_estimates_s
-    return event._replace(
-        outcome="found",
-        delay_s=(alarm.at - onset) / 1e9,
-        bin_fill_s=bin_fill / 1e9,
-        decision_s=(alarm.at - onset - look_ahead - bin_fill) / 1e9,
-        error_s=(_ns(estimates[alarm.number]) - onset) / 1e9 if estimates else math.nan,
-    )
+    window: int | None
 
 
 def _ns(seconds: float) -> int:
     return round(min(seconds, _FOREVER_S) * 1e9)
 
 
-class Number(TypedDict):
-    """A number and its interval; the ends are None where one recording alone says nothing of it."""
-
-    value: float
-    low: float | None
-    high: float | None
-
-
-class Draws(NamedTuple):
-    """How recordings are drawn.
-
-    Args:
-        level: of the intervals, whose ends are percentiles.
-        num: how many draws.
-        seed: of the draws.
-    """
-
-    level: float = 0.95
-    num: int = 1000
-    seed: int = 0
-
-
-class Resampled:
-    """A set of recordings and its draws.
+class Bootstrap:
+    """A set of recordings, and as many drawn with replacement, again and again.
 
     An interval always holds its value. For shares and rates the score interval of independent
     events is taken where it reaches further: no miss among a few slips is no proof of none.
 
     Args:
         num_recordings: in the set.
-        draws: how they are drawn.
+        level: of the intervals, whose ends are percentiles.
+        num: how many draws.
+        seed: of the draws.
 
     Raises:
         ValueError: if the level is not between 0 and 1, or nothing is to be drawn.
@@ -322,36 +273,54 @@ class Resampled:
         (1927), J. Am. Stat. Assoc. 22, 209-212, and its form for a Poisson count.
     """
 
-    def __init__(self, num_recordings: int, draws: Draws) -> None:
-        if not (0 < draws.level < 1 and draws.num >= 1):
+    def __init__(
+        self, num_recordings: int, level: float = 0.95, num: int = 1000, seed: int = 0
+    ) -> None:
+        if not (0 < level < 1 and num >= 1):
             raise ValueError(
-                f"an interval needs a level between 0 and 1 and at least one draw, got {draws}"
+                "an interval needs a level between 0 and 1 and at least one draw, got "
+                f"level={level} and num_resamples={num}"
             )
-        generator = torch.Generator().manual_seed(draws.seed)
-        shape = (draws.num, num_recordings)
+        generator = torch.Generator().manual_seed(seed)
+        shape = (num, num_recordings)
         drawn = torch.randint(max(num_recordings, 1), shape, generator=generator)
-        tail = (1 - draws.level) / 2
-        self._ends = torch.tensor([tail, 1 - tail], dtype=torch.float64)
+        self._ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
         self._z = float(torch.special.ndtri(self._ends[1]))
         self._times = torch.zeros(shape, dtype=torch.float64)  # how often each is in each draw
         self._times.scatter_add_(1, drawn, torch.ones_like(self._times))
 
     def share(self, parts: Sequence[float], wholes: Sequence[float]) -> Number | None:
-        """Sum of parts, of which each is within its whole, by sum of wholes; None of nothing."""
-        return self._ratio(parts, wholes, 1.0, _share_end)
+        """``ratio`` of parts that are each within their whole."""
+        return self.ratio(parts, wholes, end=_share_end)
 
     def rate(
         self, counts: Sequence[float], times: Sequence[float], per: float = 1.0
     ) -> Number | None:
-        """Counts in so much time, for ``per`` units of it; None of no time."""
-        return self._ratio(counts, times, per, _rate_end)
+        """``ratio`` of counts in so much time, for ``per`` units of it."""
+        return self.ratio(counts, times, per, _rate_end)
 
-    def mean(self, sums: Sequence[float], numbers: Sequence[float]) -> Number | None:
-        """Sum of sums by sum of numbers; None of nothing."""
-        return self._ratio(sums, numbers, 1.0, None)
+    def ratio(
+        self,
+        parts: Sequence[float],
+        wholes: Sequence[float],
+        per: float = 1.0,
+        end: Callable[[float, float, float], float] | None = None,
+    ) -> Number | None:
+        """Sum of parts by sum of wholes, of each recording; None of nothing."""
+        part, whole = math.fsum(parts), math.fsum(wholes)
+        if not whole > 0:
+            return None
+        sums = self._times @ torch.tensor([parts, wholes], dtype=torch.float64).T  # [draws, 2]
+        drawn, having = per * sums[:, 0] / sums[:, 1], torch.tensor(wholes).nonzero()
+        low, high = self._interval(value := per * part / whole, drawn, having)
+        if end is not None:
+            ends = [per * end(part, whole, z) for z in (-self._z, self._z)]
+            low = ends[0] if low is None else min(ends[0], low)
+            high = ends[1] if high is None else max(ends[1], high)
+        return {"value": value, "low": low, "high": high}
 
-    def quantiles(self, values: Tensor, recording: Tensor, shares: Sequence[float]) -> list[Number]:
-        """Quantiles of values, linear between neighbours, each value drawn with its recording.
+    def quantile(self, values: Tensor, recording: Tensor, share: float) -> Number:
+        """Quantile of values, linear between neighbours, each value drawn with its recording.
 
         Shape:
             - values, recording: ``[N]``, N at least 1; recording is a number below that of the set
@@ -359,57 +328,40 @@ class Resampled:
         order = values.argsort()
         ordered = values[order]
         reached = self._times[:, recording[order]].cumsum(1)  # [draws, N], values up to each
-        last = reached[:, -1:] - 1  # place of the last one drawn, -1 where none is
-        numbers = []
-        for share in shares:
-            place = share * last
-            low, high = (
-                ordered[torch.searchsorted(reached, at, right=True).clamp(max=len(ordered) - 1)]
-                for at in (place.floor(), place.ceil())
-            )
-            drawn = low + (place - place.floor()) * (high - low)
-            drawn = torch.where(last < 0, torch.nan, drawn)[:, 0]
-            numbers.append(self._between(float(ordered.quantile(share)), drawn, recording))
-        return numbers
+        place = share * (reached[:, -1:] - 1)  # below 0 where none is drawn
+        low, high = (
+            ordered[torch.searchsorted(reached, at, right=True).clamp(max=len(ordered) - 1)]
+            for at in (place.floor(), place.ceil())
+        )
+        drawn = low + (place - place.floor()) * (high - low)
+        drawn = torch.where(reached[:, -1:] < 1, torch.nan, drawn)[:, 0]
+        return self._number(float(ordered.quantile(share)), drawn, recording)
 
-    def average(self, values: Tensor, recording: Tensor) -> Number:
-        """Mean of values; shapes as of ``quantiles``."""
+    def mean(self, values: Tensor, recording: Tensor) -> Number:
+        """Mean of values; shapes as of ``quantile``."""
         times = self._times[:, recording]
-        return self._between(float(values.mean()), times @ values / times.sum(1), recording)
+        return self._number(float(values.mean()), times @ values / times.sum(1), recording)
 
     def deviation(self, values: Tensor, recording: Tensor) -> Number:
-        """Standard deviation of values, of the population; shapes as of ``quantiles``."""
+        """Standard deviation of values, of the population; shapes as of ``quantile``."""
         away = values - values.mean()
         powers = torch.stack([torch.ones_like(away), away, away**2])  # [3, N]
         count, first, second = (self._times[:, recording] @ powers.T).T
         drawn = (second / count - (first / count) ** 2).clamp(min=0).sqrt()
-        return self._between(float(away.square().mean().sqrt()), drawn, recording)
+        return self._number(float(away.square().mean().sqrt()), drawn, recording)
 
-    def _ratio(
-        self,
-        parts: Sequence[float],
-        wholes: Sequence[float],
-        per: float,
-        end: Callable[[float, float, float], float] | None,
-    ) -> Number | None:
-        part, whole = math.fsum(parts), math.fsum(wholes)
-        if not whole > 0:
-            return None
-        sums = self._times @ torch.tensor([parts, wholes], dtype=torch.float64).T  # [draws, 2]
-        having = torch.tensor(wholes).nonzero()
-        number = self._between(per * part / whole, per * sums[:, 0] / sums[:, 1], having)
-        if end is not None:
-            low, high = (per * end(part, whole, z) for z in (-self._z, self._z))
-            number["low"] = low if number["low"] is None else min(low, number["low"])
-            number["high"] = high if number["high"] is None else max(high, number["high"])
-        return number
+    def _number(self, value: float, drawn: Tensor, recording: Tensor) -> Number:
+        low, high = self._interval(value, drawn, recording)
+        return {"value": value, "low": low, "high": high}
 
-    def _between(self, value: float, drawn: Tensor, recording: Tensor) -> Number:
+    def _interval(
+        self, value: float, drawn: Tensor, recording: Tensor
+    ) -> tuple[float | None, float | None]:
         known = drawn[~drawn.isnan()]  # NaN where a draw says nothing
         if len(recording.unique()) < 2 or not len(known):
-            return {"value": value, "low": None, "high": None}
+            return None, None
         low, high = known.quantile(self._ends).tolist()
-        return {"value": value, "low": min(low, value), "high": max(high, value)}
+        return min(low, value), max(high, value)
 
 
 def _share_end(part: float, whole: float, z: float) -> float:
@@ -419,26 +371,6 @@ def _share_end(part: float, whole: float, z: float) -> float:
 
 def _rate_end(count: float, time: float, z: float) -> float:
     return max(count + z * z / 2 + z * math.sqrt(count + z * z / 4), 0.0) / time
-
-
-PAPER_SCENE = "paper"
-"""The scene of recordings that are the paper's protocol."""
-
-_STEPS = 20  # between the quantiles that are kept
-
-
-def event_metrics(
-    watched: Sequence[Watched],
-    rules: EventRules,
-    latency: LatencyParts,
-    *,
-    level: float = 0.95,
-    num_resamples: int = 1000,
-    seed: int = 0,
-) -> dict[str, Any]:
-    """``pooled_metrics`` of recordings that one detector watched, with ``rules`` and ``level``."""
-    events = [recording_events(one, rules, latency) for one in watched]
-    return pooled_metrics(events, level=level, num_resamples=num_resamples, seed=seed)
 
 
 def pooled_metrics(
@@ -463,8 +395,8 @@ def pooled_metrics(
       quantiles; a false alarm has no speed. Of several scenes, materials and speeds are of the
       paper's alone.
 
-    A number with an interval is ``{"value", "low", "high"}``, by bootstrap over recordings
-    (``resampling``); what bears one name is one recording.
+    A number with an interval is ``{"value", "low", "high"}``, by bootstrap over recordings;
+    what bears one name is one recording.
 
     Args:
         events: of ``recording_events``; of several detectors if they are to be pooled.
@@ -476,48 +408,51 @@ def pooled_metrics(
         ValueError: if the level is not between 0 and 1, or nothing is to be drawn.
     """
     events = sorted(events, key=lambda one: (*_name(one), one.quiet_s, str(one.onsets)))
-    draws = Draws(level, num_resamples, seed)
     is_one = len({one.scene for one in events}) < 2
     counted = [one for one in events if is_one or one.scene == PAPER_SCENE]
-    speeds = sorted({onset.speed_mm_s for one in counted for onset in one.onsets})
 
-    def of_group(own: Sequence[RecordingEvents]) -> dict[str, Any]:
-        numbers = _summary(own, draws)
-        if numbers["delay_ms"]:
+    def summary(own: Sequence[RecordingEvents], *, is_group: bool = True) -> dict[str, Any]:
+        numbers = _summary(own, level, num_resamples, seed)
+        if is_group and numbers["delay_ms"]:
             del numbers["delay_ms"]["quantiles"]
         return numbers
 
-    def by(name: str, among: Sequence[RecordingEvents]) -> dict[str, Any]:
-        groups: dict[str, list[RecordingEvents]] = {}
-        for one in among:
-            groups.setdefault(getattr(one, name), []).append(one)
-        return {group: of_group(own) for group, own in groups.items()}
+    def by(name: str, events: Sequence[RecordingEvents]) -> dict[str, Any]:
+        groups = dict.fromkeys(getattr(one, name) for one in events)
+        return {
+            group: summary([one for one in events if getattr(one, name) == group])
+            for group in groups
+        }
 
-    def at(speed: float) -> list[RecordingEvents]:
-        own = (
-            (one, tuple(onset for onset in one.onsets if onset.speed_mm_s == speed))
+    per_speed = {}
+    for speed in sorted({onset.speed_mm_s for one in counted for onset in one.onsets}):
+        own = [
+            one._replace(onsets=onsets, false_alarms_s=(), quiet_s=0.0)
             for one in counted
-        )
-        return [one._replace(onsets=o, false_alarms_s=(), quiet_s=0.0) for one, o in own if o]
-
+            if (onsets := tuple(onset for onset in one.onsets if onset.speed_mm_s == speed))
+        ]
+        per_speed[f"{speed:g}"] = summary(own)
     return {
-        **_summary(events, draws),
+        **summary(events, is_group=False),
         "level": level,
         "per_material": by("material", counted),
-        "per_speed": {f"{speed:g}": of_group(at(speed)) for speed in speeds},
+        "per_speed": per_speed,
         "per_scene": by("scene", events),
     }
 
 
-def _summary(events: Sequence[RecordingEvents], draws: Draws) -> dict[str, Any]:
+def _summary(
+    events: Sequence[RecordingEvents], level: float, num_resamples: int, seed: int
+) -> dict[str, Any]:
+    """The numbers of ``pooled_metrics`` but for its groups."""
     names = {name: place for place, name in enumerate(dict.fromkeys(map(_name, events)))}
-    place = [names[_name(one)] for one in events]
-    resampled = Resampled(len(names), draws)
+    bootstrap = Bootstrap(len(names), level, num_resamples, seed)
 
     def total(of: Callable[[RecordingEvents], float]) -> list[float]:
+        """Of every recording, by its place."""
         sums = [0.0] * len(names)
-        for at, one in zip(place, events, strict=True):
-            sums[at] += of(one)
+        for one in events:
+            sums[names[_name(one)]] += of(one)
         return sums
 
     def of(outcome: str) -> list[float]:
@@ -529,69 +464,56 @@ def _summary(events: Sequence[RecordingEvents], draws: Draws) -> dict[str, Any]:
     false = total(lambda one: len(one.false_alarms_s))
     hours = total(lambda one: one.quiet_s / 3600)
     found = [
-        (at, one.latency, onset)
-        for at, one in zip(place, events, strict=True)
+        (names[_name(one)], one.latency, onset)
+        for one in events
         for onset in one.onsets
         if onset.outcome == "found"
     ]
+    delay_ms = latency_ms = error_ms = None
+    if found:
+        recording = torch.tensor([place for place, _, _ in found])
+        delay = 1000 * torch.tensor([onset.delay_s for _, _, onset in found], dtype=torch.float64)
+        steps = torch.linspace(0, 1, _STEPS + 1, dtype=torch.float64)
+        delay_ms = {
+            "median": bootstrap.quantile(delay, recording, 0.5),
+            "p95": bootstrap.quantile(delay, recording, 0.95),
+            "quantiles": delay.quantile(steps).tolist(),
+        }
+        compute = [latency.compute_s for _, latency, _ in found if latency.compute_s is not None]
+        latency_ms = {
+            "look_ahead": _mean_ms([latency.look_ahead_s for _, latency, _ in found]),
+            "bin_fill": _mean_ms([onset.bin_fill_s for _, _, onset in found]),
+            "decision": _mean_ms([onset.decision_s for _, _, onset in found]),
+            "delay": _mean_ms([onset.delay_s for _, _, onset in found]),
+            "compute": _mean_ms(compute) if compute else None,
+        }
+        error = 1000 * torch.tensor([onset.error_s for _, _, onset in found], dtype=torch.float64)
+        is_known = ~error.isnan()
+        if bool(is_known.any()):
+            error, recording = error[is_known], recording[is_known]
+            error_ms = {
+                "median": bootstrap.quantile(error, recording, 0.5),
+                "sd": bootstrap.deviation(error, recording),
+                "mean_abs": bootstrap.mean(error.abs(), recording),
+            }
     return {
         "num_recordings": len(names),
         "num_onsets": int(sum(onsets)),
         **{f"num_{outcome}": int(sum(counts)) for outcome, counts in outcomes.items()},
         "num_false_alarms": int(sum(false)),
         "quiet_hours": sum(hours),
-        **{outcome: resampled.share(counts, onsets) for outcome, counts in outcomes.items()},
-        "alarms_per_slip": resampled.mean(alarms, onsets),
-        "false_alarms_per_minute": resampled.rate(false, hours, per=1 / 60),
-        "false_alarms_per_hour": resampled.rate(false, hours),
-        "delay_ms": _delays(found, resampled),
-        "latency_ms": _parts(found),
-        "onset_error_ms": _errors(found, resampled),
+        **{outcome: bootstrap.share(counts, onsets) for outcome, counts in outcomes.items()},
+        "alarms_per_slip": bootstrap.ratio(alarms, onsets),
+        "false_alarms_per_minute": bootstrap.rate(false, hours, per=1 / 60),
+        "false_alarms_per_hour": bootstrap.rate(false, hours),
+        "delay_ms": delay_ms,
+        "latency_ms": latency_ms,
+        "onset_error_ms": error_ms,
     }
 
 
-_Found = Sequence[tuple[int, LatencyParts, OnsetEvent]]
-"""The slips found: which recording's, and the rest of what their delay is made of."""
-
-
-def _delays(found: _Found, resampled: Resampled) -> dict[str, Any] | None:
-    if not found:
-        return None
-    delay = 1000 * torch.tensor([onset.delay_s for _, _, onset in found], dtype=torch.float64)
-    recording = torch.tensor([at for at, _, _ in found])
-    median, p95 = resampled.quantiles(delay, recording, (0.5, 0.95))
-    steps = torch.linspace(0, 1, _STEPS + 1, dtype=torch.float64)
-    return {"median": median, "p95": p95, "quantiles": delay.quantile(steps).tolist()}
-
-
-def _parts(found: _Found) -> dict[str, float | None] | None:
-    if not found:
-        return None
-
-    def mean_ms(seconds: Sequence[float]) -> float:
-        return 1000 * math.fsum(seconds) / len(seconds)
-
-    measured = [latency.compute_s for _, latency, _ in found if latency.compute_s is not None]
-    return {
-        "look_ahead": mean_ms([latency.look_ahead_s for _, latency, _ in found]),
-        "bin_fill": mean_ms([onset.bin_fill_s for _, _, onset in found]),
-        "decision": mean_ms([onset.decision_s for _, _, onset in found]),
-        "delay": mean_ms([onset.delay_s for _, _, onset in found]),
-        "compute": mean_ms(measured) if measured else None,
-    }
-
-
-def _errors(found: _Found, resampled: Resampled) -> dict[str, Any] | None:
-    known = [(at, onset.error_s) for at, _, onset in found if not math.isnan(onset.error_s)]
-    if not known:
-        return None
-    recording = torch.tensor([at for at, _ in known])
-    error = 1000 * torch.tensor([error for _, error in known], dtype=torch.float64)
-    return {
-        "median": resampled.quantiles(error, recording, (0.5,))[0],
-        "sd": resampled.deviation(error, recording),
-        "mean_abs": resampled.average(error.abs(), recording),
-    }
+def _mean_ms(seconds: Sequence[float]) -> float:
+    return 1000 * math.fsum(seconds) / len(seconds)
 
 
 def _name(one: RecordingEvents) -> tuple[str, str, str]:

@@ -12,14 +12,16 @@ to lie is not decided here (``onset.thresholds``).
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from tactslip_torch.runtime import is_concrete
 
 NEUTRAL = 0.0
 """The log likelihood ratio of a decision that says nothing; it stands for invalid ones."""
@@ -28,7 +30,6 @@ NOTHING_YET = -1e30
 """What ``KOfN`` takes for decisions before the first; finite, and below every real one."""
 
 _LONG_AGO = 2**62  # decisions since an alarm that never was
-_FEW = 8  # rows up to which plain numbers are quicker than tensors
 
 
 @dataclass(frozen=True)
@@ -124,9 +125,15 @@ class Cusum:
             - state: ``[*, 1]``
         """
         _check_state(llr, state, 1)
+        steps = self.evidence * (llr - self.drift)
+        if llr.ndim == 1 and is_concrete(llr) and is_concrete(state):
+            one, sums = np.float32 if llr.dtype == torch.float32 else float, state.tolist()
+            for step in steps.tolist():  # plain numbers, quicker than small tensors
+                sums.append(float(one(min(max(one(sums[-1] + step), 0.0), self.ceiling))))
+            return llr.new_tensor(sums[1:]), llr.new_tensor(sums[-1:])
         total = state[..., 0]
         statistic = []
-        for step in _by_decision(self.evidence * (llr - self.drift)):
+        for step in steps.movedim(-1, 0).contiguous().unbind(0):  # the same kernels for any T
             total = (total + step).clamp(0.0, self.ceiling)
             statistic.append(total)
         return torch.stack(statistic, dim=-1) if statistic else llr, total.unsqueeze(-1)
@@ -210,100 +217,58 @@ def latch(
     Raises:
         ValueError: if rearm or refractory is negative.
     """
-    level = _level(statistic, threshold, rearm, refractory)
-    shape = torch.broadcast_shapes(statistic.shape[:-1], level.shape, state.is_on.shape)
-    if statistic.shape[-1] == 0:
-        nothing = torch.zeros((*shape, 0), dtype=torch.bool, device=statistic.device)
-        return nothing, nothing.clone(), Latch(*(part.expand(shape).clone() for part in state))
-    if 0 < math.prod(shape) <= _FEW:
-        return _row_by_row(statistic, level.expand(shape), rearm, refractory, state)
-    rows = (part.expand(shape) for part in state)
-    steps = list(_walk(_by_decision(statistic.detach()), level, rearm, refractory, *rows))
-    alarms, standing, *_ = zip(*steps, strict=True)
-    return torch.stack(alarms, dim=-1), torch.stack(standing, dim=-1), Latch(*steps[-1][1:])
-
-
-def count_alarms(
-    statistic: Tensor,
-    threshold: Tensor | float,
-    *,
-    rearm: int,
-    refractory: int,
-    skipped: Tensor | None = None,
-) -> Tensor:
-    """How many alarms ``latch`` raises from its start, without keeping which: ``[*]``, int64.
-
-    Takes what ``latch`` takes. ``skipped``, ``[*, T]``, is how many decisions were left out before
-    each, all below the threshold.
-
-    Raises:
-        ValueError: if rearm or refractory is negative.
-    """
-    level = _level(statistic, threshold, rearm, refractory)
-    shape = torch.broadcast_shapes(statistic.shape[:-1], level.shape)
-    count = torch.zeros(shape, dtype=torch.int64, device=statistic.device)
-    gaps = itertools.repeat(0) if skipped is None else _by_decision(skipped)
-    decisions = _by_decision(statistic.detach())
-    for step in _walk(decisions, level, rearm, refractory, *latch_start(count), gaps):
-        count += step[0]
-    return count
-
-
-def _level(statistic: Tensor, threshold: Tensor | float, rearm: int, refractory: int) -> Tensor:
-    """The threshold in the statistic's dtype."""
     if rearm < 0 or refractory < 0:
         raise ValueError(f"rearm and refractory must not be negative, got {rearm} and {refractory}")
-    return torch.as_tensor(threshold, dtype=statistic.dtype, device=statistic.device).detach()
-
-
-def _walk(
-    statistic: Iterable[Any],
-    level: Any,
-    rearm: int,
-    refractory: int,
-    is_on: Any,
-    below: Any,
-    since: Any,
-    skipped: Iterable[Any] = itertools.repeat(0),
-) -> Iterator[tuple[Any, Any, Any, Any]]:
-    """Decision by decision: whether it raises an alarm, and the parts of the state after it.
-
-    The definition, for tensors ``[*]`` and for plain numbers alike. ``skipped`` decisions before
-    each were low; re-armed among them is re-armed before the decision, so one look is enough.
-    """
-    in_a_row = max(rearm, 1)
-    for x, gap in zip(statistic, skipped, strict=False):
-        is_low = x < level
-        run = below + gap + is_low
-        is_on = is_on & (run < in_a_row)
-        since = since + gap + 1
-        is_alarm = (is_on ^ True) & (x >= level) & (since >= refractory)
-        is_on, below, since = is_on | is_alarm, run * is_low, since * (is_alarm ^ True)
-        yield is_alarm, is_on, below, since
-
-
-def _row_by_row(
-    statistic: Tensor, level: Tensor, rearm: int, refractory: int, state: Latch
-) -> tuple[Tensor, Tensor, Latch]:
-    """``latch`` by plain numbers, which for a few rows are quicker than tensors."""
-    shape, size = level.shape, statistic.shape[-1]
+    device, size = statistic.device, statistic.shape[-1]
+    level = torch.as_tensor(threshold, dtype=statistic.dtype, device=device).detach()
+    shape = torch.broadcast_shapes(statistic.shape[:-1], level.shape, state.is_on.shape)
     rows = zip(
-        statistic.detach().expand(*shape, size).reshape(-1, size).tolist(),
+        statistic.detach().expand(*shape, size).reshape(math.prod(shape), size).tolist(),
         *(part.expand(shape).flatten().tolist() for part in (level, *state)),
         strict=True,
     )
-    alarms, standing, ends = [], [], []
-    for values, threshold, *before in rows:
-        steps = list(_walk(values, threshold, rearm, refractory, *before))
-        alarms.append([step[0] for step in steps])
-        standing.append([step[1] for step in steps])
-        ends.append(steps[-1][1:])
-    device = statistic.device
+    alarms, standing, ends = list[bool](), list[bool](), list[tuple[bool, int, int]]()
+    for values, least, *before in rows:
+        of_row = latch_row(values, least, rearm, refractory, *before)
+        alarms += of_row[0]
+        standing += of_row[1]
+        ends.append(of_row[2])
+    end = [list(column) for column in zip(*ends, strict=True)] or [[], [], []]
+    kinds = (torch.bool, torch.int64, torch.int64)
     return (
-        torch.tensor(alarms, device=device).view(*shape, size),
-        torch.tensor(standing, device=device).view(*shape, size),
-        Latch(*(torch.tensor(part, device=device).view(shape) for part in zip(*ends, strict=True))),
+        torch.tensor(alarms, dtype=torch.bool, device=device).view(*shape, size),
+        torch.tensor(standing, dtype=torch.bool, device=device).view(*shape, size),
+        Latch(
+            *(
+                torch.tensor(column, dtype=kind, device=device).view(shape)
+                for column, kind in zip(end, kinds, strict=True)
+            )
+        ),
     )
+
+
+def latch_row(
+    statistic: Iterable[float],
+    threshold: float,
+    rearm: int,
+    refractory: int,
+    is_on: bool = False,
+    below: int = 0,
+    since: int = _LONG_AGO,
+) -> tuple[list[bool], list[bool], tuple[bool, int, int]]:
+    """``latch`` of one stream, in plain numbers: quicker than small tensors."""
+    alarms, standing = [], []
+    for x in statistic:
+        below = below + 1 if x < threshold else 0
+        if below >= max(rearm, 1):
+            is_on = False
+        since += 1
+        is_alarm = not is_on and x >= threshold and since >= refractory
+        if is_alarm:
+            is_on, since = True, 0
+        alarms.append(is_alarm)
+        standing.append(is_on)
+    return alarms, standing, (is_on, below, since)
 
 
 def _check_state(llr: Tensor, state: Tensor, size: int) -> None:
@@ -312,8 +277,3 @@ def _check_state(llr: Tensor, state: Tensor, size: int) -> None:
             f"expected llr [*, T] and the state [*, {size}] that start or scan gave, "
             f"got {tuple(llr.shape)} and {tuple(state.shape)}"
         )
-
-
-def _by_decision(x: Tensor) -> tuple[Tensor, ...]:
-    """``[*, T]`` as ``T`` contiguous tensors ``[*]``: the same kernels run for any ``T``."""
-    return x.movedim(-1, 0).contiguous().unbind(0)

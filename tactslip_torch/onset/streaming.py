@@ -1,7 +1,8 @@
 """``StreamingDetector``: samples in as they come, decisions and alarms out as soon as they can be.
 
 The same mathematics as ``score_stream`` and ``Decider`` on the whole recording, at the look-ahead
-of the detector and with a memory of fixed size: a sample is filtered once, and a bin scored once.
+of the detector and with a memory of fixed size: raw samples of one bin and its context. From them
+to the scores it is one call of the native engine, where that can be used.
 """
 
 from __future__ import annotations
@@ -17,10 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import ChannelMask, masked_names, without
-from tactslip_torch.onset.decisions import Decider, Decisions, is_usable, score_filtered
-from tactslip_torch.onset.settings import AlarmSettings
-from tactslip_torch.signals.stream import FilterStream, SampleClock
+from tactslip_torch.model.missing_channels import ChannelMask, masked_names
+from tactslip_torch.onset.decisions import AlarmSettings, Decider, Decisions, is_usable
+from tactslip_torch.signals.filtering import past_of
 
 _LOG = logging.getLogger(__name__)
 _NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
@@ -85,9 +85,9 @@ class StreamingDetector:
         self.masked_channels = masked_names(masked_channels, pool.hand.names)
         self._clock = SampleClock(pool.sample_rate_hz)
         self._max_gap = round(max_gap_s * pool.sample_rate_hz)
-        wide = pool.widen(torch.empty(0, dtype=dtype)).dtype
-        channels = detector.needed_index.tolist()
-        self._filter = FilterStream(detector.channel_filter, wide, channels)
+        self._wide = pool.widen(torch.empty(0, dtype=dtype)).dtype
+        lengths = detector.channel_filter.window_lengths
+        self._frame = max(lengths[channel] for channel in detector.needed_index.tolist())
         self._first = pool.bin_samples + detector.look_ahead
         parts = (pool.sample_rate_hz, pool.bin_samples, detector.look_ahead)
         self._decider = Decider(self.settings, *parts)
@@ -120,8 +120,7 @@ class StreamingDetector:
     @property
     def state_bytes(self) -> int:
         """Memory of the samples that are remembered."""
-        held = [self._filtered, *self._pending]
-        return self._filter.num_bytes + sum(each.untyped_storage().nbytes() for each in held)
+        return int(self._held.nbytes)
 
     def push(
         self, samples: ArrayLike | Tensor, time_s: ArrayLike | Tensor | None = None
@@ -164,8 +163,14 @@ class StreamingDetector:
 
         Then as ``reset``. ``available_s`` is when they would have been there, had it gone on.
         """
-        settled = [self._filter.push(samples) for samples in self._pending]
-        decisions = self._decide(torch.cat([*settled, self._filter.flush()], dim=-1))
+        detector, num_samples = self.detector, self._clock.num_samples
+        decisions = self._nothing
+        last_start = num_samples - detector.pool.bin_samples
+        if num_samples >= self._frame and last_start >= self._number * self.settings.hop_samples:
+            ends = torch.from_numpy(self._held[:, -self._frame :]).flip(-1)
+            future = past_of(ends, detector.channel_filter, detector.needed_index.tolist())
+            self._append(future.flip(-1)[:, : detector.context_after].numpy())
+            decisions = self._decide(last_start)
         self._start()
         return decisions
 
@@ -175,30 +180,27 @@ class StreamingDetector:
         self._start()
 
     def _start(self) -> None:
-        num_channels = len(self.detector.pool.hand)
-        for part in (self._filter, self._clock, self._decider):
-            part.reset()
-        self._pending: list[Tensor] = []
-        self._filtered = torch.empty(num_channels, 0, dtype=self._filter.dtype)
-        self._dropped = 0  # filtered samples before those held
+        self._clock.reset()
+        self._decider.reset()
+        self._held = np.empty((len(self.detector.pool.hand), 0), _NUMPY[self._wide])
+        self._start_of_held = 0  # its first sample's place in the stream
         self._number = 0  # of the next decision
-        self._nothing = self._decide(self._filtered)
+        self._nothing = self._decide(-1)
 
     def _samples_for(self, number: Array) -> Array:
         """Samples that must have come before decisions can be made, ``[m]``."""
         samples: Array = number * self.settings.hop_samples + self._first
-        return samples.clip(min=self._filter.frame)  # which may be longer than a bin
+        return samples.clip(min=self._frame)  # which may be longer than a bin
 
-    def _read(self, samples: ArrayLike | Tensor) -> Tensor:
+    def _read(self, samples: ArrayLike | Tensor) -> Array:
         """Samples ``[n, C]`` as a copy ``[C, n]`` in the stream's dtype."""
-        num_channels = len(self.detector.pool.hand)
         if not isinstance(samples, Tensor):
             array = np.asarray(samples)
             self._check(array.shape, array.dtype, array.dtype.kind == "f")
             with np.errstate(over="ignore"):  # beyond float32 is Inf, which is flagged
-                return torch.from_numpy(np.array(array.T, _NUMPY[self.dtype], order="C"))
+                return np.array(array.T, _NUMPY[self.dtype], order="C")
         self._check(tuple(samples.shape), samples.dtype, samples.is_floating_point())
-        return torch.empty(num_channels, len(samples), dtype=self.dtype).copy_(samples.detach().T)
+        return samples.detach().T.to("cpu", self.dtype, copy=True).numpy()
 
     def _check(self, shape: tuple[int, ...], dtype: object, is_floating: bool) -> None:
         names = self.detector.pool.hand.names
@@ -217,57 +219,153 @@ class StreamingDetector:
         self.num_gaps += 1
         return decisions
 
-    def _fill(self, x: Tensor, missing: Array, times_s: Array) -> Decisions:
+    def _fill(self, x: Array, missing: Array, times_s: Array) -> Decisions:
         """Take samples, the first of which have times, with NaN for those missing before each."""
         places = np.arange(x.shape[-1])
         places[: len(missing)] += missing.cumsum()
         places[len(missing) :] += missing.sum()
         if missing.any():
-            full = x.new_full((len(x), int(places[-1]) + 1), torch.nan)
-            full[:, torch.from_numpy(places)] = x
+            full = np.full((len(x), int(places[-1]) + 1), np.nan, x.dtype)
+            full[:, places] = x
             x = full
         return self._take(x, places[: len(missing)], times_s)
 
-    def _take(self, x: Tensor, places: Array, times_s: Array) -> Decisions:
+    def _take(self, x: Array, places: Array, times_s: Array) -> Decisions:
         """Filter and decide, once the next decision has all its samples."""
         self._clock.take(x.shape[-1], places, times_s)
-        self._pending.append(x)
-        if self._clock.num_samples < self._due:
-            return self._nothing
-        samples, self._pending = torch.cat(self._pending, dim=-1), []
-        return self._decide(self._filter.push(samples))
+        self._append(x)
+        num_samples, due = self._clock.num_samples, int(self._samples_for(np.array(self._number)))
+        return self._nothing if num_samples < due else self._decide(num_samples - self._first)
 
-    def _decide(self, filtered: Tensor) -> Decisions:
-        """The decisions on bins that are full now."""
-        self._filtered = torch.cat([self._filtered, filtered], dim=-1)
-        self._drop()
-        hop = self.settings.hop_samples
+    def _append(self, x: Array) -> None:
+        self._held = np.concatenate([self._held, x], -1, dtype=self._held.dtype)
+
+    def _drop(self) -> None:
+        """Forget what is before the next bin and is no longer needed."""
+        kept = max(self.detector.context_before, self._frame)
+        start = self._number * self.settings.hop_samples - kept
+        surplus = min(start - self._start_of_held, self._held.shape[-1])
+        if surplus > 0:
+            self._held = self._held[:, surplus:].copy()  # a view would keep all of it
+            self._start_of_held += surplus
+
+    def _decide(self, last_start: int) -> Decisions:
+        """The decisions on bins that begin no later than this sample."""
+        detector, hop = self.detector, self.settings.hop_samples
+        before, length = detector.context_before, detector.pool.bin_samples
+        count = last_start // hop + 1 - self._number
+        if count <= 0:
+            none = torch.empty(0, dtype=self.dtype)
+            return self._timed(self._decider.decide(none, none.bool()))
         with torch.no_grad():
-            masked = without(self._filtered, self._masked_channels, self.detector.pool.hand.names)
-            scores = score_filtered(self.detector, masked, hop, self.dtype)
-            tells = is_usable(scores.score, scores.is_missing, self.detector.needed_index)
-            decisions = self._decider.decide(scores.score, scores.is_valid, tells, scores.variance)
-        self._number += len(decisions.number)
-        self._due = int(self._samples_for(np.array(self._number)))
+            if self._number == 0 and self._start_of_held == 0:
+                first = torch.from_numpy(self._held)
+                past = past_of(first, detector.channel_filter, detector.needed_index.tolist())
+                self._held = np.concatenate([past.numpy(), self._held], -1)
+                self._start_of_held = -before
+            start = self._number * hop - before - self._start_of_held
+            whole = before + length + detector.context_after
+            stop = start + (count - 1) * hop + whole
+            held = self._held[:, start:stop]
+            padded = np.zeros(
+                (len(held), stop - start), held.dtype
+            )  # where no channel in use looks
+            padded[:, : held.shape[-1]] = held
+            windows = torch.from_numpy(padded).unfold(-1, whole, hop).transpose(0, 1)
+            scores = detector.predict_raw(
+                windows, given=self.dtype, masked_channels=self._masked_channels or None
+            )
+            is_whole = not scores.is_missing.numpy().any()
+            tells = (
+                scores.score.isfinite()
+                if is_whole
+                else is_usable(scores.score, scores.is_missing, detector.needed_index)
+            )
+            variance = None if is_whole else scores.variance
+            decisions = self._decider.decide(scores.score, scores.is_valid, tells, variance)
+        self._number += count
         self._drop()
         return self._timed(decisions)
 
-    def _drop(self) -> None:
-        """Let go of filtered samples before the next bin."""
-        hop = self.settings.hop_samples
-        surplus = min(self._number * hop - self._dropped, self._filtered.shape[-1])
-        if surplus > 0:
-            self._filtered = self._filtered[:, surplus:].clone()  # a view would keep all of it
-            self._dropped += surplus
-
     def _timed(self, decisions: Decisions) -> Decisions:
         """The same by the times of the samples, and no earlier than the first frame."""
-        if not self._clock.is_timed and self._filter.frame <= self._first:
+        if not self._clock.is_timed and self._frame <= self._first:
             return decisions
         samples = self._samples_for(decisions.number.numpy())
         available_s = torch.from_numpy(self._clock.end_s(samples))
         onset_s = available_s - (decisions.available_s - decisions.onset_s)
         return decisions._replace(available_s=available_s, onset_s=onset_s)
+
+
+class SampleClock:
+    """When the samples of a stream were taken, and how many never came.
+
+    Times are those of the last sample that had one and the samples counted since: nothing adds up,
+    so a clock that runs a little faster or slower than the nominal rate is followed.
+
+    Args:
+        sample_rate_hz: nominal.
+
+    Attributes:
+        num_samples: that came or were missing since the start.
+        is_timed: whether any had a time; if none, the first is at 0.
+    """
+
+    def __init__(self, sample_rate_hz: float) -> None:
+        self.sample_rate_hz = sample_rate_hz
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        self.num_samples = 0  # Python's integers: exact for ever
+        self.is_timed = False
+        self._places, self._times_s = np.zeros(1, np.int64), np.zeros(1)  # of those with a time
+
+    def missing(self, times_s: Array) -> Array:
+        """How many samples are missing before each of those that come next.
+
+        Shape:
+            - times_s: ``[k]``, float64, of the first ``k``, good to a quarter of a sample
+            - output: ``[k]``, whole float64; the first is 0 if no sample had a time before
+
+        Raises:
+            ValueError: if a time is earlier than the last sample's end.
+        """
+        ahead = np.diff(times_s, prepend=self._times_s[-1]) * self.sample_rate_hz
+        since = self.num_samples - self._places[-1]
+        ahead -= np.concatenate([[since if self.is_timed else ahead[0]], np.ones(len(ahead) - 1)])
+        missing: Array = np.rint(ahead) + 0.0
+        if (missing < 0).any():
+            first = int(np.argmax(missing < 0))
+            raise ValueError(
+                f"time_s goes back: sample {first} of these is at {times_s[first]:.6f} s, "
+                f"{-missing[first]:g} samples before its turn; leave out what came twice"
+            )
+        return missing
+
+    def take(self, num: int, places: Array, times_s: Array) -> None:
+        """Count samples, some of which have times.
+
+        Args:
+            num: how many.
+            places: which of them have times, ``[k]``, rising.
+            times_s: those, ``[k]``.
+        """
+        if len(places) or len(self._places) > 1:
+            self._places = np.concatenate([self._places[-1:], self.num_samples + places])
+            self._times_s = np.concatenate([self._times_s[-1:], times_s])
+        self.num_samples += num
+        self.is_timed |= len(places) > 0
+
+    def end_s(self, num_samples: Array) -> Array:
+        """When so many samples had come: the end of the last of them, ``[m]``, float64.
+
+        It must be one of the samples that the last ``take`` counted, or a later one.
+        """
+        last = np.searchsorted(self._places, num_samples - 1, side="right") - 1
+        since = num_samples - self._places[last]
+        end_s: Array = self._times_s[last] + since / self.sample_rate_hz
+        return end_s
 
 
 def _times(time_s: ArrayLike | Tensor | None, num: int) -> Array:

@@ -8,19 +8,19 @@ a stream will use, and recordings are what the bootstrap draws.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.special import gammainccinv, gammaincinv
 from torch import Tensor
 
-from tactslip_torch.onset.rules import Rule, count_alarms
+from tactslip_torch.onset.rules import Rule
 
 _NUM_RESAMPLES = 2000
-_WORK = 2**26  # threshold times decision, at most, in one stage of the search
-_FEWEST = 32  # thresholds tried of a piece, whatever the work
+_TRIED_ONE_BY_ONE = 500  # thresholds, the highest
 
 
 @dataclass(frozen=True)
@@ -121,27 +121,21 @@ def alarm_rate(
     ends = [poisson_interval(total, level)]
     if total and len(alarms) > 1:
         surplus = (alarms - watched * (total / length)).square().sum() / total
-        size = max(1.0, float(surplus) * len(alarms) / (len(alarms) - 1))  # alarms a cluster
-        low, high = poisson_interval(total / size, level)
-        ends.append((low * size, high * size))
+        cluster = max(1.0, float(surplus) * len(alarms) / (len(alarms) - 1))  # alarms in one
+        low, high = poisson_interval(total / cluster, level)
+        ends.append((low * cluster, high * cluster))
         tails = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
-        rates = torch.cat(list(_resampled(alarms, watched, seed)))
-        low, high = (rates.quantile(tails) * length).tolist()
+        generator, rates = torch.Generator().manual_seed(seed), []
+        has_time = watched > 0
+        size = int(has_time.sum())
+        for first in range(0, _NUM_RESAMPLES, rows := max(1, 2**20 // size)):
+            shape = (min(rows, _NUM_RESAMPLES - first), size)
+            drawn = has_time.nonzero()[:, 0][torch.randint(size, shape, generator=generator)]
+            rates.append(alarms[drawn].sum(-1) / watched[drawn].sum(-1))
+        low, high = (torch.cat(rates).quantile(tails) * length).tolist()
         ends.append((low, high))
     low, high = min(end[0] for end in ends) / length, max(end[1] for end in ends) / length
     return AlarmRate(total, length, total / length, low, high, level)
-
-
-def _resampled(alarms: Tensor, watched: Tensor, seed: int) -> Iterator[Tensor]:
-    """Rates of recordings drawn with replacement, as many as there are; those watched at all."""
-    alarms, watched = alarms[watched > 0], watched[watched > 0]
-    generator = torch.Generator().manual_seed(seed)
-    size = len(alarms)
-    rows = max(1, 2**20 // size)
-    for first in range(0, _NUM_RESAMPLES, rows):
-        shape = (min(rows, _NUM_RESAMPLES - first), size)
-        drawn = torch.randint(size, shape, generator=generator)
-        yield alarms[drawn].sum(-1) / watched[drawn].sum(-1)
 
 
 def alarm_counts(
@@ -160,21 +154,32 @@ def alarm_counts(
         ValueError: if there is no decision, a statistic is not a row of finite numbers, or
             rearm or refractory is negative.
     """
-    flat, recording = _joined(statistics)
-    counts = []
-    for threshold in torch.as_tensor(thresholds, dtype=flat.dtype, device=flat.device):
-        count = torch.zeros(len(statistics), dtype=torch.int64, device=flat.device)
-        for piece in _segments(flat, recording, threshold, rearm, refractory):
-            alarms = count_alarms(
-                piece.values,
-                threshold,
-                rearm=rearm,
-                refractory=refractory,
-                skipped=piece.skipped,
-            )
-            count.index_add_(0, piece.recording, alarms)
-        counts.append(count)
-    return torch.stack(counts) if counts else recording.new_zeros(0, len(statistics))
+    if rearm < 0 or refractory < 0:
+        raise ValueError(f"rearm and refractory must not be negative, got {rearm} and {refractory}")
+    _check(statistics)
+    levels = torch.as_tensor(thresholds, dtype=statistics[0].dtype).tolist()
+    rows = [statistic.detach().cpu().numpy() for statistic in statistics]
+    counts = [
+        [_count_alarms(np.flatnonzero(row >= level), rearm, refractory) for row in rows]
+        for level in levels
+    ]
+    return torch.tensor(counts, dtype=torch.int64).view(len(levels), len(rows))
+
+
+def _count_alarms(above: NDArray[np.int64], rearm: int, refractory: int) -> int:
+    """Alarms of a latch, from the places ``[A]`` of the decisions at or above its threshold."""
+    # the latch is armed again at the first of each run
+    first = np.flatnonzero(np.diff(above, prepend=above[:1] - rearm - 2) > max(rearm, 1))
+    if refractory <= max(rearm, 1) + 1 or not len(above):
+        return len(first)
+    count = place = 0
+    while place < len(above):
+        count += 1
+        later = np.searchsorted(first, place, side="right")
+        if later == len(first):
+            break
+        place = max(first[later], np.searchsorted(above, above[place] + refractory))
+    return count
 
 
 def choose_threshold(
@@ -193,10 +198,11 @@ def choose_threshold(
 
     It and every higher one tried raise at most ``floor(target * hours)`` alarms; fewer need not
     follow from higher, as a lower threshold may join two alarms into one. Tried are the values at
-    which the count can change: those of the statistic. Of the thresholds between two of them, which
-    raise the same alarms, the upper one is taken: then fresh recordings have about as many in the
-    mean, and not one more. Where none is allowed it is the next number above all. Only where
-    recordings are so busy that the work would grow without bound, evenly spaced ranks are tried.
+    which the count can change: those of the statistic, from the highest, one by one; beyond the
+    highest 500 in steps of a five hundredth of them, and the last step by halves. Of the thresholds
+    between two values, which raise the same alarms, the upper one is taken: then fresh recordings
+    have about as many in the mean, and not one more. Where none is allowed it is the next number
+    above all, at least the least normal float32 above 0.
 
     With too few hours for the target (less than one alarm allowed) none is allowed; ``rate.high``
     tells what that proves.
@@ -218,123 +224,41 @@ def choose_threshold(
     """
     if not 0 < false_alarms_per_hour < math.inf:
         raise ValueError(f"false_alarms_per_hour must be positive, got {false_alarms_per_hour}")
-    hours = _hours(statistics, hop_s)
-    flat, recording = _joined(statistics)
+    if not 0 < hop_s < math.inf:
+        raise ValueError(f"hop_s must be positive, got {hop_s}")
+    _check(statistics)
+    hours = torch.tensor([s.numel() * hop_s / 3600 for s in statistics], dtype=torch.float64)
     allowed = math.floor(false_alarms_per_hour * float(hours.sum()) * (1 + 1e-9))
-    highest = float(torch.tensor(min(rule.ceiling, ceiling), dtype=flat.dtype))
-    for value in _candidates(flat, recording, rearm, refractory, allowed):
-        value = min(value, highest)
-        counts = alarm_counts(statistics, [value], rearm=rearm, refractory=refractory)[0]
-        reached = int(counts.sum()) <= allowed
-        if reached or value == highest:
+    flat = torch.cat([statistic.detach() for statistic in statistics]).cpu().numpy()
+    sizes = [len(statistic) for statistic in statistics]
+    apart = np.repeat(np.arange(len(sizes)), sizes) * (rearm + refractory + 2)
+    places = np.arange(len(flat)) + apart  # so far apart that no latch remembers
+    ranked = np.sort(flat)[::-1]
+    value, num = float(np.nextafter(ranked[0], np.inf, dtype=flat.dtype)), 0
+    if 0 < value < (least := float(np.finfo(np.float32).tiny)):
+        value = least  # denormal numbers have no digits to tell a threshold from its ceiling
+    most = len(flat)  # decisions to go down by at once
+    while num < len(flat):
+        step = min(num // _TRIED_ONE_BY_ONE, most)
+        below = ranked[min(num + step, len(flat) - 1)]
+        is_reached = flat >= below
+        if _count_alarms(places[is_reached], rearm, refractory) <= allowed:
+            value, num = float(below), int(is_reached.sum())
+        elif step == 0:
             break
+        else:
+            most = step // 2
+    value = min(value, float(torch.tensor(min(rule.ceiling, ceiling), dtype=statistics[0].dtype)))
+    counts = alarm_counts(statistics, [value], rearm=rearm, refractory=refractory)[0]
     rate = alarm_rate(counts, hours, level, seed)
-    return Threshold(value, false_alarms_per_hour, rate, reached)
+    return Threshold(value, false_alarms_per_hour, rate, int(counts.sum()) <= allowed)
 
 
-def _candidates(
-    flat: Tensor, recording: Tensor, rearm: int, refractory: int, allowed: int
-) -> Iterator[float]:
-    """The threshold sought; should rounding or untried ones have misled, higher and higher ones."""
-    num = max(1024, 8 * (allowed + 1))
-    while True:
-        floor = flat.new_tensor(-math.inf)
-        if num < len(flat):
-            floor = flat.kthvalue(len(flat) - num + 1).values
-        tried, alarms = _curve(flat, recording, floor, rearm, refractory)  # downwards
-        too_many = (alarms > allowed).nonzero()
-        if len(too_many) or num >= len(flat):
-            break
-        num *= 2
-    num_fit = int(too_many[0]) if len(too_many) else len(tried)
-    step = 1
-    while num_fit > 0:
-        yield float(tried[num_fit - 1])
-        num_fit, step = num_fit - step, 2 * step
-    yield float(torch.nextafter(flat.max(), flat.new_tensor(math.inf)))
-
-
-def _curve(
-    flat: Tensor, recording: Tensor, floor: Tensor, rearm: int, refractory: int
-) -> tuple[Tensor, Tensor]:
-    """Thresholds at which the count of alarms changes, downwards, and the count at each.
-
-    All thresholds that are not below ``floor``. The total changes with one piece at a time, and
-    that piece at its own values alone: so each is counted at these, and changes add up.
-    """
-    values, changes = [], []
-    pieces = list(_segments(flat, recording, floor, rearm, refractory))
-    work = sum(piece.values.numel() for piece in pieces)
-    for piece in pieces:
-        tried = piece.values.sort(dim=-1, descending=True).values
-        tried = tried[:, :: math.ceil(tried.shape[-1] / max(_FEWEST, _WORK // work))]
-        alarms = count_alarms(
-            piece.values[:, None, :],
-            tried,
-            rearm=rearm,
-            refractory=refractory,
-            skipped=piece.skipped[:, None, :],
-        )
-        is_meant = (tried >= floor) & tried.isfinite()  # a row's first ones
-        values.append(tried[is_meant])
-        changes.append(alarms.diff(dim=-1, prepend=torch.zeros_like(alarms[:, :1]))[is_meant])
-    tried, order = torch.cat(values).sort(descending=True)
-    alarms = torch.cat(changes)[order].cumsum(0)
-    is_last = torch.ones_like(tried, dtype=torch.bool)
-    is_last[:-1] = tried[1:] < tried[:-1]
-    is_last &= tried <= flat.max()
-    return tried[is_last], alarms[is_last]
-
-
-class _Segments(NamedTuple):
-    """Parts of recordings, of about one length, that no latch's memory links to the rest.
-
-    Attributes:
-        values: the decisions at or above a level, ``[S, E]``; where there are fewer, -inf behind.
-        skipped: how many lower ones were left out before each, ``[S, E]``.
-        recording: which recording each is of, ``[S]``.
-    """
-
-    values: Tensor
-    skipped: Tensor
-    recording: Tensor
-
-
-def _segments(
-    flat: Tensor, recording: Tensor, floor: Tensor, rearm: int, refractory: int
-) -> Iterator[_Segments]:
-    """What any threshold of at least ``floor`` has to look at, by length.
-
-    Recordings are cut wherever so many decisions in a row lie below that a latch is as at its
-    start again. ``flat`` and ``recording`` are those of ``_joined``.
-    """
-    where = (flat >= floor).nonzero().squeeze(-1)
-    if not len(where):
-        return
-    gaps = where.diff() - 1
-    owner = recording[where]
-    is_first = torch.ones_like(where, dtype=torch.bool)
-    is_first[1:] = (gaps >= max(rearm, 1, refractory - 1)) | (owner.diff() != 0)
-    skipped = torch.zeros_like(where)
-    skipped[1:] = gaps
-    skipped[is_first] = 0
-    first = is_first.nonzero().squeeze(-1)
-    sizes = torch.cat([first, first.new_tensor([len(where)])]).diff()
-    power = (sizes - 1).double().add(1).log2().ceil().long()
-    for exponent in power.unique().tolist():
-        begin, size = first[power == exponent], sizes[power == exponent]
-        steps = torch.arange(int(size.max()), device=flat.device)
-        is_real = steps < size[:, None]
-        index = (begin[:, None] + steps).clamp(max=len(where) - 1)
-        values = flat[where[index]].masked_fill(~is_real, -math.inf)
-        yield _Segments(values, skipped[index].masked_fill(~is_real, 0), owner[begin])
-
-
-def _joined(statistics: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """All decisions of recordings ``[T_r]`` in one row, and the number of each one's recording.
+def _check(statistics: Sequence[Tensor]) -> None:
+    """Refuse what are no statistics of recordings.
 
     Raises:
-        ValueError: if there is none, or a statistic is not a row of finite numbers.
+        ValueError: if there is no decision, or a statistic is not a row of finite numbers.
     """
     if not sum(statistic.numel() for statistic in statistics):
         raise ValueError("no decision to count alarms in; give at least one recording without slip")
@@ -344,12 +268,3 @@ def _joined(statistics: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
                 f"the statistic of recording {number} must be a row of finite numbers, "
                 f"got shape {tuple(statistic.shape)}; invalid decisions enter a rule as NEUTRAL"
             )
-    flat = torch.cat([statistic.detach() for statistic in statistics])
-    sizes = torch.tensor([len(statistic) for statistic in statistics], device=flat.device)
-    return flat, torch.arange(len(sizes), device=flat.device).repeat_interleave(sizes)
-
-
-def _hours(statistics: Sequence[Tensor], hop_s: float) -> Tensor:
-    if not 0 < hop_s < math.inf:
-        raise ValueError(f"hop_s must be positive, got {hop_s}")
-    return torch.tensor([s.numel() * hop_s / 3600 for s in statistics], dtype=torch.float64)

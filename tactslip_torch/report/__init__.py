@@ -1,7 +1,6 @@
 """Reports for people: scores per bin, tables, figures, and the paper's numbers beside."""
 
 from tactslip_torch.report.metrics import bin_metrics, confusion_matrix, split_metrics
-from tactslip_torch.report.pipeline import pipeline_figure
 from tactslip_torch.report.published import PublishedSplit
 from tactslip_torch.report.results import (
     confusion_figure,
@@ -19,7 +18,6 @@ __all__ = [
     "confusion_figure",
     "confusion_matrix",
     "materials_table",
-    "pipeline_figure",
     "selected_features_figure",
     "selected_table",
     "solve_line",

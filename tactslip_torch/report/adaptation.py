@@ -28,15 +28,19 @@ def adaptation_table(content: Mapping[str, Any]) -> str:
     Args:
         content: of ``adaptation.json``.
     """
-    rows = [["balanced accuracy %", "before", "after", "points"]]
+    rows = []
     for name, before, after in _scores(content):
-        points = "-" if after is None else f"{100 * (after - before):+.2f}"
-        rows.append([name, percent(before), percent(after), points])
+        row: dict[str, object] = {
+            "balanced accuracy %": name,
+            "before": percent(before),
+            "after": percent(after),
+        }
+        rows.append(row | {"points": None if after is None else f"{100 * (after - before):+.2f}"})
     blocks = [marked(content["simulated"], _action(content)), table(rows)]
     if len(content["tried"]) > 1:
-        tried = [[f"{factor:g}", percent(loss)] for factor, loss in content["tried"]]
-        header = ["weight, in average old materials", "old lose, points"]
-        blocks.append(table([header, *tried]))
+        names = ("weight, in average old materials", "old lose, points")
+        tried = [(f"{factor:g}", percent(loss)) for factor, loss in content["tried"]]
+        blocks.append(table([dict(zip(names, row, strict=True)) for row in tried]))
     seconds = ", ".join(f"{name} {value:.1f} s" for name, value in content["seconds"].items())
     return "\n\n".join([*blocks, f"took {seconds}"])
 
@@ -45,13 +49,12 @@ def journal_table(steps: Sequence[Mapping[str, Any]]) -> str:
     """Every step of a detector since it was trained, first to last."""
     if not steps:
         return "no step since training"
-    rows = [["step", "when (UTC)", "action", "material", "recordings", "weight", "slip-free"]]
-    rows[0].append("forced")
+    rows = []
     for number, step in enumerate(steps, 1):
-        weight = "-" if step["weight"] is None else f"{step['weight']:.3g}"
-        row = [str(number), step["when"], step["action"], ", ".join(step["materials"])]
-        row += [str(len(step["recordings"])), weight]
-        rows.append([*row, *("yes" if step[name] else "no" for name in ("slip_free", "forced"))])
+        row = {"step": number, "when (UTC)": step["when"], "action": step["action"]}
+        row |= {"material": ", ".join(step["materials"]), "recordings": len(step["recordings"])}
+        row |= {"weight": None if step["weight"] is None else f"{step['weight']:.3g}"}
+        rows.append(row | {"slip-free": bool(step["slip_free"]), "forced": bool(step["forced"])})
     return table(rows, num_left=4)
 
 

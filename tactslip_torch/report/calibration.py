@@ -27,12 +27,14 @@ def calibration_table(content: Mapping[str, Any]) -> str:
         content: of ``calibration.json``.
     """
     target = content["target"]
-    header = ["d", *(name.rsplit("_", 1)[0] for name in content["values"]), "accuracy %"]
-    rows = [[*header, *(f"seed {seed}" for seed in content["seeds"]), "signal checks"]]
+    rows = []
     for point in _by_difficulty(content):
-        row = [f"{point['difficulty']:+.2f}", *map(_value, point["parameters"].values())]
-        row += map(percent, [point["accuracy"], *point["accuracy_by_seed"]])
-        rows.append([*row, "hold" if point["holds"] else f"fail: {_failing(point)}"])
+        row = {"d": f"{point['difficulty']:+.2f}"}
+        row |= {name.rsplit("_", 1)[0]: _value(v) for name, v in point["parameters"].items()}
+        row |= {"accuracy %": percent(point["accuracy"])}
+        by_seed = zip(content["seeds"], point["accuracy_by_seed"], strict=True)
+        row |= {f"seed {seed}": percent(accuracy) for seed, accuracy in by_seed}
+        rows.append(row | {"signal checks": _checks(point)})
     blocks = [
         marked(
             True,
@@ -43,23 +45,22 @@ def calibration_table(content: Mapping[str, Any]) -> str:
         table(rows),
     ]
     if content["facts"]:
-        checks = [["signal check", "range", "values at the point kept"]]
+        checks = []
         for check in content["facts"]:
-            values = " ".join(f"{value:.3g}" for value in check["values"].values())
-            high = check["high"]
-            low = f"{check['low']:g}"
+            low, high = f"{check['low']:g}", check["high"]
             span = f"above {low}" if high is None else f"{low} to {high:g}"
-            checks.append([check["says"], span, values])
+            values = " ".join(f"{value:.3g}" for value in check["values"].values())
+            row = {"signal check": check["says"], "range": span}
+            checks.append(row | {"values at the point kept": values})
         blocks.append(table(checks, num_left=3))
     return "\n\n".join([*blocks, f"kept: {_kept(content)}\n{content['verdict']}"])
 
 
 def point_line(point: Mapping[str, Any]) -> str:
     """A point in one line, as soon as it is tried."""
-    checks = "hold" if point["holds"] else f"fail: {_failing(point)}"
     by_seed = " ".join(map(percent, point["accuracy_by_seed"]))
     accuracy = percent(point["accuracy"])
-    return f"d {point['difficulty']:+.2f}: {accuracy} % ({by_seed}), signal checks {checks}"
+    return f"d {point['difficulty']:+.2f}: {accuracy} % ({by_seed}), signal checks {_checks(point)}"
 
 
 def calibration_figure(content: Mapping[str, Any], path: str | Path) -> None:
@@ -105,8 +106,9 @@ def _by_difficulty(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return sorted(content["points"], key=lambda point: float(point["difficulty"]))
 
 
-def _failing(point: Mapping[str, Any]) -> str:
-    return ", ".join(check["name"] for check in point["facts"] if not check["holds"])
+def _checks(point: Mapping[str, Any]) -> str:
+    failing = ", ".join(check["name"] for check in point["facts"] if not check["holds"])
+    return "hold" if point["holds"] else f"fail: {failing}"
 
 
 def _kept(content: Mapping[str, Any]) -> str:

@@ -37,34 +37,37 @@ def crossval_table(content: Mapping[str, Any]) -> str:
     return marked(content["simulated"], line, "", "\n\n".join(tables))
 
 
-def split_rows(content: Mapping[str, Any]) -> list[list[str]]:
-    """A header and one row per recipe and role: the distribution of the scores of all splits."""
-    rows = [["recipe", "evaluated on", "mean", "sd", "least", "5 %", "median", "most"]]
-    rows[0] += ["the paper's four", "splits"]
+def split_rows(content: Mapping[str, Any]) -> list[dict[str, object]]:
+    """One row per recipe and role: the distribution of the scores of all splits."""
+    rows: list[dict[str, object]] = []
     for name, splits in content["splits"].items():
         for role in ("test", "unseen"):
             scores = sorted(split[role] for split in splits if split[role] is not None)
-            if not scores:
-                rows.append([name, role, *["-"] * 7, "0"])
-                continue
-            numbers = [mean(scores), _spread(scores), scores[0], scores[int(0.05 * len(scores))]]
-            numbers += [median(scores), scores[-1]]
-            numbers.append(next((split[role] for split in splits if _is_papers(split)), None))
-            rows.append([name, role, *map(percent, numbers), str(len(scores))])
+            known = scores or [None]
+            papers = next((split[role] for split in splits if _is_papers(split)), None)
+            numbers = {
+                "mean": mean(scores) if scores else None,
+                "sd": _spread(scores) if scores else None,
+                "least": known[0],
+                "5 %": known[int(0.05 * len(known))],
+                "median": median(scores) if scores else None,
+                "most": known[-1],
+                "the paper's four": papers,
+            }
+            row = {title: percent(value) for title, value in numbers.items()}
+            rows.append({"recipe": name, "evaluated on": role, **row, "splits": len(scores)})
     return rows
 
 
-def material_rows(content: Mapping[str, Any]) -> list[list[str]]:
-    """A header and one row per material: its scores in the splits where it is unseen."""
-    header = ["unseen material"]
-    for name in content["splits"]:
-        header += [f"{name} mean", "sd"]
-    rows = [header]
+def material_rows(content: Mapping[str, Any]) -> list[dict[str, object]]:
+    """One row per material: its scores in the splits where it is unseen."""
+    rows: list[dict[str, object]] = []
     for material in content["materials"]:
-        row = [material]
-        for splits in content["splits"].values():
+        row: dict[str, object] = {"unseen material": material}
+        for name, splits in content["splits"].items():
             scores = material_scores(splits, material)
-            row += [percent(mean(scores) if scores else None), percent(_spread(scores))]
+            row[f"{name} mean"] = percent(mean(scores) if scores else None)
+            row[f"{name} sd"] = percent(_spread(scores))
         rows.append(row)
     return rows
 

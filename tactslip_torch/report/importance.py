@@ -1,8 +1,8 @@
 """Sensor importance: tables, CSV and a figure of ``sensors.json``.
 
-The figure draws a hand of any layout: fingers stand side by side on a palm, tips up; a finger
-called thumb leans out from its side. In each segment slowly adapting channels are squares and fast
-ones discs, in the colour of their kind, the deeper the larger the number.
+The figure draws a hand of any layout: fingers stand side by side, tips up, the thumb last and
+lower. In each segment slowly adapting channels are squares and fast ones discs, in the colour of
+their kind, the deeper the larger the number.
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ import csv
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap, to_rgb
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, FancyBboxPatch, Patch
-from matplotlib.transforms import Affine2D, Transform
+from matplotlib.patches import FancyBboxPatch
 
 from tactslip_torch.report.style import (
     GREEN,
@@ -79,21 +78,17 @@ def lines_about(content: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def unit_rows(content: Mapping[str, Any], unit: str) -> list[list[str]]:
-    """A header, and a row for each channel, finger or kind."""
-    roles = list(content["num_bins"])
-    rows = [[unit, "in use", "moves score"]]
-    rows[0] += [f"{what} {ROLE_WORDS[role]}" for what in ("lost", "reselected") for role in roles]
-    rows[0].append("alone, held-out %")
-    for row in content["units"]:
-        if row["unit"] == unit:
-            by_class = row["gradient"] or {}
-            moved = " / ".join(f"{value:.2f}" for value in by_class.values()) or "-"
-            cells = [row["name"], str(row["features_in_use"]), moved]
-            cells += [
-                _interval(row[key][role]) for key in ("lost", "lost_reselected") for role in roles
-            ]
-            rows.append([*cells, percent(row["alone"]["held_out"])])
+def unit_rows(content: Mapping[str, Any], unit: str) -> list[dict[str, object]]:
+    """A row for each channel, finger or kind."""
+    rows: list[dict[str, object]] = []
+    for row in (row for row in content["units"] if row["unit"] == unit):
+        moved = " / ".join(f"{value:.2f}" for value in (row["gradient"] or {}).values())
+        cells: dict[str, object] = {unit: row["name"], "in use": row["features_in_use"]}
+        cells["moves score"] = moved or "-"
+        for key, title in (("lost", "lost"), ("lost_reselected", "reselected")):
+            for role, lost in row[key].items():
+                cells[f"{title} {ROLE_WORDS[role]}"] = _interval(lost)
+        rows.append(cells | {"alone, held-out %": percent(row["alone"]["held_out"])})
     return rows
 
 
@@ -113,15 +108,17 @@ def best_table(content: Mapping[str, Any]) -> str:
     return f"{BEST_LINE}\n\n" + "\n\n".join(tables)
 
 
-def best_rows(content: Mapping[str, Any], unit: str) -> list[list[str]]:
-    """A header, and a row for each step of the best few."""
-    roles = list(content["num_bins"])
-    rows = [[f"{unit}s", "joins", "features", *(f"{ROLE_WORDS[role]} %" for role in roles)]]
-    rows[0] += [f"lost {ROLE_WORDS[role]}" for role in roles]
+def best_rows(content: Mapping[str, Any], unit: str) -> list[dict[str, object]]:
+    """A row for each step of the best few."""
+    rows: list[dict[str, object]] = []
     for number, step in enumerate(content["best"][unit], 1):
-        scores = [percent(step["balanced_accuracy"][role]) for role in roles]
-        cells = [str(number), step["joins"], str(step["num_features"])]
-        rows.append([*cells, *scores, *(_interval(step["lost"][role]) for role in roles)])
+        cells: dict[str, object] = {f"{unit}s": number, "joins": step["joins"]}
+        cells["features"] = step["num_features"]
+        for role, score in step["balanced_accuracy"].items():
+            cells[f"{ROLE_WORDS[role]} %"] = percent(score)
+        for role, lost in step["lost"].items():
+            cells[f"lost {ROLE_WORDS[role]}"] = _interval(lost)
+        rows.append(cells)
     return rows
 
 
@@ -166,26 +163,23 @@ def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
         content: of ``sensors.json``.
         path: the PNG to write, replaced as a whole if it exists.
     """
-    figure = Figure(figsize=(13.6, 11.4))
+    figure = Figure(figsize=(13.6, 11.4), layout="constrained")
     kind = " (SIMULATED hand and recordings)" if content["simulated"] else ""
-    figure.suptitle(f"Which sensors matter{kind}", fontsize=13, x=0.03, ha="left", y=0.98)
-    grid = figure.add_gridspec(
-        2, 3, width_ratios=[1, 1, 0.62], height_ratios=[1.45, 1],
-        left=0.05, right=0.985, top=0.925, bottom=0.09, wspace=0.1, hspace=0.24,
-    )  # fmt: skip
-    channels = {row["name"]: row for row in content["units"] if row["unit"] == "channel"}
+    figure.suptitle(f"Which sensors matter{kind}", fontsize=13)
+    grid = figure.add_gridspec(2, 3, width_ratios=[1, 1, 0.62], height_ratios=[1.45, 1])
+    units = {row["name"]: row for row in content["units"] if row["unit"] == "channel"}
     moved = {}
-    for name, row in channels.items():  # root mean square over both classes, which count alike
+    for name, row in units.items():  # root mean square over both classes, which count alike
         moved[name] = math.hypot(row["gradient"]["non_slip"], row["gradient"]["slip"]) / 2**0.5
-    alone = {name: 100 * row["alone"]["held_out"] for name, row in channels.items()}
-    moves = _Hand(content["channels"], moved, (0.0, max(moved.values()) or 1.0), "{:.1f}")
-    tells = _Hand(content["channels"], alone, (50.0, max(*alone.values(), 51.0)), "{:.0f}")
+    alone = {name: 100 * row["alone"]["held_out"] for name, row in units.items()}
     axes = figure.add_subplot(grid[0, 0])
     axes.set_title("(a) the trained detector moves with it", loc="left", fontsize=11)
-    moves.draw(axes, "gradient times own spread, sd of the score; 0: not in use")
+    unit = "gradient times own spread, sd of the score; 0: not in use"
+    _hand(axes, content["channels"], moved, (0.0, max(moved.values()) or 1.0), "{:.1f}", unit)
     axes = figure.add_subplot(grid[0, 1])
     axes.set_title("(b) with it alone", loc="left", fontsize=11)
-    tells.draw(axes, "balanced accuracy with this channel alone, held-out, %")
+    unit = "balanced accuracy with this channel alone, held-out, %"
+    _hand(axes, content["channels"], alone, (50.0, max(*alone.values(), 51.0)), "{:.0f}", unit)
     _absences(figure.add_subplot(grid[0, 2]), content)
     _best_few(figure.add_subplot(grid[1, :]), content)
     save(figure, path)
@@ -251,146 +245,84 @@ def _best_few(axes: Axes, content: Mapping[str, Any]) -> None:
 
 
 # The hand ----------------------------------------------------------------------------------------
-_SKIN, _EDGE, _PALE = "#F6F1EA", "#C9BEAF", "#FFFFFF"
 _FROM_TIP = ("tip", "distal", "intermediate", "middle", "proximal", "base", "palm")
-_DROP = {"little": 0.4, "ring": 0.12, "index": 0.1}  # of a root below that of the middle finger
-_WIDTH, _HEIGHT = 0.92, 0.94  # of a segment
 _MOST_NAMED = 4  # channels of a segment that still have room for name and number
 
 
-class _Finger(NamedTuple):
-    name: str
-    segments: list[list[Row]]  # from the tip
-    place: Affine2D  # from its own axes, root at 0, to those of the hand
-    degrees: float
-
-
-class _Hand:
-    """A hand whose channels are shaded by a number.
+def _hand(
+    axes: Axes,
+    channels: Sequence[Row],
+    values: Mapping[str, float],
+    limits: tuple[float, float],
+    written: str,
+    unit: str,
+) -> None:
+    """A hand whose channels are shaded by a number, the shades of each kind below.
 
     Args:
+        axes: to draw on.
         channels: of the hand, in order; fingers stand in the order in which they first occur.
         values: by channel.
         limits: values of the palest and of the deepest shade.
         written: how a value is written into its mark, where there is room.
+        unit: of the values.
     """
-
-    def __init__(
-        self,
-        channels: Sequence[Row],
-        values: Mapping[str, float],
-        limits: tuple[float, float],
-        written: str,
-    ) -> None:
-        self._channels, self._values = channels, values
-        self._limits, self._written = limits, written
-        self._colours = kind_colours(row["kind"] for row in channels)
-
-    def draw(self, axes: Axes, unit: str) -> None:
-        """Draw it, with its shades and the unit of the values below."""
-        fingers = _fingers(self._channels)
-        straight = max(1, sum(finger.degrees == 0 for finger in fingers))
-        left, right = -_WIDTH / 2 - 0.04, straight - 1 + _WIDTH / 2 + 0.04
-        depth = 0.5 + 0.31 * straight
-        _box(axes, (left, -0.03 - depth), (right - left, depth), axes.transData, 0.3)
-        for finger in fingers:
-            for number, segment in enumerate(reversed(finger.segments)):
-                corner = (-_WIDTH / 2, number + (1 - _HEIGHT) / 2)
-                _box(axes, corner, (_WIDTH, _HEIGHT), finger.place + axes.transData, 0.2)
-                self._draw_segment(axes, finger, segment, number + 0.5)
-            x, y = finger.place.transform((0.0, len(finger.segments) + 0.2))
-            axes.text(x, y, finger.name, ha="center", va="center", fontsize=9, color=INK)
-        tops = [finger.place.transform((0.0, len(finger.segments) + 0.4)) for finger in fingers]
-        axes.set_xlim(-0.75, max(right + 0.2, *(float(x) + 0.55 for x, _ in tops)))
-        axes.set_ylim(-0.7 - depth, max(float(y) for _, y in tops))
-        axes.set_aspect("equal", anchor="N")
-        axes.axis("off")
-        self._draw_shades(axes.inset_axes((0.14, 0.0, 0.56, 0.026 * len(self._colours))), unit)
-
-    def _draw_segment(
-        self, axes: Axes, finger: _Finger, segment: Sequence[Row], middle: float
-    ) -> None:
-        """A mark for each channel, in lines; named where there is room."""
-        columns = math.ceil(math.sqrt(len(segment)))
-        lines = math.ceil(len(segment) / columns)
-        pitch = 0.86 / max(columns, lines, 2)
-        radius = 0.44 * pitch
-        is_named = len(segment) <= _MOST_NAMED
-        placed = finger.place + axes.transData
-        centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6.5}
-        centred["transform"] = placed
-        for number, row in enumerate(sorted(segment, key=_is_fast)):
-            line, column = divmod(number, columns)
-            in_line = min(columns, len(segment) - line * columns)
-            x = pitch * (column - (in_line - 1) / 2)
-            y = middle - pitch * (line - (lines - 1) / 2) - (0.06 if is_named else 0.0)
-            colour, value = self._colours[row["kind"]], self._values[row["name"]]
-            low, high = self._limits
-            depth = min(max((value - low) / (high - low), 0.0), 1.0) if high > low else 0.0
-            fill = _shade(colour, depth)
-            mark: Patch = Circle((x, y), radius)
-            if not _is_fast(row):
-                shape = f"round,pad=0,rounding_size={0.25 * radius}"
-                corner, side = (x - 0.9 * radius, y - 0.9 * radius), 1.8 * radius
-                mark = FancyBboxPatch(corner, side, side, boxstyle=shape)
-            mark.set(facecolor=fill, edgecolor=colour, linewidth=0.9, transform=placed)
-            axes.add_patch(mark)
-            if is_named:
-                ink = _PALE if np.dot(fill, (0.299, 0.587, 0.114)) < 0.55 else INK
-                text = self._written.format(value) if value else "0"
-                axes.text(x, y, text, color=ink, **centred)
-                turned: dict[str, Any] = {"color": GREY, "rotation": finger.degrees}
-                axes.text(x, y + radius + 0.1, row["name"], **turned, **centred)
-
-    def _draw_shades(self, axes: Axes, unit: str) -> None:
-        """The shades of each kind as strips, with what the palest and the deepest stand for."""
-        fast = {row["kind"]: _is_fast(row) for row in self._channels}
-        depths = np.linspace(0, 1, 128)
-        strips = [[_shade(colour, depth) for depth in depths] for colour in self._colours.values()]
-        axes.imshow(strips, aspect="auto", extent=(*self._limits, len(strips), 0))
-        names = [f"{kind} {'●' if fast[kind] else '■'}" for kind in self._colours]
-        axes.set_yticks(np.arange(len(strips)) + 0.5, names, fontsize=8)
-        axes.tick_params(length=0, labelsize=8)
-        axes.set_xlabel(unit, fontsize=8, color=GREY, labelpad=2)
-        axes.spines[:].set_visible(False)
-
-
-def _fingers(channels: Sequence[Row]) -> list[_Finger]:
-    """The fingers with their segments from the tip: known ones in their order, others behind."""
     by_finger: dict[str, dict[str, list[Row]]] = {}
     for row in channels:
         by_finger.setdefault(row["finger"], {}).setdefault(row["segment"], []).append(row)
-    straight = [name for name in by_finger if name != "thumb"] or list(by_finger)
-    fingers: list[_Finger] = []
-    for name in sorted(by_finger, key=lambda name: name not in straight):  # a thumb comes last
-        segments = by_finger[name]
+    marks: dict[str, list[tuple[float, float, Row]]] = {row["kind"]: [] for row in channels}
+    fingers = sorted(by_finger, key=lambda name: name == "thumb" and len(by_finger) > 1)
+    for place, finger in enumerate(fingers):
+        segments = by_finger[finger]
         known = [segment for segment in _FROM_TIP if segment in segments]
         order = [*known, *(segment for segment in segments if segment not in known)]
-        if name in straight:
-            place, degrees = Affine2D().translate(len(fingers), -_DROP.get(name, 0.0)), 0.0
-        else:
-            degrees = -32.0
-            place = Affine2D().rotate_deg(degrees).translate(len(straight) - 0.34, -1.3)
-        fingers.append(_Finger(name, [segments[segment] for segment in order], place, degrees))
-    return fingers
+        root = -1.3 if finger == "thumb" and place else 0.0
+        axes.text(place, root + len(order) + 0.1, finger, ha="center", fontsize=9, color=INK)
+        for up, segment in enumerate(reversed(order)):
+            corner = (place - 0.46, root + up + 0.03)
+            box = FancyBboxPatch(corner, 0.92, 0.94, boxstyle="round,pad=0,rounding_size=0.2")
+            axes.add_patch(box).set(facecolor="#F6F1EA", edgecolor="#C9BEAF")
+            for (x, y), row in _placed(segments[segment]):
+                marks[row["kind"]].append((place + x, root + up + 0.5 + y, row))
+    most = max(len(rows) for segments in by_finger.values() for rows in segments.values())
+    size = 1100 / max(math.ceil(math.sqrt(most)), 2) ** 2 / max(1, len(fingers) / 5)
+    for kind, colour in kind_colours(marks).items():
+        xs, ys, rows = zip(*marks[kind], strict=True)
+        ramp = LinearSegmentedColormap.from_list("shade", ["#FFFFFF", colour])
+        shown = axes.scatter(
+            xs, ys, s=size, c=[values[row["name"]] for row in rows], cmap=ramp, vmin=limits[0],
+            vmax=limits[1], marker="o" if _is_fast(rows[0]) else "s", edgecolors=colour,
+        )  # fmt: skip
+        bar = axes.figure.colorbar(
+            shown, ax=axes, location="bottom", shrink=0.6, aspect=40, pad=0.01
+        )
+        bar.set_label(f"{kind}: {unit}", fontsize=SMALL, color=GREY)
+        bar.ax.tick_params(labelsize=SMALL)
+        for x, y, row in marks[kind] if most <= _MOST_NAMED else ():
+            value = values[row["name"]]
+            is_deep = value > limits[0] + 0.6 * (limits[1] - limits[0])
+            style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6.5}
+            text = written.format(value) if value else "0"
+            axes.text(x, y, text, color="white" if is_deep else INK, **style)
+            axes.text(x, y + 0.3, row["name"], color=GREY, **style)
+    axes.set_xlim(-0.6, len(fingers) - 0.4)
+    axes.set_ylim(-1.4 if "thumb" in fingers[1:] else -0.1, max(map(len, by_finger.values())) + 0.5)
+    axes.set_aspect("equal", anchor="N")
+    axes.axis("off")
 
 
-def _box(
-    axes: Axes,
-    corner: tuple[float, float],
-    size: tuple[float, float],
-    placed: Transform,
-    rounding: float,
-) -> None:
-    box = FancyBboxPatch(corner, *size, boxstyle=f"round,pad=0,rounding_size={rounding}")
-    box.set(facecolor=_SKIN, edgecolor=_EDGE, linewidth=1.0, transform=placed)
-    axes.add_patch(box)
-
-
-def _shade(colour: str, depth: float) -> tuple[float, float, float]:
-    ramp = LinearSegmentedColormap.from_list("shade", [_PALE, colour])
-    red, green, blue = to_rgb(ramp(depth))
-    return red, green, blue
+def _placed(rows: Sequence[Row]) -> list[tuple[tuple[float, float], Row]]:
+    """Where channels stand about the middle of their segment, in lines, slow ones first."""
+    columns = math.ceil(math.sqrt(len(rows)))
+    lines = math.ceil(len(rows) / columns)
+    pitch = 0.86 / max(columns, lines, 2)
+    placed = []
+    for number, row in enumerate(sorted(rows, key=_is_fast)):
+        line, column = divmod(number, columns)
+        in_line = min(columns, len(rows) - line * columns)
+        at = pitch * (column - (in_line - 1) / 2), -pitch * (line - (lines - 1) / 2)
+        placed.append((at, row))
+    return placed
 
 
 def _is_fast(row: Row) -> bool:

@@ -54,7 +54,6 @@ _NUM_SEGMENTS = 1500  # of each line, of which the least and the greatest value 
 _MOST_ROWS = 40
 _SAME_S = 1e-8
 _WIDTH, _ROOM = 1.2, 40  # of marks, in points, as long as there are no more of a kind
-_MOST_LINES = 250
 _INVALID: dict[str, Any] = {
     "facecolor": "none", "edgecolor": "#999999", "hatch": "////", "linewidth": 0, "zorder": 0.5,
 }  # fmt: skip
@@ -372,19 +371,19 @@ def onsets_table(content: Mapping[str, Any]) -> str:
         content: of ``onsets.json``.
     """
     rows = onset_rows(content)
-    cells = [["file", "alarm s", "onset s", "P(slip)", "valid", "true onset s", "delay s"]]
-    cells[0].append("outcome")
+    shown = []
     for row in rows[:_MOST_ROWS]:
-        shown = [row["file"], _seconds(row["alarm_s"]), _seconds(row["onset_s"])]
-        shown += [
-            _seconds(row["probability"], 2),
-            {None: "-", True: "yes"}.get(row["is_valid"], "NO"),
-        ]
-        shown += [_seconds(row["true_onset_s"]), _seconds(row["delay_s"])]
-        cells.append([*shown, row["outcome"] or "-"])
-    rest = len(rows) - _MOST_ROWS
-    lines = [table(cells, merged=1) if rows else "no alarm, and no slip missed"]
-    lines += [f"and {rest} more, see onsets.csv"] if rest > 0 else []
+        cells: dict[str, object] = {"file": row["file"], "alarm s": _seconds(row["alarm_s"])}
+        cells |= {"onset s": _seconds(row["onset_s"]), "P(slip)": _seconds(row["probability"], 2)}
+        cells |= {"valid": "NO" if row["is_valid"] is False else row["is_valid"]}
+        cells |= {
+            "true onset s": _seconds(row["true_onset_s"]),
+            "delay s": _seconds(row["delay_s"]),
+        }
+        shown.append(cells | {"outcome": row["outcome"]})
+    lines = [table(shown, merged=1) if rows else "no alarm, and no slip missed"]
+    if len(rows) > _MOST_ROWS:
+        lines.append(f"and {len(rows) - _MOST_ROWS} more, see onsets.csv")
     return marked(content["simulated"], *lines)
 
 
@@ -495,11 +494,11 @@ def onset_figure(stream: StreamSummary, path: str | Path, *, title: str) -> None
 
 def _draw_channels(axes: Axes, stream: StreamSummary, slips: Segments) -> None:
     """A lane per channel around its median, in the colours of the status; bursts may cross."""
-    known = [values[np.isfinite(values)] for _, values in stream.channels.values()]
-    height = lane_height([values for values in known if values.size])
+    height = lane_height([values for _, values in stream.channels.values()])
     middles = -height * np.arange(len(stream.channels))
     for place, (times, values) in enumerate(stream.channels.values()):
-        centre = float(np.median(known[place])) if known[place].size else 0.0
+        known = values[np.isfinite(values)]
+        centre = float(np.median(known)) if known.size else 0.0
         is_slip = _status_at(stream.is_slip, times)
         for colour, shown in ((REST, ~is_slip), (SLIP, is_slip)):
             reaching = shown.copy()
@@ -509,25 +508,26 @@ def _draw_channels(axes: Axes, stream: StreamSummary, slips: Segments) -> None:
     _shade(axes, slips, "slip", facecolor="#FFF0CC", edgecolor="none", zorder=0)
     _mark(axes, stream, stream.onsets_s, "onset", **_ONSET)
     seen = _mark(axes, stream, [alarm for alarm, _ in stream.alarms], "alarm", **_ALARM)
-    if 0 < len(seen) <= _MOST_LINES:
+    if seen:
         above = axes.get_xaxis_transform()
-        axes.plot(seen, [1.0] * len(seen), "v", color=ALARM, transform=above, clip_on=False)
+        axes.plot(
+            seen, [1.0] * len(seen), "v", color=ALARM, markersize=4, transform=above, clip_on=False
+        )
     axes.set_yticks(middles, list(stream.channels), fontsize=7)
     axes.set_ylim(middles[-1] - 0.8 * height, 0.8 * height)
     axes.grid(visible=False)
     axes.set_ylabel(f"channels, lanes {height:.2g} {stream.units} apart", fontsize=8)
 
 
-def lane_height(known: Sequence[Array]) -> float:
-    """Distance of lanes: room for what is usual, while a burst may cross its neighbours.
-
-    Args:
-        known: finite samples of each channel, none empty.
-    """
-    usual = [float(np.subtract(*np.quantile(values, [0.95, 0.05]))) for values in known]
-    bursts = [float(np.ptp(values)) for values in known]
-    height = max([0.0, *(1.5 * span for span in usual), *(0.25 * span for span in bursts)])
-    return height if height > 0 else 1.0
+def lane_height(lines: Iterable[Array]) -> float:
+    """Distance of lanes: room for what is usual, while a burst may cross its neighbours."""
+    least = 0.0
+    for line in lines:
+        known = line[np.isfinite(line)]
+        if known.size:
+            usual = 1.5 * float(np.subtract(*np.quantile(known, [0.95, 0.05])))
+            least = max(least, usual, 0.25 * float(np.ptp(known)))
+    return least or 1.0
 
 
 def _draw_status(axes: Axes, stream: StreamSummary, slips: Segments) -> None:
@@ -562,13 +562,12 @@ def _draw_probability(axes: Axes, stream: StreamSummary) -> None:
 def _mark(
     axes: Axes, stream: StreamSummary, times: Sequence[float], name: str, **style: Any
 ) -> list[float]:
-    """Lines from top to bottom, the finer the more there are; of too many their upper ends."""
+    """Lines from top to bottom, the finer the more there are."""
     seen = [time for time in times if stream.view[0] <= time <= stream.view[1]]
     if seen:  # a collection of nothing has no layout
         width = max(0.2, _WIDTH * min(1.0, _ROOM / len(seen)) ** 0.5)
-        bottom = 0.0 if len(seen) <= _MOST_LINES else 0.97
         through = axes.get_xaxis_transform()
-        axes.vlines(seen, bottom, 1, transform=through, linewidth=width, gid=name, **style)
+        axes.vlines(seen, 0, 1, transform=through, linewidth=width, gid=name, **style)
     return seen
 
 

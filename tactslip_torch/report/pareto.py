@@ -49,21 +49,29 @@ def pareto_table(content: Mapping[str, Any]) -> str:
         f"validation: {content['validation']}",
         f"{_busy(interrupted)} (the most of any detector on the front)",
     ]
-    header = ["latency ms", "look-ahead", "bin", "hop", "compute us", "p50 us", "valid. %", "K"]
-    header += ["deg.", "numbers", "filter", "channels", "components", "columns", "ranking"]
     front = sorted(content["front"], key=lambda row: float(row["latency"]["worst_ms"]))
-    rows = table([header, *map(_front_row, front)], num_left=0)
+    rows = table(list(map(_front_row, front)), num_left=0)
     named, chosen = _named_lines(content), _chosen_lines(content)
     return marked(content["simulated"], *head, "", rows, "", *named, "", *chosen)
 
 
-def _front_row(row: Mapping[str, Any]) -> list[str]:
+_FRONT = {
+    "K": "num_features",
+    "deg.": "degree",
+    "numbers": "arithmetic",
+    "filter": "align",
+    **{name: name for name in ("channels", "components", "columns", "ranking")},
+}
+
+
+def _front_row(row: Mapping[str, Any]) -> dict[str, object]:
     latency = row["latency"]
-    cells = [f"{latency['worst_ms']:.2f}"]
-    cells += [f"{latency[part]:g}" for part in ("look_ahead_ms", "bin_ms", "hop_ms")]
-    cells += [f"{row['p99_us']:.0f}", f"{row['p50_us']:.0f}", percent(row["validation"])]
-    names = ("num_features", "degree", "arithmetic", "align", "channels", "components", "columns")
-    return cells + [str(row[name]) for name in (*names, "ranking")]
+    cells: dict[str, object] = {"latency ms": f"{latency['worst_ms']:.2f}"}
+    for title in ("look-ahead", "bin", "hop"):
+        cells[title] = f"{latency[title.replace('-', '_') + '_ms']:g}"
+    cells |= {"compute us": f"{row['p99_us']:.0f}", "p50 us": f"{row['p50_us']:.0f}"}
+    cells |= {"valid. %": percent(row["validation"])}
+    return cells | {title: row[key] for title, key in _FRONT.items()}
 
 
 def _named_lines(content: Mapping[str, Any]) -> list[str]:

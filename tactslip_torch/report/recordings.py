@@ -8,19 +8,16 @@ that every burst is seen. Colours are fingers, paler towards the palm.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from PIL import Image
 from torch import Tensor
 
 from tactslip_torch.report.onset import Array, Segments, envelope, lane_height
@@ -40,7 +37,6 @@ from tactslip_torch.report.style import (
     stack,
     table,
 )
-from tactslip_torch.runtime import whole_file
 
 Channels = Sequence[Mapping[str, str]]
 """Rows of ``name``, ``kind``, ``finger``, ``segment``, ``adapting`` where the kind does not say it,
@@ -55,7 +51,6 @@ _NUM_SEGMENTS = 1200  # of each line, of which the least and the greatest sample
 _LANE = 0.13  # least height of one, in inches, for its name to be read
 _MOST_LANES = 24
 _NAMES = 6.5  # font size of channels in points
-_NUM_COLOURS = 255  # of the PNG: a third of the bytes, and nobody sees it
 
 
 @dataclass(frozen=True)
@@ -138,15 +133,38 @@ def _grouped(key: str, trials: Sequence[Trial]) -> str:
         groups.setdefault(getattr(trial, key), []).append(trial)
     if len(groups) > 1:
         groups["all"] = list(trials)
-    rows = [[key, "recordings", "shortest s", "longest s", "seconds", "onsets", "slip s"]]
-    rows[0].append("non-slip s")
+    rows = []
     for name, group in groups.items():
         durations = [trial.duration_s for trial in group]
-        row = [name, str(len(group)), f"{min(durations):.2f}", f"{max(durations):.2f}"]
-        row += [f"{sum(durations):.1f}", str(sum(trial.num_onsets for trial in group))]
-        row.append(f"{sum(trial.slip_s for trial in group):.1f}")
-        rows.append([*row, f"{sum(trial.non_slip_s for trial in group):.1f}"])
+        row: dict[str, object] = {key: name, "recordings": len(group)}
+        row |= {"shortest s": f"{min(durations):.2f}", "longest s": f"{max(durations):.2f}"}
+        row |= {"seconds": f"{sum(durations):.1f}"}
+        row |= {"onsets": sum(trial.num_onsets for trial in group)}
+        row |= {"slip s": f"{sum(trial.slip_s for trial in group):.1f}"}
+        rows.append(row | {"non-slip s": f"{sum(trial.non_slip_s for trial in group):.1f}"})
     return table(rows)
+
+
+def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
+    """How many recordings of each scene are in files, how long, how large, how many made now.
+
+    Args:
+        written: of each recording its ``line`` of the manifest, ``made``, ``duration_s`` and
+            ``num_bytes``.
+        seconds: that it took.
+    """
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for one in written:
+        groups.setdefault(one["line"]["scene"], []).append(one)
+    if len(groups) > 1:
+        groups["all"] = list(written)
+    rows = []
+    for scene, own in groups.items():
+        row = {"scene": scene, "recordings": len(own), "made now": sum(o["made"] for o in own)}
+        row |= {"seconds of signal": f"{sum(one['duration_s'] for one in own):.1f}"}
+        rows.append(row | {"MB": f"{sum(one['num_bytes'] for one in own) / 1e6:.1f}"})
+    simulated = any(one["line"]["simulated"] == "true" for one in written)
+    return marked(simulated, table(rows), f"took {seconds:.1f} s")
 
 
 def ranges_table(channels: Channels, ranges: Array, units: str) -> str:
@@ -155,12 +173,14 @@ def ranges_table(channels: Channels, ranges: Array, units: str) -> str:
     Shape:
         - ranges: ``[C, 2]``, NaN where nothing is finite
     """
-    rows = [["kind", "channels", f"least, {units}", f"greatest, {units}"]]
+    rows = []
     for kind in dict.fromkeys(channel["kind"] for channel in channels):
         places = [place for place, channel in enumerate(channels) if channel["kind"] == kind]
         known = ranges[places][np.isfinite(ranges[places]).all(-1)]
         least, greatest = (known[:, 0].min(), known[:, 1].max()) if len(known) else (np.nan,) * 2
-        rows.append([kind, str(len(places)), f"{least:.6g}", f"{greatest:.6g}"])
+        row: dict[str, object] = {"kind": kind, "channels": len(places)}
+        row |= {f"least, {units}": f"{least:.6g}", f"greatest, {units}": f"{greatest:.6g}"}
+        rows.append(row)
     return table(rows)
 
 
@@ -172,62 +192,36 @@ def dataset_figure(
     *,
     title: str,
 ) -> None:
-    """Write the figure that ``draw_dataset`` draws as PNG, replaced as a whole if it exists."""
-    save(draw_dataset(trials, example, names, title=title), path, dpi=120)
-
-
-def draw_dataset(
-    trials: Sequence[Trial], example: DrawnRecording, names: Sequence[str], *, title: str
-) -> Figure:
-    """Seconds of each material by what is known of them, and below the traces of one recording.
+    """Write seconds of each material by what is known of them, and the traces of one recording.
 
     Of more channels than fit, so many are drawn, evenly chosen.
 
     Args:
         trials: at least one.
-        example: drawn in lanes, slip and non-slip shaded.
+        example: drawn in lanes, each on a scale of its own, slip and non-slip shaded.
         names: of its channels.
+        path: the PNG to write, replaced as a whole if it exists.
         title: of the figure; says what is simulated.
-
-    Raises:
-        ValueError: if there is no recording.
     """
-    if not trials:
-        raise ValueError("no recording to draw; give at least one")
-    num_materials = len({trial.material for trial in trials})
-    heights = [0.28 * num_materials + 0.8, 0.2 * min(len(names), _MOST_LANES) + 0.9]
+    materials = list(dict.fromkeys(trial.material for trial in trials))
+    num_lanes = min(len(names), _MOST_LANES)
+    heights = [0.28 * len(materials) + 0.8, 0.2 * num_lanes + 0.9]
     figure = new_figure(11.0, sum(heights) + 0.9, title)
     bars, traces = figure.subplots(2, 1, gridspec_kw={"height_ratios": heights})
-    _draw_seconds(bars, trials)
-    _draw_example(traces, example, names)
     colours = {VERMILION: "slip", BLUE: "non-slip", _UNKNOWN: "not labelled"}
-    handles: list[Any] = [Patch(color=colour, label=label) for colour, label in colours.items()]
-    handles += [Line2D([], [], label="onset", **_ONSET)] if example.onsets_s else []
-    legend_below(figure, handles, 4)
-    return figure
-
-
-def _draw_seconds(axes: Axes, trials: Sequence[Trial]) -> None:
-    """A bar a material: seconds of slip, of non-slip, and of what is not labelled."""
-    materials = list(dict.fromkeys(trial.material for trial in trials))
-    style: dict[str, Any] = {"va": "center", "fontsize": 7, "color": GREY}
-    for place, material in enumerate(materials):
+    for lane, material in enumerate(materials):
         group = [trial for trial in trials if trial.material == material]
         slip = sum(trial.slip_s for trial in group)
         quiet = sum(trial.non_slip_s for trial in group)
         whole = max(sum(trial.duration_s for trial in group), slip + quiet)
-        stack(axes, place, (slip, quiet, whole - slip - quiet), (VERMILION, BLUE, _UNKNOWN))
-        text = f"{len(group)} recording{'s' * (len(group) != 1)}"
-        axes.annotate(text, (whole, place), xytext=(4, 0), textcoords="offset points", **style)
-    clean(axes, "x")
-    lanes(axes, materials)
-    axes.margins(x=0.12)
-    axes.set_xlabel("seconds of signal", fontsize=TEXT, color=GREY)
+        stack(bars, lane, (slip, quiet, whole - slip - quiet), colours)
+        text = f"  {len(group)} recording{'s' * (len(group) != 1)}"
+        bars.text(whole, lane, text, va="center", fontsize=7, color=GREY)
+    clean(bars, "x")
+    lanes(bars, materials)
+    bars.margins(x=0.12)
+    bars.set_xlabel("seconds of signal", fontsize=TEXT, color=GREY)
 
-
-def _draw_example(axes: Axes, example: DrawnRecording, names: Sequence[str]) -> None:
-    """Channels in lanes, each on a scale of its own, over shaded segments."""
-    num_lanes = min(len(names), _MOST_LANES)
     chosen = sorted({round(place) for place in np.linspace(0, len(names) - 1, num_lanes)})
     view = (0.0, example.duration_s)
     times, values = _points(example, chosen, view)
@@ -235,29 +229,25 @@ def _draw_example(axes: Axes, example: DrawnRecording, names: Sequence[str]) -> 
     for line in values:
         known = line[np.isfinite(line)]
         spans.append(float(np.subtract(*np.quantile(known, [0.99, 0.01]))) if known.size else 0.0)
-    heights = [1.25 * span or 1.0 for span in spans]
+    scales = [1.25 * span or 1.0 for span in spans]
     labels = [
         f"{names[place]}  {span or 1.0:.3g} {example.units}"
         for place, span in zip(chosen, spans, strict=True)
     ]
-    _draw_lanes(axes, times, values, labels, [INK] * len(chosen), heights, most=1.2)
-    axes.set_ylim(-len(chosen) + 0.2, 0.8)
-    _mark(axes, example, view)
-    axes.set_xlabel("time, s", fontsize=TEXT, color=GREY)
+    _draw_lanes(traces, times, values, labels, [INK] * len(chosen), scales, most=1.2)
+    traces.set_ylim(-len(chosen) + 0.2, 0.8)
+    _mark(traces, example, view)
+    traces.set_xlabel("time, s", fontsize=TEXT, color=GREY)
     some = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} channels"
     what = f"{example.title}{some}; beside each name the span of all but 2 % of it"
-    axes.set_title(what, fontsize=TEXT, color=GREY)
+    traces.set_title(what, fontsize=TEXT, color=GREY)
+    handles: list[Any] = [Patch(color=colour, label=label) for colour, label in colours.items()]
+    handles += [Line2D([], [], label="onset", **_ONSET)] if example.onsets_s else []
+    legend_below(figure, handles, 4)
+    save(figure, path, dpi=120)
 
 
 # Signals -----------------------------------------------------------------------------------------
-class _Column(NamedTuple):
-    """One column of the figure: the channels of a kind that adapt alike."""
-
-    kind: str
-    channels: list[int]
-    in_lanes: bool
-
-
 def signals_figure(
     rows: Sequence[DrawnRecording],
     channels: Channels,
@@ -266,70 +256,55 @@ def signals_figure(
     title: str,
     views: Sequence[tuple[float, float]] | None = None,
 ) -> None:
-    """Write the figure that ``draw_signals`` draws as PNG, replaced as a whole if it exists."""
-    figure = draw_signals(rows, channels, title=title, views=views)
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=120, facecolor="white")
-    with whole_file(path) as temporary, Image.open(drawn) as image:
-        image.convert("RGB").quantize(_NUM_COLOURS, dither=Image.Dither.NONE).save(
-            temporary, format="png", optimize=True
-        )
-
-
-def draw_signals(
-    rows: Sequence[DrawnRecording],
-    channels: Channels,
-    *,
-    title: str,
-    views: Sequence[tuple[float, float]] | None = None,
-) -> Figure:
-    """Draw one recording a row: slow channels as measured and in lanes, fast ones in lanes.
+    """Write one recording a row: slow channels as measured and in lanes, fast ones in lanes.
 
     Args:
         rows: at least one, all of the same hand.
         channels: of the hand.
+        path: the PNG to write, replaced as a whole if it exists.
         title: of the figure; says what is simulated.
         views: ``(start, end)`` in seconds of what is shown of each row, ``None`` for all.
-
-    Raises:
-        ValueError: if there is no row, or channels or views are fewer or more than wanted.
     """
-    if not rows:
-        raise ValueError("no recording to draw; give at least one row")
-    for row in rows:
-        if len(row.samples) != len(channels):
-            raise ValueError(f"{row.title} has {len(row.samples)} channels, not {len(channels)}")
     views = [(0.0, row.duration_s) for row in rows] if views is None else views
-    if len(views) != len(rows):
-        raise ValueError(f"views must be one per row, got {len(views)} for {len(rows)}")
     columns = _columns(channels)
-    height = max(1.9, *(_LANE * len(column.channels) for column in columns))
+    colours = channel_colours(channels)
+    height = max(1.9, *(_LANE * len(places) for _, places, _ in columns))
     figure = new_figure(13.0, height * len(rows) + 1.3, title)
-    widths = {"width_ratios": [1.0 if column.in_lanes else 0.75 for column in columns]}
+    widths = {"width_ratios": [1.0 if in_lanes else 0.75 for _, _, in_lanes in columns]}
     grid = figure.subplots(len(rows), len(columns), squeeze=False, gridspec_kw=widths)
     for panels, row, view in zip(grid, rows, views, strict=True):
-        for axes, column in zip(panels, columns, strict=True):
-            _draw_column(axes, row, view, column, channels)
+        for axes, (_, places, in_lanes) in zip(panels, columns, strict=True):
+            names, own = [channels[i]["name"] for i in places], [colours[i] for i in places]
+            times, values = _points(row, places, view)
+            scale = lane_height(values) if in_lanes else 1.0
+            if in_lanes:
+                _draw_lanes(axes, times, values, names, own, [scale] * len(names))
+                apart = f"lanes {scale:.2g} {row.units} apart"
+                axes.set_title(apart, loc="right", fontsize=_NAMES, color=GREY)
+            for time_s, line, name, colour in zip(times, values, names, own, strict=True):
+                if not in_lanes:
+                    axes.plot(time_s, line, color=colour, linewidth=0.7, label=name)
+            _mark(axes, row, view)
         unit = "volts" if row.units == "V" else row.units
         panels[0].set_ylabel(f"{row.title}\n{unit}", fontsize=TEXT, color=INK)
-    for axes, column in zip(grid[0], columns, strict=True):
-        how = "in lanes, offsets removed" if column.in_lanes else "as measured"
-        axes.set_title(f"{column.kind}, {how}", fontsize=TEXT, color=GREY)
+    for axes, (kind, _, in_lanes) in zip(grid[0], columns, strict=True):
+        how = "offsets removed" if in_lanes else "as measured"
+        axes.set_title(f"{kind}, {how}", fontsize=TEXT, color=GREY, loc="left")
     for axes in grid[-1]:
         axes.set_xlabel("time, s", fontsize=TEXT, color=GREY)
     legend_below(figure, _legend(rows, channels), 9)
-    return figure
+    save(figure, path, dpi=120)
 
 
-def _columns(channels: Channels) -> list[_Column]:
-    """Of every kind that adapts slowly two, as measured and in lanes; then of every other one."""
+def _columns(channels: Channels) -> list[tuple[str, list[int], bool]]:
+    """Kind, channels and whether in lanes: of every slow kind two columns, of every other one."""
     groups: dict[tuple[bool, str], list[int]] = {}
     for place, channel in enumerate(channels):
         kind = channel["kind"]
         is_fast = channel.get("adapting", "slow" if kind == "SG" else "fast") == "fast"
         groups.setdefault((is_fast, kind), []).append(place)
     return [
-        _Column(kind, places, in_lanes)
+        (kind, places, in_lanes)
         for (is_fast, kind), places in sorted(groups.items(), key=lambda item: item[0][0])
         for in_lanes in ((True,) if is_fast else (False, True))
     ]
@@ -340,42 +315,10 @@ def channel_colours(channels: Channels) -> list[tuple[float, float, float]]:
     hues = colours_of(channel["finger"] for channel in channels)
     colours = []
     for channel in channels:
-        pale = _PALER.get(channel["segment"], 0.0)
-        mixed = (part + pale * (1.0 - part) for part in to_rgb(hues[channel["finger"]]))
-        red, green, blue = mixed
+        pale, own = _PALER.get(channel["segment"], 0.0), to_rgb(hues[channel["finger"]])
+        red, green, blue = (part + pale * (1.0 - part) for part in own)
         colours.append((red, green, blue))
     return colours
-
-
-def _draw_column(
-    axes: Axes,
-    row: DrawnRecording,
-    view: tuple[float, float],
-    column: _Column,
-    channels: Channels,
-) -> None:
-    """The channels of a kind, overlaid as measured or in lanes of one height with its scale."""
-    names = [channels[place]["name"] for place in column.channels]
-    all_colours = channel_colours(channels)
-    colours = [all_colours[place] for place in column.channels]
-    times, values = _points(row, column.channels, view)
-    if column.in_lanes:
-        known = [line[np.isfinite(line)] for line in values]
-        height = lane_height([line for line in known if line.size])
-        _draw_lanes(axes, times, values, names, colours, [height] * len(names))
-        for label, colour in zip(axes.get_yticklabels(), colours, strict=True):
-            label.set_color(colour)
-        bar = _round_number(2 * height)
-        bottom, top = 1 - len(names), 1 - len(names) + bar / height
-        style: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "clip_on": False}
-        axes.plot([1.012, 1.012], [bottom, top], color=INK, linewidth=2, **style)
-        style = {"xycoords": ("axes fraction", "data"), "va": "center", "annotation_clip": False}
-        place = (1.02, (bottom + top) / 2)
-        axes.annotate(f"{bar:g} {row.units}", place, fontsize=7.5, color=INK, **style)
-    else:
-        for time_s, line, name, colour in zip(times, values, names, colours, strict=True):
-            axes.plot(time_s, line, color=colour, linewidth=0.7, label=name)
-    _mark(axes, row, view)
 
 
 def _points(
@@ -394,23 +337,17 @@ def _draw_lanes(
     values: Array,
     names: Sequence[str],
     colours: Sequence[Any],
-    heights: Sequence[float],
-    *,
+    scales: Sequence[float],
     most: float = np.inf,
 ) -> None:
     """A lane per channel around its median, the first on top; bursts reach ``most`` lanes."""
-    for lane, (time_s, line, height) in enumerate(zip(times, values, heights, strict=True)):
+    for lane, (time_s, line, scale) in enumerate(zip(times, values, scales, strict=True)):
         known = line[np.isfinite(line)]
-        centre = np.median(known) if known.size else 0.0
-        shown = np.clip((line - centre) / height, -most, most) - lane
-        axes.plot(time_s, shown, color=colours[lane], linewidth=0.5, label=names[lane])
+        shown = np.clip((line - (np.median(known) if known.size else 0.0)) / scale, -most, most)
+        axes.plot(time_s, shown - lane, color=colours[lane], linewidth=0.5, label=names[lane])
     axes.set_yticks(-np.arange(len(names)), names)
-
-
-def _round_number(value: float) -> float:
-    """The greatest of 1, 2 and 5 times a power of ten that does not exceed a positive value."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(power * max(digit for digit in (1, 2, 5) if digit * power <= value))
+    for label, colour in zip(axes.get_yticklabels(), colours, strict=True):
+        label.set_color(colour)
 
 
 def _mark(axes: Axes, row: DrawnRecording, view: tuple[float, float]) -> None:
@@ -439,9 +376,8 @@ def _legend(rows: Sequence[DrawnRecording], channels: Channels) -> list[Any]:
         handles.append(Line2D([], [], color="#CCCCCC", linewidth=2, label="paler: nearer the palm"))
     if any(row.onsets_s for row in rows):
         handles.append(Line2D([], [], label="onset of slip", **_ONSET))
-    for label, style, is_there in (
-        ("slip", _SLIP, any(row.slip_s for row in rows)),
-        ("non-slip", _NON_SLIP, any(row.non_slip_s for row in rows)),
-    ):
-        handles += [Patch(label=label, **style)] if is_there else []
+    if any(row.slip_s for row in rows):
+        handles.append(Patch(label="slip", **_SLIP))
+    if any(row.non_slip_s for row in rows):
+        handles.append(Patch(label="non-slip", **_NON_SLIP))
     return handles

@@ -6,7 +6,7 @@ on matplotlib's ``Figure`` objects, so that no window opens and no global state 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any, Literal
@@ -30,51 +30,46 @@ UPPER_LEFT_OUTSIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.
 
 
 # Tables ------------------------------------------------------------------------------------------
-def table(rows: Sequence[Sequence[object]], num_left: int = 1, merged: int = 0) -> str:
+def table(rows: Sequence[Mapping[str, object]], num_left: int = 1, merged: int = 0) -> str:
     """Columns padded to their widest cell: ``num_left`` flush left, the others flush right.
 
     Args:
-        rows: cells as ``text_rows`` takes them; the first row is the header.
+        rows: cells by column, the same columns in each; ``-`` stands for ``None``, ``yes`` and
+            ``no`` for truth values.
         num_left: number of columns that hold words.
-        merged: number of leading columns in which a repeated cell is left blank.
+        merged: number of leading columns in which a cell that repeats the one above is left
+            blank, as long as those to its left repeat as well.
 
     Example:
-        >>> print(table([["stage", "seconds"], ["solve", "9.50"], ["total", None]]))
-        stage  seconds
-        solve     9.50
-        total        -
+        >>> print(table([{"stage": "solve", "s": "9.50"}, {"stage": "total", "s": None}]))
+        stage     s
+        solve  9.50
+        total     -
     """
-    texts = text_rows(rows, merged)
-    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    texts = cells(rows)
+    shown = [list(row) for row in texts]
+    for above, row, own in zip(texts[1:], texts[2:], shown[2:], strict=False):
+        for column in range(merged):
+            if above[: column + 1] == row[: column + 1]:
+                own[column] = ""
+    widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
     lines = []
-    for row in texts:
-        cells = [
-            cell.ljust(width) if position < num_left else cell.rjust(width)
-            for position, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append("  ".join(cells).rstrip())
+    for row in shown:
+        padded = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
+        for column in range(num_left):
+            padded[column] = row[column].ljust(widths[column])
+        lines.append("  ".join(padded).rstrip())
     return "\n".join(lines)
 
 
-def text_rows(rows: Sequence[Sequence[object]], merged: int = 0) -> list[list[str]]:
-    """Cells as text: ``-`` for ``None``, ``yes`` or ``no`` for truth values.
-
-    Of the first ``merged`` columns a cell that repeats the one above is blank, as long as those to
-    its left repeat as well.
-    """
-    texts = [[_text(cell) for cell in row] for row in rows]
-    shown = [list(row) for row in texts]
-    for above, row, cells in zip(texts, texts[1:], shown[1:], strict=False):
-        for column in range(merged):
-            if above[: column + 1] == row[: column + 1]:
-                cells[column] = ""
-    return shown
-
-
-def _text(cell: object) -> str:
-    if cell is None:
-        return "-"
-    return ("yes" if cell else "no") if isinstance(cell, bool) else str(cell)
+def cells(rows: Sequence[Mapping[str, object]]) -> list[list[str]]:
+    """The header and the rows as text; no row gives nothing."""
+    words_of = {None: "-", True: "yes", False: "no"}
+    texts = [list(rows[0])] if rows else []
+    for row in rows:
+        values = row.values()
+        texts.append([words_of[v] if v is None or isinstance(v, bool) else str(v) for v in values])
+    return texts
 
 
 def marked(simulated: bool, *lines: str) -> str:

@@ -18,11 +18,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
-import numpy as np
 import torch
 from torch import Tensor, nn
-
-from tactslip_torch.runtime import is_concrete
 
 Align = Literal["centred", "causal", "trailing"]
 """Which part of its frame's polynomial a sample takes, and where the frame lies.
@@ -244,7 +241,7 @@ def overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
     return padded.unfold(0, num_kept + len(kernel) - 1, 1).flip(0).T
 
 
-def as_index(channels: Sequence[int]) -> slice | list[int]:
+def _as_index(channels: Sequence[int]) -> slice | list[int]:
     """The same channels, so that they are looked up without a copy if they are neighbours."""
     first, last = channels[0], channels[-1]
     return slice(first, last + 1) if last - first + 1 == len(channels) else list(channels)
@@ -277,7 +274,6 @@ def _checked_kernels(
 
 _TOLERANCE = 1e-9  # of the sum of a kernel
 _MOST_MATRICES = 16  # that are kept
-_FEW_BINS = 4
 
 
 class _Group(NamedTuple):
@@ -401,8 +397,6 @@ class ChannelFilter(nn.Module):
                 f"expected bins with {self.context_before} samples of context before and "
                 f"{self.context_after} behind, got {samples.shape[-1]} samples in all"
             )
-        if is_concrete(samples) and samples.shape[:-2].numel() <= _FEW_BINS:
-            return self._valid_of_few(samples, num_samples, channels)
         filtered = samples.narrow(-1, 0, num_samples).clone()
         for length, start, chosen, is_wanted in self._groups_for(channels):
             kept = samples[..., chosen, start : start + num_samples + length - 1]
@@ -412,22 +406,6 @@ class ChannelFilter(nn.Module):
             else:
                 filtered[..., chosen, :] = torch.maximum(kept.amax(-1), -kept.amin(-1))[..., None]
         return filtered
-
-    def _valid_of_few(
-        self, samples: Tensor, num_samples: int, channels: Collection[int] | None
-    ) -> Tensor:
-        """The same of few bins and no more than values: NumPy's calls take a third of the time."""
-        x = samples.detach().numpy()
-        filtered = np.empty((*x.shape[:-1], num_samples), x.dtype)
-        with np.errstate(all="ignore"):  # 0 times Inf is a NaN, as it should be
-            for length, start, chosen, is_wanted in self._groups_for(channels):
-                kept = x[..., chosen, start : start + num_samples + length - 1]
-                if is_wanted:
-                    matrix = self._matrix(length, num_samples, samples).numpy()
-                    filtered[..., chosen, :] = kept @ matrix
-                else:
-                    filtered[..., chosen, :] = np.abs(kept).max(-1, keepdims=True)
-        return torch.from_numpy(filtered)
 
     def _groups_for(self, channels: Collection[int] | None) -> list[_Group]:
         """The channels by their frames, those that are wanted apart from the others."""
@@ -443,7 +421,7 @@ class ChannelFilter(nn.Module):
                 _Group(
                     length,
                     self.context_before - reach(length, self.align)[0],
-                    as_index(chosen),
+                    _as_index(chosen),
                     is_wanted,
                 )
                 for (length, is_wanted), chosen in by_frame.items()
@@ -505,18 +483,30 @@ def extended(samples: Tensor, channel_filter: ChannelFilter) -> Tensor:
     """
     channel_filter.check(samples)
     _check_length(samples, max(channel_filter.window_lengths))
-    first, last = samples[..., :1], samples[..., -1:]
-    before = first.repeat_interleave(channel_filter.context_before, -1)
-    after = last.repeat_interleave(channel_filter.context_after, -1)
-    whole = torch.cat([before, samples, after], dim=-1)
-    start = channel_filter.context_before
-    stop = start + samples.shape[-1]
-    for channel, length in enumerate(channel_filter.window_lengths):
-        frame = (length, channel_filter.polyorder, channel_filter.align)
-        past, future = past_matrix(*frame).to(samples), _future_matrix(*frame).to(samples)
-        x, begin, end = samples[..., channel, :], first[..., channel, :], last[..., channel, :]
-        of_past = begin + (x[..., :length] - begin) @ past.T
-        of_future = end + (x[..., -length:] - end) @ future.T
-        whole[..., channel, start - len(past) : start] = of_past
-        whole[..., channel, stop : stop + len(future)] = of_future
-    return whole
+    future = past_of(samples.flip(-1), channel_filter).flip(-1)  # the mirror image
+    past = past_of(samples, channel_filter)
+    return torch.cat([past, samples, future[..., : channel_filter.context_after]], dim=-1)
+
+
+def past_of(
+    samples: Tensor, channel_filter: ChannelFilter, channels: Sequence[int] | None = None
+) -> Tensor:
+    """What a filter takes to lie before a recording (``past_matrix``).
+
+    Args:
+        samples: its first ones, as many as the longest frame or more.
+        channel_filter: that it is going to be filtered by.
+        channels: which matter, by default all; the others begin with their first sample.
+
+    Shape:
+        - samples: ``[*, C, T]``
+        - output: ``[*, C, context_before]``
+    """
+    num = channel_filter.context_before
+    past = samples[..., :1].repeat_interleave(num, -1)
+    for channel in range(samples.shape[-2]) if channels is None else channels:
+        length = channel_filter.window_lengths[channel]
+        matrix = past_matrix(length, channel_filter.polyorder, channel_filter.align).to(samples)
+        x = samples[..., channel, :length]
+        past[..., channel, num - len(matrix) :] = x[..., :1] + (x - x[..., :1]) @ matrix.T
+    return past

@@ -1,8 +1,10 @@
 """The simulated hand: scenes in, recordings with exact truth out."""
 
-from tactslip_torch.simulation.parameters import (
+from tactslip_torch.simulation.scene import (
+    FIDELITIES,
     MATERIALS,
     SEEN_MATERIALS,
+    SIMULATION_VERSION,
     UNSEEN_MATERIALS,
     Contact,
     Disturbances,
@@ -11,13 +13,9 @@ from tactslip_torch.simulation.parameters import (
     Handling,
     Imperfections,
     Material,
+    Scene,
     Sensors,
     Stroke,
-)
-from tactslip_torch.simulation.scene import (
-    FIDELITIES,
-    SIMULATION_VERSION,
-    Scene,
     paper_scenes,
 )
 from tactslip_torch.simulation.simulate import Timeline, simulate, simulate_many, timeline

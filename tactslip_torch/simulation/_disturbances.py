@@ -34,8 +34,7 @@ from tactslip_torch.simulation._blocks import (
     lognormal,
     smooth_step,
 )
-from tactslip_torch.simulation._contact import ElementContact
-from tactslip_torch.simulation._grasp import Grasp
+from tactslip_torch.simulation._contact import ElementContact, Grasp
 from tactslip_torch.simulation._sensors import (
     Vibration,
     band_responses,

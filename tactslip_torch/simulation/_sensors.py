@@ -27,8 +27,7 @@ from tactslip_torch.simulation._blocks import (
     log_uniform,
     lognormal,
 )
-from tactslip_torch.simulation._contact import ElementContact
-from tactslip_torch.simulation._grasp import Grasp, Surface
+from tactslip_torch.simulation._contact import ElementContact, Grasp
 from tactslip_torch.simulation.scene import Motion, Scene
 
 _REFERENCE_MM_S = 40.0  # the speed at which levels are given
@@ -77,16 +76,14 @@ class SharedVibration:
     @classmethod
     def of(cls, scene: Scene, grasp: Grasp, motion: Motion) -> SharedVibration:
         """Levels and lines as the arm's speed and position make them."""
-        return cls(
-            *_levels_v(scene, grasp.surface, motion.speed_mm_s), _lines(scene, grasp, motion)
-        )
+        return cls(*_levels_v(scene, grasp, motion.speed_mm_s), _lines(scene, grasp, motion))
 
 
-def _levels_v(scene: Scene, surface: Surface, speed_mm_s: Array) -> tuple[Array, Array]:
+def _levels_v(scene: Scene, grasp: Grasp, speed_mm_s: Array) -> tuple[Array, Array]:
     """Volts rms of friction noise at mu = 1 and of texture, both at 1 N."""
     relative, contact = speed_mm_s / _REFERENCE_MM_S, scene.contact
     friction_v = 1e-3 * contact.friction_noise_mv * relative**contact.friction_noise_exponent
-    return friction_v, 1e-3 * surface.texture_mv * relative**surface.texture_exponent
+    return friction_v, 1e-3 * grasp.texture_mv * relative**grasp.texture_exponent
 
 
 def _lines(scene: Scene, grasp: Grasp, motion: Motion) -> Array:
@@ -96,17 +93,17 @@ def _lines(scene: Scene, grasp: Grasp, motion: Motion) -> Array:
     order; these lines stand for its stick-slip, so bristles, which stick and slip, have none. Lines
     near or beyond the Nyquist frequency are faded out, not folded.
     """
-    surface, shape = grasp.surface, motion.grid.time_s.shape
-    tacky = surface.material.character == "tacky"
-    if surface.wavelength_mm is None or (tacky and scene.fidelity != "kinematic"):
+    shape = motion.grid.time_s.shape
+    tacky = grasp.material.character == "tacky"
+    if grasp.wavelength_mm is None or (tacky and scene.fidelity != "kinematic"):
         return np.zeros((2, 0, *shape))
     rng = generator(*scene.session_key("lines"), scene.material)
     orders = np.repeat([1, 2, 3, 4], 2) if tacky else np.ones(6)
-    spread = lognormal(rng, surface.material.line_bandwidth, len(orders))
+    spread = lognormal(rng, grasp.material.line_bandwidth, len(orders))
     weights = 1.0 / orders / np.sqrt(np.sum(1.0 / orders**2))
     middle_hz = float(np.median(grasp.resonance_hz))
     out = np.empty((2, len(orders), *shape))
-    for number, wavelength in enumerate(surface.wavelength_mm * spread / orders):
+    for number, wavelength in enumerate(grasp.wavelength_mm * spread / orders):
         frequency = motion.speed_mm_s / wavelength
         passed = np.minimum(_resonance(frequency, middle_hz, _LINE_DAMPING), 1.0)
         passed *= weights[number] * np.clip(4.5 - 10.0 * frequency / scene.sample_rate_hz, 0, 1)
@@ -128,7 +125,7 @@ def band_responses(grasp: Grasp, element: int, sample_rate_hz: float) -> Spectru
     belong to the session, so its recordings share them.
     """
     resonance_hz, damping = float(grasp.resonance_hz[element]), float(grasp.damping[element])
-    return _band_responses(grasp.surface.spectral_exponent, resonance_hz, damping, sample_rate_hz)
+    return _band_responses(grasp.spectral_exponent, resonance_hz, damping, sample_rate_hz)
 
 
 @lru_cache(maxsize=256)
@@ -154,7 +151,7 @@ def element_vibration(
     grid: Grid,
 ) -> Vibration:
     """One touching element's vibration over the whole grid; work only in blocks that slide."""
-    surface, material = grasp.surface, grasp.surface.material
+    material = grasp.material
     low_fraction, line_fraction = scene.contact.friction_noise_low_share, material.line_share
     root_load = np.sqrt(grasp.load_n[element])
     mixture = generator(*scene.key("line mixture"), element).standard_normal(shared.lines.shape[:2])
@@ -168,10 +165,10 @@ def element_vibration(
         )
         if scene.fidelity == "bristles":  # a speed of its own, with the sound of that speed
             friction_gate = _powered(slide, scene.contact.friction_noise_exponent)
-            texture_gate = _powered(slide, surface.texture_exponent)
+            texture_gate = _powered(slide, grasp.texture_exponent)
         else:  # a fading in
             friction_gate = texture_gate = slide
-        friction = surface.mu_ratio * surface.mu_s * root_load * shared.friction_v[rows]
+        friction = grasp.mu_ratio * grasp.mu_s * root_load * shared.friction_v[rows]
         friction = friction * friction_gate
         texture = root_load * shared.texture_v[rows] * texture_gate
         broad = np.sqrt((1 - low_fraction) * friction**2 + (1 - line_fraction) * texture**2)
@@ -184,9 +181,8 @@ def element_vibration(
 
 def steady_vibration_v(scene: Scene, grasp: Grasp, element: int, speed_mm_s: float) -> float:
     """Volts rms of an element that slides steadily, its texture's lines counted as noise."""
-    surface = grasp.surface
-    friction_v, texture_v = _levels_v(scene, surface, np.asarray(speed_mm_s))
-    kinetic = surface.mu_ratio * surface.mu_s
+    friction_v, texture_v = _levels_v(scene, grasp, np.asarray(speed_mm_s))
+    kinetic = grasp.mu_ratio * grasp.mu_s
     return float(np.sqrt(grasp.load_n[element]) * np.hypot(kinetic * friction_v, texture_v))
 
 

@@ -1,36 +1,612 @@
 """A scene: everything that determines one simulated recording, and how its arm moves.
 
-Times in seconds from the start of the recording, positions in millimetres from where the arm was
-then.
+Defaults are the starting values of PHYSICS.md unless marked. Every ``*_spread`` is the standard
+deviation of the logarithm of a factor of median 1. Times are in seconds from the start of the
+recording, positions in millimetres from where the arm was then.
+
+Three parameters are *calibrated*: set once, by ``tactslip calibrate``, on seen-material test
+accuracy and the signal checks alone, and frozen with where they come from in ``calibrated.json``.
+They move together along one line of difficulty: ``d`` prior standard deviations harder means less
+friction noise, longer presliding and more bursts, each by its own spread to the power ``d``.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, cast
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.simulation._blocks import Array, Grid, Key
-from tactslip_torch.simulation.parameters import (
-    MATERIALS,
-    SEEN_MATERIALS,
-    UNSEEN_MATERIALS,
-    Contact,
-    Disturbances,
-    Dynamics,
-    Faults,
-    Handling,
-    Imperfections,
-    Moves,
-    Sensors,
-    Stroke,
+
+# --- calibrated parameters ----------------------------------------------------------------------
+
+Value = float | tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A calibrated parameter before calibration.
+
+    Args:
+        start: PHYSICS.md's starting value, or both ends of a range.
+        spread: prior standard deviation, as a factor. It moves both ends of a range.
+        harder: the sign of the parameter's change where slip gets harder to tell.
+        source: of the spread.
+    """
+
+    start: Value
+    spread: float
+    harder: int
+    source: str
+
+    def at(self, difficulty: float) -> Value:
+        """The parameter ``difficulty`` prior standard deviations harder, to four digits."""
+        factor = self.spread ** (self.harder * difficulty)
+        if isinstance(self.start, tuple):
+            low, high = self.start
+            return float(f"{low * factor:.4g}"), float(f"{high * factor:.4g}")
+        return float(f"{self.start * factor:.4g}")
+
+
+PRIORS: Mapping[str, Prior] = {
+    "friction_noise_mv": Prior(
+        8.0, 1.5, -1, "PHYSICS.md: 2 to 12 mV, about two standard deviations on either side"
+    ),
+    "presliding_mm": Prior(
+        (0.3, 3.0), 1.5, 1, "PHYSICS.md: .2 to 2 mm beside a starting range of .3 to 3 mm"
+    ),
+    "burst_rate_hz": Prior(0.3, 2.0, 1, "ours; PHYSICS.md gives no range"),
+}
+"""The calibrated parameters by name."""
+
+CALIBRATED_PATH = Path(__file__).parent / "calibrated.json"
+"""The frozen values, part of the package."""
+
+
+def read_calibrated(path: Path = CALIBRATED_PATH) -> dict[str, Any]:
+    """The values that a calibration froze: numbers, and ``(low, high)`` for a range.
+
+    Raises:
+        ValueError: if the file is missing or damaged. Nothing can start without it, ``calibrate``
+            included, so the error says to restore it.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))["values"]
+        return {
+            name: tuple(map(float, values[name]))
+            if isinstance(prior.start, tuple)
+            else float(values[name])
+            for name, prior in PRIORS.items()
+        }
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ValueError(
+            f"{path} must hold the calibrated parameters, but: {error!r}; restore it from the "
+            "release (reinstall tactslip_torch)"
+        ) from None
+
+
+_CALIBRATED = read_calibrated()
+
+# --- groups of parameters -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Parameters:
+    """A group of parameters: lists become tuples, numbers are checked, ranges are in order."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, list):
+                value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
+                object.__setattr__(self, each.name, value)
+            if isinstance(value, int | float):
+                fine = math.isfinite(value) and value >= 0
+                self._require(each.name, fine, "finite and not negative")
+            elif isinstance(value, tuple) and "tuple[float, float]" in str(each.type):
+                fine = len(value) == 2 and 0 < value[0] <= value[1] < math.inf
+                self._require(each.name, fine, "(low, high), 0 < low <= high")
+
+    def _require(self, name: str, holds: bool, wanted: str) -> None:
+        if not holds:
+            where, value = type(self).__name__, getattr(self, name)
+            raise ValueError(f"{where}.{name} must be {wanted}, got {value!r}")
+
+
+Moves = Literal["hand", "object", "both"]
+
+
+@dataclass(frozen=True)
+class Stroke(_Parameters):
+    """One straight movement after a pause.
+
+    Args:
+        speed_mm_s: steady speed.
+        distance_mm: travel from rest to rest.
+        pause_s: rest before the stroke.
+        moves: ``"hand"``: the arm draws the hand over the resting object, as in the paper.
+            ``"object"``: the object is pulled along the resting hand; it slides and no motor runs.
+            ``"both"``: the arm carries the hand with the object; motors run and nothing slides.
+
+    Raises:
+        ValueError: if speed or distance is not positive, the pause negative, or ``moves`` unknown.
+    """
+
+    speed_mm_s: float
+    distance_mm: float = 100.0
+    pause_s: float = 2.0
+    moves: Moves = "hand"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require("speed_mm_s", self.speed_mm_s > 0, "positive")
+        self._require("distance_mm", self.distance_mm > 0, "positive")
+        known = get_args(Moves)
+        self._require("moves", self.moves in known, f"one of {', '.join(known)}")
+
+    @property
+    def slides(self) -> bool:
+        """Whether hand and object move against each other."""
+        return self.moves != "both"
+
+
+PAPER_FINGER_LOADS = (
+    ("little", 0.6),
+    ("ring", 0.8),
+    ("middle", 0.8),
+    ("index", 2.0),
+    ("thumb", 0.6),
 )
+"""Relative normal load of each finger; fingers not named here carry 1."""
+
+
+@dataclass(frozen=True)
+class Contact(_Parameters):
+    """How the hand touches, and what sliding does to the skin.
+
+    Args:
+        load_n: median normal force of an element on a finger of relative load 1 (prior, ours).
+        finger_loads: ``(finger, relative load)`` pairs.
+        session_share_spread: spread of the elements' load shares between sessions.
+        recording_share_spread: the same between recordings of a session.
+        lifted_fraction: probability that an element does not touch in a recording.
+        touching: names of channels whose elements may touch; ``None`` for all. An element is a
+            segment of a finger with all its channels.
+        mu_s: static friction instead of the material's prior, without spread.
+        mu_k: kinetic friction instead of the material's prior, without spread. A ``mu_s`` that
+            is drawn is raised to it where it falls below.
+        friction_spread: spread of ``mu_s`` between sessions (prior, ours; a fifth of it between
+            recordings).
+        presliding_mm: *calibrated.* Range of the travel that stretches the skin before a fresh
+            contact lets go; log-uniform, drawn per recording.
+        presliding_spread: spread of that travel between the elements of a recording (prior,
+            ours), cut at a factor 1.5.
+        relaxation: range of the share of shear that a long pause relaxes, at most 1.
+        relaxation_time_s: range of its time constant.
+        recoil_s: time constant of the shear's fall from static to kinetic (prior, ours). On the
+            kinematic fidelity alone: bristles integrate that fall.
+        friction_noise_mv: *calibrated.* Broadband friction noise of every sliding element, rms
+            at a PVDF film for mu = 1, 1 N and 40 mm/s.
+        friction_noise_exponent: power of speed it grows with.
+        friction_noise_low_share: share of its power below 25 Hz.
+        texture_scale: factor on every material's texture (prior, ours).
+        onset_pulse_v: first swing of the PVDF burst when an element lets go, per newton of
+            friction. On kinematic fidelity alone: see ``Dynamics.release_v_per_n``.
+        runout: relative change of normal load along the travel.
+        skin_resonance_hz: range of the skin's resonance, drawn per session.
+        skin_damping: range of its damping ratio (prior, ours).
+
+    Raises:
+        ValueError: if a parameter is negative or not finite, ``mu_k`` exceeds ``mu_s``, or no
+            element could touch.
+    """
+
+    load_n: float = 1.0
+    finger_loads: tuple[tuple[str, float], ...] = PAPER_FINGER_LOADS
+    session_share_spread: float = 0.3
+    recording_share_spread: float = 0.3
+    lifted_fraction: float = 0.1
+    touching: tuple[str, ...] | None = None
+    mu_s: float | None = None
+    mu_k: float | None = None
+    friction_spread: float = 0.2
+    presliding_mm: tuple[float, float] = _CALIBRATED["presliding_mm"]
+    presliding_spread: float = 0.2
+    relaxation: tuple[float, float] = (0.1, 0.3)
+    relaxation_time_s: tuple[float, float] = (0.2, 2.0)
+    recoil_s: float = 0.008
+    friction_noise_mv: float = _CALIBRATED["friction_noise_mv"]
+    friction_noise_exponent: float = 0.75
+    friction_noise_low_share: float = 0.3
+    texture_scale: float = 1.0
+    onset_pulse_v: float = 0.5
+    runout: float = 0.04
+    skin_resonance_hz: tuple[float, float] = (40.0, 100.0)
+    skin_damping: tuple[float, float] = (0.1, 0.3)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        static, kinetic = self.mu_s, self.mu_k
+        self._require("mu_s", static is None or static > 0, "positive")
+        if static is not None and kinetic is not None and kinetic > static:
+            raise ValueError(
+                f"Contact.mu_k must not exceed mu_s, got mu_k={kinetic} and mu_s={static}"
+            )
+        loads = all(0 <= load < math.inf for _, load in self.finger_loads)
+        self._require("finger_loads", loads, "finite and not negative")
+        self._require("recoil_s", self.recoil_s > 0, "positive")
+        self._require("friction_noise_low_share", self.friction_noise_low_share <= 1, "at most 1")
+        self._require("runout", self.runout <= 1, "at most 1")
+        self._require("relaxation", self.relaxation[1] <= 1, "at most 1")
+        none = "or no element is in contact"
+        self._require("load_n", self.load_n > 0, f"positive, {none}")
+        self._require("lifted_fraction", self.lifted_fraction < 1, f"below 1, {none}")
+        self._require("touching", self.touching != (), f"null or some channels, {none}")
+
+
+@dataclass(frozen=True)
+class Sensors(_Parameters):
+    """The sensing elements and their front end.
+
+    Args:
+        white_noise_mv: rms of each channel's white noise.
+        white_noise_session_spread: its spread between sessions.
+        gain_spread: spread of the channels' gains between sessions (a third between recordings).
+        sg_preload_v_per_n: SG volts per newton of normal force (prior, ours).
+        sg_shear_v_per_n: SG volts per newton of friction (prior, ours).
+        sg_session_offset_v: spread of SG offsets between sessions (prior, ours).
+        sg_offset_v: spread of SG offsets between recordings, from grasping again.
+        sg_drift_mv: size of the SG's slow drift (prior, ours).
+        pvdf_shear_v_per_n: PVDF volts per newton of friction, before the high-pass (prior, ours).
+        pvdf_highpass_hz: corner of the film and its amplifier (6.6 Hz at 10 MOhm, MSI
+            manual), at least 2 Hz.
+        pvdf_offset_mv: largest offset behind the high-pass; keep it at or below 2 mV.
+        pvdf_drift_mv: size of the film's slow (pyroelectric) drift.
+        warming_mv: how far an SG channel's zero moves over the recording as the hand warms up,
+            with a sign and size of its own in every channel; a PVDF channel moves a fiftieth of it.
+        num_bits: of the converter.
+        rail_v: the converter's range is plus and minus this.
+
+    Raises:
+        ValueError: if a parameter is negative or not finite, or the converter has no range.
+    """
+
+    white_noise_mv: float = 1.0
+    white_noise_session_spread: float = 0.5
+    gain_spread: float = 0.3
+    sg_preload_v_per_n: float = 0.2
+    sg_shear_v_per_n: float = 0.3
+    sg_session_offset_v: float = 0.3
+    sg_offset_v: float = 0.5
+    sg_drift_mv: float = 3.0
+    pvdf_shear_v_per_n: float = 0.05
+    pvdf_highpass_hz: float = 6.6
+    pvdf_offset_mv: float = 2.0
+    pvdf_drift_mv: float = 1.0
+    warming_mv: float = 0.0
+    num_bits: int = 16
+    rail_v: float = 5.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require("num_bits", 2 <= self.num_bits <= 32, "2 to 32")
+        self._require("rail_v", self.rail_v > 0, "positive")
+        wanted = "at least 2, for slower films outlast a block of a quarter second"
+        self._require("pvdf_highpass_hz", self.pvdf_highpass_hz >= 2, wanted)
+
+
+@dataclass(frozen=True)
+class Disturbances(_Parameters):
+    """What is in the recording but is not slip.
+
+    Args:
+        mains_mv: amplitude of the mains' fundamental, the session's median (prior, ours: at
+            PHYSICS.md's 4 to 10 mV rest would exceed the 1.5 to 4 mV rms it asks for).
+        mains_session_spread: its spread between sessions.
+        mains_hz: nominal frequency; harmonics up to the ninth share a common phase.
+        arm_transient_mv: ringing of the arm's modes at each start and stop, in every channel.
+        motor_vibration_mv: rms of the vibration felt in every channel while the arm moves, at
+            40 mm/s. In the paper's data slip *is* arm motion, so this one alone can tell slip.
+            A pair is a range, drawn per recording, log-uniform.
+        mains_bursts_per_s: intervals of a tenth to a whole second in which the mains is stronger
+            (a welder, a lift).
+        mains_burst_mv: added amplitude of the fundamental in them, with its harmonics.
+        machine_mv: vibration of a neighbouring machine, rms, felt in every channel, in intervals
+            that start and stop with the machine.
+        machine_hz: range of its rotation; it has harmonics (prior, ours).
+        burst_rate_hz: *calibrated.* Random bursts (knocks) a second.
+        burst_mv: their size.
+        label_jitter_ms: standard deviation of a person's onset marks, cut at three times that.
+
+    Raises:
+        ValueError: if a parameter is negative or not finite, or a range empty.
+    """
+
+    mains_mv: float = 3.0
+    mains_session_spread: float = 0.7
+    mains_hz: float = 50.0
+    arm_transient_mv: float = 50.0
+    motor_vibration_mv: float | tuple[float, float] = 1.0
+    mains_bursts_per_s: float = 0.0
+    mains_burst_mv: float = 50.0
+    machine_mv: float = 0.0
+    machine_hz: tuple[float, float] = (12.0, 60.0)
+    burst_rate_hz: float = _CALIBRATED["burst_rate_hz"]
+    burst_mv: float = 30.0
+    label_jitter_ms: float = 15.0
+
+
+@dataclass(frozen=True)
+class Handling(_Parameters):
+    """Loads on the contact that are not slip. All priors are ours.
+
+    Args:
+        carried_kg: mass of the object that moves with the hand (strokes that move ``"both"``);
+            its inertia loads the contact with shear, shared among elements by normal load.
+        taps_per_s: knocks of the object on the hand a second, at rest and in strokes that move
+            ``"both"``, never while the contact slides.
+        tap_n: range of a tap's peak force on an element of relative load 1; log-uniform.
+        tap_ms: range of a tap's duration, a half sine; log-uniform.
+        grips_per_s: changes of grip a second, where taps may be: the normal load rises, stays
+            and falls back, never below what it was, so that a contact that sticks sticks on.
+        grip_share: range of the rise over the load; log-uniform.
+        grip_s: range of its duration with both ramps, which take a quarter each; log-uniform.
+
+    Raises:
+        ValueError: if a parameter is negative or not finite.
+    """
+
+    carried_kg: float = 0.2
+    taps_per_s: float = 0.0
+    tap_n: tuple[float, float] = (0.2, 2.0)
+    tap_ms: tuple[float, float] = (5.0, 40.0)
+    grips_per_s: float = 0.0
+    grip_share: tuple[float, float] = (0.1, 1.0)
+    grip_s: tuple[float, float] = (0.2, 1.0)
+
+
+@dataclass(frozen=True)
+class Faults(_Parameters):
+    """Broken channels and lost samples; the truth about the contact is not touched.
+
+    Args:
+        dead: channels of which nothing but the converter's zero is recorded.
+        saturated: channels that stand at the upper rail.
+        swapped: pairs of channels whose cables are exchanged.
+        drops_per_s: losses of samples a second, in all channels at once; the last sample before
+            a loss is repeated until it ends, as data loggers do.
+        drop_ms: range of their length; log-uniform, at most 200 ms.
+
+    Raises:
+        ValueError: if a parameter is negative or not finite, a pair is not two channels, a channel
+            has two faults, or losses may be longer than 200 ms.
+    """
+
+    dead: tuple[str, ...] = ()
+    saturated: tuple[str, ...] = ()
+    swapped: tuple[tuple[str, str], ...] = ()
+    drops_per_s: float = 0.0
+    drop_ms: tuple[float, float] = (1.0, 50.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require("drop_ms", self.drop_ms[1] <= 200, "at most 200")
+        pairs = all(len(pair) == 2 and pair[0] != pair[1] for pair in self.swapped)
+        self._require("swapped", pairs, "pairs of channels")
+        twice = [name for name, count in Counter(self.names).items() if count > 1]
+        if twice:
+            raise ValueError(f"Faults names {', '.join(twice)} twice; a channel has one fault")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Channels with a fault of their own."""
+        return (*self.dead, *self.saturated, *(name for pair in self.swapped for name in pair))
+
+
+@dataclass(frozen=True)
+class Dynamics(_Parameters):
+    """Friction and steps of fidelity ``"bristles"``; the kinematic one has none.
+
+    Stiffness, mass and damping of the skin follow from what both share: the presliding travel,
+    the resonance and its damping ratio. PHYSICS.md, *Stiffness*.
+
+    Args:
+        step_us: of the integration; a whole number of steps makes a sample.
+        num_bristles: of an element, under a Hertz pressure. 1 is LuGre's model: an element sticks
+            or slides as a whole. 16 to 64 are a patch whose edge lets go first (incipient slip).
+        bristle_share: share of the presliding travel that the bristles take, the skin behind them
+            the rest (prior, ours). It sets how long incipient slip is, and how gently a patch
+            lets go: a bristle's friction falls with the patch's speed.
+        bristle_stiffness_n_m: of a single bristle, which takes what of the presliding travel this
+            stiffness needs, at most ``bristle_share``. Of no use with more bristles.
+        sliding_damping: damping ratio of the skin beyond that with which it rings in the
+            closed forms (prior, ours).
+        sliding_damping_s_m: more of it, in N s/m per newton of static friction (prior, ours).
+            Friction that falls with speed feeds a slide, at 20 mm/s with up to 1.8 of these for a
+            smooth material and 8 for a tacky one: between them the one slides smoothly on any skin
+            and the other sticks and slips, but for the softest skins of all and most patches.
+        bristle_damping: damping ratio of the bristles with the skin's mass (prior, ours).
+        viscous_n_s_m: viscous friction, which the closed forms do not have.
+        release_v_per_n: PVDF volts per newton of the skin's inertia: what a film at the
+            surface hears when the skin lets go (prior, ours: so that the bursts of M2 to M5
+            stand out of their slides with a single bristle, REFERENCE.md section 6, *signals*).
+
+    Raises:
+        ValueError: if a parameter is negative or not finite, a step is longer than 5 ms or zero, or
+            there are no bristles.
+    """
+
+    step_us: float = 250.0
+    bristle_share: float = 0.15
+    num_bristles: int = 24
+    bristle_stiffness_n_m: float = 1e5
+    sliding_damping: float = 0.5
+    sliding_damping_s_m: float = 1.8
+    bristle_damping: float = 1.0
+    viscous_n_s_m: float = 0.0
+    release_v_per_n: float = 14.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require("step_us", 0 < self.step_us <= 5000, "in (0, 5000]")
+        self._require("bristle_share", 0 < self.bristle_share < 1, "in (0, 1)")
+        whole = self.num_bristles == int(self.num_bristles) >= 1
+        self._require("num_bristles", whole, "a whole number of 1 or more")
+        self._require("bristle_stiffness_n_m", self.bristle_stiffness_n_m > 0, "positive")
+
+
+@dataclass(frozen=True)
+class Imperfections(_Parameters):
+    """What makes channels differ without slip, and what makes slip differ between channels.
+
+    On the paper's simulated hand, slip alone makes channels differ: everything else (mains, arm,
+    motor) moves them together. On real electrodes at rest neighbours are nearly independent
+    (``python -m benchmarks.realism``). None of these moves an onset.
+
+    Args:
+        local_noise_mv: noise of every element that touches, sliding or not, independent between
+            elements, rms at a PVDF film at 1 N. It stands for creep and settling of asperities
+            behind the skin's resonance, so it has the spectrum of friction noise; its level wanders
+            within the recording and differs between elements (prior, ours: below the 1.5 to 4 mV
+            rms that PHYSICS.md gives rest; independent, as a real fingertip's electrodes in touch).
+        share_wander: spread of the logarithm of each element's load while a grasp lasts, over
+            half a second to ten (prior: in the real set a channel's level wanders about the mean
+            over channels by .2 to .3 within seconds).
+        gain_drift: the same of each channel's gain: temperature, glue (prior, ours).
+        pickup_mv: broadband pick-up, one signal in all channels, rms at a film of coupling 1. Each
+            channel has a coupling and sign of its own, so it too makes channels differ; its level
+            wanders (a film is a source of high impedance, near motor drives and cables: MSI/TE
+            Piezo Film Sensors Technical Manual asks for shielding; level prior, ours).
+        partial_slips_per_s: how often a finger does what the hand does not. At rest it creeps over
+            a part of its presliding travel and vibrates, while the others hold; in a slide it
+            sticks for as long. That is no slip of the hand, and not labelled (slip grows from the
+            edge of a contact before all of it slides: Delhaye, Lefevre and Thonnard 2014, J. R.
+            Soc. Interface, 10.1098/rsif.2014.0698; Andre et al. 2011, ibid.; rate prior, ours).
+
+    Raises:
+        ValueError: if a parameter is negative or not finite.
+    """
+
+    local_noise_mv: float = 0.0
+    share_wander: float = 0.0
+    gain_drift: float = 0.0
+    pickup_mv: float = 0.0
+    partial_slips_per_s: float = 0.0
+
+
+# --- materials ------------------------------------------------------------------------------------
+
+Character = Literal["smooth", "textured", "rough", "tacky"]
+"""How sliding sounds. ``rough``: sustained vibration. ``tacky``: sustained stick-slip."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """A surface, as ranges to draw a session from.
+
+    Args:
+        title: the name in words.
+        mu_s: static friction coefficient, the centre of its lognormal prior; dimensionless.
+        mu_ratio: lowest and highest kinetic over static friction, dimensionless.
+        ra_um: lowest and highest roughness Ra; with ``texture_mv`` it sets how strongly the
+            material vibrates (a session rougher than the middle of its range vibrates more).
+        wavelength_mm: shortest and longest dominant wavelength, or ``None`` without one. For a
+            tacky material: travel per stick-slip cycle.
+        line_bandwidth: relative spread of the wavelengths around the dominant one.
+        line_share: share of the texture's power at the dominant wavelength; the rest is the
+            broad ``k^-a`` part.
+        texture_mv: rms of the texture's vibration at 40 mm/s and 1 N at a PVDF film (prior, ours).
+        character: see ``Character``.
+        stribeck_mm_s: speed over which static becomes kinetic friction of bristles;
+            near the speeds of sliding it makes a material stick and slip (PHYSICS.md).
+        fast_ratio: kinetic over static friction far above that speed, of bristles, where
+            it is not ``mu_ratio``: a tacky material's is the mean over sticking and slipping at
+            the speeds of sliding. The range is drawn with ``mu_ratio``, low with low.
+
+    Raises:
+        ValueError: if friction is not positive, kinetic exceeds static friction, or a range is
+            empty.
+    """
+
+    title: str
+    mu_s: float
+    mu_ratio: tuple[float, float]
+    ra_um: tuple[float, float]
+    wavelength_mm: tuple[float, float] | None
+    line_bandwidth: float
+    line_share: float
+    texture_mv: float
+    character: Character
+    stribeck_mm_s: float = 10.0
+    fast_ratio: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        low, high = self.mu_ratio
+        if not (self.mu_s > 0 and 0 < low <= high <= 1):
+            raise ValueError(
+                f"{self.title}: expected mu_s > 0 and mu_ratio (mu_k / mu_s) with "
+                f"0 < low <= high <= 1, got {self.mu_s} and {self.mu_ratio}"
+            )
+
+
+def _prior(
+    title: str,
+    mu_s: float,
+    ra_um: tuple[float, float],
+    texture_mv: float,
+    character: Character = "smooth",
+    wavelength_mm: tuple[float, float] | None = None,
+    line_bandwidth: float = 0.1,
+) -> Material:
+    """A row of the table; the kinetic ratio is .75 to .95 for every material."""
+    line_share = 0.0 if wavelength_mm is None else (0.5 if character == "tacky" else 0.4)
+    return Material(
+        title,
+        mu_s,
+        (0.75, 0.95),
+        ra_um,
+        wavelength_mm,
+        line_bandwidth,
+        line_share,
+        texture_mv,
+        character,
+        *((50.0, (0.4, 0.55)) if character == "tacky" else (10.0, None)),
+    )
+
+
+# Friction, Ra and wavelengths: PHYSICS.md's table, as priors: none was measured on this hand.
+# Each session draws its own from the ranges. Texture levels: rough 150 mV and smooth 10 mV
+# (its starting values), the materials between by roughness and softness (prior, ours). The tacky
+# fast_ratio: with it the force oscillates by about a quarter (prior, ours).
+MATERIALS: dict[str, Material] = {
+    "M1": _prior("ABS", 0.8, (5.0, 12.0), 150.0, "rough", (0.18, 0.22), 0.05),
+    "M2": _prior("aluminium foil", 0.7, (0.15, 0.25), 10.0),
+    "M3": _prior("fibreglass aluminium foil", 0.7, (2.5, 3.5), 14.0, "textured", (0.5, 1.5)),
+    "M4": _prior("oil paper", 0.5, (3.0, 5.0), 12.0, "textured", (0.05, 0.5), 0.5),
+    "M5": _prior("acrylic", 1.0, (0.02, 0.1), 8.0),
+    "M6": _prior("PVC tape", 1.1, (1.0, 2.0), 120.0, "tacky", (0.8, 2.0), 0.03),
+    "iron": _prior("iron", 0.7, (0.8, 3.0), 12.0),
+    "cloth": _prior("duct tape", 0.8, (10.0, 20.0), 60.0, "rough", (0.5, 1.0)),
+    "copper": _prior("copper", 0.6, (0.2, 0.8), 10.0),
+    "wood": _prior("wood", 0.6, (3.0, 10.0), 25.0, "textured", (0.1, 1.0), 0.3),
+}
+"""Every known material by the short id used everywhere else."""
+
+SEEN_MATERIALS = ("M1", "M2", "M3", "M4", "M5", "M6")
+"""The paper's training materials, in its order."""
+
+UNSEEN_MATERIALS = ("iron", "cloth", "copper", "wood")
+"""The paper's held-out materials. Nothing is tuned on them."""
+
+# --- scenes ---------------------------------------------------------------------------------------
 
 FIDELITIES = ("kinematic", "bristles")
 """How contacts are modelled: by closed forms, or by skin and bristles integrated in time."""

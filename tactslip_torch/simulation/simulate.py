@@ -21,7 +21,15 @@ from numpy.typing import NDArray
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.native import BackendName
 from tactslip_torch.simulation._blocks import Array, Grid, generator
-from tactslip_torch.simulation._contact import Contacts, StrokeTrace, scene_contact, traces_of
+from tactslip_torch.simulation._contact import (
+    Contacts,
+    Grasp,
+    Slips,
+    StrokeTrace,
+    draw_grasp,
+    scene_contact,
+    traces_of,
+)
 from tactslip_torch.simulation._disturbances import (
     Handled,
     add_imperfections,
@@ -32,7 +40,6 @@ from tactslip_torch.simulation._disturbances import (
     recorded_channels,
     stuck_volts,
 )
-from tactslip_torch.simulation._grasp import Grasp, Slips, draw_grasp
 from tactslip_torch.simulation._sensors import (
     SharedVibration,
     converted,

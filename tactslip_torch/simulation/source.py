@@ -9,8 +9,13 @@ from typing import Any
 from tactslip_torch.data.recording import Recording, RecordingId
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.simulation._bristles import integrator
-from tactslip_torch.simulation.parameters import SEEN_MATERIALS, UNSEEN_MATERIALS
-from tactslip_torch.simulation.scene import PAPER, Scene, paper_scenes
+from tactslip_torch.simulation.scene import (
+    PAPER,
+    SEEN_MATERIALS,
+    UNSEEN_MATERIALS,
+    Scene,
+    paper_scenes,
+)
 from tactslip_torch.simulation.simulate import Timeline, simulate, timeline
 
 
@@ -24,8 +29,8 @@ class SimulatedRecordings:
         channels: rows for ``HandLayout.from_rows``; ``None`` for the paper's hand.
         fidelity: of the contact, one of ``FIDELITIES``.
         scene: overrides of any parameter of the scenes; ``name`` is the kind they are.
-        others: further kinds of scenes by name, with their overrides; ``cycles`` among them is
-            the kind's own number. They start from the same parameters as ``scene``.
+        extra_scenes: further kinds of scenes by name, with their overrides; ``cycles`` among them
+            is the kind's own number. They start from the same parameters as ``scene``.
         sessions: mountings of every material, each with all its cycles and kinds of scenes. The
             first one's recordings are those of a set with one session; further ones are named
             "2", "3" and so on, and draw everything that belongs to a mounting again: noise floor,
@@ -35,8 +40,9 @@ class SimulatedRecordings:
         ValueError: as ``paper_scenes``; or if there is no session.
 
     Example:
+        >>> noisy = {"machine_mv": 20.0, "cycles": 1}
         >>> source = SimulatedRecordings(
-        ...     cycles=2, materials=["M1"], others={"noisy": {"machine_mv": 20.0, "cycles": 1}}
+        ...     cycles=2, materials=["M1"], extra_scenes={"noisy": noisy}
         ... )
         >>> [str(recording) for recording in source.ids]
         ['M1/0', 'M1/1', 'M1/0/noisy']
@@ -53,7 +59,7 @@ class SimulatedRecordings:
         channels: Iterable[Mapping[str, str]] | None = None,
         fidelity: str = "kinematic",
         scene: Mapping[str, Any] | None = None,
-        others: Mapping[str, Mapping[str, Any]] | None = None,
+        extra_scenes: Mapping[str, Mapping[str, Any]] | None = None,
         sessions: int = 1,
     ) -> None:
         if sessions < 1:
@@ -61,7 +67,9 @@ class SimulatedRecordings:
         self.hand = HandLayout.paper24() if channels is None else HandLayout.from_rows(channels)
         base = {"fidelity": fidelity, "name": PAPER, **(scene or {})}
         kinds = [{**base, "cycles": cycles}]
-        kinds += [{**kinds[0], **changes, "name": name} for name, changes in (others or {}).items()]
+        kinds += [
+            {**kinds[0], **changes, "name": name} for name, changes in (extra_scenes or {}).items()
+        ]
         materials = tuple(materials)
         self._scenes: dict[RecordingId, Scene] = {}
         for number in range(1, sessions + 1):

@@ -1,34 +1,40 @@
 """A new material in a detector without training again: recordings into its sums, and out again.
 
-Sums with other bins are solved in closed form, and so is what every known bin scores by the machine
-without its recording, from one factor: without the bins of a group ``g`` the residuals are
-``e_g = (I - H_gg)^-1 (t - f)_g`` with the hat matrix of the machine of all bins
-(``HeldOut``). Here all bins are in the sums, and a group is what is known of a recording: of
-one that was added all bins, of one trained on those sampled. The rest of the latter stays in, so a
-score is a little better than that of a machine without the recording; before and after a change
-alike. By these scores a change is accepted only if the old materials are still known.
+``statistics.pt`` beside a detector keeps what it is solved again from: sums over all training bins,
+a bounded sample of these bins, and all that came later: recordings with their bins and weights, and
+every step with the detector it replaced. Bins are taken out as they were put in, so any step can be
+undone.
+
+A change is accepted only if the old materials keep their accuracy. What every known bin scores by
+the machine without its recording follows in closed form from the factor that solves for the machine
+(``model.leave_one_group_out``). Of an added recording all bins are known, of one trained on those
+sampled; its other bins stay in, so a score is a little better than that of a machine without the
+recording, before and after a change alike.
 """
 
 from __future__ import annotations
 
+import bisect
 import copy
 import itertools
 import logging
 import math
+import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import Split
-from tactslip_torch.features.bin_sample import SampledBins
+from tactslip_torch.features.bin_sample import SampledBins, bin_keys
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.abstention import KEY as ABSTAIN
-from tactslip_torch.model.abstention import Abstention, abstention_of, conformal_abstention
+from tactslip_torch.model.abstention import Abstention
 from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins
@@ -37,21 +43,452 @@ from tactslip_torch.model.leave_one_group_out import MOST_CONDITION, HeldOut, re
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.solve import solve_symmetric
-from tactslip_torch.onset.settings import KEY as ALARM
-from tactslip_torch.runtime import bar
+from tactslip_torch.onset.decisions import KEY as ALARM
+from tactslip_torch.runtime import SeenBatches, bar, content_digest, load_table, save_table
 from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.fitting import TrainingPass, solve_metadata
+from tactslip_torch.training.plan import TrainingPass, solve_metadata
 from tactslip_torch.training.recipe import Recipe
-from tactslip_torch.training.statistics import (
-    KnownBins,
-    Machine,
-    RecordingBins,
-    Statistics,
-    Step,
-    detector_digest,
-)
 
+log = logging.getLogger(__name__)
+
+FILE = "statistics.pt"
+
+FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Weights that ``auto`` tries, in parts of that of an average old material.
+
+Where every training material in turn was new (simulated, ``benchmarks.adapting``), its own accuracy
+kept rising to about the last of these, and what the others lost rose with it.
+"""
+
+_FORMAT = "tactslip_torch statistics 4"
+_JOURNAL = "adaptations"  # under which SlipDetector.info keeps the entries of all steps
 _CHUNK = 1024  # bins of whole recordings whose columns are solved at a time, unless one has more
+_MOST_WEIGHT = 8000.0  # of a bin; more would hide the others
+_OF_ONE = 4.0
+"""A single material may fall by so many margins: some 800 sampled bins tell its change to half a
+point at best, so a tighter limit would refuse by chance. Their mean is known far better."""
+_OF_MARGIN = 0.5
+"""``auto`` spends this part of the margin: how far old materials fall is itself an estimate."""
+
+
+# What a detector is solved again from ------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingBins:
+    """All bins of one recording.
+
+    Args:
+        material: of the recording.
+        z: ``[N, K]``, float64, scaled selected features.
+        is_slip: ``[N]``, bool.
+        key: digest of what determines the samples, as ``train_recordings`` of a detector has it.
+    """
+
+    material: str
+    z: Tensor
+    is_slip: Tensor
+    key: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownBins:
+    """Bins in the sums that are known one by one: a sample of training, and all that were added.
+
+    Args:
+        z: ``[n, K]``, float64, scaled selected features.
+        is_slip: ``[n]``, bool.
+        weight: ``[n]``, float64, of each bin in the sums; 1 of those of training.
+        sample_weight: ``[n]``, float64, total weight of the bins that it was drawn from.
+        recording: ``[n]``, int64, index into the two lists that follow.
+        recordings: names.
+        materials: of each of these recordings.
+    """
+
+    z: Tensor
+    is_slip: Tensor
+    weight: Tensor
+    sample_weight: Tensor
+    recording: Tensor
+    recordings: tuple[str, ...]
+    materials: tuple[str, ...]
+
+    def with_others(
+        self, bins: Mapping[str, RecordingBins], weights: Mapping[str, float]
+    ) -> KnownBins:
+        """These with the bins of some recordings replaced: by all, or by none at weight 0."""
+        kept = ~self.of_recordings(bins)
+        new = {name: own for name, own in sorted(bins.items()) if weights[name] > 0}
+        sizes = torch.tensor([len(own.z) for own in new.values()], dtype=torch.int64)
+        place = torch.arange(len(new)).repeat_interleave(sizes)
+        weight = torch.tensor([weights[name] for name in new], dtype=torch.float64)[place]
+        return KnownBins(
+            torch.cat([self.z[kept], *(own.z for own in new.values())]),
+            torch.cat([self.is_slip[kept], *(own.is_slip for own in new.values())]),
+            torch.cat([self.weight[kept], weight]),
+            torch.cat([self.sample_weight[kept], weight]),
+            torch.cat([self.recording[kept], place + len(self.recordings)]),
+            (*self.recordings, *new),
+            (*self.materials, *(own.material for own in new.values())),
+        )
+
+    @property
+    def material_names(self) -> list[str]:
+        """Of all recordings, ascending."""
+        return sorted(set(self.materials))
+
+    @property
+    def material(self) -> Tensor:
+        """``[n]``, int64, index into ``material_names``."""
+        names = self.material_names
+        return torch.tensor([names.index(name) for name in self.materials])[self.recording]
+
+    def of_recordings(self, recordings: Collection[str]) -> Tensor:
+        """Which bins are of these recordings, ``[n]``, bool."""
+        return torch.tensor([name in recordings for name in self.recordings])[self.recording]
+
+
+@dataclass(frozen=True)
+class Machine:
+    """How sums become a machine.
+
+    Args:
+        penalty: the paper's ``C``.
+        offset: the kernel's ``c``.
+        balance: of the classes, as ``SufficientStats.solve`` takes it.
+    """
+
+    penalty: float
+    offset: float
+    balance: Literal["weights", "none"]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One change of a detector.
+
+    Args:
+        entry: of the journal, JSON-able.
+        weights: of ``Statistics``, before it.
+        changed: weight before it of each recording that it changed.
+        replaced: bins before it of recordings that came back with others.
+        detector: digest of the detector before it.
+        file: that detector's file, bytes.
+    """
+
+    entry: Mapping[str, Any]
+    weights: Mapping[str, float]
+    changed: Mapping[str, float]
+    replaced: Mapping[str, RecordingBins]
+    detector: str
+    file: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Sums, a sample of training bins, and what changed since training.
+
+    Args:
+        sums: over all bins that are in.
+        machine: how they are solved.
+        labels: how bins were laid and labelled, arguments of ``LabelRule``.
+        rehearsal: a bounded sample of the training bins.
+        detector: digest of the detector that these sums make.
+        bins: of recordings that were added, or trained on and taken out, by name.
+        weights: of a bin of each recording of ``bins``; 0 where it is out.
+        steps: in their order.
+    """
+
+    sums: SufficientStats
+    machine: Machine
+    labels: Mapping[str, Any]
+    rehearsal: KnownBins
+    detector: str
+    bins: Mapping[str, RecordingBins] = field(default_factory=dict)
+    weights: Mapping[str, float] = field(default_factory=dict)
+    steps: Sequence[Step] = ()
+
+    @classmethod
+    def of_training(
+        cls,
+        gathered: TrainingPass,
+        sample: SampledBins,
+        materials: Mapping[str, str],
+        labels: Mapping[str, Any],
+        detector: SlipDetector,
+    ) -> Statistics:
+        """What a second pass gathered, with a sample of its bins.
+
+        A machine of few bins was solved from the bins themselves; their sums give the same to
+        rounding.
+
+        Args:
+            gathered: the second pass, with its plan.
+            sample: of the first pass.
+            materials: of each training recording, by its name.
+            labels: arguments of ``LabelRule``.
+            detector: that was solved.
+        """
+        plan = gathered.plan
+        assert isinstance(plan.kernel, Polynomial)  # check_recipe
+        sums = gathered.stats
+        if sums is None:
+            sums = SufficientStats(len(plan.selection.selected))
+            for name in sorted(gathered.bins):
+                sums.update(name, *gathered.bins[name])
+        # of the sampled bins those that were trained on
+        fraction = torch.tensor(plan.fractions, dtype=torch.float64)[sample.is_slip.long()]
+        most = int(sample.bin_index.max()) + 1
+        keys = torch.stack([bin_keys(name, most) for name in sample.recording_names])
+        kept = (fraction >= 1) | (keys[sample.recording, sample.bin_index] < fraction)
+        rehearsal = KnownBins(
+            plan.selection(sample.features[kept]),
+            sample.is_slip[kept],
+            torch.ones_like(fraction[kept]),
+            (sample.sample_weight * fraction)[kept],
+            sample.recording[kept],
+            sample.recording_names,
+            tuple(materials[name] for name in sample.recording_names),
+        )
+        balance: Literal["weights", "none"]
+        balance = "weights" if plan.recipe.balance == "weights" else "none"
+        machine = Machine(plan.penalty, plan.kernel.offset, balance)
+        return cls(sums, machine, dict(labels), rehearsal, detector_digest(detector))
+
+    def weight_of(self, recording: str) -> float:
+        """Of a bin of a recording: 1 as trained, 0 if it is not in."""
+        return self.weights.get(recording, float(recording in self.sums.seen_batches))
+
+    def known(self) -> KnownBins:
+        """Bins that are in the sums and known one by one."""
+        return self.rehearsal.with_others(self.bins, self.weights)
+
+    @property
+    def materials(self) -> dict[str, str]:
+        """The material of every recording that is or was in, by name."""
+        trained = dict(zip(self.rehearsal.recordings, self.rehearsal.materials, strict=True))
+        return trained | {name: own.material for name, own in self.bins.items()}
+
+    def reweighed(
+        self, weights: Mapping[str, float], bins: Mapping[str, RecordingBins] | None = None
+    ) -> Statistics:
+        """The same with other weights of some recordings; exact, whatever was before.
+
+        Args:
+            weights: by recording; 0 takes it out.
+            bins: of recordings that are not known yet, or are out and come back with others.
+
+        Raises:
+            ValueError: if a recording that is taken out holds something else than was put in.
+        """
+        known = {**self.bins, **(bins or {})}
+        sums = copy.deepcopy(self.sums)
+        for name, weight in weights.items():
+            own, before = known[name], self.weight_of(name)
+            if weight == before:
+                continue
+            for value, change in ((before, sums.remove), (weight, sums.update)):
+                if value > 0:
+                    change(name, own.z, own.is_slip, own.z.new_full((len(own.z),), value))
+        return replace(self, sums=sums, bins=known, weights={**self.weights, **weights})
+
+    def with_step(
+        self, after: Statistics, entry: Mapping[str, object], file: Tensor, digest: str
+    ) -> Statistics:
+        """The statistics after a change of these, with the step.
+
+        Args:
+            after: the changed ones.
+            entry: of the journal.
+            file: of the detector before it, bytes.
+            digest: of the detector after it.
+        """
+        changed = {
+            name: before
+            for name in after.bins
+            if (before := self.weight_of(name)) != after.weight_of(name)
+        }
+        replaced = {name: own for name, own in self.bins.items() if own is not after.bins[name]}
+        step = Step(entry, self.weights, changed, replaced, self.detector, file)
+        return replace(after, steps=(*self.steps, step), detector=digest)
+
+    def undo(self) -> tuple[Statistics, Tensor]:
+        """The statistics before the last step, and the file of the detector they belong to.
+
+        Raises:
+            ValueError: if there is no step.
+        """
+        if not self.steps:
+            raise ValueError("there is nothing to undo: this detector is as it was trained")
+        *earlier, last = self.steps
+        back = self.reweighed(dict.fromkeys(last.changed, 0.0))
+        back = back.reweighed(last.changed, last.replaced)
+        bins = {name: own for name, own in back.bins.items() if name in last.weights}
+        steps = tuple(earlier)
+        state = replace(back, bins=bins, weights=last.weights, steps=steps, detector=last.detector)
+        return state, last.file
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a file, whole or not at all."""
+        plain = vars(self) | {
+            "sums": {
+                "num_features": self.sums.num_features,
+                "about": self.sums.about,
+                "seen_batches": dict(self.sums.seen_batches),
+                "sums": self.sums.sums,
+                "count": self.sums.count,
+            }
+        }
+        tensors: dict[str, Tensor] = {}
+        save_table(path, _FORMAT, _without_tensors(plain, tensors), tensors)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Statistics:
+        """What ``save`` wrote; nothing in the file is executed.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is another kind of file, or damaged.
+        """
+        plain = _with_tensors(*load_table(path, _FORMAT))
+        of_sums = plain["sums"]
+        sums = SufficientStats(of_sums["num_features"], of_sums["about"])
+        sums.seen_batches = SeenBatches(of_sums["seen_batches"])
+        sums.sums, sums.count = of_sums["sums"], of_sums["count"]
+        rehearsal = plain["rehearsal"]
+        for name in ("recordings", "materials"):
+            rehearsal[name] = tuple(rehearsal[name])
+
+        def bins(by_name: Mapping[str, Any]) -> dict[str, RecordingBins]:
+            return {name: RecordingBins(**own) for name, own in by_name.items()}
+
+        steps = [Step(**own | {"replaced": bins(own["replaced"])}) for own in plain["steps"]]
+        restored = {
+            "sums": sums,
+            "machine": Machine(**plain["machine"]),
+            "rehearsal": KnownBins(**rehearsal),
+            "bins": bins(plain["bins"]),
+            "steps": tuple(steps),
+        }
+        return cls(**plain | restored)
+
+
+def _without_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any:
+    """A tree of dataclasses, mappings and lists in what JSON has; its tensors go by their path."""
+    if isinstance(value, Tensor):
+        tensors[path] = value
+        return {"tensor": path}
+    if isinstance(value, list | tuple):
+        return [_without_tensors(x, tensors, f"{path}/{i}") for i, x in enumerate(value)]
+    if isinstance(value, RecordingBins | KnownBins | Machine | Step):
+        value = vars(value)
+    if isinstance(value, Mapping):
+        return {name: _without_tensors(x, tensors, f"{path}/{name}") for name, x in value.items()}
+    return value
+
+
+def _with_tensors(value: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """The tree that ``_without_tensors`` wrote, dataclasses as dictionaries."""
+    if isinstance(value, list):
+        return [_with_tensors(item, tensors) for item in value]
+    if isinstance(value, dict):
+        if value.keys() == {"tensor"}:
+            return tensors[value["tensor"]]
+        return {name: _with_tensors(item, tensors) for name, item in value.items()}
+    return value
+
+
+def detector_digest(detector: SlipDetector) -> str:
+    """Of what a detector computes with: scaling and machine, whatever else its file says."""
+    state = detector.state_dict()
+    names = sorted(name for name in state if name.startswith(("scaler.", "head.")))
+    places = torch.tensor(detector.selected)
+    return content_digest(places, *(state[name] for name in names))
+
+
+def statistics_of(model: str | os.PathLike[str], detector: SlipDetector) -> Statistics:
+    """The statistics beside a detector's file.
+
+    Args:
+        model: where the detector is.
+        detector: what is there.
+
+    Raises:
+        FileNotFoundError: if there are none.
+        ValueError: if they are damaged, or of another detector.
+    """
+    path = Path(model).with_name(FILE)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no {FILE} beside {model}; train with recipe=robust statistics=true, which leaves it "
+            "there"
+        )
+    found = Statistics.load(path)
+    if found.detector != (digest := detector_digest(detector)):
+        if found.steps and found.steps[-1].detector == digest:
+            raise ValueError(
+                f"{path} is one step ahead of {model}, as when writing was cut off between the "
+                "two; action=undo takes that step back"
+            )
+        raise ValueError(f"{path} belongs to another detector than {model}; train again")
+    return found
+
+
+@contextmanager
+def locked(model: str | os.PathLike[str]) -> Iterator[None]:
+    """A lock file beside a detector, for as long as it is changed.
+
+    A program that is killed leaves it; the message to the next says how to go on.
+
+    Raises:
+        ValueError: if another program changes the detector.
+
+    Example:
+        >>> model = getfixture("tmp_path") / "detector.pt"
+        >>> with locked(model):
+        ...     [path.name for path in model.parent.iterdir()]
+        ['.detector.pt.lock']
+        >>> list(model.parent.iterdir())
+        []
+    """
+    path = Path(model).with_name(f".{Path(model).name}.lock")
+    try:
+        path.touch(exist_ok=False)
+    except FileExistsError:
+        raise ValueError(
+            f"another adapt is changing {os.fspath(model)}; wait for it or, if none runs any more, "
+            f"remove {path}"
+        ) from None
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def check_recipe(recipe: Recipe) -> None:
+    """Refuse what makes a detector that cannot be solved again from sums.
+
+    Raises:
+        ValueError: if its kernel does not add up, a penalty is not finite, or it is chosen nested.
+    """
+    if recipe.validation == "nested":
+        raise ValueError(
+            "statistics=true needs a machine of degree 2 on features of channels, which "
+            f"recipe={recipe.name} does not always make; take recipe=robust or recipe=paper"
+        )
+    if not all(isinstance(k, Polynomial) and k.degree == 2 for k in recipe.kernels):
+        raise ValueError(
+            "statistics=true needs recipe.kernel=polynomial recipe.degree=2, whose bins add up; "
+            f"got {recipe.kernels[0]}"
+        )
+    if not math.isfinite(most := recipe.penalties_ascending[-1]):
+        raise ValueError(
+            f"statistics=true needs finite recipe.penalties, got {most:g}: without a ridge no "
+            "machine without a recording can be told"
+        )
+
+
+# Machines, and what they score without a recording -----------------------------------------------
 
 
 class Solved(NamedTuple):
@@ -67,13 +504,15 @@ class Solved(NamedTuple):
     known: KnownBins
     scores: Tensor
 
-
-def _class_scales(sums: SufficientStats, machine: Machine) -> Tensor:
-    """What the balance multiplies the weight of non-slip and of slip with, ``[2]``."""
-    weight = sums.weight
-    if machine.balance == "none":
-        return torch.ones_like(weight)
-    return weight.sum() / (2 * weight)
+    def accuracies(self, recordings: Collection[str]) -> dict[str, float]:
+        """Mean recall of every material in these recordings, from held-out scores."""
+        known, says_slip = self.known, self.scores >= 0
+        wanted, material = known.of_recordings(recordings), known.material
+        return {
+            name: mean_recall(says_slip[mine], known.is_slip[mine])
+            for number, name in enumerate(known.material_names)
+            if bool((mine := wanted & (material == number)).any())
+        }
 
 
 def solve(statistics: Statistics) -> Solved:
@@ -99,8 +538,7 @@ def solve(statistics: Statistics) -> Solved:
     assert factor is not None  # as most_condition is given
     head = kernel.head(weights, sums.num_features)
     head.solved = report
-    scales = _class_scales(sums, machine)
-    roots = (scales[known.is_slip.long()] * known.weight).sqrt()
+    roots = (class_scales(statistics)[known.is_slip.long()] * known.weight).sqrt()
     targets = torch.where(known.is_slip, 1.0, -1.0).double()
     right = roots * (targets - head(known.z))
     residuals = torch.empty_like(right)
@@ -108,105 +546,31 @@ def solve(statistics: Statistics) -> Solved:
         rows = torch.cat(groups)
         scaled = kernel.monomials(known.z[rows]) * roots[rows, None]
         columns = torch.linalg.solve_triangular(factor, scaled.mT, upper=False)
-        parts = columns.split([len(group) for group in groups], dim=1)
-        for group, part in zip(groups, parts, strict=True):
+        for group, own in zip(groups, columns.split([*map(len, groups)], dim=1), strict=True):
             name = int(known.recording[group[0]])
-            residuals[group] = residuals_without(part.mT @ part, right[group], name)
+            residuals[group] = residuals_without(own.mT @ own, right[group], name)
     return Solved(head, known, targets - residuals / roots)
+
+
+def class_scales(statistics: Statistics) -> Tensor:
+    """What the balance multiplies the weight of non-slip and of slip with, ``[2]``."""
+    weight = statistics.sums.weight
+    if statistics.machine.balance == "none":
+        return torch.ones_like(weight)
+    return weight.sum() / (2 * weight)
 
 
 def _chunks(recording: Tensor) -> Iterator[list[Tensor]]:
     """Rows of whole recordings, some at a time."""
-    order = recording.argsort(stable=True)
     _, sizes = torch.unique(recording, return_counts=True)
     groups: list[Tensor] = []
-    for rows in order.split(sizes.tolist()):
+    for rows in recording.argsort(stable=True).split(sizes.tolist()):
         if groups and sum(map(len, groups)) + len(rows) > _CHUNK:
             yield groups
             groups = []
         groups.append(rows)
     if groups:
         yield groups
-
-
-_OF_ONE = 4.0
-"""A single material may fall by so many margins: some 800 rehearsal tell its change to half a point
-at best, so a tighter limit would refuse by chance. Their mean is told several times better."""
-
-
-@dataclass(frozen=True)
-class AccuracyChange:
-    """Balanced accuracy of every old material before and after a change.
-
-    Args:
-        before: by material, from 0 to 1, each bin scored by the machine without its recording.
-        after: likewise, of the same bins.
-    """
-
-    before: Mapping[str, float]
-    after: Mapping[str, float]
-
-    @property
-    def falls(self) -> dict[str, float]:
-        """How much each material loses; negative where it gains."""
-        return {name: before - self.after[name] for name, before in self.before.items()}
-
-    @property
-    def mean_fall(self) -> float:
-        """How much they lose on average; 0 if there is none."""
-        falls = self.falls.values()
-        return sum(falls) / len(falls) if falls else 0.0
-
-    def problem(self, margin: float) -> str | None:
-        """Why the change is not accepted, in a line with figures; ``None`` if it is.
-
-        Args:
-            margin: that the mean may fall by; any one material by ``_OF_ONE`` times as much.
-        """
-        if not self.falls:
-            return None
-        if self.mean_fall > margin:
-            mean = [sum(of.values()) / len(of) for of in (self.before, self.after)]
-            return (
-                f"old materials fall from {100 * mean[0]:.2f} to {100 * mean[1]:.2f} % balanced "
-                f"accuracy on average, {100 * margin:g} points are allowed"
-            )
-        worst = max(self.falls, key=lambda name: self.falls[name])
-        if self.falls[worst] > _OF_ONE * margin:
-            return (
-                f"{worst} falls from {100 * self.before[worst]:.2f} to "
-                f"{100 * self.after[worst]:.2f} % balanced accuracy, {100 * _OF_ONE * margin:g} "
-                "points are allowed of one material"
-            )
-        return None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values."""
-        return {"before": dict(self.before), "after": dict(self.after)}
-
-
-def compare(before: Solved, after: Solved) -> AccuracyChange:
-    """Both machines on the bins of recordings that both know."""
-    both = set(before.known.recordings) & set(after.known.recordings)
-    return _change_of(accuracies(before, both), accuracies(after, both))
-
-
-def _change_of(before: Mapping[str, float], after: Mapping[str, float]) -> AccuracyChange:
-    """Of the materials in both."""
-    both = sorted(before.keys() & after.keys())
-    return AccuracyChange({n: before[n] for n in both}, {n: after[n] for n in both})
-
-
-def accuracies(solved: Solved, recordings: Collection[str]) -> dict[str, float]:
-    """Balanced accuracy of every material in these recordings, held out in closed form."""
-    known, says_slip = solved.known, solved.scores >= 0
-    wanted, material = known.of_recordings(recordings), known.material
-    found = {}
-    for number, name in enumerate(known.material_names):
-        mine = wanted & (material == number)
-        if bool(mine.any()):
-            found[name] = mean_recall(says_slip[mine], known.is_slip[mine])
-    return found
 
 
 def mean_recall(says_slip: Tensor, is_slip: Tensor) -> float:
@@ -220,15 +584,58 @@ def mean_recall(says_slip: Tensor, is_slip: Tensor) -> float:
     return float(torch.stack(recalls).mean())
 
 
-FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""Weights that ``auto`` tries, in parts of that of an average old material.
+@dataclass(frozen=True)
+class AccuracyChange:
+    """Balanced accuracy of every old material before and after a change.
 
-Where every training material in turn was new (simulated, ``benchmarks.adapting``), its own accuracy
-kept rising to about the last of these, and what the others lost rose with it.
-"""
-_MOST_WEIGHT = 8000.0  # of a bin; more drowns the others
-_OF_MARGIN = 0.5
-"""``auto`` spends this part of the margin: how far old materials fall is itself an estimate."""
+    Args:
+        before: by material, from 0 to 1, each bin scored by the machine without its recording.
+        after: likewise, of the same materials.
+    """
+
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+
+    @property
+    def mean_fall(self) -> float:
+        """How much they lose on average; 0 if there is none."""
+        return sum(self._falls.values()) / max(len(self.before), 1)
+
+    @property
+    def _falls(self) -> dict[str, float]:
+        return {name: before - self.after[name] for name, before in self.before.items()}
+
+    def problem(self, margin: float) -> str | None:
+        """Why the change is not accepted, in a line with figures; ``None`` if it is.
+
+        Args:
+            margin: that the mean may fall by; any one material by ``_OF_ONE`` times as much.
+        """
+        if not self.before:
+            return None
+        if self.mean_fall > margin:
+            mean = [sum(of.values()) / len(of) for of in (self.before, self.after)]
+            return (
+                f"old materials fall from {100 * mean[0]:.2f} to {100 * mean[1]:.2f} % balanced "
+                f"accuracy on average, {100 * margin:g} points are allowed"
+            )
+        worst = max(self._falls, key=self._falls.__getitem__)
+        if self._falls[worst] > _OF_ONE * margin:
+            return (
+                f"{worst} falls from {100 * self.before[worst]:.2f} to "
+                f"{100 * self.after[worst]:.2f} % balanced accuracy, {100 * _OF_ONE * margin:g} "
+                "points are allowed of one material"
+            )
+        return None
+
+
+def _change_of(before: Mapping[str, float], after: Mapping[str, float]) -> AccuracyChange:
+    """Of the materials in both."""
+    both = sorted(before.keys() & after.keys())
+    return AccuracyChange({n: before[n] for n in both}, {n: after[n] for n in both})
+
+
+# Steps -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +645,7 @@ class Change:
     Args:
         statistics: after it.
         solved: their machine.
-        old: old materials, before and after.
+        old: old materials, before and after, on the recordings that both machines know.
         since_training: those of them that there were before the first step, as they were then,
             and after.
         weight: of a bin that was added; ``None`` where none was.
@@ -258,14 +665,30 @@ class Change:
     tried: Mapping[float, float] = field(default_factory=dict)
     new: Mapping[str, float | None] = field(default_factory=dict)
 
-    def problem(self, margin: float, share: float = 1.0) -> str | None:
+    @classmethod
+    def between(
+        cls, statistics: Statistics, before: Solved, after: Statistics, weight: float | None = None
+    ) -> Change:
+        """From some statistics and their machine to others.
+
+        Raises:
+            ValueError: as ``solve``.
+        """
+        solved = solve(after)
+        both = set(before.known.recordings) & set(solved.known.recordings)
+        old = _change_of(before.accuracies(both), solved.accuracies(both))
+        first = statistics.steps[0].entry.get("old", {}).get("before") if statistics.steps else None
+        since_training = _change_of(first or old.before, old.after)
+        return cls(after, solved, old, since_training, weight)
+
+    def problem(self, margin: float, fraction: float = 1.0) -> str | None:
         """Why the old materials do not allow it, in a line; ``None`` if they do.
 
         Args:
             margin: that their mean may fall by, by all steps together.
-            share: the part of it that this step may take.
+            fraction: of it that this step may take.
         """
-        if problem := self.old.problem(share * margin):
+        if problem := self.old.problem(fraction * margin):
             return problem
         problem = self.since_training.problem(margin)
         return problem and f"since before the first step, {problem}"
@@ -303,35 +726,36 @@ def add(
         for name, own in statistics.bins.items()
         if own.material == material and statistics.weight_of(name) > 0
     }
-    changes: dict[float, Change] = {}
 
     def change(value: float) -> Change:
         after = statistics.reweighed(dict.fromkeys(mine, value), bins)
-        solved = solve(after)
-        return _change(statistics, before, after, solved, value)
+        return Change.between(statistics, before, after, value)
 
+    tried: dict[float, Change] = {}
     if weight is not None:
         chosen = change(weight)
     else:
-        unit = _average_weight(before, material, list(mine.values()))
-        low, high = 0, len(FACTORS)  # the largest that is accepted is among low..high-1
-        while high - low > 1:
-            middle = (low + high) // 2
-            factor = FACTORS[middle]
+        unit = _average_weight(before.known, material, list(mine.values()))
+
+        def is_refused(factor: float) -> bool:
             with suppress(ValueError):
-                changes[factor] = replace(change(factor * unit), factor=factor)
-            is_fine = factor in changes and changes[factor].problem(margin, _OF_MARGIN) is None
-            low, high = (middle, high) if is_fine else (low, middle)
-        factor = FACTORS[low]
-        chosen = changes.get(factor) or replace(change(factor * unit), factor=factor)
-        changes[factor] = chosen
-    tried_falls = {factor: of.old.mean_fall for factor, of in sorted(changes.items())}
-    return replace(chosen, tried=tried_falls, new=_new_scores(before, chosen.solved, bins))
+                tried[factor] = replace(change(factor * unit), factor=factor)
+            return factor not in tried or bool(tried[factor].problem(margin, _OF_MARGIN))
+
+        factor = FACTORS[bisect.bisect_left(FACTORS, True, lo=1, key=is_refused) - 1]
+        chosen = tried.get(factor) or replace(change(factor * unit), factor=factor)
+        tried[factor] = chosen
+    falls = {factor: of.old.mean_fall for factor, of in sorted(tried.items())}
+    own = [each for each in bins.values() if len(each.z)]
+    says_slip = torch.cat([before.head(each.z) >= 0 for each in own])
+    found = {
+        "before": mean_recall(says_slip, torch.cat([each.is_slip for each in own])),
+        "after": chosen.solved.accuracies(bins)[material] if len(own) > 1 else None,
+    }
+    return replace(chosen, tried=falls, new=found)
 
 
-def forget(
-    statistics: Statistics, before: Solved, bins: Mapping[str, RecordingBins] | None = None
-) -> Change:
+def forget(statistics: Statistics, before: Solved, bins: Mapping[str, RecordingBins]) -> Change:
     """Recordings go out again, exactly.
 
     Args:
@@ -343,62 +767,11 @@ def forget(
     Raises:
         ValueError: if one is not in or holds something else, no class is left, or as ``solve``.
     """
-    bins = bins or {}
     if absent := [name for name in bins if not statistics.weight_of(name)]:
         raise ValueError(
             f"{absent[0]} is not in these statistics; action=list shows what was added"
         )
-    after = statistics.reweighed(dict.fromkeys(bins, 0.0), bins)
-    return _change(statistics, before, after, solve(after))
-
-
-def _change(
-    statistics: Statistics,
-    before: Solved,
-    after: Statistics,
-    solved: Solved,
-    weight: float | None = None,
-) -> Change:
-    old = compare(before, solved)
-    first = statistics.steps[0].entry.get("old", {}).get("before") if statistics.steps else None
-    return Change(after, solved, old, _change_of(first or old.before, old.after), weight)
-
-
-def undo(statistics: Statistics) -> tuple[Statistics, Tensor]:
-    """The statistics before the last step, and the file of the detector they belong to.
-
-    Raises:
-        ValueError: if there is no step.
-    """
-    if not statistics.steps:
-        raise ValueError("there is nothing to undo: this detector is as it was trained")
-    *earlier, last = statistics.steps
-    out = statistics.reweighed(dict.fromkeys(last.changed, 0.0))
-    back = out.reweighed(last.changed, last.replaced)
-    known = {name: own for name, own in back.bins.items() if name in last.weights}
-    return replace(
-        back, bins=known, weights=last.weights, steps=tuple(earlier), detector=last.detector
-    ), last.file
-
-
-def accepted(
-    before: Statistics, change: Change, entry: Mapping[str, object], file: Tensor, digest: str
-) -> Statistics:
-    """The statistics after a step, with the step.
-
-    Args:
-        before: the statistics it started from.
-        change: the step.
-        entry: of the journal.
-        file: of the detector before it, bytes.
-        digest: of the detector after it.
-    """
-    after = change.statistics
-    moved = {name: before.weight_of(name) for name in after.bins}
-    moved = {name: value for name, value in moved.items() if value != after.weight_of(name)}
-    replaced = {name: own for name, own in before.bins.items() if own is not after.bins[name]}
-    step = Step(entry, before.weights, moved, replaced, before.detector, file)
-    return replace(after, steps=(*before.steps, step), detector=digest)
+    return Change.between(statistics, before, statistics.reweighed(dict.fromkeys(bins, 0.0), bins))
 
 
 def check_weight(weight: float | None) -> None:
@@ -428,40 +801,23 @@ def _check_new(statistics: Statistics, bins: Mapping[str, RecordingBins]) -> Non
         )
 
 
-def _average_weight(before: Solved, material: str, mine: Sequence[RecordingBins]) -> float:
+def _average_weight(known: KnownBins, material: str, mine: Sequence[RecordingBins]) -> float:
     """Of a bin of new recordings that together weigh as much as an average old material.
 
     Only classes that the new recordings have are counted.
     """
-    known = before.known
-    slip = [bool(own.is_slip.any()) for own in mine]
-    rest = [bool((~own.is_slip).any()) for own in mine]
-    counted = (known.is_slip & any(slip)) | (~known.is_slip & any(rest))
+    is_slip = torch.cat([own.is_slip for own in mine])
+    counted = (known.is_slip & is_slip.any()) | (~known.is_slip & (~is_slip).any())
     totals = [
         float(known.sample_weight[counted & (known.material == number)].sum())
         for number, name in enumerate(known.material_names)
         if name != material
     ]
     totals = [total for total in totals if total > 0]
-    num_bins = sum(len(own.z) for own in mine)
-    return sum(totals) / len(totals) / num_bins if totals else 1.0
+    return sum(totals) / len(totals) / len(is_slip) if totals else 1.0
 
 
-def _new_scores(
-    before: Solved, after: Solved, bins: Mapping[str, RecordingBins]
-) -> dict[str, float | None]:
-    """Balanced accuracy of new recordings before and after."""
-    parts = [own for own in bins.values() if len(own.z)]
-    says_slip = torch.cat([before.head(own.z) >= 0 for own in parts])
-    is_slip = torch.cat([own.is_slip for own in parts])
-    held_out = accuracies(after, bins)[parts[0].material] if len(parts) > 1 else None
-    return {"before": mean_recall(says_slip, is_slip), "after": held_out}
-
-
-log = logging.getLogger(__name__)
-
-_JOURNAL = "adaptations"
-"""Under which ``SlipDetector.info`` keeps the entries of all steps."""
+# The detector after a step -----------------------------------------------------------------------
 
 
 def refitted(
@@ -480,43 +836,36 @@ def refitted(
         solved: their machine.
         entry: of the journal.
     """
-    new, known = copy.deepcopy(detector), solved.known
+    new, known, machine = copy.deepcopy(detector), solved.known, statistics.machine
     new.head = solved.head
-    bins = _training_bins(statistics, known)
-    _refit_imputation(new, bins)
-    info = new.info
+    weights = class_scales(statistics)[known.is_slip.long()] * known.sample_weight
+    bins = TrainingBins(known.z, known.is_slip, weights)
+    gaussians = ClassGaussians.fit(bins.features, bins.is_slip, weights)
+    new.imputation.copy_(gaussians.mean.mean(0))  # both classes counting alike
+    if new.gaussians is not None:
+        new.gaussians = gaussians
+    info, taken_in = new.info, statistics.sums.seen_batches
     info["solve"] = solve_metadata(solved.head)
     info["num_bins"] = int(statistics.sums.count.sum())
     info[_JOURNAL] = [*info.get(_JOURNAL, []), dict(entry)]
     info["train_materials"] = [known.material_names[i] for i in known.material.unique()]
     keys = info.get("train_recordings", {}) | {n: b.key for n, b in statistics.bins.items()}
-    entries = statistics.sums.seen_batches
-    out = {name for name in statistics.bins if name not in entries}
-    info["train_recordings"] = {n: key for n, key in keys.items() if n not in out}
+    out = {name for name in statistics.bins if name not in taken_in}
+    info["train_recordings"] = {name: key for name, key in keys.items() if name not in out}
     if info.get("calibration") or ALARM in info:
-        found = _calibration(bins, known, statistics.machine)
+        calibration = None
+        try:
+            scores = _scores_without(known.material, bins, machine)
+            calibration = fit_platt(scores, known.is_slip, weights).to_dict()
+        except ValueError as error:
+            log.warning("the calibration stays as it was: %s", error)
         if info.get("calibration"):
-            info["calibration"] = found or info["calibration"]
+            info["calibration"] = calibration or info["calibration"]
         if ALARM in info:
-            info[ALARM] = _alarm(info[ALARM], found)
-    if (answers := abstention_of(new)) is not None:
-        info[ABSTAIN] = _thresholds(bins, known, statistics.machine, answers)
+            info[ALARM] = _alarm(info[ALARM], calibration)
+    if (abstention := Abstention.of(new)) is not None:
+        info[ABSTAIN] = _thresholds(bins, known, machine, abstention)
     return new
-
-
-def _training_bins(statistics: Statistics, known: KnownBins) -> TrainingBins:
-    """Known bins, each weighing as much as all that it stands for, the classes balanced."""
-    scales = _class_scales(statistics.sums, statistics.machine)
-    weights = scales[known.is_slip.long()] * known.sample_weight
-    return TrainingBins(known.z, known.is_slip, weights)
-
-
-def _refit_imputation(detector: SlipDetector, bins: TrainingBins) -> None:
-    """What is expected of a sensor that is missing."""
-    gaussians = ClassGaussians.fit(bins.features, bins.is_slip, bins.weights)
-    detector.imputation.copy_(gaussians.mean.mean(0))  # both classes counting alike
-    if detector.gaussians is not None:
-        detector.gaussians = gaussians
 
 
 def _scores_without(groups: Tensor, bins: TrainingBins, machine: Machine) -> Tensor:
@@ -524,20 +873,10 @@ def _scores_without(groups: Tensor, bins: TrainingBins, machine: Machine) -> Ten
     return HeldOut(bins, groups, Polynomial(2, machine.offset)).at(machine.penalty).scores
 
 
-def _calibration(bins: TrainingBins, known: KnownBins, machine: Machine) -> dict[str, Any] | None:
-    """From held-out scores, each material left out; ``None`` where that cannot be told."""
-    try:
-        scores = _scores_without(known.material, bins, machine)
-        return fit_platt(scores, known.is_slip, bins.weights).to_dict()
-    except ValueError as error:
-        log.warning("the calibration stays as it was: %s", error)
-        return None
-
-
 def _alarm(plain: Mapping[str, Any], calibration: Mapping[str, Any] | None) -> dict[str, Any]:
     """Settings of an alarm without its rate, with the calibration if there is a new one."""
     which = "that of the machine before" if calibration is None else "made anew"
-    said = (
+    adapted = (
         "the machine changed after the threshold was set: it stands for no rate; the calibration "
         f"is {which}; train with +exp=onset"
     )
@@ -545,16 +884,16 @@ def _alarm(plain: Mapping[str, Any], calibration: Mapping[str, Any] | None) -> d
         **plain,
         "calibration": calibration or plain["calibration"],
         "target_per_hour": None,
-        "facts": {**(plain.get("facts") or {}), "adapted": said},
+        "metadata": {**(plain.get("metadata") or {}), "adapted": adapted},
     }
 
 
 def _thresholds(
-    bins: TrainingBins, known: KnownBins, machine: Machine, answers: Abstention
+    bins: TrainingBins, known: KnownBins, machine: Machine, kept: Abstention
 ) -> dict[str, Any] | None:
     """Conformal thresholds for the same coverage on the recordings that are known."""
-    left_out = "recording" if answers.metadata.get("left_out") == "recording" else "material"
-    metadata = dict(answers.metadata) | {
+    left_out = "recording" if kept.metadata.get("left_out") == "recording" else "material"
+    metadata = dict(kept.metadata) | {
         "left_out": left_out,
         "adapted": "set anew on all recordings that are known, added ones included, each bin "
         f"scored by a machine of the others without its {left_out}",
@@ -562,25 +901,72 @@ def _thresholds(
     try:
         groups = known.recording if left_out == "recording" else known.material
         scores = _scores_without(groups, bins, machine)
-        found = conformal_abstention(
-            scores, known.is_slip, known.recording, answers.coverage, metadata
-        )
+        found = Abstention.fit(scores, known.is_slip, known.recording, kept.coverage, metadata)
     except ValueError as error:
         log.warning("the detector abstains no more: %s", error)
         return None
     return found.to_dict()
 
 
-def known_names(
-    statistics: Statistics, trained: Mapping[str, str], *, is_in: bool
-) -> dict[str, tuple[str, str]]:
-    """Name and material of recordings, by key.
+# Recordings of a source --------------------------------------------------------------------------
+
+
+def recording_bins(
+    detector: SlipDetector,
+    maker: FeatureMaker,
+    statistics: Statistics | None = None,
+    *,
+    material: str | None = None,
+    slip_free: bool = False,
+    is_new: bool = True,
+) -> dict[str, RecordingBins]:
+    """The bins of every recording of a source, by name; those without a labelled bin are left out.
+
+    A recording that the statistics know by its content has the name that it has there.
 
     Args:
-        statistics: of a detector.
-        trained: the keys it tells of recordings that it was trained on, by name.
-        is_in: those alone that are in; else those that were taken out too.
+        detector: whose features are made.
+        maker: of the recordings, with the detector's pool and filter.
+        statistics: of the detector, if names matter.
+        material: to call new recordings, whatever they are called; they are numbered then in their
+            order, on from those that there are.
+        slip_free: take the bins without slip alone.
+        is_new: whether the recordings are to come in, not to go out.
+
+    Raises:
+        ValueError: if a recording cannot be read, or is to come in twice, by whatever name.
     """
+    trained: Mapping[str, str] = detector.info.get("train_recordings", {})
+    names_in = {} if statistics is None else _names(statistics, trained, is_in=True)
+    names = names_in
+    if is_new:
+        ever = {} if statistics is None else _names(statistics, trained, is_in=False)
+        names = {key: name for key, name in ever.items() if name[1] == material}
+    taken = {} if statistics is None else statistics.materials
+    everyone = Split("adapt", dict.fromkeys(maker.source.ids, "train"))
+    found: dict[str, RecordingBins] = {}
+    numbers, first = itertools.count(), dict[str, str]()
+    for recording in bar(maker.source.ids, "features, new recordings", "recording"):
+        key = cache_key(maker.source.key(recording))
+        name, called = names.get(key) or _named(recording, material, numbers, taken)
+        made = maker(recording, everyone)
+        kept = ~made.is_slip if slip_free else made.is_slip | True
+        z = detector.scaler(made.features[kept][:, list(detector.selected)].double())
+        if not len(z):
+            continue
+        if is_new and key in names_in:
+            known = "" if names_in[key][0] == name else f" as {names_in[key][0]}"
+            raise ValueError(f"{name} is in already{known}; action=forget takes it out first")
+        if is_new and (other := first.setdefault(key, name)) != name:
+            raise ValueError(f"{name} is the same recording as {other}; give it once")
+        found[name] = RecordingBins(called, z, made.is_slip[kept], key)
+    return found
+
+
+def _names(
+    statistics: Statistics, trained: Mapping[str, str], *, is_in: bool
+) -> dict[str, tuple[str, str]]:
+    """Name and material of recordings by key: those that are in, or were."""
     materials = statistics.materials
     keys = dict(trained) | {name: own.key for name, own in statistics.bins.items()}
     order = sorted(keys, key=lambda name: statistics.weight_of(name) > 0)  # one that is in wins
@@ -591,133 +977,11 @@ def known_names(
     }
 
 
-def check_once(bins: Mapping[str, RecordingBins], names_in: Mapping[str, tuple[str, str]]) -> None:
-    """That no recording comes in twice.
-
-    Args:
-        bins: of the recordings that are to come in, by name.
-        names_in: what ``known_names`` tells of those that are in.
-
-    Raises:
-        ValueError: if one is in already, or is there twice, by whatever name.
-    """
-    first: dict[str, str] = {}
-    for name, own in bins.items():
-        if own.key in names_in:
-            known, _ = names_in[own.key]
-            called = "" if known == name else f" as {known}"
-            raise ValueError(f"{name} is in already{called}; action=forget takes it out first")
-        if (other := first.setdefault(own.key, name)) != name:
-            raise ValueError(f"{name} is the same recording as {other}; give it once")
-
-
-def recording_bins(
-    detector: SlipDetector,
-    maker: FeatureMaker,
-    *,
-    material: str | None = None,
-    slip_free: bool = False,
-    names: Mapping[str, tuple[str, str]] | None = None,
-    taken: Collection[str] = (),
-) -> dict[str, RecordingBins]:
-    """The bins of every recording of a source, by name; those without a labelled bin are left out.
-
-    Args:
-        detector: whose features are made.
-        maker: of the recordings, with the detector's pool and filter.
-        material: to call them, whatever they are called; they are numbered then in their order.
-        slip_free: take the bins without slip alone.
-        names: what recordings are called and their materials, by key, whatever else holds.
-        taken: names that none is numbered to.
-
-    Raises:
-        ValueError: if a recording cannot be read.
-    """
-    ids = maker.source.ids
-    everyone = Split("adapt", dict.fromkeys(ids, "train"))
-    found, number = {}, itertools.count()
-    for recording in bar(ids, "features, new recordings", "recording"):
-        key = cache_key(maker.source.key(recording))
-        name, called = (names or {}).get(key) or _named(recording, material, number, taken)
-        made = maker(recording, everyone)
-        kept = ~made.is_slip if slip_free else made.is_slip | True
-        z = detector.scaler(made.features[kept][:, list(detector.selected)].double())
-        if len(z):
-            found[name] = RecordingBins(called, z, made.is_slip[kept], key)
-    return found
-
-
 def _named(
-    recording: RecordingId, material: str | None, number: Iterator[int], taken: Collection[str]
+    recording: RecordingId, material: str | None, numbers: Iterator[int], taken: Collection[str]
 ) -> tuple[str, str]:
     """Name and material; of one that is renamed the next number that is free."""
     if material is None:
         return str(recording), recording.material
-    names = (str(replace(recording, material=material, cycle=cycle)) for cycle in number)
+    names = (str(replace(recording, material=material, cycle=cycle)) for cycle in numbers)
     return next(name for name in names if name not in taken), material
-
-
-def check_recipe(recipe: Recipe) -> None:
-    """That a detector made this way can be solved again from sums.
-
-    Raises:
-        ValueError: if its kernel does not add up, a penalty is not finite, or it is chosen nested.
-    """
-    if recipe.validation == "nested":
-        raise ValueError(
-            "statistics=true needs a machine of degree 2 on features of channels, which "
-            f"recipe={recipe.name} does not always make; take recipe=robust or recipe=paper"
-        )
-    if not all(isinstance(k, Polynomial) and k.degree == 2 for k in recipe.kernels):
-        raise ValueError(
-            "statistics=true needs recipe.kernel=polynomial recipe.degree=2, whose bins add up; "
-            f"got {recipe.kernels[0]}"
-        )
-    if not math.isfinite(most := recipe.penalties_ascending[-1]):
-        raise ValueError(
-            f"statistics=true needs finite recipe.penalties, got {most:g}: without a ridge no "
-            "machine without a recording can be told"
-        )
-
-
-def gathered_statistics(
-    gathered: TrainingPass,
-    sample: SampledBins,
-    materials: Mapping[str, str],
-    labels: Mapping[str, Any],
-    detector: SlipDetector,
-) -> Statistics:
-    """What a second pass gathered, with a sample of its bins.
-
-    A machine of few bins was solved from the bins themselves; their sums give the same to rounding.
-
-    Args:
-        gathered: the second pass, with its plan.
-        sample: of the first pass.
-        materials: of each training recording, by its name.
-        labels: arguments of ``LabelRule``.
-        detector: that was solved.
-
-    Raises:
-        ValueError: if there is no room for a sum.
-    """
-    plan = gathered.plan
-    assert isinstance(plan.kernel, Polynomial)  # check_recipe
-    sums = gathered.stats
-    if sums is None:
-        sums = SufficientStats(len(plan.selection.selected))
-        for name in sorted(gathered.bins):
-            sums.update(name, *gathered.bins[name])
-    return Statistics(
-        sums,
-        Machine(
-            plan.penalty,
-            plan.kernel.offset,
-            "weights" if plan.recipe.balance == "weights" else "none",
-        ),
-        dict(labels),
-        KnownBins.of(plan, sample, materials),
-        detector_digest(detector),
-        {},
-        {},
-    )

@@ -1,8 +1,8 @@
 """The alarm of a fitted detector, set on recordings that it was not trained on.
 
-``CalibratedAlarm`` sets it for a false-alarm rate. Half of the seen materials' cycles *calibrate*:
-score to log likelihood ratio, the threshold of every rule, how far an onset lies back. The other
-half and the unseen materials say what became of it, and set nothing.
+``CalibratedAlarm`` sets it for a false-alarm rate. Half of the cycles of the materials seen in
+training *calibrate*: score to log likelihood ratio, the threshold of every rule, how far an onset
+lies back. The other half and the held-out materials evaluate the result and set nothing.
 
 ``DebouncedAlarm`` is for sets with too little recorded without slip to count false alarms on: k of
 the last n decisions say slip, by the calibration of the held-out scores that training chose by.
@@ -16,8 +16,10 @@ import math
 import statistics
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +27,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.data.labels import whole_samples
-from tactslip_torch.data.recording import RecordingId, RecordingSource
+from tactslip_torch.data.recording import RecordingId, RecordingSource, Timeline
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.calibration import (
@@ -38,42 +40,310 @@ from tactslip_torch.model.calibration import (
     reliability,
 )
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.onset.decisions import Scorer
-from tactslip_torch.onset.events import EventRules, LatencyParts, event_metrics
+from tactslip_torch.onset.decisions import (
+    KEY,
+    AlarmSettings,
+    Decider,
+    Decisions,
+    Scorer,
+    calibration_of,
+    is_usable,
+    score_stream,
+)
+from tactslip_torch.onset.events import (
+    EventRules,
+    LatencyParts,
+    Watched,
+    pooled_metrics,
+    recording_events,
+)
 from tactslip_torch.onset.rules import Cusum, KOfN, Rule, rule_from_dict
-from tactslip_torch.onset.settings import KEY, AlarmSettings, calibration_of
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.onset.thresholds import Threshold, alarm_counts, alarm_rate, choose_threshold
 from tactslip_torch.report.metrics import weights_at_share
-from tactslip_torch.runtime import bar
-from tactslip_torch.training.stream_evaluation import (
-    Clock,
-    Stream,
-    decide,
-    slip_bins,
-    watch,
-    watched,
-)
+from tactslip_torch.runtime import bar, check_number, in_processes, one_thread
 
 log = logging.getLogger(__name__)
 
 OURS = "detector"
-"""The name of the detector among those that watch."""
+"""The name of the detector among those that score; the others are baselines."""
 
 FIRST_TRANSITION = "first transition"
 """The name of the paper's rule."""
-
-CEILING = 1.5
-"""Largest sum of ``Cusum`` in thresholds: what lies above only takes time to come down."""
-
-_STEP = 1.01  # by which a threshold is raised that a capped sum does not keep
-_ABOVE_NEUTRAL = 1e-30  # a score of slip, and no decision that tells nothing
 
 FITS: Mapping[str, Callable[[Tensor, Tensor], Calibration]] = {
     "platt": fit_platt,
     "isotonic": fit_isotonic,
 }
 """From scores to log likelihood ratios."""
+
+LEAST, MOST = 0.1, 1000.0
+"""False alarms an hour that are of interest."""
+
+_CEILING = 1.5  # largest sum of Cusum in thresholds: what lies above only takes time to come down
+_STEP = 1.01  # by which a threshold is raised that a capped sum does not keep
+_ABOVE_NEUTRAL = 1e-30  # a score of slip, and no decision that tells nothing
+_NUM_POINTS = 25  # of a threshold curve, at most
+_NUM_TRIED = 100
+_TOGETHER = 256  # streams decided at once
+_PUSHES = 200  # timed
+
+
+# Streams, and what a detector decides in them ----------------------------------------------------
+
+
+class Stream(NamedTuple):
+    """A recording as a detector scored it, one decision per hop.
+
+    Attributes:
+        recording: which.
+        times: when things happen in it.
+        score: ``[N]``, float32.
+        is_valid: whether every channel in use could be trusted, ``[N]``.
+        is_usable: whether the score tells anything: some channel in use was there, ``[N]``.
+    """
+
+    recording: RecordingId
+    times: Timeline
+    score: Tensor
+    is_valid: Tensor
+    is_usable: Tensor
+
+
+class Timing(NamedTuple):
+    """What decisions are about, and how long they wait.
+
+    Attributes:
+        sample_rate_hz: of the stream.
+        hop_samples: distance of two decisions.
+        bin_samples: what each is about.
+        look_ahead: samples behind its bin that a decision waits for.
+    """
+
+    sample_rate_hz: float
+    hop_samples: int
+    bin_samples: int
+    look_ahead: int
+
+    @property
+    def hop_s(self) -> float:
+        """Time between two decisions."""
+        return self.hop_samples / self.sample_rate_hz
+
+
+def score_streams(
+    source: RecordingSource,
+    recordings: Sequence[RecordingId],
+    scorers: Mapping[str, Scorer],
+    hop_samples: int,
+    num_workers: int | None = None,
+) -> dict[str, list[Stream]]:
+    """The recordings, in order, as each detector scores them; made by workers.
+
+    Args:
+        source: of the recordings.
+        recordings: which of them.
+        scorers: detectors by name.
+        hop_samples: distance of two decisions.
+        num_workers: processes; ``None`` for as many as there are processors, at most 8.
+
+    Raises:
+        ValueError: if a recording has other channels than a detector.
+    """
+    scored = partial(_scored, source, scorers, hop_samples)
+    rows = list(in_processes(scored, recordings, "watch streams", "recording", num_workers))
+    return {name: [row[place] for row in rows] for place, name in enumerate(scorers)}
+
+
+def _scored(
+    source: RecordingSource,
+    scorers: Mapping[str, Scorer],
+    hop_samples: int,
+    recording: RecordingId,
+) -> list[Stream]:
+    samples, times = source.load(recording).samples, source.timeline(recording)
+    streams = []
+    for scorer in scorers.values():
+        found = score_stream(scorer, samples, hop_samples)
+        usable = is_usable(found.score, found.is_missing, scorer.needed_index)
+        streams.append(Stream(recording, times, found.score.float(), found.is_valid, usable))
+    return streams
+
+
+def labelled(streams: Sequence[Stream], timing: Timing) -> tuple[Tensor, Tensor]:
+    """Scores of valid bins that are wholly slip or non-slip, ``[N]``, and which they are.
+
+    A bin is slip if it lies in a slide, and non-slip if it meets none.
+    """
+    scores, labels = [torch.zeros(0)], [torch.zeros(0, dtype=torch.bool)]
+    for stream in streams:
+        number = torch.arange(len(stream.score), dtype=torch.float64)
+        start = number * timing.hop_samples / timing.sample_rate_hz
+        end = start + timing.bin_samples / timing.sample_rate_hz
+        slides = torch.tensor(stream.times.sliding_s, dtype=torch.float64).reshape(-1, 2, 1)
+        is_slip = ((start >= slides[:, 0]) & (end <= slides[:, 1])).any(0)
+        meets = ((end > slides[:, 0]) & (start < slides[:, 1])).any(0)
+        kept = (is_slip | ~meets) & stream.is_valid
+        scores.append(stream.score[kept])
+        labels.append(is_slip[kept])
+    return torch.cat(scores), torch.cat(labels)
+
+
+def decide(
+    streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
+) -> Iterator[tuple[Stream, Decisions]]:
+    """What a detector decides in each stream; those of one length are decided together.
+
+    ``settings.hop_samples`` may be a multiple of the timing's: so many decisions are left out.
+
+    Yields:
+        Every stream with its decisions, in order of length.
+    """
+    step = settings.hop_samples // timing.hop_samples
+    for _, group in groupby(sorted(streams, key=_length), key=_length):
+        alike = list(group)
+        for first in range(0, len(alike), _TOGETHER):
+            part = alike[first : first + _TOGETHER]
+            decider = Decider(
+                settings, timing.sample_rate_hz, timing.bin_samples, timing.look_ahead
+            )
+            made = decider.decide(
+                torch.stack([stream.score[::step] for stream in part]),
+                torch.stack([stream.is_valid[::step] for stream in part]),
+                torch.stack([stream.is_usable[::step] for stream in part]),
+            )
+            for row, stream in enumerate(part):
+                yield stream, Decisions(*(x[row] if x.ndim > 1 else x for x in made))
+
+
+def _length(stream: Stream) -> int:
+    return len(stream.score)
+
+
+def watched(stream: Stream, decisions: Decisions) -> Watched:
+    """The alarms of a stream beside what is true of it."""
+    times, available_s = stream.times, decisions.available_s.numpy()
+    raised = np.flatnonzero(decisions.is_alarm.numpy())
+    off = np.append(np.flatnonzero(~decisions.is_on.numpy()), len(available_s))
+    ends = off[np.searchsorted(off, raised)]
+    says_slip = available_s[np.flatnonzero(decisions.llr.numpy() > 0)]
+    first = np.append(says_slip, math.nan)[np.searchsorted(says_slip, times.onsets_s)]
+    return Watched(
+        recording=str(stream.recording),
+        material=stream.recording.material,
+        scene=stream.recording.scene,
+        duration_s=times.duration_s,
+        alarms_s=tuple(available_s[raised].tolist()),
+        onset_estimates_s=tuple(decisions.onset_s.numpy()[raised].tolist()),
+        onsets_s=times.onsets_s,
+        sliding_s=times.sliding_s,
+        speeds_mm_s=times.speeds_mm_s,
+        first_positive_s=tuple(first.tolist()),
+        alarm_ends_s=tuple(np.append(available_s, math.inf)[ends].tolist()),
+    )
+
+
+# What is told of an alarm ------------------------------------------------------------------------
+
+
+def threshold_curve(
+    quiet: Sequence[Stream], settings: AlarmSettings, timing: Timing
+) -> list[list[float]]:
+    """Thresholds and the false alarms of the detector an hour at each, by the rule in the settings.
+
+    Rates fall as thresholds rise; from ``LEAST`` to ``MOST`` an hour, at most 25 points that are
+    about equally far apart by the rate's logarithm. Fewer where the recordings show no more: none
+    is below one alarm in all of them.
+
+    Args:
+        quiet: recordings in which nothing slips.
+        settings: calibration, rule, re-arming; their threshold does not count.
+        timing: of the scores.
+    """
+    statistics = [made.statistic for _, made in decide(quiet, settings, timing)]
+    hours = sum(map(len, statistics)) * timing.hop_s / 3600
+    falling = torch.cat(statistics).sort(descending=True).values
+    ranks = np.unique(np.geomspace(1, len(falling), _NUM_TRIED).astype(int)) - 1
+    points = list[list[float]]()
+    for value in dict.fromkeys(falling[ranks].tolist()):
+        alarms = alarm_counts(
+            statistics,
+            [value],
+            rearm=settings.decisions(settings.rearm_s, timing.sample_rate_hz),
+            refractory=settings.decisions(settings.refractory_s, timing.sample_rate_hz),
+        )
+        rate = int(alarms.sum()) / hours
+        if rate > MOST:
+            break
+        if rate >= LEAST and (not points or rate > points[-1][1]):
+            points.append([value, rate])
+    if len(points) > _NUM_POINTS:
+        rates = np.log([rate for _, rate in points])
+        wanted = np.linspace(rates[0], rates[-1], _NUM_POINTS)
+        nearest = np.abs(rates - wanted[:, None]).argmin(axis=1)
+        points = [points[place] for place in np.unique(nearest)]
+    return points[::-1]
+
+
+def _reliability(
+    streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
+) -> dict[str, Any] | None:
+    """Stated probabilities beside what happened, of bins weighted to the settings' slip fraction.
+
+    None without bins of both classes.
+    """
+    scores, is_slip = labelled(streams, timing)
+    if not bool(is_slip.any()) or bool(is_slip.all()):
+        return None
+    stated = probability(settings.calibration.llr(scores), settings.slip_share)
+    weights = weights_at_share(is_slip, settings.slip_share)
+    return reliability(stated, is_slip, weights=weights).to_dict()
+
+
+def _reliability_by_material(
+    streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
+) -> dict[str, Any] | None:
+    """``_reliability`` of all, with that of each of its materials."""
+    if (found := _reliability(streams, settings, timing)) is None:
+        return None
+    by_material = {
+        name: _reliability([s for s in streams if s.recording.material == name], settings, timing)
+        for name in dict.fromkeys(stream.recording.material for stream in streams)
+    }
+    return found | {"per_material": {name: own for name, own in by_material.items() if own}}
+
+
+def _push_seconds(detector: SlipDetector, settings: AlarmSettings) -> float:
+    """Median time of a push of one hop: what a decision costs a stream here, on one thread."""
+    live = StreamingDetector(detector, settings)
+    generator = torch.Generator().manual_seed(0)
+    hop = torch.randn(settings.hop_samples, len(detector.pool.hand), generator=generator)
+    seconds = []
+    with one_thread():
+        live.push(hop.repeat(-(-2 * detector.pool.bin_samples // settings.hop_samples), 1))  # full
+        for _ in range(_PUSHES):
+            started = time.perf_counter()
+            live.push(hop)
+            seconds.append(time.perf_counter() - started)
+    return statistics.median(seconds[_PUSHES // 10 :])
+
+
+def _lead_s(streams: Sequence[Stream], settings: AlarmSettings, timing: Timing) -> float:
+    """From an onset to where the run of ratios that found it began: the median."""
+    errors = []
+    for stream, decisions in decide(streams, settings, timing):
+        seen = watched(stream, decisions)
+        for onset_s in seen.onsets_s:
+            later = [
+                estimate - onset_s
+                for alarm, estimate in zip(seen.alarms_s, seen.onset_estimates_s, strict=True)
+                if onset_s <= alarm <= onset_s + EventRules().found_within_s
+            ]
+            errors += later[:1]
+    return statistics.median(errors) if errors else 0.0
+
+
+# The stages behind a fit -------------------------------------------------------------------------
 
 
 class Method(NamedTuple):
@@ -95,140 +365,6 @@ class Method(NamedTuple):
         return {"scorer": self.scorer, "calibrated": calibrated, **self.settings.to_dict()}
 
 
-def labelled(streams: Sequence[Stream], scorer: str, clock: Clock) -> tuple[Tensor, Tensor]:
-    """Scores of valid bins that are wholly slip or non-slip, ``[N]``, and which they are."""
-    scores, labels = [np.zeros(0, np.float32)], [np.zeros(0, bool)]
-    for stream in streams:
-        score = stream.score[scorer]
-        is_clear, is_slip = slip_bins(stream, clock, len(score))
-        kept = is_clear & stream.is_valid[scorer]
-        scores.append(score[kept])
-        labels.append(is_slip[kept])
-    return torch.from_numpy(np.concatenate(scores)), torch.from_numpy(np.concatenate(labels))
-
-
-def _lead_s(streams: Sequence[Stream], scorer: str, settings: AlarmSettings, clock: Clock) -> float:
-    """From an onset to where the run of ratios that found it began: the median."""
-    errors = []
-    for stream, decisions in decide(streams, scorer, settings, clock):
-        seen = watched(stream, decisions)
-        for onset_s in seen.onsets_s:
-            later = [
-                estimate - onset_s
-                for alarm, estimate in zip(seen.alarms_s, seen.onset_estimates_s, strict=True)
-                if onset_s <= alarm <= onset_s + EventRules().found_within_s
-            ]
-            errors += later[:1]
-    return statistics.median(errors) if errors else 0.0
-
-
-LEAST, MOST = 0.1, 1000.0
-"""False alarms an hour that are of interest."""
-
-_NUM_POINTS = 25
-_NUM_TRIED = 100
-
-
-def threshold_curve(
-    quiet: Sequence[Stream], settings: AlarmSettings, clock: Clock
-) -> list[list[float]]:
-    """Thresholds and the false alarms of the detector an hour at each, by the rule in the settings.
-
-    Rates fall as thresholds rise; from ``LEAST`` to ``MOST`` an hour, at most 25 points that are
-    about equally far apart by the rate's logarithm. Fewer where the recordings show no more: none
-    is below one alarm in all of them.
-
-    Args:
-        quiet: recordings in which nothing slips.
-        settings: calibration, rule, re-arming; their threshold does not count.
-        clock: of the scores.
-    """
-    statistics = [made.statistic for _, made in decide(quiet, OURS, settings, clock)]
-    hours = sum(len(statistic) for statistic in statistics) * clock.hop_s / 3600
-    falling = torch.cat(statistics).sort(descending=True).values
-    ranks = np.unique(np.geomspace(1, len(falling), _NUM_TRIED).astype(int)) - 1
-    found = list[list[float]]()
-    for value in dict.fromkeys(falling[ranks].tolist()):
-        alarms = alarm_counts(
-            statistics,
-            [value],
-            rearm=settings.decisions(settings.rearm_s, clock.sample_rate_hz),
-            refractory=settings.decisions(settings.refractory_s, clock.sample_rate_hz),
-        )
-        rate = int(alarms.sum()) / hours
-        if rate > MOST:
-            break
-        if rate >= LEAST and (not found or rate > found[-1][1]):
-            found.append([value, rate])
-    return _thinned(found)[::-1]
-
-
-def _thinned(points: list[list[float]]) -> list[list[float]]:
-    """Those next to evenly spaced logarithms of the rate."""
-    if len(points) <= _NUM_POINTS:
-        return points
-    rates = np.log([rate for _, rate in points])
-    wanted = np.linspace(rates[0], rates[-1], _NUM_POINTS)
-    nearest = np.abs(rates - wanted[:, None]).argmin(axis=1)
-    return [points[place] for place in np.unique(nearest)]
-
-
-def reliability_of(
-    parts: Mapping[str, Sequence[Stream]], settings: AlarmSettings, clock: Clock
-) -> dict[str, Any]:
-    """Stated probabilities beside what happened: of each part, and of each of its materials.
-
-    Bins are weighted to the share of slip that probabilities are stated for.
-    """
-    found: dict[str, Any] = {}
-    for part, streams in parts.items():
-        groups: dict[str, list[Stream]] = {"": list(streams)}
-        for stream in streams:
-            groups.setdefault(stream.recording.material, []).append(stream)
-        rows = {}
-        for material, own in groups.items():
-            scores, is_slip = labelled(own, OURS, clock)
-            if bool(is_slip.any()) and not bool(is_slip.all()):
-                stated = probability(settings.calibration.llr(scores), settings.slip_share)
-                weights = weights_at_share(is_slip, settings.slip_share)
-                rows[material] = reliability(stated, is_slip, weights=weights).to_dict()
-        if "" in rows:
-            found[part] = rows.pop("") | {"per_material": rows}
-    return found
-
-
-def push_seconds(detector: SlipDetector, settings: AlarmSettings, pushes: int = 200) -> float:
-    """Median time of a push of one hop: what a decision costs a stream here, on one thread."""
-    live = StreamingDetector(detector, settings)
-    generator = torch.Generator().manual_seed(0)
-    hop = torch.randn(settings.hop_samples, len(detector.pool.hand), generator=generator)
-    taken = []
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        live.push(hop.repeat(-(-2 * detector.pool.bin_samples // settings.hop_samples), 1))  # full
-        for _ in range(pushes):
-            started = time.perf_counter()
-            live.push(hop)
-            taken.append(time.perf_counter() - started)
-    finally:
-        torch.set_num_threads(threads)
-    return statistics.median(taken[pushes // 10 :])
-
-
-def amounts_of(streams: Mapping[str, Sequence[Stream]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Recordings, hours and slips of each role and scene."""
-    amounts: dict[str, dict[str, dict[str, float]]] = {}
-    for role, own in streams.items():
-        for stream in own:
-            none = {"recordings": 0, "hours": 0.0, "slips": 0}
-            row = amounts.setdefault(role, {}).setdefault(stream.recording.scene, none)
-            row["recordings"] += 1
-            row["hours"] += stream.duration_s / 3600
-            row["slips"] += len(stream.onsets_s)
-    return amounts
-
-
 @dataclass(frozen=True)
 class CalibratedAlarm:
     """Sets the alarm of a fitted detector for a false-alarm rate.
@@ -239,7 +375,7 @@ class CalibratedAlarm:
         hop_ms: distance of two decisions.
         false_alarms_per_hour: at most.
         hours: of recordings without slip, at most, to set thresholds on, and as many to check
-            them on, for seen and for unseen materials.
+            them on, for seen and for held-out materials.
         slip_free: the scene without slip, on which false alarms are counted.
         rules: of ``onset.rules``, by name.
         rule: the one that the detector's file gets; those of baselines are like it.
@@ -277,13 +413,10 @@ class CalibratedAlarm:
                 f"onset.slip_free must be a scene of onset.streams, {', '.join(scenes)}, "
                 f"got {self.slip_free!r}"
             )
-        for name in ("hop_ms", "false_alarms_per_hour", "hours"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"onset.{name} must be positive, got {getattr(self, name)}")
+        _check_numbers(self, positive=("hop_ms", "false_alarms_per_hour", "hours"))
         if not 0 < self.level < 1:
             raise ValueError(f"onset.level must lie between 0 and 1, got {self.level}")
-        for rule in self.made_rules(self.hop_samples).values():  # bad numbers are refused now
-            self._settings(rule, Platt(1.0, 0.0), self.hop_samples)
+        self.made_rules(self.hop_samples)  # bad numbers are refused now
 
     @property
     def hop_samples(self) -> int:
@@ -292,16 +425,16 @@ class CalibratedAlarm:
 
     def made_rules(self, bin_samples: int) -> dict[str, Rule]:
         """The rules; where they leave it open, evidence is hop / bin."""
-        made = {}
-        for name, given in self.rules.items():
-            numbers = dict(given)
-            if numbers.get("evidence", 1) is None:
-                numbers["evidence"] = min(1.0, self.hop_samples / bin_samples)
-            made[name] = rule_from_dict(numbers)
-        return made
+        evidence = min(1.0, self.hop_samples / bin_samples)
+        return {
+            name: rule_from_dict(
+                {**given, "evidence": evidence} if given.get("evidence", 1) is None else given
+            )
+            for name, given in self.rules.items()
+        }
 
     def roles(self, detector: SlipDetector) -> dict[str, list[RecordingId]]:
-        """Which recordings calibrate, and which evaluate, of seen and of unseen materials.
+        """Which recordings calibrate, and which evaluate, of seen and of held-out materials.
 
         Every second cycle of a seen material calibrates, of the paper's scene and the one without
         slip; nothing that was trained on has a role.
@@ -347,14 +480,14 @@ class CalibratedAlarm:
     def __call__(
         self,
         detector: SlipDetector,
-        others: Mapping[str, Scorer] | None = None,
+        baselines: Mapping[str, Scorer] | None = None,
         num_workers: int | None = None,
     ) -> dict[str, Any]:
         """Set the alarm of a detector, in its ``info``, and evaluate it.
 
         Args:
             detector: fitted.
-            others: baselines by name, which are calibrated and evaluated alike.
+            baselines: by name; they are calibrated and evaluated alike.
             num_workers: processes that score streams.
 
         Returns:
@@ -368,51 +501,46 @@ class CalibratedAlarm:
             ValueError: if there is nothing to calibrate on.
         """
         roles = self.roles(detector)
-        role_of = {recording: role for role, own in roles.items() for recording in own}
-        scorers: dict[str, Scorer] = {OURS: detector, **(others or {})}
-        streams: dict[str, list[Stream]] = {role: [] for role in roles}
-        for stream in watch(self.streams, list(role_of), scorers, self.hop_samples, num_workers):
-            streams[role_of[stream.recording]].append(stream)
-        rate = self.streams.sample_rate_hz
-        clocks = {
-            name: Clock(rate, self.hop_samples, scorer.pool.bin_samples, scorer.look_ahead)
+        recordings = [recording for own in roles.values() for recording in own]
+        scorers: dict[str, Scorer] = {OURS: detector, **(baselines or {})}
+        scored = score_streams(self.streams, recordings, scorers, self.hop_samples, num_workers)
+        rate, num_calibrate = self.streams.sample_rate_hz, len(roles["calibrate"])
+        timings = {
+            name: Timing(rate, self.hop_samples, scorer.pool.bin_samples, scorer.look_ahead)
             for name, scorer in scorers.items()
         }
-        amounts = amounts_of(streams)
-        calibrating = streams.pop("calibrate")
-        methods = self.methods(calibrating, clocks)
+        calibrating = {name: own[:num_calibrate] for name, own in scored.items()}
+        methods = self.methods(calibrating, timings)
+        amounts = self._amounts(roles)
         settings = methods[self.rule].settings
+        curve = threshold_curve(self._quiet(calibrating[OURS]), settings, timings[OURS])
         metadata = {
+            **settings.metadata,
             "simulated": self.streams.is_simulated,
             "streams": amounts["calibrate"],
-            "threshold_curve": threshold_curve(self._quiet(calibrating), settings, clocks[OURS]),
+            "threshold_curve": curve,
         }
-        settings = replace(settings, facts={**settings.facts, **metadata})
+        settings = replace(settings, metadata=metadata)
         detector.info[KEY] = settings.to_dict()
-        usual: dict[str, list[Stream]] = {}
-        scenes: dict[str, dict[str, list[Stream]]] = {}
-        for role, own in streams.items():
-            for stream in own:
-                scene = stream.recording.scene
-                if scene in (PAPER_SCENE, self.slip_free):
-                    usual.setdefault(f"{role} stream", []).append(stream)
-                else:
-                    scenes.setdefault(scene, {}).setdefault(role, []).append(stream)
-        compute_s = {OURS: push_seconds(detector, settings)}
-        rows = [
-            (part, name)
-            for part in [*usual.values(), *(own for of in scenes.values() for own in of.values())]
-            for name in methods
-        ]
-        events: dict[int, dict[str, Any]] = {}
-        for part, name in bar(rows, "events", "table row"):
+        places = [role for role, own in roles.items() for _ in own]
+        groups: dict[tuple[str, str], list[int]] = {}  # by scene, "" for the usual ones, and role
+        for index, (role, recording) in enumerate(zip(places, recordings, strict=True)):
+            scene = "" if recording.scene in (PAPER_SCENE, self.slip_free) else recording.scene
+            if role != "calibrate":
+                groups.setdefault((scene, role), []).append(index)
+        compute_s = {OURS: _push_seconds(detector, settings)}
+        events: dict[str, dict[str, dict[str, Any]]] = {"": {}}
+        rows = [(group, name) for group in groups for name in methods]
+        for (scene, role), name in bar(rows, "events", "table row"):
             method = methods[name]
-            clock = clocks[method.scorer]
-            latency = LatencyParts(clock.look_ahead_s, clock.bin_s, compute_s.get(method.scorer))
-            made = decide(part, method.scorer, method.settings, clock)
-            seen = [watched(stream, decisions) for stream, decisions in made]
-            found = event_metrics(seen, EventRules(), latency, level=self.level)
-            events.setdefault(id(part), {})[name] = found
+            own = [scored[method.scorer][index] for index in groups[scene, role]]
+            found = self._events(own, method, timings[method.scorer], compute_s.get(method.scorer))
+            events.setdefault(scene, {}).setdefault(role, {})[name] = found
+        usual = {role: [scored[OURS][i] for i in groups["", role]] for role in events[""]}
+        parts = {
+            f"{role} stream": _reliability_by_material(own, settings, timings[OURS])
+            for role, own in usual.items()
+        }
         trained = {
             name.split("/")[2]
             for name in detector.info.get("train_recordings", {})
@@ -424,100 +552,93 @@ class CalibratedAlarm:
             "settings": settings.to_dict(),
             "streams": amounts,
             "methods": {name: method.to_dict() for name, method in methods.items()},
-            "reliability": reliability_of(usual, settings, clocks[OURS]),
-            "events": {name: events[id(part)] for name, part in usual.items()},
+            "reliability": {name: found for name, found in parts.items() if found},
+            "events": {f"{role} stream": found for role, found in events.pop("").items()},
             "scenes": {
-                scene: {"trained": scene in trained}
-                | {role: events[id(part)] for role, part in by_role.items()}
-                for scene, by_role in scenes.items()
+                scene: {"trained": scene in trained} | by_role for scene, by_role in events.items()
             },
         }
 
-    def methods(self, streams: Sequence[Stream], clocks: Mapping[str, Clock]) -> dict[str, Method]:
-        """Every rule on our scores, the main one on those of the others, and the paper's own.
+    def methods(
+        self, streams: Mapping[str, Sequence[Stream]], timings: Mapping[str, Timing]
+    ) -> dict[str, Method]:
+        """Every rule on our scores, the main one on those of baselines, and the paper's own.
 
         The paper's rule, ``FIRST_TRANSITION``, makes every change of the score to slip an alarm,
         one decision a bin: there is no threshold but the score's own, and no memory beyond the bin
         before. It is left out where the hop does not divide the bin.
 
         Args:
-            streams: that calibrate.
-            clocks: of every scorer, ``OURS`` included.
+            streams: that calibrate, by scorer, ``OURS`` included.
+            timings: of every scorer.
 
         Raises:
-            ValueError: if our scores cannot be calibrated; others whose cannot are left out.
+            ValueError: if our scores cannot be calibrated; baselines whose cannot are left out.
         """
-        rules, methods = self.made_rules(clocks[OURS].bin_samples), {}
-        for scorer, clock in clocks.items():
+        rules, methods = self.made_rules(timings[OURS].bin_samples), {}
+        for scorer, timing in timings.items():
             try:
-                calibration = FITS[self.calibration](*labelled(streams, scorer, clock))
+                calibration = FITS[self.calibration](*labelled(streams[scorer], timing))
             except ValueError as error:
                 if scorer == OURS:
                     raise
                 log.warning("%s is left out: %s", scorer, error)
                 continue
             for name, rule in rules.items() if scorer == OURS else [(scorer, rules[self.rule])]:
-                methods[name] = self.calibrated(scorer, rule, calibration, streams, clock)
-            if scorer == OURS and clock.bin_samples % clock.hop_samples == 0:
-                settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), clock.bin_samples)
+                settings, threshold = self.calibrated(rule, calibration, streams[scorer], timing)
+                methods[name] = Method(scorer, settings, threshold)
+            if scorer == OURS and timing.bin_samples % timing.hop_samples == 0:
+                settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timing.bin_samples)
                 settings = replace(settings, threshold=_ABOVE_NEUTRAL, rearm_s=0, refractory_s=0)
                 methods[FIRST_TRANSITION] = Method(scorer, settings, None)
         return methods
 
     def calibrated(
-        self,
-        scorer: str,
-        rule: Rule,
-        calibration: Calibration,
-        streams: Sequence[Stream],
-        clock: Clock,
-    ) -> Method:
+        self, rule: Rule, calibration: Calibration, streams: Sequence[Stream], timing: Timing
+    ) -> tuple[AlarmSettings, Threshold]:
         """A rule with the threshold for the rate, and the lead of its onset estimates.
 
         A ``Cusum`` without ceiling gets one above its threshold. A sum that is capped is sooner low
-        again, so what was one alarm can be two: it is counted anew, by the rule that goes into the
-        file, and the threshold is raised until the rate is kept.
+        again, so what was one alarm can be two: they are counted again by the rule that goes into
+        the file, and the threshold is raised until the rate is kept.
 
         Args:
-            scorer: whose scores.
-            rule: what makes statistics of them.
-            calibration: what makes ratios of them.
+            rule: what makes statistics of ratios.
+            calibration: what makes ratios of scores.
             streams: that calibrate, those of the scene without slip included.
-            clock: of the scores.
+            timing: of the scores.
         """
-        settings = self._settings(rule, calibration, clock.hop_samples)
+        settings = self._settings(rule, calibration, timing.hop_samples)
         quiet = self._quiet(streams)
         highest = math.inf  # of a statistic that is itself a ratio, what the calibration gives
         if isinstance(rule, KOfN) and isinstance(calibration, Isotonic):
             highest = max(calibration.llrs)
         threshold = choose_threshold(
-            [made.statistic for _, made in decide(quiet, scorer, settings, clock)],
+            [made.statistic for _, made in decide(quiet, settings, timing)],
             rule,
-            clock.hop_s,
+            timing.hop_s,
             self.false_alarms_per_hour,
-            rearm=settings.decisions(self.rearm_s, clock.sample_rate_hz),
-            refractory=settings.decisions(self.refractory_s, clock.sample_rate_hz),
+            rearm=settings.decisions(self.rearm_s, timing.sample_rate_hz),
+            refractory=settings.decisions(self.refractory_s, timing.sample_rate_hz),
             ceiling=highest,
             level=self.level,
         )
         settings = replace(settings, threshold=threshold.value)
         if isinstance(rule, Cusum) and rule.ceiling == math.inf and threshold.value > 0:
             allowed = math.floor(self.false_alarms_per_hour * threshold.rate.hours)
-            value = threshold.value
-            while True:
-                capped = replace(rule, ceiling=CEILING * value)
-                settings = replace(settings, rule=capped, threshold=value)
-                made = [decisions for _, decisions in decide(quiet, scorer, settings, clock)]
-                counts = [int(decisions.is_alarm.sum()) for decisions in made]
-                if sum(counts) <= allowed:
-                    break
+            counts, value = [allowed + 1], threshold.value / _STEP
+            while sum(counts) > allowed:
                 value *= _STEP
-            hours = [len(decisions.number) * clock.hop_s / 3600 for decisions in made]
+                capped = replace(rule, ceiling=_CEILING * value)
+                settings = replace(settings, rule=capped, threshold=value)
+                made = [decisions for _, decisions in decide(quiet, settings, timing)]
+                counts = [int(decisions.is_alarm.sum()) for decisions in made]
+            hours = [len(decisions.number) * timing.hop_s / 3600 for decisions in made]
             rate = alarm_rate(counts, hours, self.level)
             threshold = replace(threshold, value=value, rate=rate)
-        facts = {"slip_free": self.slip_free, "calibrated": asdict(threshold)}
-        lead_s = _lead_s(streams, scorer, settings, clock)
-        return Method(scorer, replace(settings, lead_s=lead_s, facts=facts), threshold)
+        metadata = {"slip_free": self.slip_free, "calibrated": asdict(threshold)}
+        lead_s = _lead_s(streams, settings, timing)
+        return replace(settings, lead_s=lead_s, metadata=metadata), threshold
 
     def _settings(self, rule: Rule, calibration: Calibration, hop_samples: int) -> AlarmSettings:
         """Without a threshold yet."""
@@ -532,13 +653,39 @@ class CalibratedAlarm:
             self.refractory_s,
         )
 
+    def _events(
+        self, streams: Sequence[Stream], method: Method, timing: Timing, compute_s: float | None
+    ) -> dict[str, Any]:
+        rate = timing.sample_rate_hz
+        latency = LatencyParts(timing.look_ahead / rate, timing.bin_samples / rate, compute_s)
+        seen = [
+            recording_events(watched(*made), EventRules(), latency)
+            for made in decide(streams, method.settings, timing)
+        ]
+        return pooled_metrics(seen, level=self.level)
+
+    def _amounts(
+        self, roles: Mapping[str, Sequence[RecordingId]]
+    ) -> dict[str, dict[str, dict[str, float]]]:
+        """Recordings, hours and slips of each role and scene."""
+        amounts: dict[str, dict[str, dict[str, float]]] = {}
+        for role, recordings in roles.items():
+            for recording in recordings:
+                none = {"recordings": 0, "hours": 0.0, "slips": 0}
+                row = amounts.setdefault(role, {}).setdefault(recording.scene, none)
+                times = self.streams.timeline(recording)
+                row["recordings"] += 1
+                row["hours"] += times.duration_s / 3600
+                row["slips"] += len(times.onsets_s)
+        return amounts
+
     def _quiet(self, streams: Sequence[Stream]) -> list[Stream]:
         return [stream for stream in streams if stream.recording.scene == self.slip_free]
 
 
 @dataclass(frozen=True)
 class DebouncedAlarm:
-    """The stage behind the fit.
+    """Sets the alarm of a fitted detector at no given rate: k of the last n decisions say slip.
 
     Args:
         hop_ms: distance of two decisions; ``None`` for half a bin.
@@ -562,20 +709,10 @@ class DebouncedAlarm:
     refractory_s: float = 0.2
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            is_number = type(value) in (int, float)
-            if name in ("k", "n"):
-                is_fine, wanted = type(value) is int, "be a whole number"
-            elif name in ("probability", "slip_share"):
-                is_fine, wanted = is_number and 0 < value < 1, "lie between 0 and 1"
-            elif name == "hop_ms":
-                is_fine = value is None or (is_number and 0 < value < math.inf)
-                wanted = "be positive, or null"
-            else:
-                is_fine, wanted = is_number and 0 <= value < math.inf, "be seconds from 0"
-            if not is_fine:
-                raise ValueError(f"onset.{name} must {wanted}, got {value!r}")
-        _ = KOfN(self.k, self.n)
+        _check_numbers(self, positive=() if self.hop_ms is None else ("hop_ms",))
+        for name in ("k", "n"):
+            check_number(f"onset.{name}", getattr(self, name), whole=True)
+        KOfN(self.k, self.n)
 
     def hop_samples(self, sample_rate_hz: float, bin_samples: int) -> int:
         """The distance of two decisions in samples.
@@ -587,13 +724,8 @@ class DebouncedAlarm:
             return max(bin_samples // 2, 1)
         return whole_samples(self.hop_ms, sample_rate_hz, "onset.hop_ms")
 
-    def __call__(
-        self,
-        detector: SlipDetector,
-        others: Mapping[str, Scorer] | None = None,
-        num_workers: int | None = None,
-    ) -> dict[str, Any]:
-        """Set the alarm of a detector, in its ``info``; there is nothing to report of it.
+    def __call__(self, detector: SlipDetector) -> None:
+        """Set the alarm of a detector, in its ``info``.
 
         Raises:
             ValueError: if training had nothing to choose, so that scores have no calibration.
@@ -605,19 +737,27 @@ class DebouncedAlarm:
                 "nothing; give several recipe.penalties"
             )
         pool = detector.pool
+        odds, share_odds = (p / (1 - p) for p in (self.probability, self.slip_share))
         settings = AlarmSettings(
             hop_samples=self.hop_samples(pool.sample_rate_hz, pool.bin_samples),
             calibration=known[0],
             rule=KOfN(self.k, self.n),
-            threshold=_log_odds(self.probability) - _log_odds(self.slip_share),
+            threshold=math.log(odds) - math.log(share_odds),
             target_per_hour=None,
             slip_share=self.slip_share,
             rearm_s=self.rearm_s,
             refractory_s=self.refractory_s,
         )
         detector.info[KEY] = settings.to_dict()
-        return {}
 
 
-def _log_odds(probability: float) -> float:
-    return math.log(probability / (1 - probability))
+def _check_numbers(stage: CalibratedAlarm | DebouncedAlarm, positive: Sequence[str]) -> None:
+    """Refuse numbers that cannot be, of both stages."""
+    for name in positive:
+        check_number(f"onset.{name}", getattr(stage, name))
+    for name in ("rearm_s", "refractory_s"):
+        check_number(f"onset.{name}", getattr(stage, name), least=0)
+    for name in ("slip_share", "probability"):
+        value = getattr(stage, name, 0.5)
+        if type(value) not in (int, float) or not 0 < value < 1:
+            raise ValueError(f"onset.{name} must lie between 0 and 1, got {value!r}")

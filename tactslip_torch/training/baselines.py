@@ -28,9 +28,8 @@ from torch import Tensor
 
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.names import FeatureName
-from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pool import FeaturePool, is_rounding
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.features.rounding import is_rounding
 from tactslip_torch.model.threshold import FeatureThreshold, best_threshold
 from tactslip_torch.training.recipe import balanced_accuracy, sample_groups
 
@@ -101,92 +100,103 @@ class SimpleStatistics:
 class LogisticRegression:
     """A linear decision, ``weights @ x + constant >= 0``.
 
+    Args:
+        weights: of the columns or, with ``log_floor``, of them and of their logarithms.
+        constant: added.
+        penalty: scikit-learn's ``C``.
+        log_floor: below which the logarithm of a magnitude levels out; ``None`` takes none.
+
     Shape:
-        - weights: ``[K]``, float64
+        - weights: ``[K]``, float64, ``[2 K]`` with logarithms; log_floor: ``[K]``
     """
 
     weights: Tensor
     constant: float
     penalty: float
+    log_floor: Tensor | None = None
 
     @classmethod
-    def fit(cls, columns: Tensor, sample: SampledBins) -> LogisticRegression:
+    def fit(
+        cls, columns: Tensor, sample: SampledBins, *, with_logs: bool = False
+    ) -> LogisticRegression:
         """Fit standardised columns, with ``C`` chosen by leaving groups out unless they are many.
 
+        Args:
+            columns: of the sampled bins.
+            sample: their labels, weights and groups.
+            with_logs: add the logarithm of each column's magnitude: amplitudes range over decades,
+                so logarithms are worth seven points on the simulated hand.
+
         Shape:
-            - columns: ``[n, K]``, of the sampled bins
+            - columns: ``[n, K]``
 
         Raises:
             ValueError: if a class is absent.
         """
-        from sklearn.linear_model import LogisticRegression as Regression
-        from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # sklearn's own
-
-        x, is_wide = columns.double(), columns.shape[1] > WIDE
+        check_classes(sample.is_slip)
+        x, floor = columns.double(), None
+        if with_logs:
+            floor = LOG_FLOOR * columns.abs().median(0).values
+            floor = torch.where(floor > 0, floor, 1.0)
+            x = _with_logs(x, floor)
         sd, centre = torch.std_mean(x, 0, correction=0)
         scale = torch.where(sd > 0, sd, 1.0)
         z = (x - centre) / scale
-        solver = "lbfgs" if is_wide else "newton-cholesky"
-
-        def fitted(rows: Tensor, penalty: float) -> tuple[Tensor, float]:
-            made = Regression(C=penalty, class_weight="balanced", max_iter=2000, solver=solver)
-            weights = sample.represents[rows]
-            with warnings.catch_warnings(), threadpool_limits(1):  # small: threads would wait
-                warnings.simplefilter("ignore")  # newton-cholesky falls back to lbfgs by itself
-                made.fit(z[rows].numpy(), sample.is_slip[rows].numpy(), weights.numpy())
-            return torch.from_numpy(made.coef_[0]), float(made.intercept_[0])
-
-        check_classes(sample.is_slip)
-        everything = torch.ones(len(z), dtype=torch.bool)
-        groups, names = sample_groups(sample)
-        num_folds = min(len(names), MOST_FOLDS)
-        folds = [groups % num_folds == fold for fold in range(num_folds)]
-        folds = [out for out in folds if _has_both(sample.is_slip[~out])]
-        penalty = WIDE_PENALTY
-        if not is_wide and len(names) > 1 and folds:
-            found = {}
-            for candidate in PENALTIES:
-                right = []
-                for out in folds:
-                    weights, constant = fitted(~out, candidate)
-                    says_slip = z[out] @ weights + constant >= 0
-                    right.append(balanced_accuracy(says_slip, sample.is_slip[out]))
-                known = [value for value in right if value is not None]
-                found[candidate] = sum(known) / max(len(known), 1)
-            penalty = max(found, key=found.__getitem__)  # the strongest of equals
-        weights, constant = fitted(everything, penalty)
-        return cls(weights / scale, constant - float(weights @ (centre / scale)), penalty)
+        penalty = WIDE_PENALTY if z.shape[1] > WIDE else _chosen_penalty(z, sample)
+        weights, constant = _fitted_regression(z, sample, slice(None), penalty)
+        constant -= float(weights @ (centre / scale))
+        return cls(weights / scale, constant, penalty, floor)
 
     def __call__(self, columns: Tensor) -> Tensor:
         """Decisions, ``[N, K] -> [N]``, bool."""
-        return columns.double() @ self.weights + self.constant >= 0
+        x = columns.double()
+        if self.log_floor is not None:
+            x = _with_logs(x, self.log_floor)
+        return x @ self.weights + self.constant >= 0
 
     def metadata(self) -> dict[str, Any]:
         """What was chosen, JSON-able."""
         return {"C": self.penalty}
 
 
-class SimpleLogisticRegression:
-    """``LogisticRegression`` on simple statistics and the logarithms of their magnitudes.
+def _with_logs(columns: Tensor, floor: Tensor) -> Tensor:
+    return torch.cat([columns, (columns.abs() + floor).log()], 1)
 
-    Amplitudes range over decades, so logarithms are worth seven points on the simulated hand.
-    """
 
-    def __init__(self, statistics: Tensor, sample: SampledBins) -> None:
-        floor = LOG_FLOOR * statistics.abs().median(0).values
-        self._floor = torch.where(floor > 0, floor, 1.0)
-        self.regression = LogisticRegression.fit(self._with_logs(statistics), sample)
+def _chosen_penalty(z: Tensor, sample: SampledBins) -> float:
+    """The ``C`` of the best balanced accuracy on groups left out; the strongest of equals."""
+    groups, names = sample_groups(sample)
+    num_folds = min(len(names), MOST_FOLDS)
+    folds = [groups % num_folds == fold for fold in range(num_folds)]
+    folds = [out for out in folds if _has_both(sample.is_slip[~out])]
+    if num_folds < 2 or not folds:
+        return WIDE_PENALTY
+    means = {}
+    for penalty in PENALTIES:
+        found = []
+        for out in folds:
+            weights, constant = _fitted_regression(z, sample, ~out, penalty)
+            says_slip = z[out] @ weights + constant >= 0
+            found.append(balanced_accuracy(says_slip, sample.is_slip[out]))
+        known = [value for value in found if value is not None]
+        means[penalty] = sum(known) / max(len(known), 1)
+    return max(means, key=means.__getitem__)
 
-    def __call__(self, statistics: Tensor) -> Tensor:
-        """Decisions, ``[N, 3 C] -> [N]``, bool."""
-        return self.regression(self._with_logs(statistics))
 
-    def metadata(self) -> dict[str, Any]:
-        """As ``LogisticRegression.metadata``."""
-        return self.regression.metadata()
+def _fitted_regression(
+    z: Tensor, sample: SampledBins, rows: Tensor | slice, penalty: float
+) -> tuple[Tensor, float]:
+    """Weights and constant of some bins, both classes of one weight."""
+    from sklearn.linear_model import LogisticRegression as Regression
+    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # sklearn's own
 
-    def _with_logs(self, statistics: Tensor) -> Tensor:
-        return torch.cat([statistics, (statistics.abs() + self._floor).log()], 1)
+    solver = "lbfgs" if z.shape[1] > WIDE else "newton-cholesky"
+    made = Regression(C=penalty, class_weight="balanced", max_iter=2000, solver=solver)
+    weights = sample.sample_weight[rows].numpy()
+    with warnings.catch_warnings(), threadpool_limits(1):  # small: threads would wait
+        warnings.simplefilter("ignore")  # newton-cholesky falls back to lbfgs by itself
+        made.fit(z[rows].numpy(), sample.is_slip[rows].numpy(), weights)
+    return torch.from_numpy(made.coef_[0]), float(made.intercept_[0])
 
 
 class RandomForest:
@@ -206,7 +216,7 @@ class RandomForest:
         made = RandomForestClassifier(
             NUM_TREES, class_weight="balanced", random_state=0, n_jobs=2, max_features="sqrt"
         )
-        truth, weights = sample.is_slip.numpy(), sample.represents.numpy()
+        truth, weights = sample.is_slip.numpy(), sample.sample_weight.numpy()
         made.fit(_single(columns), truth, sample_weight=weights)
         self._trees = [tree.tree_ for tree in made.estimators_]
 
@@ -241,9 +251,6 @@ def _single(columns: Tensor) -> NDArray[np.float32]:
     return x
 
 
-Classifier = SimpleLogisticRegression | RandomForest
-
-
 @dataclass(frozen=True)
 class PooledNumber:
     """One statistic over channels of one descriptor, and a threshold.
@@ -270,7 +277,7 @@ class PooledNumber:
         features = sample.features[:: -(-len(sample.features) // CONSTANT_BINS)][:, places]
         layer = ChannelPooling.fit(pool.hand, names, features, ["mean", "std"])
         columns = layer(sample.features[:, _places(pool, layer)].double())
-        rule = best_threshold(columns, sample.is_slip, sample.represents)
+        rule = best_threshold(columns, sample.is_slip, sample.sample_weight)
         layer = layer.select([rule.index])
         return cls(layer, tuple(_places(pool, layer)), replace(rule, index=0))
 
@@ -278,6 +285,11 @@ class PooledNumber:
     def name(self) -> FeatureName:
         """What the number is."""
         return self.pooling.names[0]
+
+    def metadata(self) -> dict[str, Any]:
+        """What it is, and its threshold, JSON-able."""
+        rule = self.rule
+        return {"feature": str(self.name), "threshold": rule.threshold, "sign": rule.sign}
 
     def __call__(self, features: Tensor) -> Tensor:
         """Decisions from features of the whole pool, ``[N, F] -> [N]``, bool."""
@@ -304,24 +316,24 @@ class Baselines:
     """Fitted baselines.
 
     Args:
+        pool: of the features.
         pooled: the best pooled number.
-        regression: on the scaled columns of the detector.
-        statistics: simple ones, of features of the pool.
-        simple: classifiers of simple statistics, by name.
+        scaled: a baseline of the scaled columns of the detector, by name.
+        simple: baselines of simple statistics, by name.
         num_bins: that all were fitted on.
     """
 
     def __init__(
         self,
+        pool: FeaturePool,
         pooled: PooledNumber,
-        regression: LogisticRegression | None = None,
-        statistics: SimpleStatistics | None = None,
-        simple: Mapping[str, Classifier] | None = None,
+        scaled: Mapping[str, LogisticRegression] | None = None,
+        simple: Mapping[str, LogisticRegression | RandomForest] | None = None,
         num_bins: int | None = None,
     ) -> None:
         self.pooled, self.num_bins = pooled, num_bins
-        self._regression = regression
-        self._statistics, self._simple = statistics, dict(simple or {})
+        self._scaled, self._simple = dict(scaled or {}), dict(simple or {})
+        self._statistics = SimpleStatistics(pool) if self._simple else None
 
     @classmethod
     def fit(cls, pool: FeaturePool, scaled: Tensor, sample: SampledBins) -> Baselines:
@@ -336,14 +348,13 @@ class Baselines:
             ValueError: if a class is absent.
         """
         check_classes(sample.is_slip)
-        statistics = SimpleStatistics(pool)
-        x = statistics(sample.features)
+        x = SimpleStatistics(pool)(sample.features)
         return cls(
+            pool,
             PooledNumber.fit(pool, sample),
-            LogisticRegression.fit(scaled, sample),
-            statistics,
+            {"logistic_regression": LogisticRegression.fit(scaled, sample)},
             {
-                "logistic_regression_simple": SimpleLogisticRegression(x, sample),
+                "logistic_regression_simple": LogisticRegression.fit(x, sample, with_logs=True),
                 "random_forest_simple": RandomForest(x, sample),
             },
             len(sample.is_slip),
@@ -358,8 +369,7 @@ class Baselines:
             - output: each ``[N]``, bool
         """
         found = {POOLED_NUMBER: self.pooled(features)}
-        if self._regression is not None:
-            found["logistic_regression"] = self._regression(scaled)
+        found |= {name: made(scaled) for name, made in self._scaled.items()}
         if self._statistics is not None:
             x = self._statistics(features)
             found |= {name: made(x) for name, made in self._simple.items()}
@@ -367,19 +377,9 @@ class Baselines:
 
     def metadata(self) -> dict[str, dict[str, Any]]:
         """What each is, by name, JSON-able."""
-        rule = self.pooled.rule
-        found: dict[str, dict[str, Any]] = {
-            POOLED_NUMBER: {
-                "feature": str(self.pooled.name),
-                "threshold": rule.threshold,
-                "sign": rule.sign,
-            }
-        }
-        if self._regression is not None:
-            found["logistic_regression"] = self._regression.metadata()
-        found |= {name: made.metadata() for name, made in self._simple.items()}
+        made = {POOLED_NUMBER: self.pooled, **self._scaled, **self._simple}
         bins = {} if self.num_bins is None else {"num_bins": self.num_bins}
-        return {name: about | bins for name, about in found.items()}
+        return {name: own.metadata() | bins for name, own in made.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """What a detector keeps: the best pooled number, JSON-able; the others are too large."""
@@ -388,7 +388,7 @@ class Baselines:
     @classmethod
     def from_dict(cls, pool: FeaturePool, plain: Mapping[str, Any]) -> Baselines:
         """The baselines that ``to_dict`` kept."""
-        return cls(PooledNumber.from_dict(pool, plain[POOLED_NUMBER]))
+        return cls(pool, PooledNumber.from_dict(pool, plain[POOLED_NUMBER]))
 
 
 def _places(pool: FeaturePool, layer: ChannelPooling) -> list[int]:

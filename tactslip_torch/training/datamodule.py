@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections import Counter
 from collections.abc import Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import lightning as L
@@ -19,7 +17,6 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-import tactslip_torch
 from tactslip_torch.data.labels import (
     LabelledBins,
     LabelRule,
@@ -27,11 +24,11 @@ from tactslip_torch.data.labels import (
     label_bins,
     needed_windows,
     shuffled,
+    whole_samples,
 )
 from tactslip_torch.data.recording import Recording, RecordingId, RecordingSource, Timeline
 from tactslip_torch.data.splits import ROLES, Split
 from tactslip_torch.features.cache import FeatureCache, cache_key, source_digest
-from tactslip_torch.features.extractor import FeatureExtractor
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.native import BackendName
 from tactslip_torch.signals.binning import bins_at
@@ -96,8 +93,8 @@ class FeatureMaker:
         backend: what computes them.
 
     Raises:
-        ValueError: if rate, channels or bin length of the parts disagree, or the backend is none
-            that can be used.
+        ValueError: if rate, channels or bin length of the parts disagree, bins or hops are no whole
+            number of samples, or the backend is none that can be used.
     """
 
     def __init__(
@@ -121,7 +118,9 @@ class FeatureMaker:
                 f"the features expect {pool.sample_rate_hz:g} Hz, the recordings have "
                 f"{source.sample_rate_hz:g} Hz; make the features for that rate, or resample"
             )
-        bin_samples = round(rule.bin_ms * source.sample_rate_hz / 1000)
+        bin_samples = whole_samples(rule.bin_ms, source.sample_rate_hz, "labels.bin_ms")
+        if rule.hop_ms is not None:
+            whole_samples(rule.hop_ms, source.sample_rate_hz, "labels.hop_ms")
         if pool.bin_samples != bin_samples:
             raise ValueError(
                 f"the features expect bins of {pool.bin_samples} samples, labels.bin_ms="
@@ -129,12 +128,12 @@ class FeatureMaker:
             )
         self.source = source
         self.pool = pool
-        self.extractor = FeatureExtractor(pool, backend=backend)
+        self.extractor = pool.select(range(len(pool.names)), backend)
         self.channel_filter = channel_filter
         self.rule = rule
         self.cache = cache
         self.dtype = dtype
-        self._code = source_digest(Path(tactslip_torch.__file__).parent)
+        self._code = source_digest()
         self._libraries = [version(name) for name in ("torch", "numpy", "ptwt", "PyWavelets")]
 
     def __call__(self, recording: RecordingId, split: Split) -> RecordingFeatures:
@@ -239,7 +238,7 @@ class FeatureMaker:
         filtered = self._filter(recording, loaded, bins)
         seconds["filter"] = _lap(started, seconds)
         with torch.no_grad():
-            features = self.extractor(filtered).float()
+            features: Tensor = self.extractor(filtered).float()
         seconds["features"] = _lap(started, seconds)
         if self.cache is not None:
             self.cache.store(key, features)
@@ -274,7 +273,7 @@ class FeatureMaker:
 
     def _key(self, recording: RecordingId, bins: LabelledBins) -> str:
         pool = self.pool
-        facts: dict[str, Any] = {
+        content: dict[str, Any] = {
             "recording": dict(self.source.key(recording)),
             "starts": bins.starts.tolist(),
             "bin_samples": bins.bin_samples,
@@ -286,47 +285,12 @@ class FeatureMaker:
             "code": self._code,
             "libraries": self._libraries,
         }
-        return cache_key(facts)
+        return cache_key(content)
 
 
 def _lap(started: float, seconds: dict[str, float]) -> float:
     """Seconds since ``started`` that no earlier stage has."""
     return time.perf_counter() - started - sum(seconds.values())
-
-
-_UNITS = {
-    "simulate": "recordings",
-    "read": "recordings",
-    "features": "bins",
-    "read_cache": "recordings",
-}
-
-
-class Throughput:
-    """What recordings took, added up.
-
-    Attributes:
-        seconds: that workers spent on each stage, summed over them.
-    """
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._done: dict[str, Counter[str]] = {}
-
-    def add(self, made: RecordingFeatures) -> None:
-        """Count a recording."""
-        for stage, seconds in made.seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
-            done = self._done.setdefault(stage, Counter())
-            done.update(recordings=1, bins=len(made.is_slip))
-
-    def rates(self) -> dict[str, str]:
-        """Of one worker, for people."""
-        return {
-            stage: f"{self._done[stage][unit] / max(self.seconds[stage], 1e-9):.0f} {unit}/s"
-            for stage, unit in _UNITS.items()
-            if stage in self._done
-        }
 
 
 NOTHING: Any = ()
@@ -374,7 +338,7 @@ class SlipDataModule(L.LightningDataModule):
         features = {
             str(recording): self.maker.key(recording) for recording in split.having("train")
         }
-        shared = [split.test_share_of_bins, split.seed, self.maker.rule.shuffle_seed]
+        shared = [split.test_fraction, split.seed, self.maker.rule.shuffle_seed]
         return cache_key({"features": features, "shared": shared})
 
     def transfer_batch_to_device(self, batch: Any, device: Any, dataloader_idx: int) -> Any:

@@ -8,8 +8,10 @@ import sys
 import tempfile
 import time
 import warnings
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,9 +23,11 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 from tqdm.auto import tqdm
 
-import tactslip_torch
+from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import Split
+from tactslip_torch.deploy.check import GraphKind
+from tactslip_torch.deploy.export import export_detector, read_sidecar
 from tactslip_torch.features.cache import (
     FeatureCache,
     cache_key,
@@ -33,50 +37,43 @@ from tactslip_torch.features.cache import (
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import statistics_of
-from tactslip_torch.graph.export import export_detector, sidecar_facts, worst_error
-from tactslip_torch.graph.facts import GraphKind
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.native import BackendName, backend_of
 from tactslip_torch.onset.baselines import BaselineDetector, BaselineName
-from tactslip_torch.onset.decisions import Scorer
-from tactslip_torch.onset.events import RecordingEvents
-from tactslip_torch.onset.settings import KEY
+from tactslip_torch.onset.decisions import KEY, Scorer
 from tactslip_torch.report.metrics import merged_answers, merged_metrics, summed_metrics
 from tactslip_torch.report.results import tuning_figure
-from tactslip_torch.runtime import LEAD, whole_file
+from tactslip_torch.runtime import LEAD, __version__, whole_file
 from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.spectrum import SpectrumMethod
 from tactslip_torch.signals.wavelet import highest_level
-from tactslip_torch.training.adaptation import check_recipe, gathered_statistics
+from tactslip_torch.training.adaptation import FILE as STATISTICS
+from tactslip_torch.training.adaptation import Statistics, check_recipe
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
-from tactslip_torch.training.datamodule import SlipDataModule
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.learner import SlipLearner, event_numbers
-from tactslip_torch.training.recipe import Recipe, sample_weight
-from tactslip_torch.training.statistics import FILE as STATISTICS
-from tactslip_torch.training.tuning import Tuning, settled_learner
+from tactslip_torch.training.recipe import FeatureSelection, Recipe
+from tactslip_torch.training.tuning import Tuning
 
 
 def combined(folds: dict[str, dict[str, Any]], *, by_fold: bool) -> dict[str, Any]:
     """One fold as it is; of several, ``merged_results``, and the features that all selected."""
     if len(folds) == 1:
-        (found,) = folds.values()
-        del found["recording_events"]
-        return found
+        (only,) = folds.values()
+        del only["recording_events"]
+        return only
     merged = merged_results(folds, by_fold=by_fold)
-    parts = list(folds.values())
-    for part in parts:
-        del part["recording_events"]
-    shared = set.intersection(*(set(part["selected"]) for part in parts))
-    times = {name: [part.pop(name) for part in parts] for name in ("timing_s", "worker_s")}
-    return merged | {
-        "selected": [name for name in parts[0]["selected"] if name in shared],
-        **{
-            name: {stage: sum(x.get(stage, 0.0) for x in own) for x in own for stage in x}
-            for name, own in times.items()
-        },
-        "folds": folds,
-    }
+    found = list(folds.values())
+    times = {name: dict[str, float]() for name in ("timing_s", "worker_s")}
+    for own in found:
+        del own["recording_events"]
+        for name, total in times.items():
+            for stage, seconds in own.pop(name).items():
+                total[stage] = total.get(stage, 0.0) + seconds
+    shared = set.intersection(*(set(own["selected"]) for own in found))
+    selected = [name for name in found[0]["selected"] if name in shared]
+    return merged | times | {"selected": selected, "folds": folds}
 
 
 def merged_results(
@@ -89,32 +86,28 @@ def merged_results(
         by_fold: whether folds have the same bins, which then are not summed: results have each role
             of each fold, such as ``"protocol/unseen"``.
     """
-    splits: dict[str, list[dict[str, Any]]] = {}
-    answers: dict[str, dict[str, Any]] = {}
-    baselines: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    events: dict[str, dict[str, list[RecordingEvents]]] = {}
+    splits, answers = defaultdict[str, list[Any]](list), defaultdict[str, dict[str, Any]](dict)
+    baselines, events = (defaultdict[str, Any](lambda: defaultdict(list)) for _ in range(2))
     for fold, found in folds.items():
         before = f"{fold}/" if by_fold else ""
         for role, scores in found["splits"].items():
-            splits.setdefault(before + role, []).append(scores)
+            splits[before + role].append(scores)
         for role, own in found.get("answers", {}).items():
-            answers.setdefault(before + role, {})[fold] = own
+            answers[before + role][fold] = own
         for name, about in found["baselines"].items():
             for role, scores in about["splits"].items():
-                baselines.setdefault(name, {}).setdefault(before + role, []).append(scores)
+                baselines[name][before + role].append(scores)
         for role, by_rule in found["recording_events"].items():
             for name, recordings in by_rule.items():
-                events.setdefault(before + role, {}).setdefault(name, []).extend(recordings)
-    if len(folds) == 1:  # what baselines are is told of one fold alone
-        of_baselines = next(iter(folds.values()))["baselines"]
-    else:
-        of_baselines = {
-            name: {"splits": {role: summed_metrics(own) for role, own in by_role.items()}}
-            for name, by_role in baselines.items()
-        }
+                events[before + role][name] += recordings
+    summed = {
+        name: {"splits": {role: summed_metrics(own) for role, own in by_role.items()}}
+        for name, by_role in baselines.items()
+    }
+    only = next(iter(folds.values()))["baselines"] if len(folds) == 1 else None
     return {
         "splits": {role: merged_metrics(scores) for role, scores in splits.items()},
-        "baselines": of_baselines,
+        "baselines": summed if only is None else only,  # what they are is told of one fold alone
         "events": event_numbers(events),
         "answers": {role: merged_answers(own) for role, own in answers.items()},
     }
@@ -125,9 +118,9 @@ MOST_LEVELS = 4
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
-def feature_parts(
+def feature_maker(
     source: RecordingSource,
-    bin_ms: float,
+    rule: LabelRule,
     *,
     frames: Mapping[str, int | None],
     polyorder: int,
@@ -138,12 +131,12 @@ def feature_parts(
     backend: BackendName,
     align: Align = "centred",
     pooling: str | Sequence[str] | None = None,
-) -> tuple[FeaturePool, ChannelFilter, torch.dtype, BackendName]:
-    """Pool, filter, dtype and backend from the ``features`` section; no recording is read for it.
+) -> FeatureMaker:
+    """The features of the ``features`` section, without a cache; no recording is read for it.
 
     Args:
         source: of the recordings, whose hand and rate they are for.
-        bin_ms: length of a bin.
+        rule: how bins are laid and labelled.
         frames: as ``frame_lengths`` takes them.
         polyorder: of the filter.
         wavelet: of the branches.
@@ -163,7 +156,7 @@ def feature_parts(
     if pooling is not None:
         statistics_of(pooling, len(source.hand))
     lengths = frame_lengths(source.hand, frames)
-    bin_samples = round(bin_ms * source.sample_rate_hz / 1000)
+    bin_samples = round(rule.bin_ms * source.sample_rate_hz / 1000)
     pool = FeaturePool(
         source.hand,
         source.sample_rate_hz,
@@ -173,7 +166,9 @@ def feature_parts(
         spectrum=spectrum,
         arithmetic="native" if dtype == "float32" else "double",
     )
-    return pool, ChannelFilter(lengths, polyorder, align), DTYPES[dtype], backend_of(backend)
+    channel_filter = ChannelFilter(lengths, polyorder, align)
+    computed_in, computed_by = DTYPES[dtype], backend_of(backend)
+    return FeatureMaker(source, pool, channel_filter, rule, None, computed_in, computed_by)
 
 
 def frame_lengths(hand: HandLayout, frames: Mapping[str, int | None]) -> list[int]:
@@ -256,7 +251,7 @@ class RecordingProgressBar(TQDMProgressBar):
     def on_train_epoch_start(self, trainer: Any, *args: Any) -> None:
         """Name the pass."""
         super().on_train_epoch_start(trainer, *args)
-        what = "survey" if trainer.current_epoch == 0 else "sums"
+        what = "statistics" if trainer.current_epoch == 0 else "sums"
         self.train_progress_bar.set_description_str(self._stage(what))
 
     def on_test_batch_start(self, *args: Any, **kwargs: Any) -> None:
@@ -268,13 +263,8 @@ class RecordingProgressBar(TQDMProgressBar):
         return f"{self._verb + ', ' + what:{LEAD}}"
 
     def get_metrics(self, trainer: Any, pl_module: Any) -> dict[str, Any]:
-        """The rate of each stage of making features, instead of Lightning's version number."""
-        return dict(pl_module.rates())
-
-    def on_test_batch_end(self, trainer: Any, pl_module: Any, *args: Any, **kwargs: Any) -> None:
-        """Show rates in the test pass as well."""
-        super().on_test_batch_end(trainer, pl_module, *args, **kwargs)
-        self.test_progress_bar.set_postfix(self.get_metrics(trainer, pl_module), refresh=False)
+        """Nothing, instead of Lightning's version number."""
+        return {}
 
 
 def make_trainer(
@@ -338,13 +328,15 @@ def feature_rows(names: Sequence[FeatureName], hand: HandLayout) -> list[dict[st
 def versions() -> dict[str, str]:
     """What made a result, for files that say so."""
     return {
-        "tactslip_torch": tactslip_torch.__version__,
+        "tactslip_torch": __version__,
         "torch": torch.__version__,
-        "code": source_digest(Path(tactslip_torch.__file__).parent),
+        "code": source_digest(),
     }
 
 
-def common_facts(source: RecordingSource, pool: FeaturePool, config: DictConfig) -> dict[str, Any]:
+def common_metadata(
+    source: RecordingSource, pool: FeaturePool, config: DictConfig
+) -> dict[str, Any]:
     """What every ``metrics.json`` says of its origin."""
     return {
         "simulated": source.is_simulated,
@@ -397,29 +389,46 @@ def tune_fold(
             "trainer.devices and trainer.num_nodes, or take tuning=none"
         )
     trainer.fit(first, datamodule=data)
-    facts: dict[str, Any] = {"fit_s": time.perf_counter() - started}
+    found: dict[str, Any] = {"fit_s": time.perf_counter() - started}
     plan, (_, sample) = first.plan, first.gathered
-    weights = sample_weight(first.recipe, sample)
-    names = [str(name) for name in data.maker.pool.names]
-    tuned = tuning(plan, first.recipe, sample, weights, names)
-    facts |= tuned.facts
-    start = facts["start"]
-    by_loss = settled_learner(first, data.maker, plan.selection, start["penalty"], start["offset"])
+    tuned = tuning(plan, sample, [str(name) for name in data.maker.pool.names])
+    found |= tuned.metadata
+    start = found["start"]
+    by_loss = _settled(first, data, plan.selection, start["penalty"], start["offset"])
     other = make_trainer(config.trainer, folder / "start")
     other.fit(by_loss, datamodule=data)
-    facts["splits"] = {}
+    found["splits"] = {}
     tests = (("grid", "recipe", trainer, first), ("start", "grid", other, by_loss))
     for name, way, tester, learner in tests:
         tester.test(learner, datamodule=data, verbose=False)
-        facts["splits"][way] = learner.metrics["splits"]
+        found["splits"][way] = learner.metrics["splits"]
         if learner.detector is not None:
             learner.detector.info |= _origin(config, data)
             learner.detector.save(folder / f"{name}.pt")
     simulated = data.maker.source.is_simulated
-    tuning_figure(facts, folder / "tuning.png", simulated=simulated)
-    learner = settled_learner(first, data.maker, tuned.selection, tuned.penalty, tuned.offset)
-    facts["validation"] = first.metadata["validation"]
-    return learner, facts
+    tuning_figure(found, folder / "tuning.png", simulated=simulated)
+    found["validation"] = first.metadata["validation"]
+    return _settled(first, data, tuned.selection, tuned.penalty, tuned.offset), found
+
+
+def _settled(
+    first: SlipLearner,
+    data: SlipDataModule,
+    selection: FeatureSelection,
+    penalty: float,
+    offset: float,
+) -> SlipLearner:
+    """A learner like the first with nothing left to choose."""
+    size = len(selection.selected)
+    recipe = replace(first.recipe, num_features=size, penalties=penalty, offsets=offset)
+    return SlipLearner(
+        data.maker.pool,
+        data.maker.channel_filter,
+        recipe,
+        selection=selection,
+        abstaining=first.abstaining,
+        with_baselines=first.with_baselines,
+    )
 
 
 def run_fold(
@@ -462,7 +471,10 @@ def run_fold(
         alarming = None  # hours of streams are no quick look
     if trainer.is_global_zero and alarming is not None:
         detector.save(folder / "detector.pt")  # what was fitted stays, whatever comes
-        alarm = alarming(detector, _baselines(detector), config.num_workers)
+        if isinstance(alarming, CalibratedAlarm):
+            alarm = alarming(detector, _baselines(detector), config.num_workers)
+        else:
+            alarming(detector)
     told = time.perf_counter()
     if trainer.is_global_zero:
         detector.save(folder / "detector.pt")
@@ -510,7 +522,7 @@ def _save_statistics(
     """What ``adapt`` solves again from, beside the detector."""
     materials = {str(recording): recording.material for recording in fold.having("train")}
     labels = {str(key): value for key, value in config.labels.items() if key != "_target_"}
-    gathered_statistics(*learner.gathered, materials, labels, detector).save(path)
+    Statistics.of_training(*learner.gathered, materials, labels, detector).save(path)
 
 
 def _origin(config: DictConfig, data: SlipDataModule) -> dict[str, Any]:
@@ -552,8 +564,9 @@ def export_fold(detector: SlipDetector, folder: Path) -> dict[str, dict[str, flo
     for kind in kinds:
         try:
             paths = export_detector(detector, folder, [kind], source=folder / "detector.pt")
-            facts = sidecar_facts(paths[0])
-            found[kind] = {"error": worst_error(facts), "bytes": facts["onnx_bytes"]}
+            written = read_sidecar(paths[0])
+            error, size = written["check"]["worst_sd"], written["onnx_bytes"]
+            found[kind] = {"error": error, "bytes": size}
         except Exception as error:  # of onnxruntime they have no base in common
             log.exception("the %s graph was not written", kind)
             found[kind] = (str(error) or type(error).__name__).splitlines()[0]

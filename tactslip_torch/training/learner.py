@@ -9,23 +9,23 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import lightning as L
+import numpy as np
 import torch
+import torch.distributed
 from torch import Tensor, nn
-from torch.nn.utils.rnn import pad_sequence
 
 from tactslip_torch.data.labels import NO_POSITION
-from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import ROLES
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.features.survey import Survey
-from tactslip_torch.model.abstention import KEY, abstention_of
+from tactslip_torch.features.statistics import TrainingStatistics
+from tactslip_torch.model.abstention import KEY, Abstention
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.events import (
     EventRules,
@@ -35,7 +35,6 @@ from tactslip_torch.onset.events import (
     pooled_metrics,
     recording_events,
 )
-from tactslip_torch.onset.rules import KOfN, latch, latch_start
 from tactslip_torch.report.metrics import (
     answer_counts,
     answer_metrics,
@@ -43,25 +42,27 @@ from tactslip_torch.report.metrics import (
     confusion_matrix,
     split_metrics,
 )
+from tactslip_torch.runtime import SeenBatches
 from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.training.abstention import Abstaining
 from tactslip_torch.training.baselines import KEY as BASELINES
 from tactslip_torch.training.baselines import Baselines
-from tactslip_torch.training.datamodule import RecordingFeatures, SlipDataModule, Throughput
-from tactslip_torch.training.fitting import (
+from tactslip_torch.training.datamodule import RecordingFeatures, SlipDataModule
+from tactslip_torch.training.plan import (
+    Abstaining,
+    Plan,
     TrainingPass,
-    from_first_process,
-    of_all_processes,
+    plan_detector,
     solve_metadata,
 )
 from tactslip_torch.training.recipe import FeatureSelection, Recipe
-from tactslip_torch.training.selection import Plan, plan_detector
 
-RULES: Mapping[str, KOfN] = MappingProxyType(
-    {"first_transition": KOfN(1, 1), "two_of_three": KOfN(2, 3)}
+Value = TypeVar("Value")
+
+RULES: Mapping[str, tuple[int, int]] = MappingProxyType(
+    {"first_transition": (1, 1), "two_of_three": (2, 3)}
 )
-"""From decisions to alarms: the paper's, every first slip bin behind a non-slip one, and two of the
-last three. Either is armed again by a decision for which it does not hold."""
+"""From decisions to alarms, each k of the last n: the paper's, every first slip bin after a
+non-slip one, and two of three. Either is armed again by a decision for which it does not hold."""
 
 BINS_APART = "bins of one stroke are on both sides of this split"
 """Why a split by bin has no events."""
@@ -130,33 +131,15 @@ def bin_scores(parts: Sequence[EvaluatedBins]) -> tuple[dict[str, Any], dict[str
 def events_by_rule(
     parts: Sequence[EvaluatedBins], latency: LatencyParts
 ) -> dict[str, list[RecordingEvents]]:
-    """What each of ``RULES`` makes of the bins; no recordings where a split is by bin.
-
-    A rule starts anew with every stroke and every unbroken stretch of bins of no stroke. Watched is
-    from one hop before the first decision of such a stretch to the last one.
-    """
+    """What each of ``RULES`` makes of the bins; no recordings where a split is by bin."""
     if not all(part.is_whole for part in parts):
         return {name: [] for name in RULES}
-    stretches = [(part, rows) for part in parts for rows in _stretches(part.bins)]
-    says_slip = pad_sequence([part.says_slip[rows] for part, rows in stretches], batch_first=True)
-    llr = torch.where(says_slip, 1.0, -1.0)  # [streams, most bins]; what is padded changes nothing
-    events = {}
-    for name, rule in RULES.items():
-        statistic, _ = rule.scan(llr, rule.start(llr[:, 0]))
-        start = latch_start(llr[:, 0])
-        is_alarm, is_on, _ = latch(statistic, 0.0, rearm=1, refractory=0, state=start)
-        streams: dict[RecordingId, list[_Stream]] = {}
-        for (part, rows), alarms, status in zip(stretches, is_alarm, is_on, strict=True):
-            available_s = part.bins.ends_s[rows] + latency.look_ahead_s
-            stream = _Stream(available_s, alarms[: len(rows)], status[: len(rows)])
-            streams.setdefault(part.bins.recording, []).append(stream)
-        events[name] = [
-            recording_events(
-                _watched(part, streams[part.bins.recording], latency), EventRules(), latency
-            )
-            for part in parts
+    return {
+        name: [
+            recording_events(_watched(part, k, n, latency), EventRules(), latency) for part in parts
         ]
-    return events
+        for name, (k, n) in RULES.items()
+    }
 
 
 def event_numbers(
@@ -172,41 +155,33 @@ def event_numbers(
     }
 
 
-class _Stream(NamedTuple):
-    """Decisions in their order: when each is available, and what a rule made of them, ``[T]``."""
+def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Watched:
+    """A recording as the detector saw it through an alarm of k of the last n decisions.
 
-    available_s: Tensor
-    is_alarm: Tensor
-    is_on: Tensor
-
-
-def _stretches(bins: RecordingFeatures) -> list[Tensor]:
-    """The rows of each stroke, and of each unbroken stretch of bins of no stroke."""
-    rows = torch.arange(len(bins.stroke))
-    is_apart = bins.ends_s.diff() > bins.hop_s + 1e-6
-    is_new = (bins.stroke.diff() != 0) | ((bins.stroke[1:] < 0) & is_apart)
-    return list(rows.tensor_split(rows[1:][is_new]))
-
-
-def _watched(part: EvaluatedBins, streams: Sequence[_Stream], latency: LatencyParts) -> Watched:
-    """A recording as the detector saw it through a rule."""
+    It starts anew with every stroke and every unbroken stretch of bins of no stroke. Watched is
+    from one hop before the first decision of such a stretch to the last one.
+    """
     bins = part.bins
+    available_s = (bins.ends_s + latency.look_ahead_s).numpy()
+    says_slip, stroke = part.says_slip.numpy(), bins.stroke.numpy()
+    is_apart = np.diff(bins.ends_s.numpy()) > bins.hop_s + 1e-6
+    is_new = (np.diff(stroke) != 0) | ((stroke[1:] < 0) & is_apart)
+    stretches = np.split(np.arange(len(stroke)), np.flatnonzero(is_new) + 1)
     alarms: list[tuple[float, float]] = []
     seen: list[tuple[float, float]] = []
-    for stream in sorted(streams, key=lambda stream: float(stream.available_s[0])):
-        available_s = stream.available_s.tolist()
-        ended = (~stream.is_on).nonzero().flatten().tolist()
-        for raised in stream.is_alarm.nonzero().flatten().tolist():
-            end = next((available_s[place] for place in ended if place > raised), math.inf)
-            alarms.append((available_s[raised], end))
+    for rows in sorted(stretches, key=lambda rows: float(available_s[rows[0]])):
+        times = available_s[rows]
+        is_on = np.convolve(says_slip[rows], np.ones(n))[: len(rows)] > k - 0.5
+        raised = np.flatnonzero(is_on & ~np.append(False, is_on[:-1]))
+        off = np.append(np.flatnonzero(~is_on), len(rows))
+        ends = np.append(times, math.inf)[off[np.searchsorted(off, raised)]]
+        alarms += zip(times[raised].tolist(), ends.tolist(), strict=True)
         before = seen[-1][1] if seen else -math.inf  # a hop may be longer than a bin
-        seen.append((max(available_s[0] - bins.hop_s, before), available_s[-1]))
-    positive = bins.ends_s[part.says_slip] + latency.look_ahead_s
-    of = bins.stroke[part.says_slip]
+        seen.append((max(float(times[0]) - bins.hop_s, before), float(times[-1])))
     first = []
-    for number, stroke in enumerate(bins.strokes):
-        later = positive[(of == number) & (positive >= stroke.onset_s)]
-        first.append(float(later.min()) if len(later) else math.nan)
+    for number, own in enumerate(bins.strokes):
+        is_later = says_slip & (stroke == number) & (available_s >= own.onset_s)
+        first.append(float(available_s[is_later].min(initial=math.inf)))
     return Watched(
         recording=str(bins.recording),
         material=bins.recording.material,
@@ -217,7 +192,7 @@ def _watched(part: EvaluatedBins, streams: Sequence[_Stream], latency: LatencyPa
         onsets_s=tuple(stroke.onset_s for stroke in bins.strokes),
         sliding_s=tuple((stroke.onset_s, stroke.slide_end_s) for stroke in bins.strokes),
         speeds_mm_s=tuple(stroke.speed_mm_s for stroke in bins.strokes),
-        first_positive_s=tuple(first),
+        first_positive_s=tuple(time if time < math.inf else math.nan for time in first),
         watched_s=tuple(seen),
         alarm_ends_s=tuple(end for _, end in alarms),
     )
@@ -242,6 +217,7 @@ class SlipLearner(L.LightningModule):
             a detector that may abstain.
         events: what the test found in each recording, by role and rule; to be pooled with others.
         seconds: time of each stage of the fit.
+        worker_seconds: what workers spent on each stage of making features, summed over them.
     """
 
     def __init__(
@@ -272,10 +248,10 @@ class SlipLearner(L.LightningModule):
         self.metrics: dict[str, Any] = {}
         self.events: dict[str, dict[str, list[RecordingEvents]]] = {}
         self.seconds: dict[str, float] = {}
-        self._throughput = Throughput()
+        self.worker_seconds: dict[str, float] = {}
         self._pass_started = 0.0
         self._num_threads = torch.get_num_threads()
-        self._survey = Survey(len(pool.names), self.recipe.sample_bins)
+        self._statistics = TrainingStatistics(len(pool.names), self.recipe.sample_bins)
         self._plan: Plan | None = None
         self._second: TrainingPass | None = None
         self._is_resumed = False
@@ -296,15 +272,15 @@ class SlipLearner(L.LightningModule):
         torch.set_num_threads(1)
 
     def training_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
-        """Survey in the first epoch, gather what the plan needs in the second."""
+        """Gather statistics in the first epoch, what the plan needs in the second."""
         if not batch:  # NOTHING
             return
-        self._throughput.add(batch)
+        self._add_seconds(batch)
         mask = batch.roles["train"]
         features, is_slip = batch.features[mask], batch.is_slip[mask]
         if self._second is None or self._is_resumed:
             stratum = self.recipe.stratum(batch.recording)
-            self._survey.update(str(batch.recording), stratum, features, is_slip)
+            self._statistics.update(str(batch.recording), stratum, features, is_slip)
         if self._second is not None:
             self._second.update(str(batch.recording), features, is_slip, batch.recording.scene)
 
@@ -312,21 +288,22 @@ class SlipLearner(L.LightningModule):
         """Plan after the first epoch, solve after the second."""
         torch.set_num_threads(self._num_threads)
         passed = time.perf_counter()
-        name = "survey_pass" if self._second is None else "training_pass"
+        name = "statistics_pass" if self._second is None else "training_pass"
         self.seconds[name] = passed - self._pass_started
         if self._second is None or self._is_resumed:
-            parts = of_all_processes(self._survey)
-            self._survey = parts[0]
-            for part in parts[1:]:
-                self._survey.merge(part)
+            self._statistics, *others = _of_all_processes(self._statistics)
+            for other in others:
+                self._statistics.merge(other)
         if self._second is not None:
-            self._second.merge_processes()
+            _merge_processes(self._second)
             self._solve(self._second)
             return
-        self._plan = from_first_process(self._planned)
+        self._plan = _from_first_process(self._planned)
         self.seconds["validation"] = time.perf_counter() - passed
-        if self._is_single_pass:
-            self._second = self._sampled()
+        if getattr(self.trainer, "fast_dev_run", False):  # ends after one epoch
+            sample = self._statistics.sample.bins()
+            self._second = TrainingPass(replace(self._plan, fractions=(1.0, 1.0)))
+            self._second.update("sample", sample.features, sample.is_slip)
             self._solve(self._second)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -365,34 +342,32 @@ class SlipLearner(L.LightningModule):
     def test_step(self, batch: RecordingFeatures, batch_idx: int) -> None:
         """Score the bins of one recording."""
         assert self.detector is not None  # on_test_start
-        self._throughput.add(batch)
+        self._add_seconds(batch)
         chosen = batch.features[:, list(self.detector.selected)].double()
         device = next(self.detector.buffers()).device  # Lightning may have moved it
         scaled = self.detector.scaled(chosen.to(device))
         score = self.detector.head(scaled).cpu()
-        says_slip = score >= 0
         baselines = self.baselines(batch.features, scaled.cpu()) if self.baselines else {}
-        abstention = abstention_of(self.detector)
+        abstention = Abstention.of(self.detector)
         answer = abstention.answer(score) if abstention else None
-        for role, part in evaluated_bins(batch, says_slip, baselines, answer).items():
+        for role, part in evaluated_bins(batch, score >= 0, baselines, answer).items():
             self._evaluated[role].append(part)
 
     def on_test_epoch_end(self) -> None:
         """Turn decisions into metrics."""
         assert self.detector is not None  # on_test_start
         torch.set_num_threads(self._num_threads)
-        self.metrics = {"splits": {}}
-        self.events = {}
+        self.metrics, self.events = {"splits": {}}, {}
         baselines = self.baselines.metadata() if self.baselines else {}
         for about in baselines.values():
             about["splits"] = {}
-        rate_hz = self.detector.pool.sample_rate_hz
+        pool, abstention = self.detector.pool, Abstention.of(self.detector)
         latency = LatencyParts(
-            self.detector.look_ahead / rate_hz, self.detector.pool.bin_samples / rate_hz
+            self.detector.look_ahead / pool.sample_rate_hz, pool.bin_samples / pool.sample_rate_hz
         )
-        shares = of_all_processes(self._evaluated)
+        of_processes = _of_all_processes(self._evaluated)
         for role in ROLES:
-            parts = [part for share in shares for part in share[role]]
+            parts = [part for own in of_processes for part in own[role]]
             parts.sort(key=lambda part: part.bins.recording)
             if not parts:
                 continue
@@ -401,7 +376,7 @@ class SlipLearner(L.LightningModule):
                 baselines[name]["splits"][role] = found
             self.metrics["splits"][role] = scores
             self.events[role] = events_by_rule(parts, latency)
-            if abstention := abstention_of(self.detector):
+            if abstention:
                 counts = {
                     str(part.bins.recording): answer_counts(part.bins.is_slip, part.answer)
                     for part in parts
@@ -416,11 +391,6 @@ class SlipLearner(L.LightningModule):
         self.metrics["baselines"] = baselines
 
     @property
-    def worker_seconds(self) -> dict[str, float]:
-        """What workers spent on each stage of making features, summed over them."""
-        return self._throughput.seconds
-
-    @property
     def plan(self) -> Plan:
         """What the first pass decided."""
         assert self._plan is not None  # fitted
@@ -430,34 +400,31 @@ class SlipLearner(L.LightningModule):
     def gathered(self) -> tuple[TrainingPass, SampledBins]:
         """What the machine was solved from, and the first pass's sample of its bins."""
         assert self._second is not None  # fitted
-        return self._second, self._survey.sample.bins()
+        return self._second, self._statistics.sample.bins()
 
-    @property
-    def _is_single_pass(self) -> bool:
-        """``fast_dev_run`` ends after one epoch, so that one does the work of both passes."""
-        return bool(getattr(self.trainer, "fast_dev_run", False))
+    def _add_seconds(self, batch: RecordingFeatures) -> None:
+        for stage, seconds in batch.seconds.items():
+            self.worker_seconds[stage] = self.worker_seconds.get(stage, 0.0) + seconds
 
     def _fingerprint(self) -> str:
         data: SlipDataModule = self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning's
         return f"{data.fingerprint()} by {self.recipe}, {self.abstaining}"
 
     def _planned(self) -> Plan:
-        is_settled = self._selection is not None
-        parts = (self.recipe, self._survey, self.pool, self._selection)
-        plan = plan_detector(*parts, is_settled=is_settled, show=True)
-        return self.abstaining.settle(plan, self._survey.sample.bins())
-
-    def _sampled(self) -> TrainingPass:
-        """What a second pass would gather, of the bins the first one sampled."""
-        sample = self._survey.sample.bins()
-        gathered = TrainingPass(replace(self.plan, fractions=(1.0, 1.0)))
-        gathered.update("sample", sample.features, sample.is_slip)
-        return gathered
+        plan = plan_detector(
+            self.recipe,
+            self._statistics,
+            self.pool,
+            self._selection,
+            is_settled=self._selection is not None,
+            show=True,
+        )
+        return self.abstaining.settle(plan, self._statistics.sample.bins())
 
     def _solve(self, gathered: TrainingPass) -> None:
         started = time.perf_counter()
         plan = gathered.plan
-        head = from_first_process(gathered.solve)
+        head = _from_first_process(gathered.solve)
         self.log("penalty", plan.penalty, batch_size=1)
         self.metadata = plan.metadata | {
             "validation": plan.validation,
@@ -470,14 +437,64 @@ class SlipLearner(L.LightningModule):
         self.seconds["solve"] = solved - started
         info = self.metadata | {"calibration": plan.calibration, KEY: plan.abstain}
         if self.with_baselines:
-            sample = self._survey.sample.bins()
-            self.baselines = from_first_process(
+            sample = self._statistics.sample.bins()
+            self.baselines = _from_first_process(
                 lambda: Baselines.fit(self.pool, plan.selection(sample.features), sample)
             )
             self.seconds["baselines"] = time.perf_counter() - solved
             info[BASELINES] = self.baselines.to_dict()
         self.detector = plan.detector(self.pool, self.channel_filter, head, info)
 
-    def rates(self) -> dict[str, str]:
-        """How fast one worker goes through each stage, for the progress bar."""
-        return self._throughput.rates()
+
+# Processes of a distributed fit ------------------------------------------------------------------
+
+
+def _num_processes() -> int:
+    ready = torch.distributed.is_available() and torch.distributed.is_initialized()
+    return torch.distributed.get_world_size() if ready else 1
+
+
+def _of_all_processes(own: Value) -> list[Value]:
+    """What every process holds, in the order of their ranks."""
+    values: list[Any] = [own] * _num_processes()
+    if len(values) > 1:
+        torch.distributed.all_gather_object(values, own)
+    return values
+
+
+def _from_first_process(make: Callable[[], Value]) -> Value:
+    """What the first process makes, in every process; its error as well, so that none waits."""
+    if _num_processes() == 1:
+        return make()
+    box: list[Any] = [None, None]
+    if torch.distributed.get_rank() == 0:
+        try:
+            box[0] = make()
+        except Exception as error:
+            box[1] = error
+    torch.distributed.broadcast_object_list(box)
+    if box[1] is not None:
+        raise box[1]
+    made: Value = box[0]
+    return made
+
+
+def _merge_processes(gathered: TrainingPass) -> None:
+    """Put together what every process gathered; refuses a recording that two of them saw."""
+    if _num_processes() == 1:
+        return
+    if (stats := gathered.stats) is not None:
+        stats.seen_batches = _merged(_of_all_processes(stats.seen_batches))
+        for total in (stats.sums, stats.count):
+            torch.distributed.all_reduce(total)
+        return
+    gathered.seen_batches = _merged(_of_all_processes(gathered.seen_batches))
+    for bins in _of_all_processes(gathered.bins):
+        gathered.bins |= bins
+
+
+def _merged(batches: Iterable[SeenBatches]) -> SeenBatches:
+    whole = SeenBatches()
+    for own in batches:
+        whole.merge(own)
+    return whole

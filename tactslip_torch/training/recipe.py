@@ -19,11 +19,10 @@ from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCRIPTORS
 from tactslip_torch.features.groups import checked_attributes, matching
-from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.features.pool import FeaturePool, is_rounding
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.features.rounding import is_rounding
 from tactslip_torch.features.selection import ScoreVariance, rank_distinct, rank_features, t_scores
-from tactslip_torch.features.survey import Survey
+from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.kernels import Kernel, Polynomial, RadialBasis
 from tactslip_torch.model.scaling import FeatureScaler
 
@@ -310,13 +309,13 @@ class FeatureSelection:
 
 
 def select_features(
-    recipe: Recipe, survey: Survey, allowed: Tensor | None = None
+    recipe: Recipe, statistics: TrainingStatistics, allowed: Tensor | None = None
 ) -> FeatureSelection:
     """Rank and scale by the statistics of the training bins.
 
     Args:
         recipe: how.
-        survey: the statistics.
+        statistics: the statistics.
         allowed: what ``recipe.allowed`` gives; no more features are taken than it lets pass.
 
     Raises:
@@ -325,8 +324,8 @@ def select_features(
     """
     if recipe.feature_filter is not None and allowed is None:
         raise ValueError("recipe.feature_filter needs the names of features; hand over the pool")
-    sample, most = survey.sample.bins(), recipe.sizes[-1]
-    scores, features = t_scores(survey.moments, recipe.score_variance), sample.features
+    sample, most = statistics.sample.bins(), recipe.sizes[-1]
+    scores, features = t_scores(statistics.moments, recipe.score_variance), sample.features
     places = torch.arange(len(scores))
     if allowed is not None:
         places = allowed.nonzero().flatten()
@@ -335,17 +334,21 @@ def select_features(
         order = rank_distinct(scores, features, sample.is_slip, most, recipe.most_correlation)
     else:
         order = rank_features(scores, most)
-    return scaled_selection(recipe, survey, places[order].tolist())
+    return scaled_selection(recipe, statistics, places[order].tolist())
 
 
-def scaled_selection(recipe: Recipe, survey: Survey, selected: Sequence[int]) -> FeatureSelection:
+def scaled_selection(
+    recipe: Recipe, statistics: TrainingStatistics, selected: Sequence[int]
+) -> FeatureSelection:
     """Scale these features by the statistics of the training bins."""
     index = list(selected)
     if recipe.compress or recipe.tail > 0:
-        chosen = survey.sample.bins().features[:, index].double()
+        chosen = statistics.sample.bins().features[:, index].double()
         scaler = FeatureScaler.fit(chosen, compress=recipe.compress, tail=recipe.tail)
     else:  # the exact range of every training bin
-        scaler = FeatureScaler(survey.minimum[index].double(), survey.maximum[index].double())
+        scaler = FeatureScaler(
+            statistics.minimum[index].double(), statistics.maximum[index].double()
+        )
     return FeatureSelection(tuple(selected), scaler)
 
 
@@ -370,12 +373,18 @@ def class_counts(sample: SampledBins) -> list[int]:
         ValueError: if there is none of a class.
     """
     counts = [
-        round(float(sample.represents[mine].sum())) for mine in (~sample.is_slip, sample.is_slip)
+        round(float(sample.sample_weight[mine].sum())) for mine in (~sample.is_slip, sample.is_slip)
     ]
     for name, count in zip(("non-slip", "slip"), counts, strict=True):
         if not count:
             raise ValueError(f"training needs bins of both classes, got no {name} bin")
     return counts
+
+
+def number_of_bins(recipe: Recipe, sample: SampledBins) -> int:
+    """How many training bins there are, classes balanced."""
+    counts, fractions = class_counts(sample), class_fractions(recipe, sample)
+    return round(counts[0] * fractions[0] + counts[1] * fractions[1])
 
 
 def class_fractions(recipe: Recipe, sample: SampledBins) -> tuple[float, float]:
@@ -398,12 +407,12 @@ def sample_weight(recipe: Recipe, sample: SampledBins) -> Tensor:
     is_slip = sample.is_slip.long()
     if recipe.scene_weights:
         by_scene = scene_weights(recipe, sample)
-        of_stratum = sample.represents.new_tensor(
+        of_stratum = sample.sample_weight.new_tensor(
             [by_scene[_scene(name)] for name in sample.group_names]
         )
-        return sample.represents * of_stratum[sample.group, is_slip]
-    of_class = sample.represents.new_tensor(_balance(recipe, class_counts(sample)))
-    return sample.represents * of_class[is_slip]
+        return sample.sample_weight * of_stratum[sample.group, is_slip]
+    of_class = sample.sample_weight.new_tensor(_balance(recipe, class_counts(sample)))
+    return sample.sample_weight * of_class[is_slip]
 
 
 def scene_weights(recipe: Recipe, sample: SampledBins) -> dict[str, tuple[float, float]]:
@@ -420,7 +429,7 @@ def scene_weights(recipe: Recipe, sample: SampledBins) -> dict[str, tuple[float,
         )
     place = torch.tensor([scenes.index(_scene(name)) for name in sample.group_names])
     totals = torch.zeros(len(scenes), 2, dtype=torch.float64)
-    totals.index_put_((place[sample.group], sample.is_slip.long()), sample.represents, True)
+    totals.index_put_((place[sample.group], sample.is_slip.long()), sample.sample_weight, True)
     weights = torch.ones_like(totals)
     protocol = totals[scenes.index(PAPER_SCENE)] if PAPER_SCENE in scenes else 0 * totals[0]
     for row, scene in enumerate(scenes):

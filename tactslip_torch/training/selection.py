@@ -1,13 +1,11 @@
-"""From training statistics to a plan: features, scaling, K, degree, c and C, by held-out groups.
+"""Choices among features, K, degree, c and C, by groups of recordings that are left out.
 
-``plan_detector`` chooses in one of two ways.
-
-**Held** (``validation="held"``): features are ranked and scaled once; a held-out score is that of
-the machine refitted without the bin's group, in closed form (``HeldOut``). Ranking and scaling have
+**Held** (``choose_held``): features are ranked and scaled once; a held-out score is that of the
+machine refitted without the bin's group, in closed form (``HeldOut``). Ranking and scaling have
 seen the group, so these scores choose, and are not what may be reported.
 
-**Nested** (``"nested"``): a candidate is a set of features (of channels, pooled, or both; all or
-the best K), a degree and a penalty C. In each fold everything that is learned, compression
+**Nested** (``choose_model``): a candidate is a set of features (of channels, pooled, or both; all
+or the best K), a degree and a penalty C. In each fold everything that is learned, compression
 constants, ranking and scaling included, is learned without the group that is left out. Of the
 candidates within a tolerance of the best, the simplest machine with the strongest penalty is taken:
 penalties over several decades tie in validation and differ by far on a material that was not
@@ -24,7 +22,7 @@ import itertools
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -35,28 +33,20 @@ from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.features.survey import Survey
 from tactslip_torch.model.calibration import fit_platt
-from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins
-from tactslip_torch.model.kernels import Head, Kernel, Polynomial, kernel_from_dict
+from tactslip_torch.model.kernels import Kernel, Polynomial
 from tactslip_torch.model.leave_one_group_out import HeldOut
-from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.model.threshold import best_threshold
-from tactslip_torch.native import BackendName
 from tactslip_torch.runtime import Ticker, bar, for_each
-from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.recipe import (
     FeatureSelection,
     Recipe,
     balanced_accuracy,
-    class_counts,
-    class_fractions,
+    number_of_bins,
     sample_groups,
     sample_weight,
-    scene_weights,
-    select_features,
 )
 
 log = logging.getLogger(__name__)
@@ -72,238 +62,28 @@ MOST_DUAL_BINS = 2500
 fold, so its cost grows with the bins."""
 MOST_EXTENSIONS = 3
 """Decades by which a grid of penalties that ends at its edge is extended, at either end."""
-MOST_GAUSSIAN = 256
-"""So many features at most have the expected score where channels are missing: its matrices are of
-their number squared."""
-MOST_KEPT_BINS = 8192
-"""So many bins at most for a kernel that does not fold: its machine is a matrix of bins by bins."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What is decided before the second pass.
-
-    Args:
-        recipe: that it follows.
-        selection: which features, how scaled.
-        kernel: of the machine.
-        penalty: the paper's ``C``.
-        fractions: the part of non-slip and slip bins that is trained on.
-        bin_weight: how many bins each of those stands for, as in validation.
-        num_bins: how many bins are trained on; about, where fractions are below 1.
-        imputation: mean of the scaled features, both classes counting alike; for channels that are
-            missing.
-        gaussians: of the scaled features, for channels that are missing; of a kernel that folds.
-        validation: one row per choice: what was chosen from, the balanced accuracy of each
-            held-out group; of the one that was taken also ``chosen``, and the calibration of its
-            held-out scores.
-        nested: balanced accuracy of the whole choice on groups that it did not see, if it was
-            evaluated.
-        feature_filter: of a recipe that restricts the ranking: to what, how many features that
-            leaves (``matching``), and the numbers chosen from after cutting them to it.
-        abstain: thresholds for abstaining, as ``Abstention.to_dict`` has them, if set.
-        scene_weights: weight of a bin by scene, non-slip and slip, classes balanced; empty if
-            scenes are not weighed.
-    """
-
-    recipe: Recipe
-    selection: FeatureSelection
-    kernel: Kernel
-    penalty: float
-    fractions: tuple[float, float]
-    bin_weight: float
-    num_bins: int
-    imputation: Tensor
-    gaussians: ClassGaussians | None = None
-    validation: list[dict[str, Any]] = field(default_factory=list)
-    nested: dict[str, Any] | None = None
-    feature_filter: dict[str, Any] | None = None
-    abstain: dict[str, Any] | None = None
-    scene_weights: dict[str, tuple[float, float]] = field(default_factory=dict)
-
-    @property
-    def adds_up(self) -> bool:
-        """Whether training bins become sums of fixed size; few bins, or other kernels, do not."""
-        if not isinstance(self.kernel, Polynomial) or not self.kernel.collapses:
-            return False
-        return self.num_bins > self.kernel.num_monomials(self.selection.size)
-
-    @property
-    def calibration(self) -> dict[str, Any] | None:
-        """By held-out scores of the choice that was taken; None if there was nothing to choose."""
-        chosen = (row.get("calibration") for row in self.validation if row.get("chosen"))
-        return next(chosen, None)
-
-    @property
-    def metadata(self) -> dict[str, Any]:
-        """What was decided, for files, JSON-able."""
-        return {
-            "recipe": self.recipe.name,
-            "kernel": self.kernel.to_dict(),
-            "penalty": self.penalty if math.isfinite(self.penalty) else "inf",  # JSON has none
-            "balance": self.recipe.balance,
-            "num_bins": self.num_bins,
-        }
-
-    def training_bins(self, sample: SampledBins) -> TrainingBins:
-        """Sampled bins, scaled, each with the weight of all that it was drawn from."""
-        weights = sample_weight(self.recipe, sample)
-        return TrainingBins(self.selection(sample.features), sample.is_slip, weights)
-
-    def detector(
-        self,
-        pool: FeaturePool,
-        channel_filter: ChannelFilter,
-        head: Head,
-        info: Mapping[str, Any],
-        backend: BackendName = "auto",
-    ) -> SlipDetector:
-        """The detector of this plan with a machine that was solved for it."""
-        selection = self.selection
-        return SlipDetector(
-            pool,
-            channel_filter,
-            selection.selected,
-            selection.scaler,
-            head,
-            info,
-            self.imputation,
-            self.gaussians,
-            selection.pooling,
-            backend=backend,
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values and tensors, for a checkpoint; without the recipe."""
-        plain = {k: v for k, v in vars(self).items() if k not in ("recipe", "selection")}
-        pooling = self.selection.pooling
-        return plain | {
-            "selected": self.selection.selected,
-            "scaler": dict(self.selection.scaler.state_dict()),
-            "pooling": pooling and (pooling.to_dict(), dict(pooling.state_dict())),
-            "kernel": self.kernel.to_dict(),
-            "gaussians": self.gaussians and dict(self.gaussians.state_dict()),
-        }
-
-    @classmethod
-    def from_dict(cls, plain: Mapping[str, Any], recipe: Recipe, pool: FeaturePool) -> Plan:
-        """What ``to_dict`` described, of the same recipe and pool."""
-        values = dict(plain)
-        selected, scaler = values.pop("selected"), FeatureScaler(**values.pop("scaler"))
-        pooling = values.pop("pooling")
-        pooling = pooling and ChannelPooling.from_dict(pool.hand, *pooling)
-        values["kernel"] = kernel_from_dict(values["kernel"])
-        values["gaussians"] = values["gaussians"] and ClassGaussians(**values["gaussians"])
-        return cls(recipe, FeatureSelection(tuple(selected), scaler, pooling), **values)
-
-
-def plan_detector(
-    recipe: Recipe,
-    survey: Survey,
-    pool: FeaturePool | None = None,
-    selection: FeatureSelection | None = None,
-    *,
-    is_settled: bool = False,
-    is_nested: bool = True,
-    show: bool = False,
-) -> Plan:
-    """Choose the features and the machine by validation on held-out groups.
-
-    Of a recipe that leaves no choice nothing is validated, unless it ``is_settled``, by tuning:
-    then held-out scores are wanted for what follows from them, such as a calibration.
-
-    Args:
-        recipe: what to choose from, and how.
-        survey: statistics of the training bins.
-        pool: of the features; only without it may every feature be selected whatever its name.
-        selection: features that were ranked and scaled elsewhere.
-        is_settled: whether to validate a single choice too.
-        is_nested: whether to evaluate a nested choice itself.
-        show: a progress bar.
-
-    Raises:
-        ValueError: if a class is absent, a solve fails, or the recipe needs the pool.
-    """
-    sample = survey.sample.bins()
-    allowed = None if pool is None else recipe.allowed(pool)
-    fractions = class_fractions(recipe, sample)
-    num_bins: float = _num_bins(recipe, sample)
-    rows: list[dict[str, Any]] = []
-    nested = None
-    kernel: Kernel
-    if recipe.validation == "nested" and selection is None:
-        if pool is None:
-            raise ValueError("recipe.validation=nested needs the pool; hand it over as pool=")
-        structure = candidates(recipe, round(num_bins))[0]
-        penalty = recipe.penalties_ascending[len(recipe.penalties_ascending) // 2]
-        if len(sample_groups(sample)[1]) > 1:
-            choice = choose_model(recipe, pool, sample, is_nested=is_nested, show=show)
-            structure, penalty = choice.structure, choice.penalty
-            rows, nested = choice.rows, choice.nested
-            if choice.edge:
-                log.warning("%s", choice.edge)
-        else:
-            log.warning("%s, C=%g are taken unvalidated: one group", structure, penalty)
-        kernel, selection = structure.kernel, fitted_selection(recipe, pool, sample, structure)
-        has_gaussians = selection.size <= MOST_GAUSSIAN
-    else:
-        selection = selection or select_features(recipe, survey, allowed)
-        rows, size, kernel, penalty = _validated(recipe, selection, sample, is_settled, show)
-        selection, has_gaussians = selection.first(size), kernel.collapses
-    bin_weight = 1.0
-    if num_bins > MOST_KEPT_BINS and not kernel.collapses:
-        log.warning(
-            "%s takes %d of %d training bins: its machine does not fold to a fixed size",
-            kernel,
-            MOST_KEPT_BINS,
-            num_bins,
-        )
-        bin_weight, num_bins = num_bins / MOST_KEPT_BINS, MOST_KEPT_BINS
-        fractions = fractions[0] / bin_weight, fractions[1] / bin_weight
-    z, weights = selection(sample.features), sample_weight(recipe, sample)
-    means = [
-        weights[own] @ z[own] / weights[own].sum() for own in (sample.is_slip, ~sample.is_slip)
-    ]
-    feature_filter = None
-    if recipe.feature_filter is not None and allowed is not None:
-        matching = int(allowed.sum())
-        wanted = {name: list(values) for name, values in recipe.feature_filter.items()}
-        sizes = sorted({min(size, matching) for size in recipe.sizes})
-        feature_filter = {"wanted": wanted, "matching": matching, "num_features": sizes}
-    return Plan(
-        recipe=recipe,
-        selection=selection,
-        kernel=kernel,
-        penalty=penalty,
-        fractions=fractions,
-        bin_weight=bin_weight,
-        num_bins=round(num_bins),
-        imputation=(means[0] + means[1]) / 2,
-        gaussians=(
-            ClassGaussians.fit(z, sample.is_slip, weights)
-            if has_gaussians and selection.pooling is None
-            else None
-        ),
-        validation=rows,
-        nested=nested,
-        feature_filter=feature_filter,
-        scene_weights=scene_weights(recipe, sample) if recipe.scene_weights else {},
-    )
-
-
-def _num_bins(recipe: Recipe, sample: SampledBins) -> int:
-    """How many training bins there are, classes balanced."""
-    counts, fractions = class_counts(sample), class_fractions(recipe, sample)
-    return round(counts[0] * fractions[0] + counts[1] * fractions[1])
 
 
 # Held validation --------------------------------------------------------------------------
 
 
-def _validated(
-    recipe: Recipe, selection: FeatureSelection, sample: SampledBins, is_settled: bool, show: bool
+def choose_held(
+    recipe: Recipe,
+    selection: FeatureSelection,
+    sample: SampledBins,
+    *,
+    is_settled: bool = False,
+    show: bool = False,
 ) -> tuple[list[dict[str, Any]], int, Kernel, float]:
-    """Rows of the validation, and the K, kernel and C of the best of them."""
+    """Rows of the validation, and the K, kernel and C of the best of them.
+
+    Args:
+        recipe: what to choose from.
+        selection: features ranked and scaled, as many as the largest K.
+        sample: of the training bins.
+        is_settled: whether to validate a single choice too.
+        show: a progress bar.
+    """
     sizes = sorted({min(size, selection.size) for size in recipe.sizes})
     if sizes[-1] < recipe.sizes[-1]:
         log.warning(
@@ -311,19 +91,17 @@ def _validated(
         )
     penalties = recipe.penalties_ascending
     choices = list(itertools.product(sizes, recipe.kernels, penalties))
-    if (len(choices) > 1 or is_settled) and len(sample.group_names) > 1:
-        bins = TrainingBins(
-            selection(sample.features), sample.is_slip, sample_weight(recipe, sample)
-        )
-        rows = validate(bins, sample.group, sample.group_names, choices, show=show)
-        place = max(range(len(rows)), key=lambda i: rows[i]["mean"])
-        rows[place]["chosen"] = True
-        return rows, *choices[place]
-    # of the most features and the last kernel
-    chosen = choices[len(choices) - len(penalties) + len(penalties) // 2]
-    if len(choices) > 1:
-        log.warning("K=%d, %s, C=%g are taken unvalidated: one group", *chosen)
-    return [], *chosen
+    if len(sample.group_names) < 2 or not (len(choices) > 1 or is_settled):
+        # of the most features and the last kernel
+        chosen = choices[len(choices) - len(penalties) + len(penalties) // 2]
+        if len(choices) > 1:
+            log.warning("K=%d, %s, C=%g are taken unvalidated: one group", *chosen)
+        return [], *chosen
+    bins = TrainingBins(selection(sample.features), sample.is_slip, sample_weight(recipe, sample))
+    rows = validate(bins, sample.group, sample.group_names, choices, show=show)
+    place = max(range(len(rows)), key=lambda i: rows[i]["mean"])
+    rows[place]["chosen"] = True
+    return rows, *choices[place]
 
 
 def validate(
@@ -484,7 +262,7 @@ def choose_model(
     """
     bins = _Bins(recipe, pool, sample, allowed)
     groups = bins.whole_groups()
-    structures = candidates(recipe, _num_bins(recipe, sample))
+    structures = candidates(recipe, number_of_bins(recipe, sample))
     if not all(each.use == "pooled" and each.kernel.degree == 1 for each in structures):
         bins.thin_out()
     folds = [frozenset([group]) for group in groups]
@@ -610,18 +388,16 @@ class _Bins:
         Raises:
             ValueError: if there are not two.
         """
-        is_slip = [self.is_slip[self.of(group)] for group in range(len(self.names))]
-        whole = [i for i, own in enumerate(is_slip) if bool(own.any()) and not bool(own.all())]
+        whole = [
+            group
+            for group in range(len(self.names))
+            if len(self.is_slip[self.of(group)].unique()) == 2
+        ]
         if len(whole) < 2:
-            lacking = [
-                f"{self.names[i]} has no {'non-slip' if bool(own.all()) else 'slip'}"
-                for i, own in enumerate(is_slip)
-                if i not in whole
-            ]
             raise ValueError(
                 "validation leaves out groups and needs two with bins of both classes, got "
-                f"{len(whole)} ({', '.join(lacking) or 'there is one group'}); add recordings or "
-                "take another recipe.group_by"
+                f"{len(whole)} of {', '.join(self.names)}; add recordings or take another "
+                "recipe.group_by"
             )
         return whole
 

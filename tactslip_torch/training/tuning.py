@@ -1,12 +1,10 @@
 """C, the kernel's c and a scale for each feature, learned by gradient through the closed-form fit.
 
-A stage of training, between a first fit, which chooses by a grid, and a second. What is minimised
-is the log loss of held-out scores in closed form (``held_out_scores``), every group and class
-alike. What is learned by gradient can fit the training materials too closely, as any choice can. So
-each group is held out from a descent of its own, all of which go down in step with the one on all
-groups; they stop when the mean loss of held groups no longer falls, and the step at which it was
-least is taken. If that is none, the point of the grid stays from which they start: that of least
-loss, which need not be the most accurate one that a recipe takes.
+A stage of training between a first fit, which chooses by a grid, and a second. What is minimised is
+the log loss of held-out scores in closed form, every group and class alike, starting from the
+grid's point of least loss. To stop in time, each group is also held out from a descent of its own.
+All descents take their steps together, until the mean loss of the held-out groups no longer falls.
+The step at which it was least is taken; if that is step 0, the grid's point stays.
 """
 
 from __future__ import annotations
@@ -14,9 +12,9 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, NamedTuple, get_args
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -24,19 +22,18 @@ from torch.nn.functional import softplus
 
 from tactslip_torch.data.splits import Split
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
+from tactslip_torch.features.ops import signed_log
 from tactslip_torch.model.calibration import Platt, fit_platt
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.model.leave_one_group_out import HeldOut, held_out_scores
-from tactslip_torch.model.scaling import FeatureScaler, signed_log
-from tactslip_torch.runtime import bar
-from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.learner import SlipLearner
-from tactslip_torch.training.recipe import FeatureSelection, Recipe
-from tactslip_torch.training.selection import Plan
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.runtime import bar, check_number
+from tactslip_torch.training.plan import Plan
+from tactslip_torch.training.recipe import FeatureSelection, Recipe, sample_weight
 
-_Setting = Literal["penalty", "offset", "scales"]
-SETTINGS: tuple[_Setting, ...] = get_args(_Setting)
+SETTINGS = ("penalty", "offset", "scales")
+"""What can be learned."""
 
 
 class Tuned(NamedTuple):
@@ -46,13 +43,13 @@ class Tuned(NamedTuple):
         selection: features and ranges.
         penalty: C.
         offset: the kernel's c.
-        facts: JSON-able: curves, the grid, what was learned, seconds.
+        metadata: JSON-able: curves, the grid, what was learned, seconds.
     """
 
     selection: FeatureSelection
     penalty: float
     offset: float
-    facts: dict[str, Any]
+    metadata: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -60,10 +57,10 @@ class Tuning:
     """How settings are learned.
 
     Args:
-        learn: which: ``penalty``, ``offset``, ``scales``.
+        learn: some of ``SETTINGS``.
         bins: of each group and class, at most; a step costs the cube of their number in all.
         steps: at most.
-        patience: steps without gain on held groups after which descents stop.
+        patience: steps without gain on held-out groups after which descents stop.
         rate: step length of Adam, for logarithms of C, c and scales.
 
     Raises:
@@ -78,22 +75,20 @@ class Tuning:
 
     def __post_init__(self) -> None:
         is_list = isinstance(self.learn, Sequence) and not isinstance(self.learn, str)
-        if not is_list or not self.learn or any(name not in SETTINGS for name in self.learn):
+        if not is_list or not self.learn or not set(self.learn) <= set(SETTINGS):
             raise ValueError(
                 f"tuning.learn must be a list of some of {', '.join(SETTINGS)}, got {self.learn!r}"
             )
         for name in ("bins", "steps", "patience"):
-            if type(value := getattr(self, name)) is not int or value < 1:
-                raise ValueError(f"tuning.{name} must be a positive whole number, got {value!r}")
-        if type(self.rate) not in (int, float) or not 0 < self.rate < math.inf:
-            raise ValueError(f"tuning.rate must be a positive number, got {self.rate!r}")
+            check_number(f"tuning.{name}", getattr(self, name), whole=True)
+        check_number("tuning.rate", self.rate)
 
     def check(self, recipe: Recipe, split: Split) -> None:
-        """Refuse before any work what could not be tuned behind it.
+        """Refuse before any work what could not be tuned after it.
 
         Raises:
             ValueError: if the recipe is nested or not of degree 2, there are fewer than three
-                groups to hold some out, or something to be learned has no place to start from.
+                groups, or something to be learned has no finite, positive value to start from.
         """
         if recipe.validation == "nested":
             raise ValueError(
@@ -114,92 +109,91 @@ class Tuning:
                 "recipe.group_by=cycle, or more materials"
             )
 
-    def __call__(
-        self,
-        plan: Plan,
-        recipe: Recipe,
-        sample: SampledBins,
-        weights: Tensor,
-        names: Sequence[str],
-    ) -> Tuned:
+    def __call__(self, plan: Plan, sample: SampledBins, names: Sequence[str]) -> Tuned:
         """Tune a plan on training bins alone.
 
         Args:
             plan: of the first fit.
-            recipe: that made it.
             sample: bins of the first pass over the training recordings, and of no other.
-            weights: with which they stand for all that are trained on, ``[n]``.
             names: of the pool's features.
 
         Raises:
             ValueError: if scores of groups left out tell slip backwards.
         """
         started = time.perf_counter()
-        bins = tuning_bins(sample, plan.selection.selected, weights, self.bins)
+        scaler, selected = plan.selection.scaler, plan.selection.selected
+        bins = tuning_bins(sample, selected, sample_weight(plan.recipe, sample), self.bins)
         groups = range(len(bins.names))
-        grids = {
-            held: grid_points(
-                plan.selection.scaler,
-                bins.without(held),
-                recipe.penalties_ascending,
-                _offsets(recipe),
+        grids = [grid_points(scaler, bins.without(group), plan.recipe) for group in groups]
+        grid = grid_points(scaler, bins, plan.recipe)
+        final = _Descent(LearnedSettings(self.learn, least_loss(grid), scaler), bins)
+        held_out = [
+            _Descent(
+                LearnedSettings(self.learn, least_loss(points), scaler),
+                bins.without(group),
+                bins.of(group),
             )
-            for held in (None, *groups)
-        }
-        scaler = plan.selection.scaler
-        *rotations, final = descents = [
-            _Descent(self.learn, least_loss(grids[held]), scaler, bins, held)
-            for held in (*groups, None)
+            for group, points in zip(groups, grids, strict=True)
         ]
-        states = self._descend(descents)
-        losses = _mean_losses(rotations)
-        steps = losses.index(min(losses))
+        states = self._descend(final, held_out)
+        steps = _best_step(held_out)
         settings = final.settings.requires_grad_(False)
         settings.load_state_dict(states[steps])
         penalty, offset = float(settings.penalty), float(settings.offset)
-        selected = [names[index] for index in plan.selection.selected]
-        facts: dict[str, Any] = {
+        scales = zip((names[i] for i in selected), settings.scales.tolist(), strict=True)
+        reports = []
+        for group, points in zip(groups, grids, strict=True):
+            others = [descent for descent in held_out if descent is not held_out[group]]
+            by_accuracy = LearnedSettings((), most_accurate(points), scaler)
+            of_recipe = _Descent(by_accuracy, bins.without(group), bins.of(group))
+            with torch.no_grad():
+                of_recipe.loss()
+            history, own_steps = held_out[group].history, _best_step(others)
+            reports.append(
+                {
+                    "held": bins.names[group],
+                    "history": history,
+                    "recipe": _held_numbers(of_recipe.history[0]),
+                    "grid": _held_numbers(history[0]),
+                    # to stop where its own loss is least would choose by what it is evaluated by
+                    "tuned": _held_numbers(history[own_steps]) | {"steps": own_steps},
+                }
+            )
+        metadata: dict[str, Any] = {
             "learned": list(self.learn),
             "bins": len(bins.is_slip),
             "steps": steps,
             "penalty": penalty,
             "offset": offset,
-            "scales": dict(zip(selected, settings.scales.tolist(), strict=True)),
-            "grid": [asdict(point) | {"loss": _number(point.loss)} for point in grids[None]],
-            "start": asdict(least_loss(grids[None])),
-            "history": final.history,
-            "held": [
-                _held_facts(
-                    rotations,
-                    held,
-                    _Descent((), most_accurate(grids[held]), scaler, bins, held),
-                )
-                for held in groups
+            "scales": dict(scales),
+            "grid": [
+                point._asdict() | {"loss": point.loss if math.isfinite(point.loss) else None}
+                for point in grid
             ],
+            "start": least_loss(grid)._asdict(),
+            "history": final.history,
+            "held": reports,
             "seconds": time.perf_counter() - started,
         }
-        return Tuned(
-            FeatureSelection(plan.selection.selected, settings.scaler()), penalty, offset, facts
-        )
+        return Tuned(FeatureSelection(selected, settings.scaler()), penalty, offset, metadata)
 
-    def _descend(self, descents: Sequence[_Descent]) -> list[dict[str, Tensor]]:
-        """All descents, until held groups no longer gain; states of the last one, step by step."""
-        *rotations, final = descents
-        learned = [p for descent in descents for p in descent.parameters() if p.requires_grad]
+    def _descend(self, final: _Descent, held_out: Sequence[_Descent]) -> list[dict[str, Tensor]]:
+        """Step until held-out groups no longer gain; states of ``final`` after each step."""
+        descents = [*held_out, final]
+        learned = [p for own in descents for p in own.settings.parameters() if p.requires_grad]
         optimizer = torch.optim.Adam(learned, lr=self.rate)
         states = [copy.deepcopy(final.settings.state_dict())]
         try:
             for _ in bar(range(self.steps), "tune", "step"):
                 optimizer.zero_grad()
-                torch.stack([descent() for descent in descents]).sum().backward()
+                torch.stack([descent.loss() for descent in descents]).sum().backward()
                 optimizer.step()
                 states.append(copy.deepcopy(final.settings.state_dict()))
-                losses = _mean_losses(rotations)
-                if len(losses) - 1 - losses.index(min(losses)) >= self.patience:
+                if len(final.history) - 1 - _best_step(held_out) >= self.patience:
                     break
             with torch.no_grad():
                 for descent in descents:
-                    descent()
+                    descent.loss()
         except ValueError as error:
             raise ValueError(
                 f"tuning: {error}, after {len(states) - 1} steps; take smaller tuning.rate, more "
@@ -208,32 +202,17 @@ class Tuning:
         return states
 
 
-def settled_learner(
-    first: SlipLearner,
-    maker: FeatureMaker,
-    selection: FeatureSelection,
-    penalty: float,
-    offset: float,
-) -> SlipLearner:
-    """A learner with nothing left to choose.
+def _best_step(held_out: Sequence[_Descent]) -> int:
+    """The number of steps after which the mean loss of held-out groups was least."""
+    losses = [
+        sum(row["held_loss"] for row in rows)
+        for rows in zip(*(descent.history for descent in held_out), strict=True)
+    ]
+    return losses.index(min(losses))
 
-    Args:
-        first: whose recipe it takes else.
-        maker: of its features.
-        selection: which, and how scaled.
-        penalty: C.
-        offset: the kernel's c.
-    """
-    num = len(selection.selected)
-    recipe = replace(first.recipe, num_features=num, penalties=penalty, offsets=offset)
-    return SlipLearner(
-        maker.pool,
-        maker.channel_filter,
-        recipe,
-        selection=selection,
-        abstaining=first.abstaining,
-        with_baselines=first.with_baselines,
-    )
+
+def _held_numbers(row: dict[str, float]) -> dict[str, float]:
+    return {"loss": row["held_loss"], "balanced_accuracy": row["held_accuracy"]}
 
 
 # The bins ----------------------------------------------------------------------------------------
@@ -246,7 +225,7 @@ class TuningBins:
     Args:
         features: selected, unscaled, float64.
         is_slip: their truth.
-        weights: with which they stand for all bins that are trained on, so that C means the same.
+        weights: each bin's weight for all bins that are trained on, so that C means the same.
         group: index into ``names``.
         names: of the groups.
 
@@ -261,20 +240,20 @@ class TuningBins:
     names: tuple[str, ...]
 
     def of(self, group: int) -> TuningBins:
-        """The bins of one group; they stand for as much as before."""
+        """The bins of one group, with their weights."""
         return self._where(self.group == group)
 
-    def without(self, group: int | None) -> TuningBins:
-        """Those of the other groups, or all."""
-        return self if group is None else self._where(self.group != group)
+    def without(self, group: int) -> TuningBins:
+        """Those of the other groups."""
+        return self._where(self.group != group)
 
-    def _where(self, own: Tensor) -> TuningBins:
+    def _where(self, rows: Tensor) -> TuningBins:
         return replace(
             self,
-            features=self.features[own],
-            is_slip=self.is_slip[own],
-            weights=self.weights[own],
-            group=self.group[own],
+            features=self.features[rows],
+            is_slip=self.is_slip[rows],
+            weights=self.weights[rows],
+            group=self.group[rows],
         )
 
 
@@ -286,7 +265,7 @@ def tuning_bins(
     Args:
         sample: of the first pass over the training recordings, and of no other.
         selected: pool indices of the features.
-        weights: with which sampled bins stand for all that are trained on, ``[n]``.
+        weights: of sampled bins, ``[n]``; the total of each class is kept.
         most: bins of each group and class.
     """
     keys = torch.zeros(len(sample.is_slip), dtype=torch.float64)
@@ -294,14 +273,12 @@ def tuning_bins(
         own = sample.recording == place
         index = sample.bin_index[own]
         keys[own] = bin_keys(name, int(index.max()) + 1)[index]
-    kept = []
-    for group in range(len(sample.group_names)):
-        for kind in (False, True):
-            rows = ((sample.group == group) & (sample.is_slip == kind)).nonzero().flatten()
-            kept.append(rows[keys[rows].argsort(stable=True)[:most]])
+    order = keys.argsort(stable=True)
+    strata = (2 * sample.group + sample.is_slip)[order]
+    kept = [order[strata == stratum][:most] for stratum in strata.unique()]
     rows = torch.cat(kept).sort().values
     is_slip, own_weights = sample.is_slip[rows], weights[rows]
-    for kind in (False, True):  # those that are kept stand for the others
+    for kind in (False, True):
         own = is_slip == kind
         own_weights[own] *= weights[sample.is_slip == kind].sum() / own_weights[own].sum()
     features = sample.features[rows][:, list(selected)].double()
@@ -331,15 +308,15 @@ def grouped_loss(
 ) -> GroupedLoss:
     """The loss of scores that each come from a machine without the bin's group.
 
-    Scores become probabilities by one slope, ``llr = slope * score``: a detector decides at a score
-    of 0, so a machine that leans to one side has to pay for it here. The slope is the one of least
-    loss (but for Platt's targets), so that it counts as a constant on the way back.
+    Scores become probabilities by one slope, ``llr = slope * score``. A detector decides at a score
+    of 0, so there is no offset: a machine that leans to one side has a larger loss. The slope is
+    the one of least loss, so that it counts as a constant in the gradient.
 
     Args:
         scores: of bins.
         is_slip: their truth.
         groups: whole numbers.
-        calibration: by default the slope fitted to these scores; of bins that were held out from
+        calibration: by default the slope fitted to these scores; for bins that were held out from
             tuning altogether, that of the others.
 
     Shape:
@@ -354,10 +331,10 @@ def grouped_loss(
         >>> grouped_loss(scores, is_slip, groups, Platt(1.0, 0.0)).balanced_accuracy
         0.75
     """
-    cell = 2 * torch.unique(groups, return_inverse=True)[1] + is_slip  # a group and class
-    _, place, counts = torch.unique(cell, return_inverse=True, return_counts=True)
+    stratum = 2 * torch.unique(groups, return_inverse=True)[1] + is_slip
+    _, place, counts = torch.unique(stratum, return_inverse=True, return_counts=True)
     weights = (1 / (len(counts) * counts[place].double())).to(scores)
-    if calibration is None:  # every bin beside its mirror image: there is nothing to offset
+    if calibration is None:  # with every bin's mirror image the offset is 0
         mirrored = torch.cat([scores, -scores]).detach()
         both, twice = torch.cat([is_slip, ~is_slip]), torch.cat([weights, weights])
         calibration = Platt(fit_platt(mirrored, both, twice * len(weights)).slope, 0.0)
@@ -367,14 +344,13 @@ def grouped_loss(
     return GroupedLoss((weights * losses).sum(), float(weights[is_right].sum()), calibration)
 
 
-@dataclass(frozen=True)
-class GridPoint:
-    """A choice, and how good it is on groups left out one at a time.
+class GridPoint(NamedTuple):
+    """A choice of C and c, and how good it is on groups left out one at a time.
 
     Attributes:
         penalty: C.
         offset: the kernel's c.
-        loss: ``grouped_loss`` of held-out scores.
+        loss: ``grouped_loss`` of held-out scores; infinite where they tell slip backwards.
         balanced_accuracy: of the same.
     """
 
@@ -384,25 +360,24 @@ class GridPoint:
     balanced_accuracy: float
 
 
-def grid_points(
-    scaler: FeatureScaler, bins: TuningBins, penalties: Sequence[float], offsets: Sequence[float]
-) -> list[GridPoint]:
-    """Every choice of C and c; an infinite loss where held-out scores tell slip backwards.
+def grid_points(scaler: FeatureScaler, bins: TuningBins, recipe: Recipe) -> list[GridPoint]:
+    """Every choice of C and c of a recipe.
 
     Raises:
-        ValueError: if they do at every choice.
+        ValueError: if held-out scores tell slip backwards at every choice.
     """
     points = []
     training = TrainingBins(scaler(bins.features), bins.is_slip, bins.weights)
-    for offset in offsets:
-        machine = HeldOut(training, bins.group, Polynomial(2, offset))
-        for penalty in penalties:
+    for kernel in recipe.kernels:
+        assert isinstance(kernel, Polynomial)  # Tuning.check
+        machine = HeldOut(training, bins.group, kernel)
+        for penalty in recipe.penalties_ascending:
             try:
                 found = grouped_loss(machine.at(penalty).scores, bins.is_slip, bins.group)
+                numbers = float(found.loss), found.balanced_accuracy
             except ValueError:
-                points.append(GridPoint(penalty, offset, math.inf, 0.0))
-                continue
-            points.append(GridPoint(penalty, offset, float(found.loss), found.balanced_accuracy))
+                numbers = math.inf, 0.0
+            points.append(GridPoint(penalty, kernel.offset, *numbers))
     if math.isinf(least_loss(points).loss):
         raise ValueError(
             "tuning has no place to start: at every C and c of the recipe held-out scores "
@@ -411,18 +386,14 @@ def grid_points(
     return points
 
 
-def least_loss(points: Sequence[GridPoint]) -> GridPoint:
+def least_loss(points: Iterable[GridPoint]) -> GridPoint:
     """The choice of least loss, the first of equals."""
     return min(points, key=lambda point: point.loss)
 
 
-def most_accurate(points: Sequence[GridPoint]) -> GridPoint:
+def most_accurate(points: Iterable[GridPoint]) -> GridPoint:
     """The choice of the best balanced accuracy, the first of equals: what a recipe takes."""
     return max(points, key=lambda point: point.balanced_accuracy)
-
-
-def _offsets(recipe: Recipe) -> list[float]:
-    return [kernel.offset for kernel in recipe.kernels if isinstance(kernel, Polynomial)]
 
 
 # Descents ----------------------------------------------------------------------------------------
@@ -431,94 +402,77 @@ def _offsets(recipe: Recipe) -> list[float]:
 class LearnedSettings(nn.Module):
     """C, the kernel's c and a scale for each feature, as logarithms that start at a grid's point.
 
-    A scale below 1 narrows a feature in the kernel, and one of 0 would leave it out: soft
-    selection. It divides the width of the range that becomes [-1, 1], so that a scaler holds it:
-    below 1 less of a feature's tails is clipped, above 1 more.
+    A scale below 1 narrows a feature in the kernel; 0 would leave it out. It divides the width of
+    the range that becomes [-1, 1], so a scaler can hold it: below 1 less of a feature's tails is
+    clipped, above 1 more.
 
     Args:
         learn: which of ``SETTINGS``; the others stay.
-        penalty: C to start from.
-        offset: c to start from, positive if it is learned.
+        start: C and c to start from; c positive if it is learned.
         scaler: ranges of the features.
     """
 
-    def __init__(
-        self, learn: Sequence[str], penalty: float, offset: float, scaler: FeatureScaler
-    ) -> None:
+    def __init__(self, learn: Sequence[str], start: GridPoint, scaler: FeatureScaler) -> None:
         super().__init__()
-        self._start, self._offset = scaler, offset
-        zeros = torch.zeros_like(scaler.minimum, dtype=torch.float64)
-        starts = {
-            "penalty": torch.tensor(penalty, dtype=torch.float64).log(),
-            "offset": torch.tensor(offset or 1.0, dtype=torch.float64).log(),
-            "scales": zeros,
+        self._scaler, self._has_offset = scaler, start.offset > 0
+        logs = {
+            "penalty": torch.tensor(start.penalty, dtype=torch.float64).log(),
+            "offset": torch.tensor(start.offset or 1.0, dtype=torch.float64).log(),
+            "scales": torch.zeros_like(scaler.minimum, dtype=torch.float64),
         }
         self.logs = nn.ParameterDict(
-            {name: nn.Parameter(log, requires_grad=name in learn) for name, log in starts.items()}
+            {name: nn.Parameter(log, requires_grad=name in learn) for name, log in logs.items()}
         )
 
     @property
     def penalty(self) -> Tensor:
         """C, ``[]``."""
-        penalty: Tensor = self.logs["penalty"].exp()
-        return penalty
+        return torch.exp(self.logs["penalty"])
 
     @property
     def offset(self) -> Tensor:
         """The kernel's c, ``[]``."""
-        log: Tensor = self.logs["offset"]
-        return log.exp() if self._offset > 0 else log
+        return torch.exp(self.logs["offset"]) * self._has_offset
 
     @property
     def scales(self) -> Tensor:
         """Of the features, 1 at first: ``[K]``."""
-        scales: Tensor = self.logs["scales"].exp()
-        return scales
+        return torch.exp(self.logs["scales"])
 
     def scaled(self, features: Tensor) -> Tensor:
         """Features in the kernel, ``[N, K]`` in [-1, 1]; what ``scaler()`` makes of them."""
-        start = self._start
+        start = self._scaler
         if start.knee is not None:
             features = signed_log(features, start.knee)
         width = start.maximum - start.minimum
-        is_point = width == 0
-        relative = (features - start.minimum) / torch.where(is_point, 1.0, width)
-        return torch.where(is_point, 0.0, self.scales * (2 * relative - 1)).clamp(-1, 1)
+        is_constant = width == 0
+        relative = (features - start.minimum) / torch.where(is_constant, 1.0, width)
+        return torch.where(is_constant, 0.0, self.scales * (2 * relative - 1)).clamp(-1, 1)
 
     def scaler(self) -> FeatureScaler:
-        """The ranges that stand for the scales as they are now."""
-        start, scales = self._start, self.scales.detach()
+        """The ranges that hold the scales as they are now."""
+        start, scales = self._scaler, self.scales.detach()
         middle = (start.minimum + start.maximum) / 2
         half = (start.maximum - start.minimum) / 2 / scales
         return FeatureScaler(middle - half, middle + half, start.knee)
 
 
-class _Descent(nn.Module):
-    """Settings that are learned on some groups, while a held one is looked at and sets nothing.
+@dataclass
+class _Descent:
+    """Settings that are learned on some groups; a held-out one is only evaluated.
 
     Attributes:
-        name: of the held group.
         history: a row for each state, the first before any step: ``loss`` and
-            ``balanced_accuracy``, of a held group ``held_loss`` and ``held_accuracy``.
+            ``balanced_accuracy``, of a held-out group ``held_loss`` and ``held_accuracy``.
     """
 
-    def __init__(
-        self,
-        learn: Sequence[str],
-        start: GridPoint,
-        scaler: FeatureScaler,
-        bins: TuningBins,
-        held: int | None = None,
-    ) -> None:
-        super().__init__()
-        self.settings = LearnedSettings(learn, start.penalty, start.offset, scaler)
-        self.bins = bins.without(held)
-        self.held = None if held is None else bins.of(held)
-        self.name = "" if held is None else bins.names[held]
-        self.history: list[dict[str, float]] = []
+    settings: LearnedSettings
+    bins: TuningBins
+    held: TuningBins | None = None
+    history: list[dict[str, float]] = field(default_factory=list)
 
-    def forward(self) -> Tensor:
-        """The loss as settings are now, ``[]``; written down."""
+    def loss(self) -> Tensor:
+        """The loss as settings are now, ``[]``; adds a row to the history."""
         settings, bins = self.settings, self.bins
         z = settings.scaled(bins.features)
         scores = held_out_scores(
@@ -527,53 +481,12 @@ class _Descent(nn.Module):
         found = grouped_loss(scores, bins.is_slip, bins.group)
         row = {"loss": float(found.loss.detach()), "balanced_accuracy": found.balanced_accuracy}
         if self.held is not None:
-            held = _held_loss(settings, bins, self.held, found.calibration)
+            with torch.no_grad():
+                training = TrainingBins(z.detach(), bins.is_slip, bins.weights)
+                kernel = Polynomial(2, float(settings.offset))
+                machine = fit_machine(training, float(settings.penalty), kernel)
+                scores = machine(settings.scaled(self.held.features))
+                held = grouped_loss(scores, self.held.is_slip, self.held.group, found.calibration)
             row |= {"held_loss": float(held.loss), "held_accuracy": held.balanced_accuracy}
         self.history.append(row)
         return found.loss
-
-
-@torch.no_grad()
-def _held_loss(
-    settings: LearnedSettings, bins: TuningBins, held: TuningBins, calibration: Platt
-) -> GroupedLoss:
-    """What a held group gets by the machine of the others and their calibration."""
-    training = TrainingBins(settings.scaled(bins.features), bins.is_slip, bins.weights)
-    kernel = Polynomial(2, float(settings.offset))
-    scores = fit_machine(training, float(settings.penalty), kernel)(settings.scaled(held.features))
-    return grouped_loss(scores, held.is_slip, held.group, calibration)
-
-
-def _mean_losses(rotations: Sequence[_Descent]) -> list[float]:
-    """Mean loss over held groups after each number of steps."""
-    rows = [[row["held_loss"] for row in descent.history] for descent in rotations]
-    return [sum(step) / len(step) for step in zip(*rows, strict=True)]
-
-
-def _held_facts(rotations: Sequence[_Descent], held: int, by_accuracy: _Descent) -> dict[str, Any]:
-    """Of a held group: what the grid gets on it, and descending as far as the others tell to.
-
-    To stop where its own loss is least would be a choice by what it is evaluated by. The descents
-    of the others have seen it, though, and K was chosen with it: what is held out is C, c and
-    scales.
-    """
-    own = rotations[held]
-    losses = _mean_losses([other for other in rotations if other is not own])
-    steps = losses.index(min(losses))
-    with torch.no_grad():
-        by_accuracy()
-
-    def at(row: dict[str, float]) -> dict[str, float]:
-        return {"loss": row["held_loss"], "balanced_accuracy": row["held_accuracy"]}
-
-    return {
-        "held": own.name,
-        "history": own.history,
-        "recipe": at(by_accuracy.history[0]),
-        "grid": at(own.history[0]),
-        "tuned": {"steps": steps, **at(own.history[steps])},
-    }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None  # JSON has no infinity

@@ -23,16 +23,14 @@ from tactslip_torch.model.fit import fit_quadratic
 from tactslip_torch.model.leave_one_group_out import held_out_scores
 
 PACKAGE = "tactslip_torch"
-REPLACED_NEXT = ("features/", "graph/", "model/few_bins")
+REPLACED_NEXT = ("features/", "deploy/")
 """Of the package, what the issue behind this one replaces; not counted in ``modules.py``."""
-ENGINES = ("native",)
-"""Of ``FeatureExtractor``, beside the reference, which is the pool itself."""
+ENGINES = ("torch", "auto")
+"""Of ``FeaturePool``: the definitions, and the fastest there is."""
 
 
 def FeatureExtractor(pool, selected=None, *, engine="auto"):
-    from tactslip_torch import FeatureExtractor
-
-    return FeatureExtractor(pool, selected, backend=engine)
+    return pool.select(range(len(pool.names)) if selected is None else selected, backend=engine)
 
 
 def predict_raw(detector, samples, **options):
@@ -148,8 +146,8 @@ KEYS = {
     "split": "split",
     "statistics": "statistics",
     "tolerance": "tolerance",
-    "train_share": "split.train_share",
-    "train_share_of_crossval": "train_share",
+    "train_share": "split.train_fraction",
+    "train_share_of_crossval": "train_fraction",
     "workers": "num_workers",
 }
 """By the tests' word the key on the command line."""

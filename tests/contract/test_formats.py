@@ -2,9 +2,9 @@
 
 import importlib.util
 import json
+import os
 import pickle
 import shutil
-import zipfile
 from itertools import pairwise
 
 import h5py
@@ -51,7 +51,8 @@ from .names import (
     rate_in_set,
 )
 
-ENDINGS = ("npz", "csv", "tsv", "txt", "dat", "h5", "hdf5", "he5", "mat", "mcap", "parquet", "bag2")
+ENDINGS = ("npz", "csv", "txt", "h5", "mat", "mcap", "parquet", "bag2")
+ALIKE = ("npy", "tsv", "dat", "lvm", "hdf5", "he5")
 KEY = {"scene": {"seed": 3}, "list": [1, None]}
 TRUTH = (
     "sample_rate_hz",
@@ -125,11 +126,7 @@ def read(path, how=None):
         assert bits(torch.cat(list(pieces(samples, 7)), 1)) == bits(whole)
         assert bits(samples.read(size // 3, size // 2)) == bits(whole[:, size // 3 : size // 2])
         assert samples.read(size, size + 5).shape == (samples.num_channels, 0)
-        since = opened.times and opened.times.read(0, size)
-        if opened.times:
-            part = opened.times.read(size // 3, size // 2)
-            assert torch.equal(part, since[size // 3 : size // 2])
-        return whole, opened.names, since, opened.sample_rate_hz
+        return whole, opened.names, opened.times(), opened.sample_rate_hz
 
 
 def refused(path, how=None, error=ValueError):
@@ -165,7 +162,7 @@ def test_what_goes_in_comes_out(tmp_path, ending, dtype):
         assert found.recording.samples.shape == samples.shape
         assert bits(found.recording.samples) == bits(samples.contiguous())
         assert_truth(found, wanted, hand)
-        assert form.key(path) == KEY
+        assert form.is_ours(path)
         with open_file(path) as opened:
             assert_truth(opened.archived, wanted, hand)
             assert opened.archived.recording.samples.shape == (len(hand), 0)
@@ -207,7 +204,7 @@ def test_a_folder_is_replaced_only_if_it_is_a_bag(tmp_path):
     form, bag = named_format("bag2"), tmp_path / "bag #1?%41 ü.bag2"
     form.save(bag, recording(), hand_of("ab"), {"n": 1})
     form.save(bag, recording(), hand_of("ab"), {"n": 2})
-    assert form.key(bag) == {"n": 2}
+    assert form.load(bag).key == {"n": 2}
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("years of work")
     (tmp_path / "file").write_text("a file")
@@ -286,6 +283,7 @@ def test_a_damaged_sample_of_ours_is_noticed(tmp_path, ending):
         form.load(path)
     with pytest.raises(ValueError, match=f"a.{ending}"), open_file(path) as opened:
         opened.samples.read(0, 1234)
+    assert form.is_ours(path)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -294,7 +292,7 @@ def test_a_cut_file_of_ours_gives_all_or_nothing(tmp_path, ending):
     form.save(path, recording(), hand_of("ab"), KEY)
     inner = path / "recording.db3" if path.is_dir() else path
     whole, all_of_it = inner.read_bytes(), bits(recording().samples)
-    for share in range(0, 100, 9):
+    for share in range(0, 100, 19):
         inner.write_bytes(whole[: len(whole) * share // 100])
         said, found = "", all_of_it
         try:
@@ -309,8 +307,8 @@ def test_a_cut_file_of_ours_gives_all_or_nothing(tmp_path, ending):
 
 
 def test_formats_are_known_by_their_ending(tmp_path):
-    wanted = {*ENDINGS, "npy", "lvm"} - {"bag2"}
-    assert wanted <= set(endings())
+    wanted = {*ENDINGS, *ALIKE} - {"bag2"}
+    assert wanted == {*endings()} - {"bag2"}
     for ending in wanted:
         assert find_format(tmp_path / f"A.{ending.upper()}") is named_format(ending)
     assert find_format(tmp_path / "a.png") is find_format(tmp_path / ".csv") is None
@@ -321,19 +319,21 @@ def test_formats_are_known_by_their_ending(tmp_path):
         named_format("png")
 
 
-@pytest.mark.parametrize("ending", [*(e for e in ENDINGS if e != "bag2"), "npy", "lvm"])
+@pytest.mark.parametrize("ending", [e for e in ENDINGS if e != "bag2"])
 def test_what_is_no_such_file_is_one_line(tmp_path, ending):
     path = tmp_path / f"a.{ending}"
     junk = [b"", bytes(5000), b"to be or not to be\n" * 50, b"\x89PNG\r\n\x1a\n" + bytes(99)]
     for content in (*junk, b"PK\x05\x06" + bytes(18), bytes(range(256)) * 40, pickle.dumps([1])):
         path.write_bytes(content)
         refused(path)
-        for way in (named_format(ending).load, named_format(ending).key):
-            with pytest.raises(ValueError, match=f"a.{ending}") as caught:
-                way(path)
-            assert "\n" not in str(caught.value)
+        with pytest.raises(ValueError, match=f"a.{ending}") as caught:
+            named_format(ending).load(path)
+        assert "\n" not in str(caught.value)
+        assert not named_format(ending).is_ours(path)
     (tmp_path / f"folder.{ending}").mkdir()
+    os.mkfifo(tmp_path / f"pipe.{ending}")  # reading it would wait for ever
     refused(tmp_path / f"folder.{ending}")
+    assert "must be a file" in refused(tmp_path / f"pipe.{ending}")
 
 
 def test_theirs_is_not_loaded_as_ours(tmp_path):
@@ -345,42 +345,14 @@ def test_theirs_is_not_loaded_as_ours(tmp_path):
     write_mcap(tmp_path / "a.mcap", [wrenches(10)[0]])
     write_bag(tmp_path / "bag", [wrenches(10)[0]])
     for path in sorted(tmp_path.iterdir()):
-        for way in (format_of(path).load, format_of(path).key):
-            with pytest.raises(ValueError, match="no recording of ours") as caught:
-                way(path)
-            assert str(path) in str(caught.value)
+        with pytest.raises(ValueError, match="no recording of ours") as caught:
+            format_of(path).load(path)
+        assert str(path) in str(caught.value)
+        assert not format_of(path).is_ours(path)
     later = {"format": np.array("tactslip_torch recording 2"), "samples": np.zeros((2, 9))}
     np.savez(tmp_path / "later.npz", **later)
     with pytest.raises(ValueError, match="must be of format 'tactslip_torch recording 1', got"):
         format_of(tmp_path / "later.npz").load(tmp_path / "later.npz")
-
-
-class Runs:
-    """What leaves a file behind if it is ever unpickled."""
-
-    def __init__(self, canary):
-        self.canary = canary
-
-    def __reduce__(self):
-        return (open, (str(self.canary), "w"))
-
-
-def test_nothing_in_a_file_is_executed(tmp_path):
-    canary = tmp_path / "canary"
-    held = np.array([[Runs(canary)]], dtype=object)
-    np.save(tmp_path / "a.npy", held, allow_pickle=True)
-    np.savez(tmp_path / "a.npz", samples=held)
-    np.savez(tmp_path / "b.npz", samples=np.zeros((9, 2)), time=np.array([Runs(canary)] * 9))
-    for ending in ENDINGS:
-        if ending != "bag2":
-            (tmp_path / f"p.{ending}").write_bytes(pickle.dumps(Runs(canary)))
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["samples"] = np.void(pickle.dumps(Runs(canary)))
-    (tmp_path / "bag").mkdir()
-    (tmp_path / "bag" / "metadata.yaml").write_text(f"!!python/object/apply:os.mkdir [{canary}]\n")
-    for path in sorted(tmp_path.iterdir()):
-        refused(path, Reading(time="time") if path.name == "b.npz" else None)
-    assert not canary.exists()
 
 
 # Text ------------------------------------------------------------------------------------------
@@ -541,7 +513,7 @@ def made_73(path, **variables):
     return path
 
 
-@pytest.mark.parametrize("dtype", ["f4", "f8", ">f4", ">f8", "i1", "u2", "i4", "i8"])
+@pytest.mark.parametrize("dtype", ["f4", ">f8", "u2", "i4"])
 def test_numpy_arrays(tmp_path, dtype):
     volts = np.random.default_rng(0).integers(0, 99, (60, 3)).astype(dtype)
     np.save(tmp_path / "a.npy", volts)
@@ -619,22 +591,6 @@ def test_several_arrays_are_named_and_one_is_chosen(tmp_path):
     assert read(tmp_path / "b.h5", Reading(channels=("y",)))[0].shape == (1, 8)
 
 
-def test_hdf5_never_leaves_its_file(tmp_path):
-    other = made_hdf5(tmp_path / "other.h5", samples=np.zeros((90, 2)))
-    (tmp_path / "other.raw").write_bytes(np.ones((90, 2)).tobytes())
-    layout = h5py.VirtualLayout((90, 2), "f8")
-    layout[:] = h5py.VirtualSource(str(other), "samples", (90, 2))
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["link"] = h5py.ExternalLink(str(other), "/samples")
-        file["soft"] = h5py.SoftLink("/link")
-        file.create_virtual_dataset("virtual", layout)
-        raw = [(str(tmp_path / "other.raw"), 0, 1440)]
-        file.create_dataset("raw", (90, 2), "f8", external=raw)
-        file["circle/a"] = file["/"]
-    assert "no samples" in refused(tmp_path / "a.h5")
-    assert "file" in refused(tmp_path / "a.h5", Reading(samples="virtual"))
-
-
 @pytest.mark.parametrize("is_compressed", [False, True])
 def test_mat_files_of_version_5(tmp_path, is_compressed):
     path, volts = tmp_path / "a.mat", noise(60, 3).astype(np.float32)
@@ -710,9 +666,10 @@ def test_parquet_tables(tmp_path, rows):
 # Messages: MCAP and rosbag2 --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("packing", ["none", "lz4", "zstd"])
-@pytest.mark.parametrize("is_chunked", [True, False])
-@pytest.mark.parametrize("is_indexed", [True, False])
+@pytest.mark.parametrize(
+    ("packing", "is_chunked", "is_indexed"),
+    [("none", False, False), ("none", True, True), ("lz4", True, False), ("zstd", True, True)],
+)
 def test_stamped_messages_in_mcap(tmp_path, packing, is_chunked, is_indexed):
     sent, values = wrenches(500)
     path = write_mcap(tmp_path / "a.mcap", [sent], How(packing, is_chunked, is_indexed))
@@ -814,7 +771,7 @@ def test_blocks_of_samples(tmp_path):
     messages = blocks_of(values, [20] * 50)
     del messages[17]
     with open_file(write_mcap(path, [Sent("/b", FLOATS, messages)])) as opened:
-        clock = even_clock(opened.times, opened.samples.num_samples)
+        clock = even_clock(opened.times())
     assert [(gap.start, gap.missing) for gap in clock.gaps] == [(340, 20)]
     single = write_mcap(path, [Sent("/b", FLOATS, blocks_of(values, [9]))])
     assert read(single)[2] is None
@@ -828,7 +785,7 @@ def test_messages_go_by_their_times(tmp_path):
     for path in (write_mcap(tmp_path / "a.mcap", [sent]), write_bag(tmp_path / "bag", [sent])):
         samples, _, since, _ = read(path)
         np.testing.assert_array_equal(samples, values)
-        assert (since.diff() > 0).all()
+        assert (np.diff(since) > 0).all()
 
 
 def test_the_topic_is_the_one_named_or_the_only_one(tmp_path):
@@ -862,23 +819,6 @@ def test_a_cut_mcap_file_is_refused_with_its_remedy(tmp_path):
     assert "mcap recover" in said
 
 
-# Claims that are not believed ------------------------------------------------------------------
-
-
-def test_small_files_that_claim_much_are_refused(tmp_path):
-    np.savez_compressed(tmp_path / "a.npz", samples=np.zeros((2, 2**23)))
-    with zipfile.ZipFile(tmp_path / "b.npz", "w", zipfile.ZIP_LZMA) as archive:
-        archive.writestr("samples.npy", b"x")
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("samples", (24, 2**40), "f8", chunks=(24, 2**10))
-    scipy.io.savemat(tmp_path / "a.mat", {"x": np.zeros((2, 2**23))}, do_compression=True)
-    zeros = np.zeros(2**23)
-    pq.write_table(pa.table({"x": zeros, "y": zeros}), tmp_path / "a.parquet")
-    for path in sorted(tmp_path.iterdir()):
-        assert path.stat().st_size < 2**20
-        refused(path)
-
-
 # Libraries that are not there ------------------------------------------------------------------
 
 NEEDED = {"a.h5": "h5py", "a.mcap": "mcap", "a.bag2": "rosbags", "a.parquet": "pyarrow"}
@@ -901,25 +841,19 @@ def test_an_absent_library_is_one_line_with_its_remedy(tmp_path, monkeypatch, na
 # Files from strangers --------------------------------------------------------------------------
 
 
-def test_isolated_reading_gives_the_same(tmp_path):
+@pytest.mark.slow
+def test_isolated_reading_gives_the_same_or_is_refused_in_a_line(tmp_path):
     path = write_mcap(tmp_path / "a.mcap", [wrenches(50)[0]])
     wanted, found = read(path), read(path, Reading(**ISOLATED))
     assert torch.equal(found[0], wanted[0])
     assert found[1] == wanted[1]
-    torch.testing.assert_close(found[2], wanted[2], rtol=0, atol=1e-15)
-
-
-@pytest.mark.slow
-def test_isolated_reading_of_ours_and_of_what_is_wrong(tmp_path):
+    np.testing.assert_allclose(found[2], wanted[2], rtol=0, atol=1e-15)
     named_format("h5").save(tmp_path / "a.h5", recording(), hand_of("ab"), KEY)
     with open_file(tmp_path / "a.h5", Reading(**ISOLATED)) as opened:
         assert_truth(opened.archived, recording(), hand_of("ab"))
         assert torch.equal(opened.samples.read(100, 200), recording().samples[:, 100:200])
     (tmp_path / "b.csv").write_text("t,a\n0,1\n1,two\n")
     assert "line 3" in refused(tmp_path / "b.csv", Reading(**ISOLATED))
-
-
-def test_isolated_reading_has_limits(tmp_path):
     path = tmp_path / "a.mat"
     scipy.io.savemat(path, {"x": np.random.default_rng(0).random((2, 2**22))})
     assert "memory" in refused(path, Reading(**ISOLATED | {MOST_MEMORY: 0.01}))

@@ -41,7 +41,7 @@ MISTAKES = {
     "layout": ("train", settings(layout="nope"), "labels.layout 'nope' whole_slide half_second"),
     "bin of half samples": ("train", settings(bin_ms=50.1), "labels.bin_ms=50.1 100.2 2000"),
     "no recordings left": ("train", settings(cycles=0), "cycles 1 0"),
-    "share": ("train", files(train_share=1.5), "split.train_share 0 1 1.5"),
+    "share": ("train", files(train_share=1.5), "split.train_fraction 0 1 1.5"),
     "even frame": ("train", files(frames={"SG": 50, "PVDF": 11}), "features.frames.SG odd 50"),
     "dtype": ("train", files(dtype="float16"), "features.dtype float64 float32 'float16'"),
     "engine": ("train", files(engine="cuda"), "backend 'cuda' native torch"),

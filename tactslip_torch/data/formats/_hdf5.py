@@ -2,7 +2,8 @@
 
 Ours hold ``/samples`` ``[C, T]`` in chunks of time with check sums, so that damage to them is
 noticed. Only hard links are followed, each object once, so links in a circle end; links to other
-files, virtual datasets and those stored in other files stay closed.
+files, virtual datasets and those stored in other files stay closed. MAT files of version 7.3 are
+HDF5 underneath, with rows and columns exchanged and the class of each variable as an attribute.
 """
 
 from __future__ import annotations
@@ -10,31 +11,37 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._arrays import (
+from tactslip_torch.data.formats._choice import (
     LABEL_NAMES,
     Array,
-    ArraySamples,
     choose,
+    labels_near,
     rate_in,
     why_not_numbers,
 )
-from tactslip_torch.data.formats._header import DTYPES, header_in, opened_from, text_of
-from tactslip_torch.data.formats._limits import (
+from tactslip_torch.data.formats._reading import (
     FREE_BYTES,
     MOST_MEMBERS,
+    Opened,
+    Reading,
     Refused,
     check_plausible,
+    header_in,
     needs,
+    opened_from,
+    text_of,
 )
-from tactslip_torch.data.formats._reading import Opened, Reading
 
 _CHUNK_BYTES = 256 * 2**10
+_CLASSES = {"", "double", "single"} | {f"{u}int{b}" for u in ("", "u") for b in (8, 16, 32, 64)}
+"""Of MATLAB, that are numbers."""
 
 
 def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
@@ -57,6 +64,12 @@ def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
         stored.attrs["channel_name"] = _fixed(*(row["name"] for row in header["channels"]))
 
 
+def _fixed(*words: str) -> NDArray[np.bytes_]:
+    """UTF-8 of one length, filled up with NULs, so that no heap is needed."""
+    encoded = [word.encode() for word in words]
+    return np.array(encoded, dtype=f"S{max(1, *map(len, encoded))}")
+
+
 def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     """The samples of a file, read by slices.
 
@@ -64,62 +77,47 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     name, wherever they stand; times by name; the rate by an attribute or a single number, names of
     channels by words, that are called so.
     """
-    file = opened_hdf5(path, stack)
-    own = _header(file)
+    file = stack.enter_context(needs("h5py", f"reading {path.suffix}").File(path, "r"))
+    said = _attribute(file, "header")
+    own = header_in(said[0]) if len(said) == 1 else None
     if own is not None:
-        samples = file["samples"]
-        if why := why_not(samples):
+        if why := _why_not(file["samples"]):
             raise ValueError(f"/samples {why}")
-        array = Array(path, "/samples", samples)
-        return opened_from(own, ArraySamples(array, 1, dtype=DTYPES[own["dtype"]]))
+        return opened_from(own, path, file["samples"], 1)
     refused: dict[str, str] = {}
     numbers: dict[str, Any] = {}
-    words: list[tuple[str, ...]] = []
-    for name, dataset in datasets(file, refused):
-        why = why_not(dataset)
+    words: dict[str, tuple[str, ...]] = {}
+    for name, dataset in _datasets(file, refused):
+        why = _why_not(dataset)
         if why is None:
             numbers[name] = dataset
             continue
         refused[name] = why
-        if name.rpartition("/")[2].lower() in LABEL_NAMES and why_elsewhere(dataset) is None:
-            words.append(words_of(dataset))
+        is_label = name.rpartition("/")[2].lower() in LABEL_NAMES
+        if is_label and _why_elsewhere(dataset) is None and _are_words(dataset):
+            words[name] = _decoded(dataset[()])
+    return choose(path, _described(numbers, words, "/"), refused, how)
+
+
+def _described(
+    numbers: Mapping[str, Any], words: Mapping[str, tuple[str, ...]], separator: str
+) -> list[Array]:
+    """Datasets of numbers with the names of channels and the rate that are said of them."""
     arrays = []
     for name, dataset in numbers.items():
         around = [dataset]
         while around[-1].name != "/":
             around.append(around[-1].parent)
         named = [
-            attribute(one, at) for one in around for at in one.attrs if at.lower() in LABEL_NAMES
+            _attribute(one, at) for one in around for at in one.attrs if at.lower() in LABEL_NAMES
         ]
+        labels = [*named, *labels_near(name, words, separator)]
         rate = next(filter(None, map(_rate_of, around)), None)
-        leaf = name.rpartition("/")[2]
-        arrays.append(
-            Array(path, name, dataset, leaf, labels=[*named, *words], sample_rate_hz=rate)
-        )
-    return choose(arrays, refused, how)
+        arrays.append(Array(name, dataset, name.rpartition(separator)[2], labels, rate))
+    return arrays
 
 
-def header(path: Path) -> dict[str, Any] | None:
-    """All of a file of ours but its samples; ``None`` if it is another's."""
-    with ExitStack() as stack:
-        return _header(opened_hdf5(path, stack))
-
-
-def _header(file: Any) -> dict[str, Any] | None:
-    words = attribute(file, "header")
-    return header_in(words[0]) if len(words) == 1 else None
-
-
-def opened_hdf5(path: Path, stack: ExitStack) -> Any:
-    """An open HDF5 file.
-
-    Raises:
-        Refused: if h5py is absent.
-    """
-    return stack.enter_context(needs("h5py", f"reading {path.suffix}").File(path, "r"))
-
-
-def datasets(file: Any, refused: dict[str, str]) -> Iterator[tuple[str, Any]]:
+def _datasets(file: Any, refused: dict[str, str]) -> Iterator[tuple[str, Any]]:
     """Every dataset that hard links lead to, by name, breadth first.
 
     Args:
@@ -155,17 +153,17 @@ def datasets(file: Any, refused: dict[str, str]) -> Iterator[tuple[str, Any]]:
                 yield name, found
 
 
-def why_elsewhere(dataset: Any) -> str | None:
+def _why_elsewhere(dataset: Any) -> str | None:
     """The reason why reading a dataset would open other files, if there is one."""
     if dataset.is_virtual:
         return "is virtual: its numbers are in other files"
     return "is stored in other files" if dataset.external else None
 
 
-def why_not(dataset: Any) -> str | None:
+def _why_not(dataset: Any) -> str | None:
     """The reason why a dataset is not read as numbers of up to two dimensions, if there is one."""
     try:
-        why = why_elsewhere(dataset) or why_not_numbers(dataset.dtype, dataset.shape)
+        why = _why_elsewhere(dataset) or why_not_numbers(dataset.dtype, dataset.shape)
         if why is None:
             stored = min(dataset.id.get_storage_size(), dataset.file.id.get_filesize())
             claimed = max(math.prod(dataset.shape), math.prod(dataset.chunks or (0,)))
@@ -177,16 +175,11 @@ def why_not(dataset: Any) -> str | None:
     return why
 
 
-def attribute(thing: Any, name: str) -> tuple[str, ...]:
+def _attribute(thing: Any, name: str) -> tuple[str, ...]:
     """The words of an attribute; none if it is not there, or holds others."""
     if name not in thing.attrs or not _are_words(thing.attrs.get_id(name)):
         return ()
     return _decoded(thing.attrs[name])
-
-
-def words_of(dataset: Any) -> tuple[str, ...]:
-    """The words of a dataset of no or one dimension; none if it holds others."""
-    return _decoded(dataset[()]) if _are_words(dataset) else ()
 
 
 def _are_words(kept: Any) -> bool:
@@ -212,7 +205,70 @@ def _rate_of(thing: Any) -> float | None:
     return rate_in({name: float(np.ravel(thing.attrs[name])[0]) for name in single})
 
 
-def _fixed(*words: str) -> NDArray[np.bytes_]:
-    """UTF-8 of one length, filled up with NULs, so that no heap is needed."""
-    encoded = [word.encode() for word in words]
-    return np.array(encoded, dtype=f"S{max(1, *map(len, encoded))}")
+# MAT files of version 7.3 -----------------------------------------------------------------------
+
+
+def read_mat(path: Path, how: Reading, stack: ExitStack) -> Opened:
+    """The samples of a MAT file of version 7.3, variables of structs as ``trial.volts``."""
+    file = stack.enter_context(needs("h5py", "reading .mat of version 7.3").File(path, "r"))
+    numbers, words, refused = _variables(file)
+    own = header_in("".join(words.get("header", ())))
+    if own is not None:
+        return opened_from(own, path, numbers["samples"])
+    if how.time_first is not None:
+        how = replace(how, time_first=not how.time_first)  # as MATLAB shows it
+    return choose(path, _described(numbers, words, "."), refused, how)
+
+
+def _variables(file: Any) -> tuple[dict[str, Any], dict[str, tuple[str, ...]], dict[str, str]]:
+    """Numbers, words, and the reasons why others are neither, by the classes MATLAB wrote."""
+    refused: dict[str, str] = {}
+    numbers: dict[str, Any] = {}
+    words: dict[str, tuple[str, ...]] = {}
+    for path_in_file, thing in _datasets(file, refused):
+        name = path_in_file.strip("/").replace("/", ".")
+        if name.startswith("#"):
+            continue
+        kind = "".join(_attribute(thing, "MATLAB_class"))
+        why = _why_elsewhere(thing) or ("is empty" if "MATLAB_empty" in thing.attrs else None)
+        if why is None and kind in ("char", "cell"):
+            found = _characters(thing) if kind == "char" else _cells(file, thing)
+            if found is not None:
+                words[name] = found
+                continue
+            why = f"is a {kind} array"
+        if why is None and kind == "logical":
+            why = "holds true or false"
+        if why is None and ("MATLAB_object_decode" in thing.attrs or kind not in _CLASSES):
+            why = f"is of class {kind[:40]}"
+        if why is None and "MATLAB_sparse" in thing.parent.attrs:
+            why = "is of a sparse matrix"
+        why = why or _why_not(thing)
+        if why is None:
+            numbers[name] = thing
+        else:
+            refused[name] = why
+    return numbers, words, refused
+
+
+def _characters(thing: Any) -> tuple[str, ...] | None:
+    """The rows of a character array, without the blanks that fill them up."""
+    is_text = thing.ndim == 2 and thing.dtype == np.uint16 and _why_not(thing) is None
+    if not is_text or not 0 < thing.size <= FREE_BYTES // 4:
+        return None
+    rows = np.ascontiguousarray(thing[()].T).astype("<u2")
+    return tuple(row.tobytes().decode("utf-16-le", "replace").rstrip(" \0") for row in rows)
+
+
+def _cells(file: Any, thing: Any) -> tuple[str, ...] | None:
+    """The words of cells that hold one each."""
+    if thing.dtype.kind != "O" or thing.ndim != 2 or not 0 < thing.size <= MOST_MEMBERS:
+        return None
+    words: list[str] = []
+    for reference in thing[()].reshape(-1):
+        cell = file[reference]
+        if _attribute(cell, "MATLAB_class") != ("char",) or _why_elsewhere(cell) is not None:
+            return None
+        is_empty = "MATLAB_empty" in cell.attrs
+        words += ("",) if is_empty else (_characters(cell) or ())[:1]
+    return tuple(words)

@@ -10,8 +10,6 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._header import header_in
-from tactslip_torch.data.formats._limits import Refused, check_plausible, needs
 from tactslip_torch.data.formats._messages import (
     HEADER,
     TOPIC,
@@ -19,11 +17,18 @@ from tactslip_torch.data.formats._messages import (
     Topic,
     Types,
     blocks,
-    header_text,
     kind_of,
     opened_messages,
 )
-from tactslip_torch.data.formats._reading import Opened, Reading
+from tactslip_torch.data.formats._reading import (
+    Opened,
+    Reading,
+    Refused,
+    check_plausible,
+    header_in,
+    needs,
+    text_of,
+)
 
 _RECORDING = "tactslip_torch recording"
 _MOST_CHUNK = 256 * 2**20
@@ -36,7 +41,7 @@ def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
     with path.open("wb") as file:
         output = writer.Writer(file, compression=writer.CompressionType.NONE)
         output.start(profile="ros2", library="tactslip_torch")
-        output.add_metadata(_RECORDING, {HEADER: header_text(header)})
+        output.add_metadata(_RECORDING, {HEADER: text_of(header)})
         schema = output.register_schema(kind, "ros2msg", types.definition(kind).encode())
         channel = output.register_channel(TOPIC, "cdr", schema)
         for number, (time, message) in enumerate(blocks(samples, header, types)):
@@ -51,12 +56,6 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     """
     reader = _reader(path, stack)
     return opened_messages(path, _messages(reader), _header(reader), how, stack)
-
-
-def header(path: Path) -> dict[str, Any] | None:
-    """All of a file of ours but its samples; ``None`` if it is another's."""
-    with ExitStack() as stack:
-        return _header(_reader(path, stack))
 
 
 def _reader(path: Path, stack: ExitStack) -> Any:

@@ -21,21 +21,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._arrays import (
-    Array,
-    ArraySamples,
-    ArrayTimes,
+from tactslip_torch.data.formats._choice import chosen_columns, unit_of_time
+from tactslip_torch.data.formats._reading import (
+    MOST_MEMBERS,
+    SECONDS,
+    Opened,
+    Reading,
+    Refused,
+    Samples,
     Spool,
-    chosen_columns,
-    float_for,
-    unit_of_time,
+    needs,
+    opened_from,
 )
-from tactslip_torch.data.formats._header import DTYPES, MOST_HEADER, opened_from, text_of
-from tactslip_torch.data.formats._limits import MOST_MEMBERS, Refused, needs
-from tactslip_torch.data.formats._reading import SECONDS, Opened, Reading
 
 TOPIC = "/tactile"
 HEADER = "tactslip_torch"
@@ -131,21 +130,6 @@ def _sizes(kind: Any) -> Iterator[int]:
 # Ours --------------------------------------------------------------------------------------------
 
 
-def header_text(header: Mapping[str, Any]) -> str:
-    """A header as text.
-
-    Raises:
-        Refused: if it is longer than is read.
-    """
-    text = text_of(header)
-    if len(text) > MOST_HEADER:
-        raise Refused(
-            f"cannot hold provenance, key and the rest of {len(text)} characters, at most "
-            f"{MOST_HEADER} are read; keep less in them"
-        )
-    return text
-
-
 def kind_of(header: Mapping[str, Any]) -> str:
     """The type of the messages that hold the samples."""
     bits = header["dtype"].removeprefix("float")
@@ -174,68 +158,12 @@ def blocks(
         yield round(first / rate * 1e9), bytes(content)
 
 
+def checksum_text(checksum: int) -> str:
+    """A CRC-32 as words, which no YAML takes for a number."""
+    return f"crc32 {checksum:08x}"
+
+
 # Messages as numbers -----------------------------------------------------------------------------
-
-
-class _Decoder:
-    """Messages of one topic as rows of numbers; all hold the same channels as the first.
-
-    Raises:
-        Refused: if they are of an encoding that is not read, or hold no samples.
-    """
-
-    def __init__(self, topic: Topic, first: bytes, types: Types | None) -> None:
-        self.topic, self._types = topic.name, types
-        self._kind = types.known_name(topic) if types is not None else ""
-        self.is_array = _ARRAY.fullmatch(self._kind) is not None
-        self.dtype: Any = np.dtype(np.float64)
-        self._keys: list[tuple[str, int | None]] | None = None
-        rows, stamp = self(first)
-        self.is_stamped, self.num_columns = stamp is not None, rows.shape[1]
-        if not 0 < self.num_columns <= _MOST_NUMBERS:
-            raise Refused(f"{self.num_columns} numbers an instant, 1 to {_MOST_NUMBERS} are read")
-
-    @property
-    def names(self) -> tuple[str, ...] | None:
-        """Of the columns, such as ``wrench.force.x`` or ``position[2]``, if they have any."""
-        if self.is_array:
-            return None
-        return tuple(
-            name if count is None else f"{name}[{place}]"
-            for name, count in self._keys or ()
-            for place in range(1 if count is None else count)
-        )
-
-    def __call__(self, message: bytes) -> tuple[NDArray[Any], int | None]:
-        """Rows ``[n, C]``, of dtype object where numbers have names, and the stamp if there is one.
-
-        Raises:
-            Refused: if the message is damaged or holds other channels than the first.
-        """
-        if self._types is None:
-            content = json.loads(message)
-        else:
-            content = self._types.store.deserialize_cdr(message, self._kind)
-        stamp = None
-        if self.is_array:
-            rows = _rows_of(content)
-            keys: list[tuple[str, int | None]] = [("data", rows.shape[1])]
-            self.dtype = np.dtype("f4" if float_for(rows.dtype) == torch.float32 else "f8")
-        else:
-            keys, values = [], list[Any]()
-            _collect(content, "", keys, values, _MOST_DEPTH)
-            rows, stamp = np.empty((1, len(values)), object), _stamp(content)
-            rows[0] = values
-        if self._keys is None:
-            if len({name for name, _ in keys}) < len(keys):
-                raise Refused("two numbers of one name")
-            self._keys = keys
-        elif keys != self._keys or (stamp is not None) != self.is_stamped:
-            raise Refused(
-                f"holds a message on {self.topic} with other channels than the first: "
-                f"{rows.shape[1]} channels after one with {self.num_columns}, or other names"
-            )
-        return rows, stamp
 
 
 def _rows_of(message: Any) -> NDArray[Any]:
@@ -260,24 +188,23 @@ def _rows_of(message: Any) -> NDArray[Any]:
     return data.reshape(sizes[0], -1) if time == 0 else data.reshape(-1, sizes[-1]).T
 
 
-def _collect(
-    part: Any, name: str, keys: list[tuple[str, int | None]], values: list[Any], depth: int
-) -> None:
-    """All numbers in a message, however nested; times and texts are none, ``null`` is NaN."""
+def _collect(part: Any, name: str, found: list[tuple[str, Any]], depth: int) -> None:
+    """All numbers in a message by name, however nested, arrays as they are.
+
+    Times and texts are none, ``null`` is NaN.
+    """
     if depth < 0:
         raise Refused(f"messages nested deeper than {_MOST_DEPTH}")
     if isinstance(part, np.ndarray):
-        keys.append((name, part.size))
-        values.extend(part.reshape(-1).tolist())
+        found.append((name, part.reshape(-1).tolist()))
     elif isinstance(part, list):
         for place, value in enumerate(part):
-            _collect(value, f"{name}[{place}]", keys, values, depth - 1)
+            _collect(value, f"{name}[{place}]", found, depth - 1)
     elif part is None or isinstance(part, (int, float)):
-        keys.append((name, None))
-        values.append(float("nan") if part is None else part)
+        found.append((name, float("nan") if part is None else part))
     elif _clock(part) is None:
         for inner, value in _fields(part).items():
-            _collect(value, f"{name}.{inner}" if name else inner, keys, values, depth - 1)
+            _collect(value, f"{name}.{inner}" if name else inner, found, depth - 1)
 
 
 def _fields(part: Any) -> dict[str, Any]:
@@ -310,6 +237,155 @@ def _clock(part: Any) -> int | None:
 # A topic as samples ------------------------------------------------------------------------------
 
 
+class _TopicSamples:
+    """The samples of a topic in the order of the file, and when they were taken.
+
+    Args:
+        first: message; all others must hold the same channels.
+        types: that its messages are of; ``None`` for JSON.
+        how: what a person says of the file.
+        stack: closes what is kept.
+
+    Raises:
+        Refused: if the messages hold no samples.
+    """
+
+    def __init__(self, first: Message, types: Types | None, how: Reading, stack: ExitStack) -> None:
+        self.topic, self._types, self._how, self._stack = first.topic.name, types, how, stack
+        self._kind = types.known_name(first.topic) if types is not None else ""
+        self._is_array = _ARRAY.fullmatch(self._kind) is not None
+        self.checksum = 0
+        rows, self._sizes, stamp = self._decoded(first.content)
+        self._is_stamped, num_columns = stamp is not None, rows.shape[1]
+        if not 0 < num_columns <= _MOST_NUMBERS:
+            raise Refused(f"{num_columns} numbers an instant, 1 to {_MOST_NUMBERS} are read")
+        if len({name for name, _ in self._sizes}) < len(self._sizes):
+            raise Refused("two numbers of one name")
+        names = None if self._is_array else self._names()
+        if how.time == _LOG_TIME or (how.time == "auto" and (self._is_stamped or names is None)):
+            how = replace(how, time=None)
+        self._time, self._columns = chosen_columns(names, num_columns, how)
+        self.names = None if names is None else tuple(names[place] for place in self._columns)
+        self._time_name = names[self._time] if names and self._time is not None else None
+        is_small = self._is_array and np.can_cast(rows.dtype, np.float32)
+        self._spool = Spool(len(self._columns), "f4" if is_small else "f8", stack)
+        self._logged, self._stamps, self._counts = (array("q") for _ in range(3))
+        self._named: list[Any] = []  # the times that ``how`` names
+
+    def _names(self) -> list[str]:
+        """Of the columns, such as ``wrench.force.x`` or ``position[2]``."""
+        return [
+            name if count is None else f"{name}[{place}]"
+            for name, count in self._sizes
+            for place in range(1 if count is None else count)
+        ]
+
+    def _decoded(
+        self, message: bytes
+    ) -> tuple[NDArray[Any], list[tuple[str, int | None]], int | None]:
+        """Rows ``[n, C]``, the name and length of what a row is made of, and the stamp, if any."""
+        if self._types is None:
+            content = json.loads(message)
+        else:
+            content = self._types.store.deserialize_cdr(message, self._kind)
+        if self._is_array:
+            rows = _rows_of(content)
+            return rows, [("data", rows.shape[1])], None
+        found: list[tuple[str, Any]] = []
+        _collect(content, "", found, _MOST_DEPTH)
+        values: list[Any] = []
+        sizes: list[tuple[str, int | None]] = []
+        for name, value in found:
+            values += value if isinstance(value, list) else [value]
+            sizes.append((name, len(value) if isinstance(value, list) else None))
+        rows = np.empty((1, len(values)), object)
+        rows[0] = values
+        return rows, sizes, _stamp(content)
+
+    def add(self, message: Message) -> None:
+        """Keep a message.
+
+        Raises:
+            Refused: if it is damaged or holds other channels than the first.
+        """
+        rows, sizes, stamp = self._decoded(message.content)
+        if sizes != self._sizes or (stamp is not None) != self._is_stamped:
+            raise Refused(
+                f"holds a message on {self.topic} with other channels than the first: "
+                f"{rows.shape[1]} numbers, or other names"
+            )
+        self._spool.add(rows[:, self._columns])
+        self.checksum = zlib.crc32(message.content, self.checksum)
+        self._logged.append(message.log_time)
+        self._counts.append(len(rows))
+        if stamp is not None:
+            self._stamps.append(stamp)
+        if self._time is not None:
+            self._named.append(rows[0, self._time])
+
+    def rows(self) -> NDArray[Any]:
+        """All samples ``[T, C]`` in the order of the file."""
+        return self._spool.array()
+
+    def ordered(self) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
+        """All samples ``[T, C]`` in the order of their times, and these in seconds.
+
+        No times if nobody asks for them, or of a single block where nobody gives the rate.
+        """
+        rows, times, counts = self.rows(), self._message_times(), np.array(self._counts)
+        if (np.diff(times) < 0).any():
+            order = np.argsort(times, kind="stable")
+            starts = np.cumsum(counts) - counts  # the first row of each message
+            place = np.concatenate([np.arange(starts[n], starts[n] + counts[n]) for n in order])
+            spool = Spool(rows.shape[1], rows.dtype, self._stack)
+            for first in range(0, len(rows), _STRETCH):
+                spool.add(rows[place[first : first + _STRETCH]])
+            rows, times, counts = spool.array(), times[order], counts[order]
+        return rows, None if self._how.time is None else self._seconds(times, counts)
+
+    def _seconds(
+        self, times: NDArray[np.int64], counts: NDArray[np.int64]
+    ) -> NDArray[np.float64] | None:
+        """When each sample was taken, from the first; those of a message up to the next.
+
+        Where the next message comes later than usual, samples are spread as usual, so that the gap
+        shows.
+        """
+        spacings = np.diff(times) / counts[:-1]
+        if self._how.sample_rate_hz is not None:
+            usual = _SECOND / self._how.sample_rate_hz
+        elif len(spacings):
+            usual = float(np.median(spacings))
+        elif counts[0] > 1:
+            return None
+        else:
+            usual = 0.0
+        spacing = np.append(np.where(spacings > _GAP * usual, usual, spacings), usual)
+        number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        since = np.repeat((times - times[0]).astype(np.float64), counts)
+        return np.asarray((since + number * np.repeat(spacing, counts)) / _SECOND)
+
+    def _message_times(self) -> NDArray[np.int64]:
+        """In nanoseconds."""
+        if self._time is not None:
+            unit = unit_of_time(self._time_name, self._how)
+            return _nanoseconds(np.array(self._named), SECONDS[unit])
+        is_stamped = self._how.time == "auto" and any(self._stamps)
+        return np.array(self._stamps if is_stamped else self._logged, np.int64)
+
+
+def _nanoseconds(times: NDArray[Any], seconds: float) -> NDArray[np.int64]:
+    """Times of a unit of so many seconds since the least; of whole numbers nothing is lost."""
+    unit = round(seconds * _SECOND)
+    if times.dtype.kind not in "iuf" or not np.isfinite(times).all():
+        raise Refused("holds a time that is no number; say reading.time")
+    first, last = times.min().item(), times.max().item()
+    if (last - first) * unit > _LONGEST:
+        raise Refused(f"has times {(last - first) * seconds:g} s apart; see reading.time_unit")
+    since = (times - times.dtype.type(first)) * unit
+    return np.asarray(np.round(since), np.int64)
+
+
 def opened_messages(
     path: Path,
     messages: Iterable[Message],
@@ -338,163 +414,59 @@ def opened_messages(
             not the same channels throughout.
     """
     if header is not None and how.samples in (None, TOPIC):
-        topic = _read_topic(messages, Reading(samples=TOPIC, time=None), stack, or_none=True)
-        if checksum is not None and checksum != checksum_text(topic.total if topic else 0):
+        topic, _ = _read_topic(messages, Reading(samples=TOPIC, time=None), stack)
+        if checksum is not None and checksum != checksum_text(topic.checksum if topic else 0):
             raise ValueError("the messages fail their checksum")
-        rows = np.empty((0, header["shape"][0])) if topic is None else topic.rows()
-        array = Array(path, TOPIC, rows)
-        return opened_from(header, ArraySamples(array, 0, dtype=DTYPES[header["dtype"]]))
-    topic = _read_topic(messages, how, stack)
-    dtype = torch.float32 if topic.decoder.dtype == np.float32 else torch.float64
-    samples = ArraySamples(Array(path, "messages", topic.rows()), 0, dtype=dtype)
-    seconds = topic.seconds()
-    times = None
-    if seconds is not None:
-        times = ArrayTimes(ArraySamples([Array(path, "times", seconds)]), "s")
-    names = topic.decoder.names
-    chosen = None if names is None else tuple(names[place] for place in topic.columns)
-    return Opened(samples, None, chosen, times)
-
-
-def checksum_text(checksum: int) -> str:
-    """A CRC-32 as words, which no YAML takes for a number."""
-    return f"crc32 {checksum:08x}"
-
-
-class _TopicSamples:
-    """The samples of a topic in the order of the file, and when they were taken."""
-
-    def __init__(self, decoder: _Decoder, how: Reading, stack: ExitStack) -> None:
-        self.decoder, self._how, self._stack, self.total = decoder, how, stack, 0
-        is_other = decoder.is_stamped or decoder.names is None
-        if how.time == _LOG_TIME or (how.time == "auto" and is_other):
-            how = replace(how, time=None)
-        self._time, self.columns = chosen_columns(decoder.names, decoder.num_columns, how)
-        self._spool = Spool(len(self.columns), decoder.dtype, stack)
-        self._logged, self._stamps, self._counts = (array("q") for _ in range(3))
-        self._named: list[Any] = []  # the times that ``how`` names
-
-    def add(self, message: Message) -> None:
-        """Keep a message."""
-        rows, stamp = self.decoder(message.content)
-        self._spool.add(rows[:, self.columns])
-        self.total = zlib.crc32(message.content, self.total)
-        self._logged.append(message.log_time)
-        self._counts.append(len(rows))
-        if stamp is not None:
-            self._stamps.append(stamp)
-        if self._time is not None:
-            self._named.append(rows[0, self._time])
-
-    def rows(self) -> NDArray[Any]:
-        """All samples ``[T, C]`` in the order of their times."""
-        rows, order = self._spool.array(), self._order()
-        if order is None:
-            return rows
-        counts = np.array(self._counts)
-        before = (np.cumsum(counts) - counts)[order]  # the first row of each message
-        shift = before - (np.cumsum(counts[order]) - counts[order])
-        place = np.arange(len(rows)) + np.repeat(shift, counts[order])
-        ordered = Spool(len(self.columns), rows.dtype, self._stack)
-        for first in range(0, len(rows), _STRETCH):
-            ordered.add(rows[place[first : first + _STRETCH]])
-        return ordered.array()
-
-    def seconds(self) -> NDArray[np.float64] | None:
-        """When each sample was taken, from the first; those of a message up to the next.
-
-        Where the next message comes later than usual, samples are spread as usual, so that the gap
-        shows. ``None`` if nobody asks for times, or of a single block where nobody gives the rate.
-        """
-        if self._how.time is None:
-            return None
-        times, counts = self._message_times(), np.array(self._counts)
-        if (order := self._order()) is not None:
-            times, counts = times[order], counts[order]
-        spacings = np.diff(times) / counts[:-1]
-        if self._how.sample_rate_hz is not None:
-            usual = _SECOND / self._how.sample_rate_hz
-        elif len(spacings):
-            usual = float(np.median(spacings))
-        elif counts[0] > 1:
-            return None
-        else:
-            usual = 0.0
-        spacing = np.append(np.where(spacings > _GAP * usual, usual, spacings), usual)
-        number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-        since = np.repeat((times - times[0]).astype(np.float64), counts)
-        return np.asarray((since + number * np.repeat(spacing, counts)) / _SECOND)
-
-    def _message_times(self) -> NDArray[np.int64]:
-        """In nanoseconds."""
-        if self._time is not None:
-            names = self.decoder.names
-            unit = unit_of_time(names[self._time] if names else None, self._how)
-            return _nanoseconds(np.array(self._named), SECONDS[unit])
-        if self._how.time == "auto" and any(self._stamps):
-            return np.array(self._stamps, np.int64)
-        return np.array(self._logged, np.int64)
-
-    def _order(self) -> NDArray[np.intp] | None:
-        """That of the times; ``None`` if it is that of the file."""
-        times = self._message_times()
-        return None if (np.diff(times) >= 0).all() else np.argsort(times, kind="stable")
-
-
-def _nanoseconds(times: NDArray[Any], seconds: float) -> NDArray[np.int64]:
-    """Times of a unit of so many seconds since the least; of whole numbers nothing is lost."""
-    unit = round(seconds * _SECOND)
-    if times.dtype.kind not in "iuf" or not np.isfinite(times).all():
-        raise Refused("holds a time that is no number; say reading.time")
-    first, last = times.min().item(), times.max().item()
-    if (last - first) * unit > _LONGEST:
-        raise Refused(f"has times {(last - first) * seconds:g} s apart; see reading.time_unit")
-    since = (times - times.dtype.type(first)) * unit
-    return np.asarray(np.round(since), np.int64)
+        nothing = np.empty((0, header["shape"][0]))
+        return opened_from(header, path, topic.rows() if topic else nothing)
+    topic, others = _read_topic(messages, how, stack)
+    if topic is not None:
+        rows, seconds = topic.ordered()
+        stamps = None if seconds is None else Samples(path, [seconds])
+        return Opened(Samples(path, rows), None, topic.names, stamps)
+    if how.samples is None:
+        why = "; ".join(f"{name}: {said}" for name, said in sorted(others.items())) or "no messages"
+        raise Refused(f"has no topic with samples ({why[:800]})")
+    if how.samples in others:
+        raise Refused(f"cannot be read at topic {how.samples}: {others[how.samples]}")
+    known = ", ".join(sorted(others)) or "none"
+    raise Refused(f"has no message on topic {how.samples!r}; its topics are {known}")
 
 
 def _read_topic(
-    messages: Iterable[Message], how: Reading, stack: ExitStack, or_none: bool = False
-) -> Any:
-    """The samples of the one topic that holds any, all messages looked at."""
+    messages: Iterable[Message], how: Reading, stack: ExitStack
+) -> tuple[_TopicSamples | None, dict[str, str]]:
+    """The one topic that holds samples, all messages looked at, and why each other is not read."""
     found: _TopicSamples | None = None
     types: Types | None = None
-    met: dict[str, str] = {}  # topics, each with the reason why it is not read
+    others: dict[str, str] = {}
     for message in messages:
         topic = message.topic
-        if found is not None and topic.name == found.decoder.topic:
+        if found is not None and topic.name == found.topic:
             found.add(message)
             continue
-        if topic.name in met:
+        if topic.name in others:
             continue
-        if len(met) > MOST_MEMBERS:
+        if len(others) > MOST_MEMBERS:
             raise Refused(f"has more than {MOST_MEMBERS} topics")
-        met[topic.name] = "is none of samples"
+        others[topic.name] = "is none of samples"
         if how.samples != topic.name and (how.samples or topic.name in _NOT_SAMPLES):
             continue
         if topic.encoding not in ("cdr", "json"):
-            met[topic.name] = f"messages in {topic.encoding[:40]!r}; cdr and json are read"
+            others[topic.name] = f"messages in {topic.encoding[:40]!r}; cdr and json are read"
             continue
         try:
             if topic.encoding == "cdr":
                 types = types or Types()
-            decoder = _Decoder(topic, message.content, types if topic.encoding == "cdr" else None)
+            one = _TopicSamples(message, types if topic.encoding == "cdr" else None, how, stack)
         except Exception as error:  # rosbags and json raise many kinds
-            met[topic.name] = " ".join(str(error).split())[:200] or type(error).__name__
+            others[topic.name] = " ".join(str(error).split())[:200] or type(error).__name__
             continue
         if found is not None:
             raise Refused(
-                f"has several topics that may hold samples, {found.decoder.topic}, "
+                f"has several topics that may hold samples, {found.topic}, "
                 f"{topic.name}; say which by reading.samples"
             )
-        found = _TopicSamples(decoder, how, stack)
+        found = one
         found.add(message)
-    if found is not None or or_none:
-        return found
-    if how.samples is None:
-        why = "; ".join(f"{name}: {said}" for name, said in sorted(met.items())) or "no messages"
-        raise Refused(f"has no topic with samples ({why[:800]})")
-    if how.samples in met:
-        raise Refused(f"cannot be read at topic {how.samples}: {met[how.samples]}")
-    topics = ", ".join(sorted(met)) or "none"
-    raise Refused(f"has no message on topic {how.samples!r}; its topics are {topics}")
+    return found, others

@@ -24,10 +24,18 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._arrays import Array, ArraySamples, choose, why_not_numbers
-from tactslip_torch.data.formats._header import DTYPES, FORM, MOMENTS, STRETCHES, opened_from
-from tactslip_torch.data.formats._limits import MOST_CHANNELS, Refused, check_plausible
-from tactslip_torch.data.formats._reading import Opened, Reading
+from tactslip_torch.data.formats._choice import Array, choose, why_not_numbers
+from tactslip_torch.data.formats._reading import (
+    FORM,
+    MOMENTS,
+    MOST_CHANNELS,
+    STRETCHES,
+    Opened,
+    Reading,
+    Refused,
+    check_plausible,
+    opened_from,
+)
 
 _LOCAL_HEADER = struct.Struct("<26xHH")  # of a ZIP member: lengths of its name and extra field
 _MOST_BESIDE = 16 * 2**20  # bytes of a member of ours that is read whole: names, numbers, JSON
@@ -80,25 +88,12 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
             }
         if "format" in stored and how.samples in (None, "samples"):
             values = stored["samples"]
-            header = _header(path, values.shape, values.dtype)
-            samples = Array(path, "samples", values)
-            return opened_from(header, ArraySamples(samples, 1, dtype=DTYPES[header["dtype"]]))
+            return opened_from(_header(path, values.shape, values.dtype), path, values, 1)
         if how.samples is None and "samples" in stored:
             how = replace(how, samples="samples", time_first=how.time_first is True)
     whys = {name: why_not_numbers(kept.dtype, kept.shape) for name, kept in stored.items()}
-    arrays = [Array(path, name, kept) for name, kept in stored.items() if whys[name] is None]
-    return choose(arrays, {name: why for name, why in whys.items() if why is not None}, how)
-
-
-def header(path: Path) -> dict[str, Any] | None:
-    """All of a file of ours but its samples; ``None`` if it is another's."""
-    with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-        members = {member.filename: member for member in _checked(archive)}
-        if "format.npy" not in members:
-            return None
-        with archive.open(members["samples.npy"]) as content:
-            shape, _, dtype = _head(content)
-    return _header(path, shape, dtype)
+    arrays = [Array(name, kept) for name, kept in stored.items() if whys[name] is None]
+    return choose(path, arrays, {n: why for n, why in whys.items() if why is not None}, how)
 
 
 def _header(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:

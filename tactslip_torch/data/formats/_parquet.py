@@ -5,7 +5,7 @@ Ours have check sums, so that damage to them is noticed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
@@ -13,22 +13,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._arrays import Array, ArraySamples, choose, rate_in
-from tactslip_torch.data.formats._header import (
-    DTYPES,
+from tactslip_torch.data.formats._choice import chosen_columns, rate_in, unit_of_time
+from tactslip_torch.data.formats._reading import (
+    MOST_CHANNELS,
     MOST_HEADER,
+    MOST_WHOLE,
+    Opened,
+    Reading,
+    Refused,
+    Samples,
+    check_plausible,
     header_in,
+    needs,
     opened_from,
     text_of,
 )
-from tactslip_torch.data.formats._limits import (
-    MOST_CHANNELS,
-    MOST_WHOLE,
-    Refused,
-    check_plausible,
-    needs,
-)
-from tactslip_torch.data.formats._reading import Opened, Reading
 
 _TIME = "time_s"
 _GROUP_BYTES = 4 * 2**20
@@ -77,37 +76,44 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         raise Refused(f"has several columns of one name, or more than {MOST_CHANNELS}; rename them")
     check_plausible("its table", rows * len(names) * 8, path.stat().st_size, MOST_WHOLE)
     types = needs("pyarrow", "reading .parquet").types
-    units, refused = {}, {}
-    for name, kind in zip(names, schema.types, strict=True):
-        if types.is_timestamp(kind):
-            units[name] = kind.unit
-        elif types.is_floating(kind) or types.is_integer(kind):
-            units[name] = None
-        else:
-            refused[name] = f"holds {str(kind)[:40]!r}"
+    stamps = [n for n, kind in enumerate(schema.types) if types.is_timestamp(kind)]
+    is_number = [types.is_floating(kind) or types.is_integer(kind) for kind in schema.types]
+    refused = [n for n, good in enumerate(is_number) if not good and n not in stamps]
+    own = header_in(metadata.get("header"))
+    if own is not None:
+        if names[:1] != [_TIME] or len(names) < 2 or refused:
+            raise ValueError("times must stand first, then channels")
+        return opened_from(own, path, _columns(file, names[1:]))
+    if len(refused) == len(names):
+        raise Refused(f"holds no samples ({names[0]!r} holds {str(schema.types[0])[:40]!r})")
+    time, channels = chosen_columns(names, len(names), how, refused, stamps)
+    for place in [*channels, *([] if time is None else [time])]:
+        if place in refused:
+            raise Refused(f"holds {str(schema.types[place])[:40]!r} in column {names[place]!r}")
     said: dict[str, float] = {}
     for name, text in metadata.items():
         with suppress(ValueError):
             said[name] = float(text)
-    rate = rate_in(said)
-    table = file.read(columns=list(units), use_threads=False)
-    arrays = []
-    for name, unit in units.items():
-        column = table.column(table.schema.names.index(name))  # nulls are NaN, stamps whole numbers
-        values = (column if unit is None else column.cast("int64")).to_numpy()
-        arrays.append(Array(path, name, values, time_unit=unit, sample_rate_hz=rate))
-    own = header_in(metadata.get("header"))
-    if own is not None:
-        if names[:1] != [_TIME] or len(arrays) < 2 or refused:
-            raise ValueError("times must stand first, then channels")
-        return opened_from(own, ArraySamples(arrays[1:], dtype=DTYPES[own["dtype"]]))
-    return choose(arrays, refused, how, columns=names)
+    opened = Opened(
+        Samples(path, _columns(file, [names[place] for place in channels])),
+        names=tuple(names[place] for place in channels),
+        sample_rate_hz=rate_in(said),
+    )
+    if time is None:
+        return opened
+    unit = schema.types[time].unit if time in stamps else unit_of_time(names[time], how)
+    return opened._replace(stamps=Samples(path, _columns(file, [names[time]])), time_unit=unit)
 
 
-def header(path: Path) -> dict[str, Any] | None:
-    """All of a file of ours but its samples; ``None`` if it is another's."""
-    with ExitStack() as stack:
-        return header_in(_opened(path, stack)[1].get("header"))
+def _columns(file: Any, names: Sequence[str]) -> list[NDArray[Any]]:
+    """The numbers of columns; nulls are NaN, time stamps whole numbers."""
+    table = file.read(columns=list(names), use_threads=False)
+    columns = [table.column(name) for name in names]
+    is_stamp = [str(column.type).startswith("timestamp") for column in columns]
+    return [
+        (column.cast("int64") if of_time else column).to_numpy()
+        for column, of_time in zip(columns, is_stamp, strict=True)
+    ]
 
 
 def _opened(path: Path, stack: ExitStack) -> tuple[Any, dict[str, str]]:

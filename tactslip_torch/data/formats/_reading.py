@@ -1,94 +1,116 @@
-"""What a file gives when it is open, and what a person says that the file does not."""
+"""What a file gives when it is open, what a person says that it does not, and what it may cost.
+
+Of a file of ours all but the samples is its *header*: plain values that a file of any format can
+hold as one line of JSON.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple, Protocol, get_args
+import importlib.util
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, fields
+from types import ModuleType
+from typing import Any, Literal, NamedTuple, get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.hand import HandLayout
+from tactslip_torch.runtime import check_number
+
+# Limits, and faults in one line -----------------------------------------------------------------
+
+MOST_WHOLE = 4 * 2**30
+"""Bytes of numbers in a file of a format that is read whole: MAT of version 5 and Parquet."""
+MOST_CHANNELS = 2**16
+MOST_MEMBERS = 10_000
+"""Arrays, groups, columns or topics of one file that are looked at."""
+MOST_RATIO, FREE_BYTES = 100, 64 * 2**20
+"""A file may hold so many times its size, and so many bytes in any case."""
+_MOST_SAID = 200
+
+
+class Refused(ValueError):
+    """A line for people that says all."""
+
+
+@contextmanager
+def guarded(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn whatever a library raises of a file into one line.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        Refused: of anything else that is raised inside; it begins with the path.
+    """
+    name = os.fspath(path)
+    try:
+        yield
+    except Refused as error:
+        said = str(error)
+        raise (error if said.startswith(name) else Refused(f"{name} {said}")) from None
+    except FileNotFoundError:
+        raise FileNotFoundError(f"no file at {name}") from None
+    except MemoryError as error:
+        raise Refused(
+            f"{name} needs more memory than there is, or than reading.isolate_gib; use .h5"
+        ) from error
+    except Exception as error:  # HDF5, Arrow, zlib, struct, SQLite and YAML raise many kinds
+        said = " ".join(str(error).split())[:_MOST_SAID] or type(error).__name__
+        raise Refused(f"{name} is damaged or no recording of ours ({said})") from error
+
+
+def check_plausible(what: str, claimed: int, stored: int, most: int | None = None) -> None:
+    """Refuse claims that a file of its size can hardly mean, before anything is allocated.
+
+    Args:
+        what: claims it, for the message.
+        claimed: bytes of numbers.
+        stored: bytes in the file.
+        most: bytes that are read at all; ``None`` where a file is read by stretches.
+
+    Raises:
+        Refused: in one line with both sizes.
+    """
+    if claimed > max(FREE_BYTES, MOST_RATIO * stored):
+        raise Refused(
+            f"{what} claims {claimed} bytes and stores {stored}, of which {MOST_RATIO} times are "
+            "believed; write it again without compression"
+        )
+    if most is not None and claimed > most:
+        raise Refused(
+            f"{what} has {claimed} bytes, of its format at most {most} are read; convert it to .h5"
+        )
+
+
+def needs(module: str, what: str) -> ModuleType:
+    """A library that is there only if the extra ``formats`` was installed.
+
+    Args:
+        module: to import.
+        what: it is for, such as ``"reading .h5"``.
+
+    Raises:
+        Refused: in one line, if it is absent.
+    """
+    name = module.partition(".")[0]
+    if importlib.util.find_spec(name) is None:
+        raise Refused(
+            f'{what} needs {name}, which is not installed; pip install "tactslip-torch[formats]"'
+        )
+    return importlib.import_module(module)
+
+
+# What a person says -----------------------------------------------------------------------------
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 SECONDS: dict[TimeUnit, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-
-
-class Samples(Protocol):
-    """Samples ``[C, T]`` that stay in their file until they are asked for."""
-
-    @property
-    def num_channels(self) -> int:
-        """Rows."""
-
-    @property
-    def num_samples(self) -> int:
-        """Columns."""
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """``float32`` or ``float64``; of whole numbers the smaller that holds them all."""
-
-    def read(self, first: int, stop: int) -> Tensor:
-        """Samples from ``first`` to before ``stop``, as far as there are any, ``[C, n]``.
-
-        Raises:
-            ValueError: if the file was damaged or cut since it was opened.
-        """
-
-
-class Times(Protocol):
-    """When samples were taken."""
-
-    def read(self, first: int, stop: int) -> Tensor:
-        """Seconds since the first sample, ``[n]``, float64, of the samples in that range."""
-
-
-class Archived(NamedTuple):
-    """What a file of ours holds.
-
-    Args:
-        recording: samples and truth.
-        hand: its channels.
-        key: what determined the samples, as plain values.
-    """
-
-    recording: Recording
-    hand: HandLayout
-    key: dict[str, Any]
-
-
-class Opened(NamedTuple):
-    """A recording in a file that is open.
-
-    Args:
-        samples: all of them.
-        archived: all else of a file of ours, around no samples; ``None`` for other files.
-        names: of the channels, if the file says.
-        times: of the samples, if the file has any.
-        sample_rate_hz: if the file says; what a person says is not here.
-    """
-
-    samples: Samples
-    archived: Archived | None = None
-    names: tuple[str, ...] | None = None
-    times: Times | None = None
-    sample_rate_hz: float | None = None
-
-
-def pieces(samples: Samples, num_samples: int) -> Iterator[Tensor]:
-    """All samples in order, ``num_samples`` at a time and the rest at the end; ``[C, n]`` each."""
-    for first in range(0, samples.num_samples, num_samples):
-        yield samples.read(first, first + num_samples)
-
-
-def is_number(value: object) -> bool:
-    """Whether a setting is a finite number; ``True`` is none."""
-    is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return is_real and math.isfinite(value)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -126,32 +148,23 @@ class Reading:
     isolate_s: float = 120.0
 
     def __post_init__(self) -> None:
-        units, columns = get_args(TimeUnit), self.channels
+        for name in ("sample_rate_hz", "isolate_gib", "isolate_s"):
+            if (value := getattr(self, name)) is not None or name != "sample_rate_hz":
+                check_number(f"reading.{name}", value)
+        units, columns, mark = get_args(TimeUnit), self.channels, self.delimiter
         is_list = isinstance(columns, Sequence) and not isinstance(columns, str) and bool(columns)
-        mark = self.delimiter
-        rate = self.sample_rate_hz
+        is_mark = mark is None or (isinstance(mark, str) and len(mark) == 1)
         for name, is_right, wanted in (
-            ("sample_rate_hz", rate is None or _is_positive(rate), "positive"),
-            ("isolate_gib", _is_positive(self.isolate_gib), "positive"),
-            ("isolate_s", _is_positive(self.isolate_s), "positive"),
             ("time_unit", self.time_unit in units, f"one of {', '.join(units)}"),
+            ("samples", isinstance(self.samples, str | None), "the name of an array or topic"),
+            ("time_first", self.time_first in (True, False, None), "true, false or null"),
+            ("isolate", isinstance(self.isolate, bool), "true or false"),
+            ("time", self.time is None or _is_column(self.time), "a name, a number or null"),
+            ("delimiter", is_mark, "one character"),
             (
                 "channels",
                 columns is None or (is_list and all(map(_is_column, columns))),
                 "a list of columns, by name or number",
-            ),
-            (
-                "samples",
-                isinstance(self.samples, str | None),
-                "the name of a dataset, variable or topic, or null",
-            ),
-            ("time_first", self.time_first in (True, False, None), "true, false or null"),
-            ("isolate", isinstance(self.isolate, bool), "true or false"),
-            ("time", self.time is None or _is_column(self.time), "a name, a number or null"),
-            (
-                "delimiter",
-                mark is None or (isinstance(mark, str) and len(mark) == 1),
-                "one character",
             ),
         ):
             if not is_right:
@@ -161,15 +174,293 @@ class Reading:
             if len(set(columns)) < len(columns):
                 raise ValueError(f"reading.channels names a column twice: {list(columns)}")
 
+    @classmethod
+    def of(cls, given: object) -> Reading:
+        """From what a configuration says; nothing if it is ``None``.
+
+        Raises:
+            ValueError: for a key or value that is none.
+        """
+        known = [one.name for one in fields(cls)]
+        if given is not None and not (isinstance(given, Mapping) and set(given) <= set(known)):
+            raise ValueError(f"reading must be of {', '.join(known)}, got {given!r}")
+        return cls(**dict(given or {}))
+
     def key(self) -> dict[str, Any]:
         """What decides the samples that are read, as plain values; ``isolate`` does not."""
         return {n: value for n, value in asdict(self).items() if not n.startswith("isolate")}
 
 
-def _is_positive(value: object) -> bool:
-    return is_number(value) and value > 0  # type: ignore[operator]
-
-
 def _is_column(value: object) -> bool:
     """Whether a setting says a column, by name or number."""
     return isinstance(value, (str, int)) and not isinstance(value, bool)
+
+
+# What a file gives ------------------------------------------------------------------------------
+
+
+class Samples:
+    """Samples ``[C, T]`` that stay in their file until they are asked for.
+
+    Args:
+        path: of the file, for messages.
+        source: an array of two axes, sliced as NumPy's are, or for each channel one whose other
+            axes, if any, have length 1.
+        time_axis: of the array.
+        rows: of the array, along its other axis, that are channels; ``None`` for all.
+        dtype: ``float32`` or ``float64``; ``None``: the smaller that holds all numbers exactly
+            (whole numbers beyond 2**53 are rounded).
+    """
+
+    num_channels: int
+    num_samples: int
+    dtype: torch.dtype
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        source: Any,
+        time_axis: int = 0,
+        rows: Sequence[int] | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        self._path, self._source, self._axis = path, source, time_axis
+        self._rows = None if rows is None else list(rows)
+        columns: Sequence[Any] = source if isinstance(source, list) else [source]
+        stored = [column.dtype for column in columns]
+        is_small = all(kind.itemsize <= (4 if kind.kind == "f" else 2) for kind in stored)
+        self.dtype = dtype or (torch.float32 if is_small else torch.float64)
+        if isinstance(source, list):
+            self.num_channels, self.num_samples = len(source), max(source[0].shape)
+        else:
+            self.num_channels = source.shape[1 - time_axis] if rows is None else len(rows)
+            self.num_samples = source.shape[time_axis]
+
+    def read(self, first: int, stop: int) -> Tensor:
+        """Samples from ``first`` to before ``stop``, as far as there are any, ``[C, n]``.
+
+        Raises:
+            ValueError: if the file was damaged or cut since it was opened.
+        """
+        wanted = np.float32 if self.dtype == torch.float32 else np.float64
+        with np.errstate(over="ignore"):  # a number beyond float32 is infinite in it
+            return torch.from_numpy(np.array(self.stored(first, stop), wanted, order="C"))
+
+    def stored(self, first: int, stop: int) -> NDArray[Any]:
+        """As ``read``, in the numbers that the file has."""
+        first = min(first, self.num_samples)
+        part = slice(first, max(min(stop, self.num_samples), first))
+        with guarded(self._path):
+            if isinstance(self._source, list):
+                return np.stack([_along(column, part) for column in self._source])
+            if self._axis:
+                values = np.asarray(self._source[:, part])
+            else:
+                values = np.asarray(self._source[part]).T
+        return values if self._rows is None else values[self._rows]
+
+
+def _along(column: Any, part: slice) -> NDArray[Any]:
+    """A stretch of an array along its longest axis, ``[n]``."""
+    axis = int(np.argmax(column.shape))
+    return np.asarray(column[(*[slice(None)] * axis, part)]).reshape(-1)
+
+
+def pieces(samples: Any, num_samples: int) -> Iterator[Tensor]:
+    """All samples in order, ``num_samples`` at a time and the rest at the end; ``[C, n]`` each."""
+    for first in range(0, samples.num_samples, num_samples):
+        yield samples.read(first, first + num_samples)
+
+
+class Archived(NamedTuple):
+    """What a file of ours holds.
+
+    Args:
+        recording: samples and truth.
+        hand: its channels.
+        key: what determined the samples, as plain values.
+    """
+
+    recording: Recording
+    hand: HandLayout
+    key: dict[str, Any]
+
+
+class Opened(NamedTuple):
+    """A recording in a file that is open.
+
+    Args:
+        samples: all of them.
+        archived: all else of a file of ours, around no samples; ``None`` for other files.
+        names: of the channels, if the file says.
+        stamps: when the samples were taken, in the only channel, if the file says.
+        time_unit: of the stamps.
+        sample_rate_hz: if the file says; what a person says is not here.
+    """
+
+    samples: Samples
+    archived: Archived | None = None
+    names: tuple[str, ...] | None = None
+    stamps: Samples | None = None
+    time_unit: TimeUnit = "s"
+    sample_rate_hz: float | None = None
+
+    def times(self) -> NDArray[np.float64] | None:
+        """Seconds since the first sample, ``[T]``; ``None`` if the file does not say.
+
+        Whole numbers are subtracted as such: nanoseconds since 1970 are more than a float holds.
+        """
+        if self.stamps is None:
+            return None
+        values = self.stamps.stored(0, self.stamps.num_samples)[0]
+        values = values.astype(np.int64 if values.dtype.kind in "iu" else np.float64)
+        return np.asarray((values - values[:1]).astype(np.float64) * SECONDS[self.time_unit])
+
+
+class Spool:
+    """Rows of numbers ``[T, C]`` that grow, in a temporary file (``TMPDIR``)."""
+
+    def __init__(self, num_columns: int, dtype: Any, stack: ExitStack) -> None:
+        self._num_columns, self._dtype = num_columns, dtype
+        self._file = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
+
+    def add(self, rows: NDArray[Any]) -> None:
+        """Put rows ``[n, C]`` behind those that are there."""
+        with np.errstate(over="ignore"):
+            self._file.write(np.asarray(rows, self._dtype).tobytes())
+
+    def array(self) -> NDArray[Any]:
+        """All rows; none can be added behind them."""
+        self._file.flush()
+        if not self._file.tell():
+            return np.empty((0, self._num_columns), self._dtype)
+        rows: NDArray[Any] = np.memmap(self._file, self._dtype, "r")
+        return rows.reshape(-1, self._num_columns)
+
+
+# Headers of ours --------------------------------------------------------------------------------
+
+FORM = "tactslip_torch recording 1"
+MOST_HEADER = 16 * 2**20
+"""Bytes of header text; a longer one is no header of ours."""
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+MOMENTS = ("speeds_mm_s", "onsets_s", "annotated_onsets_s")
+STRETCHES = ("sliding_s", "non_slip_s", "slip_s")
+
+
+def header_of(recording: Recording, hand: HandLayout, key: Mapping[str, Any]) -> dict[str, Any]:
+    """What ``opened_from`` reads, numbers to the bit, as JSON has it.
+
+    Raises:
+        ValueError: if samples are neither float32 nor float64, the hand has another number of
+            channels, a word holds a NUL, or provenance or key is not JSON-able.
+    """
+    samples = recording.samples
+    if samples.dtype not in DTYPES.values():
+        raise ValueError(f"samples must be float32 or float64 to be saved, got {samples.dtype}")
+    if len(hand) != len(samples):
+        raise ValueError(f"the hand has {len(hand)} channels, the recording {len(samples)}")
+    for word in (recording.units, recording.material, *hand.names):
+        if "\0" in word:
+            raise ValueError(f"a name must not hold a NUL to be saved, got {word!r}")
+    header = {
+        "format": FORM,
+        "dtype": str(samples.dtype).removeprefix("torch."),
+        "shape": list(samples.shape),
+        "units": recording.units,
+        "sample_rate_hz": float(recording.sample_rate_hz),
+        "material": recording.material,
+        **{name: list(getattr(recording, name)) for name in (*MOMENTS, *STRETCHES)},
+        "channels": hand.to_rows(),
+    }
+    for name, values in (("provenance", recording.provenance), ("key", key)):
+        try:
+            header[name] = json.loads(text_of(dict(values)))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name} must be plain JSON values to be saved: {error}") from error
+    return header
+
+
+def text_of(header: Mapping[str, Any]) -> str:
+    """One line of JSON, ASCII; equal headers give equal text.
+
+    Raises:
+        Refused: if it is longer than is read.
+    """
+    text = json.dumps(header, sort_keys=True, allow_nan=False)
+    if len(text) > MOST_HEADER:
+        raise Refused(
+            f"cannot hold provenance, key and the rest of {len(text)} characters, at most "
+            f"{MOST_HEADER} are read; keep less in them"
+        )
+    return text
+
+
+def header_in(text: str | None) -> dict[str, Any] | None:
+    """What ``text_of`` wrote; ``None`` if a text is not ours.
+
+    Raises:
+        Refused: if it is of another version, or too long.
+        ValueError: if it is damaged.
+    """
+    if text is None or FORM.rpartition(" ")[0] not in text:
+        return None
+    if len(text) > MOST_HEADER:
+        raise Refused(f"has a header of {len(text)} characters, at most {MOST_HEADER} are read")
+    header = json.loads(text)
+    form = header.get("format") if isinstance(header, dict) else None
+    if form != FORM:
+        raise Refused(f"must be of format {FORM!r}, got {str(form)[:80]!r}")
+    return dict(header)
+
+
+def shape_of(header: Mapping[str, Any]) -> tuple[int, int]:
+    """Channels and samples that a header states.
+
+    Raises:
+        ValueError: if these are no numbers that can be.
+    """
+    num_channels, num_samples = header["shape"]
+    is_count = all(type(n) is int and 0 <= n < 2**62 for n in (num_channels, num_samples))
+    if not is_count or not 0 < num_channels <= MOST_CHANNELS:
+        raise ValueError(f"a header of {str(header['shape'])[:40]} samples")
+    return num_channels, num_samples
+
+
+def opened_from(
+    header: Mapping[str, Any],
+    path: str | os.PathLike[str],
+    source: Any,
+    time_axis: int = 0,
+    rows: Sequence[int] | None = None,
+) -> Opened:
+    """An open file of ours: its samples, as ``Samples`` has them, and all else around none of them.
+
+    Raises:
+        ValueError: if a part of the header is missing or wrong, or belongs to other samples.
+    """
+    try:
+        samples = Samples(path, source, time_axis, rows, DTYPES[header["dtype"]])
+        found = samples.num_channels, samples.num_samples
+        if shape_of(header) != found:
+            raise ValueError(
+                f"{found[0]} by {found[1]} samples, where its header says {header['shape']}"
+            )
+        hand = HandLayout.from_rows(header["channels"])
+        if len(hand) != samples.num_channels:
+            raise ValueError(f"{len(hand)} rows of channels for {samples.num_channels} channels")
+        truth: dict[str, Any] = {name: tuple(map(float, header[name])) for name in MOMENTS}
+        for name in STRETCHES:
+            truth[name] = tuple((float(start), float(end)) for start, end in header[name])
+        recording = Recording(
+            samples.read(0, 0),
+            float(header["sample_rate_hz"]),
+            str(header["material"]),
+            **truth,
+            provenance=dict(header["provenance"]),
+            units=str(header["units"]),
+        )
+        archived = Archived(recording, hand, dict(header["key"]))
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        raise ValueError(f"a header that lacks a part: {error}") from error
+    return Opened(samples, archived, hand.names, sample_rate_hz=recording.sample_rate_hz)

@@ -14,8 +14,6 @@ from urllib.parse import quote, unquote
 
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._header import MOST_HEADER, header_in
-from tactslip_torch.data.formats._limits import Refused, needs
 from tactslip_torch.data.formats._messages import (
     HEADER,
     TOPIC,
@@ -24,11 +22,18 @@ from tactslip_torch.data.formats._messages import (
     Types,
     blocks,
     checksum_text,
-    header_text,
     kind_of,
     opened_messages,
 )
-from tactslip_torch.data.formats._reading import Opened, Reading
+from tactslip_torch.data.formats._reading import (
+    MOST_HEADER,
+    Opened,
+    Reading,
+    Refused,
+    header_in,
+    needs,
+    text_of,
+)
 
 _METADATA = "metadata.yaml"
 _CHECKSUM = "tactslip_torch_message_sum"
@@ -48,7 +53,7 @@ def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
             for time, message in blocks(samples, header, types):
                 writer.write(channel, time, message)
                 total = zlib.crc32(message, total)
-            custom = {HEADER: header_text(header), _CHECKSUM: checksum_text(total)}
+            custom = {HEADER: text_of(header), _CHECKSUM: checksum_text(total)}
             for name, text in custom.items():
                 writer.set_custom_data(name, quote(text, safe=_SAFE))
         shutil.copytree(plain, path)
@@ -61,12 +66,6 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     own = header_in(custom.get(HEADER))
     checksum = None if own is None else custom.get(_CHECKSUM, "")
     return opened_messages(path, _messages(reader), own, how, stack, checksum)
-
-
-def header(path: Path) -> dict[str, Any] | None:
-    """All of a folder of ours but its samples; ``None`` if it is another's."""
-    with ExitStack() as stack:
-        return header_in(_custom_of(_reader(path, stack)).get(HEADER))
 
 
 def _reader(path: Path, stack: ExitStack) -> Any:

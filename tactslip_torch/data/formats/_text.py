@@ -21,25 +21,20 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactslip_torch.data.formats._arrays import (
-    Array,
-    ArraySamples,
-    ArrayTimes,
-    Spool,
-    chosen_columns,
-    unit_of_time,
-)
-from tactslip_torch.data.formats._header import (
-    DTYPES,
+from tactslip_torch.data.formats._choice import chosen_columns, unit_of_time
+from tactslip_torch.data.formats._reading import (
     FORM,
     MOST_HEADER,
+    Opened,
+    Reading,
+    Refused,
+    Samples,
+    Spool,
     header_in,
     opened_from,
     shape_of,
     text_of,
 )
-from tactslip_torch.data.formats._limits import Refused
-from tactslip_torch.data.formats._reading import Opened, Reading
 
 _HEAD = 2**20  # characters in which the first row must be found, and the most of a line
 _TO_WRITE = 4096  # rows at a time
@@ -114,28 +109,24 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
         spool = Spool(layout.num_columns, np.float64, stack)
         for line, lines in _blocks(file, layout.first_line):
             spool.add(_rows_of(lines, layout, line))
-    table = Array(path, "table", spool.array())
+    table = spool.array()
     if own is not None:
-        rows = range(1, layout.num_columns)
-        return opened_from(own, ArraySamples(table, 0, rows, DTYPES[own["dtype"]]))
-    names, first_rows = layout.names, table.values[:_TO_COUNT]
+        return opened_from(own, path, table, 0, range(1, layout.num_columns))
+    names, first_rows = layout.names, table[:_TO_COUNT]
     if names is None and how.time == "auto" and how.sample_rate_hz is None:
         how = replace(how, time=0 if layout.num_columns > 1 else None)
     is_count = (first_rows[1:] == first_rows[:-1] + 1).all(0) & (len(first_rows) > 2)
-    counts = np.flatnonzero(is_count).tolist()
+    numbers = [
+        n for n, name in enumerate(names or ()) if name in ("", f"column {n}", f"Unnamed: {n}")
+    ]
+    counts = [n for n in numbers if is_count[n]]  # of the rows, which some libraries write first
     time, columns = chosen_columns(names, layout.num_columns, how, counts)
-    times = None
+    chosen = tuple(names[column] for column in columns) if names is not None else None
+    opened = Opened(Samples(path, table, 0, columns), None, chosen)
     if time is not None and not (layout.is_time_empty and time == 0):
         unit = unit_of_time(names[time] if names else None, how)
-        times = ArrayTimes(ArraySamples(table, 0, [time]), unit)
-    chosen = tuple(names[column] for column in columns) if names is not None else None
-    return Opened(ArraySamples(table, 0, columns), None, chosen, times, layout.sample_rate_hz)
-
-
-def header(path: Path) -> dict[str, Any] | None:
-    """All of a file of ours but its samples; ``None`` if it is another's."""
-    with _text_of(path) as file:
-        return _header(file)
+        opened = opened._replace(stamps=Samples(path, table, 0, [time]), time_unit=unit)
+    return opened._replace(sample_rate_hz=layout.sample_rate_hz)
 
 
 def _header(file: IO[str]) -> dict[str, Any] | None:

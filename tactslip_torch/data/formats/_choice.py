@@ -1,0 +1,320 @@
+"""Which numbers of other people's files are samples, and which are times."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from tactslip_torch.data.formats._reading import (
+    SECONDS,
+    Opened,
+    Reading,
+    Refused,
+    Samples,
+    TimeUnit,
+)
+
+LABEL_NAMES = ("channel_name", "channel_names", "channels", "columns", "labels")
+_RATE_NAMES = ("sample_rate_hz", "sample_rate", "sampling_rate", "samplingrate", "fs", "rate")
+_TIME_NAME = re.compile(  # "Time (ms)", "t_us", "t/s", "timestamps"
+    r"(?:time|t|timestamps?|stamp|time_stamp|seconds)(?:[\s_/(\[]+(s|ms|us|ns)[)\]]?)?"
+)
+_MOST_NAMED = 8  # in a message
+_NOT_NUMBERS = {"b": "true or false", "c": "complex numbers", "V": "compound values"}
+_NOT_NUMBERS |= {"O": "objects or text", "S": "text", "U": "text"}
+
+
+@dataclass(frozen=True)
+class Array:
+    """Numbers of no more than two dimensions in an open file.
+
+    Args:
+        name: in full, as people of the format write it: ``/group/volts``, ``trial.volts``.
+        values: have ``shape`` and ``dtype`` and are sliced as NumPy's are.
+        leaf: the last part of the name, if it has parts.
+        labels: words that may name its channels, the likeliest first.
+        sample_rate_hz: if the file says it of this array.
+    """
+
+    name: str
+    values: Any
+    leaf: str = ""
+    labels: Sequence[tuple[str, ...]] = ()
+    sample_rate_hz: float | None = None
+
+    @property
+    def short_name(self) -> str:
+        """Without the groups it stands in."""
+        return self.leaf or self.name
+
+    @property
+    def length(self) -> int:
+        """Of the longest axis."""
+        return int(max(self.values.shape))
+
+    @property
+    def is_column(self) -> bool:
+        """Whether no more than one axis is longer than 1."""
+        return len([length for length in self.values.shape if length > 1]) < 2
+
+
+def why_not_numbers(dtype: np.dtype[Any], shape: Sequence[int] | None) -> str | None:
+    """The reason why values are no samples, if there is one."""
+    if dtype.kind not in "iuf" or dtype.itemsize > 8:
+        return f"holds {_NOT_NUMBERS.get(dtype.kind, str(dtype))}"
+    if shape is None or len(shape) > 2:
+        return "is empty" if shape is None else f"has {len(shape)} dimensions"
+    return None
+
+
+def rate_in(numbers: Mapping[str, float]) -> float | None:
+    """The sample rate among numbers by name, if one is called so."""
+    lower = {name.lower(): value for name, value in numbers.items()}
+    return next((lower[n] for n in _RATE_NAMES if 0 < lower.get(n, 0) < math.inf), None)
+
+
+def unit_of_time(name: str | None, how: Reading) -> TimeUnit:
+    """The unit a time's name ends in, if it has one, else the one that is said."""
+    found = _TIME_NAME.fullmatch((name or "").strip().lower())
+    unit = found[1] if found else None
+    return next((known for known in SECONDS if known == unit), how.time_unit)
+
+
+def _is_time_name(name: str) -> bool:
+    return _TIME_NAME.fullmatch(name.strip().lower()) is not None
+
+
+# Columns of one table ---------------------------------------------------------------------------
+
+
+def chosen_columns(
+    names: Sequence[str] | None,
+    num_columns: int,
+    how: Reading,
+    others: Iterable[int] = (),
+    stamps: Sequence[int] = (),
+) -> tuple[int | None, list[int]]:
+    """The place of the column of times, if there is one, and those of the channels.
+
+    If ``how`` does not say which hold samples, all do but times and ``others``.
+
+    Args:
+        names: of all columns, if the file says.
+        num_columns: how many there are.
+        how: what a person says of the file.
+        others: columns that are no channels unless a person says so.
+        stamps: columns that hold times by their type.
+
+    Raises:
+        Refused: if there is no such column, or none is left for samples.
+    """
+    called = [place for place, name in enumerate(names or ()) if _is_time_name(name)]
+    called = sorted({*called, *stamps})
+    time: int | None = None
+    if how.time == "auto":
+        time = called[0] if called else None
+    elif how.time is not None:
+        time = _position(names, num_columns, how.time, "time")
+    if how.channels is not None:
+        return time, [_position(names, num_columns, one, "channels") for one in how.channels]
+    beside = {time, *others, *stamps, *(called if time is not None else ())}
+    channels = [place for place in range(num_columns) if place not in beside]
+    if not channels:
+        raise Refused(
+            "has one column, and it is taken for times; say reading.time=null and "
+            "reading.sample_rate_hz if it holds samples"
+        )
+    return time, channels
+
+
+def _position(names: Sequence[str] | None, num_columns: int, wanted: str | int, what: str) -> int:
+    if isinstance(wanted, int) and 0 <= wanted < num_columns:
+        return wanted
+    if isinstance(wanted, str) and names is not None and wanted in names:
+        return list(names).index(wanted)
+    there = f"{num_columns} columns{' without names' * (names is None)}, 0 to {num_columns - 1}"
+    if isinstance(wanted, str) and names is not None:
+        there = _some(list(map(repr, names)))
+    raise Refused(f"has no column {wanted!r} that reading.{what} names; it has {there}")
+
+
+def _some(words: Sequence[str]) -> str:
+    more = len(words) - _MOST_NAMED
+    return ", ".join(words[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+# Arrays of a file -------------------------------------------------------------------------------
+
+
+def choose(
+    path: str | os.PathLike[str],
+    arrays: Sequence[Array],
+    refused: Mapping[str, str],
+    how: Reading,
+) -> Opened:
+    """The samples of a file: its only array of two dimensions, or all columns of one length.
+
+    What ``how`` names goes first: ``samples`` an array or a group, ``channels`` columns, ``time``
+    an array or a column. Single numbers are no samples.
+
+    Args:
+        path: of the file.
+        arrays: that can be read.
+        refused: names of what cannot, each with the reason.
+        how: what a person says of the file.
+
+    Raises:
+        Refused: in one line that names what could be meant, if that is none or several.
+    """
+    several = [array for array in arrays if math.prod(array.values.shape) > 1]
+    within = several if how.samples is None else _named(how.samples, several, refused)
+    times = [] if isinstance(how.time, int) else _times_of(several, refused, how)
+    singles = [array for array in within if array.is_column and array not in times]
+    matrices = [array for array in within if not array.is_column]
+    words = {word for single in singles for word in (single.name, single.leaf)}
+    if matrices and (how.channels is None or not words.issuperset(how.channels)):
+        if len(matrices) > 1:
+            raise Refused(f"holds several arrays, {_listed(matrices)}; say reading.samples")
+        opened = _of_matrix(path, matrices[0], times, how)
+        near = matrices[0]
+    elif singles:
+        columns = [array for array in several if array.is_column]
+        opened, near = _of_columns(path, singles, columns, how)
+    else:
+        said = "; ".join([f"{name!r} {why}" for name, why in refused.items()][:3])
+        reasons = f" ({said})" if said else ""
+        raise Refused(f"holds no samples{reasons}; say reading.samples if it does")
+    if opened.stamps is None and times:
+        opened = _with_times(path, opened, times, how)
+    rate = near.sample_rate_hz or _single_rate(arrays, near.name)
+    return opened._replace(sample_rate_hz=rate)
+
+
+def _times_of(
+    several: Sequence[Array], refused: Mapping[str, str], how: Reading
+) -> Sequence[Array]:
+    """The arrays that may be times, by the name that was given or by what they are called."""
+    if how.time == "auto":
+        return [a for a in several if a.is_column and _is_time_name(a.short_name)]
+    if how.time is None:
+        return []
+    wanted = str(how.time)
+    if any(wanted in labels for array in several for labels in array.labels):
+        return []  # a column of a matrix
+    return _named(wanted, several, refused)
+
+
+def _with_times(
+    path: str | os.PathLike[str], opened: Opened, times: Sequence[Array], how: Reading
+) -> Opened:
+    """The first of these times that has a time for every sample."""
+    length = opened.samples.num_samples
+    fitting = [array for array in times if array.is_column and array.length == length]
+    if fitting:
+        unit = unit_of_time(fitting[0].short_name, how)
+        return opened._replace(stamps=Samples(path, [fitting[0].values]), time_unit=unit)
+    if how.time != "auto":
+        raise Refused(f"has times {_listed(times)} for {length} samples; say reading.time")
+    return opened
+
+
+def _of_matrix(
+    path: str | os.PathLike[str], matrix: Array, times: Sequence[Array], how: Reading
+) -> Opened:
+    axis = _time_axis(matrix, {array.length for array in times}, how)
+    count = matrix.values.shape[1 - axis]
+    fitting = (labels for labels in matrix.labels if len(labels) == len(set(labels)) == count)
+    labels = next(fitting, None)
+    is_elsewhere = bool(times) and how.time != "auto"
+    time, rows = chosen_columns(labels, count, replace(how, time=None) if is_elsewhere else how)
+    used = None if rows == list(range(count)) else rows
+    names = None if labels is None else tuple(labels[row] for row in rows)
+    opened = Opened(Samples(path, matrix.values, axis, used), names=names)
+    if time is None:
+        return opened
+    unit = unit_of_time(labels[time] if labels else None, how)
+    return opened._replace(stamps=Samples(path, matrix.values, axis, [time]), time_unit=unit)
+
+
+def _time_axis(matrix: Array, lengths: set[int], how: Reading) -> int:
+    """The axis that is said, or as long as the times, or the longer one."""
+    if how.time_first is not None:
+        return 0 if how.time_first else 1
+    rows, columns = matrix.values.shape
+    if (rows in lengths) != (columns in lengths):
+        return 0 if rows in lengths else 1
+    if rows == columns:
+        raise Refused(
+            f"holds {matrix.name!r} of {rows} by {columns}, so it does not show which axis is "
+            "time; say reading.time_first=true or false"
+        )
+    return 0 if rows > columns else 1
+
+
+def _of_columns(
+    path: str | os.PathLike[str], singles: Sequence[Array], columns: Sequence[Array], how: Reading
+) -> tuple[Opened, Array]:
+    """Arrays of one column each, and the first of them; numbers count all such of the file."""
+
+    def found(wanted: str | int, what: str) -> Array:
+        if isinstance(wanted, str):
+            return _named(wanted, singles, {})[0]
+        return columns[_position(None, len(columns), wanted, what)]
+
+    time = found(how.time, "time") if isinstance(how.time, int) else None
+    if how.channels is None:
+        chosen = [single for single in singles if single is not time]
+    else:
+        chosen = [found(wanted, "channels") for wanted in how.channels]
+    if not chosen:
+        raise Refused("holds no column but the times; say reading.time=null if it is none")
+    if len({column.length for column in chosen}) > 1:
+        raise Refused(f"holds columns of several lengths, {_listed(chosen)}; say reading.channels")
+    names = tuple(column.short_name for column in chosen)
+    if len(set(names)) < len(names):
+        names = tuple(column.name for column in chosen)
+    opened = Opened(Samples(path, [column.values for column in chosen]), names=names)
+    return (opened if time is None else _with_times(path, opened, [time], how)), chosen[0]
+
+
+def _named(wanted: str, arrays: Sequence[Array], refused: Mapping[str, str]) -> list[Array]:
+    """The array of that name, or those of that group; else what is only called so at its end."""
+    plain = wanted.strip("/")
+    for exact in (True, False):
+        found = [a for a in arrays if plain == (a.name.strip("/") if exact else a.leaf)]
+        if len(found) == 1:
+            return found
+    groups = (f"{plain}/", f"{plain}.")
+    if inside := [array for array in arrays if array.name.strip("/").startswith(groups)]:
+        return inside
+    for name, why in refused.items():
+        if name.strip("/") == plain:
+            raise Refused(f"cannot be read at {name!r}: it {why}")
+    raise Refused(f"has no {wanted!r} of numbers; it has {_listed(arrays) or 'none'}")
+
+
+def _listed(arrays: Sequence[Array]) -> str:
+    return _some([f"{a.name!r} {' by '.join(map(str, a.values.shape))}" for a in arrays])
+
+
+def _single_rate(arrays: Sequence[Array], name: str) -> float | None:
+    """A rate that is an array of one number, the nearest to the samples by its name."""
+    single = [a for a in arrays if math.prod(a.values.shape) == 1]
+    single = [a for a in single if a.short_name.lower() in _RATE_NAMES]
+    single.sort(key=lambda one: len(os.path.commonprefix([one.name, name])))
+    return rate_in({one.short_name: float(np.ravel(one.values[()])[0]) for one in single})
+
+
+def labels_near(
+    name: str, words: Mapping[str, tuple[str, ...]], separator: str
+) -> list[tuple[str, ...]]:
+    """The words of a file that may name the channels of an array, those beside it first."""
+    group = name.rpartition(separator)[0]
+    called = [at for at in words if at.rpartition(separator)[2].lower() in LABEL_NAMES]
+    return [words[at] for at in sorted(called, key=lambda at: at.rpartition(separator)[0] != group)]

@@ -1,0 +1,216 @@
+"""From raw bins to scores, as a graph: what ``SlipDetector.predict_raw`` does, and no more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+import torch
+
+from tactslip_torch.deploy.head import llr_of, probability_of, scored
+from tactslip_torch.deploy.value import BOOL, F64, Graph, Value
+from tactslip_torch.features.bank import Bank, Frame, Samples
+from tactslip_torch.features.ops import TINY
+from tactslip_torch.features.pool import LARGEST_SAMPLE
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.onset.decisions import calibration_of
+from tactslip_torch.signals.filtering import overlap_matrix
+
+Precision = Literal["float32", "float64"]
+"""Of samples, scores and all that there is one of per sample; what steps or cancels is float64."""
+
+
+def dtype_of(precision: str) -> np.dtype[Any]:
+    """The dtype of samples and scores.
+
+    Raises:
+        ValueError: for another precision.
+    """
+    if precision not in (known := get_args(Precision)):
+        raise ValueError(f"precision must be one of {', '.join(known)}, got {precision!r}")
+    return np.dtype(precision)
+
+
+@dataclass(frozen=True)
+class RawBin:
+    """The raw samples that one bin is scored by.
+
+    Attributes:
+        channels: indices in the hand of the channels in use, ascending.
+        before: samples before the bin that their filters take in.
+        bin: samples of the bin.
+        after: samples behind it, the look-ahead.
+    """
+
+    channels: tuple[int, ...]
+    before: int
+    bin: int
+    after: int
+
+    @classmethod
+    def of(cls, detector: SlipDetector) -> RawBin:
+        """That of a detector."""
+        channels = detector.extractor.plan.channels
+        reaches = [detector.channel_filter.reaches[channel] for channel in channels]
+        before, after = (max(each) for each in zip(*reaches, strict=True))
+        return cls(channels, before, detector.pool.bin_samples, after)
+
+    @property
+    def length(self) -> int:
+        """Of all samples."""
+        return self.before + self.bin + self.after
+
+
+class Scored(NamedTuple):
+    """What a graph makes of ``B`` bins.
+
+    Attributes:
+        score: ``[B]``, at least 0 is slip.
+        is_valid: ``[B]``, bool: every channel in use can be trusted.
+        is_usable: ``[B]``, bool: the score tells something (``onset.decisions.is_usable``).
+        variance: ``[B]``, float64, of the score; None: of none.
+    """
+
+    score: Value
+    is_valid: Value
+    is_usable: Value
+    variance: Value | None
+
+
+def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph:
+    """A graph of independent bins.
+
+    Args:
+        detector: that scores them.
+        precision: of samples and scores.
+
+    Shape:
+        - in ``samples``: ``[batch, C, RawBin.length]``, volts
+        - in ``masked_channels``: ``[C]``, bool; may be left out: none is
+        - out ``score``, ``valid`` (bool) and, if calibrated, ``probability``: ``[batch]``
+
+    Raises:
+        ValueError: for another precision.
+    """
+    graph, raw, dtype = Graph(), RawBin.of(detector), dtype_of(precision)
+    num_channels = len(detector.pool.hand)
+    samples = graph.input("samples", dtype, ("batch", num_channels, raw.length))
+    masked = masked_input(graph, detector)
+    calibrated = calibration_of(detector)
+    outputs: dict[str, np.dtype[Any]] = {"score": dtype, "valid": BOOL}
+    if calibrated is not None:
+        outputs["probability"] = dtype
+
+    def scores() -> list[Value]:
+        found = score_bins(samples.take(raw.channels, 1), detector, masked)
+        if calibrated is None:
+            return [found.score, found.is_valid]
+        llr = llr_of(found.score, calibrated[0], found.variance)
+        return [found.score, found.is_valid, probability_of(llr, calibrated[1])]
+
+    def nothing() -> list[Value]:  # onnxruntime reduces and reshapes no empty batch
+        return [graph.constant([], kind) for kind in outputs.values()]
+
+    made = graph.if_(samples.length(0).squeeze(0) > 0, scores, nothing)
+    for name, value in zip(outputs, made, strict=True):
+        graph.output(name, value, ("batch",))
+    return graph
+
+
+def masked_input(graph: Graph, detector: SlipDetector) -> Value:
+    """The input ``masked_channels [C]``, bool: by default no channel is."""
+    num = len(detector.pool.hand)
+    return graph.input("masked_channels", BOOL, (num,), np.zeros(num, bool))
+
+
+def score_bins(windows: Value, detector: SlipDetector, masked: Value) -> Scored:
+    """Score raw bins.
+
+    Where samples of a bin differ by more than their precision can hold, or by so little that they
+    are denormal in it, their channel may count as missing or dead (1e38 V and 1e-38 V in float32).
+
+    Args:
+        windows: raw samples in volts of the channels in use, in the dtype that scores shall have.
+        detector: that scores them.
+        masked: which channels of the hand are missing whatever they say, bool.
+
+    Shape:
+        - windows: ``[B, channels in use, RawBin.length]``, at least one bin
+        - masked: ``[C]``
+    """
+    features, is_missing, is_trusted = described(windows, detector)
+    is_masked = masked.take(detector.extractor.plan.channels, 0)
+    is_missing = is_missing | is_masked
+    score, variance = scored(features, is_missing, detector, windows.dtype)
+    is_finite = score.isfinite()
+    is_valid = (is_trusted & ~is_masked).all(1) & is_finite
+    return Scored(score, is_valid, is_finite & ~is_missing.all(1), variance)
+
+
+def described(windows: Value, detector: SlipDetector) -> tuple[Value, Value, Value]:
+    """Features of raw bins, and which channels are missing, and which can be trusted.
+
+    A channel is missing where a NaN or Inf is within the frame of its filter; it is trusted where
+    it is neither missing nor dead (``FeaturePool.validity``).
+
+    Shape:
+        - windows: as ``score_bins``
+        - output: ``[B, M]``, float64, the selected features in their order; ``[B, channels]`` twice
+    """
+    used, graph = RawBin.of(detector).channels, windows.graph
+    layer, films = detector.channel_filter, set(detector.pool.hand.fast)
+    alike: dict[tuple[int, bool], list[int]] = {}
+    for channel in used:
+        alike.setdefault((layer.window_lengths[channel], channel in films), []).append(channel)
+    frames = [
+        Frame(
+            tuple(channels),
+            is_film,
+            overlap_matrix(layer.kernel(channels[0]), detector.pool.bin_samples).T.contiguous(),
+        )
+        for (_, is_film), channels in alike.items()
+    ]
+    samples, is_missing, is_trusted = zip(
+        *(_samples(windows, detector, frame) for frame in frames), strict=True
+    )
+    dtype = torch.float64 if windows.dtype == F64 else torch.float32
+    features: Any = Bank(detector.pool.maps, detector.extractor.plan, frames, dtype)(samples)
+    order = [channel for frame in frames for channel in frame.channels]
+    places = [order.index(channel) for channel in used]
+    missing, trusted = (
+        graph.concat(*each, axis=1).take(places, 1) for each in (is_missing, is_trusted)
+    )
+    return features, missing, trusted
+
+
+def _samples(windows: Value, detector: SlipDetector, frame: Frame) -> tuple[Samples, Value, Value]:
+    """What rows are made of; which channels of the frame are missing, and which can be trusted."""
+    raw, graph, dtype = RawBin.of(detector), windows.graph, windows.dtype
+    assert frame.smooth is not None  # frames of raw samples have a filter
+    before, after = detector.channel_filter.reaches[frame.channels[0]]
+    start = raw.before - before
+    x: Any = windows.take([raw.channels.index(channel) for channel in frame.channels], 1)
+    x = x.slice(start, start + before + raw.bin + after, 2)
+    first = x.slice(before, before + 1, 2)
+    moving, unit = x - first, None
+    if dtype == F64:  # whose squares float64 does not hold
+        unit = x.abs().amax(2, keepdim=True).maximum(TINY)
+        moving, first = moving / unit, first / unit
+        shifted = graph.concat(moving, first, axis=2)
+    else:
+        shifted = graph.concat(x.double() - first.double(), first.double(), axis=2)
+    moving = moving @ frame.smooth.T
+    filtered = moving + first
+    high, low = filtered.amax(2), filtered.amin(2)
+    scale = high.maximum(-low)
+    probe = filtered[..., 0]  # NaN if anything in the window is no number
+    probe = scale + (probe - probe)
+    unit = None if unit is None else unit.squeeze(2)
+    largest = min(LARGEST_SAMPLE, float(np.finfo(dtype).max))
+    is_known = (probe if unit is None else probe * unit) <= largest
+    of_dtype = torch.empty(0, dtype=torch.float64 if dtype == F64 else torch.float32)
+    inverse = detector.pool.inverse_span(of_dtype)[list(frame.channels)]
+    is_alive = (high - low) * inverse > scale
+    values: tuple[Any, ...] = shifted, moving, scale.double(), unit
+    return Samples(*values), ~is_known, is_alive & is_known

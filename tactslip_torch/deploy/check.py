@@ -1,0 +1,551 @@
+"""The self-check behind every export: a graph in onnxruntime against the detector in float64.
+
+Bins: noise and a simulated slip in batches of several sizes, bins at which formulas end, masked
+channels. Streams: a simulated slip in pieces of several sizes, another threshold, broken and masked
+channels.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import cycle, pairwise
+from typing import Any, Literal
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import pad
+
+from tactslip_torch.deploy.bins import Precision, RawBin
+from tactslip_torch.deploy.stream import Timing
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.calibration import probability, widened_llr
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.missing_channels import ChannelMask
+from tactslip_torch.model.prediction import Prediction
+from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
+from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.simulation.extremes import EXTREMES, RAIL_V, extreme_bins
+from tactslip_torch.simulation.scene import Scene
+from tactslip_torch.simulation.simulate import simulate
+
+GraphKind = Literal["bin", "stream"]
+Arrays = Mapping[str, NDArray[Any]]
+Run = Callable[[Arrays], dict[str, NDArray[Any]]]
+
+DEGENERATE: tuple[str, ...] = (*EXTREMES, "step", "nan", "inf", "-inf", "all nan")
+"""Degenerate bins by name."""
+WORST_SD = {"float32": 1e-3, "float64": 1e-9}
+"""Largest score error allowed, in standard deviations of the score on simulated bins."""
+WORST_DEGENERATE_SD = {"float32": 1e-2, "float64": 1e-6}
+"""The same on degenerate bins, but for those that rounding decides, and where channels are lost."""
+WORST_PROBABILITY = {"float32": 1e-5, "float64": 1e-9}
+"""By which a probability may differ from that of the score beside it."""
+_BATCHES = (1, 7, 0, 56)  # of noise
+_SIMULATED, _EACH = 256, 16  # bins, and of each degenerate kind
+_BEFORE_S, _AFTER_S = 1.0, 0.5  # of the simulated onset
+_FEWEST_BINS = 4  # that the simulated slip lasts at least, whatever the rate
+_SPARE = 10  # samples that the simulator may leave out at the ends
+_QUIET_V = 2e-3  # twice the least range of a channel of a detector of simulated recordings
+_DECISIONS = 12  # of the stream, at least
+_STATISTIC = {"float32": 1e-3, "float64": 1e-8}  # by which it may differ, as a part of its range
+_LATE_S = 1e-9  # by which times may differ
+
+
+def check_model(
+    model: onnx.ModelProto, detector: SlipDetector, kind: GraphKind, precision: Precision
+) -> dict[str, Any]:
+    """Hold a model against its detector.
+
+    Args:
+        model: as written.
+        detector: that it was made of.
+        kind: of its graph.
+        precision: of its graph.
+
+    Returns:
+        What was measured, in JSON types; ``worst_sd`` is the largest score error on noise and on
+        the simulated slip, in standard deviations of the score.
+
+    Raises:
+        ValueError: for the first thing that is wrong, in one line.
+    """
+    run = runner(session_of(model))
+    check = check_bins if kind == "bin" else check_stream
+    return {
+        "against": "torch float64",
+        "torch": torch.__version__,
+        "onnxruntime": onnxruntime.__version__,
+        "simulated": True,
+        **check(run, detector, precision),
+    }
+
+
+def session_of(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+    """A session on one thread, optimised as onnxruntime does by default.
+
+    Raises:
+        ValueError: if onnxruntime cannot load the model.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.log_severity_level = 4  # what is wrong is raised
+    content = model.SerializeToString()
+    try:
+        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's errors have no other base in common
+        raise ValueError(f"onnxruntime cannot load it: {_first_line(error)}") from error
+
+
+def runner(session: onnxruntime.InferenceSession) -> Run:
+    """The model as a function of arrays by name.
+
+    Raises:
+        ValueError: by the function, if the model cannot be run on what it is given.
+    """
+    names = [output.name for output in session.get_outputs()]
+
+    def run(inputs: Arrays) -> dict[str, NDArray[Any]]:
+        try:
+            return dict(zip(names, session.run(names, dict(inputs)), strict=True))
+        except Exception as error:
+            shapes = ", ".join(f"{name} {list(x.shape)}" for name, x in inputs.items())
+            raise ValueError(
+                f"onnxruntime cannot run it on {shapes}: {_first_line(error)}"
+            ) from error
+
+    return run
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+# Bins ------------------------------------------------------------------------------------------
+
+
+def check_bins(run: Run, detector: SlipDetector, precision: Precision) -> dict[str, Any]:
+    """Hold a bin graph, as a function of its inputs, against the detector; as ``check_model``."""
+    hand, dtype = detector.pool.hand, getattr(torch, precision)
+    length, unit = RawBin.of(detector).length, _unit_of(detector)
+    slip = unit * simulated_bins(hand, detector.pool.sample_rate_hz, _SIMULATED, length, dtype)
+    compare = _BinComparison(run, detector, precision, slip)
+    worst = compare(slip, "simulated bins")
+    for seed, batch in enumerate(_BATCHES):
+        worst = max(worst, compare(unit * noise_bins(hand, batch, length, seed, dtype), "noise"))
+    of_kind = {}
+    for kind in DEGENERATE:
+        bins = degenerate_bins(hand, kind, _EACH, length, dtype)
+        of_kind[kind] = compare(bins, f"degenerate bins ({kind})", degenerate=True)
+        mixed = torch.cat([bins[:1], slip[:_EACH]])  # where a graph may go another way
+        compare(mixed, f"simulated bins behind a degenerate one ({kind})", behind=1)
+    of_mask = {}
+    for name, mask in _masks(detector).items():
+        what = f"simulated bins without {name}"
+        of_mask[name] = compare(slip, what, degenerate=True, mask=mask)
+    return {
+        "bins": len(slip) + sum(_BATCHES),
+        "score_sd": compare.sd,
+        "worst_sd": worst,
+        "degenerate_worst_sd": of_kind,
+        "masked_worst_sd": of_mask,
+    }
+
+
+class _BinComparison:
+    """Bins scored by a graph, and by its detector in float64.
+
+    Args:
+        run: the graph.
+        detector: that it was made of.
+        precision: of the graph.
+        usual: bins whose scores tell the unit of errors.
+    """
+
+    def __init__(
+        self, run: Run, detector: SlipDetector, precision: Precision, usual: Tensor
+    ) -> None:
+        self._run, self._precision = run, precision
+        self._detector = copy.deepcopy(detector).double()
+        self._calibrated = calibration_of(detector)
+        raw = RawBin.of(detector)  # what no filter in use takes in is 0
+        self._context = detector.context_before - raw.before, detector.context_after - raw.after
+        self.sd = float(self._predict(usual.double(), None).score.std()) or 1.0
+
+    def __call__(
+        self,
+        samples: Tensor,
+        what: str,
+        *,
+        degenerate: bool = False,
+        behind: int = 0,
+        mask: Tensor | None = None,
+    ) -> float:
+        """The worst score error, in standard deviations, of those that rounding does not decide.
+
+        Args:
+            samples: raw bins of the channels of the hand.
+            what: they are, for messages.
+            degenerate: whether the larger tolerance counts.
+            behind: so many bins, the scores are compared.
+            mask: masked channels.
+
+        Raises:
+            ValueError: if anything differs by more than it may.
+        """
+        exact = self._predict(samples.double(), mask)
+        # a channel is trusted by what its samples resolve in the precision they come in
+        is_valid = self._predict(samples, mask).is_valid.numpy()
+        feeds = {"samples": samples.numpy()}
+        try:
+            got = self._run(feeds if mask is None else feeds | {"masked_channels": mask.numpy()})
+        except ValueError as error:
+            raise ValueError(f"{what}: {error}") from error
+        wanted = {"score": f"{self._precision}[{len(samples)}]", "valid": f"bool[{len(samples)}]"}
+        if self._calibrated is not None:
+            wanted["probability"] = wanted["score"]
+        _check_outputs(got, wanted, what)
+        score = got["score"].astype(np.float64)
+        if not np.isfinite(score).all():
+            raise ValueError(f"{what}: {(~np.isfinite(score)).sum()} scores are not finite")
+        if wrong := int((got["valid"] != is_valid).sum()):
+            raise ValueError(f"{what}: valid differs from torch on {wrong} of {len(score)} bins")
+        off = np.abs(score - exact.score.numpy())[behind:] / self.sd
+        worst = (WORST_DEGENERATE_SD if degenerate else WORST_SD)[self._precision]
+        if degenerate and mask is None and not (off <= worst).all():
+            off = np.where(self._rounding_decides(samples, exact.score, worst), 0.0, off)
+        if not (found := float(off.max(initial=0.0))) <= worst:
+            raise ValueError(
+                f"{what}: scores differ from torch in float64 by {found:.1e} of their standard "
+                f"deviation, more than {worst:g}"
+            )
+        if self._calibrated is not None:
+            calibration, slip_share = self._calibrated
+            llr = widened_llr(calibration, torch.from_numpy(score), exact.variance.double())
+            unstated = np.abs(got["probability"] - probability(llr, slip_share).numpy())
+            _refuse(unstated, WORST_PROBABILITY[self._precision], "", f"{what}: probability")
+        return found
+
+    def _predict(self, samples: Tensor, mask: Tensor | None) -> Prediction:
+        with torch.no_grad():
+            return self._detector.predict_raw(pad(samples, self._context), masked_channels=mask)
+
+    def _rounding_decides(self, samples: Tensor, score: Tensor, worst: float) -> NDArray[np.bool_]:
+        """Bins ``[N]`` whose score moves by more than it may where samples move by their rounding.
+
+        Such as the sign of a mean of 0, by which the coefficient of variation takes its own, or a
+        step between values of few digits. Samples move by 4 eps of the largest of their channel,
+        together and each by itself, up and down: a constant stays one.
+        """
+        x = samples.double()
+        size = x.nan_to_num(0.0, 0.0, 0.0).abs().amax(-1, keepdim=True)
+        size = 4 * torch.finfo(x.dtype).eps * size
+        generator = torch.Generator().manual_seed(0)
+        drawn = 2 * torch.rand((4, *x.shape), generator=generator, dtype=x.dtype) - 1
+        moves = [size, -size, *(size * drawn), *(-size * drawn)]
+        moved = torch.stack([self._predict(x + move, None).score for move in moves])
+        return ((moved - score).abs() > worst * self.sd).any(0).numpy()
+
+
+def _check_outputs(got: Arrays, wanted: Mapping[str, str], what: str) -> None:
+    """Refuse outputs that differ from what is wanted, name by name, such as ``float32[7]``."""
+    found = {name: f"{array.dtype}{list(array.shape)}" for name, array in got.items()}
+    if odd := sorted(n for n in found.keys() | wanted.keys() if found.get(n) != wanted.get(n)):
+        gives, expected = (
+            ", ".join(f"{name} {each.get(name, 'missing')}" for name in odd)
+            for each in (found, wanted)
+        )
+        raise ValueError(f"{what}: it gives {gives}, expected {expected}")
+
+
+def _refuse(off: NDArray[Any], most: float, unit: str, what: str) -> None:
+    if not (found := float(off.max(initial=0.0))) <= most:
+        raise ValueError(f"{what} differs from torch by {found:.1e} {unit}, more than {most:g}")
+
+
+# Streams ---------------------------------------------------------------------------------------
+
+_FLAGS, _TIMES = ("valid", "alarm", "on"), ("time_s", "onset_s")
+
+
+def check_stream(run: Run, detector: SlipDetector, precision: Precision) -> dict[str, Any]:
+    """Hold a stream graph, as a function of its inputs, against the detector; as ``check_model``.
+
+    The simulated slip is repeated as often as a long hop asks for.
+    """
+    settings = AlarmSettings.of(detector)
+    timing = Timing.of(detector, settings)
+    slip = simulated_stream(
+        detector.pool.hand,
+        detector.pool.sample_rate_hz,
+        getattr(torch, precision),
+        _FEWEST_BINS * max(timing.first, timing.frame),
+    )
+    num = max(slip.shape[1], max(timing.first, timing.frame) + _DECISIONS * timing.hop)
+    samples = _unit_of(detector) * slip.T[torch.arange(num) % slip.shape[1]]
+    compare = _StreamComparison(run, detector, precision, samples)
+    generator = np.random.default_rng(0)
+    anyhow = np.cumsum(generator.integers(0, 400, num) * (generator.random(num) < 0.8))
+    cuts: dict[str, Sequence[int]] = {
+        "whole": [],
+        "by hop": range(timing.hop, num, timing.hop),
+        "by sample": range(min(num, 300)),
+        "anyhow": [0, *(int(cut) for cut in anyhow if cut < num)],
+    }
+    worst = max(compare(samples, settings, cut, f"cut {name}") for name, cut in cuts.items())
+    by_hop = cuts["by hop"]
+    middling = replace(settings, threshold=_middle_threshold(compare.usual["statistic"]))
+    compare(samples, middling, by_hop, "another threshold")
+    broken = _broken(samples, detector.needed_index.tolist())
+    mask = _masks(detector)["every other"]
+    return {
+        "decisions": len(compare.usual["score"]),
+        "alarms": int(compare.usual["alarm"].sum()),
+        "score_sd": compare.sd,
+        "worst_sd": worst,
+        "broken_worst_sd": compare(broken, settings, by_hop, "broken channels", degenerate=True),
+        "masked_worst_sd": compare(
+            samples, settings, by_hop, "masked channels", degenerate=True, mask=mask
+        ),
+    }
+
+
+class _StreamComparison:
+    """A stream watched by a graph, and by its detector in float64.
+
+    Args:
+        run: the graph.
+        detector: that it was made of.
+        precision: of the graph.
+        usual: samples ``[T, C]`` whose scores tell the unit of errors.
+
+    Attributes:
+        usual: what the detector says of them, under the graph's names.
+        sd: standard deviation of their scores.
+    """
+
+    def __init__(
+        self, run: Run, detector: SlipDetector, precision: Precision, usual: Tensor
+    ) -> None:
+        self._run, self._precision = run, precision
+        self._detector = copy.deepcopy(detector).double()
+        settings = AlarmSettings.of(detector)
+        self._timing = Timing.of(detector, settings)
+        self.usual = self._expected(usual, settings, ())
+        self.sd = float(self.usual["score"].std()) or 1.0
+
+    def __call__(
+        self,
+        samples: Tensor,
+        settings: AlarmSettings,
+        cuts: Sequence[int],
+        what: str,
+        *,
+        degenerate: bool = False,
+        mask: Tensor | None = None,
+    ) -> float:
+        """The worst score error, in standard deviations.
+
+        Args:
+            samples: of all channels, ``[T, C]``.
+            settings: whose threshold the graph is given.
+            cuts: places where a piece of the stream ends and the next begins.
+            what: it is, for messages.
+            degenerate: whether the larger tolerance counts.
+            mask: masked channels.
+
+        Raises:
+            ValueError: if anything differs by more than it may.
+        """
+        expected = self._expected(samples, settings, () if mask is None else mask)
+        got = self._watched(samples.numpy(), settings.threshold, cuts, mask, what)
+        num = len(expected["score"])
+        for name in _FLAGS:
+            if places := np.flatnonzero(got[name] != expected[name]).tolist():
+                raise ValueError(
+                    f"{what}: {name} differs from torch at {len(places)} of {num} decisions, the "
+                    f"first at {expected['time_s'][places[0]]:.3f} s"
+                )
+        for name in _TIMES:
+            _refuse(np.abs(got[name] - expected[name]), _LATE_S, "s", f"{what}: {name}")
+        score, precision = got["score"].astype(np.float64), self._precision
+        error = np.abs(score - expected["score"]) / self.sd
+        worst = WORST_DEGENERATE_SD if degenerate else WORST_SD
+        _refuse(error, worst[precision], "standard deviations", f"{what}: score")
+        tells = expected["statistic"] > -1e30  # before that a rule has seen too few decisions
+        statistic = expected["statistic"][tells]
+        span = float(np.ptp(statistic)) if len(statistic) else 0.0
+        off = np.abs(got["statistic"][tells] - statistic) / (span or 1.0)
+        _refuse(off, _STATISTIC[precision], "of its range", f"{what}: statistic")
+        stated = probability(settings.calibration.llr(torch.from_numpy(score)), settings.slip_share)
+        off = np.abs(got["probability"] - stated.numpy())[got["valid"]]
+        _refuse(off, WORST_PROBABILITY[precision], "", f"{what}: probability")
+        return float(error.max(initial=0.0))
+
+    def _watched(
+        self,
+        samples: NDArray[Any],
+        threshold: float,
+        cuts: Sequence[int],
+        mask: Tensor | None,
+        what: str,
+    ) -> dict[str, NDArray[Any]]:
+        """All columns, by a host that hands on tail and state and nothing else."""
+        timing, precision = self._timing, self._precision
+        feeds = {
+            "tail": samples[:0],
+            "state": np.empty(0),
+            "threshold": np.array([threshold]),
+        }
+        if mask is not None:
+            feeds["masked_channels"] = mask.numpy()
+        pieces = []
+        for start, stop in pairwise([0, *cuts, len(samples)]):
+            got = self._run(feeds | {"samples": samples[start:stop]})
+            num = timing.decisions(stop) - timing.decisions(start)
+            wanted = dict.fromkeys(self.usual, f"{precision}[{num}]")
+            wanted |= dict.fromkeys(_FLAGS, f"bool[{num}]")
+            wanted |= dict.fromkeys(_TIMES, f"float64[{num}]")
+            wanted["next_tail"] = f"{precision}{[timing.tail, samples.shape[1]]}"
+            wanted["next_state"] = f"float64{[timing.state_size]}"
+            _check_outputs(got, wanted, f"{what}: at sample {stop}")
+            feeds["tail"], feeds["state"] = got.pop("next_tail"), got.pop("next_state")
+            pieces.append(got)
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+    def _expected(
+        self, samples: Tensor, settings: AlarmSettings, mask: ChannelMask
+    ) -> dict[str, NDArray[Any]]:
+        """What the detector says, under the graph's names."""
+        stream, in_its_own = (
+            StreamingDetector(self._detector, settings, dtype=dtype, masked_channels=mask)
+            for dtype in (torch.float64, samples.dtype)
+        )
+        decisions = stream.push(samples)
+        columns = {
+            "score": decisions.score,
+            "probability": decisions.probability,
+            "statistic": decisions.statistic,
+            # a channel is trusted by what its samples resolve in the precision they come in
+            "valid": in_its_own.push(samples).is_valid,
+            "alarm": decisions.is_alarm,
+            "on": decisions.is_on,
+            "time_s": decisions.available_s,
+            "onset_s": decisions.onset_s,
+        }
+        return {name: column.numpy() for name, column in columns.items()}
+
+
+def _middle_threshold(statistic: NDArray[Any]) -> float:
+    """A threshold that the statistic crosses, in the widest gap between its middling values."""
+    low, high = np.quantile(statistic, [0.5, 0.95])
+    values = np.unique(statistic[(low <= statistic) & (statistic <= high)])
+    if len(values) < 2:
+        return float(low)
+    widest = int(np.diff(values).argmax())
+    return float(values[widest : widest + 2].mean())
+
+
+# Signals ---------------------------------------------------------------------------------------
+
+
+def noise_bins(hand: HandLayout, num: int, length: int, seed: int, dtype: torch.dtype) -> Tensor:
+    """Noise of sizes from 1 V to 1 mV, slow channels on an offset: ``[num, C, length]``, volts."""
+    generator = torch.Generator().manual_seed(seed)
+    size = 10 ** torch.linspace(0, -3, num, dtype=torch.float64)[:, None, None]
+    noise = torch.randn(num, len(hand), length, generator=generator, dtype=torch.float64)
+    samples = size * noise
+    samples[:, list(hand.slow)] += 1.0
+    return samples.to(dtype)
+
+
+def degenerate_bins(
+    hand: HandLayout, kind: str, num: int, length: int, dtype: torch.dtype
+) -> Tensor:
+    """Bins of one kind of ``DEGENERATE``, ``[num, C, length]``, volts.
+
+    ``"nan"`` and the infinities are one sample of one channel of noise, another in each bin.
+    """
+    seed = DEGENERATE.index(kind)
+    generator = torch.Generator().manual_seed(seed)
+    if kind in EXTREMES:
+        return extreme_bins(kind, (num, len(hand), length), generator, dtype)
+    samples = noise_bins(hand, num, length, seed, dtype)
+    if kind == "step":
+        edge = torch.randint(length, (num, len(hand), 1), generator=generator)
+        return torch.where(torch.arange(length) < edge, 0.0, RAIL_V).to(dtype)
+    if kind == "all nan":
+        return samples.fill_(torch.nan)
+    channels = torch.randint(len(hand), (num,), generator=generator)
+    places = torch.randint(length, (num,), generator=generator)
+    samples[torch.arange(num), channels, places] = float(kind)
+    return samples
+
+
+def simulated_stream(
+    hand: HandLayout, sample_rate_hz: float, dtype: torch.dtype, at_least: int = 0
+) -> Tensor:
+    """A slip as the simulator records it, ``[C, T]``, volts; 1 s before its onset, .5 s behind.
+
+    Of another hand than the simulated one, each channel is the next that adapts as it does. Where
+    that makes fewer samples than ``at_least``, the rate is that at which it makes so many: what a
+    model is tried on must fill bins, not keep time.
+    """
+    simulated = HandLayout.paper24()
+    places = {"slow": cycle(simulated.slow), "fast": cycle(simulated.fast)}
+    rows = [next(places[str(channel.adapting)]) for channel in hand.channels]
+    fewest = (at_least + _SPARE) / (_BEFORE_S + _AFTER_S)
+    return _simulated(max(sample_rate_hz, fewest))[rows].to(dtype)
+
+
+def simulated_bins(
+    hand: HandLayout, sample_rate_hz: float, num: int, length: int, dtype: torch.dtype
+) -> Tensor:
+    """Bins of the simulated slip, evenly spread over it: ``[num, C, length]``, volts."""
+    samples = simulated_stream(hand, sample_rate_hz, dtype, _FEWEST_BINS * length)
+    starts = torch.linspace(0, samples.shape[-1] - length, num).long()
+    return samples.unfold(-1, length, 1)[:, starts].movedim(1, 0).contiguous()
+
+
+@lru_cache(maxsize=1)
+def _simulated(sample_rate_hz: float) -> Tensor:
+    """Of the whole hand, float64; not to be written to."""
+    scene = Scene("M1", seed=1, sample_rate_hz=sample_rate_hz)
+    onset_s = simulate(scene, windows=[]).onsets_s[0]
+    window = (onset_s - _BEFORE_S, onset_s + _AFTER_S)
+    samples = simulate(scene, windows=[window], dtype=torch.float64).samples
+    return samples[:, samples.isfinite().all(0)]
+
+
+def _broken(samples: Tensor, needed: Sequence[int]) -> Tensor:
+    """Samples ``[T, C]`` with a channel that dies, one that tears off, and lost instants."""
+    broken, sixth = samples.clone(), len(samples) // 6
+    broken[sixth : 2 * sixth, needed[0]] = broken[sixth, needed[0]]
+    broken[3 * sixth : 4 * sixth, needed[-1]] = torch.inf
+    broken[5 * sixth : 5 * sixth + 30] = torch.nan
+    return broken
+
+
+def _masks(detector: SlipDetector) -> dict[str, Tensor]:
+    """Masks ``[C]`` of channels by name: the first in use, every other one, all of them."""
+    used, none = detector.needed_index, torch.zeros(len(detector.pool.hand), dtype=torch.bool)
+    chosen = {"the first": used[:1], "every other": used[::2], "all": used}
+    return {name: none.index_fill(0, own, True) for name, own in chosen.items()}
+
+
+def _unit_of(detector: SlipDetector) -> float:
+    """What a volt is to a detector, a power of 2 from 1 on.
+
+    A detector that leaves out channels which hardly move was trained in some unit; in what it is
+    tried on, something must move by it.
+    """
+    least = None if detector.pooling is None else detector.pooling.least_range
+    quietest = 0.0 if least is None or not len(least) else float(least.max()) / _QUIET_V
+    return 2.0 ** max(math.ceil(math.log2(quietest)), 0) if quietest > 0 else 1.0

@@ -1,0 +1,283 @@
+"""From features to scores and probabilities, as nodes: pooling, scaling, head, missing channels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tactslip_torch.deploy.value import F32, F64, I64, Value
+from tactslip_torch.features.pooling import over_channels
+from tactslip_torch.model.calibration import (
+    LARGEST_LLR,
+    LARGEST_SCORE,
+    Calibration,
+    Isotonic,
+    Platt,
+)
+from tactslip_torch.model.detector import SlipDetector
+from tactslip_torch.model.kernels import Head, KernelSum, Polynomial, QuadraticForm
+from tactslip_torch.model.missing_channels import ClassGaussians
+from tactslip_torch.model.scaling import FeatureScaler
+
+_LARGEST = float(np.finfo(np.float64).max)
+
+
+def scored(
+    features: Value, is_missing: Value, detector: SlipDetector, dtype: np.dtype[Any]
+) -> tuple[Value, Value | None]:
+    """Scores, and their variance: None of a detector that knows of none.
+
+    Args:
+        features: of channels, float64; anything where missing.
+        is_missing: which channels in use are, bool.
+        detector: whose columns, scaler and head.
+        dtype: of scores.
+
+    Shape:
+        - features: ``[B, M]``; is_missing: ``[B, channels in use]``
+        - scores: ``[B]``; variance: ``[B]``, float64
+    """
+    head, gaussians = detector.head, detector.gaussians
+    channels = detector.extractor.plan.channels
+    z = _scaled(_pooled(features, is_missing, detector), detector.scaler)
+    # a column that is pooled is of no channel; a product is quicker than to pick flags
+    of_channel = np.equal.outer(np.array(channels), detector.channel_index.numpy())
+    is_lost = is_missing.cast(F32) @ of_channel > 0.0  # [B, K]
+    score = _machine(is_lost.graph.where(is_lost, _float64(z, detector.imputation), z), head, dtype)
+    if gaussians is None or not isinstance(head, QuadraticForm):
+        return score, None
+    return _expected_scores(score, z, is_lost, head, gaussians)
+
+
+def _pooled(features: Value, is_missing: Value, detector: SlipDetector) -> Value:
+    """Columns for the scaler, ``[B, K]``, float64: ``ChannelPooling``; without one as they are."""
+    layer, graph = detector.pooling, features.graph
+    if layer is None:
+        return features
+    used = detector.extractor.plan.channels
+    columns, is_some = list[Any](), list[Value]()
+    if layer.singles:
+        columns.append(features.take(layer.singles, 1))
+    for index, group in enumerate(layer.groups):
+        num = len(group.channels)
+        least = float(layer.least_range[index])
+        is_lost = is_missing.take([used.index(channel) for channel in group.channels], 1)
+        in_use: Any = ~((features.take(group.ranges, 1) < least) | is_lost)
+        is_some.append(in_use.any(1, keepdim=True))
+        values = features.take(group.columns, 1).reshape(0, len(group.families), num)
+        knee = layer.knee[list(group.families), None].double()
+        bent: Any = (values.abs() * (1 / knee) + 1.0).log() * values.sign() * knee
+        columns += over_channels(bent, in_use.unsqueeze(1), group.statistics, num)
+    always = is_some[0] | ~is_some[0]
+    known = graph.concat(*is_some, always, axis=1).cast(F32).take(layer.kind_of, 1) > 0.0
+    made = graph.concat(*columns, axis=1).take(layer.order, 1)
+    return graph.where(known, made, _float64(made, layer.fill))
+
+
+def _scaled(features: Value, scaler: FeatureScaler) -> Value:
+    """Features in [-1, 1], ``[B, K]``, float64: ``FeatureScaler``.
+
+    ONNX has no ``log1p``: the knee becomes ``Log(1 + x)``, off by some eps of the knee.
+    """
+    least, width = scaler.minimum.double(), (scaler.maximum - scaler.minimum).double()
+    is_point = width == 0
+    slope = torch.where(is_point, 0.0, 2 / width.masked_fill(is_point, 1.0))
+    offset = torch.where(is_point, 0.0, -1 - slope * least)
+    if bool(is_point.any()):  # 0 times Inf
+        features = features.clamp(-_LARGEST, _LARGEST)
+    if scaler.knee is not None:
+        knee = scaler.knee.double()
+        slope = slope * knee
+        features = (features.abs() * (1 / knee) + 1.0).log() * features.sign()
+    return (features * slope + _float64(features, offset)).clamp(-1.0, 1.0)
+
+
+def _machine(z: Value, head: Head, dtype: np.dtype[Any]) -> Value:
+    """The score of scaled features: ``[B, K] -> [B]``.
+
+    A quadratic form is computed in the dtype of scores. The sum over training bins of a kernel that
+    does not fold cancels, so it is float64 always.
+    """
+    if isinstance(head, KernelSum):
+        score = _kernel_sum(z, head)
+    else:
+        z = z.cast(dtype)
+        pull: Value = z.graph.constant(head.linear.double(), dtype)
+        if not head.is_linear:
+            pull = z @ head.quadratic.double() + pull
+        score = (pull * z).sum(1) + float(head.constant)
+    largest = float(np.finfo(dtype).max)
+    return score.clamp(-largest, largest).cast(dtype)
+
+
+def _kernel_sum(z: Value, head: KernelSum) -> Value:
+    support, kernel = head.support.double(), head.kernel
+    gram = z @ support.T.double()
+    if isinstance(kernel, Polynomial):
+        base = gram + kernel.offset
+        values = base
+        for _ in range(kernel.degree - 1):
+            values = values * base
+    else:
+        norms = _float64(z, support.square().sum(-1))
+        squares = (z * z).sum(1, keepdim=True) + norms - gram * 2.0
+        values = (squares.clamp(min=0.0) * -kernel.gamma).exp()
+    return (values @ head.beta[:, None].double()).squeeze(1)
+
+
+# Missing channels ------------------------------------------------------------------------------
+
+
+def _expected_scores(
+    score: Value, z: Value, is_lost: Value, head: QuadraticForm, gaussians: ClassGaussians
+) -> tuple[Value, Value]:
+    """Expected scores and variances (``model.missing_channels``); 0 of bins that miss nothing.
+
+    ONNX has no solver. The precision of the features is swept on those that are missing, one after
+    the other (``Scan``): a step is one term of rank one, so all of it is exact, of as many steps as
+    features are missing, and of the memory of one mask however many bins come. Bins that miss the
+    same as the one before share its matrices. Where nothing is missing, none of it is run.
+    """
+    graph, num = score.graph, head.num_features
+
+    def bin_by_bin() -> list[Value]:
+        rows = [graph.where(is_lost, 0.0, z), is_lost.cast(F64), score.cast(F64)]
+        no_mask = graph.constant([-1.0] * num, F64)  # no bin has it
+        zeros = graph.constant([0.0, 0.0], F64)
+        start = [no_mask, graph.constant(np.zeros((2, num, num)), F64), zeros, zeros, zeros]
+        shapes = [(num,), (2, num, num), (2,), (2,), (2,), (num,), (num,), ()]
+        _, (mean, variance) = graph.scan(one_bin, start, rows, shapes)
+        largest = float(np.finfo(score.dtype).max)
+        return [mean.clamp(-largest, largest).cast(score.dtype), variance]
+
+    def one_bin(before: list[Value], row: list[Value]) -> tuple[list[Value], list[Value]]:
+        own_z, own_lost, own_score = row
+
+        def missing() -> list[Value]:
+            is_same = (own_lost - before[0]).abs().amax(0) <= 0.0
+            mask = graph.if_(is_same, lambda: before, lambda: _swept(own_lost, head, gaussians))
+            return [*mask, *_expected(own_z, mask, head, gaussians)]
+
+        def whole() -> list[Value]:
+            return [*before, own_score, graph.constant(0.0, F64)]
+
+        made = graph.if_(own_lost.amax(0) > 0.0, missing, whole)
+        return made[:-2], made[-2:]
+
+    is_any = is_lost.cast(I64).amax(1).amax(0) > 0
+    mean, variance = graph.if_(is_any, bin_by_bin, lambda: [score, score.cast(F64) * 0.0])
+    return mean, variance
+
+
+def _swept(is_lost: Value, head: QuadraticForm, gaussians: ClassGaussians) -> list[Value]:
+    """What a mask makes of both classes, behind the mask itself ``[K]``, 1 or 0.
+
+    The swept precision ``[2, K, K]``, the log determinant of the observed covariance ``[2]``, and
+    what the missing features add to the mean and to the variance of a score, ``[2]`` each.
+    """
+    graph, (precision, log_det_of_all) = is_lost.graph, gaussians.precision()
+    count = np.arange(head.num_features)
+    places = graph.op("NonZero", is_lost > 0.0, dtype=I64).squeeze(0)
+
+    def on_one(state: list[Value], row: list[Value]) -> tuple[list[Value], list[Value]]:
+        swept, log_det = state
+        unit = graph.constant(count, I64).eq(row[0]).cast(F64)  # [K]
+        column = graph.op("Gather", swept, row[0], axis=2)  # [2, K]
+        pivot = (column * unit).sum(1, keepdim=True)
+        away = column - unit
+        corner = unit.unsqueeze(1) * unit.unsqueeze(0) * 2.0
+        after = swept - (away / pivot).unsqueeze(2) * away.unsqueeze(1) - corner
+        return [after, log_det + pivot.log().squeeze(1)], []
+
+    start = [_float64(is_lost, precision), _float64(is_lost, -log_det_of_all)]
+    shapes = [(2, len(count), len(count)), (2,), ()]
+    (swept, log_det), _ = graph.scan(on_one, start, [places], shapes)
+    bend = _float64(is_lost, head.dense_quadratic) * is_lost.unsqueeze(1) * is_lost
+    bent = bend @ swept
+    spread = (bent * bent.transpose(0, 2, 1)).sum(2).sum(1) * 2.0
+    return [is_lost, swept, log_det, -(bend * swept).sum(2).sum(1), spread]
+
+
+def _expected(
+    z: Value, mask: Sequence[Value], head: QuadraticForm, gaussians: ClassGaussians
+) -> list[Value]:
+    """Mean and variance of the score of one bin, both ``[]``."""
+    is_lost, swept, log_det, lift, spread = mask
+    is_seen = 1.0 - is_lost
+    middle, linear = _float64(z, gaussians.mean), _float64(z, head.linear)
+    away = (z - middle) * is_seen  # [2, K]
+    turned = (swept @ away.unsqueeze(2)).squeeze(2)
+    filled = z * is_seen + (middle - turned) * is_lost
+    evidence = ((turned * away).sum(1) + log_det) * -0.5
+    pull = filled @ _float64(z, head.dense_quadratic)
+    mean = ((pull + linear) * filled).sum(1) + float(head.constant) + lift
+    slope = (pull * 2.0 + linear) * is_lost
+    variance = spread - ((swept @ slope.unsqueeze(2)).squeeze(2) * slope).sum(1)
+    weight = evidence.softmax(0)
+    total = (weight * mean).sum(0)
+    apart = mean - total
+    return [total, (weight * (variance + apart * apart)).sum(0)]
+
+
+# Calibration -----------------------------------------------------------------------------------
+
+
+def llr_of(score: Value, calibration: Calibration, variance: Value | None = None) -> Value:
+    """Log likelihood ratios of finite scores, in float64 and rounded once.
+
+    Args:
+        score: expected.
+        calibration: from a score to its ratio.
+        variance: of the score, float64; ``model.calibration.widened_llr``.
+
+    Shape:
+        - score, variance, output: ``[*]``
+
+    Raises:
+        ValueError: for a calibration other than ``Platt`` and ``Isotonic``.
+    """
+    if variance is None:
+        return _certain_llr(score, calibration)
+    llr, wide, away = _certain_llr(score, calibration), score.cast(F64), variance.sqrt()
+    spread = _certain_llr(wide + away, calibration) - _certain_llr(wide - away, calibration)
+    widened = llr.cast(F64) / (spread * spread * (math.pi / 32) + 1.0).sqrt()
+    return widened.cast(score.dtype)
+
+
+def _certain_llr(score: Value, calibration: Calibration) -> Value:
+    wide = score.cast(F64)
+    match calibration:
+        case Platt(slope, offset):
+            line = wide.clamp(-LARGEST_SCORE, LARGEST_SCORE) * slope + offset
+            return line.clamp(-LARGEST_LLR, LARGEST_LLR).cast(score.dtype)
+        case Isotonic(scores, llrs):
+            return _between_knots(wide, scores, llrs).cast(score.dtype)
+    raise ValueError(f"expected a calibration Platt or Isotonic, got {calibration!r}")
+
+
+def _between_knots(score: Value, scores: Sequence[float], llrs: Sequence[float]) -> Value:
+    inside = score.clamp(scores[0], scores[-1])
+    if len(scores) == 1:
+        return inside * 0.0 + llrs[0]
+    is_right = inside.unsqueeze(-1) > score.graph.constant(scores, F64)  # [k, knots]
+    place = (is_right.cast(I64).sum(-1) - 1).clamp(0, len(scores) - 2)  # of the knot to the left
+    tables = scores[:-1], np.diff(scores), llrs[:-1], llrs[1:]
+    x, width, left, right = (place.entries_of(table) for table in tables)
+    share, rise = (inside - x) / width, right - left
+    return score.graph.where(share < 0.5, left + share * rise, right - rise * (1.0 - share))
+
+
+def probability_of(llr: Value, slip_share: float) -> Value:
+    """How probable slip is where this share of all bins is slip: ``[*] -> [*]``."""
+    odds = math.log(slip_share) - math.log1p(-slip_share)
+    return (llr + odds if odds else llr).sigmoid()
+
+
+def _float64(like: Value, x: Tensor) -> Value:
+    """A tensor as a constant in float64, in the graph of a value."""
+    return like.graph.constant(x.double(), F64)

@@ -1,0 +1,328 @@
+"""Recordings in and out of a detector's sums: compared with refits, and undone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tactslip_torch.features.bin_sample import BinSample, bin_keys
+from tactslip_torch.model.fit import TrainingBins, fit_machine
+from tactslip_torch.model.kernels import Polynomial
+from tactslip_torch.model.moments import SufficientStats
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.training import adaptation
+from tactslip_torch.training.adaptation import (
+    FACTORS,
+    AccuracyChange,
+    KnownBins,
+    Machine,
+    RecordingBins,
+    Statistics,
+    add,
+    class_scales,
+    forget,
+    mean_recall,
+    solve,
+)
+from tactslip_torch.training.plan import Plan, TrainingPass
+from tactslip_torch.training.recipe import FeatureSelection, Recipe
+
+K, NUM_BINS = 3, 24
+MACHINE = Machine(0.05, 0.5, "weights")
+
+
+def recording(material, seed, num_bins=NUM_BINS, turn=0.0):
+    """Bins whose class depends on the first feature or, as far as ``turn`` says, on the second."""
+    rng = np.random.default_rng(seed)
+    z = torch.from_numpy(rng.uniform(-1, 1, (num_bins, K)))
+    level = (1 - turn) * z[:, 0] + turn * z[:, 1] + 0.4 * z[:, 0] * z[:, 2]
+    is_slip = level + 0.2 * torch.from_numpy(rng.standard_normal(num_bins)) > -0.3
+    return RecordingBins(material, z, is_slip, f"{material} {seed}")
+
+
+def recordings(material, number, first_seed, turn=0.0):
+    return {
+        f"{material}/{i}": recording(material, first_seed + i, turn=turn) for i in range(number)
+    }
+
+
+def without_slip(own):
+    return replace(own, z=own.z[~own.is_slip], is_slip=own.is_slip[~own.is_slip])
+
+
+def statistics(trained):
+    """Of recordings whose bins are all in the rehearsal sample."""
+    sums = SufficientStats(K)
+    for name, own in trained.items():
+        sums.update(name, own.z, own.is_slip)
+    sizes = torch.tensor([len(own.z) for own in trained.values()])
+    ones = torch.ones(int(sizes.sum()), dtype=torch.float64)
+    rehearsal = KnownBins(
+        torch.cat([own.z for own in trained.values()]),
+        torch.cat([own.is_slip for own in trained.values()]),
+        ones,
+        ones,
+        torch.arange(len(trained)).repeat_interleave(sizes),
+        tuple(trained),
+        tuple(own.material for own in trained.values()),
+    )
+    return Statistics(sums, MACHINE, {"bin_ms": 50.0}, rehearsal, "digest")
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return recordings("a", 4, 0) | recordings("b", 4, 10) | recordings("c", 4, 20, turn=0.1)
+
+
+@pytest.fixture(scope="module")
+def old(trained):
+    return statistics(trained)
+
+
+@pytest.fixture(scope="module")
+def before(old):
+    return solve(old)
+
+
+@pytest.fixture(scope="module")
+def new():
+    return recordings("new", 3, 100, turn=1.0)
+
+
+def assert_same(one, other, folder, weight=1.0):
+    """Sums to what float64 keeps of bins beside some of this weight, the rest to the bit."""
+    tolerance = 1e-12 * max(1.0, weight)
+    torch.testing.assert_close(one.sums.sums, other.sums.sums, rtol=0, atol=tolerance)
+    assert torch.equal(one.sums.count, other.sums.count)
+    assert one.sums.seen_batches == other.sums.seen_batches
+    for name, each in (("one", one), ("other", other)):
+        replace(each, sums=other.sums).save(folder / name)
+    assert (folder / "one").read_bytes() == (folder / "other").read_bytes()
+
+
+# Machines ----------------------------------------------------------------------------------------
+
+
+def test_machine_and_scores_without_a_recording_are_those_of_refits(old, trained, new):
+    after = old.reweighed(dict.fromkeys(new, 2.5), new)
+    solved, scales, everyone = solve(after), class_scales(after), trained | new
+
+    def refitted_without(name, z):
+        kept = {other: own for other, own in everyone.items() if other != name}
+        is_slip = torch.cat([own.is_slip for own in kept.values()])
+        weight = torch.cat([torch.full((NUM_BINS,), 2.5 if n in new else 1.0) for n in kept])
+        weight = weight.double() * scales[is_slip.long()]
+        bins = TrainingBins(torch.cat([own.z for own in kept.values()]), is_slip, weight)
+        kernel = Polynomial(2, MACHINE.offset)
+        return fit_machine(bins, MACHINE.penalty, kernel, route="dual")(z)
+
+    z = recording("any", 5).z
+    torch.testing.assert_close(solved.head(z), refitted_without(None, z), rtol=1e-8, atol=1e-9)
+    for name in ("b/2", "new/1"):
+        found = solved.scores[solved.known.of_recordings([name])]
+        expected = refitted_without(name, everyone[name].z)
+        torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-9)
+
+
+def test_mean_recall_is_balanced_accuracy_or_that_of_the_one_class():
+    truth = torch.tensor([True, True, True, False])
+    assert mean_recall(torch.tensor([True, False, True, False]), truth) == pytest.approx(5 / 6)
+    assert mean_recall(truth, ~torch.zeros(4, dtype=torch.bool)) == pytest.approx(3 / 4)
+
+
+def test_a_change_of_accuracy_names_what_falls():
+    same = {"a": 0.9, "b": 0.8}
+    assert AccuracyChange(same, same).problem(0.0) is None
+    assert AccuracyChange({}, {}).problem(0.0) is None
+    fall = AccuracyChange(same, {"a": 0.88, "b": 0.8})
+    assert fall.problem(0.0101) is None
+    assert fall.problem(0.005).startswith("old materials fall from 85.00 to 84.00 %")
+    of_one = AccuracyChange(same | {"c": 0.7}, {"a": 0.95, "b": 0.75, "c": 0.7})
+    assert of_one.problem(0.01).startswith("b falls from 80.00 to 75.00 %")  # four times as much
+
+
+def test_known_bins_of_a_recording_give_way_to_those_that_changed(old, trained, new):
+    weights = {"a/0": 0.0} | dict.fromkeys(new, 3.0)
+    known = old.rehearsal.with_others({"a/0": trained["a/0"]} | new, weights)
+    assert not bool(known.of_recordings(["a/0"]).any())
+    assert set(known.weight[known.of_recordings(new)].tolist()) == {3.0}
+    assert len(known.z) == (len(trained) - 1 + len(new)) * NUM_BINS
+    assert known.material_names == ["a", "b", "c", "new"]
+    names = [known.recordings[i] for i in known.recording.tolist()]
+    materials = [known.material_names[i] for i in known.material.tolist()]
+    assert all(name.startswith(f"{of}/") for name, of in zip(names, materials, strict=True))
+
+
+def test_the_sample_of_training_holds_bins_that_were_trained_on(rng, monkeypatch):
+    ends = torch.zeros(2).double(), torch.ones(2).double()
+    selection = FeatureSelection((0, 2), FeatureScaler(*ends))
+    plan = Plan(Recipe(), selection, Polynomial(2, 0.5), 1.0, (1.0, 0.4), 1.0, 60, torch.zeros(2))
+    sample, gathered, kept = BinSample(30), TrainingPass(plan), {}
+    for name in ("m/0", "m/1"):
+        features = torch.from_numpy(rng.uniform(0, 1, (40, 4))).float()
+        is_slip = torch.arange(40) % 2 == 0
+        sample.update(name, "m", features, is_slip)
+        gathered.update(name, features, is_slip)
+        kept[name] = selection(features[~is_slip | (bin_keys(name, 40) < 0.4)])
+    monkeypatch.setattr(adaptation, "detector_digest", lambda detector: "digest")
+    materials = {"m/0": "m", "m/1": "m"}
+    found = Statistics.of_training(gathered, sample.bins(), materials, {}, None)
+    assert sorted(found.sums.seen_batches) == ["m/0", "m/1"]
+    known = found.rehearsal
+    for number, name in enumerate(known.recordings):
+        rows = known.z[known.recording == number]
+        assert len(rows) > 0
+        assert bool((rows[:, None] == kept[name]).all(-1).any(-1).all())
+    num_slip = sum(float(len(z) - 20) for z in kept.values())
+    assert 0.5 < float(known.sample_weight[known.is_slip].sum()) / num_slip < 2.0
+
+
+# In and out --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weight", [0.3, 31.9, 5000.0])
+@pytest.mark.parametrize("num_bins", [1, NUM_BINS])
+def test_bins_go_out_as_they_came_in(old, num_bins, weight, tmp_path):
+    own = recording("few", 61)
+    few = {"few/0": replace(own, z=own.z[:num_bins], is_slip=own.is_slip[:num_bins])}
+    there = old.reweighed({"few/0": weight}, few)
+    added = float(there.sums.weight.sum() - old.sums.weight.sum())
+    assert added == pytest.approx(num_bins * weight)
+    back = there.reweighed({"few/0": 0.5}).reweighed({"few/0": 0.0})
+    assert_same(replace(back, bins={}, weights={}), old, tmp_path, weight)
+
+
+def test_undone_steps_leave_no_trace(old, trained, new, tmp_path):
+    """One adds, one takes out recordings of training too, one brings others of a known name."""
+    file, states = torch.arange(5, dtype=torch.uint8), [old]
+    gone = {"b/1": trained["b/1"], "new/0": new["new/0"]}
+    for number, step in enumerate(
+        (
+            lambda at: add(at, solve(at), new, 2.0, margin=1.0),
+            lambda at: forget(at, solve(at), gone),
+            lambda at: add(at, solve(at), {"new/0": without_slip(new["new/0"])}, 3.0, margin=1.0),
+        )
+    ):
+        change = step(states[-1])
+        states.append(
+            states[-1].with_step(change.statistics, {}, file + number, f"digest {number}")
+        )
+    states[-1].save(tmp_path / "last")
+    at = Statistics.load(tmp_path / "last")
+    for number in (2, 1, 0):
+        at, found = at.undo()
+        assert torch.equal(found, file + number)
+        assert_same(at, states[number], tmp_path)
+    with pytest.raises(ValueError, match="nothing to undo"):
+        at.undo()
+
+
+def test_forgetting_is_as_if_it_was_never_in(old, before, trained, tmp_path):
+    mine = {name: own for name, own in trained.items() if own.material == "c"}
+    others = {name: own for name, own in trained.items() if own.material != "c"}
+    found = forget(old, before, mine)
+    expected = statistics(others).sums
+    torch.testing.assert_close(found.statistics.sums.sums, expected.sums, rtol=0, atol=1e-12)
+    assert sorted(found.old.after) == ["a", "b"]
+    with pytest.raises(ValueError, match="other content"):
+        forget(old, before, {"a/1": replace(trained["a/1"], z=trained["a/2"].z)})
+    with pytest.raises(ValueError, match="d/1 is not in"):
+        forget(old, before, {"d/1": trained["a/1"]})
+
+
+def test_a_new_material_is_learned_and_later_recordings_share_its_weight(old, before, new):
+    sums = old.sums.sums.clone()
+    found = add(old, before, new, 4.0, margin=1.0)
+    assert torch.equal(old.sums.sums, sums)  # nothing that is given is changed
+    assert not old.bins
+    assert found.new["after"] > found.new["before"] + 0.1
+    assert sorted(found.old.before) == ["a", "b", "c"]
+    more = {"new/7": recording("new", 107, turn=1.0)}
+    later = add(found.statistics, found.solved, more, 2.0, margin=1.0)
+    assert dict(later.statistics.weights) == dict.fromkeys([*new, *more], 2.0)
+    assert later.new["after"] is None  # nothing else of this recording is known
+    assert "new" in later.old.before
+
+
+@pytest.mark.parametrize("margin", [0.1, 0.0])
+def test_auto_takes_the_largest_weight_that_old_materials_allow(old, before, new, margin):
+    found = add(old, before, new, None, margin=margin)
+    assert found.tried[found.factor] == found.old.mean_fall
+    # a material has 4 recordings, the new one 3
+    assert found.weight * 3 == pytest.approx(found.factor * 4)
+    if margin == 0:
+        assert min(found.tried) == found.factor == FACTORS[0]
+        return
+    assert found.old.problem(0.5 * margin) is None
+    larger = FACTORS[FACTORS.index(found.factor) + 1]
+    by_hand = add(old, before, new, found.weight * larger / found.factor, margin=margin)
+    assert by_hand.old.problem(0.5 * margin) is not None
+
+
+@pytest.mark.parametrize("largest", [0.0, FACTORS[0], FACTORS[2]])
+def test_auto_leaves_out_weights_that_lead_to_no_machine(old, before, new, monkeypatch, largest):
+    def solved(statistics):
+        if statistics.weight_of("new/0") > 1.01 * largest * 4 / 3:
+            raise ValueError("no machine")
+        return solve(statistics)
+
+    monkeypatch.setattr(adaptation, "solve", solved)
+    if largest:
+        assert add(old, before, new, None, margin=0.9).factor == largest
+        return
+    with pytest.raises(ValueError, match="no machine"):
+        add(old, before, new, None, margin=0.9)
+
+
+def test_bins_without_slip_weigh_as_those_of_an_average_material(old, before, trained):
+    quiet = without_slip(recording("quiet", 50))
+    found = add(old, before, {"quiet/0": quiet}, None, margin=0.0)
+    num_quiet = sum(int((~own.is_slip).sum()) for own in trained.values()) / 3
+    assert found.weight * len(quiet.z) / num_quiet == pytest.approx(found.factor)
+
+
+def test_small_steps_together_keep_the_margin(old, before):
+    at, solved = old, before
+    for number in range(6):
+        more = recordings(f"new{number}", 2, 200 + 10 * number, turn=1.0)
+        change = add(at, solved, more, 1.0, margin=1.0)
+        entry = {"old": {"before": change.old.before}}
+        at = at.with_step(change.statistics, entry, torch.zeros(1, dtype=torch.uint8), f"{number}")
+        solved = change.solved
+    assert change.since_training.before == before.accuracies(before.known.recordings)
+    assert change.since_training.after == {name: change.old.after[name] for name in "abc"}
+    step, together = change.old.mean_fall, change.since_training.mean_fall
+    assert together > 2 * step
+    margin = (step + together) / 2
+    assert change.old.problem(margin) is None
+    assert change.problem(margin).startswith("since before the first step, ")
+
+
+@pytest.mark.parametrize(
+    ("bins", "weight", "message"),
+    [
+        (recordings("d", 1, 0) | recordings("e", 1, 0), 1.0, "one material at a time, got d, e"),
+        (recordings("a", 1, 0), 1.0, "a/0 is in already"),
+        ({"d/0": recording("d", 0, num_bins=0)}, 1.0, "no labelled bin"),
+        ({}, 1.0, "no labelled bin"),
+        (recordings("d", 1, 0), -1.0, "weight must be auto or a positive number"),
+        (recordings("d", 1, 0), float("nan"), "weight must be auto or a positive number"),
+    ],
+)
+def test_what_cannot_be_added_is_refused(old, before, bins, weight, message):
+    with pytest.raises(ValueError, match=message):
+        add(old, before, bins, weight, margin=0.1)
+
+
+def test_statistics_come_back_from_their_file_and_damage_is_noticed(old, new, tmp_path):
+    there = replace(old.reweighed(dict.fromkeys(new, 2.0), new), labels={"layout": "whole_slide"})
+    there.save(tmp_path / "statistics.pt")
+    back = Statistics.load(tmp_path / "statistics.pt")
+    assert (back.machine, back.labels) == (there.machine, there.labels)
+    assert torch.equal(solve(back).scores, solve(there).scores)
+    content = bytearray((tmp_path / "statistics.pt").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "statistics.pt").write_bytes(content)
+    with pytest.raises(ValueError, match="damaged"):
+        Statistics.load(tmp_path / "statistics.pt")

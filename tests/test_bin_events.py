@@ -1,0 +1,242 @@
+"""From decisions on labelled bins to events: alarms by hand, stretches, splits by bin."""
+
+import math
+from collections import deque
+
+import pytest
+import torch
+
+from tactslip_torch.data.labels import NO_POSITION, LabelRule, label_bins
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.onset.events import LatencyParts
+from tactslip_torch.training.datamodule import RecordingFeatures, Stroke
+from tactslip_torch.training.learner import (
+    BINS_APART,
+    RULES,
+    bin_scores,
+    evaluated_bins,
+    event_numbers,
+    events_by_rule,
+)
+
+RATE_HZ = 2000.0
+LATENCY = LatencyParts(look_ahead_s=0.0125, bin_s=0.05)
+
+
+def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), recording=None, roles=None, **rule):
+    """What the learner sees of a recording without disturbances, features left out."""
+    rule = LabelRule(**rule)
+    slides = tuple(zip(onsets, ends, strict=True))
+    bins = label_bins(rule, onsets, slides, 12.0, RATE_HZ, stretches)
+    num = len(bins.starts)
+    speeds = (20.0, 40.0, 60.0)
+    return RecordingFeatures(
+        recording or RecordingId("M1", 0),
+        torch.zeros(num, 1),
+        bins.is_slip,
+        torch.tensor([*speeds[: len(onsets)], 0.0])[bins.stroke],
+        bins.position,
+        bins.stroke,
+        (bins.starts + bins.bin_samples).double() / RATE_HZ,
+        tuple(Stroke(o, e, v) for o, e, v in zip(onsets, ends, speeds, strict=False)),
+        (rule.hop_ms or rule.bin_ms) / 1000,
+        roles or {"test": torch.ones(num, dtype=torch.bool)},
+        {},
+    )
+
+
+def events_of(batch, says_slip, latency=LATENCY, role="test"):
+    part = evaluated_bins(batch, says_slip, {})[role]
+    return {name: own[0] for name, own in events_by_rule([part], latency).items()}
+
+
+def says(batch, *, right=True, wrong=()):
+    """The truth, or never slip, but for bins given as (stroke, position)."""
+    decisions = batch.is_slip.clone() if right else torch.zeros_like(batch.is_slip)
+    for stroke, position in wrong:
+        place = (batch.stroke == stroke) & (batch.position == position)
+        assert int(place.sum()) == 1
+        decisions[place] = ~decisions[place]
+    return decisions
+
+
+def seen(events):
+    return [(onset.outcome, onset.num_alarms) for onset in events.onsets]
+
+
+# -------------------------------------------------------------------------------- what rules see
+def test_a_detector_without_errors_finds_every_slip_one_bin_later_by_two_of_three():
+    batch = batch_of()
+    events = events_of(batch, batch.is_slip)
+    for name, delay in (("first_transition", 0.0525), ("two_of_three", 0.1025)):
+        assert seen(events[name]) == [("found", 1), ("found", 1)], name
+        # the label's onset is 10 ms early, the bin 50 ms long, the look-ahead 12.5
+        assert [onset.delay_s for onset in events[name].onsets] == pytest.approx([delay] * 2)
+        assert events[name].false_alarms_s == ()
+        # a second before the onset moved 10 ms, all later by the look-ahead, 0.2 s are early
+        assert events[name].quiet_s == pytest.approx(2 * (1.01 - 0.0125 - 0.2)), name
+    for onset in events["two_of_three"].onsets:
+        assert onset.decision_s == pytest.approx(0.05)
+        assert onset.bin_fill_s == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "first_transition", "two_of_three", "num_false"),
+    [
+        ([(0, -10)], [("found", 1), ("found", 1)], [("found", 1), ("found", 1)], 1),
+        ([(0, -1), (0, -2), (0, -3), (1, -3)], [("early", 1), ("found", 2)],
+         [("early", 1), ("found", 1)], 0),  # an alarm before the onset that stands is early
+        ([(0, 5), (0, 9), (0, 10), (0, 11)], [("found", 3), ("found", 1)],
+         [("found", 2), ("found", 1)], 0),  # a slip that breaks off is several alarms
+    ],
+)  # fmt: skip
+def test_wrong_bins_are_false_alarms_early_ones_or_several(
+    wrong, first_transition, two_of_three, num_false
+):
+    batch = batch_of()
+    events = events_of(batch, says(batch, wrong=wrong))
+    assert seen(events["first_transition"]) == first_transition
+    assert seen(events["two_of_three"]) == two_of_three
+    assert len(events["first_transition"].false_alarms_s) == num_false
+    assert events["two_of_three"].false_alarms_s == ()
+
+
+def test_never_slip_misses_all_and_always_slip_finds_nothing():
+    batch = batch_of()
+    quiet = events_of(batch, torch.zeros_like(batch.is_slip))
+    loud = events_of(batch, torch.ones_like(batch.is_slip))
+    for name in RULES:
+        assert seen(quiet[name]) == [("missed", 0)] * 2
+        assert seen(loud[name]) == [("missed", 0)] * 2
+        assert quiet[name].false_alarms_s == ()
+        assert len(loud[name].false_alarms_s) == 2  # one for each stroke, each seen alone
+
+
+def plain_alarms(decisions, name):
+    """Whether each decision raises an alarm: the paper's rule, and two of three, by hand."""
+    last, was_on, raised = deque(maxlen=3), False, []
+    for decision in decisions:
+        last.append(bool(decision))
+        is_on = last[-1] if name == "first_transition" else sum(last) >= 2
+        raised.append(is_on and not was_on)
+        was_on = is_on
+    return raised
+
+
+@pytest.mark.parametrize("hop_ms", [None, 10.0, 25.0])
+@pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
+def test_random_decisions_raise_the_alarms_that_rules_by_hand_do(layout, hop_ms):
+    generator = torch.Generator().manual_seed(3)
+    batch = batch_of(stretches=((9.0, 10.0), (10.5, 11.5)), layout=layout, hop_ms=hop_ms)
+    for share in (0.2, 0.5, 0.8):
+        decisions = torch.rand(len(batch.is_slip), generator=generator) < share
+        events = events_of(batch, decisions)
+        groups = [batch.stroke == 0, batch.stroke == 1]
+        groups += [(batch.stroke == -1) & (batch.ends_s < 10.1)]
+        groups += [(batch.stroke == -1) & (batch.ends_s > 10.4)]
+        for name in RULES:
+            alarms = []
+            for rows in groups:
+                raised = plain_alarms(decisions[rows], name)
+                ends = batch.ends_s[rows].tolist()
+                alarms += [e + 0.0125 for e, r in zip(ends, raised, strict=True) if r]
+            own = [onset.num_alarms for onset in events[name].onsets]
+            false = [
+                alarm
+                for alarm in alarms
+                if not any(o - 0.2 <= alarm <= e + 0.1125 for o, e in ((2.0, 4.0), (6.0, 8.0)))
+            ]
+            assert events[name].false_alarms_s == pytest.approx(false)
+            assert sum(own) == len(alarms) - len(false) > 0
+
+
+def test_overlapping_bins_of_a_stroke_are_one_stream_over_the_onset():
+    batch = batch_of(onsets=(2.0,), ends=(4.0,), hop_ms=10.0)
+    events = events_of(batch, batch.is_slip)
+    # no bin over the onset has a label: the first that has comes as without overlap
+    for name, delay in (("first_transition", 0.0525), ("two_of_three", 0.0625)):
+        assert [onset.delay_s for onset in events[name].onsets] == pytest.approx([delay])
+
+
+def test_bins_of_no_stroke_are_watched_and_a_hole_between_them_is_not():
+    batch = batch_of(onsets=(), ends=(), stretches=((1.0, 3.0), (5.0, 6.0)))
+    assert bool((batch.position == NO_POSITION).all())
+    says_slip = torch.zeros(60, dtype=torch.bool)
+    says_slip[[10, 39, 40, 59]] = True  # the last of the first stretch, the first of the second
+    events = events_of(batch, says_slip)
+    assert events["first_transition"].quiet_s == pytest.approx(3.0)
+    expected = [1.55 + 0.0125, 3.0 + 0.0125, 5.05 + 0.0125, 6.0 + 0.0125]
+    assert events["first_transition"].false_alarms_s == pytest.approx(expected)
+    assert events["two_of_three"].false_alarms_s == ()
+    assert events["first_transition"].onsets == ()
+
+
+def test_a_hop_longer_than_a_bin_watches_no_time_twice():
+    batch = batch_of(stretches=((4.0, 4.25), (4.3, 4.6)), hop_ms=150.0)
+    events = events_of(batch, batch.is_slip)
+    assert events["first_transition"].quiet_s < 12.0
+
+
+def test_where_no_decision_speaks_for_slip_there_is_no_first():
+    batch = batch_of(onsets=(2.0,), ends=(4.0,))
+    late = says(batch, right=False, wrong=[(0, 4)])
+    (onset,) = events_of(batch, late)["first_transition"].onsets
+    assert onset.delay_s == pytest.approx(0.2525)
+    assert onset.bin_fill_s == pytest.approx(0.24)
+    spoke_before = says(batch, wrong=[(0, -5)])  # what is said before the onset is not of it
+    (onset,) = events_of(batch, spoke_before)["first_transition"].onsets
+    assert (onset.bin_fill_s, onset.decision_s) == pytest.approx((0.04, 0.0))
+    (onset,) = events_of(batch, says(batch, right=False))["first_transition"].onsets
+    assert onset.outcome == "missed"
+    assert math.isnan(onset.delay_s)
+
+
+# ---------------------------------------------------------------------------------- whole roles
+def test_a_split_by_bin_has_no_events_and_says_why():
+    whole = batch_of()
+    num = len(whole.is_slip)
+    some = torch.arange(num) % 5 > 0
+    apart = batch_of(roles={"train": some, "test": ~some, "unseen": torch.zeros_like(some)})
+    parts = evaluated_bins(apart, apart.is_slip, {})
+    assert list(parts) == ["train", "test"]
+    assert [part.is_whole for part in parts.values()] == [False, False]
+    assert sum(len(part.says_slip) for part in parts.values()) == num
+    events = {role: events_by_rule([part], LATENCY) for role, part in parts.items()}
+    for by_rule in event_numbers(events).values():
+        assert list(by_rule) == list(RULES)
+        for numbers in by_rule.values():
+            assert numbers["reason"] == BINS_APART
+            assert numbers["found"] is numbers["false_alarms_per_minute"] is None
+    of_whole = evaluated_bins(whole, whole.is_slip, {})["test"]
+    assert events_by_rule([of_whole, parts["test"]], LATENCY) == {name: [] for name in RULES}
+    numbers = event_numbers({"test": events_by_rule([of_whole], LATENCY)})
+    assert "reason" not in numbers["test"]["first_transition"]
+
+
+def test_recordings_of_different_length_do_not_mix():
+    short = batch_of(onsets=(2.0,), ends=(2.5,), recording=RecordingId("M2", 1))
+    long = batch_of(stretches=((9.0, 11.0),))
+    parts = []
+    for batch, wrong in ((short, [(0, -12)]), (long, [(1, -4), (1, 3)])):
+        decisions = says(batch, wrong=wrong)
+        parts.append(evaluated_bins(batch, decisions, {})["test"])
+    alone = [events_by_rule([part], LATENCY) for part in parts]
+    for name, own in events_by_rule(parts, LATENCY).items():
+        assert own == [one[name][0] for one in alone]
+        assert [(one.recording, one.material) for one in own] == [("M2/1", "M2"), ("M1/0", "M1")]
+
+
+def test_scores_are_of_all_bins_of_a_role():
+    first, second = batch_of(), batch_of(onsets=(), ends=(), stretches=((1.0, 2.0),))
+    never = [torch.zeros_like(batch.is_slip) for batch in (first, second)]
+    parts = [
+        evaluated_bins(batch, batch.is_slip, {"never": none, "right": batch.is_slip})["test"]
+        for batch, none in zip((first, second), never, strict=True)
+    ]
+    scores, baselines = bin_scores(parts)
+    assert scores["accuracy"] == 1.0
+    assert baselines["right"]["accuracy"] == 1.0
+    found = baselines["never"]
+    assert scores["num_bins"] == found["num_bins"] == len(first.is_slip) + 20
+    assert (found["slip_recall"], found["non_slip_recall"]) == (0.0, 1.0)
+    assert sum(of["num_bins"] for of in scores["per_position"].values()) == len(first.is_slip)

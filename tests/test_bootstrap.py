@@ -1,0 +1,123 @@
+"""Intervals over recordings: against lists drawn one by one, SciPy, and how often they hold."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from tactslip_torch.onset.events import Bootstrap
+
+
+def values_of(rng, num_recordings=12, num_values=40):
+    recording = np.sort(rng.integers(0, num_recordings, num_values))
+    return rng.exponential(50.0, num_values), recording
+
+
+def drawn_lists(bootstrap, values, recording):
+    """What each draw holds, value by value; empty lists left out."""
+    for times in bootstrap._times.long().tolist():
+        own = [v for v, r in zip(values, recording, strict=True) for _ in range(times[r])]
+        if own:
+            yield np.array(own)
+
+
+@pytest.mark.parametrize("few", [False, True])
+def test_numbers_are_those_of_the_lists_drawn(few, rng):
+    """With values in two of many recordings some draws have none of them, and say nothing."""
+    values, recording = (np.array([3.0, 5.0]), np.array([0, 7])) if few else values_of(rng)
+    bootstrap = Bootstrap(12, 0.36, 400)
+    lists = list(drawn_lists(bootstrap, values, recording))
+    assert (len(lists) < 400) == few
+    tensors = torch.from_numpy(values), torch.from_numpy(recording)
+    made = [(bootstrap.mean(*tensors), np.mean), (bootstrap.deviation(*tensors), np.std)]
+    for share in (0.0, 0.5, 0.95, 1.0):
+        number = bootstrap.quantile(*tensors, share)
+        made.append((number, lambda own, share=share: np.quantile(own, share)))
+    for number, of in made:
+        low, high = np.quantile([of(own) for own in lists], [0.32, 0.68])
+        value = of(values)
+        assert number == pytest.approx(
+            {"value": value, "low": min(low, value), "high": max(high, value)}
+        )
+
+
+def test_a_ratio_agrees_with_scipys_bootstrap(rng):
+    sums, numbers = rng.poisson(3.0, 30).astype(float), rng.integers(1, 5, 30).astype(float)
+    ours = Bootstrap(30, 0.95, 4000).ratio(sums.tolist(), numbers.tolist())
+
+    def ratio(a, b, axis):
+        return a.sum(axis) / b.sum(axis)
+
+    options = {"paired": True, "vectorized": True, "method": "percentile", "n_resamples": 4000}
+    theirs = stats.bootstrap((sums, numbers), ratio, rng=0, **options).confidence_interval
+    width = theirs.high - theirs.low
+    assert ours["low"] == pytest.approx(theirs.low, abs=0.06 * width)
+    assert ours["high"] == pytest.approx(theirs.high, abs=0.06 * width)
+
+
+@pytest.mark.parametrize(("part", "whole"), [(0, 9), (9, 9), (3, 40)])
+def test_a_share_of_one_recording_has_wilsons_interval(part, whole):
+    share = Bootstrap(1).share([part], [whole])
+    theirs = stats.binomtest(part, whole).proportion_ci(0.95, method="wilson")
+    assert share == pytest.approx({"value": part / whole, "low": theirs.low, "high": theirs.high})
+
+
+@pytest.mark.parametrize("count", [0, 7])
+def test_the_ends_of_a_rate_are_two_sided_scores_of_a_poisson_count(count):
+    """The rates at which the count lies just ``z`` standard deviations away."""
+    hours, z = 2.5, stats.norm.ppf(0.95)
+    rate = Bootstrap(1, 0.9).rate([count], [hours], per=3.0)
+    for end, sign in (("low", 1), ("high", -1)):
+        expected = rate[end] / 3 * hours
+        assert count - expected == pytest.approx(sign * z * np.sqrt(expected), abs=1e-9)
+    assert rate["value"] == pytest.approx(3 * count / hours)
+
+
+def test_what_never_happened_may_still_happen_and_nothing_is_none():
+    many = Bootstrap(30)
+    assert many.share([0] * 30, [3] * 30)["high"] == pytest.approx(
+        stats.binomtest(0, 90).proportion_ci(method="wilson").high
+    )
+    assert many.ratio([0] * 30, [3] * 30)["high"] == 0.0  # no count of independent events
+    assert many.rate([1] * 30, [0] * 30) is Bootstrap(0).share([], []) is None
+
+
+def test_one_recording_alone_has_no_interval_of_what_is_no_count():
+    values, recording = torch.tensor([1.0, 2.0]).double(), torch.tensor([3, 3])
+    five = Bootstrap(5)
+    numbers = [five.quantile(values, recording, 0.5), five.mean(values, recording)]
+    numbers += [five.deviation(values, recording), five.ratio([0, 4.0, 0, 0, 0], [0, 2, 0, 0, 0])]
+    for number in numbers:
+        assert number["low"] is number["high"] is None
+    assert five.share([1, 0, 0, 0, 0], [2, 0, 0, 0, 0])["low"] > 0
+
+
+@pytest.mark.parametrize("wrong", [{"level": 0.0}, {"level": 1.0}, {"num": 0}])
+def test_draws_that_are_none_are_refused(wrong):
+    with pytest.raises(ValueError, match="level between 0 and 1 and at least one draw"):
+        Bootstrap(3, **wrong)
+
+
+def test_intervals_hold_as_often_as_they_say(rng):
+    """Recordings differ in their rate: 95 % hold the truth, a Poisson count's own interval not."""
+    sets, num = 200, 40
+    held = alone = shares = medians = 0
+    for _ in range(sets):
+        hours = rng.uniform(0.5, 1.5, num)
+        counts = rng.poisson(hours * rng.gamma(0.5, 4.0, num))  # 2 an hour in the mean
+        bootstrap = Bootstrap(num, num=200)
+        rate = bootstrap.rate(counts.tolist(), hours.tolist())
+        naive = Bootstrap(1, num=1).rate([counts.sum()], [hours.sum()])
+        held += rate["low"] <= 2.0 <= rate["high"]
+        alone += naive["low"] <= 2.0 <= naive["high"]
+        found = rng.binomial(3, rng.beta(4.0, 1.0, num))  # 80 % in the mean
+        share = bootstrap.share(found.tolist(), [3] * num)
+        shares += share["low"] <= 0.8 <= share["high"]
+        away = rng.normal(50.0, 10.0, num)[:, None] + rng.normal(0.0, 5.0, (num, 3))
+        recording = torch.arange(num).repeat_interleave(3)
+        median = bootstrap.quantile(torch.from_numpy(away).flatten(), recording, 0.5)
+        medians += median["low"] <= 50.0 <= median["high"]
+    assert 0.87 < held / sets < 0.985  # the bootstrap of 40 is a little short of 95
+    assert alone / sets < 0.8
+    assert 0.9 < shares / sets < 0.995
+    assert 0.9 < medians / sets < 0.995

@@ -1,0 +1,544 @@
+"""Exported streams in Python, C and Node decide what the package decides, and refuse the same."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import hosts
+import numpy as np
+import pytest
+import torch
+from hosts import (
+    ALARM_KEYS,
+    EXPORT,
+    altered,
+    assert_same,
+    copied,
+    installed,
+    run_host,
+    saved,
+    sidecar_of,
+    slipping_stream,
+    truncated,
+    truth,
+)
+
+pytestmark = pytest.mark.onnx
+
+NEEDS_GCC = pytest.mark.skipif(
+    not (shutil.which("gcc") and shutil.which("make")), reason="no gcc and make here"
+)
+PYTHON = [sys.executable, EXPORT / "python" / "detect.py"]
+
+
+@pytest.fixture(scope="module")
+def make(tmp_path_factory):
+    """Runs ``make`` with words of a command line, all it builds in a folder of this session."""
+    build = tmp_path_factory.mktemp("c")
+
+    def run(*words):
+        folder = EXPORT / "c"
+        command = ["make", "-C", folder, "CC=gcc", f"PYTHON={sys.executable}", f"BUILD={build}"]
+        done = subprocess.run([*command, *words], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    run.build = build
+    return run
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        "python",
+        pytest.param("c", marks=NEEDS_GCC),
+        pytest.param("node", marks=pytest.mark.slow),
+    ],
+)
+def host(request):
+    """The words of a host's command."""
+    if request.param == "python":
+        return PYTHON
+    if request.param == "node":
+        installed(EXPORT / "node")
+        return ["node", EXPORT / "node" / "detect.mjs"]
+    make = request.getfixturevalue("make")
+    make()
+    return [make.build / "detect"]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    return hosts.exported(tmp_path_factory) / "stream.onnx"
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return saved(tmp_path_factory.mktemp("recording") / "recording.npy", slipping_stream())
+
+
+# What is right ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chunk", [1, 1999])
+def test_every_decision_is_that_of_the_package(host, model, recording, chunk):
+    ran = run_host(host, model, recording, "--decisions", "--chunk", chunk, "--rate", 2000)
+    assert_same(ran, truth(slipping_stream()))
+    assert ran.summary["seconds"] == len(slipping_stream()) / hosts.RATE
+    assert ran.stderr == ""
+
+
+def test_alarms_alone_are_printed_unless_asked(host, model, recording):
+    ran = run_host(host, model, recording)
+    expected = [row for row in truth(slipping_stream()) if row["alarm"]]
+    assert len(expected) > 1
+    assert [list(line) for line in ran.lines] == [list(ALARM_KEYS)] * len(expected)
+    assert [line["time_s"] for line in ran.lines] == [row["time_s"] for row in expected]
+
+
+@pytest.mark.slow
+def test_a_graph_in_double_precision_is_fed_in_it(host, tmp_path, tmp_path_factory):
+    precise = hosts.exported(tmp_path_factory, "float64") / "stream.onnx"
+    samples = slipping_stream()[2000:5000] * (1 + 2.0**-40)  # no float32
+    ran = run_host(host, precise, saved(tmp_path / "recording.npy", samples), "--decisions")
+    assert_same(ran, truth(samples), exact=True)
+
+
+def test_a_graph_in_single_precision_takes_a_recording_in_double(host, model, tmp_path):
+    samples = slipping_stream().astype(np.float64)
+    ran = run_host(host, model, saved(tmp_path / "recording.npy", samples), "--decisions")
+    assert_same(ran, truth(samples))
+
+
+def test_a_broken_sensor_is_flagged_and_told_in_one_line(host, model, tmp_path):
+    samples = slipping_stream().copy()
+    samples[1000:1010] = np.nan
+    expected = truth(samples)
+    ran = run_host(host, model, saved(tmp_path / "recording.npy", samples), "--decisions")
+    assert_same(ran, expected)
+    times_s = [row["time_s"] for row in expected if not row["valid"]]
+    (line,) = ran.stderr.splitlines()
+    found = re.fullmatch(
+        r"warning: (\d+) of (\d+) decisions are not valid, the first at ([\d.]+) s: "
+        r"a channel in use is dead or broken",
+        line,
+    )
+    assert found, line
+    assert [int(found[1]), int(found[2])] == [len(times_s), len(expected)]
+    assert abs(float(found[3]) - times_s[0]) <= 1e-3
+
+
+def test_a_recording_of_nothing_has_no_decision(host, model, tmp_path):
+    ran = run_host(host, model, saved(tmp_path / "nothing.npy", slipping_stream()[:0]))
+    assert ran == ([], {"decisions": 0, "alarms": 0, "seconds": 0}, "", 0)
+
+
+@pytest.mark.parametrize("version", [(2, 0), (3, 0)])
+def test_later_versions_of_the_file_format_are_read(host, model, tmp_path, version):
+    path = tmp_path / "recording.npy"
+    with path.open("wb") as file:
+        np.lib.format.write_array(file, slipping_stream(), version=version)
+    assert_same(run_host(host, model, path, "--decisions"), truth(slipping_stream()))
+
+
+SPELLINGS = {
+    "negative": (["--threshold", "-1e-3"], -1e-3),
+    "negative behind =": (["--threshold=-.5"], -0.5),
+    "behind =": (["--threshold=4.5"], 4.5),
+    "exponent": (["--threshold", "+45E-1"], 4.5),
+    "the last counts": (["--threshold=1", "--threshold", "4.5"], 4.5),
+    "all of them": (["--rate=2e3", "--chunk=0200", "--threshold", "4.5"], 4.5),
+}
+"""Options in ways that every host reads, and the threshold they mean."""
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_options_are_read_however_they_are_written(host, model, recording, spelling):
+    """The alarms are those of the threshold meant, the options before the files or behind."""
+    options, threshold = SPELLINGS[spelling]
+    expected = truth(slipping_stream(), threshold)
+    assert [row["on"] for row in expected] != [row["on"] for row in truth(slipping_stream())]
+    assert_same(run_host(host, *options, model, "--decisions", recording), expected)
+
+
+# What is wrong ---------------------------------------------------------------------------------
+
+
+class Case(NamedTuple):
+    """Something wrong, and what a host is to say of it.
+
+    Attributes:
+        arguments: made of a fresh folder and a whole ``stream.onnx``.
+        says: all of them stand in the one line on stderr.
+        status: of the exit.
+    """
+
+    arguments: Callable[[Path, Path], list[object]]
+    says: tuple[str, ...]
+    status: int = 1
+
+
+def _recording(folder: Path) -> Path:
+    return saved(folder / "recording.npy", slipping_stream()[:600])
+
+
+def _with_model(change: Callable[[Path], object]) -> Callable[[Path, Path], list[object]]:
+    """Arguments with a model that was changed behind its export."""
+
+    def arguments(folder: Path, model: Path) -> list[object]:
+        mine = copied(model, folder)
+        change(mine)
+        return [mine, _recording(folder)]
+
+    return arguments
+
+
+def _with_array(make: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path, Path], list[object]]:
+    """Arguments with another array in the recording's file."""
+
+    def arguments(folder: Path, model: Path) -> list[object]:
+        return [model, saved(folder / "recording.npy", make(slipping_stream()[:600]))]
+
+    return arguments
+
+
+def _with_file(change: Callable[[Path], object]) -> Callable[[Path, Path], list[object]]:
+    """Arguments with a recording whose file was changed."""
+
+    def arguments(folder: Path, model: Path) -> list[object]:
+        path = _recording(folder)
+        change(path)
+        return [model, path]
+
+    return arguments
+
+
+def _with_options(*options: object) -> Callable[[Path, Path], list[object]]:
+    return lambda folder, model: [model, _recording(folder), *options]
+
+
+def _with_sidecar(**facts: object) -> Callable[[Path, Path], list[object]]:
+    """Arguments with a sidecar that says other facts, or none of those given as None."""
+
+    def change(model: Path) -> None:
+        told = json.loads(sidecar_of(model).read_text()) | facts
+        kept = {key: value for key, value in told.items() if value is not None}
+        sidecar_of(model).write_text(json.dumps(kept, indent=1))
+
+    return _with_model(change)
+
+
+def _with_header(old: bytes, new: bytes) -> Callable[[Path, Path], list[object]]:
+    """Arguments with a recording whose header has other bytes; the blanks behind it make room."""
+
+    def change(path: Path) -> None:
+        head, body = path.read_bytes().split(b"\n", 1)
+        assert old in head
+        changed = head.replace(old, new)
+        path.write_bytes(changed[: len(head)].ljust(len(head)) + b"\n" + body)
+
+    return _with_file(change)
+
+
+def _folder_as_recording(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+NEEDED = (
+    "onnx_sha256",
+    "graph",
+    "precision",
+    "channels",
+    "sample_rate_hz",
+    "hop_samples",
+    "first_samples",
+    "frame_samples",
+    "tail_samples",
+    "state_size",
+)
+SIDECAR = "stream.onnx.json"
+CASES = {
+    "no model": Case(_with_model(Path.unlink), ("stream.onnx",)),
+    "truncated model": Case(_with_model(truncated), (SIDECAR, "again")),
+    "altered model": Case(_with_model(altered), (SIDECAR, "again")),
+    "no sidecar": Case(_with_model(lambda path: sidecar_of(path).unlink()), (SIDECAR, "beside")),
+    "truncated sidecar": Case(_with_model(lambda path: truncated(sidecar_of(path))), (SIDECAR,)),
+    "sidecar of something else": Case(
+        _with_model(lambda path: sidecar_of(path).write_text("{}")), (SIDECAR, "format")
+    ),
+    "bin graph": Case(
+        lambda folder, model: [model.with_name("model.onnx"), _recording(folder)],
+        ("model.onnx", "bin", "stream"),
+    ),
+    **{
+        f"no {key}": Case(_with_sidecar(**{key: None}), (SIDECAR, key, "nothing", "again"))
+        for key in NEEDED
+    },
+    "half precision": Case(
+        _with_sidecar(precision="float16"), (SIDECAR, "precision", "float16", "float32 or float64")
+    ),
+    "no channel": Case(_with_sidecar(channels=[]), (SIDECAR, "channels []", "names")),
+    "rate of zero": Case(
+        _with_sidecar(sample_rate_hz=0), (SIDECAR, "sample_rate_hz 0", "positive")
+    ),
+    "rate in words": Case(_with_sidecar(sample_rate_hz="2 kHz"), (SIDECAR, '"2 kHz"', "positive")),
+    "half a hop": Case(_with_sidecar(hop_samples=0.5), (SIDECAR, "hop_samples 0.5", "whole")),
+    "negative tail": Case(_with_sidecar(tail_samples=-1), (SIDECAR, "tail_samples -1", "whole")),
+    "no recording": Case(_with_file(Path.unlink), ("recording.npy",)),
+    "truncated recording": Case(_with_file(truncated), ("recording.npy", "cut off")),
+    "truncated header": Case(_with_file(lambda path: truncated(path, 0.001)), ("recording.npy",)),
+    "folder": Case(_with_file(_folder_as_recording), ("recording.npy", "save")),
+    "negative shape": Case(_with_header(b"(600, 24)", b"(-60, 24)"), ("recording.npy", "save")),
+    "endless shape": Case(_with_header(b"(600, 24)", b"(%d, 24)" % 10**30), ("recording.npy",)),
+    "later version": Case(_with_header(b"NUMPY\1", b"NUMPY\4"), ("recording.npy", "version", "4")),
+    "text": Case(_with_file(lambda path: path.write_text("volts\n")), ("recording.npy", ".npy")),
+    "Fortran order": Case(_with_array(np.asfortranarray), ("Fortran",)),
+    "integers": Case(
+        _with_array(lambda x: (1000 * x).astype("<i2")), ("recording.npy", "<i2", "float32")
+    ),
+    "big-endian": Case(_with_array(lambda x: x.astype(">f4")), (">f4", "little-endian")),
+    "one axis": Case(_with_array(np.ravel), ("14400", "24")),
+    "three axes": Case(_with_array(lambda x: x[None]), ("600", "24")),
+    "seven channels": Case(_with_array(lambda x: x[:, :7].copy()), ("7", "24")),
+    "channels first": Case(_with_array(lambda x: x.T.copy()), ("600", "24")),
+    "another rate": Case(_with_options("--rate", 1000), ("1000", "2000")),
+    "no chunk": Case(_with_options("--chunk", 0), ("--chunk", "0"), 2),
+    "too large a chunk": Case(_with_options("--chunk", 5000), ("--chunk", "5000", "2000"), 2),
+    "half a chunk": Case(_with_options("--chunk", 2.5), ("--chunk", "2.5"), 2),
+    "no number": Case(_with_options("--threshold", "high"), ("--threshold", "high"), 2),
+    "threshold that is NaN": Case(_with_options("--threshold", "nan"), ("--threshold", "nan"), 2),
+    "endless threshold": Case(_with_options("--threshold", "1e400"), ("--threshold", "1e400"), 2),
+    "infinite threshold": Case(
+        _with_options("--threshold=-Infinity"), ("--threshold", "-Infinity"), 2
+    ),
+    "threshold in hexadecimal": Case(_with_options("--threshold", "0x1"), ("0x1",), 2),
+    "threshold with an underscore": Case(_with_options("--threshold", "1_0"), ("1_0",), 2),
+    "empty threshold": Case(_with_options("--threshold="), ("--threshold",), 2),
+    "threshold left out": Case(_with_options("--threshold"), ("--threshold",), 2),
+    "option as threshold": Case(
+        _with_options("--threshold", "--decisions"), ("--threshold", "--decisions"), 2
+    ),
+    "chunk with a point": Case(_with_options("--chunk", "200.0"), ("--chunk", "200.0"), 2),
+    "chunk with an exponent": Case(_with_options("--chunk=2e2"), ("--chunk", "2e2"), 2),
+    "chunk with a sign": Case(_with_options("--chunk", "+200"), ("--chunk", "+200"), 2),
+    "chunk beyond any integer": Case(_with_options("--chunk", "9" * 30), ("--chunk", "999"), 2),
+    "rate in hexadecimal": Case(_with_options("--rate", "0x7d0"), ("--rate", "0x7d0"), 2),
+    "rate behind a blank": Case(_with_options("--rate", " 2000"), ("--rate", " 2000"), 2),
+    "value for a flag": Case(_with_options("--decisions=1"), ("--decisions",), 2),
+    "short option": Case(_with_options("-d"), ("-d",), 2),
+    "unknown option": Case(_with_options("--verbose"), ("--verbose",), 2),
+    "no arguments": Case(lambda folder, model: [], ("recording.npy",), 2),
+}
+"""By name; ``pytest.mark.parametrize("case", CASES)``."""
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_wrong_is_said_in_one_line(host, model, tmp_path, case):
+    ran = run_host(host, *CASES[case].arguments(tmp_path, model))
+    assert ran.status == CASES[case].status, ran.stderr
+    (line,) = ran.stderr.splitlines()
+    assert line.startswith("error: ")
+    for words in CASES[case].says:
+        assert words in line
+    assert ran.lines == []
+
+
+@pytest.mark.parametrize("options", [["--decisions"], ["--threshold", "1e9"]], ids=len)
+def test_lines_that_cannot_be_written_are_an_error(host, model, recording, options):
+    command = [str(word) for word in (*host, model, recording, *options)]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=300
+        )
+    assert done.returncode == 1, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: the output cannot be written")
+
+
+# C ---------------------------------------------------------------------------------------------
+
+
+@NEEDS_GCC
+def test_c_prints_what_python_prints(make, model, recording):
+    """Both run the same library: not a bit may be lost on the way out."""
+    make()
+    both = [make.build / "detect"], PYTHON
+    found, expected = (run_host(h, model, recording, "--decisions") for h in both)
+    single = {"score", "probability", "statistic"}
+    for ran in (found, expected):
+        for line in ran.lines:
+            line.update({name: float(np.float32(line[name])) for name in single})
+    assert found == expected
+
+
+@NEEDS_GCC
+def test_parts_hold_chunks_agree_and_a_push_takes_no_memory(make, model):
+    assert "parts and pushes hold" in make("test", f"MODEL={model}")
+
+
+@NEEDS_GCC
+def test_a_program_may_write_numbers_with_a_comma(make, model, tmp_path):
+    if shutil.which("localedef") is None:
+        pytest.skip("no localedef here to make a locale")
+    ascii_map = "".join(f"<U{i:04X}> /x{i:02x}\n" for i in range(128))
+    head = "<code_set_name> ANSI_X3.4-1968\n<comment_char> %\n<escape_char> /\n"
+    (tmp_path / "ascii").write_text(f"{head}CHARMAP\n{ascii_map}END CHARMAP\n")
+    mark = 'decimal_point ","\nthousands_sep ""\ngrouping -1\n'
+    (tmp_path / "comma.txt").write_text(f"LC_NUMERIC\n{mark}END LC_NUMERIC\n")
+    command = ["localedef", "-c", "-f", "./ascii", "-i", "./comma.txt", "./comma"]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)  # 1: it is no whole one
+    make(f"{make.build}/check")
+    done = subprocess.run(
+        [make.build / "check", model],
+        env={"LOCPATH": str(tmp_path), "LC_NUMERIC": "comma"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["parts and pushes hold", "a half is written 0,5 here"]
+
+
+@NEEDS_GCC
+def test_the_example_of_the_page_compiles_and_feels_the_slips(make, model, tmp_path):
+    make()
+    page = (EXPORT / "c" / "README.md").read_text(encoding="utf-8")
+    example = page.split("<!-- example -->\n```c\n")[1].split("```")[0]
+    raw = tmp_path / "samples.raw"
+    raw.write_bytes(slipping_stream().tobytes())
+    around = """
+static FILE *file;
+static size_t acquire(float *samples, size_t most) {
+    return fread(samples, 24 * sizeof(float), most, file);
+}
+int main(int count, char **words) {
+    return count == 3 && (file = fopen(words[2], "rb")) ? watch(words[1], acquire) : 2;
+}
+"""
+    (tmp_path / "loop.c").write_text(example + around)
+    parts = [EXPORT / "c" / f"{name}.c" for name in ("slip", "model", "sidecar", "sha256")]
+    command = [
+        "gcc",
+        "-std=c11",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        f"-I{EXPORT / 'c'}",
+        tmp_path / "loop.c",
+    ]
+    command += [*parts, f"-L{make.build}", "-lonnxruntime", f"-Wl,-rpath,{make.build}"]
+    subprocess.run([*command, "-o", tmp_path / "loop"], check=True)
+    words = [tmp_path / "loop", model, raw]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    found = [float(text) for text in re.findall(r"slip since ([\d.]+) s\n", done.stdout)]
+    expected = [row["onset_s"] for row in truth(slipping_stream()) if row["alarm"]]
+    assert found == pytest.approx(expected, abs=1e-3)
+
+
+# Node ------------------------------------------------------------------------------------------
+
+PROGRAM = """
+import { readFileSync } from "node:fs";
+import { SlipStream } from "./stream.mjs";
+
+const volts = new Float64Array(JSON.parse(readFileSync(0)));
+const stream = await SlipStream.open(process.argv[1]);
+const width = stream.facts.channels.length;
+const whole = await stream.push(volts);
+await stream.reset();
+const cuts = [0, 1, 1, 250, 3397].map((rows) => rows * width);
+const pieces = cuts.map((cut, i) => stream.push(volts.subarray(cut, cuts[i + 1])));
+const cut = (await Promise.all(pieces)).flat();
+const refused = [];
+for (const wrong of [volts.subarray(1), [0, 1]]) {
+  await stream.push(wrong).catch((error) => refused.push(error.message));
+}
+await stream.reset();
+const after = await stream.push(volts);
+console.log(JSON.stringify({ whole, cut, after, refused }));
+"""
+
+
+def test_a_program_may_cut_and_begin_again_as_it_likes(model):
+    installed(EXPORT / "node")
+    volts = slipping_stream().astype(float)  # more than the graph is given at a time
+    told = subprocess.run(
+        ["node", "--input-type=module", "-e", PROGRAM, model],
+        input=json.dumps(volts.ravel().tolist()),
+        cwd=EXPORT / "node",
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    said = json.loads(told.stdout)
+    expected = truth(slipping_stream())
+    for decisions in (said["whole"], said["cut"], said["after"]):
+        for name in ("time_s", "valid", "alarm", "on"):
+            assert [each[name] for each in decisions] == [row[name] for row in expected]
+    rows, kind = said["refused"]
+    assert "24 channels (SG1 to PVDF10)" in rows
+    assert "Float32Array" in kind
+
+
+# Python ----------------------------------------------------------------------------------------
+
+
+def test_it_needs_no_torch(model, recording):
+    code = (
+        "import runpy, sys; sys.modules |= dict.fromkeys(['torch', 'tactslip_torch']); "
+        "sys.argv = sys.argv[1:]; sys.path.insert(0, sys.argv.pop(0)); "
+        "runpy.run_path(sys.argv[0], run_name='__main__')"
+    )
+    without = [sys.executable, "-c", code, EXPORT / "python", PYTHON[1]]
+    assert run_host(without, model, recording) == run_host(PYTHON, model, recording)
+
+
+# Bins by themselves ----------------------------------------------------------------------------
+
+
+def test_bins_are_scored_as_the_package_scores_them(model, tmp_path):
+    samples = slipping_stream().copy()
+    samples[3000] = np.nan
+    detector = hosts.alarming_detector()
+    before, after = detector.context_before, detector.context_after
+    path = saved(tmp_path / "recording.npy", samples)
+    ran = run_host(
+        [sys.executable, EXPORT / "python" / "score.py"], model.with_name("model.onnx"), path
+    )
+    lines = [*ran.lines, ran.summary]  # there is no line of sums
+
+    starts = [round(line["start_s"] * hosts.RATE) for line in lines]
+    assert np.diff(starts).tolist() == [100] * (len(lines) - 1)
+    assert starts[0] <= before
+    assert len(samples) - 100 < starts[-1] + 100 + after <= len(samples)
+    bins = torch.stack(
+        [torch.from_numpy(samples[s - before : s + 100 + after].T.copy()) for s in starts[1:-1]]
+    )
+    judged = detector.predict_raw(bins.double())
+    assert [line["valid"] for line in lines[1:-1]] == judged.is_valid.tolist()
+    assert not judged.is_valid.all()
+    found = torch.tensor([line["score"] for line in lines[1:-1]], dtype=torch.float64)
+    torch.testing.assert_close(found, judged.score, rtol=0, atol=1e-3 * hosts.score_std())
+
+
+@pytest.mark.parametrize("case", ["truncated model", "no recording", "seven channels"])
+def test_what_is_wrong_with_bins_is_one_line(model, tmp_path, case):
+    stream, path, *_ = CASES[case].arguments(tmp_path, model)
+    wrong = case == "truncated model"
+    given = stream if wrong else model.with_name("model.onnx")
+    ran = run_host([sys.executable, EXPORT / "python" / "score.py"], given, path)
+    assert (ran.status, ran.lines) == (1, [])
+    (line,) = ran.stderr.splitlines()
+    assert line.startswith("error: ")
+
+
+def test_a_stream_graph_is_refused_for_bins(model, recording):
+    ran = run_host([sys.executable, EXPORT / "python" / "score.py"], model, recording)
+    assert ran.status == 1
+    assert "give model.onnx" in ran.stderr

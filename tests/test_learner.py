@@ -1,0 +1,288 @@
+"""What the learner learns from, and that it learns from nothing else."""
+
+from collections import Counter
+from dataclasses import replace
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+from small_set import RATE_HZ, SmallSet, small_maker, small_recipe
+
+from tactslip_torch.data.labels import LabelRule
+from tactslip_torch.data.recording import RecordingId
+from tactslip_torch.data.splits import random_bins, seen6, unseen4
+from tactslip_torch.features.cache import FeatureCache
+from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.training.learner import SlipLearner
+from tactslip_torch.training.recipe import Recipe
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*isinstance.treespec, LeafSpec.*",
+    "ignore:The '.*_dataloader' does not have many workers",
+    "ignore:.*does not have many workers",
+)
+
+
+def trainer(**changes):
+    options = {
+        "accelerator": "cpu",
+        "max_epochs": 2,
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+    }
+    return L.Trainer(**(options | changes))
+
+
+def learn(source, split, maker=None, recipe=None, *, with_baselines=False):
+    maker = maker or small_maker(source)
+    data = SlipDataModule(maker, split, num_workers=0)
+    recipe = recipe or small_recipe()
+    learner = SlipLearner(maker.pool, maker.channel_filter, recipe, with_baselines=with_baselines)
+    backend = trainer()
+    backend.fit(learner, datamodule=data)
+    backend.test(learner, datamodule=data, verbose=False)
+    return learner
+
+
+def unseen_c(source):
+    return unseen4(source.ids, seen=["a", "b"], unseen=["c"])[0]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return FeatureCache(tmp_path_factory.mktemp("features"))
+
+
+@pytest.fixture(scope="module")
+def plain(cache):
+    """A learner of the unperturbed set, tested."""
+    source = SmallSet()
+    return learn(source, unseen_c(source), small_maker(source, cache))
+
+
+def learned_state(learner):
+    detector = learner.detector
+    return {"selected": detector.selected, **learner.metadata, **detector.state_dict()}
+
+
+def assert_same(left, right):
+    assert left.keys() == right.keys()
+    for name, value in left.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, right[name]), name
+        else:
+            assert value == right[name], name
+
+
+# What is learned from ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("role", ["held out", "train"])
+def test_training_recordings_change_what_is_learned_and_held_out_ones_nothing(plain, cache, role):
+    split = unseen_c(SmallSet())
+    held_out = [*split.having("test"), RecordingId("c", 3)]
+    perturbed = held_out if role == "held out" else split.having("train")[:1]
+    source = SmallSet(gains=dict.fromkeys(perturbed, 7.0))
+    after = learn(source, split, small_maker(source, cache))
+    before, found = learned_state(plain), learned_state(after)
+    if role == "held out":
+        assert_same(before, found)
+        assert plain.metrics["splits"]["train"] == after.metrics["splits"]["train"]
+        assert plain.metrics["splits"] != after.metrics["splits"]  # but it is evaluated by them
+        return
+    assert before["selected"] != found["selected"]
+    for name in ("scaler.maximum", "head.quadratic", "head.linear"):
+        assert not torch.equal(before[name], found[name]), name
+    assert before["validation"] != found["validation"]
+
+
+def test_held_out_bins_of_the_random_split_are_not_learned_from(cache):
+    source = SmallSet()
+    split = random_bins(source.ids, seen=["a", "b", "c"])[0]
+    maker = small_maker(source, cache)
+    before = learn(source, split, maker)
+
+    class Perturbed(FeatureMaker):
+        def __call__(self, recording, split):
+            made = super().__call__(recording, split)
+            noisy = torch.where(made.roles["test"][:, None], -9.0, made.features)
+            return made._replace(features=noisy)
+
+    options = (maker.pool, maker.channel_filter, maker.rule, cache)
+    after = learn(source, split, Perturbed(source, *options))
+    assert_same(learned_state(before), learned_state(after))
+    assert before.metrics["splits"]["test"] != after.metrics["splits"]["test"]
+
+
+def test_a_finished_pass_survives_a_checkpoint_for_the_same_bins(plain, cache, tmp_path):
+    source = SmallSet()
+    split, maker = unseen_c(source), small_maker(source, cache)
+
+    def fit(split, maker, max_epochs=2, checkpoint=None):
+        learner = SlipLearner(
+            maker.pool, maker.channel_filter, small_recipe(), with_baselines=False
+        )
+        backend, data = trainer(max_epochs=max_epochs), SlipDataModule(maker, split, num_workers=0)
+        backend.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+        return learner, backend
+
+    first, half = fit(split, maker, max_epochs=1)
+    assert first.detector is None
+    path = tmp_path / "half.ckpt"
+    half.save_checkpoint(path)
+    second, _ = fit(split, maker, checkpoint=path)
+    assert "statistics_pass" not in second.seconds
+    assert_same(learned_state(plain), learned_state(second))
+    others = unseen4(source.ids, seen=["a", "c"], unseen=["b"])[0]
+    louder = small_maker(SmallSet(gains={split.having("train")[0]: 2.0}))
+    for other in ((others, maker), (split, louder)):
+        with pytest.raises(ValueError, match="other training bins"):
+            fit(*other, checkpoint=path)
+
+
+def test_a_test_without_a_detector_is_refused():
+    maker = small_maker(SmallSet())
+    learner = SlipLearner(maker.pool, maker.channel_filter)
+    with pytest.raises(ValueError, match="nothing to test"):
+        trainer().test(learner, datamodule=SlipDataModule(maker, unseen_c(maker.source), 0))
+
+
+# What a test tells -------------------------------------------------------------------------------
+
+
+def test_metrics_count_every_bin_once_in_its_role(plain):
+    splits = plain.metrics["splits"]
+    assert {role: s["num_bins"] for role, s in splits.items()} == {
+        "train": 8 * 37,
+        "test": 2 * 37,
+        "unseen": 5 * 37,
+    }
+    assert list(splits["unseen"]["per_material"]) == ["c"]
+    assert list(splits["train"]["per_speed"]) == ["20"]
+    for scores in splits.values():
+        counted = {scene: of["num_bins"] for scene, of in scores["per_scene"].items()}
+        assert counted == {"paper": scores["num_bins"]}
+        places = scores["per_position"]
+        assert list(places) == [str(place) for place in range(-20, 17)]
+        (quiet_right, _), (_, slip_right) = scores["confusion"]
+        rights = [of["num_right"] for of in places.values()]
+        assert [sum(rights[:20]), sum(rights[20:])] == [quiet_right, slip_right]
+
+
+def test_bins_of_no_stroke_have_no_position_but_a_scene():
+    class Handled(SmallSet):
+        """The second cycle of each material is another scene, with a stretch without slip."""
+
+        def __init__(self):
+            super().__init__()
+            kinds = ("paper", "tapped")
+            self.ids = tuple(
+                RecordingId(r.material, r.cycle, kinds[r.cycle == 1]) for r in self.ids
+            )
+
+        def timeline(self, recording):
+            stretch = ((0.0, 0.05),) if recording.scene == "tapped" else ()
+            return replace(super().timeline(recording), non_slip_s=stretch)
+
+    source = Handled()
+    scores = learn(source, unseen_c(source)).metrics["splits"]["unseen"]
+    counted = {scene: of["num_bins"] for scene, of in scores["per_scene"].items()}
+    assert counted == {"paper": 4 * 37, "tapped": 38}
+    for groups in ("per_speed", "per_position"):  # of the paper's scene alone
+        assert sum(of["num_bins"] for of in scores[groups].values()) == 4 * 37, groups
+    assert "0" not in scores["per_speed"]
+
+
+def test_events_are_of_the_detectors_own_decisions_and_the_exact_onset():
+    """By hand: alarms of its decisions in order, at the end of their bin and the look-ahead."""
+
+    class Apart(SmallSet):
+        """A person marked the onset 20 ms late."""
+
+        def timeline(self, recording):
+            return replace(super().timeline(recording), annotated_onsets_s=(1.12,))
+
+    source = Apart()
+    learner = learn(source, unseen_c(source))
+    maker = small_maker(source)
+    ahead_s = learner.detector.look_ahead / RATE_HZ
+    for role in ("test", "unseen"):
+        outcomes, delays, false, right = Counter(), [], 0, []
+        for recording in unseen_c(source).having(role):
+            bins, labels = maker.filtered_bins(recording)
+            decisions = learner.detector(bins) >= 0
+            right.append(decisions == labels.is_slip)
+            says_slip, ends_s = decisions.tolist(), (labels.starts + 100) / RATE_HZ + ahead_s
+            alarms = [
+                (float(end), next((float(e) for e, s in after if not s), 9.0))
+                for i, end in enumerate(ends_s)
+                if says_slip[i] and not (i and says_slip[i - 1])
+                for after in [list(zip(ends_s[i:], says_slip[i:], strict=True))]
+            ]
+            false += sum(alarm < 0.9 for alarm, _ in alarms)
+            found = [alarm for alarm, _ in alarms if 1.1 <= alarm <= 1.6]
+            if any(0.9 <= alarm < 1.1 < end for alarm, end in alarms):
+                outcomes["early"] += 1
+            elif found:
+                outcomes["found"] += 1
+                delays.append(1000 * (found[0] - 1.1))
+            else:
+                outcomes["missed"] += 1
+        accuracy = float(torch.cat(right).double().mean())
+        assert learner.metrics["splits"][role]["accuracy"] == pytest.approx(accuracy)
+        events = learner.metrics["events"][role]["first_transition"]
+        for name in ("found", "early", "missed"):
+            assert events[f"num_{name}"] == outcomes[name], name
+        assert events["num_false_alarms"] == false
+        assert events["delay_ms"]["median"]["value"] == pytest.approx(float(np.median(delays)))
+        assert events["quiet_hours"] * 3600 == pytest.approx(
+            sum(outcomes.values()) * (0.9 - 0.11 - ahead_s)  # from 1.12 - 0.01 - 1 on
+        )
+        of_two = learner.metrics["events"][role]["two_of_three"]
+        assert of_two["num_onsets"] == sum(outcomes.values())
+    assert len(learner.events["unseen"]["two_of_three"]) == 5
+
+
+def test_the_solve_is_reported_with_its_condition(plain):
+    solve = plain.detector.info["solve"]
+    assert solve == plain.metadata["solve"]
+    assert solve["method"] == "cholesky"
+    assert 1 < solve["condition"] <= solve["condition_bound"]
+    assert solve["rank"] == solve["size"] <= plain.metadata["num_bins"]
+
+
+@pytest.mark.slow
+def test_shuffled_labels_are_not_learned():
+    source = SmallSet(cycles=30)
+    split = seen6(source.ids, seen=["a", "b", "c"])[0]
+    honest = learn(source, split).metrics["splits"]["test"]["balanced_accuracy"]
+    shuffled = learn(source, split, small_maker(source, shuffle_seed=1))
+    found = shuffled.metrics["splits"]["test"]
+    # 666 bins, independent labels: a standard deviation of 2 %
+    assert found["num_bins"] == 18 * 37
+    assert abs(found["balanced_accuracy"] - 0.5) < 0.08
+    assert honest > 0.75
+    events = shuffled.metrics["events"]["test"]["first_transition"]
+    assert events["num_onsets"] == 18
+    assert events["num_false_alarms"] > 18  # whatever comes: it decides by nothing
+
+
+@pytest.mark.slow
+def test_on_the_simulated_hand_the_score_is_neither_trivial_nor_perfect(tmp_path):
+    seen = ["M1", "M2", "M3", "M4", "M5", "M6"]
+    source = SimulatedRecordings(cycles=4, materials=seen)
+    pool, cache = FeaturePool(source.hand), FeatureCache(tmp_path)
+    frames = [51 if channel.kind == "SG" else 11 for channel in source.hand.channels]
+    maker = FeatureMaker(source, pool, ChannelFilter(frames), LabelRule(), cache)
+    split = seen6(source.ids, seen=seen)[0]
+    recipe = Recipe(penalties=(0.1, 1.0), sample_bins=100)
+    learner = learn(source, split, maker, recipe, with_baselines=True)
+    ours = learner.metrics["splits"]["test"]["balanced_accuracy"]
+    pooled = learner.metrics["baselines"]["best_pooled_number"]["splits"]["test"]
+    assert pooled["balanced_accuracy"] < ours < 1.0

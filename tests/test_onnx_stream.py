@@ -1,0 +1,331 @@
+"""The graph of a stream against ``StreamingDetector``, push by push; rules, latch, calibration."""
+
+import math
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from streams import detector_of, signal
+
+from tactslip_torch.deploy.check import runner, session_of
+from tactslip_torch.deploy.head import llr_of, probability_of
+from tactslip_torch.deploy.stream import (
+    LATCH_START,
+    Timing,
+    latched,
+    rule_start,
+    statistic_of,
+    stream_graph,
+)
+from tactslip_torch.deploy.value import F32, F64, Graph
+from tactslip_torch.model.calibration import LARGEST_LLR, Isotonic, Platt, probability
+from tactslip_torch.onset.decisions import AlarmSettings, score_stream
+from tactslip_torch.onset.rules import Cusum, KOfN, latch, latch_start
+from tactslip_torch.onset.streaming import StreamingDetector
+from tactslip_torch.signals.filtering import ChannelFilter
+
+pytestmark = pytest.mark.onnx
+KINDS = ("all", "PVDF", "long")  # long: a frame that a causal bin does not hold
+ALIGNMENTS = ("centred", "causal", "trailing")
+RULES = {rule.name: rule for rule in (KOfN(2, 3), Cusum(0.5, 0.5, 2))}
+EXACT = {"valid": "is_valid", "alarm": "is_alarm", "on": "is_on", "time_s": "available_s"}
+CLOSE = {"float64": 1e-9, "float32": 1e-3}  # of scores, in standard deviations
+
+
+@cache
+def watching(kind="all", align="centred", rule="k_of_n", hop=20, threshold=1.0, isotonic=False):
+    """A detector, and settings by which about half of its decisions speak for slip."""
+    detector = detector_of("all" if kind == "long" else kind, align)
+    if kind == "long":
+        detector.channel_filter = ChannelFilter([151, 51, 11, 3], align=align)
+    scores = score_stream(detector, signal(900, 99), 20).score  # of no stream below
+    middle, spread = float(scores.median()), float(scores.std())
+    calibration = Platt(2 / spread, -2 * middle / spread)
+    if isotonic:
+        knots = tuple(middle + spread * x for x in (-2.0, -0.5, 0.0, 0.5, 1.0))
+        calibration = Isotonic(knots, (-3.0, -2.0, -0.5, 1.0, 2.5))
+    settings = AlarmSettings(
+        hop,
+        calibration,
+        RULES[rule],
+        threshold,
+        target_per_hour=1.0,
+        slip_share=0.3,
+        rearm_s=0.02,
+        refractory_s=0.05,
+        lead_s=0.03,
+    )
+    return detector, settings, spread
+
+
+@cache
+def graph_of(precision, **options):
+    detector, settings, _ = watching(**options)
+    return runner(session_of(stream_graph(detector, settings, precision).model()))
+
+
+class Host:
+    """What a program around the graph does: it keeps tail and state, and nothing else."""
+
+    def __init__(self, precision="float64", **options):
+        self.run, self.dtype = graph_of(precision, **options), np.dtype(precision)
+        self.tail, self.state = np.zeros((0, 4), self.dtype), np.zeros(0)
+
+    def push(self, samples, threshold=()):
+        found = self.run(
+            {
+                "samples": np.ascontiguousarray(samples, self.dtype),
+                "tail": self.tail,
+                "state": self.state,
+                "threshold": np.array(threshold, np.float64),
+            }
+        )
+        self.tail, self.state = found.pop("next_tail"), found.pop("next_state")
+        return found
+
+
+def assert_same_stream(samples, cuts=(), precision="float64", **options):
+    """Push pieces to both; returns how many alarms there were."""
+    detector, settings, spread = watching(**options)
+    dtype, host = getattr(torch, precision), Host(precision, **options)
+    stream = StreamingDetector(detector, settings, dtype=dtype)
+    timing, num, close = Timing.of(detector, settings), 0, CLOSE[precision]
+    places = [0, *sorted(min(cut, samples.shape[-1]) for cut in cuts), samples.shape[-1]]
+    for start, stop in pairwise(places):
+        piece = samples[:, start:stop].T.to(dtype)
+        expected, found = stream.push(piece), host.push(piece.numpy())
+        for name, attribute in EXACT.items():
+            wanted = getattr(expected, attribute).numpy()
+            np.testing.assert_array_equal(found[name], wanted, err_msg=name)
+        np.testing.assert_allclose(found["onset_s"], expected.onset_s, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found["score"], expected.score, rtol=0, atol=close * spread)
+        for name in ("probability", "statistic"):
+            wanted = getattr(expected, name)
+            np.testing.assert_allclose(found[name], wanted, rtol=close, atol=9 * close)
+            assert found[name].dtype == host.dtype
+        assert (host.tail.shape, host.state.shape) == ((timing.tail, 4), (timing.state_size,))
+        assert (host.tail.dtype, host.state.dtype) == (host.dtype, np.float64)
+        num += len(expected.alarms)
+    return num
+
+
+@given(
+    num_samples=st.integers(0, 900),
+    cuts=st.lists(st.integers(0, 900), max_size=30),
+    kind=st.sampled_from(KINDS),
+    align=st.sampled_from(ALIGNMENTS),
+    rule=st.sampled_from(list(RULES)),
+    isotonic=st.booleans(),
+    hop=st.sampled_from([7, 20, 120]),
+    seed=st.integers(0, 20),
+    bad=st.lists(st.tuples(st.integers(0, 899), st.sampled_from([np.nan, np.inf])), max_size=3),
+)
+def test_any_cut_gives_what_the_detector_gives(
+    num_samples, cuts, kind, align, rule, isotonic, hop, seed, bad
+):
+    samples = signal(900, seed)
+    for place, value in bad:
+        samples[place % 4, place] = value
+    options = {"kind": kind, "align": align, "rule": rule, "isotonic": isotonic, "hop": hop}
+    assert_same_stream(samples[:, :num_samples], cuts, **options)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("precision", CLOSE)
+def test_small_pieces_raise_the_same_alarms(rule, precision):
+    cuts = [*range(150), *range(150, 2000, 37)]
+    samples = signal(2000, 5)
+    samples[2, 1500] = torch.nan
+    assert assert_same_stream(samples, cuts, precision, rule=rule) >= 3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("align", ALIGNMENTS)
+def test_the_start_of_a_stream_is_filtered_as_a_recording(kind, align):
+    samples = signal(300, 3) + torch.linspace(0, 5, 300, dtype=torch.float64)
+    assert_same_stream(samples, [120, 180], kind=kind, align=align, hop=7)
+    still = torch.full((4, 300), 0.1, dtype=torch.float64)  # 0.1 has no exact mean
+    assert_same_stream(still, kind=kind, align=align, hop=7)
+
+
+@pytest.mark.parametrize("align", ALIGNMENTS)
+@pytest.mark.parametrize("channel", [0, 3])
+def test_a_hole_at_the_start_reaches_as_far_as_in_the_detector(align, channel):
+    for place in (0, 4, 5, 11, 25, 51, 99):
+        samples = signal(300, 3)
+        samples[channel, place] = torch.nan
+        assert_same_stream(samples, [60, 140], align=align, hop=7)
+
+
+def test_a_decision_that_nothing_reaches_says_nothing():
+    samples = signal(900, 5)
+    samples[:, 400:410] = torch.nan
+    detector, settings, _ = watching()
+    llr = StreamingDetector(detector, settings, dtype=torch.float64).push(samples.T).llr
+    assert (llr == 0).any()
+    assert_same_stream(samples)
+
+
+def test_a_threshold_that_is_given_counts_for_that_push():
+    host, samples = Host(), signal(1200, 8).T.numpy()
+    for threshold in (0.3, 2.0, -np.inf, np.inf):
+        own = Host(threshold=threshold)
+        own.tail, own.state = host.tail, host.state
+        expected, found = own.push(samples), host.push(samples, [threshold])
+        for name, value in expected.items():
+            np.testing.assert_array_equal(found[name], value, err_msg=name)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_stream_that_ran_for_years_goes_on(rule):
+    young, old, samples = Host(rule=rule), Host(rule=rule), signal(2000, 5).T.numpy()
+    young.push(samples[:700])
+    num = 10**12  # decisions
+    old.tail, old.state = young.tail, young.state.copy()
+    old.state[[0, 1, 2]] += [num * 20, num, num]
+    expected, found = young.push(samples[700:]), old.push(samples[700:])
+    for name in ("score", "statistic", "valid", "alarm", "on"):
+        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+    assert expected["alarm"].any()
+    by_then = np.rint(expected["time_s"] * 2000.0) + num * 20
+    np.testing.assert_array_equal(found["time_s"], by_then / 2000.0)
+
+
+# Calibration -----------------------------------------------------------------------------------
+
+CALIBRATIONS = (
+    Platt(2.0, -0.7),
+    Platt(0.0, 0.3),
+    Platt(1 + 1e-9, 0.0),
+    Platt(1e12, -3.0),
+    Isotonic((-1.0, -0.25, 0.0, 0.1, 3.0), (-4.0, -4.0, -0.5, 0.0, 5.0)),
+    Isotonic((-1e300, 1e300), (-1e30, 1e30)),
+    Isotonic((0.5,), (0.0,)),
+)
+
+
+def scores_of(dtype):
+    """Any finite score, and often one of a few."""
+    largest, width = float(np.finfo(dtype).max), dtype.itemsize * 8
+    usual = st.floats(-4, 4, width=width) | st.sampled_from([0.0, -0.25, 0.1, 3.0])
+    any_ = st.floats(-largest, largest, width=width, allow_nan=False)
+    return arrays(dtype, st.integers(1, 30), elements=usual | any_)
+
+
+@cache
+def calibrating(calibration, dtype, slip_share):
+    graph = Graph()
+    llr = llr_of(graph.input("score", dtype, ("k",)), calibration)
+    graph.output("llr", llr, ("k",))
+    graph.output("probability", probability_of(llr, slip_share), ("k",))
+    return runner(session_of(graph.model()))
+
+
+@pytest.mark.parametrize("dtype", [F32, F64], ids=str)
+@pytest.mark.parametrize("calibration", CALIBRATIONS)
+@given(data=st.data(), slip_share=st.sampled_from([0.5, 0.02]))
+def test_scores_become_the_same_ratios_and_probabilities(calibration, dtype, data, slip_share):
+    ends = np.array([np.finfo(dtype).min, np.finfo(dtype).max, 0.0], dtype)
+    knots = np.array(getattr(calibration, "scores", ())).clip(*ends[:2]).astype(dtype)
+    score = np.concatenate([data.draw(scores_of(dtype)), ends, knots])
+    expected = calibration.llr(torch.from_numpy(score))
+    found = calibrating(calibration, dtype, slip_share)({"score": score})
+    assert found["llr"].dtype == found["probability"].dtype == dtype
+    assert np.abs(found["llr"]).max() <= LARGEST_LLR
+    tiny = 4 * np.finfo(dtype).eps
+    largest = max(1.0, *map(abs, (*getattr(calibration, "llrs", ()), 0.0)))
+    np.testing.assert_allclose(found["llr"], expected, rtol=tiny, atol=tiny * largest)
+    close = 1e-12 if dtype == F64 else 2e-7
+    stated = probability(expected, slip_share)
+    np.testing.assert_allclose(found["probability"], stated, rtol=0, atol=close)
+
+
+def test_another_calibration_is_refused():
+    with pytest.raises(ValueError, match="Platt or Isotonic, got 'line'"):
+        llr_of(Graph().input("score", F64, ("k",)), "line")
+
+
+# Rules and latch -------------------------------------------------------------------------------
+
+
+@cache
+def ruling(rule, dtype):
+    graph = Graph()
+    llr, memory = graph.input("llr", dtype, ("k",)), graph.input("memory", F64, ("m",))
+    statistic, after = statistic_of(rule, llr, memory)
+    graph.output("statistic", statistic, ("k",))
+    graph.output("after", after, (len(rule_start(rule)),))
+    return runner(session_of(graph.model()))
+
+
+@pytest.mark.parametrize("dtype", [F32, F64], ids=str)
+@pytest.mark.parametrize(
+    "rule",
+    [KOfN(1, 1), KOfN(1, 4), KOfN(2, 3), KOfN(5, 5), Cusum(0.5, 0.2, 3.0), Cusum(-0.1, 1 - 1e-9)],
+    ids=str,
+)
+@given(data=st.data())
+def test_rules_make_the_same_statistic_in_any_pieces(rule, dtype, data):
+    llr = data.draw(scores_of(dtype)).clip(-LARGEST_LLR, LARGEST_LLR)
+    cuts = data.draw(st.lists(st.integers(0, len(llr)), max_size=4))
+    expected, _ = rule.scan(torch.from_numpy(llr), rule.start(torch.from_numpy(llr)[0]))
+    memory, statistics = np.array(rule_start(rule)), []
+    for piece in np.split(llr, sorted(cuts)):
+        if len(piece):
+            made = ruling(rule, dtype)({"llr": piece, "memory": memory})
+            statistics.append(made["statistic"])
+            memory = made["after"]
+    found = np.concatenate(statistics)
+    assert found.dtype == dtype
+    np.testing.assert_array_equal(found, expected.numpy())
+
+
+@cache
+def latching(dtype, rearm, refractory):
+    graph = Graph()
+    statistic, number = graph.input("statistic", dtype, ("k",)), graph.input("number", F64, ("k",))
+    level, memory = graph.input("level", dtype, (1,)), graph.input("memory", F64, (3,))
+    made = latched(statistic, level, number, memory, rearm=rearm, refractory=refractory)
+    graph.output("alarms", made.alarm, ("k",))
+    graph.output("standing", made.on, ("k",))
+    graph.output("memory_after", made.memory, (3,))
+    return runner(session_of(graph.model()))
+
+
+@pytest.mark.parametrize("dtype", [F32, F64], ids=str)
+@given(
+    data=st.data(),
+    rearm=st.sampled_from([0, 1, 3]),
+    refractory=st.sampled_from([0, 1, 4, 9]),
+    threshold=st.sampled_from([0.5, 0.1, 0.8, math.inf, -math.inf]),
+    first=st.sampled_from([0, 10**12]),
+)
+def test_the_latch_raises_the_same_alarms_in_any_pieces(
+    dtype, rearm, refractory, threshold, first, data
+):
+    level = np.array([threshold], dtype)
+    below = np.nextafter(level[0], -dtype.type(np.inf))
+    exact = [float(level[0]), float(below), 0.0, 1.0]
+    values = st.sampled_from([value for value in exact if math.isfinite(value)])
+    statistic = data.draw(arrays(dtype, st.integers(1, 40), elements=values))
+    cuts = data.draw(st.lists(st.integers(0, len(statistic)), max_size=5))
+    state, memory, number = latch_start(torch.zeros(())), np.array(LATCH_START), first
+    for piece in np.split(statistic, sorted(cuts)):
+        if not len(piece):
+            continue
+        alarm, on, state = latch(
+            torch.from_numpy(piece), threshold, rearm=rearm, refractory=refractory, state=state
+        )
+        numbers = number + np.arange(len(piece), dtype=np.float64)
+        feeds = {"statistic": piece, "level": level, "memory": memory, "number": numbers}
+        found = latching(dtype, rearm, refractory)(feeds)
+        np.testing.assert_array_equal(found["alarms"], alarm.numpy())
+        np.testing.assert_array_equal(found["standing"], on.numpy())
+        memory = found["memory_after"]
+        assert memory[0] == float(state.is_on)
+        number += len(piece)
