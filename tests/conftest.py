@@ -36,6 +36,7 @@ def pytest_configure(config: pytest.Config) -> None:
         if config.option.dist == "load":  # the plugin's choice where the user made none
             config.option.dist = "loadfile"
         config.option.loadscopereorder = False  # the order is that of slow_files_first
+        config.option.maxworkerrestart = "0"  # a crash ends the run and is told, in place of a wait
     if not hasattr(config, "workerinput"):
         why_not()  # builds the native engine of a checkout, once, and not in the midst of a test
 

@@ -29,8 +29,8 @@ from tactslip_torch.data.formats import FORMATS, pieces
 from tactslip_torch.data.manifest import read_manifest
 
 FORM = "tactslip_torch recording 1"
-MOST_BYTES = 2**30
-"""Of address space beyond what is in use."""
+MOST_BYTES = 2**33
+"""Of address space beyond what is in use; libraries reserve gigabytes that they never touch."""
 MOST_TAKEN = 200 * 2**20
 """Of memory really touched by one file."""
 LONGEST = 1000  # characters of a line for people, beside the path
