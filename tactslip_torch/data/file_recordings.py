@@ -11,7 +11,6 @@ import logging
 import math
 import os
 import re
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -229,8 +229,8 @@ class _Part(NamedTuple):
         """What a file of ours says."""
         if self.own is None:
             return Truth()
-        names = (*MOMENTS, "sliding_s", "slip_s", "non_slip_s")
-        return Truth(**{name: getattr(self.own.recording, name) for name in names})
+        told = self.own.recording
+        return Truth(**{name: getattr(told, name) for name in (*MOMENTS, *STRETCHES)})
 
 
 def look(path: Path, stream: Stream, stated_hz: float | None = None) -> _Part:
@@ -372,8 +372,11 @@ class EvenSamples(Samples):
         self.num_channels = samples.num_channels if rows is None else len(rows)
         self._inner, self._most, self._wanted = samples, most_bridged, rows
         self._level = level
-        self._gaps = (Gap(0, 0, 0), *clock.gaps)
-        self._starts = [gap.start for gap in self._gaps]
+        self._gaps = clock.gaps
+        edges = [(gap.start, gap.missing) for gap in clock.gaps]
+        self._starts, missing = np.array([(0, 0), *edges]).T
+        self._lost = missing.cumsum()  # samples, up to the end of each gap
+        self._ends = self._starts + missing
 
     def read(self, first: int, stop: int) -> Tensor:
         """Samples from ``first`` to before ``stop`` on the clock, ``[C, n]``."""
@@ -381,31 +384,26 @@ class EvenSamples(Samples):
 
     def exact(self, first: int, stop: int) -> Tensor:
         """The same, in float64 if a level is taken off."""
-        first, stop = max(first, 0), min(stop, self.num_samples)
-        size = self._inner.num_channels, max(stop - first, 0)
-        found = torch.full(size, torch.nan, dtype=self.dtype)
-        for place in range(bisect_right(self._starts, first) - 1, len(self._gaps)):
-            gap = self._gaps[place]
-            behind = gap.start + gap.missing  # the first sample that is there again
-            following = [*self._starts, self.num_samples][place + 1]
-            low, high = max(gap.start, first), min(behind, stop)
-            if low < high and gap.missing <= self._most:
-                found[:, low - first : high - first] = self._line(gap, low, high)
-            low, high = max(behind, first), min(following, stop)
-            if low < high:
-                shift = gap.place - behind  # file's number less the clock's
-                read = self._inner.read(low + shift, high + shift)
-                found[:, low - first : high - first] = read
-            if following >= stop:
-                break
+        ticks = np.arange(max(first, 0), min(stop, self.num_samples))
+        behind = np.searchsorted(self._starts, ticks, "right") - 1  # the gap before each
+        is_there = ticks >= self._ends[behind]
+        places = (ticks - self._lost[behind])[is_there]  # in the file, one after the other
+        found = torch.full((self._inner.num_channels, len(ticks)), torch.nan, dtype=self.dtype)
+        if len(places):
+            read = self._inner.read(int(places[0]), int(places[-1]) + 1)
+            found[:, torch.from_numpy(is_there)] = read
+        for number in np.unique(behind[~is_there]):
+            gap = self._gaps[number - 1]
+            if gap.missing <= self._most:
+                within = torch.from_numpy(~is_there & (behind == number))
+                found[:, within] = self._line(gap, torch.from_numpy(ticks)[within])
         found = found if self._wanted is None else found[list(self._wanted)]
         return found if self._level is None else found - self._level
 
-    def _line(self, gap: Gap, low: int, high: int) -> Tensor:
-        """The straight line across a gap, at samples ``low`` to before ``high``."""
+    def _line(self, gap: Gap, ticks: Tensor) -> Tensor:
+        """The straight line across a gap, at those ticks of it."""
         ends = self._inner.read(gap.place - 1, gap.place + 1).double()
-        weight = torch.arange(low, high, dtype=torch.float64) - (gap.start - 1)
-        weight /= gap.missing + 1
+        weight = (ticks.double() - (gap.start - 1)) / (gap.missing + 1)
         return (ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * weight).to(self.dtype)
 
 
@@ -586,175 +584,15 @@ def _difference(own: HandLayout, others: HandLayout) -> str:
 # All files of a set -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """How all files of a set are read, treated and labelled; as ``FileRecordings`` has it.
-
-    Raises:
-        ValueError: for a value that cannot be.
-    """
-
-    root: Path
-    streams: tuple[Stream, ...]
-    gaps: GapRule
-    bridge_ms: float
-    resample_hz: float | None
-    tare_s: Stretch | None
-    skip_s: float
-    slide_s: float
-
-    def __post_init__(self) -> None:
-        if self.gaps not in GAP_RULES:
-            known = ", ".join(GAP_RULES)
-            raise ValueError(f"data.gaps must be one of {known}, got {self.gaps!r}")
-        check_number("data.skip_s", self.skip_s, least=0)
-        check_number("data.slide_s", self.slide_s, least=0)
-        check_number("data.bridge_ms", self.bridge_ms)
-        if self.resample_hz is not None:
-            check_number("data.resample_hz", self.resample_hz)
-
-    def key(self) -> dict[str, Any]:
-        """What of it determines the samples, as plain values."""
-        names = ("gaps", "bridge_ms", "resample_hz", "tare_s")
-        return {name: getattr(self, name) for name in names}
-
-    def num_recorded(self, part: _Part) -> int:
-        """How many samples of a stream the recording has."""
-        num = part.clock.num_samples
-        if self.resample_hz is None:
-            return num
-        return int(num * self.resample_hz / part.rate_hz + 1e-6)
-
-    def most_bridged(self, rate_hz: float) -> int:
-        """The most samples of a gap that is bridged."""
-        return int(self.bridge_ms * rate_hz / 1000 + 1e-6) if self.gaps == "bridge" else 0
-
-    def missing_s(self, part: _Part) -> list[Stretch]:
-        """The stretches without samples, wider by what resampling draws from them."""
-        rate_hz, most = part.rate_hz, self.most_bridged(part.rate_hz)
-        reach_s = _REACH / min(rate_hz, self.resample_hz) if self.resample_hz else 0.0
-        return [
-            (max(gap.start / rate_hz - reach_s, 0.0), (gap.start + gap.missing) / rate_hz + reach_s)
-            for gap in part.clock.gaps
-            if gap.missing > most
-        ]
-
-    def look_at(self, entry: Entry) -> tuple[_Part, ...] | str:
-        """What the file of an entry says of each stream, or why it cannot be read."""
-        path = self.root / entry.file
-        try:
-            return tuple(look(path, stream, entry.sample_rate_hz) for stream in self.streams)
-        except (ValueError, OSError) as error:
-            return str(error).replace(f"{self.root}{os.sep}", "")
-
-
-class _Surveyed(NamedTuple):
+class _File(NamedTuple):
     """A recording that can be read: each of its streams, and when things happen in it."""
 
     entry: Entry
     parts: tuple[_Part, ...]
     times: FileTimeline
 
-    @property
-    def is_simulated(self) -> bool:
-        """Whether any of its files says so."""
-        owns = [part.own for part in self.parts]
-        return any(own.recording.provenance.get("simulated") for own in owns if own)
 
-
-def _survey(
-    plan: _Plan, entries: Sequence[Entry]
-) -> tuple[list[_Surveyed], list[Problem], list[Problem]]:
-    """Look at every file of a set.
-
-    Returns:
-        The recordings that can be read and agree with most of the others; the problems of those
-        that are left out; and what is worth a look in the others.
-
-    Raises:
-        ValueError: if streams of several rates are not to be resampled.
-    """
-    looked: Iterable[tuple[_Part, ...] | str] = map(plan.look_at, entries)
-    if len(entries) > _FEW:
-        looked = in_processes(plan.look_at, entries, "looking at files", "file")
-    looked = list(looked)
-    seen = [(e, parts) for e, parts in zip(entries, looked, strict=True) if type(parts) is tuple]
-    wrong = {
-        entry.place: [what]
-        for entry, what in zip(entries, looked, strict=True)
-        if isinstance(what, str)
-    }
-    places = [entry.place for entry, _ in seen]
-    columns = [_with_rates([parts[n] for _, parts in seen]) for n in range(len(plan.streams))]
-    for column in columns if seen else ():
-        any_rate = plan.resample_hz is not None
-        for place, what in zip(
-            places, _differences(column, places, any_rate=any_rate), strict=True
-        ):
-            if what and what not in wrong.setdefault(place, []):
-                wrong[place].append(what)
-    recordings: list[_Surveyed] = []
-    warnings: list[Problem] = []
-    for (entry, _), *parts in zip(seen, *columns, strict=True):
-        if not wrong.get(entry.place):
-            recording, misfits = _timed(plan, entry, tuple(parts))
-            wrong[entry.place] = misfits
-            if not misfits:
-                recordings.append(recording)
-                warnings += [_at(entry, doubt) for doubt in _doubts(recording)]
-    problems = [_at(entry, what) for entry in entries for what in wrong.get(entry.place, ())]
-    rates = [part.rate_hz for part in recordings[0].parts] if recordings else []
-    if plan.resample_hz is None and len(set(rates)) > 1:
-        named = zip(plan.streams, rates, strict=True)
-        told = ", ".join(f"{stream.name} has {rate:g} Hz" for stream, rate in named)
-        raise ValueError(f"the streams must be brought to one rate, {told}: resample_hz=...")
-    return recordings, problems, warnings
-
-
-def _timed(plan: _Plan, entry: Entry, parts: tuple[_Part, ...]) -> tuple[_Surveyed, list[str]]:
-    """A recording with its truth on its time, and what does not fit."""
-    wrong = []
-    for part in parts:
-        if plan.resample_hz is not None:
-            try:  # refuses ratios that cannot be
-                resample(torch.zeros(1, 1), part.rate_hz, plan.resample_hz)
-            except ValueError as error:
-                wrong.append(str(error))
-        if plan.gaps == "refuse" and (gaps := part.clock.gaps):
-            wrong.append(
-                f"{sum(gap.missing for gap in gaps)} samples are missing in {len(gaps)} gaps, "
-                f"first {gaps[0].missing} at {gaps[0].start / part.clock.sample_rate_hz:.4f} s; "
-                "give gaps=missing, or gaps=bridge with bridge_ms"
-            )
-    ends_s = [plan.num_recorded(part) / (plan.resample_hz or part.rate_hz) for part in parts]
-    duration_s = min(ends_s)
-    if max(ends_s) - duration_s > _MOST_CUT_S:
-        wrong.append(
-            f"its streams last {duration_s:.4g} to {max(ends_s):.4g} s; cut the longer one"
-        )
-    missing_s = [gap for part in parts for gap in plan.missing_s(part)]
-    if plan.tare_s is not None:
-        first_s, last_s = plan.tare_s
-        if last_s > duration_s:
-            wrong.append(f"lasts {duration_s:.4g} s, tare_s wants {last_s:g} s")
-        if any(start <= first_s and last_s <= end for start, end in missing_s):
-            wrong.append(f"nothing is there to tare on from {first_s:g} to {last_s:g} s")
-    truth = entry.truth or parts[0].truth
-    pace = parts[0].clock.sample_rate_hz / parts[0].rate_hz
-    if parts[0].is_measured and abs(pace - 1) > _ROUNDING:  # a person read the file's own times
-        truth = scaled(truth, pace)
-    times, misfits = on_time(
-        truth,
-        duration_s,
-        skip_s=plan.skip_s,
-        slide_s=plan.slide_s,
-        slack_s=math.inf if entry.is_nominal else 1.0 / parts[0].rate_hz,
-        missing_s=missing_s,
-    )
-    return _Surveyed(entry, parts, times), [*wrong, *misfits]
-
-
-def _doubts(recording: _Surveyed) -> list[str]:
+def _doubts(recording: _File) -> list[str]:
     """What is worth a look in a recording that can be read."""
     entry, parts, times = recording
     doubts = []
@@ -851,31 +689,141 @@ class FileRecordings:
     ) -> None:
         self.root = Path(root)
         shared = {"channels": channels, "kind": kind, "adapting": adapting, "units": units}
-        self._plan = _Plan(
-            self.root,
-            _streams_of(shared, reading, streams),
-            gaps,
-            bridge_ms,
-            resample_hz,
-            _tare_of(tare_s, "data.tare_s"),
-            skip_s,
-            slide_s,
-        )
+        self._streams = _streams_of(shared, reading, streams)
+        self._tare_s = _tare_of(tare_s, "data.tare_s")
+        if gaps not in GAP_RULES:
+            raise ValueError(f"data.gaps must be one of {', '.join(GAP_RULES)}, got {gaps!r}")
+        check_number("data.skip_s", skip_s, least=0)
+        check_number("data.slide_s", slide_s, least=0)
+        check_number("data.bridge_ms", bridge_ms)
+        if resample_hz is not None:
+            check_number("data.resample_hz", resample_hz)
+        self._gaps, self._bridge_ms, self._resample_hz = gaps, bridge_ms, resample_hz
+        self._skip_s, self._slide_s = skip_s, slide_s
         if not isinstance(manifest, Listing):
             manifest = read_manifest(manifest_of(self.root, manifest), self.root)
-        recordings, problems, warnings = _survey(
-            self._plan, _chosen(manifest.entries, materials, cycles)
-        )
+        self._files: dict[RecordingId, _File] = {}
+        problems, warnings = self._look_at_all(_chosen(manifest.entries, materials, cycles))
         self.problems = (*manifest.problems, *problems)
         self.warnings = (*manifest.warnings, *warnings)
-        self._recordings = {one.entry.recording: one for one in recordings}
-        self.ids = tuple(self._recordings)
+        self.ids = tuple(self._files)
         if strict:
             self._refuse(manifest.problems if skip_failed else self.problems)
             for problem in problems:
                 log.warning("left out: %s", problem)
-            if not recordings:
+            if not self.ids:
                 raise ValueError(f"no recording of {self.root} is left: {self.problems[0]}")
+
+    def _look_at_all(self, entries: Sequence[Entry]) -> tuple[list[Problem], list[Problem]]:
+        """Look at every file; those that can be read and agree with most others are kept.
+
+        Returns:
+            The problems of those that are left out, and what is worth a look in the others.
+
+        Raises:
+            ValueError: if streams of several rates are not to be resampled.
+        """
+        looked: Iterable[tuple[_Part, ...] | str] = map(self._look_at, entries)
+        if len(entries) > _FEW:
+            looked = in_processes(self._look_at, entries, "looking at files", "file")
+        found = list(looked)
+        wrong = [[what] if isinstance(what, str) else [] for what in found]
+        seen = [number for number, what in enumerate(found) if not isinstance(what, str)]
+        places = [entries[number].place for number in seen]
+        streams = [_with_rates(parts) for parts in zip(*(found[n] for n in seen), strict=True)]
+        for parts in streams:
+            differences = _differences(parts, places, any_rate=self._resample_hz is not None)
+            for number, what in zip(seen, differences, strict=True):
+                if what and what not in wrong[number]:
+                    wrong[number].append(what)
+        warnings = []
+        for number, *own in zip(seen, *streams, strict=True):
+            if not wrong[number]:
+                entry = entries[number]
+                file, wrong[number] = self._timed(entry, tuple(own))
+                if not wrong[number]:
+                    self._files[entry.recording] = file
+                    warnings += [_at(entry, doubt) for doubt in _doubts(file)]
+        problems = [
+            _at(entry, what) for entry, each in zip(entries, wrong, strict=True) for what in each
+        ]
+        rates = [part.rate_hz for part in self._any.parts] if self._files else []
+        if self._resample_hz is None and len(set(rates)) > 1:
+            named = zip(self._streams, rates, strict=True)
+            told = ", ".join(f"{stream.name} has {rate:g} Hz" for stream, rate in named)
+            raise ValueError(f"the streams must be brought to one rate, {told}: resample_hz=...")
+        return problems, warnings
+
+    def _look_at(self, entry: Entry) -> tuple[_Part, ...] | str:
+        """What the file of an entry says of each stream, or why it cannot be read."""
+        path = self.root / entry.file
+        try:
+            return tuple(look(path, stream, entry.sample_rate_hz) for stream in self._streams)
+        except (ValueError, OSError) as error:
+            return str(error).replace(f"{self.root}{os.sep}", "")
+
+    def _timed(self, entry: Entry, parts: tuple[_Part, ...]) -> tuple[_File, list[str]]:
+        """A recording with its truth on its time, and what does not fit."""
+        wrong, missing_s = [], []
+        for part in parts:
+            if self._resample_hz is not None:
+                try:  # refuses ratios that cannot be
+                    resample(torch.zeros(1, 1), part.rate_hz, self._resample_hz)
+                except ValueError as error:
+                    wrong.append(str(error))
+            if self._gaps == "refuse" and (gaps := part.clock.gaps):
+                wrong.append(
+                    f"{sum(gap.missing for gap in gaps)} samples are missing in {len(gaps)} gaps, "
+                    f"first {gaps[0].missing} at {gaps[0].start / part.clock.sample_rate_hz:.4f} "
+                    "s; give gaps=missing, or gaps=bridge with bridge_ms"
+                )
+            missing_s += self._missing_s(part)
+        ends_s = [self._num_recorded(part) / (self._resample_hz or part.rate_hz) for part in parts]
+        duration_s = min(ends_s)
+        if max(ends_s) - duration_s > _MOST_CUT_S:
+            wrong.append(
+                f"its streams last {duration_s:.4g} to {max(ends_s):.4g} s; cut the longer one"
+            )
+        if self._tare_s is not None:
+            first_s, last_s = self._tare_s
+            if last_s > duration_s:
+                wrong.append(f"lasts {duration_s:.4g} s, tare_s wants {last_s:g} s")
+            if any(start <= first_s and last_s <= end for start, end in missing_s):
+                wrong.append(f"nothing is there to tare on from {first_s:g} to {last_s:g} s")
+        truth = entry.truth or parts[0].truth
+        pace = parts[0].clock.sample_rate_hz / parts[0].rate_hz
+        if parts[0].is_measured and abs(pace - 1) > _ROUNDING:  # a person read the file's own times
+            truth = scaled(truth, pace)
+        times, misfits = on_time(
+            truth,
+            duration_s,
+            skip_s=self._skip_s,
+            slide_s=self._slide_s,
+            slack_s=math.inf if entry.is_nominal else 1.0 / parts[0].rate_hz,
+            missing_s=missing_s,
+        )
+        return _File(entry, parts, times), [*wrong, *misfits]
+
+    def _num_recorded(self, part: _Part) -> int:
+        """How many samples of a stream the recording has."""
+        num = part.clock.num_samples
+        if self._resample_hz is None:
+            return num
+        return int(num * self._resample_hz / part.rate_hz + 1e-6)
+
+    def _most_bridged(self, rate_hz: float) -> int:
+        """The most samples of a gap that is bridged."""
+        return int(self._bridge_ms * rate_hz / 1000 + 1e-6) if self._gaps == "bridge" else 0
+
+    def _missing_s(self, part: _Part) -> list[Stretch]:
+        """The stretches without samples, wider by what resampling draws from them."""
+        rate_hz, most = part.rate_hz, self._most_bridged(part.rate_hz)
+        reach_s = _REACH / min(rate_hz, self._resample_hz) if self._resample_hz else 0.0
+        return [
+            (max(gap.start / rate_hz - reach_s, 0.0), (gap.start + gap.missing) / rate_hz + reach_s)
+            for gap in part.clock.gaps
+            if gap.missing > most
+        ]
 
     @property
     def hand(self) -> HandLayout:
@@ -885,7 +833,7 @@ class FileRecordings:
     @property
     def sample_rate_hz(self) -> float:
         """Of every recording."""
-        return float(self._plan.resample_hz or self._any.parts[0].rate_hz)
+        return float(self._resample_hz or self._any.parts[0].rate_hz)
 
     @property
     def units(self) -> str:
@@ -895,26 +843,32 @@ class FileRecordings:
     @property
     def is_simulated(self) -> bool:
         """Whether any file says that it comes from a simulation."""
-        return any(one.is_simulated for one in self._recordings.values())
+        owns = [part.own for file in self._files.values() for part in file.parts]
+        return any(own.recording.provenance.get("simulated") for own in owns if own)
 
     def entry(self, recording: RecordingId) -> Entry:
         """Where a recording is, and what was said of it."""
-        return self._recordings[recording].entry
+        return self._files[recording].entry
 
     def timeline(self, recording: RecordingId) -> FileTimeline:
         """When things happen in a recording; nothing is read for it."""
-        return self._recordings[recording].times
+        return self._files[recording].times
 
     def key(self, recording: RecordingId) -> Mapping[str, Any]:
         """What determines the samples: what the file holds, not its name, and how it is read."""
-        one = self._recordings[recording]
+        one = self._files[recording]
         return {
             "sha256": file_digest(self.root / one.entry.file),
             "channels": self.hand.to_rows(),
-            "treatment": self._plan.key(),
+            "treatment": {
+                "gaps": self._gaps,
+                "bridge_ms": self._bridge_ms,
+                "resample_hz": self._resample_hz,
+                "tare_s": self._tare_s,
+            },
             "streams": [
                 {"reading": stream.reading.key(), "rows": part.rows, "rate_hz": part.rate_hz}
-                for stream, part in zip(self._plan.streams, one.parts, strict=True)
+                for stream, part in zip(self._streams, one.parts, strict=True)
             ],
         }
 
@@ -929,7 +883,7 @@ class FileRecordings:
             FileNotFoundError: if its file is gone.
             ValueError: if it is damaged, or has changed.
         """
-        one = self._recordings[recording]
+        one = self._files[recording]
         times, own = one.times, one.parts[0].own
         num_samples = round(times.duration_s * self.sample_rate_hz)
         return Recording(
@@ -946,16 +900,14 @@ class FileRecordings:
             units=self.units,
         )
 
-    def _read(
-        self, one: _Surveyed, windows: Sequence[tuple[float, float]] | None
-    ) -> Iterator[Tensor]:
+    def _read(self, one: _File, windows: Sequence[tuple[float, float]] | None) -> Iterator[Tensor]:
         """The samples of each stream as the recording has them, NaN outside of windows."""
-        wanted_hz = self._plan.resample_hz
-        for part, samples in self._opened(one, self._plan.tare_s):
+        wanted_hz = self._resample_hz
+        for part, samples in self._opened(one, self._tare_s):
             rate_hz, num = part.rate_hz, samples.num_samples
             if wanted_hz is not None and wanted_hz != rate_hz:
                 even = resample(samples.exact(0, num).double(), rate_hz, wanted_hz)
-                yield even[:, : self._plan.num_recorded(part)].to(samples.dtype)
+                yield even[:, : self._num_recorded(part)].to(samples.dtype)
                 continue
             kept = torch.full((samples.num_channels, num), torch.nan, dtype=samples.dtype)
             for start, end in windows if windows is not None else [(0.0, num / rate_hz)]:
@@ -965,13 +917,13 @@ class FileRecordings:
             yield kept
 
     def _opened(
-        self, one: _Surveyed, tare_s: Stretch | None = None
+        self, one: _File, tare_s: Stretch | None = None
     ) -> Iterator[tuple[_Part, EvenSamples]]:
         """Each stream of a recording with its samples, open until the next."""
         path = self.root / one.entry.file
-        for stream, part in zip(self._plan.streams, one.parts, strict=True):
+        for stream, part in zip(self._streams, one.parts, strict=True):
             with open_file(path, stream.reading) as opened:
-                most = self._plan.most_bridged(part.rate_hz)
+                most = self._most_bridged(part.rate_hz)
                 yield part, _of_hand(opened, path, part, tare_s, most)
 
     def inspect(self, recording: RecordingId) -> Inspected:
@@ -981,7 +933,7 @@ class FileRecordings:
             FileNotFoundError: if its file is gone.
             ValueError: if it is damaged.
         """
-        one = self._recordings[recording]
+        one = self._files[recording]
         found = Inspected([], [], {})
         for part, samples in self._opened(one):
             rate_hz = part.rate_hz
@@ -1009,8 +961,8 @@ class FileRecordings:
         return found
 
     @property
-    def _any(self) -> _Surveyed:
-        for one in self._recordings.values():
+    def _any(self) -> _File:
+        for one in self._files.values():
             return one
         raise ValueError(f"no recording of {self.root} can be read: {self.problems[0]}")
 
@@ -1109,14 +1061,12 @@ def _chosen(
         )
     if cycles is not None and not (isinstance(cycles, int) and cycles > 0):
         raise ValueError(f"data.cycles must be a number of trials or null, got {cycles!r}")
-    taken: Counter[tuple[str, str, str]] = Counter()
+    taken: Counter[RecordingId] = Counter()
     kept = set()
     for entry in sorted(entries, key=lambda entry: entry.recording):
-        name = entry.recording
-        place = name.material, name.scene, name.session
-        if (materials is None or name.material in materials) and taken[place] < (
-            cycles or math.inf
-        ):
-            taken[place] += 1
-            kept.add(entry.place)
-    return [entry for entry in entries if entry.place in kept]
+        group = replace(entry.recording, cycle=0)
+        is_wanted = materials is None or group.material in materials
+        if is_wanted and taken[group] < (cycles or math.inf):
+            taken[group] += 1
+            kept.add(entry)
+    return [entry for entry in entries if entry in kept]

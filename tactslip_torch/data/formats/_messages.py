@@ -17,6 +17,7 @@ from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -188,23 +189,22 @@ def _rows_of(message: Any) -> NDArray[Any]:
     return data.reshape(sizes[0], -1) if time == 0 else data.reshape(-1, sizes[-1]).T
 
 
-def _collect(part: Any, name: str, found: list[tuple[str, Any]], depth: int) -> None:
-    """All numbers in a message by name, however nested, arrays as they are.
+def _numbers(part: Any, name: str = "", depth: int = _MOST_DEPTH) -> Iterator[tuple[str, Any]]:
+    """Every number in a message by name, such as ``wrench.force.x`` or ``position[2]``.
 
     Times and texts are none, ``null`` is NaN.
     """
     if depth < 0:
         raise Refused(f"messages nested deeper than {_MOST_DEPTH}")
-    if isinstance(part, np.ndarray):
-        found.append((name, part.reshape(-1).tolist()))
-    elif isinstance(part, list):
+    part = part.reshape(-1).tolist() if isinstance(part, np.ndarray) else part
+    if isinstance(part, list):
         for place, value in enumerate(part):
-            _collect(value, f"{name}[{place}]", found, depth - 1)
+            yield from _numbers(value, f"{name}[{place}]", depth - 1)
     elif part is None or isinstance(part, (int, float)):
-        found.append((name, float("nan") if part is None else part))
+        yield name, float("nan") if part is None else part
     elif _clock(part) is None:
         for inner, value in _fields(part).items():
-            _collect(value, f"{name}.{inner}" if name else inner, found, depth - 1)
+            yield from _numbers(value, f"{name}.{inner}" if name else inner, depth - 1)
 
 
 def _fields(part: Any) -> dict[str, Any]:
@@ -255,13 +255,14 @@ class _TopicSamples:
         self._kind = types.known_name(first.topic) if types is not None else ""
         self._is_array = _ARRAY.fullmatch(self._kind) is not None
         self.checksum = 0
-        rows, self._sizes, stamp = self._decoded(first.content)
-        self._is_stamped, num_columns = stamp is not None, rows.shape[1]
+        rows, names, stamp = self._decoded(first.content)
+        num_columns, self._is_stamped = rows.shape[1], stamp is not None
+        self._alike = names, num_columns, self._is_stamped  # in all messages
         if not 0 < num_columns <= _MOST_NUMBERS:
-            raise Refused(f"{num_columns} numbers an instant, 1 to {_MOST_NUMBERS} are read")
-        if len({name for name, _ in self._sizes}) < len(self._sizes):
+            what = f"{num_columns}" if num_columns <= _MOST_NUMBERS else f"over {_MOST_NUMBERS}"
+            raise Refused(f"{what} numbers an instant, 1 to {_MOST_NUMBERS} are read")
+        if names is not None and len(set(names)) < num_columns:
             raise Refused("two numbers of one name")
-        names = None if self._is_array else self._names()
         if how.time == _LOG_TIME or (how.time == "auto" and (self._is_stamped or names is None)):
             how = replace(how, time=None)
         self._time, self._columns = chosen_columns(names, num_columns, how)
@@ -272,35 +273,17 @@ class _TopicSamples:
         self._logged, self._stamps, self._counts = (array("q") for _ in range(3))
         self._named: list[Any] = []  # the times that ``how`` names
 
-    def _names(self) -> list[str]:
-        """Of the columns, such as ``wrench.force.x`` or ``position[2]``."""
-        return [
-            name if count is None else f"{name}[{place}]"
-            for name, count in self._sizes
-            for place in range(1 if count is None else count)
-        ]
-
-    def _decoded(
-        self, message: bytes
-    ) -> tuple[NDArray[Any], list[tuple[str, int | None]], int | None]:
-        """Rows ``[n, C]``, the name and length of what a row is made of, and the stamp, if any."""
+    def _decoded(self, message: bytes) -> tuple[NDArray[Any], tuple[str, ...] | None, int | None]:
+        """Rows ``[n, C]``, the names of their columns and the stamp, where there are any."""
         if self._types is None:
             content = json.loads(message)
         else:
             content = self._types.store.deserialize_cdr(message, self._kind)
         if self._is_array:
-            rows = _rows_of(content)
-            return rows, [("data", rows.shape[1])], None
-        found: list[tuple[str, Any]] = []
-        _collect(content, "", found, _MOST_DEPTH)
-        values: list[Any] = []
-        sizes: list[tuple[str, int | None]] = []
-        for name, value in found:
-            values += value if isinstance(value, list) else [value]
-            sizes.append((name, len(value) if isinstance(value, list) else None))
-        rows = np.empty((1, len(values)), object)
-        rows[0] = values
-        return rows, sizes, _stamp(content)
+            return _rows_of(content), None, None
+        found = list(islice(_numbers(content), _MOST_NUMBERS + 1))
+        rows = np.array([[value for _, value in found]], object)
+        return rows, tuple(name for name, _ in found), _stamp(content)
 
     def add(self, message: Message) -> None:
         """Keep a message.
@@ -308,8 +291,8 @@ class _TopicSamples:
         Raises:
             Refused: if it is damaged or holds other channels than the first.
         """
-        rows, sizes, stamp = self._decoded(message.content)
-        if sizes != self._sizes or (stamp is not None) != self._is_stamped:
+        rows, names, stamp = self._decoded(message.content)
+        if (names, rows.shape[1], stamp is not None) != self._alike:
             raise Refused(
                 f"holds a message on {self.topic} with other channels than the first: "
                 f"{rows.shape[1]} numbers, or other names"
