@@ -8,11 +8,12 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import torch
 
-from tactslip_torch.deploy.head import llr_of, probability_of, scored
+from tactslip_torch.deploy.head import scored
 from tactslip_torch.deploy.value import BOOL, F64, Graph, Value
 from tactslip_torch.features.bank import Bank, Frame, Samples
 from tactslip_torch.features.ops import TINY
 from tactslip_torch.features.pool import LARGEST_SAMPLE
+from tactslip_torch.model.calibration import Calibration, probability, widened_llr
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.signals.filtering import overlap_matrix
@@ -77,6 +78,14 @@ class Scored(NamedTuple):
     is_usable: Value
     variance: Value | None
 
+    def llr(self, calibration: Calibration) -> Any:
+        """Log likelihood ratios ``[B]`` of finite scores, as wide as their variance asks for."""
+        score: Any = self.score
+        if self.variance is None:
+            return calibration.llr(score)
+        variance: Any = self.variance
+        return widened_llr(calibration, score, variance)
+
 
 def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph:
     """A graph of independent bins.
@@ -106,8 +115,8 @@ def bin_graph(detector: SlipDetector, precision: Precision = "float32") -> Graph
         found = score_bins(samples.take(raw.channels, 1), detector, masked)
         if calibrated is None:
             return [found.score, found.is_valid]
-        llr = llr_of(found.score, calibrated[0], found.variance)
-        return [found.score, found.is_valid, probability_of(llr, calibrated[1])]
+        stated: Any = probability(found.llr(calibrated[0]), calibrated[1])
+        return [found.score, found.is_valid, stated]
 
     def nothing() -> list[Value]:  # onnxruntime reduces and reshapes no empty batch
         return [graph.constant([], kind) for kind in outputs.values()]

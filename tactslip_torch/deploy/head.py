@@ -1,8 +1,7 @@
-"""From features to scores and probabilities, as nodes: pooling, scaling, head, missing channels."""
+"""From features to scores, as nodes: pooling, scaling, head, missing channels."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,13 +11,6 @@ from torch import Tensor
 
 from tactslip_torch.deploy.value import F32, F64, I64, Value
 from tactslip_torch.features.pooling import over_channels
-from tactslip_torch.model.calibration import (
-    LARGEST_LLR,
-    LARGEST_SCORE,
-    Calibration,
-    Isotonic,
-    Platt,
-)
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import Head, KernelSum, Polynomial, QuadraticForm
 from tactslip_torch.model.missing_channels import ClassGaussians
@@ -222,60 +214,6 @@ def _expected(
     total = (weight * mean).sum(0)
     apart = mean - total
     return [total, (weight * (variance + apart * apart)).sum(0)]
-
-
-# Calibration -----------------------------------------------------------------------------------
-
-
-def llr_of(score: Value, calibration: Calibration, variance: Value | None = None) -> Value:
-    """Log likelihood ratios of finite scores, in float64 and rounded once.
-
-    Args:
-        score: expected.
-        calibration: from a score to its ratio.
-        variance: of the score, float64; ``model.calibration.widened_llr``.
-
-    Shape:
-        - score, variance, output: ``[*]``
-
-    Raises:
-        ValueError: for a calibration other than ``Platt`` and ``Isotonic``.
-    """
-    if variance is None:
-        return _certain_llr(score, calibration)
-    llr, wide, away = _certain_llr(score, calibration), score.cast(F64), variance.sqrt()
-    spread = _certain_llr(wide + away, calibration) - _certain_llr(wide - away, calibration)
-    widened = llr.cast(F64) / (spread * spread * (math.pi / 32) + 1.0).sqrt()
-    return widened.cast(score.dtype)
-
-
-def _certain_llr(score: Value, calibration: Calibration) -> Value:
-    wide = score.cast(F64)
-    match calibration:
-        case Platt(slope, offset):
-            line = wide.clamp(-LARGEST_SCORE, LARGEST_SCORE) * slope + offset
-            return line.clamp(-LARGEST_LLR, LARGEST_LLR).cast(score.dtype)
-        case Isotonic(scores, llrs):
-            return _between_knots(wide, scores, llrs).cast(score.dtype)
-    raise ValueError(f"expected a calibration Platt or Isotonic, got {calibration!r}")
-
-
-def _between_knots(score: Value, scores: Sequence[float], llrs: Sequence[float]) -> Value:
-    inside = score.clamp(scores[0], scores[-1])
-    if len(scores) == 1:
-        return inside * 0.0 + llrs[0]
-    is_right = inside.unsqueeze(-1) > score.graph.constant(scores, F64)  # [k, knots]
-    place = (is_right.cast(I64).sum(-1) - 1).clamp(0, len(scores) - 2)  # of the knot to the left
-    tables = scores[:-1], np.diff(scores), llrs[:-1], llrs[1:]
-    x, width, left, right = (place.entries_of(table) for table in tables)
-    share, rise = (inside - x) / width, right - left
-    return score.graph.where(share < 0.5, left + share * rise, right - rise * (1.0 - share))
-
-
-def probability_of(llr: Value, slip_share: float) -> Value:
-    """How probable slip is where this share of all bins is slip: ``[*] -> [*]``."""
-    odds = math.log(slip_share) - math.log1p(-slip_share)
-    return (llr + odds if odds else llr).sigmoid()
 
 
 def _float64(like: Value, x: Tensor) -> Value:

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.deploy.bins import Precision, RawBin, dtype_of, masked_input, score_bins
-from tactslip_torch.deploy.head import llr_of, probability_of
 from tactslip_torch.deploy.value import BOOL, END, F64, I64, Graph, Value
+from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings
 from tactslip_torch.onset.rules import NEUTRAL, NOTHING_YET, Cusum, KOfN, Rule
@@ -111,8 +111,7 @@ def stream_graph(
         number = places.cast(F64) + made
         windows = _windows(held, seen, made * float(timing.hop), places, detector, timing)
         scored = score_bins(windows.cast(dtype), detector, masked)
-        llr = llr_of(scored.score, settings.calibration, scored.variance)
-        llr = graph.where(scored.is_usable, llr, NEUTRAL)
+        llr = graph.where(scored.is_usable, scored.llr(settings.calibration), NEUTRAL)
         statistic, of_rule = statistic_of(settings.rule, llr, of_rule)
         own = graph.constant([settings.threshold], F64)
         level = graph.concat(threshold, own, axis=0).slice(0, 1, 0).cast(dtype)
@@ -123,9 +122,11 @@ def stream_graph(
         )
         latch = latched(statistic, level, number, of_latch, rearm=rearm, refractory=refractory)
         run = _latest(llr <= 0.0, run, number + 1.0)
+        ratio: Any = llr
+        stated: Any = probability(ratio, settings.slip_share)
         return [
             scored.score,
-            probability_of(llr, settings.slip_share),
+            stated,
             statistic,
             scored.is_valid,
             latch.alarm,

@@ -183,7 +183,7 @@ class Graph:
         made = self.ops("Scan", *state, *rows, dtypes=dtypes, body=body, num_scan_inputs=len(rows))
         return made[: len(state)], made[len(state) :]
 
-    def model(self, metadata: Mapping[str, str] | None = None) -> onnx.ModelProto:
+    def model(self) -> onnx.ModelProto:
         """The model, checked by onnx.
 
         Raises:
@@ -195,7 +195,6 @@ class Graph:
             ir_version=IR_VERSION,
             producer_name="tactslip_torch",
         )
-        helper.set_model_props(model, dict(metadata or {}))
         onnx.checker.check_model(model)
         return model
 
@@ -209,9 +208,30 @@ class Graph:
         return f"v{self._count}"
 
 
+def _of_itself(kind: str) -> Callable[[Value], Value]:
+    """A method that is an operator of one input."""
+    return lambda value: value.graph.op(kind, value)
+
+
+def _with_operand(
+    kind: str, dtype: np.dtype[Any] | None = None
+) -> Callable[[Value, Operand], Value]:
+    """A method that is an operator of two inputs of one dtype; the output has it if not said."""
+    return lambda value, other: value.graph.op(kind, value, value.meet(other), dtype=dtype)
+
+
+def _along_axis(kind: str) -> Callable[..., Value]:
+    """A method that reduces an axis."""
+
+    def reduced(value: Value, axis: int = -1, keepdim: bool = False) -> Value:
+        return value.graph.op(kind, value, value.graph.axes(axis), keepdims=int(keepdim))
+
+    return reduced
+
+
 @dataclass(frozen=True, eq=False)
 class Value:
-    """What a node gives, an input, or a constant.
+    """What a node gives, an input, or a constant; its methods are those of a ``Tensor``.
 
     Args:
         graph: that it is of.
@@ -223,11 +243,31 @@ class Value:
     name: str
     dtype: np.dtype[Any]
 
-    def __add__(self, other: Operand) -> Value:
-        return self._with("Add", other)
+    __add__ = _with_operand("Add")
+    __sub__ = _with_operand("Sub")
+    __matmul__ = _with_operand("MatMul")
+    __lt__ = _with_operand("Less", BOOL)
+    __le__ = _with_operand("LessOrEqual", BOOL)
+    __gt__ = _with_operand("Greater", BOOL)
+    __ge__ = _with_operand("GreaterOrEqual", BOOL)
+    eq = _with_operand("Equal", BOOL)
+    minimum = _with_operand("Min")
+    maximum = _with_operand("Max")
 
-    def __sub__(self, other: Operand) -> Value:
-        return self._with("Sub", other)
+    __neg__ = _of_itself("Neg")
+    __invert__ = _of_itself("Not")
+    abs = _of_itself("Abs")
+    sqrt = _of_itself("Sqrt")
+    log = _of_itself("Log")
+    exp = _of_itself("Exp")
+    floor = _of_itself("Floor")
+    sign = _of_itself("Sign")
+    sigmoid = _of_itself("Sigmoid")
+
+    sum = _along_axis("ReduceSum")
+    mean = _along_axis("ReduceMean")
+    amax = _along_axis("ReduceMax")  # in onnxruntime a NaN may be passed over
+    amin = _along_axis("ReduceMin")  # likewise
 
     def __rsub__(self, other: Operand) -> Value:
         return self.meet(other) - self
@@ -235,57 +275,23 @@ class Value:
     def __mul__(self, other: Operand) -> Value:
         if _is_taken_for_one(other):
             return self * (other / 2) * 2.0
-        return self._with("Mul", other)
+        return self.graph.op("Mul", self, self.meet(other))
 
-    def __rmul__(self, other: Operand) -> Value:
-        return self * other
+    __rmul__ = __mul__
 
     def __truediv__(self, other: Operand) -> Value:
         if _is_taken_for_one(other):
             return self / (other * 2) * 2.0
-        return self._with("Div", other)
+        return self.graph.op("Div", self, self.meet(other))
 
     def __rtruediv__(self, other: Operand) -> Value:
         return self.meet(other) / self
-
-    def __matmul__(self, other: Operand) -> Value:
-        return self._with("MatMul", other)
-
-    def __neg__(self) -> Value:
-        return self.graph.op("Neg", self)
-
-    def __invert__(self) -> Value:
-        return self.graph.op("Not", self)
 
     def __and__(self, other: Value) -> Value:
         return self.graph.op("And", self, other)
 
     def __or__(self, other: Value) -> Value:
         return self.graph.op("Or", self, other)
-
-    def __lt__(self, other: Operand) -> Value:
-        return self._with("Less", other, BOOL)
-
-    def __le__(self, other: Operand) -> Value:
-        return self._with("LessOrEqual", other, BOOL)
-
-    def __gt__(self, other: Operand) -> Value:
-        return self._with("Greater", other, BOOL)
-
-    def __ge__(self, other: Operand) -> Value:
-        return self._with("GreaterOrEqual", other, BOOL)
-
-    def eq(self, other: Operand) -> Value:
-        """Where both are the same, bool."""
-        return self._with("Equal", other, BOOL)
-
-    def minimum(self, other: Operand) -> Value:
-        """The smaller of two."""
-        return self._with("Min", other)
-
-    def maximum(self, other: Operand) -> Value:
-        """The larger of two."""
-        return self._with("Max", other)
 
     def clamp(self, min: float | None = None, max: float | None = None) -> Value:
         """Within bounds."""
@@ -294,50 +300,6 @@ class Value:
             return self.maximum(min)
         low = None if min is None else self.meet(min)
         return self.graph.op("Clip", self, low, self.meet(max))
-
-    def abs(self) -> Value:
-        """Magnitudes."""
-        return self.graph.op("Abs", self)
-
-    def sqrt(self) -> Value:
-        """Square roots."""
-        return self.graph.op("Sqrt", self)
-
-    def log(self) -> Value:
-        """Natural logarithms."""
-        return self.graph.op("Log", self)
-
-    def exp(self) -> Value:
-        """Exponentials."""
-        return self.graph.op("Exp", self)
-
-    def floor(self) -> Value:
-        """Whole numbers below."""
-        return self.graph.op("Floor", self)
-
-    def sign(self) -> Value:
-        """-1, 0 or 1."""
-        return self.graph.op("Sign", self)
-
-    def sigmoid(self) -> Value:
-        """Logistic function."""
-        return self.graph.op("Sigmoid", self)
-
-    def sum(self, axis: int = -1, keepdim: bool = False) -> Value:
-        """Sums along an axis."""
-        return self._reduced("ReduceSum", axis, keepdim)
-
-    def mean(self, axis: int = -1, keepdim: bool = False) -> Value:
-        """Means along an axis."""
-        return self._reduced("ReduceMean", axis, keepdim)
-
-    def amax(self, axis: int = -1, keepdim: bool = False) -> Value:
-        """Largest along an axis; in onnxruntime a NaN may be passed over."""
-        return self._reduced("ReduceMax", axis, keepdim)
-
-    def amin(self, axis: int = -1, keepdim: bool = False) -> Value:
-        """Smallest along an axis; in onnxruntime a NaN may be passed over."""
-        return self._reduced("ReduceMin", axis, keepdim)
 
     def all(self, axis: int) -> Value:
         """Whether a mask holds everywhere along an axis."""
@@ -373,6 +335,8 @@ class Value:
     def detach(self) -> Value:
         """Itself: a graph has no gradients."""
         return self
+
+    contiguous = detach
 
     def __getitem__(self, place: tuple[Any, slice | int | None]) -> Value:
         """Of the last axis (``x[..., place]``) a slice or an entry; or one more, of length 1."""
@@ -432,6 +396,16 @@ class Value:
     def entries_of(self, table: ArrayLike | Tensor) -> Value:
         """Of a constant table of float64, at the places that are these values."""
         return self.graph.op("Gather", self.graph.constant(table, F64), self)
+
+    def places_in(self, knots: Tensor) -> Value:
+        """How many of some knots ``[n]``, ascending, are smaller."""
+        is_larger = self.unsqueeze(-1) > self.graph.constant(knots, F64)
+        return is_larger.cast(I64).sum(-1)
+
+    def interpolated(self, end: Value, weight: Value) -> Value:
+        """From this value to another, exact at both ends: ``torch.lerp``."""
+        rise = end - self
+        return self.graph.where(weight < 0.5, self + weight * rise, end - rise * (1.0 - weight))
 
     @classmethod
     def __torch_function__(
@@ -494,18 +468,14 @@ class Value:
             raise TypeError(f"{self.dtype} meets {other.dtype}; cast one of them")
         return other
 
-    def _with(self, kind: str, other: Operand, dtype: np.dtype[Any] | None = None) -> Value:
-        return self.graph.op(kind, self, self.meet(other), dtype=dtype)
-
-    def _reduced(self, kind: str, axis: int, keepdim: bool) -> Value:
-        return self.graph.op(kind, self, self.graph.axes(axis), keepdims=int(keepdim))
-
 
 _FUNCTIONS: dict[Callable[..., Any], Callable[..., Value]] = {
     torch.where: lambda mask, yes, no: mask.graph.where(mask, yes, no),
     torch.cat: lambda values, dim: values[0].graph.concat(*values, axis=dim),
     torch.minimum: Value.minimum,
     torch.maximum: Value.maximum,
+    torch.lerp: lambda start, end, weight: start.interpolated(end, weight),
+    torch.searchsorted: lambda ascending, values: values.places_in(ascending),
 }
 """Functions of torch that take values, and what they do."""
 

@@ -15,13 +15,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, softplus
 
+from tactslip_torch.features.ops import like, looked_up
+
 LARGEST_LLR = 1e30  # where llrs saturate, so that what adds them up stays finite in float32
 LARGEST_SCORE = 1e300  # beyond it the difference of two scores may leave float64
 _END_WEIGHT = 2.0  # of what tells nothing, at either end of an isotonic fit
 
 
 class Calibration(Protocol):
-    """From scores to log likelihood ratios: never falling, differentiable, saturating."""
+    """From scores to log likelihood ratios: never falling, differentiable, saturating.
+
+    Written in operations that values of an ONNX graph have too, as is what is below on ratios.
+    """
 
     def llr(self, score: Tensor) -> Tensor:
         """Log likelihood ratios: ``[*] -> [*]``, dtype of ``score``; NaN stays NaN."""
@@ -51,7 +56,7 @@ class Platt:
     def llr(self, score: Tensor) -> Tensor:
         """Log likelihood ratios: ``[*] -> [*]``, dtype of ``score``; NaN stays NaN."""
         line = self.slope * score.double().clamp(-LARGEST_SCORE, LARGEST_SCORE) + self.offset
-        return line.clamp(-LARGEST_LLR, LARGEST_LLR).to(score.dtype)
+        return line.clamp(-LARGEST_LLR, LARGEST_LLR).type_as(score)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; ``calibration_from_dict`` reads them."""
@@ -81,13 +86,15 @@ class Isotonic:
 
     def llr(self, score: Tensor) -> Tensor:
         """Log likelihood ratios: ``[*] -> [*]``, dtype of ``score``; NaN stays NaN."""
-        x, y = _row(self.scores).to(score.device), _row(self.llrs).to(score.device)
+        x, y = _row(self.scores), _row(self.llrs)
         inside = score.double().clamp(self.scores[0], self.scores[-1])
         if len(x) == 1:
-            return (0 * inside + y[0]).to(score.dtype)
-        right = torch.searchsorted(x, inside.detach().contiguous()).clamp(1, len(x) - 1)
-        share = (inside - x[right - 1]) / (x[right] - x[right - 1])
-        return torch.lerp(y[right - 1], y[right], share).to(score.dtype)
+            return (inside * 0.0 + self.llrs[0]).type_as(score)
+        place = torch.searchsorted(like(x, inside), inside.detach().contiguous())
+        left = (place - 1).clamp(0, len(x) - 2)
+        tables = x[:-1], x.diff(), y[:-1], y[1:]
+        start, width, low, high = (looked_up(table, left) for table in tables)
+        return torch.lerp(low, high, (inside - start) / width).type_as(score)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; ``calibration_from_dict`` reads them."""
@@ -193,7 +200,7 @@ def probability(llr: Tensor, slip_share: float) -> Tensor:
     """
     if not 0 < slip_share < 1:
         raise ValueError(f"slip_share must lie between 0 and 1, got {slip_share}")
-    return torch.sigmoid(llr + math.log(slip_share) - math.log1p(-slip_share))
+    return (llr + (math.log(slip_share) - math.log1p(-slip_share))).sigmoid()
 
 
 def widened_llr(calibration: Calibration, score: Tensor, variance: Tensor) -> Tensor:
@@ -215,12 +222,11 @@ def widened_llr(calibration: Calibration, score: Tensor, variance: Tensor) -> Te
     Reference:
         MacKay (1992), Neural Computation 4(5), 720-736.
     """
-    llr = calibration.llr(score).double()
+    llr, wide = calibration.llr(score).double(), score.double()
     # 0 gives way to what changes no ratio, and has a finite slope
     away = variance.double().clamp(min=torch.finfo(torch.float64).tiny).sqrt()
-    above, below = (calibration.llr(score.double() + sign * away) for sign in (1, -1))
-    spread = (above - below) / 2
-    return (llr / (1 + math.pi / 8 * spread.square()).sqrt()).to(score.dtype)
+    spread = (calibration.llr(wide + away) - calibration.llr(wide - away)) / 2
+    return (llr / (spread * spread * (math.pi / 8) + 1.0).sqrt()).type_as(score)
 
 
 @dataclass(frozen=True)
