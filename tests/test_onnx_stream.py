@@ -13,7 +13,6 @@ from hypothesis.extra.numpy import arrays
 from streams import detector_of, signal
 
 from tactslip_torch.deploy.check import runner, session_of
-from tactslip_torch.deploy.head import llr_of, probability_of
 from tactslip_torch.deploy.stream import (
     LATCH_START,
     Timing,
@@ -220,9 +219,9 @@ def scores_of(dtype):
 @cache
 def calibrating(calibration, dtype, slip_share):
     graph = Graph()
-    llr = llr_of(graph.input("score", dtype, ("k",)), calibration)
+    llr = calibration.llr(graph.input("score", dtype, ("k",)))
     graph.output("llr", llr, ("k",))
-    graph.output("probability", probability_of(llr, slip_share), ("k",))
+    graph.output("probability", probability(llr, slip_share), ("k",))
     return runner(session_of(graph.model()))
 
 
@@ -243,11 +242,6 @@ def test_scores_become_the_same_ratios_and_probabilities(calibration, dtype, dat
     close = 1e-12 if dtype == F64 else 2e-7
     stated = probability(expected, slip_share)
     np.testing.assert_allclose(found["probability"], stated, rtol=0, atol=close)
-
-
-def test_another_calibration_is_refused():
-    with pytest.raises(ValueError, match="Platt or Isotonic, got 'line'"):
-        llr_of(Graph().input("score", F64, ("k",)), "line")
 
 
 # Rules and latch -------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import cycle, pairwise
 from typing import Any, Literal
@@ -128,6 +128,51 @@ def _first_line(error: BaseException) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
+@dataclass(frozen=True)
+class _Comparison:
+    """A graph beside the detector in float64 that it was made of."""
+
+    run: Run
+    precision: Precision
+    detector: SlipDetector
+    sd: float
+    """Standard deviation of the scores of what was simulated, the unit of score errors."""
+
+    def outputs(self, inputs: Arrays, wanted: Mapping[str, str], what: str) -> dict[str, Any]:
+        """What the graph gives, which must be as wanted by name, such as ``float32[7]``."""
+        try:
+            got = self.run(inputs)
+        except ValueError as error:
+            raise ValueError(f"{what}: {error}") from error
+        found = {name: f"{array.dtype}{list(array.shape)}" for name, array in got.items()}
+        if odd := sorted(n for n in {**found, **wanted} if found.get(n) != wanted.get(n)):
+            gives, expected = (
+                ", ".join(f"{name} {each.get(name, 'missing')}" for name in odd)
+                for each in (found, wanted)
+            )
+            raise ValueError(f"{what}: it gives {gives}, expected {expected}")
+        return got
+
+    def score_error(self, error: NDArray[Any], degenerate: bool, what: str) -> float:
+        """The worst score error in standard deviations, if it is no larger than it may be."""
+        most = (WORST_DEGENERATE_SD if degenerate else WORST_SD)[self.precision]
+        return _worst(error, most, "standard deviations", f"{what}: score")
+
+
+def _worst(error: NDArray[Any], most: float, unit: str, what: str) -> float:
+    if not (found := float(error.max(initial=0.0))) <= most:
+        raise ValueError(f"{what} differs from torch by {found:.1e} {unit}, more than {most:g}")
+    return found
+
+
+def _same_flags(got: NDArray[Any], expected: NDArray[Any], what: str) -> None:
+    if places := np.flatnonzero(got != expected).tolist():
+        num = len(expected)
+        raise ValueError(
+            f"{what} differs from torch at {len(places)} of {num}, the first is number {places[0]}"
+        )
+
+
 # Bins ------------------------------------------------------------------------------------------
 
 
@@ -136,7 +181,9 @@ def check_bins(run: Run, detector: SlipDetector, precision: Precision) -> dict[s
     hand, dtype = detector.pool.hand, getattr(torch, precision)
     length, unit = RawBin.of(detector).length, _unit_of(detector)
     slip = unit * simulated_bins(hand, detector.pool.sample_rate_hz, _SIMULATED, length, dtype)
-    compare = _BinComparison(run, detector, precision, slip)
+    exact = copy.deepcopy(detector).double()
+    sd = float(_predicted(exact, slip.double()).score.std()) or 1.0
+    compare = _BinComparison(run, precision, exact, sd)
     worst = compare(slip, "simulated bins")
     for seed, batch in enumerate(_BATCHES):
         worst = max(worst, compare(unit * noise_bins(hand, batch, length, seed, dtype), "noise"))
@@ -146,38 +193,21 @@ def check_bins(run: Run, detector: SlipDetector, precision: Precision) -> dict[s
         of_kind[kind] = compare(bins, f"degenerate bins ({kind})", degenerate=True)
         mixed = torch.cat([bins[:1], slip[:_EACH]])  # where a graph may go another way
         compare(mixed, f"simulated bins behind a degenerate one ({kind})", behind=1)
-    of_mask = {}
-    for name, mask in _masks(detector).items():
-        what = f"simulated bins without {name}"
-        of_mask[name] = compare(slip, what, degenerate=True, mask=mask)
+    of_mask = {
+        name: compare(slip, f"simulated bins without {name}", degenerate=True, mask=mask)
+        for name, mask in _masks(detector).items()
+    }
     return {
         "bins": len(slip) + sum(_BATCHES),
-        "score_sd": compare.sd,
+        "score_sd": sd,
         "worst_sd": worst,
         "degenerate_worst_sd": of_kind,
         "masked_worst_sd": of_mask,
     }
 
 
-class _BinComparison:
-    """Bins scored by a graph, and by its detector in float64.
-
-    Args:
-        run: the graph.
-        detector: that it was made of.
-        precision: of the graph.
-        usual: bins whose scores tell the unit of errors.
-    """
-
-    def __init__(
-        self, run: Run, detector: SlipDetector, precision: Precision, usual: Tensor
-    ) -> None:
-        self._run, self._precision = run, precision
-        self._detector = copy.deepcopy(detector).double()
-        self._calibrated = calibration_of(detector)
-        raw = RawBin.of(detector)  # what no filter in use takes in is 0
-        self._context = detector.context_before - raw.before, detector.context_after - raw.after
-        self.sd = float(self._predict(usual.double(), None).score.std()) or 1.0
+class _BinComparison(_Comparison):
+    """Bins scored by a graph, and by its detector."""
 
     def __call__(
         self,
@@ -200,42 +230,32 @@ class _BinComparison:
         Raises:
             ValueError: if anything differs by more than it may.
         """
-        exact = self._predict(samples.double(), mask)
-        # a channel is trusted by what its samples resolve in the precision they come in
-        is_valid = self._predict(samples, mask).is_valid.numpy()
+        exact = _predicted(self.detector, samples.double(), mask)
+        of_score, calibrated = f"{self.precision}[{len(samples)}]", calibration_of(self.detector)
+        wanted = {"score": of_score, "valid": f"bool[{len(samples)}]"}
+        if calibrated is not None:
+            wanted["probability"] = of_score
         feeds = {"samples": samples.numpy()}
-        try:
-            got = self._run(feeds if mask is None else feeds | {"masked_channels": mask.numpy()})
-        except ValueError as error:
-            raise ValueError(f"{what}: {error}") from error
-        wanted = {"score": f"{self._precision}[{len(samples)}]", "valid": f"bool[{len(samples)}]"}
-        if self._calibrated is not None:
-            wanted["probability"] = wanted["score"]
-        _check_outputs(got, wanted, what)
+        if mask is not None:
+            feeds["masked_channels"] = mask.numpy()
+        got = self.outputs(feeds, wanted, what)
         score = got["score"].astype(np.float64)
         if not np.isfinite(score).all():
             raise ValueError(f"{what}: {(~np.isfinite(score)).sum()} scores are not finite")
-        if wrong := int((got["valid"] != is_valid).sum()):
-            raise ValueError(f"{what}: valid differs from torch on {wrong} of {len(score)} bins")
-        off = np.abs(score - exact.score.numpy())[behind:] / self.sd
-        worst = (WORST_DEGENERATE_SD if degenerate else WORST_SD)[self._precision]
-        if degenerate and mask is None and not (off <= worst).all():
-            off = np.where(self._rounding_decides(samples, exact.score, worst), 0.0, off)
-        if not (found := float(off.max(initial=0.0))) <= worst:
-            raise ValueError(
-                f"{what}: scores differ from torch in float64 by {found:.1e} of their standard "
-                f"deviation, more than {worst:g}"
-            )
-        if self._calibrated is not None:
-            calibration, slip_share = self._calibrated
+        # a channel is trusted by what its samples resolve in the precision they come in
+        is_valid = _predicted(self.detector, samples, mask).is_valid.numpy()
+        _same_flags(got["valid"], is_valid, f"{what}: valid")
+        error = np.abs(score - exact.score.numpy())[behind:] / self.sd
+        worst = WORST_DEGENERATE_SD[self.precision]
+        if degenerate and mask is None and not (error <= worst).all():
+            error = np.where(self._rounding_decides(samples, exact.score, worst), 0.0, error)
+        found = self.score_error(error, degenerate, what)
+        if calibrated is not None:
+            calibration, slip_share = calibrated
             llr = widened_llr(calibration, torch.from_numpy(score), exact.variance.double())
-            unstated = np.abs(got["probability"] - probability(llr, slip_share).numpy())
-            _refuse(unstated, WORST_PROBABILITY[self._precision], "", f"{what}: probability")
+            off = np.abs(got["probability"] - probability(llr, slip_share).numpy())
+            _worst(off, WORST_PROBABILITY[self.precision], "", f"{what}: probability")
         return found
-
-    def _predict(self, samples: Tensor, mask: Tensor | None) -> Prediction:
-        with torch.no_grad():
-            return self._detector.predict_raw(pad(samples, self._context), masked_channels=mask)
 
     def _rounding_decides(self, samples: Tensor, score: Tensor, worst: float) -> NDArray[np.bool_]:
         """Bins ``[N]`` whose score moves by more than it may where samples move by their rounding.
@@ -250,28 +270,31 @@ class _BinComparison:
         generator = torch.Generator().manual_seed(0)
         drawn = 2 * torch.rand((4, *x.shape), generator=generator, dtype=x.dtype) - 1
         moves = [size, -size, *(size * drawn), *(-size * drawn)]
-        moved = torch.stack([self._predict(x + move, None).score for move in moves])
+        moved = torch.stack([_predicted(self.detector, x + move).score for move in moves])
         return ((moved - score).abs() > worst * self.sd).any(0).numpy()
 
 
-def _check_outputs(got: Arrays, wanted: Mapping[str, str], what: str) -> None:
-    """Refuse outputs that differ from what is wanted, name by name, such as ``float32[7]``."""
-    found = {name: f"{array.dtype}{list(array.shape)}" for name, array in got.items()}
-    if odd := sorted(n for n in found.keys() | wanted.keys() if found.get(n) != wanted.get(n)):
-        gives, expected = (
-            ", ".join(f"{name} {each.get(name, 'missing')}" for name in odd)
-            for each in (found, wanted)
-        )
-        raise ValueError(f"{what}: it gives {gives}, expected {expected}")
-
-
-def _refuse(off: NDArray[Any], most: float, unit: str, what: str) -> None:
-    if not (found := float(off.max(initial=0.0))) <= most:
-        raise ValueError(f"{what} differs from torch by {found:.1e} {unit}, more than {most:g}")
+def _predicted(detector: SlipDetector, samples: Tensor, mask: Tensor | None = None) -> Prediction:
+    """What the detector says of a graph's bins; what no filter in use takes in is 0."""
+    raw = RawBin.of(detector)
+    ends = detector.context_before - raw.before, detector.context_after - raw.after
+    with torch.no_grad():
+        return detector.predict_raw(pad(samples, ends), masked_channels=mask)
 
 
 # Streams ---------------------------------------------------------------------------------------
 
+_COLUMNS = {
+    "score": "score",
+    "probability": "probability",
+    "statistic": "statistic",
+    "valid": "is_valid",
+    "alarm": "is_alarm",
+    "on": "is_on",
+    "time_s": "available_s",
+    "onset_s": "onset_s",
+}
+"""Outputs of the graph, and the fields of ``Decisions`` that they are."""
 _FLAGS, _TIMES = ("valid", "alarm", "on"), ("time_s", "onset_s")
 
 
@@ -290,25 +313,28 @@ def check_stream(run: Run, detector: SlipDetector, precision: Precision) -> dict
     )
     num = max(slip.shape[1], max(timing.first, timing.frame) + _DECISIONS * timing.hop)
     samples = _unit_of(detector) * slip.T[torch.arange(num) % slip.shape[1]]
-    compare = _StreamComparison(run, detector, precision, samples)
+    exact = copy.deepcopy(detector).double()
+    usual = _decided(exact, samples, settings)
+    sd = float(usual["score"].std()) or 1.0
+    compare = _StreamComparison(run, precision, exact, sd)
     generator = np.random.default_rng(0)
     anyhow = np.cumsum(generator.integers(0, 400, num) * (generator.random(num) < 0.8))
+    by_hop = range(timing.hop, num, timing.hop)
     cuts: dict[str, Sequence[int]] = {
         "whole": [],
-        "by hop": range(timing.hop, num, timing.hop),
+        "by hop": by_hop,
         "by sample": range(min(num, 300)),
         "anyhow": [0, *(int(cut) for cut in anyhow if cut < num)],
     }
     worst = max(compare(samples, settings, cut, f"cut {name}") for name, cut in cuts.items())
-    by_hop = cuts["by hop"]
-    middling = replace(settings, threshold=_middle_threshold(compare.usual["statistic"]))
+    middling = replace(settings, threshold=_middle_threshold(usual["statistic"]))
     compare(samples, middling, by_hop, "another threshold")
     broken = _broken(samples, detector.needed_index.tolist())
     mask = _masks(detector)["every other"]
     return {
-        "decisions": len(compare.usual["score"]),
-        "alarms": int(compare.usual["alarm"].sum()),
-        "score_sd": compare.sd,
+        "decisions": len(usual["score"]),
+        "alarms": int(usual["alarm"].sum()),
+        "score_sd": sd,
         "worst_sd": worst,
         "broken_worst_sd": compare(broken, settings, by_hop, "broken channels", degenerate=True),
         "masked_worst_sd": compare(
@@ -317,29 +343,8 @@ def check_stream(run: Run, detector: SlipDetector, precision: Precision) -> dict
     }
 
 
-class _StreamComparison:
-    """A stream watched by a graph, and by its detector in float64.
-
-    Args:
-        run: the graph.
-        detector: that it was made of.
-        precision: of the graph.
-        usual: samples ``[T, C]`` whose scores tell the unit of errors.
-
-    Attributes:
-        usual: what the detector says of them, under the graph's names.
-        sd: standard deviation of their scores.
-    """
-
-    def __init__(
-        self, run: Run, detector: SlipDetector, precision: Precision, usual: Tensor
-    ) -> None:
-        self._run, self._precision = run, precision
-        self._detector = copy.deepcopy(detector).double()
-        settings = AlarmSettings.of(detector)
-        self._timing = Timing.of(detector, settings)
-        self.usual = self._expected(usual, settings, ())
-        self.sd = float(self.usual["score"].std()) or 1.0
+class _StreamComparison(_Comparison):
+    """A stream watched by a graph, and by its detector."""
 
     def __call__(
         self,
@@ -364,83 +369,64 @@ class _StreamComparison:
         Raises:
             ValueError: if anything differs by more than it may.
         """
-        expected = self._expected(samples, settings, () if mask is None else mask)
-        got = self._watched(samples.numpy(), settings.threshold, cuts, mask, what)
-        num = len(expected["score"])
+        expected = _decided(self.detector, samples, settings, () if mask is None else mask)
+        got = self._watched(samples.numpy(), settings, cuts, mask, what)
         for name in _FLAGS:
-            if places := np.flatnonzero(got[name] != expected[name]).tolist():
-                raise ValueError(
-                    f"{what}: {name} differs from torch at {len(places)} of {num} decisions, the "
-                    f"first at {expected['time_s'][places[0]]:.3f} s"
-                )
+            _same_flags(got[name], expected[name], f"{what}: {name}")
+        off = {name: np.abs(got[name].astype(np.float64) - expected[name]) for name in _COLUMNS}
         for name in _TIMES:
-            _refuse(np.abs(got[name] - expected[name]), _LATE_S, "s", f"{what}: {name}")
-        score, precision = got["score"].astype(np.float64), self._precision
-        error = np.abs(score - expected["score"]) / self.sd
-        worst = WORST_DEGENERATE_SD if degenerate else WORST_SD
-        _refuse(error, worst[precision], "standard deviations", f"{what}: score")
+            _worst(off[name], _LATE_S, "s", f"{what}: {name}")
+        found = self.score_error(off["score"] / self.sd, degenerate, what)
         tells = expected["statistic"] > -1e30  # before that a rule has seen too few decisions
-        statistic = expected["statistic"][tells]
-        span = float(np.ptp(statistic)) if len(statistic) else 0.0
-        off = np.abs(got["statistic"][tells] - statistic) / (span or 1.0)
-        _refuse(off, _STATISTIC[precision], "of its range", f"{what}: statistic")
-        stated = probability(settings.calibration.llr(torch.from_numpy(score)), settings.slip_share)
-        off = np.abs(got["probability"] - stated.numpy())[got["valid"]]
-        _refuse(off, WORST_PROBABILITY[precision], "", f"{what}: probability")
-        return float(error.max(initial=0.0))
+        span = float(np.ptp(expected["statistic"][tells])) if tells.any() else 0.0
+        error = off["statistic"][tells] / (span or 1.0)
+        _worst(error, _STATISTIC[self.precision], "of its range", f"{what}: statistic")
+        llr = settings.calibration.llr(torch.from_numpy(got["score"].astype(np.float64)))
+        stated = probability(llr, settings.slip_share).numpy()
+        error = np.abs(got["probability"] - stated)[got["valid"]]
+        _worst(error, WORST_PROBABILITY[self.precision], "", f"{what}: probability")
+        return found
 
     def _watched(
         self,
         samples: NDArray[Any],
-        threshold: float,
+        settings: AlarmSettings,
         cuts: Sequence[int],
         mask: Tensor | None,
         what: str,
     ) -> dict[str, NDArray[Any]]:
         """All columns, by a host that hands on tail and state and nothing else."""
-        timing, precision = self._timing, self._precision
-        feeds = {
-            "tail": samples[:0],
-            "state": np.empty(0),
-            "threshold": np.array([threshold]),
-        }
+        timing, threshold = Timing.of(self.detector, settings), np.array([settings.threshold])
+        feeds = {"tail": samples[:0], "state": np.empty(0), "threshold": threshold}
         if mask is not None:
             feeds["masked_channels"] = mask.numpy()
         pieces = []
         for start, stop in pairwise([0, *cuts, len(samples)]):
-            got = self._run(feeds | {"samples": samples[start:stop]})
             num = timing.decisions(stop) - timing.decisions(start)
-            wanted = dict.fromkeys(self.usual, f"{precision}[{num}]")
+            wanted = dict.fromkeys(_COLUMNS, f"{self.precision}[{num}]")
             wanted |= dict.fromkeys(_FLAGS, f"bool[{num}]")
             wanted |= dict.fromkeys(_TIMES, f"float64[{num}]")
-            wanted["next_tail"] = f"{precision}{[timing.tail, samples.shape[1]]}"
+            wanted["next_tail"] = f"{self.precision}{[timing.tail, samples.shape[1]]}"
             wanted["next_state"] = f"float64{[timing.state_size]}"
-            _check_outputs(got, wanted, f"{what}: at sample {stop}")
+            piece = feeds | {"samples": samples[start:stop]}
+            got = self.outputs(piece, wanted, f"{what}: at sample {stop}")
             feeds["tail"], feeds["state"] = got.pop("next_tail"), got.pop("next_state")
             pieces.append(got)
-        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in _COLUMNS}
 
-    def _expected(
-        self, samples: Tensor, settings: AlarmSettings, mask: ChannelMask
-    ) -> dict[str, NDArray[Any]]:
-        """What the detector says, under the graph's names."""
-        stream, in_its_own = (
-            StreamingDetector(self._detector, settings, dtype=dtype, masked_channels=mask)
-            for dtype in (torch.float64, samples.dtype)
-        )
-        decisions = stream.push(samples)
-        columns = {
-            "score": decisions.score,
-            "probability": decisions.probability,
-            "statistic": decisions.statistic,
-            # a channel is trusted by what its samples resolve in the precision they come in
-            "valid": in_its_own.push(samples).is_valid,
-            "alarm": decisions.is_alarm,
-            "on": decisions.is_on,
-            "time_s": decisions.available_s,
-            "onset_s": decisions.onset_s,
-        }
-        return {name: column.numpy() for name, column in columns.items()}
+
+def _decided(
+    detector: SlipDetector, samples: Tensor, settings: AlarmSettings, mask: ChannelMask = ()
+) -> dict[str, NDArray[Any]]:
+    """What the detector says of a stream, under the graph's names."""
+    exact, in_its_own = (
+        StreamingDetector(detector, settings, dtype=dtype, masked_channels=mask)
+        for dtype in (torch.float64, samples.dtype)
+    )
+    decisions = exact.push(samples)
+    columns = {name: getattr(decisions, field).numpy() for name, field in _COLUMNS.items()}
+    # a channel is trusted by what its samples resolve in the precision they come in
+    return columns | {"valid": in_its_own.push(samples).is_valid.numpy()}
 
 
 def _middle_threshold(statistic: NDArray[Any]) -> float:
