@@ -11,7 +11,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
+import numpy as np
 import torch
+from scipy.optimize import isotonic_regression
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, softplus
 
@@ -179,17 +181,13 @@ def fit_isotonic(scores: Tensor, is_slip: Tensor, weights: Tensor | None = None)
     below = mass.sum(-1).cumsum(0)
     for end in (0, -1):
         mass[end] += _END_WEIGHT * torch.stack([share, 1 - share])
-    steps: list[tuple[float, float, int]] = []  # of slip, of others, place of its last score
-    for last, (of_slip, of_rest) in enumerate(mass.tolist()):
-        while steps and steps[-1][0] * of_rest >= of_slip * steps[-1][1]:
-            of_slip, of_rest = of_slip + steps[-1][0], of_rest + steps[-1][1]
-            steps.pop()
-        steps.append((of_slip, of_rest, last))
-    odds = values.new_tensor([step[:2] for step in steps]).log()
-    llrs = (odds[:, 0] - odds[:, 1] - torch.logit(share)).cummax(0).values
-    edges = torch.cat([below.new_zeros(1), below[[step[2] for step in steps]]])
+    weight = mass.sum(-1).cpu().numpy()
+    steps = isotonic_regression(mass[:, 0].cpu().numpy() / weight, weights=weight).blocks
+    odds = torch.from_numpy(np.add.reduceat(mass.cpu().numpy(), steps[:-1])).log()
+    llrs = (odds[:, 0] - odds[:, 1] - torch.logit(share).cpu()).cummax(0).values
+    edges = torch.cat([below.new_zeros(1), below])[torch.from_numpy(steps)]
     medians = values[torch.searchsorted(below, (edges[:-1] + edges[1:]) / 2)]
-    return Isotonic(tuple(medians.tolist()), tuple(llrs.tolist()) if len(steps) > 1 else (0.0,))
+    return Isotonic(tuple(medians.tolist()), tuple(llrs.tolist()) if len(llrs) > 1 else (0.0,))
 
 
 def probability(llr: Tensor, slip_share: float) -> Tensor:

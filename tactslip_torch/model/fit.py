@@ -118,20 +118,18 @@ def fit_machine(
         layout.add_(total, bins.features, bins.sample_weight)
         normal = layout.normal_matrix(total, kernel.offset)
         moment = kernel.sum_of_monomials(bins.features, bins.sample_weight * bins.targets)
-        solved, report, _ = solve_symmetric(normal, moment, penalty, name="X'WX", in_span=True)
-        machine: Head = kernel.head(solved, bins.features.shape[1])
-    else:
-        gram = gram_matrix(kernel, bins.features)
-        beta, report, _ = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
-        machine = machine_of(bins.features, beta, kernel)
-        if isinstance(machine, KernelSum):
-            log.info(
-                "%s does not fold into a quadratic form: all %d training bins are kept, %s",
-                kernel,
-                len(bins.features),
-                machine.cost,
-            )
+        return kernel.solve(normal, moment, penalty, bins.features.shape[1])[0]
+    gram = gram_matrix(kernel, bins.features)
+    beta, report, _ = solve_symmetric(gram, bins.targets, penalty, bins.weights, name="gram")
+    machine = machine_of(bins.features, beta, kernel)
     machine.solved = report
+    if isinstance(machine, KernelSum):
+        log.info(
+            "%s does not fold into a quadratic form: all %d training bins are kept, %s",
+            kernel,
+            len(bins.features),
+            machine.cost,
+        )
     return machine
 
 

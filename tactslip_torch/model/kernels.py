@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.model.solve import SolveReport
+from tactslip_torch.model.solve import SolveReport, solve_symmetric
 
 _GRAM_ROWS = 512
 _MOST_QUADRATIC = 1000
@@ -69,12 +69,13 @@ class Polynomial:
 
     def scale(self, num_features: int) -> Tensor:
         """What each monomial is multiplied with, so that the map gives the kernel: ``[P]``."""
-        c = torch.as_tensor(self.offset, dtype=torch.float64)
-        if self.degree == 1:
-            return torch.cat([c.sqrt()[None], torch.ones(num_features, dtype=c.dtype)])
-        first, second = _pairs(num_features)
-        factors = torch.stack([c, (2 * c).sqrt(), torch.full_like(c, math.sqrt(2))])
-        of_each = factors[(first > 0).long() + (second > 0)]
+        c, (first, second) = (
+            torch.as_tensor(self.offset, dtype=torch.float64),
+            self._pairs(num_features),
+        )
+        one = torch.ones_like(c)
+        factors = [c.sqrt(), one] if self.degree == 1 else [c, (2 * c).sqrt(), one * math.sqrt(2)]
+        of_each = torch.stack(factors)[(first > 0).long() + (second > 0)]
         return torch.where((first == second) & (first > 0), 1.0, of_each)
 
     def monomials(self, z: Tensor) -> Tensor:
@@ -87,11 +88,8 @@ class Polynomial:
             - z: ``[N, K]``
             - output: ``[N, P]``, float64
         """
-        variables = torch.cat([torch.ones_like(z[:, :1]), z], dim=-1)
-        if self.degree == 2:
-            first, second = _pairs(z.shape[-1])
-            variables = variables[:, first] * variables[:, second]
-        return variables * self.scale(z.shape[-1])
+        variables, (first, second) = _with_one(z), self._pairs(z.shape[-1])
+        return variables[:, first] * variables[:, second] * self.scale(z.shape[-1])
 
     def sum_of_monomials(self, z: Tensor, shares: Tensor) -> Tensor:
         """``monomials(z).mT @ shares`` without making them.
@@ -99,11 +97,10 @@ class Polynomial:
         Shape:
             - z: ``[N, K]``; shares: ``[N]``; output: ``[P]``, float64
         """
-        variables = torch.cat([torch.ones_like(z[:, :1]), z], dim=-1)
-        if self.degree == 1:
-            return (variables.mT @ shares) * self.scale(z.shape[-1])
-        products = variables.mT @ (variables * shares[:, None])
-        return products[*_pairs(z.shape[-1])] * self.scale(z.shape[-1])
+        variables = _with_one(z)
+        left = variables if self.degree == 2 else variables[:, :1]
+        products = left.mT @ (variables * shares[:, None])
+        return products[*self._pairs(z.shape[-1])] * self.scale(z.shape[-1])
 
     def head(self, weights: Tensor, num_features: int) -> QuadraticForm:
         """The quadratic form that weights of ``monomials`` stand for.
@@ -123,9 +120,44 @@ class Polynomial:
         if self.degree == 1:
             return QuadraticForm(scaled.new_zeros(0, 0), scaled[1:], scaled[0])
         upper = scaled.new_zeros(num_features + 1, num_features + 1)
-        upper = upper.index_put(_pairs(num_features), scaled)
+        upper = upper.index_put(self._pairs(num_features), scaled)
         squares = upper[1:, 1:]
         return QuadraticForm((squares + squares.mT) / 2, upper[0, 1:], upper[0, 0])
+
+    def solve(
+        self,
+        normal: Tensor,
+        moment: Tensor,
+        penalty: float,
+        num_features: int,
+        most_condition: float | None = None,
+    ) -> tuple[QuadraticForm, Tensor | None]:
+        """The machine of normal equations in the monomials, and their Cholesky factor.
+
+        Args:
+            normal: ``X' W X``.
+            moment: ``X' W t``.
+            penalty: the paper's ``C``.
+            num_features: ``K``.
+            most_condition: as ``solve_symmetric``, like the errors and the factor.
+
+        Shape:
+            - normal: ``[P, P]``; moment: ``[P]``
+        """
+        weights, report, factor = solve_symmetric(
+            normal, moment, penalty, name="X'WX", in_span=True, most_condition=most_condition
+        )
+        machine = self.head(weights, num_features)
+        machine.solved = report
+        return machine, factor
+
+    def _pairs(self, num_features: int) -> tuple[Tensor, Tensor]:
+        """The two variables of each monomial, of which 0 is the constant 1."""
+        if self.degree == 1:
+            second = torch.arange(num_features + 1)
+            return torch.zeros_like(second), second
+        first, second = torch.triu_indices(num_features + 1, num_features + 1)
+        return first, second
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; ``kernel_from_dict`` takes it."""
@@ -173,10 +205,9 @@ class RadialBasis:
         return {"kind": "radial basis", **asdict(self)}
 
 
-def _pairs(num_features: int) -> tuple[Tensor, Tensor]:
-    """The two variables of each monomial of degree 2, of which 0 is the constant."""
-    first, second = torch.triu_indices(num_features + 1, num_features + 1)
-    return first, second
+def _with_one(z: Tensor) -> Tensor:
+    """The variables ``(1, z_1, .., z_K)`` of bins."""
+    return torch.cat([torch.ones_like(z[:, :1]), z], dim=-1)
 
 
 Kernel = Polynomial | RadialBasis

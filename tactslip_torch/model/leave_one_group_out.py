@@ -31,7 +31,7 @@ from tactslip_torch.model.kernels import (
     machine_of,
 )
 from tactslip_torch.model.moments import ProductSums
-from tactslip_torch.model.solve import SolveReport, solve_symmetric
+from tactslip_torch.model.solve import solve_symmetric
 
 MOST_CONDITION = 1e10  # of all bins; above, the scores of a group left out lose their digits
 _LEAST_EIGENVALUE = 1e-6  # of I - H_gg; below, the rounding of the factor shows in the scores
@@ -152,9 +152,9 @@ class HeldOut:
         assert isinstance(kernel, Polynomial)
         pull = self._weights * self._targets
         moment = kernel.sum_of_monomials(self._z, pull)
-        solved, report, factor = _solve_primal(self._system, moment, penalty)
-        head = kernel.head(solved, layout.num_features)
-        head.solved = report
+        num = layout.num_features
+        head, factor = kernel.solve(self._system, moment, penalty, num, MOST_CONDITION)
+        assert factor is not None  # as most_condition is given
         residuals, roots = self._targets - head(self._z), self._weights.sqrt()
         for groups, part in _chunks(self._small):
             scaled = kernel.monomials(self._z[part]) * roots[part, None]
@@ -169,10 +169,10 @@ class HeldOut:
             normal = layout.normal_matrix(self._total - sums, kernel.offset)
             others = moment - kernel.sum_of_monomials(z, pull[own.rows])
             try:
-                weights, _, _ = _solve_primal(normal, others, penalty)
+                without, _ = kernel.solve(normal, others, penalty, num, MOST_CONDITION)
             except ValueError as error:
                 raise ValueError(f"without group {own.name}: {error}") from None
-            residuals[own.rows] = self._targets[own.rows] - kernel.head(weights, z.shape[1])(z)
+            residuals[own.rows] = self._targets[own.rows] - without(z)
         return head, residuals
 
     def _sums(self, layout: ProductSums, rows: slice) -> Tensor:
@@ -274,16 +274,6 @@ class _Group(NamedTuple):
         """Its own block of a matrix over the bins of a part."""
         own = slice(self.rows.start - part.start, self.rows.stop - part.start)
         return products[own, own]
-
-
-def _solve_primal(
-    normal: Tensor, moment: Tensor, penalty: float
-) -> tuple[Tensor, SolveReport, Tensor]:
-    weights, report, factor = solve_symmetric(
-        normal, moment, penalty, name="X'WX", in_span=True, most_condition=MOST_CONDITION
-    )
-    assert factor is not None  # as most_condition is given
-    return weights, report, factor
 
 
 def _ordered(groups: Tensor, is_slip: Tensor) -> tuple[Tensor, list[_Group]]:

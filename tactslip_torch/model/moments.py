@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
-from tactslip_torch.model.solve import solve_symmetric
+from tactslip_torch.model.solve import check_weights
 from tactslip_torch.runtime import SeenBatches, content_digest, load_table, save_table
 
 FORMAT = "tactslip_torch sums 2"
@@ -191,10 +191,8 @@ class SufficientStats:
             Zong, Huang and Chen (2013), Neurocomputing 101, 229-242 (weighted ELM).
         """
         normal, moment = self.normal_equations(offset, num_features, balance)
-        weights, report, _ = solve_symmetric(normal, moment, penalty, name="X'WX", in_span=True)
-        machine = Polynomial(self.degree, offset).head(weights, num_features or self.num_features)
-        machine.solved = report
-        return machine
+        kernel = Polynomial(self.degree, offset)
+        return kernel.solve(normal, moment, penalty, num_features or self.num_features)[0]
 
     def normal_equations(
         self, offset: float, num_features: int | None = None, balance: str = "weights"
@@ -225,19 +223,16 @@ class SufficientStats:
             )
         z = z.detach().cpu().double()
         weights = z.new_ones(len(z)) if weights is None else weights.detach().cpu().double()
-        if not bool((z.abs() <= 1).all()):
-            number, feature = (~(z.abs() <= 1)).nonzero()[0].tolist()
+        if len(outside := (~(z.abs() <= 1)).nonzero()):
+            number, feature = outside[0].tolist()
             raise ValueError(
                 f"batch {batch_id!r}: z must be within [-1, 1], got {float(z[number, feature]):g} "
                 f"at bin {number}, feature {feature}; scale it and clip"
             )
-        wrong = ~((weights > 0) & weights.isfinite())
-        if bool(wrong.any()):
-            number = int(wrong.nonzero()[0])
-            raise ValueError(
-                f"batch {batch_id!r}: weights must be positive and finite, got "
-                f"{float(weights[number]):g} at bin {number}"
-            )
+        try:
+            check_weights(weights)
+        except ValueError as error:
+            raise ValueError(f"batch {batch_id!r}: {error}") from None
         return z, is_slip.cpu().bool(), weights
 
     def _add(self, z: Tensor, is_slip: Tensor, weights: Tensor, sign: int) -> None:
@@ -337,11 +332,9 @@ class ProductSums:
         for start in range(0, len(matrix), _STRIP):  # only what is above the diagonal is there
             own, after = slice(start, start + _STRIP), slice(start, None)
             strip = matrix[own, after].mul_(scale[after]).mul_(scale[own, None])
-            corner = strip[:, : len(strip)]
+            corner, others = strip[:, : len(strip)], strip[:, len(strip) :]
             corner.copy_(corner.triu() + corner.triu(1).mT)
-            for column in range(start + _STRIP, len(matrix), _STRIP):  # tiles that fit a cache
-                others = slice(column, column + _STRIP)
-                matrix[others, own] = matrix[own, others].mT
+            matrix[start + len(strip) :, own] = others.mT
         return matrix
 
     def moment_vector(

@@ -6,8 +6,7 @@ quantiles are ours, for features whose tails are heavy on real recordings.
 
 from __future__ import annotations
 
-import math
-
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -40,10 +39,10 @@ class FeatureScaler(nn.Module):
 
     def __init__(self, minimum: Tensor, maximum: Tensor, knee: Tensor | None = None) -> None:
         super().__init__()
-        if minimum.shape != maximum.shape:
+        shapes = [tuple(x.shape) for x in (minimum, maximum, knee) if x is not None]
+        if len(set(shapes)) > 1:
             raise ValueError(
-                f"minimum and maximum must agree in shape, got {tuple(minimum.shape)} "
-                f"and {tuple(maximum.shape)}"
+                f"minimum, maximum and knee must agree in shape, got {', '.join(map(str, shapes))}"
             )
         bad = ~(minimum.isfinite() & maximum.isfinite() & (minimum <= maximum))
         bad |= ~(maximum - minimum).isfinite()
@@ -54,11 +53,6 @@ class FeatureScaler(nn.Module):
                 f"{float(minimum[i]):g} and {float(maximum[i]):g}"
             )
         if knee is not None:
-            if knee.shape != minimum.shape:
-                raise ValueError(
-                    f"knee must have the shape of minimum, {tuple(minimum.shape)}, "
-                    f"got {tuple(knee.shape)}"
-                )
             bad = ~(knee.isfinite() & (knee > 0))
             if bool(bad.any()):
                 i = int(bad.nonzero()[0])
@@ -120,25 +114,20 @@ class FeatureScaler(nn.Module):
 
 def _ranges_of(columns: Tensor, compress: bool, tail: float) -> tuple[Tensor, Tensor, Tensor]:
     """Minimum, maximum and knee of some features ``[N, k]``; ``[k]`` each."""
-    ordered = columns.mT.sort().values
-    knee = torch.ones_like(ordered[:, 0])
+    knee = torch.ones_like(columns[0])
     if compress:
-        size = columns.mT.abs().sort().values
-        middle, largest = _quantile(size, 0.5), size[:, -1]
+        middle, largest = _quantiles(columns.abs(), 0.5)[0], columns.abs().amax(0)
         knee = torch.where(middle > 0, middle, torch.where(largest > 0, largest, knee))
-        ordered = signed_log(ordered, knee[:, None])
-    low, high = _quantile(ordered, tail), -_quantile(-ordered.flip(1), tail)
+        columns = signed_log(columns, knee)
+    low, high = _quantiles(columns, tail, 1 - tail)
     is_range = low < high
     return (
-        torch.where(is_range, low, ordered[:, 0]),
-        torch.where(is_range, high, ordered[:, -1]),
+        torch.where(is_range, low, columns.amin(0)),
+        torch.where(is_range, high, columns.amax(0)),
         knee,
     )
 
 
-def _quantile(ordered: Tensor, share: float) -> Tensor:
-    """``numpy.quantile`` of ascending rows, for a share below 1."""
-    position = share * (ordered.shape[1] - 1)
-    index = math.floor(position)
-    above = ordered[:, min(index + 1, ordered.shape[1] - 1)]
-    return torch.lerp(ordered[:, index], above, position - index)
+def _quantiles(columns: Tensor, *shares: float) -> Tensor:
+    found: Tensor = torch.from_numpy(np.quantile(columns.numpy(force=True), shares, axis=0))
+    return found.to(columns)

@@ -211,9 +211,11 @@ def check_weights(weights: Tensor) -> None:
     Raises:
         ValueError: if there is one.
     """
-    wrong = weights[~((weights > 0) & weights.isfinite())]
-    if len(wrong):
-        raise ValueError(f"weights must be positive and finite, got {float(wrong[0]):g}")
+    if len(wrong := (~((weights > 0) & weights.isfinite())).nonzero()):
+        place = int(wrong[0])
+        raise ValueError(
+            f"weights must be positive and finite, got {float(weights[place]):g} at bin {place}"
+        )
 
 
 def _truncated(
