@@ -7,7 +7,7 @@ import torch
 from small_detector import small_detector
 from streams import detector_of, signal
 
-from tactslip_torch.model.prediction import Prediction
+from tactslip_torch.model.missing_channels import Prediction
 from tactslip_torch.onset.decisions import score_stream
 
 HOP = 20

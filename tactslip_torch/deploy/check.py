@@ -28,8 +28,7 @@ from tactslip_torch.deploy.stream import Timing
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.calibration import probability, widened_llr
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.missing_channels import ChannelMask
-from tactslip_torch.model.prediction import Prediction
+from tactslip_torch.model.missing_channels import ChannelMask, Prediction
 from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.simulation.extremes import EXTREMES, RAIL_V, extreme_bins

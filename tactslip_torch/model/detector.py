@@ -22,10 +22,13 @@ from tactslip_torch.model.kernels import Head, KernelSum, QuadraticForm, kernel_
 from tactslip_torch.model.missing_channels import (
     ChannelMask,
     ClassGaussians,
+    Nonfinite,
+    Prediction,
+    check_nonfinite,
     missing_scores,
+    predict_in_parts,
     without,
 )
-from tactslip_torch.model.prediction import Nonfinite, Prediction, check_nonfinite, predict_in_parts
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName, Filters, Machine, Scores, backend_of
 from tactslip_torch.runtime import (

@@ -1,4 +1,4 @@
-"""What a detector says where channels are missing, and how sure it can be of that.
+"""What a detector says of bins, and of those whose channels are missing: how sure it can be.
 
 Scaled features ``z`` of class y are taken as ``N(mu_y, Sigma_y)``. Of a bin whose features m are
 missing and o observed, class y leaves ``z_m ~ N(mu_m + B (z_o - mu_o), S)`` with ``B = Sigma_mo
@@ -17,25 +17,82 @@ Reference:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Literal, NamedTuple, TypeVar, get_args
 
 import torch
 from torch import Tensor, nn
 
 from tactslip_torch.features.ops import saturating
 from tactslip_torch.model.kernels import Head, QuadraticForm
-from tactslip_torch.runtime import are_unchanged, has_values, stamps_of
+from tactslip_torch.runtime import are_unchanged, has_values, in_parts, is_concrete, stamps_of
+from tactslip_torch.signals.binning import refuse_nonfinite
 
 ChannelMask = Sequence[str] | Tensor
 """Channels that are not to be listened to: their names, or a mask ``[C]``, bool."""
+
+Nonfinite = Literal["mask", "raise"]
+"""What to do about NaN and Inf: their channels count as missing, or they are refused."""
 
 RESOLUTION = 1e-5
 """Variance that every scaled feature has at least (a sixth of a percent of its range), so that
 constant and repeated features leave a covariance that can be inverted."""
 
 _Stamps = list[tuple[Tensor, int | Tensor]]
+_PART_BINS = 256  # that stay in a cache
 _MOST_KEPT = 32  # masks whose matrices are kept, 230 KB each of 120 features
+
+
+class Prediction(NamedTuple):
+    """Scores, and whether they can be relied on.
+
+    Attributes:
+        score: ``[*]``, at least 0 means slip; finite, unless the head overflows its dtype.
+        is_valid: ``[*]``, bool: every channel that the score depends on can be trusted, and the
+            score is finite.
+        is_missing: ``[*, C]``, bool: the channel holds a NaN or Inf, or was said to be dead, and
+            was left out.
+        variance: ``[*]``, of the score, which is an expected one where a channel in use is missing;
+            0 where none is.
+    """
+
+    score: Tensor
+    is_valid: Tensor
+    is_missing: Tensor
+    variance: Tensor
+
+
+Said = TypeVar("Said", Tensor, Prediction)
+
+
+def check_nonfinite(policy: str, samples: Tensor, names: Sequence[str]) -> None:
+    """Hold samples ``[*, C, n]`` of the named channels against a policy.
+
+    Raises:
+        ValueError: for an unknown policy, or under ``"raise"`` for a NaN or Inf.
+    """
+    if policy not in get_args(Nonfinite):
+        raise ValueError(f"nonfinite must be 'mask' or 'raise', got {policy!r}")
+    if policy == "raise":
+        refuse_nonfinite(samples, names, "repair the samples, or take nonfinite='mask'")
+
+
+def predict_in_parts(predict: Callable[[Tensor], Said], x: Tensor) -> Said:
+    """What ``predict`` says of bins ``[*, C, n]``: of many in parts that stay in a cache."""
+    if x.ndim < 3 or x.shape[:-2].numel() <= _PART_BINS or not is_concrete(x):
+        return predict(x)
+
+    def joined(parts: Sequence[Tensor]) -> Tensor:
+        whole: Tensor = torch.cat(list(parts)).unflatten(0, x.shape[:-2])
+        return whole
+
+    found = in_parts(predict, x.flatten(0, -3).split(_PART_BINS))
+    if isinstance(found[0], Prediction):
+        return Prediction(*map(joined, zip(*found, strict=True)))
+    return joined(found)
+
+
+# Missing channels ------------------------------------------------------------------------------
 
 
 def channel_mask(masked: ChannelMask, names: Sequence[str]) -> Tensor:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from tactslip_torch.features.ops import is_nowhere, power_of_two_below
 from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.model.prediction import Prediction
+from tactslip_torch.model.missing_channels import Prediction
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
 from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names

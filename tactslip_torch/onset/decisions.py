@@ -27,7 +27,7 @@ from tactslip_torch.model.calibration import (
     widened_llr,
 )
 from tactslip_torch.model.detector import SlipDetector
-from tactslip_torch.model.prediction import Prediction
+from tactslip_torch.model.missing_channels import Prediction
 from tactslip_torch.onset.rules import NEUTRAL, Rule, latch, latch_row, latch_start, rule_from_dict
 from tactslip_torch.signals.filtering import ChannelFilter
 
