@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ import torch
 from tactslip_torch.data.labels import NO_POSITION, LabelRule, label_bins
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.onset.events import LatencyParts
-from tactslip_torch.training.datamodule import RecordingFeatures, Stroke
+from tactslip_torch.training.datamodule import RecordingFeatures
 from tactslip_torch.training.learner import (
     BINS_APART,
     RULES,
@@ -38,7 +39,7 @@ def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), recording=None, r
         bins.position,
         bins.stroke,
         (bins.starts + bins.bin_samples).double() / RATE_HZ,
-        tuple(Stroke(o, e, v) for o, e, v in zip(onsets, ends, speeds, strict=False)),
+        SimpleNamespace(onsets_s=onsets, sliding_s=slides, speeds_mm_s=speeds[: len(onsets)]),
         (rule.hop_ms or rule.bin_ms) / 1000,
         roles or {"test": torch.ones(num, dtype=torch.bool)},
         {},

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tactslip_torch.model.threshold import FeatureThreshold, best_threshold
+from tactslip_torch.training.baselines import FeatureThreshold, best_threshold
 
 
 def balanced_accuracy(says_slip, is_slip):
@@ -73,5 +73,5 @@ def test_neighbouring_floats_are_told_apart():
 
 
 def test_an_absent_class_is_refused():
-    with pytest.raises(ValueError, match="a threshold needs bins of both classes"):
+    with pytest.raises(ValueError, match="both classes; got only one"):
         best_threshold(torch.randn(4, 2), torch.ones(4).bool())

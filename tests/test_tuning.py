@@ -147,8 +147,8 @@ def test_grid_is_of_refits_without_the_group(small, bins):
     expected = grouped_loss(scores, bins.is_slip, bins.group)
     assert points[3].loss == pytest.approx(float(expected.loss), rel=1e-6)
     assert least_loss(points).loss == min(point.loss for point in points)
-    two = bins.without(2)
-    backwards = replace(two, is_slip=two.is_slip ^ (two.group == 1))  # wrong of the other group
+    two = bins.where(bins.group != 2)
+    backwards = two._replace(is_slip=two.is_slip ^ (two.group == 1))  # wrong of the other group
     with pytest.raises(ValueError, match="tuning has no place to start: at every C and c"):
         grid_points(scaler, backwards, recipe)
 
@@ -202,8 +202,8 @@ def test_bad_tuning_is_refused(values, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"degree": 3}, "needs a polynomial kernel of degree 2"),
-        ({"kernel": "rbf", "gamma": 0.1}, "needs a polynomial kernel of degree 2"),
+        ({"degree": 3}, "needs recipe.kernel=polynomial recipe.degree=2"),
+        ({"kernel": "rbf", "gamma": 0.1}, "needs recipe.kernel=polynomial recipe.degree=2"),
         ({"validation": "nested"}, "tuning needs a machine of degree 2"),
         ({"offsets": 0.0}, r"needs recipe\.offsets above 0"),
         ({"penalties": float("inf")}, r"needs finite recipe\.penalties"),

@@ -34,7 +34,7 @@ from tactslip_torch.training.adaptation import (
     RecordingBins,
     Statistics,
     add,
-    check_weight,
+    checked_weight,
     detector_digest,
     forget,
     locked,
@@ -43,8 +43,7 @@ from tactslip_torch.training.adaptation import (
     solve,
     statistics_of,
 )
-from tactslip_torch.training.datamodule import FeatureMaker
-from tactslip_torch.training.experiment import DTYPES, feature_cache, save_config, versions
+from tactslip_torch.training.experiment import feature_cache, features_of, save_config, versions
 
 FORMAT = "tactslip_torch adaptation 1"
 
@@ -92,16 +91,11 @@ def _stepped(
 ) -> dict[str, Any]:
     """Add or forget, and write what came of it."""
     started = time.perf_counter()
-    margin, weight = config.margin, config.weight
+    margin = config.margin
     check_number("margin", margin, least=0)
     if margin >= 1:
         raise ValueError(f"margin must be below 1, such as 0.005 for half a point, got {margin:g}")
-    if weight == "auto":
-        weight = None
-    elif isinstance(weight, bool) or not isinstance(weight, int | float):
-        raise ValueError(f"weight must be auto or a positive number, got {weight!r}")
-    else:
-        check_weight(weight)
+    weight = checked_weight(config.weight)
     bins = _bins(config, detector, statistics)
     read = time.perf_counter()
     before = solve(statistics)
@@ -204,12 +198,10 @@ def _bins(
     if units != trained:
         raise ValueError(f"recordings are in {units}, the detector was trained on {trained}")
     rule = LabelRule(**statistics.labels)
-    dtype = DTYPES[detector.info.get("features_dtype", "float64")]
     with feature_cache(config.cache) as cache:
-        maker = FeatureMaker(source, detector.pool, detector.channel_filter, rule, cache, dtype)
         return recording_bins(
             detector,
-            maker,
+            features_of(detector, source, rule, cache),
             statistics,
             material=material,
             slip_free=bool(config.slip_free),

@@ -22,12 +22,12 @@ from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report.results import print_results, write_results
 from tactslip_torch.runtime import is_first_process
-from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
+from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.experiment import (
-    DTYPES,
     common_metadata,
     feature_cache,
     feature_rows,
+    features_of,
     make_trainer,
     merged_results,
     save_config,
@@ -61,12 +61,10 @@ def evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
             _print_overlap(fold, overlaps[fold.name])
     results: dict[str, dict[str, Any]] = {}
     with feature_cache(config.cache) as cache:
-        filters = detector.channel_filter
-        dtype = DTYPES[detector.info.get("features_dtype", "float64")]
-        maker = FeatureMaker(source, detector.pool, filters, rule, cache, dtype)
+        maker = features_of(detector, source, rule, cache)
         once = judged_once(folds)
         for fold in once:
-            learner = SlipLearner(detector.pool, filters, detector=detector)
+            learner = SlipLearner(maker.pool, maker.channel_filter, detector=detector)
             place = folder if len(once) == 1 else folder / fold.name  # each its own logs
             trainer = make_trainer(config.trainer, place)
             data = SlipDataModule(maker, fold, config.num_workers)

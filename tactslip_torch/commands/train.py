@@ -27,7 +27,6 @@ from tactslip_torch.runtime import is_first_process
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.datamodule import SlipDataModule
 from tactslip_torch.training.experiment import (
-    check_statistics,
     combined,
     common_metadata,
     feature_cache,
@@ -70,17 +69,20 @@ def train(config: DictConfig, folder: Path) -> dict[str, float]:
     maker = feature_maker(source, rule, **config.features)
     pool = maker.pool
     recipe.check_pool(len(pool.names))
-    if config.statistics:
-        check_statistics(config, recipe)
     abstaining = Abstaining(config.coverage, config.coverage_by)
     alarming: CalibratedAlarm | DebouncedAlarm | None
     alarming = instantiate(config.onset, _convert_="all") or None
     tuning: Tuning | None = instantiate(config.tuning, _convert_="all") or None
     if config.trainer.get("fast_dev_run"):
         tuning = None  # a batch has no materials to hold out
+    if config.statistics:
+        recipe.check_quadratic("statistics=true")
+    if config.ckpt_path is not None and (config.statistics or tuning):
+        raise ValueError(
+            f"{'statistics=true' if config.statistics else 'tuning'} needs the first pass, which "
+            "ckpt_path skips; train without ckpt_path (features come from the cache)"
+        )
     if tuning is not None:
-        if config.ckpt_path is not None:
-            raise ValueError("tuning starts from the first pass, which ckpt_path skips; leave it")
         for fold in folds:
             tuning.check(recipe, fold)
     if isinstance(alarming, CalibratedAlarm) and len(folds) > 1:

@@ -18,12 +18,12 @@ import bisect
 import copy
 import itertools
 import logging
-import math
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -47,7 +47,7 @@ from tactslip_torch.onset.decisions import KEY as ALARM
 from tactslip_torch.runtime import SeenBatches, bar, content_digest, load_table, save_table
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.plan import TrainingPass, solve_metadata
-from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.recipe import recalls
 
 log = logging.getLogger(__name__)
 
@@ -465,29 +465,6 @@ def locked(model: str | os.PathLike[str]) -> Iterator[None]:
         path.unlink(missing_ok=True)
 
 
-def check_recipe(recipe: Recipe) -> None:
-    """Refuse what makes a detector that cannot be solved again from sums.
-
-    Raises:
-        ValueError: if its kernel does not add up, a penalty is not finite, or it is chosen nested.
-    """
-    if recipe.validation == "nested":
-        raise ValueError(
-            "statistics=true needs a machine of degree 2 on features of channels, which "
-            f"recipe={recipe.name} does not always make; take recipe=robust or recipe=paper"
-        )
-    if not all(isinstance(k, Polynomial) and k.degree == 2 for k in recipe.kernels):
-        raise ValueError(
-            "statistics=true needs recipe.kernel=polynomial recipe.degree=2, whose bins add up; "
-            f"got {recipe.kernels[0]}"
-        )
-    if not math.isfinite(most := recipe.penalties_ascending[-1]):
-        raise ValueError(
-            f"statistics=true needs finite recipe.penalties, got {most:g}: without a ridge no "
-            "machine without a recording can be told"
-        )
-
-
 # Machines, and what they score without a recording -----------------------------------------------
 
 
@@ -579,9 +556,7 @@ def mean_recall(says_slip: Tensor, is_slip: Tensor) -> float:
     Shape:
         - says_slip, is_slip: ``[N]``, bool, N at least 1
     """
-    right = (says_slip == is_slip).double()
-    recalls = [right[mine].mean() for mine in (is_slip, ~is_slip) if bool(mine.any())]
-    return float(torch.stack(recalls).mean())
+    return fmean(recalls(says_slip, is_slip))
 
 
 @dataclass(frozen=True)
@@ -715,11 +690,10 @@ def add(
         margin: that the old materials' mean may fall by.
 
     Raises:
-        ValueError: if a recording is in already, there are several materials or no bins, the weight
-            is not positive, or as ``solve``; of ``auto``, at the smallest weight.
+        ValueError: if a recording is in already, there are several materials or no bins, or as
+            ``solve``; of ``auto``, at the smallest weight.
     """
     _check_new(statistics, bins)
-    check_weight(weight)
     material = next(iter(bins.values())).material
     mine = dict(bins) | {
         name: own
@@ -774,16 +748,21 @@ def forget(statistics: Statistics, before: Solved, bins: Mapping[str, RecordingB
     return Change.between(statistics, before, statistics.reweighed(dict.fromkeys(bins, 0.0), bins))
 
 
-def check_weight(weight: float | None) -> None:
-    """Refuse what is no weight of a bin; ``None`` stands for ``auto``.
+def checked_weight(given: Any) -> float | None:
+    """The weight of a bin as ``adapt`` takes it; ``None`` of ``"auto"``.
 
     Raises:
-        ValueError: if it is not positive, or too large.
+        ValueError: if it is no positive number, or too large.
     """
-    if weight is not None and not 0 < weight < _MOST_WEIGHT:
+    if given == "auto":
+        return None
+    is_number = isinstance(given, int | float) and not isinstance(given, bool)
+    if not is_number or not 0 < given < _MOST_WEIGHT:
         raise ValueError(
-            f"weight must be auto or a positive number below {_MOST_WEIGHT:g}, got {weight:g}"
+            f"weight must be auto or a positive number below {_MOST_WEIGHT:g}, got {given!r}"
         )
+    weight: float = given
+    return weight
 
 
 def _check_new(statistics: Statistics, bins: Mapping[str, RecordingBins]) -> None:

@@ -59,7 +59,7 @@ from tactslip_torch.onset.events import (
 )
 from tactslip_torch.onset.rules import Cusum, KOfN, Rule, rule_from_dict
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.onset.thresholds import Threshold, alarm_counts, alarm_rate, choose_threshold
+from tactslip_torch.onset.thresholds import alarm_counts, alarm_rate, choose_threshold
 from tactslip_torch.report.metrics import weights_at_share
 from tactslip_torch.runtime import bar, check_number, in_processes, one_thread
 
@@ -287,30 +287,22 @@ def threshold_curve(
 
 def _reliability(
     streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
-) -> dict[str, Any] | None:
+) -> dict[str, Any]:
     """Stated probabilities beside what happened, of bins weighted to the settings' slip fraction.
 
-    None without bins of both classes.
+    Of all streams and, under ``"per_material"``, of those of each material; nothing of streams
+    without bins of both classes.
     """
-    scores, is_slip = labelled(streams, timing)
-    if not bool(is_slip.any()) or bool(is_slip.all()):
-        return None
-    stated = probability(settings.calibration.llr(scores), settings.slip_share)
-    weights = weights_at_share(is_slip, settings.slip_share)
-    return reliability(stated, is_slip, weights=weights).to_dict()
-
-
-def _reliability_by_material(
-    streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
-) -> dict[str, Any] | None:
-    """``_reliability`` of all, with that of each of its materials."""
-    if (found := _reliability(streams, settings, timing)) is None:
-        return None
-    by_material = {
-        name: _reliability([s for s in streams if s.recording.material == name], settings, timing)
-        for name in dict.fromkeys(stream.recording.material for stream in streams)
-    }
-    return found | {"per_material": {name: own for name, own in by_material.items() if own}}
+    by_material: dict[str, Any] = {}
+    for name in (None, *dict.fromkeys(stream.recording.material for stream in streams)):
+        own = [stream for stream in streams if name in (None, stream.recording.material)]
+        scores, is_slip = labelled(own, timing)
+        if bool(is_slip.any()) and not bool(is_slip.all()):
+            stated = probability(settings.calibration.llr(scores), settings.slip_share)
+            weights = weights_at_share(is_slip, settings.slip_share)
+            by_material[name or ""] = reliability(stated, is_slip, weights=weights).to_dict()
+    everything = by_material.pop("", None)
+    return {} if everything is None else everything | {"per_material": by_material}
 
 
 def _push_seconds(detector: SlipDetector, settings: AlarmSettings) -> float:
@@ -344,25 +336,6 @@ def _lead_s(streams: Sequence[Stream], settings: AlarmSettings, timing: Timing) 
 
 
 # The stages behind a fit -------------------------------------------------------------------------
-
-
-class Method(NamedTuple):
-    """A way to alarm: whose scores, by which settings, and how its threshold was found.
-
-    Attributes:
-        scorer: the name of the detector that scores.
-        settings: what makes alarms of scores.
-        threshold: None if nothing was set.
-    """
-
-    scorer: str
-    settings: AlarmSettings
-    threshold: Threshold | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """The method as plain JSON types."""
-        calibrated = None if self.threshold is None else asdict(self.threshold)
-        return {"scorer": self.scorer, "calibrated": calibrated, **self.settings.to_dict()}
 
 
 @dataclass(frozen=True)
@@ -512,7 +485,7 @@ class CalibratedAlarm:
         calibrating = {name: own[:num_calibrate] for name, own in scored.items()}
         methods = self.methods(calibrating, timings)
         amounts = self._amounts(roles)
-        settings = methods[self.rule].settings
+        _, settings = methods[self.rule]
         curve = threshold_curve(self._quiet(calibrating[OURS]), settings, timings[OURS])
         metadata = {
             **settings.metadata,
@@ -532,14 +505,15 @@ class CalibratedAlarm:
         events: dict[str, dict[str, dict[str, Any]]] = {"": {}}
         rows = [(group, name) for group in groups for name in methods]
         for (scene, role), name in bar(rows, "events", "table row"):
-            method = methods[name]
-            own = [scored[method.scorer][index] for index in groups[scene, role]]
-            found = self._events(own, method, timings[method.scorer], compute_s.get(method.scorer))
+            scorer, made = methods[name]
+            own = [scored[scorer][index] for index in groups[scene, role]]
+            found = self._events(own, made, timings[scorer], compute_s.get(scorer))
             events.setdefault(scene, {}).setdefault(role, {})[name] = found
-        usual = {role: [scored[OURS][i] for i in groups["", role]] for role in events[""]}
-        parts = {
-            f"{role} stream": _reliability_by_material(own, settings, timings[OURS])
-            for role, own in usual.items()
+        told = {
+            f"{role} stream": _reliability(
+                [scored[OURS][index] for index in groups["", role]], settings, timings[OURS]
+            )
+            for role in events[""]
         }
         trained = {
             name.split("/")[2]
@@ -551,8 +525,15 @@ class CalibratedAlarm:
             "sample_rate_hz": rate,
             "settings": settings.to_dict(),
             "streams": amounts,
-            "methods": {name: method.to_dict() for name, method in methods.items()},
-            "reliability": {name: found for name, found in parts.items() if found},
+            "methods": {
+                name: {
+                    "scorer": scorer,
+                    "calibrated": made.metadata.get("calibrated"),
+                    **made.to_dict(),
+                }
+                for name, (scorer, made) in methods.items()
+            },
+            "reliability": {name: found for name, found in told.items() if found},
             "events": {f"{role} stream": found for role, found in events.pop("").items()},
             "scenes": {
                 scene: {"trained": scene in trained} | by_role for scene, by_role in events.items()
@@ -561,8 +542,10 @@ class CalibratedAlarm:
 
     def methods(
         self, streams: Mapping[str, Sequence[Stream]], timings: Mapping[str, Timing]
-    ) -> dict[str, Method]:
-        """Every rule on our scores, the main one on those of baselines, and the paper's own.
+    ) -> dict[str, tuple[str, AlarmSettings]]:
+        """By name whose scores, and what makes alarms of them.
+
+        Every rule on our scores, the main one on those of baselines, and the paper's own.
 
         The paper's rule, ``FIRST_TRANSITION``, makes every change of the score to slip an alarm,
         one decision a bin: there is no threshold but the score's own, and no memory beyond the bin
@@ -585,18 +568,20 @@ class CalibratedAlarm:
                 log.warning("%s is left out: %s", scorer, error)
                 continue
             for name, rule in rules.items() if scorer == OURS else [(scorer, rules[self.rule])]:
-                settings, threshold = self.calibrated(rule, calibration, streams[scorer], timing)
-                methods[name] = Method(scorer, settings, threshold)
+                settings = self.calibrated(rule, calibration, streams[scorer], timing)
+                methods[name] = scorer, settings
             if scorer == OURS and timing.bin_samples % timing.hop_samples == 0:
                 settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timing.bin_samples)
                 settings = replace(settings, threshold=_ABOVE_NEUTRAL, rearm_s=0, refractory_s=0)
-                methods[FIRST_TRANSITION] = Method(scorer, settings, None)
+                methods[FIRST_TRANSITION] = scorer, settings
         return methods
 
     def calibrated(
         self, rule: Rule, calibration: Calibration, streams: Sequence[Stream], timing: Timing
-    ) -> tuple[AlarmSettings, Threshold]:
+    ) -> AlarmSettings:
         """A rule with the threshold for the rate, and the lead of its onset estimates.
+
+        The ``Threshold`` is told in the settings' metadata, as ``"calibrated"``.
 
         A ``Cusum`` without ceiling gets one above its threshold. A sum that is capped is sooner low
         again, so what was one alarm can be two: they are counted again by the rule that goes into
@@ -638,7 +623,7 @@ class CalibratedAlarm:
             threshold = replace(threshold, value=value, rate=rate)
         metadata = {"slip_free": self.slip_free, "calibrated": asdict(threshold)}
         lead_s = _lead_s(streams, settings, timing)
-        return replace(settings, lead_s=lead_s, metadata=metadata), threshold
+        return replace(settings, lead_s=lead_s, metadata=metadata)
 
     def _settings(self, rule: Rule, calibration: Calibration, hop_samples: int) -> AlarmSettings:
         """Without a threshold yet."""
@@ -654,13 +639,17 @@ class CalibratedAlarm:
         )
 
     def _events(
-        self, streams: Sequence[Stream], method: Method, timing: Timing, compute_s: float | None
+        self,
+        streams: Sequence[Stream],
+        settings: AlarmSettings,
+        timing: Timing,
+        compute_s: float | None,
     ) -> dict[str, Any]:
         rate = timing.sample_rate_hz
         latency = LatencyParts(timing.look_ahead / rate, timing.bin_samples / rate, compute_s)
         seen = [
             recording_events(watched(*made), EventRules(), latency)
-            for made in decide(streams, method.settings, timing)
+            for made in decide(streams, settings, timing)
         ]
         return pooled_metrics(seen, level=self.level)
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import lightning as L
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from tactslip_torch.data.labels import (
     LabelledBins,
@@ -35,19 +36,11 @@ from tactslip_torch.signals.binning import bins_at
 from tactslip_torch.signals.filtering import ChannelFilter, extended
 
 
-class Stroke(NamedTuple):
-    """The exact truth about a stroke that slides."""
-
-    onset_s: float
-    slide_end_s: float
-    speed_mm_s: float
-
-
 class RecordingFeatures(NamedTuple):
     """What the learner sees of one recording.
 
     Attributes:
-        strokes: in the order of their numbers; empty where nothing slides.
+        times: what is true of the recording; its slides are in the order of the strokes' numbers.
         hop_s: distance of neighbouring bins.
 
     Shape:
@@ -67,7 +60,7 @@ class RecordingFeatures(NamedTuple):
     position: Tensor
     stroke: Tensor
     ends_s: Tensor
-    strokes: tuple[Stroke, ...]
+    times: Timeline
     hop_s: float
     roles: dict[str, Tensor]
     seconds: dict[str, float]
@@ -151,7 +144,6 @@ class FeatureMaker:
             place = self.source.ids.index(recording)
             is_slip = shuffled(is_slip, self.rule.shuffle_seed, place)
         speeds = torch.tensor([*times.speeds_mm_s, 0.0])[bins.stroke]  # -1, of no stroke: the 0
-        slides = zip(times.onsets_s, times.sliding_s, times.speeds_mm_s, strict=True)
         return RecordingFeatures(
             recording,
             features,
@@ -160,7 +152,7 @@ class FeatureMaker:
             bins.position,
             bins.stroke,
             (bins.starts + bins.bin_samples).double() / self.source.sample_rate_hz,
-            tuple(Stroke(onset_s, end_s, speed) for onset_s, (_, end_s), speed in slides),
+            times,
             (self.rule.bin_ms if self.rule.hop_ms is None else self.rule.hop_ms) / 1000,
             split.bin_roles(recording, len(is_slip)),
             seconds,
@@ -363,10 +355,12 @@ class SlipDataModule(L.LightningDataModule):
         workers = self.num_workers
         if self._shares_processors and self.trainer is not None:
             workers = max(1, workers // self.trainer.num_devices)
+        own: list[Any] = recordings[part::parts]
         return DataLoader(
-            _SplitRecordings(self.maker, self.split, recordings[part::parts], at_least),
+            own + [None] * (at_least - len(own)),  # type: ignore[arg-type]  # a list is a dataset
             batch_size=None,
             num_workers=workers,
+            collate_fn=partial(_batch, self.maker, self.split),
             persistent_workers=workers > 0,
         )
 
@@ -376,20 +370,6 @@ class SlipDataModule(L.LightningDataModule):
         return self.trainer.global_rank, self.trainer.world_size
 
 
-class _SplitRecordings(Dataset[RecordingFeatures]):
-    def __init__(
-        self, maker: FeatureMaker, split: Split, recordings: list[RecordingId], at_least: int
-    ) -> None:
-        self.maker = maker
-        self.split = split
-        self.recordings = recordings
-        self.at_least = at_least
-
-    def __len__(self) -> int:
-        return max(len(self.recordings), self.at_least)
-
-    def __getitem__(self, index: int) -> RecordingFeatures:
-        if index >= len(self.recordings):
-            nothing: RecordingFeatures = NOTHING
-            return nothing
-        return self.maker(self.recordings[index], self.split)
+def _batch(maker: FeatureMaker, split: Split, recording: RecordingId | None) -> RecordingFeatures:
+    made: RecordingFeatures = NOTHING if recording is None else maker(recording, split)
+    return made

@@ -49,11 +49,11 @@ from tactslip_torch.signals.filtering import Align, ChannelFilter
 from tactslip_torch.signals.spectrum import SpectrumMethod
 from tactslip_torch.signals.wavelet import highest_level
 from tactslip_torch.training.adaptation import FILE as STATISTICS
-from tactslip_torch.training.adaptation import Statistics, check_recipe
+from tactslip_torch.training.adaptation import Statistics
 from tactslip_torch.training.alarm import CalibratedAlarm, DebouncedAlarm
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
 from tactslip_torch.training.learner import SlipLearner, event_numbers
-from tactslip_torch.training.recipe import FeatureSelection, Recipe
+from tactslip_torch.training.recipe import FeatureSelection
 from tactslip_torch.training.tuning import Tuning
 
 
@@ -210,6 +210,14 @@ def _checked_level(level: int | None, bin_samples: int, wavelet: str) -> int:
     return level
 
 
+def features_of(
+    detector: SlipDetector, source: RecordingSource, rule: LabelRule, cache: FeatureCache
+) -> FeatureMaker:
+    """The features of a detector, computed as in its training."""
+    dtype = DTYPES[detector.info.get("features_dtype", "float64")]
+    return FeatureMaker(source, detector.pool, detector.channel_filter, rule, cache, dtype)
+
+
 @contextmanager
 def feature_cache(setting: str | bool | None) -> Iterator[FeatureCache]:
     """The cache of ``cache=auto|off|FOLDER``; ``off`` keeps features for this run only.
@@ -229,16 +237,11 @@ def feature_cache(setting: str | bool | None) -> Iterator[FeatureCache]:
 
 
 class RecordingProgressBar(TQDMProgressBar):
-    """Lightning's bar, named after the pass that is running and counting recordings.
+    """Lightning's bar, named after the pass that is running and counting recordings."""
 
-    Args:
-        verb: what workers do, such as ``"features"``.
-    """
-
-    def __init__(self, verb: str = "features") -> None:
+    def __init__(self) -> None:
         # a terminal is redrawn at every recording, a log file is not filled with bars
         super().__init__(refresh_rate=1 if sys.stderr.isatty() else 50)
-        self._verb = verb
 
     def init_train_tqdm(self) -> Any:
         """The bar of both training passes, on standard error: standard output is for results."""
@@ -252,15 +255,12 @@ class RecordingProgressBar(TQDMProgressBar):
         """Name the pass."""
         super().on_train_epoch_start(trainer, *args)
         what = "statistics" if trainer.current_epoch == 0 else "sums"
-        self.train_progress_bar.set_description_str(self._stage(what))
+        self.train_progress_bar.set_description_str(f"{'features, ' + what:{LEAD}}")
 
     def on_test_batch_start(self, *args: Any, **kwargs: Any) -> None:
         """Name the pass; Lightning numbers its loaders instead."""
         super().on_test_batch_start(*args, **kwargs)
-        self.test_progress_bar.set_description_str(self._stage("scores"))
-
-    def _stage(self, what: str) -> str:
-        return f"{self._verb + ', ' + what:{LEAD}}"
+        self.test_progress_bar.set_description_str(f"{'features, scores':{LEAD}}")
 
     def get_metrics(self, trainer: Any, pl_module: Any) -> dict[str, Any]:
         """Nothing, instead of Lightning's version number."""
@@ -504,16 +504,6 @@ def run_fold(
         "timing_s": seconds,
         "worker_s": learner.worker_seconds,
     }
-
-
-def check_statistics(config: DictConfig, recipe: Recipe) -> None:
-    """Refuse before any work what would leave no statistics."""
-    check_recipe(recipe)
-    if config.ckpt_path is not None:
-        raise ValueError(
-            "statistics=true needs the first pass, which ckpt_path skips; train without ckpt_path "
-            "(features come from the cache)"
-        )
 
 
 def _save_statistics(

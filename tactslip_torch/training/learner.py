@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
@@ -42,7 +42,6 @@ from tactslip_torch.report.metrics import (
     confusion_matrix,
     split_metrics,
 )
-from tactslip_torch.runtime import SeenBatches
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.baselines import KEY as BASELINES
 from tactslip_torch.training.baselines import Baselines
@@ -161,7 +160,7 @@ def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Watc
     It starts anew with every stroke and every unbroken stretch of bins of no stroke. Watched is
     from one hop before the first decision of such a stretch to the last one.
     """
-    bins = part.bins
+    bins, times = part.bins, part.bins.times
     available_s = (bins.ends_s + latency.look_ahead_s).numpy()
     says_slip, stroke = part.says_slip.numpy(), bins.stroke.numpy()
     is_apart = np.diff(bins.ends_s.numpy()) > bins.hop_s + 1e-6
@@ -170,18 +169,18 @@ def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Watc
     alarms: list[tuple[float, float]] = []
     seen: list[tuple[float, float]] = []
     for rows in sorted(stretches, key=lambda rows: float(available_s[rows[0]])):
-        times = available_s[rows]
+        hops_s = available_s[rows]
         is_on = np.convolve(says_slip[rows], np.ones(n))[: len(rows)] > k - 0.5
         raised = np.flatnonzero(is_on & ~np.append(False, is_on[:-1]))
         off = np.append(np.flatnonzero(~is_on), len(rows))
-        ends = np.append(times, math.inf)[off[np.searchsorted(off, raised)]]
-        alarms += zip(times[raised].tolist(), ends.tolist(), strict=True)
+        ends = np.append(hops_s, math.inf)[off[np.searchsorted(off, raised)]]
+        alarms += zip(hops_s[raised].tolist(), ends.tolist(), strict=True)
         before = seen[-1][1] if seen else -math.inf  # a hop may be longer than a bin
-        seen.append((max(float(times[0]) - bins.hop_s, before), float(times[-1])))
+        seen.append((max(float(hops_s[0]) - bins.hop_s, before), float(hops_s[-1])))
     first = []
-    for number, own in enumerate(bins.strokes):
-        is_later = says_slip & (stroke == number) & (available_s >= own.onset_s)
-        first.append(float(available_s[is_later].min(initial=math.inf)))
+    for number, onset_s in enumerate(times.onsets_s):
+        is_later = says_slip & (stroke == number) & (available_s >= onset_s)
+        first.append(next(iter(available_s[is_later].tolist()), math.nan))
     return Watched(
         recording=str(bins.recording),
         material=bins.recording.material,
@@ -189,10 +188,12 @@ def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Watc
         duration_s=seen[-1][1],
         alarms_s=tuple(alarm for alarm, _ in alarms),
         onset_estimates_s=(),
-        onsets_s=tuple(stroke.onset_s for stroke in bins.strokes),
-        sliding_s=tuple((stroke.onset_s, stroke.slide_end_s) for stroke in bins.strokes),
-        speeds_mm_s=tuple(stroke.speed_mm_s for stroke in bins.strokes),
-        first_positive_s=tuple(time if time < math.inf else math.nan for time in first),
+        onsets_s=times.onsets_s,
+        sliding_s=tuple(
+            (o, end) for o, (_, end) in zip(times.onsets_s, times.sliding_s, strict=True)
+        ),
+        speeds_mm_s=times.speeds_mm_s,
+        first_positive_s=tuple(first),
         watched_s=tuple(seen),
         alarm_ends_s=tuple(end for _, end in alarms),
     )
@@ -291,9 +292,7 @@ class SlipLearner(L.LightningModule):
         name = "statistics_pass" if self._second is None else "training_pass"
         self.seconds[name] = passed - self._pass_started
         if self._second is None or self._is_resumed:
-            self._statistics, *others = _of_all_processes(self._statistics)
-            for other in others:
-                self._statistics.merge(other)
+            self._statistics = _merged(self._statistics)
         if self._second is not None:
             _merge_processes(self._second)
             self._solve(self._second)
@@ -479,22 +478,22 @@ def _from_first_process(make: Callable[[], Value]) -> Value:
     return made
 
 
+def _merged(own: Value) -> Value:
+    """What every process holds, put together in the order of their ranks."""
+    values: list[Any] = _of_all_processes(own)
+    for other in values[1:]:
+        values[0].merge(other)
+    whole: Value = values[0]
+    return whole
+
+
 def _merge_processes(gathered: TrainingPass) -> None:
     """Put together what every process gathered; refuses a recording that two of them saw."""
-    if _num_processes() == 1:
-        return
-    if (stats := gathered.stats) is not None:
-        stats.seen_batches = _merged(_of_all_processes(stats.seen_batches))
-        for total in (stats.sums, stats.count):
-            torch.distributed.all_reduce(total)
-        return
-    gathered.seen_batches = _merged(_of_all_processes(gathered.seen_batches))
+    stats = gathered.stats
+    holder = gathered if stats is None else stats
+    holder.seen_batches = _merged(holder.seen_batches)
     for bins in _of_all_processes(gathered.bins):
         gathered.bins |= bins
-
-
-def _merged(batches: Iterable[SeenBatches]) -> SeenBatches:
-    whole = SeenBatches()
-    for own in batches:
-        whole.merge(own)
-    return whole
+    if stats is not None and _num_processes() > 1:
+        for total in (stats.sums, stats.count):
+            torch.distributed.all_reduce(total)

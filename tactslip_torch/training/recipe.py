@@ -7,7 +7,7 @@ first pass over the training recordings gathered.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -33,6 +33,17 @@ FREE_CONSTANT = 1.0e6
 """``c`` of degree 1, where it weighs the constant alone: so large, the penalty does not reach it.
 A penalised constant moves the threshold of a machine with few bins or a strong penalty."""
 _SCENE = "|"  # between group and scene in the name of a stratum
+_NUMBERS: Mapping[str, tuple[str, Callable[[float], bool]]] = {
+    "num_features": ("be whole numbers of at least 1", lambda k: k >= 1 and k.is_integer()),
+    "sample_bins": ("be at least 2", lambda num: num >= 2),
+    "penalties": ("be positive", lambda penalty: penalty > 0),
+    "offsets": ("not be negative", lambda offset: offset >= 0),
+    "tail": ("lie in [0, 0.5)", lambda part: 0 <= part < 0.5),
+    "most_correlation": ("lie in (0, 1]", lambda r: 0 < r <= 1),
+    "tolerance": ("lie in [0, 1)", lambda part: 0 <= part < 1),
+    "drop_channels": ("lie in [0, 1)", lambda part: 0 <= part < 1),
+    "scene_weights": ("be positive", lambda weight: 0 < weight < math.inf),
+}
 _CHOICES = {
     "use": ("channel", "pooled", "both"),
     "score_variance": ("pooled", "welch"),
@@ -139,31 +150,15 @@ class Recipe:
             for value in _several(getattr(self, name)):
                 if value not in known:
                     yield f".{name} must be one of {', '.join(known)}, got {value!r}"
-        sizes, penalties, offsets = self.sizes, self.penalties_ascending, _several(self.offsets)
-        if not _several(self.num_features) or any(size < 1 for size in sizes):
-            yield f".num_features must be at least 1, got {list(sizes)}"
-        if any(size != int(size) for size in sizes):
-            yield f".num_features must be whole numbers, got {list(sizes)}"
-        if self.sample_bins < 2:
-            yield f".sample_bins must be at least 2, got {self.sample_bins}"
-        if not penalties or any(not value > 0 for value in penalties):
-            yield f".penalties must be positive, got {list(penalties)}"
-        if len(penalties) > 1 and not math.isfinite(penalties[-1]):
+        for name, (wanted, is_right) in _NUMBERS.items():
+            value = getattr(self, name)
+            if not _all_pass(value, is_right, may_be_none=name == "num_features"):
+                shown = list(value) if isinstance(value, tuple) else value
+                yield f".{name} must {wanted}, got {shown}"
+        if len(self.penalties_ascending) > 1 and not math.isfinite(self.penalties_ascending[-1]):
             yield ".penalties: validation needs finite values; give inf alone, or leave it out"
-        if not offsets or any(not value >= 0 for value in offsets):
-            yield f".offsets must not be negative, got {list(offsets)}"
-        if not 0 <= self.tail < 0.5:
-            yield f".tail must lie in [0, 0.5), got {self.tail}"
-        if not 0 < self.most_correlation <= 1:
-            yield f".most_correlation must lie in (0, 1], got {self.most_correlation}"
         if self.kernel == "rbf" and self.gamma is None:
             yield ".kernel=rbf needs recipe.gamma, such as 0.01"
-        for name in ("tolerance", "drop_channels"):
-            if not 0 <= getattr(self, name) < 1:
-                yield f".{name} must lie in [0, 1), got {getattr(self, name)}"
-        for scene, weight in self.scene_weights.items():
-            if not 0 < weight < math.inf:
-                yield f".scene_weights.{scene} must be positive, got {weight}"
         if set(self.uses) != {"channel"} and self.pooling is None:
             yield ".use=pooled needs statistics over channels; set features.pooling=[mean, std]"
         degrees = _several(self.degree)
@@ -215,6 +210,25 @@ class Recipe:
                 f"recipe.num_features={self.sizes[-1]} exceeds the pool's {num_features}; give at "
                 f"most {num_features}"
             )
+
+    def check_quadratic(self, who: str) -> None:
+        """Refuse what does not always make a machine of degree 2, for ``who`` needs one.
+
+        Raises:
+            ValueError: if it is chosen nested, a kernel is another, or a penalty is not finite.
+        """
+        if self.validation == "nested":
+            raise ValueError(
+                f"{who} needs a machine of degree 2 on features of channels, which "
+                f"recipe={self.name} does not always make; take recipe=robust or recipe=paper"
+            )
+        for kernel in self.kernels:
+            if not isinstance(kernel, Polynomial) or kernel.degree != 2:
+                raise ValueError(
+                    f"{who} needs recipe.kernel=polynomial recipe.degree=2, got {kernel}"
+                )
+        if not math.isfinite(most := self.penalties_ascending[-1]):
+            raise ValueError(f"{who} needs finite recipe.penalties, got {most:g}")
 
     def allowed(self, pool: FeaturePool) -> Tensor | None:
         """Which features of a pool may be selected, ``[F]``, bool; ``None`` if all may.
@@ -352,18 +366,23 @@ def scaled_selection(
     return FeatureSelection(tuple(selected), scaler)
 
 
-def balanced_accuracy(
-    says_slip: Tensor, is_slip: Tensor, weights: Tensor | None = None
-) -> float | None:
-    """Mean recall of both classes, of decisions and truths ``[N]``; ``None`` if one is absent."""
+def recalls(says_slip: Tensor, is_slip: Tensor, weights: Tensor | None = None) -> list[float]:
+    """Recall of non-slip and of slip, of decisions and truths ``[N]``; absent classes left out."""
     is_right = says_slip == is_slip
     weights = torch.ones(len(is_slip), dtype=torch.float64) if weights is None else weights
-    recalls = [
+    return [
         float(weights[mine & is_right].sum() / weights[mine].sum())
         for mine in (~is_slip, is_slip)
         if bool(mine.any())
     ]
-    return sum(recalls) / 2 if len(recalls) == 2 else None
+
+
+def balanced_accuracy(
+    says_slip: Tensor, is_slip: Tensor, weights: Tensor | None = None
+) -> float | None:
+    """Mean recall of both classes, of decisions and truths ``[N]``; ``None`` if one is absent."""
+    found = recalls(says_slip, is_slip, weights)
+    return sum(found) / 2 if len(found) == 2 else None
 
 
 def class_counts(sample: SampledBins) -> list[int]:
@@ -458,6 +477,16 @@ def sample_groups(sample: SampledBins) -> tuple[Tensor, tuple[str, ...]]:
     names = tuple(dict.fromkeys(of_stratum))
     index = torch.tensor([names.index(name) for name in of_stratum], dtype=torch.int64)
     return index[sample.group], names
+
+
+def _all_pass(value: Any, is_right: Callable[[float], bool], *, may_be_none: bool) -> bool:
+    """Whether the numbers of a setting, at least one but of a mapping, are such."""
+    values = list(value.values()) if isinstance(value, Mapping) else _several(value)
+    try:
+        passed = [(may_be_none and x is None) or is_right(float(x)) for x in values]
+    except (TypeError, ValueError):  # no number
+        return False
+    return all(passed) and (bool(passed) or isinstance(value, Mapping))
 
 
 def _several(value: Any) -> tuple[Any, ...]:

@@ -38,8 +38,8 @@ from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.kernels import Kernel, Polynomial
 from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.model.threshold import best_threshold
 from tactslip_torch.runtime import Ticker, bar, for_each
+from tactslip_torch.training.baselines import best_threshold
 from tactslip_torch.training.recipe import (
     FeatureSelection,
     Recipe,

@@ -13,7 +13,7 @@ import copy
 import math
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
@@ -90,18 +90,9 @@ class Tuning:
             ValueError: if the recipe is nested or not of degree 2, there are fewer than three
                 groups, or something to be learned has no finite, positive value to start from.
         """
-        if recipe.validation == "nested":
-            raise ValueError(
-                "tuning needs a machine of degree 2 on features of channels, which "
-                f"recipe={recipe.name} does not always make; take recipe=robust or recipe=paper"
-            )
-        for kernel in recipe.kernels:
-            if not isinstance(kernel, Polynomial) or kernel.degree != 2:
-                raise ValueError(f"tuning needs a polynomial kernel of degree 2, got {kernel}")
-            if "offset" in self.learn and not kernel.offset > 0:
-                raise ValueError("tuning learns log c, which needs recipe.offsets above 0")
-        if not math.isfinite(recipe.penalties_ascending[-1]):
-            raise ValueError("tuning needs finite recipe.penalties to start from")
+        recipe.check_quadratic("tuning")
+        if "offset" in self.learn and not all(k.to_dict()["offset"] > 0 for k in recipe.kernels):
+            raise ValueError("tuning learns log c, which needs recipe.offsets above 0")
         groups = sorted({recipe.group(recording) for recording in split.having("train")})
         if len(groups) < 3:
             raise ValueError(
@@ -123,17 +114,14 @@ class Tuning:
         started = time.perf_counter()
         scaler, selected = plan.selection.scaler, plan.selection.selected
         bins = tuning_bins(sample, selected, sample_weight(plan.recipe, sample), self.bins)
-        groups = range(len(bins.names))
-        grids = [grid_points(scaler, bins.without(group), plan.recipe) for group in groups]
+        masks = [bins.group == group for group in range(len(sample.group_names))]
+        parts = [(bins.where(~mask), bins.where(mask)) for mask in masks]
+        grids = [grid_points(scaler, others, plan.recipe) for others, _ in parts]
         grid = grid_points(scaler, bins, plan.recipe)
         final = _Descent(LearnedSettings(self.learn, least_loss(grid), scaler), bins)
         held_out = [
-            _Descent(
-                LearnedSettings(self.learn, least_loss(points), scaler),
-                bins.without(group),
-                bins.of(group),
-            )
-            for group, points in zip(groups, grids, strict=True)
+            _Descent(LearnedSettings(self.learn, least_loss(points), scaler), *part)
+            for points, part in zip(grids, parts, strict=True)
         ]
         states = self._descend(final, held_out)
         steps = _best_step(held_out)
@@ -142,16 +130,15 @@ class Tuning:
         penalty, offset = float(settings.penalty), float(settings.offset)
         scales = zip((names[i] for i in selected), settings.scales.tolist(), strict=True)
         reports = []
-        for group, points in zip(groups, grids, strict=True):
-            others = [descent for descent in held_out if descent is not held_out[group]]
-            by_accuracy = LearnedSettings((), most_accurate(points), scaler)
-            of_recipe = _Descent(by_accuracy, bins.without(group), bins.of(group))
+        for name, points, part, own in zip(sample.group_names, grids, parts, held_out, strict=True):
+            of_recipe = _Descent(LearnedSettings((), most_accurate(points), scaler), *part)
             with torch.no_grad():
                 of_recipe.loss()
-            history, own_steps = held_out[group].history, _best_step(others)
+            history = own.history
+            own_steps = _best_step([other for other in held_out if other is not own])
             reports.append(
                 {
-                    "held": bins.names[group],
+                    "held": name,
                     "history": history,
                     "recipe": _held_numbers(of_recipe.history[0]),
                     "grid": _held_numbers(history[0]),
@@ -218,16 +205,14 @@ def _held_numbers(row: dict[str, float]) -> dict[str, float]:
 # The bins ----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class TuningBins:
+class TuningBins(NamedTuple):
     """Bins of several groups.
 
-    Args:
+    Attributes:
         features: selected, unscaled, float64.
         is_slip: their truth.
         weights: each bin's weight for all bins that are trained on, so that C means the same.
-        group: index into ``names``.
-        names: of the groups.
+        group: index into the names of the groups.
 
     Shape:
         - features: ``[N, K]``; is_slip, weights, group: ``[N]``
@@ -237,24 +222,10 @@ class TuningBins:
     is_slip: Tensor
     weights: Tensor
     group: Tensor
-    names: tuple[str, ...]
 
-    def of(self, group: int) -> TuningBins:
-        """The bins of one group, with their weights."""
-        return self._where(self.group == group)
-
-    def without(self, group: int) -> TuningBins:
-        """Those of the other groups."""
-        return self._where(self.group != group)
-
-    def _where(self, rows: Tensor) -> TuningBins:
-        return replace(
-            self,
-            features=self.features[rows],
-            is_slip=self.is_slip[rows],
-            weights=self.weights[rows],
-            group=self.group[rows],
-        )
+    def where(self, rows: Tensor) -> TuningBins:
+        """Some of them, by a mask ``[N]``."""
+        return TuningBins(*(x[rows] for x in self))
 
 
 def tuning_bins(
@@ -282,7 +253,7 @@ def tuning_bins(
         own = is_slip == kind
         own_weights[own] *= weights[sample.is_slip == kind].sum() / own_weights[own].sum()
     features = sample.features[rows][:, list(selected)].double()
-    return TuningBins(features, is_slip, own_weights, sample.group[rows], sample.group_names)
+    return TuningBins(features, is_slip, own_weights, sample.group[rows])
 
 
 # The loss, and the grid that tuning starts from --------------------------------------------------
