@@ -15,10 +15,9 @@ from tactslip_torch.report.onset import (
     REST,
     SLIP,
     DecisionCounts,
-    StreamSummary,
+    Envelope,
     Traces,
     alarm_outcome,
-    envelope,
     onset_figure,
     onset_rows,
     onsets_summary,
@@ -49,68 +48,45 @@ def pieces(rng, total, most):
     seed=seeds,
     lost=st.sampled_from([0.0, 0.3, 1.0]),
 )
-def test_an_envelope_is_samples_in_order_with_every_extreme(num_samples, num_segments, seed, lost):
+def test_an_envelope_of_pieces_has_every_extreme_in_order(num_samples, num_segments, seed, lost):
     rng = np.random.default_rng(seed)
     values = rng.standard_normal((3, num_samples))
     values[rng.random(values.shape) < lost] = rng.choice([np.nan, np.inf, -np.inf])
-    before = values.copy()
-    places, seen = envelope(values, num_segments)
-    np.testing.assert_array_equal(values, before)
-    assert places.shape == seen.shape
-    assert places.shape[1] <= 2 * num_segments
-    assert (np.diff(places, axis=1) >= 0).all()
+    kept = Envelope(3, num_samples, num_segments)
+    for piece in pieces(rng, num_samples, 50):
+        kept.add(values[:, piece])
+    numbers, seen = kept.points()
+    assert seen.shape == (3, len(numbers))
+    assert len(numbers) <= 2 * num_segments
+    assert (np.diff(numbers) >= 0).all()
     finite = np.where(np.isfinite(values), values, np.nan)
-    np.testing.assert_array_equal(seen, np.take_along_axis(finite, places, 1))
-    size = 1 if num_samples <= 2 * num_segments else -(-num_samples // num_segments)
-    for channel in range(3):
-        for start in range(0, num_samples, size):
-            part = finite[channel, start : start + size]
-            shown = seen[channel][(places[channel] >= start) & (places[channel] < start + size)]
-            if np.isnan(part).all():
-                assert np.isnan(shown).all()
-            else:
-                assert (np.nanmin(shown), np.nanmax(shown)) == (np.nanmin(part), np.nanmax(part))
+    if num_samples <= 2 * num_segments:
+        np.testing.assert_array_equal(seen, finite)
+        return
+    size = -(-num_samples // num_segments)
+    for start in range(0, num_samples, size):
+        part = finite[:, start : start + size]
+        expected = np.stack([np.fmin.reduce(part, 1), np.fmax.reduce(part, 1)], 1)
+        np.testing.assert_array_equal(seen[:, numbers == start], expected)
 
 
-@pytest.mark.parametrize("seconds", [1.2, 4.0])
-def test_traces_of_pieces_are_those_of_the_stream(rng, seconds):
-    """Whole where it is short, else its envelope; ``b`` and ``a`` are two of three channels."""
-    num, num_decisions = round(seconds * RATE_HZ), round(100 * seconds) - 10
-    samples = rng.standard_normal((3, num))
-    times = 0.07 + HOP_S * np.arange(num_decisions)
-    columns = [rng.random(num_decisions), *(rng.random((3, num_decisions)) < 0.5)]
-    traces = Traces({"b": 2, "a": 0}, RATE_HZ, HOP_S, (0.0, seconds))
-    for piece in pieces(rng, num, 700):
-        traces.add_samples(samples[:, piece])
-    for piece in pieces(rng, num_decisions, 30):
-        traces.add_decisions(times[piece], *(column[piece] for column in columns))
-    truth = {"onsets": [{"onset_s": 0.45}], "sliding_s": [(0.45, 0.9)]}
-    summary = traces.summary([(0.5, 0.4)], truth)
-    places, wanted = envelope(samples, 1500)
-    for name, row in (("b", 2), ("a", 0)):
-        np.testing.assert_allclose(summary.channels[name][0], places[row] / RATE_HZ)
-        np.testing.assert_array_equal(summary.channels[name][1], wanted[row])
-    lines = (summary.probability, summary.is_slip, summary.is_valid, summary.abstains)
-    for line, column in zip(lines, columns, strict=True):
-        np.testing.assert_allclose(line[0], times, atol=1e-9)
-        np.testing.assert_array_equal(line[1], column)
-    assert (summary.alarms, summary.onsets_s, summary.is_known) == ([(0.5, 0.4)], [0.45], True)
-    assert traces.summary([]).is_known is False
-
-
-def test_a_view_takes_its_segment_and_the_status_it_begins_with(rng):
-    samples, times = rng.standard_normal((1, 4000)), 0.065 + HOP_S * np.arange(190)
-    traces = Traces({"a": 0}, RATE_HZ, HOP_S, (0.5, 0.8))
+@pytest.mark.parametrize("view", [(0.0, 1.2), (0.5, 0.8)])
+def test_traces_take_what_is_in_view_and_the_status_it_begins_with(rng, view):
+    """Of pieces of any length; ``b`` and ``a`` are two of three channels."""
+    samples, times = rng.standard_normal((3, 4000)), 0.065 + HOP_S * np.arange(190)
+    columns = np.stack([rng.random(190), *(rng.random((3, 190)) < 0.5)])
+    traces = Traces({"b": 2, "a": 0}, RATE_HZ, HOP_S, view)
     for piece in pieces(rng, 4000, 300):
         traces.add_samples(samples[:, piece])
     for piece in pieces(rng, 190, 9):
-        now = times[piece]
-        traces.add_decisions(now, now, now < 1, now > 0, now < 0)
-    summary = traces.summary([])
-    np.testing.assert_allclose(summary.channels["a"][0], np.arange(1000, 1600) / RATE_HZ)
-    np.testing.assert_array_equal(summary.channels["a"][1], samples[0, 1000:1600])
-    np.testing.assert_allclose(summary.probability[0], times[(times > 0.494) & (times < 0.8)])
-    np.testing.assert_allclose(summary.probability[1], summary.probability[0])
+        traces.add_decisions(times[piece], *columns[:, piece])
+    first, last = (round(edge * RATE_HZ) for edge in view)
+    np.testing.assert_allclose(traces.samples()[0], np.arange(first, last) / RATE_HZ)
+    np.testing.assert_array_equal(traces.samples()[1], samples[[2, 0], first:last])
+    seen = (times > view[0] - 0.006) & (times < view[1])
+    decided_s, decided = traces.decisions()
+    np.testing.assert_allclose(decided_s, times[seen])
+    np.testing.assert_array_equal(decided, columns[:, seen])
 
 
 @pytest.mark.parametrize(
@@ -160,39 +136,35 @@ def test_decisions_are_counted_and_alarms_end_as_in_a_loop(seed, num):
 
 
 # The figure ------------------------------------------------------------------------------------
+TRUTH = {"onsets": [{"onset_s": 0.42}], "sliding_s": [(0.42, 1.1)]}
+ALARMS = [(0.5, 0.43), (1.25, 1.23)]
 
 
-def summary_of(rng, **changes):
-    """Two seconds of three films; slip is decided from 0.5 to 1.2 s, 0.2 s of it not valid.
-
-    From 0.9 to 1 s the detector abstains.
-    """
-    times = np.arange(4000) / RATE_HZ
-    decided = np.round(0.07 + HOP_S * np.arange(190), 6)
-    slip = (decided >= 0.5) & (decided < 1.2)
-    valid = ~((decided >= 0.6) & (decided < 0.8))
-    values = {
-        "view": (0.0, 2.0),
-        "channels": {f"PVDF{i}": (times, i + rng.standard_normal(4000)) for i in (1, 2, 3)},
-        "probability": (decided, 0.9 * slip + 0.05),
-        "is_slip": (decided, slip.astype(float)),
-        "is_valid": (decided, valid.astype(float)),
-        "abstains": (decided, ((decided >= 0.9) & (decided < 1.0)).astype(float)),
-        "alarms": [(0.5, 0.43), (1.9, 1.88)],
-        "onsets_s": [0.42],
-        "sliding_s": [(0.42, 1.1)],
-        "is_known": True,
-    }
-    return StreamSummary(**(values | changes))
+def traces_of(films, view=(0.0, 1.4), num_decisions=130):
+    """Slip is decided from 0.5 to 1.2 s, 0.2 s of it not valid; from 0.9 to 1 s it abstains."""
+    times = np.round(0.07 + HOP_S * np.arange(num_decisions), 6)
+    slip = (times >= 0.5) & (times < 1.2)
+    valid, abstains = (times < 0.6) | (times >= 0.8), (times >= 0.9) & (times < 1.0)
+    names = {f"PVDF{i}": i - 1 for i in range(1, 1 + len(films))}
+    traces = Traces(names, RATE_HZ, HOP_S, view)
+    traces.add_samples(films)
+    traces.add_decisions(times - 1e-9, 0.9 * slip + 0.05, slip, valid, abstains)
+    return traces
 
 
 @pytest.fixture
-def draw(drawn, tmp_path, rng):
-    """Draws a summary with these changes; its figure."""
+def films(rng):
+    return np.arange(3)[:, None] + rng.standard_normal((3, 2800))
 
-    def drawing(title="", **changes):
-        onset_figure(summary_of(rng, **changes), tmp_path / "onsets.png", title=title)
-        assert_png(tmp_path / "onsets.png")
+
+@pytest.fixture
+def draw(drawn, tmp_path, films):
+    """Draws traces; their figure."""
+
+    def drawing(traces=None, *, alarms=ALARMS, truth=TRUTH, title=""):
+        path, traces = tmp_path / "onsets.png", traces or traces_of(films)
+        onset_figure(traces, path, alarms=alarms, truth=truth, title=title)
+        assert_png(path)
         return drawn[-1]
 
     return drawing
@@ -214,74 +186,71 @@ def legend_of(figure):
     return {text.get_text() for text in figure.legends[0].get_texts()}
 
 
-def test_films_are_blue_and_yellow_by_the_decided_status(draw, drawn, tmp_path, rng):
-    summary = summary_of(rng)
-    onset_figure(summary, tmp_path / "a.png", title="")
-    films = drawn[0].axes[0]
-    for place, (times, volts) in enumerate(summary.channels.values()):
-        rest, slip = [line for line in films.lines if line.get_gid() == f"channel {place}"]
+def test_films_are_blue_and_yellow_by_the_decided_status(draw, films):
+    axes, times = draw().axes[0], np.arange(2800) / RATE_HZ
+    is_slip = (times >= 0.5) & (times < 1.2)
+    for place, volts in enumerate(films):
+        rest, slip = [line for line in axes.lines if line.get_gid() == f"channel {place}"]
         assert (to_hex(rest.get_color()), to_hex(slip.get_color())) == (REST.lower(), SLIP.lower())
         lane = rest.get_ydata()[0] - volts[0]
-        is_slip = (times >= 0.5) & (times < 1.2)
         for line, own in ((rest, ~is_slip), (slip, is_slip)):
             y = np.asarray(line.get_ydata())
             np.testing.assert_allclose(y[own], volts[own] + lane)
             assert np.isfinite(y).sum() <= own.sum() + 2  # where the colours meet, no hole
-    assert [text.get_text() for text in films.get_yticklabels()] == ["PVDF1", "PVDF2", "PVDF3"]
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["PVDF1", "PVDF2", "PVDF3"]
 
 
 def test_marks_stand_where_things_happened(draw):
-    figure = draw("SIMULATED recording a.npz")
+    figure = draw(title="SIMULATED recording a.npz")
     films, _, chance = figure.axes
     assert figure.get_suptitle() == "SIMULATED recording a.npz"
-    invalid = {(place, "invalid"): [pytest.approx((0.6, 0.8))] for place in range(3)}
-    assert marks_of(figure) == invalid | {
-        (0, "slip"): [pytest.approx((0.5, 1.2))],
-        (0, "alarm"): [0.5, 1.9],
+    expected = {
+        **{(place, "invalid"): [(0.6, 0.8)] for place in range(3)},
+        (0, "slip"): [(0.5, 1.2)],
+        (0, "alarm"): [0.5, 1.25],
         (0, "onset"): [0.42],
-        (1, f"decided {REST}"): [pytest.approx((0.07, 2.0))],
-        (1, f"decided {SLIP}"): [pytest.approx((0.5, 1.2))],
-        (1, f"truth {REST}"): [(0.0, 2.0)],
+        (1, f"decided {REST}"): [(0.07, 1.4)],
+        (1, f"decided {SLIP}"): [(0.5, 1.2)],
+        (1, f"truth {REST}"): [(0.0, 1.4)],
         (1, f"truth {SLIP}"): [(0.42, 1.1)],
         (2, "onset"): [0.42],
-        (2, "estimate"): [0.43, 1.88],
-        (2, "abstains"): [pytest.approx((0.9, 1.0))],
+        (2, "estimate"): [0.43, 1.23],
+        (2, "abstains"): [(0.9, 1.0)],
     }
+    assert marks_of(figure) == {key: list(map(pytest.approx, of)) for key, of in expected.items()}
     (markers,) = [line for line in films.lines if line.get_marker() == "v"]
-    assert list(markers.get_xdata()) == [0.5, 1.9]
+    assert list(markers.get_xdata()) == [0.5, 1.25]
     assert to_hex(markers.get_color()) == ALARM.lower()
     np.testing.assert_allclose(chance.lines[0].get_ydata().max(), 0.95)
     assert chance.lines[0].get_drawstyle() == "steps-post"  # a decision holds until the next
     assert legend_of(figure) >= {"decided: slip", "onset, true", "not valid", "abstains"}
 
 
-def test_what_is_out_of_view_or_not_known_is_not_drawn(draw):
-    figure = draw(view=(0.45, 1.0))
+def test_what_is_out_of_view_or_not_known_is_not_drawn(draw, films):
+    figure = draw(traces_of(films, view=(0.45, 1.0)))
     marks = marks_of(figure)
     assert marks[0, "alarm"] == [0.5]
     assert not {"onset", "estimate"} & {name for _, name in marks}
     assert marks[1, f"truth {SLIP}"] == [(0.45, 1.0)]
     assert figure.axes[2].get_xlim() == (0.45, 1.0)
-    never = (np.array([0.07]), np.array([0.0]))
-    unknown = draw(onsets_s=(), sliding_s=(), is_known=False, abstains=never)
+    unknown = draw(traces_of(films, num_decisions=20), truth=None)
     assert [text.get_text() for text in unknown.axes[1].get_yticklabels()] == ["decided"]
-    assert not {"onset, true", "abstains"} & legend_of(unknown)
-    without_slip = draw(onsets_s=(), sliding_s=())
+    assert not {"onset, true", "abstains", "not valid"} & legend_of(unknown)
+    without_slip = draw(truth={"onsets": [], "sliding_s": []})
     assert "truth" in [text.get_text() for text in without_slip.axes[1].get_yticklabels()]
 
 
 @pytest.mark.parametrize("level", [np.nan, 0.0, 3e38])
-def test_dead_films_and_few_decisions_are_drawn_without_a_warning(draw, level):
-    times = np.arange(100) / RATE_HZ
-    one = (np.array([0.04]), np.array([0.5]))
-    films = {"PVDF1": (times, np.full(100, level)), "PVDF2": (times, np.zeros(100))}
-    draw(view=(0.0, 0.05), channels=films, probability=one, is_slip=one, is_valid=one, alarms=[])
+@pytest.mark.parametrize("num_decisions", [0, 1])
+def test_dead_films_and_few_decisions_are_drawn_without_a_warning(draw, level, num_decisions):
+    films = np.stack([np.full(200, level), np.zeros(200)])
+    draw(traces_of(films, (0.0, 0.1), num_decisions), alarms=[])
 
 
 def test_of_many_marks_each_is_fine(draw, rng):
     few, many = (
         next(part for part in draw(alarms=alarms).axes[0].collections if part.get_gid() == "alarm")
-        for alarms in ([(1.0, 1.0)], [(time, time) for time in rng.uniform(0, 2, 300)])
+        for alarms in ([(1.0, 1.0)], [(time, time) for time in rng.uniform(0, 1.4, 300)])
     )
     assert many.get_linewidth()[0] < few.get_linewidth()[0] / 2
     assert len(many.get_paths()) == 300

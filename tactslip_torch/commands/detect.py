@@ -12,6 +12,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,6 @@ from tactslip_torch.report.onset import (
     DecisionCounts,
     Traces,
     alarm_outcome,
-    csv_writer,
     onset_figure,
     onsets_summary,
     onsets_table,
@@ -47,6 +47,7 @@ from tactslip_torch.report.onset import (
     view_of,
     write_onsets,
 )
+from tactslip_torch.report.style import csv_writer
 from tactslip_torch.runtime import Ticker, plain
 from tactslip_torch.training.experiment import save_config, versions
 
@@ -134,7 +135,8 @@ def _detect_in(
     rate, table = detector.pool.sample_rate_hz, context.folder / f"{name}_decisions.csv"
     given = hand_file(path, hand, rate, context.reading, context.units, config.tare_s)
     header = (*Decisions._fields, "answer")
-    with given as opened, csv_writer(table, header, wanted=config.decisions) as write:
+    written = csv_writer(table, header) if config.decisions else nullcontext()
+    with given as opened, written as write:
         samples, archived = opened.samples, opened.archived
         entry = file_facts(path, archived) | {"duration_s": samples.num_samples / rate}
         masked = config.masked_channels or ()
@@ -152,7 +154,8 @@ def _detect_in(
             times, is_valid, is_on = of["available_s"], of["is_valid"], of["is_on"]
             counts.add(times, of["llr"], is_valid, is_on, [asdict(a) for a in decisions.alarms])
             traces.add_decisions(times, of["probability"], is_on, is_valid, of["answer"] < 0)
-            write(zip(*(values.tolist() for values in of.values()), strict=True))
+            if write:
+                write(zip(*(values.tolist() for values in of.values()), strict=True))
 
         for piece in pieces(samples, context.piece_samples):
             traces.add_samples(piece.numpy())
@@ -167,9 +170,9 @@ def _detect_in(
         entry, events = _with_truth(entry, archived.recording, counts, stream)
     if config.figure:
         alarms = [(alarm["alarm_s"], alarm["onset_s"]) for alarm in entry["alarms"]]
-        summary = traces.summary(alarms, entry["truth"])
         title = onsets_title(entry, of_simulated=bool(detector.info.get("simulated")))
-        onset_figure(summary, context.folder / f"{name}_onsets.png", title=title)
+        path = context.folder / f"{name}_onsets.png"
+        onset_figure(traces, path, alarms=alarms, truth=entry["truth"], title=title)
     return entry, events
 
 

@@ -8,11 +8,8 @@ time at which it was known, so the delay of a decision can be seen.
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,20 +26,18 @@ from tactslip_torch.report.style import (
     INK,
     ORANGE,
     clean,
+    csv_writer,
     legend_below,
     marked,
     new_figure,
     save,
     table,
 )
-from tactslip_torch.runtime import whole_file, write_json
+from tactslip_torch.runtime import write_json
 
 Array = NDArray[np.float64]
-Points = tuple[Array, Array]
-"""Times in seconds and values there."""
 Segments = Sequence[tuple[float, float]]
 """Start and end of each, in seconds."""
-_Write = Callable[[Iterable[Iterable[Any]]], None]
 
 REST, SLIP = BLUE, ORANGE
 COLUMNS = (
@@ -63,98 +58,51 @@ _ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-"}
 _ESTIMATE: dict[str, Any] = {"color": ALARM, "linestyle": ":"}
 
 
-# Long signals ------------------------------------------------------------------------------------
-def envelope(values: Array, num_segments: int) -> tuple[NDArray[np.int64], Array]:
-    """The least and the greatest sample of each of ``num_segments`` segments, in order of time.
+# While a stream passes ---------------------------------------------------------------------------
+class Envelope:
+    """The least and the greatest sample of each segment of a signal that comes in pieces.
 
     A line through them looks like the line through all samples, and no burst is lost. Signals of
-    at most twice as many samples come back whole. Samples that are not finite count only where a
-    segment has no others, and are NaN then: a gap.
+    at most twice as many samples as segments are kept whole. Samples that are not finite count only
+    where a segment has no others, and are NaN then: a gap.
 
-    Shape:
-        - values: ``[C, T]``
-        - output: indices into ``T`` and values there, both ``[C, M]``
+    Args:
+        num_channels: ``C``.
+        num_samples: that will come in all.
+        num_segments: that are kept.
     """
-    running = _RunningEnvelope(values.shape[0], values.shape[1], num_segments)
-    running.add(values)
-    return running.points()
-
-
-class _RunningEnvelope:
-    """``envelope`` of a signal of known length that comes in pieces; keeps what is drawn."""
 
     def __init__(self, num_channels: int, num_samples: int, num_segments: int) -> None:
         self._size = max(1, -(-num_samples // num_segments))
         self._rest: Array = np.empty((num_channels, 0))
-        self._first = 0
-        self._indices: list[NDArray[np.int64]] = [np.empty((num_channels, 0), dtype=np.int64)]
-        self._values: list[Array] = [np.empty((num_channels, 0))]
+        self._kept = [self._rest]
 
     def add(self, values: NDArray[np.floating]) -> None:
         """Take the next samples, ``[C, n]``; ``n`` may be 0."""
         waiting = np.concatenate([self._rest, values], axis=1)
         whole = waiting.shape[1] // self._size * self._size
-        self._take(waiting[:, :whole])
+        if whole:  # so that the list is no longer than there are segments
+            self._kept.append(self._reduced(waiting[:, :whole]))
         self._rest = waiting[:, whole:].copy()
 
-    def points(self) -> tuple[NDArray[np.int64], Array]:
-        """Indices and values of all samples so far, the last segment as far as it came."""
-        self._take(self._rest)
+    def points(self) -> tuple[NDArray[np.floating], Array]:
+        """Numbers of samples, ``[M]``, and values there, ``[C, M]``; the last segment as it is.
+
+        Of a longer signal two values stand at the first sample of each segment.
+        """
+        self._kept = [np.concatenate([*self._kept, self._reduced(self._rest)], axis=1)]
         self._rest = self._rest[:, :0]
-        return np.concatenate(self._indices, axis=1), np.concatenate(self._values, axis=1)
+        (values,) = self._kept
+        numbers = np.arange(values.shape[1], dtype=np.float64)
+        return (numbers if self._size <= 2 else numbers // 2 * self._size), values
 
-    def _take(self, values: Array) -> None:
-        """Keep the extremes of every segment; of one or two samples they are all."""
-        num_channels, num_samples = values.shape
-        if not num_samples:
-            return  # so that the lists are no longer than there are segments
+    def _reduced(self, values: Array) -> Array:
         finite = np.where(np.isfinite(values), values, np.nan)
-        if self._size <= 2:
-            indices = np.tile(np.arange(num_samples), (num_channels, 1))
-        else:
-            starts = np.arange(0, num_samples, self._size)
-            missing = ((0, 0), (0, len(starts) * self._size - num_samples))
-            cut = np.pad(finite, missing, constant_values=np.nan)
-            cut = cut.reshape(num_channels, len(starts), self._size)
-            least = np.where(np.isnan(cut), np.inf, cut).argmin(axis=2)
-            greatest = np.where(np.isnan(cut), -np.inf, cut).argmax(axis=2)
-            places = np.sort(np.stack([least, greatest], axis=2), axis=2) + starts[None, :, None]
-            indices = places.reshape(num_channels, -1)
-        self._indices.append(indices + self._first)
-        self._values.append(np.take_along_axis(finite, indices, axis=1))
-        self._first += num_samples
-
-
-# While a stream passes ---------------------------------------------------------------------------
-@dataclass(frozen=True, eq=False)
-class StreamSummary:
-    """One recording and what was decided of it, as few points as a figure can show.
-
-    Args:
-        view: start and end of what is drawn, in seconds.
-        channels: samples of each drawn channel by its name; NaN is a gap.
-        probability: of slip.
-        is_slip: contact status after each decision, 0 or 1.
-        is_valid: whether the decision can be relied on, 0 or 1.
-        abstains: whether its score is too near the boundary to answer, or not valid, 0 or 1.
-        alarms: of each alarm, when it was raised and when its slip is estimated to have begun.
-        onsets_s: exact onsets, where they are known.
-        sliding_s: start and end of each slide.
-        is_known: whether the truth is.
-        units: of the samples.
-    """
-
-    view: tuple[float, float]
-    channels: Mapping[str, Points]
-    probability: Points
-    is_slip: Points
-    is_valid: Points
-    abstains: Points
-    alarms: Segments = ()
-    onsets_s: Sequence[float] = ()
-    sliding_s: Segments = ()
-    is_known: bool = False
-    units: str = "V"
+        starts = np.arange(0, values.shape[1], self._size)
+        if self._size <= 2 or not len(starts):
+            return finite
+        ends = [extreme.reduceat(finite, starts, axis=1) for extreme in (np.fmin, np.fmax)]
+        return np.stack(ends, axis=2).reshape(len(values), -1)
 
 
 class Traces:
@@ -176,13 +124,12 @@ class Traces:
         view: tuple[float, float],
         units: str = "V",
     ) -> None:
-        self._channels, self._view, self._units = channels, view, units
+        self.channels, self.view, self.units = channels, view, units
         self._sample_rate_hz, self._hop_s = sample_rate_hz, hop_s
         self._first, self._stop = (round(edge * sample_rate_hz) for edge in view)
-        num_decisions = round((view[1] - view[0]) / hop_s)
-        length = self._stop - self._first
-        self._samples = _RunningEnvelope(len(channels), length, _NUM_SEGMENTS)
-        self._decisions = _RunningEnvelope(4, num_decisions, _NUM_SEGMENTS)
+        length, num_decisions = self._stop - self._first, round((view[1] - view[0]) / hop_s)
+        self._samples = Envelope(len(channels), length, _NUM_SEGMENTS)
+        self._decisions = Envelope(4, num_decisions, _NUM_SEGMENTS)
         self._num_samples = 0
         self._first_s: float | None = None
 
@@ -190,48 +137,31 @@ class Traces:
         """Take the next samples, ``[C, n]``."""
         first, stop = (max(edge - self._num_samples, 0) for edge in (self._first, self._stop))
         self._num_samples += samples.shape[1]
-        self._samples.add(samples[list(self._channels.values()), first:stop])
+        self._samples.add(samples[list(self.channels.values()), first:stop])
 
-    def add_decisions(
-        self,
-        available_s: Array,
-        probability: Array,
-        is_slip: Array,
-        is_valid: Array,
-        abstains: Array,
-    ) -> None:
-        """Take the next decisions, each ``[m]``."""
-        since_s = self._view[0] - self._hop_s  # the one before the view tells the status there
-        is_seen = (available_s > since_s) & (available_s <= self._view[1])
-        if self._first_s is None and is_seen.any():
-            self._first_s = float(available_s[is_seen][0])
-        self._decisions.add(np.stack([probability, is_slip, is_valid, abstains])[:, is_seen])
-
-    def summary(self, alarms: Segments, truth: Mapping[str, Any] | None = None) -> StreamSummary:
-        """What was gathered.
+    def add_decisions(self, available_s: Array, *columns: Array) -> None:
+        """Take the next decisions, each ``[m]``.
 
         Args:
-            alarms: as ``StreamSummary`` has them.
-            truth: of an entry of ``onsets.json``; ``None`` if it is not known.
+            available_s: when they were known.
+            columns: probability of slip, contact status (0 or 1), whether the decision can be
+                relied on, and whether the detector abstains.
         """
-        places, samples = self._samples.points()
-        times = (self._first + places) / self._sample_rate_hz
+        since_s = self.view[0] - self._hop_s  # the one before the view tells the status there
+        is_seen = (available_s > since_s) & (available_s <= self.view[1])
+        if self._first_s is None and is_seen.any():
+            self._first_s = float(available_s[is_seen][0])
+        self._decisions.add(np.stack(columns)[:, is_seen])
+
+    def samples(self) -> tuple[NDArray[np.floating], Array]:
+        """Times in seconds, ``[M]``, and samples of the drawn channels, ``[C, M]``."""
+        numbers, values = self._samples.points()
+        return (self._first + numbers) / self._sample_rate_hz, values
+
+    def decisions(self) -> tuple[NDArray[np.floating], Array]:
+        """Times in seconds, ``[M]``, and the columns of ``add_decisions``, ``[4, M]``."""
         numbers, values = self._decisions.points()
-        decided_s = (self._first_s or 0.0) + numbers * self._hop_s
-        probability, is_slip, is_valid, abstains = zip(decided_s, values, strict=True)
-        return StreamSummary(
-            view=self._view,
-            channels={name: (times[row], samples[row]) for row, name in enumerate(self._channels)},
-            probability=probability,
-            is_slip=is_slip,
-            is_valid=is_valid,
-            abstains=abstains,
-            alarms=alarms,
-            onsets_s=[onset["onset_s"] for onset in truth["onsets"]] if truth else (),
-            sliding_s=truth["sliding_s"] if truth else (),
-            is_known=truth is not None,
-            units=self._units,
-        )
+        return (self._first_s or 0.0) + numbers * self._hop_s, values
 
 
 class DecisionCounts:
@@ -436,48 +366,53 @@ def write_onsets(content: Mapping[str, Any], folder: Path) -> None:
         write(row.values() for row in onset_rows(content))
 
 
-@contextmanager
-def csv_writer(path: Path, columns: Sequence[str], *, wanted: bool = True) -> Iterator[_Write]:
-    """Open a CSV file that is there, whole, when all went well; yields what writes its rows.
-
-    Args:
-        path: of the file.
-        columns: its header.
-        wanted: whether there is to be one.
-    """
-    if not wanted:
-        yield lambda rows: None
-        return
-    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        yield writer.writerows
-
-
 # Figure ------------------------------------------------------------------------------------------
-def onset_figure(stream: StreamSummary, path: str | Path, *, title: str) -> None:
+def onset_figure(
+    traces: Traces,
+    path: str | Path,
+    *,
+    alarms: Segments = (),
+    truth: Mapping[str, Any] | None = None,
+    title: str,
+) -> None:
     """Write channels in lanes, the decided and the true status, and the probability of slip.
 
     Args:
-        stream: what is drawn.
+        traces: what was gathered of the recording.
         path: the PNG to write, replaced as a whole if it exists.
+        alarms: of each, when it was raised and when its slip is estimated to have begun.
+        truth: of an entry of ``onsets.json``; ``None`` if it is not known.
         title: of the figure; says what is simulated.
     """
-    heights = [max(1.2, 0.42 * len(stream.channels)), 0.55, 1.3]
+    heights = [max(1.2, 0.42 * len(traces.channels)), 0.55, 1.3]
     figure = new_figure(12.0, sum(heights) + 1.3, title)
     panels = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": heights})
-    end_s = stream.view[1]
-    slips = _spans(stream.is_slip, end_s)
-    invalid = _spans((stream.is_valid[0], 1 - stream.is_valid[1]), end_s)
-    abstains = _spans(stream.abstains, end_s)
+    first, last = traces.view
+    onsets_s = [onset["onset_s"] for onset in truth["onsets"]] if truth else []
+    decided_s, (probability, is_slip, is_valid, abstains) = traces.decisions()
+    slips, invalid, doubtful = (
+        _spans(decided_s, status, last) for status in (is_slip, 1 - is_valid, abstains)
+    )
     for axes in panels:
         clean(axes, "y")
         _shade(axes, invalid, "invalid", **_INVALID)
-    _draw_channels(panels[0], stream, slips)
-    _draw_status(panels[1], stream, slips)
-    _draw_probability(panels[2], stream)
-    _shade(panels[2], abstains, "abstains", **_ABSTAINS)
-    panels[0].set_xlim(*stream.view)
+    _draw_channels(panels[0], traces, slips)
+    bars = {"decided": (max(decided_s[0], first) if len(decided_s) else last, slips)}
+    bars |= {"truth": (first, truth["sliding_s"])} if truth else {}
+    _draw_status(panels[1], bars, traces.view)
+    panels[2].plot(decided_s, probability, color=INK, linewidth=0.8, drawstyle="steps-post")
+    panels[2].set(ylim=(-0.04, 1.04), yticks=[0, 0.5, 1])
+    panels[2].set_ylabel("P(slip)", fontsize=8)
+    _shade(panels[2], doubtful, "abstains", **_ABSTAINS)
+    panels[0].set_xlim(first, last)
+    raised_s, estimates_s = ([alarm[which] for alarm in alarms] for which in (0, 1))
+    for axes, times, name, style in (
+        (panels[0], onsets_s, "onset", _ONSET),
+        (panels[0], raised_s, "alarm", _ALARM),
+        (panels[2], onsets_s, "onset", _ONSET),
+        (panels[2], estimates_s, "estimate", _ESTIMATE),
+    ):
+        _mark(axes, times, name, **style)
     panels[2].set_xlabel("time, s", fontsize=9, color=GREY)
     handles: list[Any] = [
         Line2D([], [], color=REST, linewidth=2, label="decided: no slip"),
@@ -485,90 +420,78 @@ def onset_figure(stream: StreamSummary, path: str | Path, *, title: str) -> None
         Line2D([], [], marker="v", label="alarm", **_ALARM),
         Line2D([], [], label="onset, detected", **_ESTIMATE),
     ]
-    handles += [Line2D([], [], label="onset, true", **_ONSET)] if stream.onsets_s else []
-    handles += [Patch(label="abstains", **_ABSTAINS)] if abstains else []
+    handles += [Line2D([], [], label="onset, true", **_ONSET)] if onsets_s else []
+    handles += [Patch(label="abstains", **_ABSTAINS)] if doubtful else []
     handles += [Patch(label="not valid", **_INVALID)] if invalid else []
     legend_below(figure, handles, len(handles))
     save(figure, path, dpi=120)
 
 
-def _draw_channels(axes: Axes, stream: StreamSummary, slips: Segments) -> None:
+def _draw_channels(axes: Axes, traces: Traces, slips: Segments) -> None:
     """A lane per channel around its median, in the colours of the status; bursts may cross."""
-    height = lane_height([values for _, values in stream.channels.values()])
-    middles = -height * np.arange(len(stream.channels))
-    for place, (times, values) in enumerate(stream.channels.values()):
-        known = values[np.isfinite(values)]
-        centre = float(np.median(known)) if known.size else 0.0
-        is_slip = _status_at(stream.is_slip, times)
+    times, samples = traces.samples()
+    height = lane_height(samples)
+    middles = -height * np.arange(len(samples))
+    is_slip = np.searchsorted(np.ravel(slips), times, side="right") % 2 == 1
+    for place, values in enumerate(samples):
+        lane = values - median(values) + middles[place]
         for colour, shown in ((REST, ~is_slip), (SLIP, is_slip)):
             reaching = shown.copy()
             reaching[1:] |= shown[:-1]  # to the first point of the other colour: no hole
-            line = np.where(reaching, values - centre + middles[place], np.nan)
+            line = np.where(reaching, lane, np.nan)
             axes.plot(times, line, color=colour, linewidth=0.6, gid=f"channel {place}")
     _shade(axes, slips, "slip", facecolor="#FFF0CC", edgecolor="none", zorder=0)
-    _mark(axes, stream, stream.onsets_s, "onset", **_ONSET)
-    seen = _mark(axes, stream, [alarm for alarm, _ in stream.alarms], "alarm", **_ALARM)
-    if seen:
-        above = axes.get_xaxis_transform()
-        axes.plot(
-            seen, [1.0] * len(seen), "v", color=ALARM, markersize=4, transform=above, clip_on=False
-        )
-    axes.set_yticks(middles, list(stream.channels), fontsize=7)
+    axes.set_yticks(middles, list(traces.channels), fontsize=7)
     axes.set_ylim(middles[-1] - 0.8 * height, 0.8 * height)
     axes.grid(visible=False)
-    axes.set_ylabel(f"channels, lanes {height:.2g} {stream.units} apart", fontsize=8)
+    axes.set_ylabel(f"channels, lanes {height:.2g} {traces.units} apart", fontsize=8)
 
 
 def lane_height(lines: Iterable[Array]) -> float:
     """Distance of lanes: room for what is usual, while a burst may cross its neighbours."""
-    least = 0.0
-    for line in lines:
-        known = line[np.isfinite(line)]
-        if known.size:
-            usual = 1.5 * float(np.subtract(*np.quantile(known, [0.95, 0.05])))
-            least = max(least, usual, 0.25 * float(np.ptp(known)))
-    return least or 1.0
+    return max(max(1.5 * span(line, 0.05), 0.25 * span(line)) for line in lines) or 1.0
 
 
-def _draw_status(axes: Axes, stream: StreamSummary, slips: Segments) -> None:
+def span(line: Array, fraction: float = 0.0) -> float:
+    """Of the finite values but so many at either end; 0 of none."""
+    known = line[np.isfinite(line)]
+    ends = np.quantile(known, [1 - fraction, fraction]) if known.size else (0.0, 0.0)
+    return float(np.subtract(*ends))
+
+
+def median(line: Array) -> float:
+    """Of the finite values; 0 of none."""
+    known = line[np.isfinite(line)]
+    return float(np.median(known)) if known.size else 0.0
+
+
+def _draw_status(
+    axes: Axes, bars: Mapping[str, tuple[float, Segments]], view: tuple[float, float]
+) -> None:
     """The decided status as a bar, and the true one below it where it is known."""
-    first, last = stream.view
-    known_s = stream.is_slip[0][0] if len(stream.is_slip[0]) else last
-    bars = [("decided", 1, max(known_s, first), slips)]
-    if stream.is_known:
-        bars.append(("truth", 0, first, stream.sliding_s))
-    for name, level, start_s, segments in bars:
-        in_view = [(max(start, first), min(end, last)) for start, end in segments]
-        in_view = [(start, end) for start, end in in_view if end > start]
+    first, last = view
+    for level, (name, (start_s, segments)) in enumerate(bars.items()):
+        cut = [(max(start, first), min(end, last)) for start, end in segments]
+        in_view = [(start, end) for start, end in cut if end > start]
         for colour, drawn in ((REST, [(start_s, last)]), (SLIP, in_view)):
             if beams := [(start, end - start) for start, end in drawn]:
                 place = (level - 0.35, 0.7)
                 axes.broken_barh(beams, place, facecolor=colour, gid=f"{name} {colour}")
-    axes.set_yticks([bar[1] for bar in bars], [bar[0] for bar in bars], fontsize=8)
-    axes.set_ylim(0.5 if len(bars) == 1 else -0.5, 1.5)
+    axes.set_yticks(range(len(bars)), list(bars), fontsize=8)
+    axes.set_ylim(len(bars) - 0.5, -0.5)
     axes.grid(visible=False)
 
 
-def _draw_probability(axes: Axes, stream: StreamSummary) -> None:
-    times, probability = stream.probability
-    axes.plot(times, probability, color=INK, linewidth=0.8, drawstyle="steps-post")
-    _mark(axes, stream, stream.onsets_s, "onset", **_ONSET)
-    _mark(axes, stream, [estimate for _, estimate in stream.alarms], "estimate", **_ESTIMATE)
-    axes.set_ylim(-0.04, 1.04)
-    axes.set_yticks([0, 0.5, 1])
-    axes.set_ylabel("P(slip)", fontsize=8)
-
-
-def _mark(
-    axes: Axes, stream: StreamSummary, times: Sequence[float], name: str, **style: Any
-) -> list[float]:
-    """Lines from top to bottom, the finer the more there are."""
-    seen = [time for time in times if stream.view[0] <= time <= stream.view[1]]
-    if seen:  # a collection of nothing has no layout
+def _mark(axes: Axes, times: Sequence[float], name: str, **style: Any) -> None:
+    """Lines from top to bottom, the finer the more there are; a triangle above an alarm."""
+    first, last = axes.get_xlim()
+    if seen := [time for time in times if first <= time <= last]:  # of nothing there is no layout
         width = max(0.2, _WIDTH * min(1.0, _ROOM / len(seen)) ** 0.5)
         through = axes.get_xaxis_transform()
         axes.vlines(seen, 0, 1, transform=through, linewidth=width, gid=name, **style)
-    return seen
+        if name == "alarm":
+            dots: dict[str, Any] = {"color": ALARM, "markersize": 4, "clip_on": False}
+            axes.plot(seen, np.ones(len(seen)), "v", transform=through, **dots)
 
 
 def _shade(axes: Axes, segments: Segments, name: str, **style: Any) -> None:
@@ -576,17 +499,9 @@ def _shade(axes: Axes, segments: Segments, name: str, **style: Any) -> None:
         axes.broken_barh(beams, (0, 1), transform=axes.get_xaxis_transform(), gid=name, **style)
 
 
-def _spans(status: Points, end_s: float) -> list[tuple[float, float]]:
+def _spans(times: NDArray[np.floating], status: Array, end_s: float) -> list[tuple[float, float]]:
     """Segments in which a status is on; it holds from its time to the next, at last to the end."""
-    times, values = status
-    is_on = np.concatenate([[False], np.asarray(values) >= 0.5, [False]])
+    is_on = np.concatenate([[False], status >= 0.5, [False]])
     edges = np.flatnonzero(is_on[1:] != is_on[:-1])
     bounds = np.append(times, end_s)[edges].reshape(-1, 2)
     return [(float(start), float(end)) for start, end in bounds if end > start]
-
-
-def _status_at(status: Points, times: Array) -> NDArray[np.bool_]:
-    """Whether a status is on at other times: off before its first."""
-    known, values = status
-    place = np.searchsorted(known, times, side="right")
-    return np.concatenate([[False], np.asarray(values) >= 0.5])[place]

@@ -8,7 +8,7 @@ that every burst is seen. Colours are fingers, paler towards the palm.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from tactslip_torch.report.onset import Array, Segments, envelope, lane_height
+from tactslip_torch.report.onset import Array, Envelope, Segments, lane_height, median, span
 from tactslip_torch.report.style import (
     BLUE,
     GREY,
@@ -120,29 +121,37 @@ def trials_table(trials: Sequence[Trial], *, simulated: bool) -> str:
 
     Of several scenes the same follows for each scene.
     """
-    tables = [_grouped("material", trials)]
+
+    def cells(group: Sequence[Trial]) -> Mapping[str, object]:
+        durations = [trial.duration_s for trial in group]
+        return {
+            "recordings": len(group),
+            "shortest s": f"{min(durations):.2f}",
+            "longest s": f"{max(durations):.2f}",
+            "seconds": f"{sum(durations):.1f}",
+            "onsets": sum(trial.num_onsets for trial in group),
+            "slip s": f"{sum(trial.slip_s for trial in group):.1f}",
+            "non-slip s": f"{sum(trial.non_slip_s for trial in group):.1f}",
+        }
+
+    tables = [_grouped("material", [(trial.material, trial) for trial in trials], cells)]
     if len({trial.scene for trial in trials}) > 1:
-        tables.append(_grouped("scene", trials))
+        tables.append(_grouped("scene", [(trial.scene, trial) for trial in trials], cells))
     return marked(simulated, "\n\n".join(tables))
 
 
-def _grouped(key: str, trials: Sequence[Trial]) -> str:
+def _grouped(
+    key: str,
+    named: Sequence[tuple[str, Any]],
+    cells: Callable[[Sequence[Any]], Mapping[str, object]],
+) -> str:
     """A row a group, in the order in which they come, and of several one of all."""
-    groups: dict[str, list[Trial]] = {}
-    for trial in trials:
-        groups.setdefault(getattr(trial, key), []).append(trial)
+    groups: dict[str, list[Any]] = {}
+    for name, each in named:
+        groups.setdefault(name, []).append(each)
     if len(groups) > 1:
-        groups["all"] = list(trials)
-    rows = []
-    for name, group in groups.items():
-        durations = [trial.duration_s for trial in group]
-        row: dict[str, object] = {key: name, "recordings": len(group)}
-        row |= {"shortest s": f"{min(durations):.2f}", "longest s": f"{max(durations):.2f}"}
-        row |= {"seconds": f"{sum(durations):.1f}"}
-        row |= {"onsets": sum(trial.num_onsets for trial in group)}
-        row |= {"slip s": f"{sum(trial.slip_s for trial in group):.1f}"}
-        rows.append(row | {"non-slip s": f"{sum(trial.non_slip_s for trial in group):.1f}"})
-    return table(rows)
+        groups["all"] = [each for _, each in named]
+    return table([{key: name, **cells(group)} for name, group in groups.items()])
 
 
 def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
@@ -153,18 +162,18 @@ def written_table(written: Sequence[Mapping[str, Any]], seconds: float) -> str:
             ``num_bytes``.
         seconds: that it took.
     """
-    groups: dict[str, list[Mapping[str, Any]]] = {}
-    for one in written:
-        groups.setdefault(one["line"]["scene"], []).append(one)
-    if len(groups) > 1:
-        groups["all"] = list(written)
-    rows = []
-    for scene, own in groups.items():
-        row = {"scene": scene, "recordings": len(own), "made now": sum(o["made"] for o in own)}
-        row |= {"seconds of signal": f"{sum(one['duration_s'] for one in own):.1f}"}
-        rows.append(row | {"MB": f"{sum(one['num_bytes'] for one in own) / 1e6:.1f}"})
+
+    def cells(group: Sequence[Mapping[str, Any]]) -> Mapping[str, object]:
+        return {
+            "recordings": len(group),
+            "made now": sum(one["made"] for one in group),
+            "seconds of signal": f"{sum(one['duration_s'] for one in group):.1f}",
+            "MB": f"{sum(one['num_bytes'] for one in group) / 1e6:.1f}",
+        }
+
+    rows = _grouped("scene", [(one["line"]["scene"], one) for one in written], cells)
     simulated = any(one["line"]["simulated"] == "true" for one in written)
-    return marked(simulated, table(rows), f"took {seconds:.1f} s")
+    return marked(simulated, rows, f"took {seconds:.1f} s")
 
 
 def ranges_table(channels: Channels, ranges: Array, units: str) -> str:
@@ -225,15 +234,12 @@ def dataset_figure(
     chosen = sorted({round(place) for place in np.linspace(0, len(names) - 1, num_lanes)})
     view = (0.0, example.duration_s)
     times, values = _points(example, chosen, view)
-    spans = []
-    for line in values:
-        known = line[np.isfinite(line)]
-        spans.append(float(np.subtract(*np.quantile(known, [0.99, 0.01]))) if known.size else 0.0)
-    scales = [1.25 * span or 1.0 for span in spans]
+    spans = [span(line, 0.01) for line in values]
     labels = [
-        f"{names[place]}  {span or 1.0:.3g} {example.units}"
-        for place, span in zip(chosen, spans, strict=True)
+        f"{names[place]}  {wide or 1.0:.3g} {example.units}"
+        for place, wide in zip(chosen, spans, strict=True)
     ]
+    scales = [1.25 * wide or 1.0 for wide in spans]
     _draw_lanes(traces, times, values, labels, [INK] * len(chosen), scales, most=1.2)
     traces.set_ylim(-len(chosen) + 0.2, 0.8)
     _mark(traces, example, view)
@@ -281,9 +287,9 @@ def signals_figure(
                 _draw_lanes(axes, times, values, names, own, [scale] * len(names))
                 apart = f"lanes {scale:.2g} {row.units} apart"
                 axes.set_title(apart, loc="right", fontsize=_NAMES, color=GREY)
-            for time_s, line, name, colour in zip(times, values, names, own, strict=True):
+            for line, name, colour in zip(values, names, own, strict=True):
                 if not in_lanes:
-                    axes.plot(time_s, line, color=colour, linewidth=0.7, label=name)
+                    axes.plot(times, line, color=colour, linewidth=0.7, label=name)
             _mark(axes, row, view)
         unit = "volts" if row.units == "V" else row.units
         panels[0].set_ylabel(f"{row.title}\n{unit}", fontsize=TEXT, color=INK)
@@ -323,17 +329,19 @@ def channel_colours(channels: Channels) -> list[tuple[float, float, float]]:
 
 def _points(
     row: DrawnRecording, places: Sequence[int], view: tuple[float, float]
-) -> tuple[Array, Array]:
+) -> tuple[NDArray[np.floating], Array]:
     """Times and samples of some channels in the view, as few as the figure can show."""
     first, last = (round(edge * row.sample_rate_hz) for edge in view)
     values = row.samples[list(places), first:last].double().cpu().numpy()
-    indices, shown = envelope(values, _NUM_SEGMENTS)
-    return (first + indices) / row.sample_rate_hz, shown
+    kept = Envelope(len(places), values.shape[1], _NUM_SEGMENTS)
+    kept.add(values)
+    numbers, shown = kept.points()
+    return (first + numbers) / row.sample_rate_hz, shown
 
 
 def _draw_lanes(
     axes: Axes,
-    times: Array,
+    times: NDArray[np.floating],
     values: Array,
     names: Sequence[str],
     colours: Sequence[Any],
@@ -341,10 +349,9 @@ def _draw_lanes(
     most: float = np.inf,
 ) -> None:
     """A lane per channel around its median, the first on top; bursts reach ``most`` lanes."""
-    for lane, (time_s, line, scale) in enumerate(zip(times, values, scales, strict=True)):
-        known = line[np.isfinite(line)]
-        shown = np.clip((line - (np.median(known) if known.size else 0.0)) / scale, -most, most)
-        axes.plot(time_s, shown - lane, color=colours[lane], linewidth=0.5, label=names[lane])
+    for lane, (line, scale) in enumerate(zip(values, scales, strict=True)):
+        shown = np.clip((line - median(line)) / scale, -most, most)
+        axes.plot(times, shown - lane, color=colours[lane], linewidth=0.5, label=names[lane])
     axes.set_yticks(-np.arange(len(names)), names)
     for label, colour in zip(axes.get_yticklabels(), colours, strict=True):
         label.set_color(colour)

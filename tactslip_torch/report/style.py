@@ -6,7 +6,9 @@ on matplotlib's ``Figure`` objects, so that no window opens and no global state 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import csv
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
 from typing import Any, Literal
@@ -70,6 +72,22 @@ def cells(rows: Sequence[Mapping[str, object]]) -> list[list[str]]:
         values = row.values()
         texts.append([words_of[v] if v is None or isinstance(v, bool) else str(v) for v in values])
     return texts
+
+
+@contextmanager
+def csv_writer(
+    path: str | Path, columns: Sequence[str]
+) -> Iterator[Callable[[Iterable[Iterable[Any]]], None]]:
+    """Open a CSV file that is there, whole, when all went well; yields what writes its rows.
+
+    Args:
+        path: of the file.
+        columns: its header.
+    """
+    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        yield writer.writerows
 
 
 def marked(simulated: bool, *lines: str) -> str:
