@@ -24,14 +24,13 @@ from tactslip_torch.analysis.importance import (
     best_first,
     count_right,
     difference,
-    draw_raw_bins,
     first_order,
     score_gradients,
     units_of,
     without,
 )
 from tactslip_torch.commands.entry import conf_dir
-from tactslip_torch.commands.importance import _trained, main, sensors
+from tactslip_torch.commands.importance import main, sensors
 from tactslip_torch.commands.train import train
 from tactslip_torch.features.bin_sample import BinSample
 from tactslip_torch.features.selection import ClassMoments, t_scores
@@ -408,26 +407,6 @@ def test_tables_and_csv_have_the_numbers_of_json(found, tmp_path):
     assert "SIMULATED" not in sensors_table(content)
     sensors_csv(simulated, tmp_path / "sensors.csv")
     assert (tmp_path / "sensors.csv").read_text().endswith("True\n")
-
-
-# Bins that are differentiated at -----------------------------------------------------------------
-
-
-def test_raw_bins_are_training_bins_of_both_classes_with_their_context(run):
-    trained = _trained(run / "detector.pt", None)
-    raw, is_slip = draw_raw_bins(trained.maker, trained.fold, 24)
-    assert raw.shape == (len(is_slip), 4, trained.detector.context_before + 125)
-    assert int(is_slip.sum()) == len(is_slip) // 2 >= 12
-    of_train = torch.cat(
-        [trained.source.load(recording).samples for recording in trained.fold.having("train")], 1
-    )
-    starts = set(of_train[0].tolist())
-    assert all(float(bin_[0, 0]) in starts for bin_ in raw)
-    again, _ = draw_raw_bins(trained.maker, trained.fold, 24)
-    assert torch.equal(raw, again)
-    filtered = trained.detector.channel_filter.valid(raw.double())
-    score = trained.detector(filtered)
-    torch.testing.assert_close(trained.detector.score_raw(raw.double()), score)
 
 
 # The figure --------------------------------------------------------------------------------------

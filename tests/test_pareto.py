@@ -19,7 +19,6 @@ from tactslip_torch.analysis.pareto import (
     Group,
     ParetoSearch,
     Search,
-    Timed,
     distinct,
     landmarks,
     nondominated,
@@ -129,12 +128,18 @@ def made_up(latency, accuracy=0.9, size=4, **changes):
     )))  # fmt: skip
     fields = {"columns": "channel", "ranking": "t", "degree": 1, "penalty": 0.01}
     fields |= {"selection": selection, "by_group": {}} | changes
-    return Candidate(group=group, balanced_accuracy=accuracy, latency=latency, **fields)
+    return Candidate(
+        group=group,
+        balanced_accuracy=accuracy,
+        latency=latency,
+        modelled_us=latency.compute_us,
+        **fields,
+    )
 
 
 def at(worst_ms, compute_us, accuracy, size=50, **changes):
     latency = Latency(worst_ms - 55 - compute_us / 1000, 50.0, 5.0, compute_us)
-    return made_up(latency, accuracy, size, **changes)
+    return made_up(latency, accuracy, size, graph_us=compute_us, **changes)
 
 
 # What is searched --------------------------------------------------------------------------------
@@ -184,10 +189,11 @@ def test_groups_hold_what_their_names_say():
         ({"calls": True}, r"search.calls must be a positive whole number, got True"),
         ({"cost_power": -1}, r"search.cost_power must be a finite number of at least 0, got -1"),
         ({"alpha": 1.5}, r"search.alpha must be at most 1, got 1.5"),
-        ({"degrees": [3]}, r"search.degrees must be of 1 and 2, got \[3\]"),
+        ({"degrees": [3]}, r"search.degrees: unknown 3, expected some of 1, 2"),
         ({"statistics": "mean"}, r"search.statistics must be a list in brackets, got 'mean'"),
-        ({"statistics": [["mean", "mode"]]}, r"search.statistics must be lists of some of mean"),
-        ({"statistics": [[]]}, r"search.statistics must be lists of some of mean, std"),
+        ({"statistics": ["mean"]}, r"search.statistics must be a list in brackets, got 'mean'"),
+        ({"statistics": [["mean", "mode"]]}, r"search.statistics: unknown 'mode', expected some"),
+        ({"statistics": [[]]}, r"search.statistics is empty, expected at least one value"),
     ],
 )
 def test_what_cannot_be_searched_is_refused(changes, message):
@@ -339,8 +345,7 @@ def test_a_detector_found_twice_is_one_candidate():
 
 def test_landmarks_are_the_best_the_cheap_and_the_small():
     def timed(accuracy, us, size):
-        made = at(60.0, us, accuracy, size)
-        return Timed(made, "double", Timing(us, us, us, 20), made.latency, us)
+        return at(60.0, us, accuracy, size)
 
     def found(*rows):
         return list(landmarks(rows).values())
@@ -387,7 +392,7 @@ def test_what_is_close_to_the_limits_is_timed(rng):
 def test_a_machine_of_all_bins_is_that_of_all_bins_but_a_large_quadratic_one(searched, degree):
     made, candidates = searched
     chosen = only(candidates, "all", "all", "t", degree, 6)
-    detector = made.make(chosen, "double", from_all=True)
+    detector = made.make(chosen, from_all=True)
     assert detector.info["fitted_to"] == "all training bins"
     maker = made.makers["centred"]
     batches = [maker(recording, made.fold) for recording in made.fold.having("train")]
@@ -399,7 +404,7 @@ def test_a_machine_of_all_bins_is_that_of_all_bins_but_a_large_quadratic_one(sea
     torch.testing.assert_close(detector.head(z), head(z), rtol=1e-6, atol=1e-6)
     made.most_summed = 3
     try:
-        fitted_to = made.make(chosen, "double", from_all=True).info["fitted_to"]
+        fitted_to = made.make(chosen, from_all=True).info["fitted_to"]
     finally:
         made.most_summed = 120
     sampled = "40 training bins of each material and class"
@@ -408,7 +413,7 @@ def test_a_machine_of_all_bins_is_that_of_all_bins_but_a_large_quadratic_one(sea
 
 def test_test_bins_come_with_the_context_of_their_filter(searched, monkeypatch):
     made, candidates = searched
-    detector = made.make(only(candidates, "all", "all", "t", 1, 3), "double")
+    detector = made.make(only(candidates, "all", "all", "t", 1, 3))
     given, predict_raw = [], detector.predict_raw
     monkeypatch.setattr(detector, "predict_raw", lambda raw: given.append(raw) or predict_raw(raw))
     found = made.evaluated(detector)
@@ -595,13 +600,9 @@ def test_ctrl_c_is_one_line_and_leaves_no_detector(monkeypatch, capsys, tmp_path
 
 
 def test_the_last_try_is_for_the_one_with_most_head_room():
-    def timed(accuracy, us):
-        made = at(60.0, us, accuracy)
-        return Timed(made, "double", Timing(us, us, us, 20), made.latency, us)
-
     limits = Limits(80.0, 500.0, [5.0])
-    able = [timed(0.6 - i / 100, 400.0 - 20 * i) for i in range(10)]
-    quick = timed(0.52, 50.0)
+    able = [at(60.0, 400.0 - 20 * i, 0.6 - i / 100) for i in range(10)]
+    quick = at(60.0, 50.0, 0.52)
     able[7] = quick
     assert command._tries(able, limits, 3) == [*able[:2], quick]
     assert command._tries(able, limits, 1) == able[:1]

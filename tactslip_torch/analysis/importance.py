@@ -8,7 +8,6 @@ training bins; held-out groups of these make every choice, bins of other roles n
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,9 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from tactslip_torch.analysis.raw_bins import bins_inside, in_turn
-from tactslip_torch.data.splits import Split
-from tactslip_torch.features.bin_sample import SampledBins, bin_keys
+from tactslip_torch.features.bin_sample import SampledBins
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.selection import rank_distinct, rank_features
 from tactslip_torch.hand import HandLayout
@@ -30,8 +27,6 @@ from tactslip_torch.model.kernels import Kernel
 from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.runtime import bar, in_parts
-from tactslip_torch.signals.binning import refuse_nonfinite
-from tactslip_torch.training.datamodule import FeatureMaker
 
 _COVERAGE = 0.95
 
@@ -443,48 +438,6 @@ def first_order(scores: Tensor, gradients: Tensor, samples: Tensor, is_slip: Ten
     moved = torch.einsum("nct,mct->cnm", gradients, deviations).square().sum(-1)  # [C, N]
     by_class = [moved[:, is_slip == value].mean(-1).sqrt() / spread for value in (False, True)]
     return torch.stack(by_class)
-
-
-_MOST_RECORDINGS = 60
-"""So many at most are read or simulated; of more, materials in turn."""
-
-
-def draw_raw_bins(maker: FeatureMaker, fold: Split, number: int) -> tuple[Tensor, Tensor]:
-    """Training bins in volts, half of each class, drawn by ``bin_keys``: the same every time.
-
-    A bin whose context leaves its recording is passed over.
-
-    Args:
-        maker: of the recordings.
-        fold: says who is trained on.
-        number: of bins, about.
-
-    Shape:
-        - first output: ``[N, C, before + n + after]``, as ``score_raw`` takes them
-        - second output: ``[N]``, bool, whether it is slip
-
-    Raises:
-        ValueError: if a class has no such bin, or a sample is not finite.
-    """
-    by_key = sorted(fold.having("train"), key=lambda r: float(bin_keys(str(r), 1)[0]))
-    recordings = in_turn(by_key)[:_MOST_RECORDINGS]
-    each = max(1, math.ceil(number / 2 / len(recordings)))
-    drawn: list[Tensor] = []
-    labels: list[Tensor] = []
-    for recording in bar(recordings, "raw bins"):
-        bins, inside = bins_inside(maker, fold, recording, "train")
-        order = inside[bin_keys(str(recording), len(bins.starts))[inside].argsort()]
-        by_class = [order[bins.is_slip[order] == value][:each] for value in (False, True)]
-        drawn.append(maker.raw_bins(recording, torch.cat(by_class)))
-        labels.append(bins.is_slip[torch.cat(by_class)])
-        refuse_nonfinite(drawn[-1], maker.source.hand.names, f"repair or leave out {recording}")
-    is_slip = torch.cat(labels)
-    for value, name in ((False, "non-slip"), (True, "slip")):
-        if not bool((is_slip == value).any()):
-            raise ValueError(
-                f"no {name} bin lies far enough inside its recording; take longer ones"
-            )
-    return torch.cat(drawn), is_slip
 
 
 def measure(

@@ -12,10 +12,11 @@ that are left are timed, fitted and evaluated.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
@@ -76,6 +77,7 @@ _MODEL_ERRS = (1.5, 1.0, 1 / 1.5)  # modelled compute over what will be measured
 _FEW_NUMBERS = 20
 _LESS_ACCURATE = 0.01
 _LESS_COMPUTE = 1 / 3
+_UNTIMED = Timing(math.nan, math.nan, math.nan, 0)
 
 
 class Group(NamedTuple):
@@ -110,7 +112,13 @@ class Candidate:
             pooled columns everything is learned without the held-out group; ranking and scaling of
             channel features saw it too, and only the machine is refitted.
         by_group: of each held-out group.
-        latency: worst case with the shortest hop, compute modelled until timed.
+        latency: worst case with the shortest hop that compute at p99 fits into; compute is
+            modelled until timed.
+        modelled_us: that compute.
+        arithmetic: of its pool.
+        timing: of a call with one raw bin, once timed.
+        graph_us: median of its ONNX graph in onnxruntime, once timed, of samples in float32; of the
+            pool in float64.
     """
 
     group: Group
@@ -122,6 +130,10 @@ class Candidate:
     balanced_accuracy: float
     by_group: Mapping[str, float | None]
     latency: Latency
+    modelled_us: float
+    arithmetic: Arithmetic = "double"
+    timing: Timing = _UNTIMED
+    graph_us: float = math.nan
 
     @property
     def point(self) -> tuple[float, float, float]:
@@ -139,36 +151,6 @@ class Candidate:
         layer = self.selection.pooling
         columns = self.selected if layer is None else layer.names
         return self.group.align, self.degree, self.penalty, frozenset(columns)
-
-
-@dataclass(frozen=True, eq=False)
-class Timed:
-    """A candidate by the clock.
-
-    Args:
-        candidate: what it is.
-        arithmetic: of its pool.
-        timing: of a call with one raw bin.
-        latency: with the shortest hop that compute at p99 fits into.
-        graph_us: median of its ONNX graph in onnxruntime, of samples in float32; of the pool in
-            float64.
-    """
-
-    candidate: Candidate
-    arithmetic: Arithmetic
-    timing: Timing
-    latency: Latency
-    graph_us: float
-
-    @property
-    def accuracy(self) -> float:
-        """Balanced accuracy in validation."""
-        return self.candidate.balanced_accuracy
-
-    @property
-    def point(self) -> tuple[float, float, float]:
-        """What is traded, smaller is better: latency, compute, errors."""
-        return self.latency.worst_ms, self.timing.p99_us, -self.accuracy
 
 
 # Which candidates are worth more -----------------------------------------------------------------
@@ -195,23 +177,23 @@ def nondominated(points: Sequence[Sequence[float]]) -> list[int]:
     return sorted(kept)
 
 
-def landmarks(timed: Sequence[Timed]) -> dict[str, Timed | None]:
+def landmarks(timed: Sequence[Candidate]) -> dict[str, Candidate | None]:
     """The detectors that a user asks for first; of several equally accurate ones the quickest.
 
     Returns:
         ``"most_accurate"``; ``"cheap"``, at most 1 point worse, with at most a third of its
         compute as a graph; ``"few"``, of at most 20 numbers. ``None`` where there is none.
     """
-    best_first = sorted(timed, key=lambda each: (-each.accuracy, each.graph_us))
+    best_first = sorted(timed, key=lambda each: (-each.balanced_accuracy, each.graph_us))
     top = next(iter(best_first), None)
     cheap = (
         each
         for each in best_first
         if top is not None
         and each.graph_us <= _LESS_COMPUTE * top.graph_us
-        and each.accuracy >= top.accuracy - _LESS_ACCURATE
+        and each.balanced_accuracy >= top.balanced_accuracy - _LESS_ACCURATE
     )
-    few = (each for each in best_first if each.candidate.selection.size <= _FEW_NUMBERS)
+    few = (each for each in best_first if each.selection.size <= _FEW_NUMBERS)
     return {"most_accurate": top, "cheap": next(cheap, None), "few": next(few, None)}
 
 
@@ -264,17 +246,6 @@ def _thinned(layer: Sequence[Candidate], room: int, limits: Limits) -> list[Cand
 
 # What is searched --------------------------------------------------------------------------------
 Ranking = Literal["t", "ccweighting", "per_cost"]
-_WORDS: Mapping[str, tuple[str, ...]] = {
-    "channels": get_args(Channels),
-    "components": get_args(Components),
-    "pooled_components": get_args(Components),
-    "rankings": get_args(Ranking),
-    "aligns": get_args(Align),
-    "arithmetics": get_args(Arithmetic),
-}
-_IS_WHOLE = {
-    "sizes": True, "degrees": True, "pooled_sizes": True, "hops_ms": False, "penalties": False
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -315,7 +286,7 @@ class Search:
     drop_fingers: bool
     components: Sequence[Components]
     rankings: Sequence[Ranking]
-    degrees: Sequence[int]
+    degrees: Sequence[Literal[1, 2]]
     aligns: Sequence[Align]
     arithmetics: Sequence[Arithmetic]
     hops_ms: Sequence[float]
@@ -330,32 +301,10 @@ class Search:
     pooled_sizes: Sequence[int | None] = (None,)
 
     def __post_init__(self) -> None:
-        for name in (*_WORDS, *_IS_WHOLE, "statistics"):
-            given = getattr(self, name)
-            if isinstance(given, str) or not isinstance(given, Sequence):
-                raise ValueError(f"search.{name} must be a list in brackets, got {given!r}")
-            if not given and name != "statistics":
-                raise ValueError(f"search.{name} is empty, expected at least one value")
-            for value in given:
-                if name in _WORDS and value not in _WORDS[name]:
-                    known = ", ".join(_WORDS[name])
-                    raise ValueError(f"search.{name}: unknown {value!r}, expected some of {known}")
-                if name in _IS_WHOLE and not (name == "pooled_sizes" and value is None):
-                    check_number(f"search.{name}", value, whole=_IS_WHOLE[name])
-        for some in self.statistics:
-            if isinstance(some, str) or not some or set(some) - set(STATISTICS):
-                raise ValueError(
-                    f"search.statistics must be lists of some of {', '.join(STATISTICS)}, such as "
-                    f"[[mean, std]], got {list(self.statistics)}"
-                )
-        for name in ("bins", "most_timed", "calls"):
-            check_number(f"search.{name}", getattr(self, name), whole=True)
-        for name in ("alpha", "cost_power"):
-            check_number(f"search.{name}", getattr(self, name), least=0)
+        for name, hint in get_type_hints(type(self)).items():
+            _check(f"search.{name}", getattr(self, name), hint, least=0)
         if self.alpha > 1:
             raise ValueError(f"search.alpha must be at most 1, got {self.alpha}")
-        if max(self.degrees) > 2:
-            raise ValueError(f"search.degrees must be of 1 and 2, got {list(self.degrees)}")
 
     def groups(self, pool: FeaturePool, components: Sequence[str]) -> list[Group]:
         """Groups of channels and of components that differ and are not empty."""
@@ -381,6 +330,30 @@ class Search:
             f"{list(self.channels)} by search.components={list(self.components)}, has "
             f"{min(self.sizes)} features, the least of search.sizes; add a group or a size"
         )
+
+
+def _check(name: str, value: Any, hint: Any, least: float | None = None) -> None:
+    """Refuse what is not as annotated. Numbers in lists are positive, text is a statistic.
+
+    A list of lists may be empty.
+    """
+    words = STATISTICS if hint is str else get_args(hint)
+    if get_origin(hint) is Sequence:
+        if isinstance(value, str) or not isinstance(value, Sequence):
+            raise ValueError(f"{name} must be a list in brackets, got {value!r}")
+        if not value and get_origin(words[0]) is not Sequence:
+            raise ValueError(f"{name} is empty, expected at least one value")
+        for each in value:
+            _check(name, each, words[0])
+    elif hint is str or get_origin(hint) is Literal:
+        if value not in words:
+            known = ", ".join(map(str, words))
+            raise ValueError(f"{name}: unknown {value!r}, expected some of {known}")
+    elif type(None) in words:
+        if value is not None:
+            _check(name, value, words[0])
+    elif hint is not bool:
+        check_number(name, value, least=None if hint is int else least, whole=hint is int)
 
 
 class ParetoSearch:
@@ -596,6 +569,7 @@ class ParetoSearch:
             balanced_accuracy=chosen["mean"],
             by_group=chosen["balanced_accuracy"],
             latency=latency.with_shortest_hop(self.search.hops_ms),
+            modelled_us=latency.compute_us,
         )
 
     def _ranked(
@@ -618,22 +592,21 @@ class ParetoSearch:
             return rank_distinct(scores, features, sample.is_slip, num, most)
         return rank_features(scores, num)
 
-    def timed(self, candidates: Sequence[Candidate]) -> list[Timed]:
+    def timed(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Detectors of the candidates, fitted to the sample, in every arithmetic, by the clock."""
         found, calls = [], self.search.calls
         for candidate in bar(candidates, "timing the front", "detector"):
-            graph_us = _time_graph(self.make(candidate, "double"), calls).p50_us
+            graph_us = _time_graph(self.make(candidate), calls).p50_us
             for arithmetic in self.search.arithmetics:
+                each = replace(candidate, arithmetic=arithmetic, graph_us=graph_us)
                 with one_thread():
-                    timing = time_detector(self.make(candidate, arithmetic), calls)
+                    timing = time_detector(self.make(each), calls)
                 latency = replace(candidate.latency, compute_us=timing.p99_us)
                 latency = latency.with_shortest_hop(self.search.hops_ms)
-                found.append(Timed(candidate, arithmetic, timing, latency, graph_us))
+                found.append(replace(each, timing=timing, latency=latency))
         return found
 
-    def make(
-        self, candidate: Candidate, arithmetic: Arithmetic, *, from_all: bool = False
-    ) -> SlipDetector:
+    def make(self, candidate: Candidate, *, from_all: bool = False) -> SlipDetector:
         """The detector of a candidate, fitted to the sample or to all training bins."""
         statistics, data = (
             self.training_statistics[candidate.group.align],
@@ -663,11 +636,12 @@ class ParetoSearch:
             "solve": solve_metadata(head),
             "simulated": self.source.is_simulated,
             "split": self.fold.name,
-            "features_dtype": "float32" if arithmetic == "native" else "float64",
+            "features_dtype": "float32" if candidate.arithmetic == "native" else "float64",
             "train_materials": sorted({recording.material for recording in trained}),
             "train_recordings": {str(r): cache_key(self.source.key(r)) for r in trained},
         }
-        pool = FeaturePool(self.pool.hand, **self.pool.facts() | {"arithmetic": arithmetic})
+        facts = self.pool.facts() | {"arithmetic": candidate.arithmetic}
+        pool = FeaturePool(self.pool.hand, **facts)
         return plan.detector(pool, data.maker.channel_filter, head, info, self.backend)
 
     def evaluated(self, detector: SlipDetector) -> dict[str, Any]:

@@ -9,18 +9,16 @@ all the same. In a program, ``tactslip_torch.analysis.certificate.certify`` need
 from __future__ import annotations
 
 import hashlib
-import math
 import sys
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from tactslip_torch.analysis.certificate import certify as measure
-from tactslip_torch.analysis.raw_bins import bins_inside, in_turn
+from tactslip_torch.analysis.raw_bins import draw_bins
 from tactslip_torch.commands.entry import entry_point
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import ROLES, Split
@@ -28,14 +26,11 @@ from tactslip_torch.deploy.export import CERTIFICATE_FORMAT
 from tactslip_torch.features.cache import cache_key
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.report.certificate import certificate_figure, conclusion
-from tactslip_torch.runtime import bar, check_number, plain, write_json
-from tactslip_torch.signals.binning import refuse_nonfinite
+from tactslip_torch.runtime import check_number, plain, write_json
 from tactslip_torch.training.datamodule import FeatureMaker
 from tactslip_torch.training.experiment import versions
 
 _EXIT_DOES_NOT_HOLD = 1
-_BINS_OF_RECORDING = 40
-"""Drawn from a recording, more where there are too few recordings."""
 
 
 def certify(config: DictConfig) -> dict[str, Any]:
@@ -66,7 +61,7 @@ def certify(config: DictConfig) -> dict[str, Any]:
     origins: dict[str, dict[str, Any]] = {}
     for role, number in _roles(config).items():
         name = "calibration" if not drawn else role
-        drawn[name], recordings = draw_bins(maker, fold, role, number, config.seed)
+        drawn[name], _, recordings = draw_bins(maker, fold, role, number, config.seed)
         keys = {cache_key(source.key(recording)) for recording in recordings}
         origins[name] = {
             "role": role,
@@ -101,42 +96,6 @@ def certify(config: DictConfig) -> dict[str, Any]:
     write_json(folder / "certificate.json", content)
     certificate_figure(content, found.points(), folder / "certificate.png")
     return content
-
-
-def draw_bins(
-    maker: FeatureMaker, fold: Split, role: str, number: int, seed: int
-) -> tuple[Tensor, list[Any]]:
-    """Raw bins of a role with the context that ``score_raw`` needs, drawn at random.
-
-    Recordings are taken from the materials in turn, a few bins of each, so that few bins are of
-    many recordings. A bin whose context leaves its recording is passed over.
-
-    Shape:
-        - first output: ``[N, C, n + 2 * context]``, ``N`` at most ``number``
-
-    Returns:
-        The bins, and the recordings they are of.
-
-    Raises:
-        ValueError: if no recording has the role, none has a bin, or a sample is not finite.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    having = fold.having(role)
-    if not having:
-        raise ValueError(f"no recording has the role {role!r} in {fold.name}; choose another split")
-    each = max(_BINS_OF_RECORDING, math.ceil(number / len(having)))
-    order = torch.randperm(len(having), generator=generator).tolist()
-    recordings = in_turn(having[place] for place in order)[: math.ceil(number / each)]
-    drawn = []
-    for recording in bar(recordings, f"{role}, recordings", "recording"):
-        _, inside = bins_inside(maker, fold, recording, role)
-        chosen = torch.randperm(len(inside), generator=generator)[:each].sort().values
-        drawn.append(maker.raw_bins(recording, inside[chosen]))
-        refuse_nonfinite(drawn[-1], maker.source.hand.names, f"repair or leave out {recording}")
-    bins = torch.cat(drawn)[:number]
-    if not len(bins):
-        raise ValueError(f"no bin of {role} lies far enough inside its recording; take longer ones")
-    return bins, recordings
 
 
 def _roles(config: DictConfig) -> dict[str, int]:

@@ -22,11 +22,11 @@ from tactslip_torch.analysis.importance import (
     HELD_OUT,
     Ranking,
     Refit,
-    draw_raw_bins,
     first_order,
     measure,
     score_gradients,
 )
+from tactslip_torch.analysis.raw_bins import draw_bins
 from tactslip_torch.commands.entry import entry_point, leave_results
 from tactslip_torch.data.recording import RecordingSource
 from tactslip_torch.data.splits import ROLES, Split
@@ -46,6 +46,7 @@ FORMAT = "tactslip_torch sensors 1"
 _WHOLE_NUMBERS = {
     "bins": 2, "scored_bins": 1, "gradient_bins": 2, "most_channels": 1, "draws": 1, "seed": 0
 }  # fmt: skip
+_BINS_OF_RECORDING = 8  # that the score is differentiated at
 _SECTIONS = ("data", "labels", "split", "recipe")
 
 
@@ -199,7 +200,10 @@ def _read(config: DictConfig, trained: Trained) -> tuple[Refit, Ranking]:
 
 def _gradients(config: DictConfig, trained: Trained) -> dict[str, dict[str, float]]:
     """By channel: how far it moves the score, at bins of either class."""
-    raw, is_slip = draw_raw_bins(trained.maker, trained.fold, config.gradient_bins)
+    number, each = config.gradient_bins, _BINS_OF_RECORDING
+    raw, is_slip, _ = draw_bins(
+        trained.maker, trained.fold, "train", number, config.seed, each, by_class=True
+    )
     scores, gradients = score_gradients(trained.detector, raw)
     moved = first_order(scores, gradients, raw, is_slip).T.tolist()
     return {

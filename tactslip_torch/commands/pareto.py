@@ -30,14 +30,12 @@ from tactslip_torch.analysis.latency import (
     DEFINITION,
     Latency,
     Limits,
-    Timing,
     time_in_fresh_process,
 )
 from tactslip_torch.analysis.pareto import (
     Candidate,
     ParetoSearch,
     Search,
-    Timed,
     distinct,
     landmarks,
     nondominated,
@@ -62,6 +60,7 @@ from tactslip_torch.training.experiment import (
 
 _EXIT_NONE_MEETS = 1
 _EXIT_INTERRUPTED = 130
+_TIMES = ("p50_us", "p99_us", "p99_all_us", "interrupted")
 _VALIDATION = (
     "a material left out at a time, training recordings only; of pooled columns, compression, "
     "ranking and scaling are learned without it; of channel features, ranking and scaling saw the "
@@ -150,14 +149,13 @@ def _prepared(config: DictConfig, cache: FeatureCache) -> tuple[Limits, ParetoSe
 
 
 def _searched(
-    limits: Limits, search: ParetoSearch, candidates: Sequence[Candidate], timed: Sequence[Timed]
+    limits: Limits,
+    search: ParetoSearch,
+    candidates: Sequence[Candidate],
+    timed: Sequence[Candidate],
 ) -> dict[str, Any]:
     """What was searched and timed, JSON-able."""
-
-    def row(each: Timed) -> dict[str, Any]:
-        return _row(search, each, limits, each.latency, each.timing)
-
-    scale = median(each.timing.p99_us / each.candidate.latency.compute_us for each in timed)
+    scale = median(each.latency.compute_us / each.modelled_us for each in timed)
     modelled = []  # brought to what was measured
     for each in candidates:
         latency = replace(each.latency, compute_us=scale * each.latency.compute_us)
@@ -168,8 +166,13 @@ def _searched(
         "limits": {"deadline_ms": limits.deadline_ms, "compute_us": limits.compute_us},
         "validation": _VALIDATION,
         "backend": search.backend,
-        "front": [row(timed[place]) for place in nondominated([each.point for each in timed])],
-        "named": {name: each and row(each) for name, each in landmarks(timed).items()},
+        "front": [
+            _row(search, timed[place], limits)
+            for place in nondominated([each.point for each in timed])
+        ],
+        "named": {
+            name: each and _row(search, each, limits) for name, each in landmarks(timed).items()
+        },
         "timed": len(timed),
         "searched": len(candidates),
         "measured_over_modelled": scale,
@@ -179,7 +182,11 @@ def _searched(
 
 
 def _chosen(
-    config: DictConfig, limits: Limits, search: ParetoSearch, timed: Sequence[Timed], trial: Path
+    config: DictConfig,
+    limits: Limits,
+    search: ParetoSearch,
+    timed: Sequence[Candidate],
+    trial: Path,
 ) -> dict[str, Any]:
     """The first that meets the limits in a fresh process too, or none; and all tries.
 
@@ -189,20 +196,20 @@ def _chosen(
     able = [
         each
         for each in timed
-        if not limits.misses(limits.latency(each.latency, each.timing.p99_us))
+        if not limits.misses(limits.latency(each.latency, each.latency.compute_us))
     ]
     rows: list[dict[str, Any]] = []
     tries = _tries(able, limits, config.tries)
     for tried, each in enumerate(bar(tries, "again, in a fresh process", "detector"), 1):
         for from_all in (False, True):
-            detector = search.make(each.candidate, each.arithmetic, from_all=from_all)
+            detector = search.make(each, from_all=from_all)
             detector.info |= {"experiment": config.name, "seed": config.seed}
             detector.save(trial)
             backend = detector.extractor.backend
             timing = time_in_fresh_process(trial, config.retime_calls, backend)
             latency = limits.latency(each.latency, timing.p99_us, config.headroom)
-            about = {"fitted_to": detector.info["fitted_to"], "backend": backend}
-            rows.append(_row(search, each, limits, latency, timing) | about)
+            row = _row(search, replace(each, latency=latency, timing=timing), limits)
+            rows.append(row | {"fitted_to": detector.info["fitted_to"], "backend": backend})
             if rows[-1]["misses"]:
                 break
         else:
@@ -213,7 +220,7 @@ def _chosen(
     return {"chosen": None, "tries": rows} | counts
 
 
-def _tries(able: Sequence[Timed], limits: Limits, most: int) -> list[Timed]:
+def _tries(able: Sequence[Candidate], limits: Limits, most: int) -> list[Candidate]:
     """The first of those to try; the last of several is the one with most head-room of the rest."""
     first, left = list(able[: max(most - 1, 1)]), able[max(most - 1, 1) :]
     if most > 1 and left:
@@ -221,41 +228,31 @@ def _tries(able: Sequence[Timed], limits: Limits, most: int) -> list[Timed]:
     return first
 
 
-def _preference(timed: Timed) -> tuple[float, bool, float]:
+def _preference(timed: Candidate) -> tuple[float, bool, float]:
     """The most accurate first; float32 only where it is needed; then the fastest."""
-    return -timed.accuracy, timed.arithmetic != "double", timed.timing.p99_us
+    return -timed.balanced_accuracy, timed.arithmetic != "double", timed.latency.compute_us
 
 
-def _row(
-    search: ParetoSearch, timed: Timed, limits: Limits, latency: Latency, timing: Timing
-) -> dict[str, Any]:
+def _row(search: ParetoSearch, timed: Candidate, limits: Limits) -> dict[str, Any]:
     """A detector, JSON-able."""
-    candidate, names = timed.candidate, search.pool.names
-    read, layer = [names[index] for index in candidate.selected], candidate.selection.pooling
+    names, layer = search.pool.names, timed.selection.pooling
+    read = [names[index] for index in timed.selected]
     return {
-        "num_features": candidate.selection.size,
+        "num_features": timed.selection.size,
         "features_read": len(read),
-        "align": candidate.group.align,
-        "channels": candidate.group.channels,
+        **{name: getattr(timed.group, name) for name in ("align", "channels", "components")},
         "channels_read": sorted(
             {name.channel for name in read}, key=search.source.hand.names.index
         ),
-        "components": candidate.group.components,
-        "columns": candidate.columns,
-        "ranking": candidate.ranking,
-        "degree": candidate.degree,
-        "penalty": candidate.penalty,
+        **{name: getattr(timed, name) for name in ("columns", "ranking", "degree", "penalty")},
         "arithmetic": timed.arithmetic,
-        "latency": latency.to_dict(),
-        "misses": limits.misses(latency),
-        "p50_us": timing.p50_us,
-        "p99_us": timing.p99_us,
+        "latency": timed.latency.to_dict(),
+        "misses": limits.misses(timed.latency),
+        **{name: getattr(timed.timing, name) for name in _TIMES},
         "graph_p50_us": timed.graph_us,
-        "p99_all_us": timing.p99_all_us,
-        "interrupted": timing.interrupted,
-        "modelled_us": candidate.latency.compute_us,
-        "validation": candidate.balanced_accuracy,
-        "validation_by_group": dict(candidate.by_group),
+        "modelled_us": timed.modelled_us,
+        "validation": timed.balanced_accuracy,
+        "validation_by_group": dict(timed.by_group),
         "selected": [str(name) for name in (read if layer is None else layer.names)],
     }
 
