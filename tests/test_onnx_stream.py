@@ -24,7 +24,7 @@ from tactslip_torch.deploy.stream import (
 from tactslip_torch.deploy.value import F32, F64, Graph
 from tactslip_torch.model.calibration import LARGEST_LLR, Isotonic, Platt, probability
 from tactslip_torch.onset.decisions import AlarmSettings, score_stream
-from tactslip_torch.onset.rules import Cusum, KOfN, latch, latch_start
+from tactslip_torch.onset.rules import Cusum, KOfN, Latch, latch
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.signals.filtering import ChannelFilter
 
@@ -308,18 +308,18 @@ def test_the_latch_raises_the_same_alarms_in_any_pieces(
     values = st.sampled_from([value for value in exact if math.isfinite(value)])
     statistic = data.draw(arrays(dtype, st.integers(1, 40), elements=values))
     cuts = data.draw(st.lists(st.integers(0, len(statistic)), max_size=5))
-    state, memory, number = latch_start(torch.zeros(())), np.array(LATCH_START), first
+    state, memory, number = Latch(), np.array(LATCH_START), first
     for piece in np.split(statistic, sorted(cuts)):
         if not len(piece):
             continue
         alarm, on, state = latch(
-            torch.from_numpy(piece), threshold, rearm=rearm, refractory=refractory, state=state
+            piece.tolist(), float(level[0]), rearm=rearm, refractory=refractory, state=state
         )
         numbers = number + np.arange(len(piece), dtype=np.float64)
         feeds = {"statistic": piece, "level": level, "memory": memory, "number": numbers}
         found = latching(dtype, rearm, refractory)(feeds)
-        np.testing.assert_array_equal(found["alarms"], alarm.numpy())
-        np.testing.assert_array_equal(found["standing"], on.numpy())
+        np.testing.assert_array_equal(found["alarms"], alarm)
+        np.testing.assert_array_equal(found["standing"], on)
         memory = found["memory_after"]
         assert memory[0] == float(state.is_on)
         number += len(piece)

@@ -22,10 +22,10 @@ from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.missing_channels import Prediction
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.signals.spectrum import frequency_axis_hz, spectrum_matrix
-from tactslip_torch.signals.wavelet import Wavelet, branch_matrix, branch_names
+from tactslip_torch.signals.wavelet import Wavelet, branch_matrix
 
 BaselineName = Literal["film_band_power", "largest_detail"]
-_VIBRATION_HZ = (5.0, 400.0)
+VIBRATION_HZ = (5.0, 400.0)
 """Where the fast-adapting afferents of a hand answer, FA-I 5 to 50 Hz and FA-II 40 to 400 Hz.
 
 The films are the paper's fast-adapting elements. Johansson and Flanagan (2009), Nature Reviews
@@ -41,9 +41,8 @@ def film_band_power(
     bins: Tensor,
     films: Sequence[int] | Tensor,
     sample_rate_hz: float = 2000.0,
-    band_hz: tuple[float, float] = _VIBRATION_HZ,
 ) -> Tensor:
-    """Log of the root of the power in a band, of the film that has most.
+    """Log of the root of the power in the band of touch (``VIBRATION_HZ``), of the strongest film.
 
     The power is the mean square of the bin's part in the band: its lines by ``rfft``, without a
     window, the constant never among them. Filtering leaves little of it above 182 Hz, the first
@@ -53,7 +52,6 @@ def film_band_power(
         bins: filtered, in volts.
         films: positions of the films, the fast adapting channels, or a mask of them.
         sample_rate_hz: of the bins.
-        band_hz: least and largest frequency, both in it.
 
     Shape:
         - bins: ``[*, C, n]``
@@ -62,7 +60,7 @@ def film_band_power(
     Raises:
         ValueError: if there is no film, or no line of a bin's spectrum lies in the band.
     """
-    lines = _band_lines(bins.shape[-1], float(sample_rate_hz), tuple(band_hz))
+    lines = _band_lines(bins.shape[-1], float(sample_rate_hz))
 
     def amplitude(x: Tensor) -> Tensor:
         power = (x @ lines.to(x).T).square().sum(-1)
@@ -76,7 +74,6 @@ def largest_detail(
     films: Sequence[int] | Tensor,
     wavelet: Wavelet = "rbio2.2",
     level: int = 4,
-    levels: Sequence[int] | None = None,
 ) -> Tensor:
     """Log of the largest magnitude that a film's detail branches reach within the bin.
 
@@ -85,17 +82,15 @@ def largest_detail(
         films: positions of the films, the fast adapting channels, or a mask of them.
         wavelet: of the branches, as features have it; a name or filters.
         level: number of levels.
-        levels: whose details count; default all.
 
     Shape:
         - bins: ``[*, C, n]``
         - output: ``[*]``, log volts of at least ``FLOOR_V``; NaN where a film is not finite
 
     Raises:
-        ValueError: if there is no film, no such level, or bins are too short for them.
+        ValueError: if there is no film, or bins are too short for so many levels.
     """
-    chosen = tuple(range(1, level + 1) if levels is None else levels)
-    details = _detail_rows(bins.shape[-1], wavelet, level, chosen)
+    details = branch_matrix(bins.shape[-1], wavelet, level)[1::2].flatten(0, 1)  # D1, D2, ..
 
     def amplitude(x: Tensor) -> Tensor:
         branches = x @ details.to(x).T  # all samples of all levels
@@ -189,29 +184,18 @@ def _log_of_largest(
 
 
 @lru_cache(maxsize=16)
-def _band_lines(num_samples: int, sample_rate_hz: float, band_hz: tuple[float, ...]) -> Tensor:
+def _band_lines(num_samples: int, sample_rate_hz: float) -> Tensor:
     """Rows whose products with a bin, squared and added up, are its mean square in the band."""
-    low, high = band_hz
+    low, high = VIBRATION_HZ
     frequency = frequency_axis_hz(num_samples, sample_rate_hz, "clean")
     is_in = (frequency >= low) & (frequency <= high) & (frequency > 0)
     if not bool(is_in.any()):
         raise ValueError(
             f"no line of {num_samples} samples at {sample_rate_hz:g} Hz lies in {low:g} to "
-            f"{high:g} Hz; widen the band or lengthen the bins"
+            f"{high:g} Hz; lengthen the bins"
         )
     with torch.inference_mode(False):  # it may be needed for a gradient later
         rows = spectrum_matrix(num_samples, "clean")  # of amplitudes: a tone has half its square
         is_tone = 2 * torch.arange(len(rows)) < num_samples  # but for half the sample rate
         rows = torch.where(is_tone[:, None], rows / 2**0.5, rows)[is_in]
         return torch.cat([rows.real, rows.imag])
-
-
-@lru_cache(maxsize=16)
-def _detail_rows(num_samples: int, wavelet: Wavelet, level: int, levels: tuple[int, ...]) -> Tensor:
-    """The detail branches of some levels, below each other, ``[levels * n, n]``."""
-    names = branch_names(level)
-    if not levels or not {f"D{m}" for m in levels} <= set(names):
-        raise ValueError(f"levels must lie in 1..{level}, got {list(levels)}")
-    with torch.inference_mode(False):
-        matrix = branch_matrix(num_samples, wavelet, level)
-        return matrix[[names.index(f"D{m}") for m in levels]].flatten(0, 1)

@@ -28,7 +28,7 @@ from tactslip_torch.model.calibration import (
 )
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import Prediction
-from tactslip_torch.onset.rules import NEUTRAL, Rule, latch, latch_row, latch_start, rule_from_dict
+from tactslip_torch.onset.rules import NEUTRAL, Latch, Rule, latch, rule_from_dict
 from tactslip_torch.signals.filtering import ChannelFilter
 
 KEY = "alarm"
@@ -196,35 +196,16 @@ def score_stream(
         )
     if hop_samples < 1 or chunk < 1:
         raise ValueError(f"hop_samples and chunk must be positive, got {hop_samples} and {chunk}")
-    used = detector.needed_index.tolist()
+    used, length = detector.needed_index.tolist(), detector.pool.bin_samples
     with torch.no_grad():
         samples = samples.detach()
-        if samples.shape[-1] < max(lengths[channel] for channel in used):
-            return score_filtered(detector, samples[:, :0], hop_samples, samples.dtype, chunk)
+        if samples.shape[-1] < max(length, *(lengths[channel] for channel in used)):
+            empty, none = samples.new_empty(0), samples.new_empty(0, len(samples)).bool()
+            return Prediction(empty, none[:, 0], none, empty)
         filtered = detector.channel_filter(detector.pool.widen(samples), used)
-        return score_filtered(detector, filtered, hop_samples, samples.dtype, chunk)
-
-
-def score_filtered(
-    detector: Scorer, filtered: Tensor, hop_samples: int, given: torch.dtype, chunk: int = 1024
-) -> Prediction:
-    """Predict every bin that fits into filtered samples ``[C, m]``, the first at their start.
-
-    Args:
-        detector: that predicts.
-        filtered: in the dtype that is computed in.
-        hop_samples: distance of the bins' starts.
-        given: dtype that the samples came in.
-        chunk: bins at once, for memory.
-    """
-    length = detector.pool.bin_samples
-    if filtered.shape[-1] < length:
-        none = filtered.new_empty(0, len(filtered))
-        empty = none.new_empty(0, dtype=given)
-        return Prediction(empty, none.bool()[:, 0], none.bool(), empty)
-    bins = filtered.unfold(-1, length, hop_samples).transpose(0, 1)  # [N, C, n], a view
-    found = [detector.predict(part.contiguous(), given=given) for part in bins.split(chunk)]
-    return found[0] if len(found) == 1 else Prediction(*map(torch.cat, zip(*found, strict=True)))
+        bins = filtered.unfold(-1, length, hop_samples).transpose(0, 1)  # [N, C, n], a view
+        parts = [detector.predict(x.contiguous(), given=samples.dtype) for x in bins.split(chunk)]
+        return Prediction(*map(torch.cat, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -323,8 +304,8 @@ class Decider:
     def reset(self) -> None:
         """Forget everything; the next decision is number 0 of a stream that begins at 0."""
         self._number = 0  # Python's integers do not end
-        # of the rule; of the latch, plain numbers if there is one stream; where the run began
-        self._state: tuple[Tensor, Any, Array] | None = None
+        # of the rule; of the latch, one a stream; where the run began
+        self._state: tuple[Tensor, list[Latch], Array] | None = None
 
     def decide(
         self,
@@ -349,9 +330,8 @@ class Decider:
         if self._state is None:
             like = score.new_zeros(score.shape[:-1])
             none = np.zeros(like.shape, np.int64)
-            armed: Any = latch_start(like) if like.ndim else ()
-            self._state = settings.rule.start(like), armed, none
-        of_rule, of_latch, run = self._state
+            self._state = settings.rule.start(like), [Latch()] * like.numel(), none
+        of_rule, latches, run = self._state
         if variance is None:
             llr = settings.calibration.llr(score)
         else:
@@ -361,26 +341,24 @@ class Decider:
         ratios = np.where(tells.numpy() & np.isfinite(ratios), ratios, ratios.dtype.type(NEUTRAL))
         llr = torch.from_numpy(ratios)
         statistic, of_rule = settings.rule.scan(llr, of_rule)
-        if score.ndim == 1:
-            least = float(ratios.dtype.type(settings.threshold))
-            alarms, stands, of_latch = latch_row(
-                statistic.tolist(), least, self._rearm, self._refractory, *of_latch
-            )
-            is_alarm, is_on = (torch.tensor(x, dtype=torch.bool) for x in (alarms, stands))
-        else:
-            is_alarm, is_on, of_latch = latch(
-                statistic,
-                settings.threshold,
-                rearm=self._rearm,
-                refractory=self._refractory,
-                state=of_latch,
-            )
+        least = float(ratios.dtype.type(settings.threshold))
+        times = {"rearm": self._rearm, "refractory": self._refractory}
+        rows = statistic.reshape(len(latches), statistic.shape[-1]).tolist()
+        made = [
+            latch(row, least, **times, state=state)
+            for row, state in zip(rows, latches, strict=True)
+        ]
+        is_alarm, is_on = (
+            torch.tensor([of_row[part] for of_row in made], dtype=torch.bool).view(statistic.shape)
+            for part in (0, 1)
+        )
+        latches = [state for _, _, state in made]
         number = np.arange(self._number, self._number + score.shape[-1])
         # where the unbroken run of positive ratios up to each decision began: behind one that is
         # not positive the next one would begin it
         runs = np.where(ratios > 0, run[..., None], number + 1)
         runs = np.maximum.accumulate(runs, -1)
-        self._state = of_rule, of_latch, runs[..., -1] if len(number) else run
+        self._state = of_rule, latches, runs[..., -1] if len(number) else run
         self._number += len(number)
         available_s = self._available_s(number)
         began_s = self._available_s(np.minimum(runs, number)) - settings.lead_s

@@ -170,7 +170,7 @@ def rule_from_dict(plain: Mapping[str, Any]) -> Rule:
 
 
 class Latch(NamedTuple):
-    """What is remembered between two decisions, ``[*]`` each.
+    """What is remembered of one stream between two decisions.
 
     Attributes:
         is_on: in alarm, so no other can be raised.
@@ -178,85 +178,34 @@ class Latch(NamedTuple):
         since: decisions since the last alarm.
     """
 
-    is_on: Tensor
-    below: Tensor
-    since: Tensor
-
-
-def latch_start(like: Tensor) -> Latch:
-    """Armed, with no alarm before: ``[*] -> [*]`` each; only shape and device of ``like`` count."""
-    return Latch(
-        torch.zeros(like.shape, dtype=torch.bool, device=like.device),
-        torch.zeros(like.shape, dtype=torch.int64, device=like.device),
-        torch.full(like.shape, _LONG_AGO, dtype=torch.int64, device=like.device),
-    )
+    is_on: bool = False
+    below: int = 0
+    since: int = _LONG_AGO
 
 
 def latch(
-    statistic: Tensor, threshold: Tensor | float, *, rearm: int, refractory: int, state: Latch
-) -> tuple[Tensor, Tensor, Latch]:
-    """Which decisions raise an alarm, and whether one stands after each.
+    statistic: Iterable[float],
+    threshold: float,
+    *,
+    rearm: int,
+    refractory: int,
+    state: Latch = Latch(),  # noqa: B008  # a tuple: armed, with no alarm before
+) -> tuple[list[bool], list[bool], Latch]:
+    """Which decisions of a stream raise an alarm, whether one stands after each, and the state.
 
     An alarm is raised where the latch is armed, the statistic is at or above the threshold and the
     last alarm is at least ``refractory`` decisions back. It stands until ``rearm`` decisions in a
     row, at least one, lie below the threshold; from that decision on the latch is armed again. A
-    statistic that is NaN is neither above nor below. No gradient flows.
+    statistic that is NaN is neither above nor below. In plain numbers, quicker than small tensors.
 
     Args:
         statistic: what a rule made of the decisions.
-        threshold: in the statistic's unit; taken in its dtype.
+        threshold: in the statistic's unit and its dtype.
         rearm: decisions in a row that must be low.
         refractory: shortest distance of two alarms, in decisions.
-        state: of ``latch_start`` or an earlier call.
-
-    Shape:
-        - statistic: ``[*, T]``, ``T`` may be 0; threshold and state broadcast against ``[*]``:
-          thresholds ``[G, 1]`` and ``R`` streams make everything ``[G, R]``
-        - output: is_alarm ``[*, T]``, is_on ``[*, T]``, state ``[*]``
-
-    Raises:
-        ValueError: if rearm or refractory is negative.
+        state: after the decisions before these.
     """
-    if rearm < 0 or refractory < 0:
-        raise ValueError(f"rearm and refractory must not be negative, got {rearm} and {refractory}")
-    device, size = statistic.device, statistic.shape[-1]
-    level = torch.as_tensor(threshold, dtype=statistic.dtype, device=device).detach()
-    shape = torch.broadcast_shapes(statistic.shape[:-1], level.shape, state.is_on.shape)
-    rows = zip(
-        statistic.detach().expand(*shape, size).reshape(math.prod(shape), size).tolist(),
-        *(part.expand(shape).flatten().tolist() for part in (level, *state)),
-        strict=True,
-    )
-    alarms, standing, ends = list[bool](), list[bool](), list[tuple[bool, int, int]]()
-    for values, least, *before in rows:
-        of_row = latch_row(values, least, rearm, refractory, *before)
-        alarms += of_row[0]
-        standing += of_row[1]
-        ends.append(of_row[2])
-    end = [list(column) for column in zip(*ends, strict=True)] or [[], [], []]
-    kinds = (torch.bool, torch.int64, torch.int64)
-    return (
-        torch.tensor(alarms, dtype=torch.bool, device=device).view(*shape, size),
-        torch.tensor(standing, dtype=torch.bool, device=device).view(*shape, size),
-        Latch(
-            *(
-                torch.tensor(column, dtype=kind, device=device).view(shape)
-                for column, kind in zip(end, kinds, strict=True)
-            )
-        ),
-    )
-
-
-def latch_row(
-    statistic: Iterable[float],
-    threshold: float,
-    rearm: int,
-    refractory: int,
-    is_on: bool = False,
-    below: int = 0,
-    since: int = _LONG_AGO,
-) -> tuple[list[bool], list[bool], tuple[bool, int, int]]:
-    """``latch`` of one stream, in plain numbers: quicker than small tensors."""
+    is_on, below, since = state
     alarms, standing = [], []
     for x in statistic:
         below = below + 1 if x < threshold else 0
@@ -268,7 +217,7 @@ def latch_row(
             is_on, since = True, 0
         alarms.append(is_alarm)
         standing.append(is_on)
-    return alarms, standing, (is_on, below, since)
+    return alarms, standing, Latch(is_on, below, since)
 
 
 def _check_state(llr: Tensor, state: Tensor, size: int) -> None:

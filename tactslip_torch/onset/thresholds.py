@@ -139,16 +139,12 @@ def alarm_rate(
 
 
 def alarm_counts(
-    statistics: Sequence[Tensor],
-    thresholds: Tensor | Sequence[float],
-    *,
-    rearm: int,
-    refractory: int,
+    statistics: Sequence[Tensor], threshold: float, *, rearm: int, refractory: int
 ) -> Tensor:
-    """How many alarms each recording has at each threshold: ``[G, R]``, int64.
+    """How many alarms each recording has at a threshold: ``[R]``, int64.
 
-    Exactly what ``latch`` raises from its start in recordings ``[T_r]``, all of one dtype, at
-    thresholds ``[G]``; made of the few decisions at or above the threshold.
+    Exactly what ``latch`` raises from its start in recordings ``[T_r]``, all of one dtype; made of
+    the few decisions at or above the threshold.
 
     Raises:
         ValueError: if there is no decision, a statistic is not a row of finite numbers, or
@@ -157,13 +153,9 @@ def alarm_counts(
     if rearm < 0 or refractory < 0:
         raise ValueError(f"rearm and refractory must not be negative, got {rearm} and {refractory}")
     _check(statistics)
-    levels = torch.as_tensor(thresholds, dtype=statistics[0].dtype).tolist()
-    rows = [statistic.detach().cpu().numpy() for statistic in statistics]
-    counts = [
-        [_count_alarms(np.flatnonzero(row >= level), rearm, refractory) for row in rows]
-        for level in levels
-    ]
-    return torch.tensor(counts, dtype=torch.int64).view(len(levels), len(rows))
+    above = [s.detach().cpu() >= torch.tensor(threshold, dtype=s.dtype) for s in statistics]
+    places = (np.flatnonzero(row.numpy()) for row in above)
+    return torch.tensor([_count_alarms(place, rearm, refractory) for place in places])
 
 
 def _count_alarms(above: NDArray[np.int64], rearm: int, refractory: int) -> int:
@@ -249,7 +241,7 @@ def choose_threshold(
         else:
             most = step // 2
     value = min(value, float(torch.tensor(min(rule.ceiling, ceiling), dtype=statistics[0].dtype)))
-    counts = alarm_counts(statistics, [value], rearm=rearm, refractory=refractory)[0]
+    counts = alarm_counts(statistics, value, rearm=rearm, refractory=refractory)
     rate = alarm_rate(counts, hours, level, seed)
     return Threshold(value, false_alarms_per_hour, rate, int(counts.sum()) <= allowed)
 

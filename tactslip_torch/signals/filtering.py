@@ -16,6 +16,7 @@ channel, of whole recordings and of bins, with Savitzky-Golay's weights or other
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -151,12 +152,6 @@ def past_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
     return solution
 
 
-def _future_matrix(window_length: int, polyorder: int, align: Align) -> Tensor:
-    """Samples behind a signal, of its last frame: the mirror image of its past if centred."""
-    past = past_matrix(window_length, polyorder, align)
-    return past.flip(0, 1) if align == "centred" else past[:0]
-
-
 def _edges_of_kernel(weights: Sequence[float], polyorder: int, align: Align) -> Edges:
     """Edges of any kernel, none of Savitzky-Golay's, in such a filter's frame.
 
@@ -171,7 +166,7 @@ def _edges_of_kernel(weights: Sequence[float], polyorder: int, align: Align) -> 
     kernel = torch.tensor(weights, dtype=torch.float64)
     frame = torch.eye(len(kernel), dtype=torch.float64)
     past = past_matrix(len(kernel), polyorder, align)
-    future = _future_matrix(len(kernel), polyorder, align)
+    future = past.flip(0, 1) if align == "centred" else past[:0]
     before, after = torch.cat([past, frame[:-1]]), torch.cat([frame[1:], future])
     return Edges(convolve_valid(before.T, kernel).T, kernel, convolve_valid(after.T, kernel).T)
 
@@ -241,12 +236,6 @@ def overlap_matrix(kernel: Tensor, num_kept: int) -> Tensor:
     return padded.unfold(0, num_kept + len(kernel) - 1, 1).flip(0).T
 
 
-def _as_index(channels: Sequence[int]) -> slice | list[int]:
-    """The same channels, so that they are looked up without a copy if they are neighbours."""
-    first, last = channels[0], channels[-1]
-    return slice(first, last + 1) if last - first + 1 == len(channels) else list(channels)
-
-
 def _checked_kernels(
     kernels: Mapping[int, Sequence[float]], window_lengths: Sequence[int]
 ) -> dict[int, tuple[float, ...]]:
@@ -273,22 +262,22 @@ def _checked_kernels(
 
 
 _TOLERANCE = 1e-9  # of the sum of a kernel
-_MOST_MATRICES = 16  # that are kept
+
+
+@lru_cache(maxsize=16)
+def _matrix_of(
+    kernel: tuple[float, ...], num_kept: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """``overlap_matrix`` of a kernel, kept: making it takes longer than using it."""
+    with torch.inference_mode(False):  # it may be needed for a gradient later
+        return overlap_matrix(torch.tensor(kernel, dtype=torch.float64).to(device, dtype), num_kept)
 
 
 class _Group(NamedTuple):
-    """Channels that share a frame.
-
-    Args:
-        length: of the frame.
-        start: of the frame of a bin's first sample, in the bin with its context.
-        channels: positions.
-        is_wanted: whether they are to be filtered.
-    """
+    """Channels that share a frame: its length, their positions, whether they are to be filtered."""
 
     length: int
-    start: int
-    channels: slice | list[int]
+    channels: slice | list[int]  # a slice of neighbours: looked up without a copy
     is_wanted: bool
 
 
@@ -338,7 +327,6 @@ class ChannelFilter(nn.Module):
         self.reaches = tuple(reach(length, align) for length in self.window_lengths)
         self.context = max(self.window_lengths) // 2
         self.context_before, self.context_after = reach(max(self.window_lengths), align)
-        self._matrices: dict[tuple[int, int, torch.dtype, torch.device], Tensor] = {}
         self._wanted: dict[tuple[int, ...] | None, list[_Group]] = {}
 
     def config(self) -> dict[str, Any]:
@@ -367,10 +355,10 @@ class ChannelFilter(nn.Module):
         """
         self.check(samples)
         filtered = samples.clone()
-        for length, _, channels_of, is_wanted in self._groups_for(channels):
+        for length, chosen, is_wanted in self._groups_for(channels):
             if is_wanted:
-                raw = samples[..., channels_of, :]
-                filtered[..., channels_of, :] = self._edges[length].filtered(raw)
+                raw = samples[..., chosen, :]
+                filtered[..., chosen, :] = self._edges[length].filtered(raw)
         return filtered
 
     def valid(self, samples: Tensor, channels: Collection[int] | None = None) -> Tensor:
@@ -398,11 +386,13 @@ class ChannelFilter(nn.Module):
                 f"{self.context_after} behind, got {samples.shape[-1]} samples in all"
             )
         filtered = samples.narrow(-1, 0, num_samples).clone()
-        for length, start, chosen, is_wanted in self._groups_for(channels):
+        for length, chosen, is_wanted in self._groups_for(channels):
+            start = self.context_before - reach(length, self.align)[0]  # of the bin's first frame
             kept = samples[..., chosen, start : start + num_samples + length - 1]
             if is_wanted:
-                matrix = self._matrix(length, num_samples, samples)
-                filtered[..., chosen, :] = kept.contiguous() @ matrix
+                filtered[..., chosen, :] = kept.contiguous() @ self._matrix(
+                    length, num_samples, samples
+                )
             else:
                 filtered[..., chosen, :] = torch.maximum(kept.amax(-1), -kept.amin(-1))[..., None]
         return filtered
@@ -417,25 +407,17 @@ class ChannelFilter(nn.Module):
             for channel in everything:
                 frame = (self.window_lengths[channel], channel in wanted)
                 by_frame.setdefault(frame, []).append(channel)
-            groups = [
-                _Group(
-                    length,
-                    self.context_before - reach(length, self.align)[0],
-                    _as_index(chosen),
-                    is_wanted,
-                )
-                for (length, is_wanted), chosen in by_frame.items()
-            ]
+            groups = []
+            for (length, is_wanted), own in by_frame.items():
+                span = slice(own[0], own[-1] + 1)
+                is_span = len(own) == own[-1] + 1 - own[0]
+                groups.append(_Group(length, span if is_span else own, is_wanted))
             self._wanted = {key: groups}  # the last one asked for, whole: other threads may look
         return groups
 
     def kernel(self, channel: int) -> Tensor:
         """Weights of the frame that a channel is filtered by, ``[W]``, float64."""
-        return self.edges(channel)[1]
-
-    def edges(self, channel: int) -> Edges:
-        """What makes a channel's first samples, those in between and its last."""
-        return self._edges[self.window_lengths[channel]]
+        return self._edges[self.window_lengths[channel]].kernel
 
     def check(self, samples: Tensor) -> None:
         """Refuse what are no samples of this hand.
@@ -450,21 +432,15 @@ class ChannelFilter(nn.Module):
             )
 
     def _matrix(self, length: int, num_kept: int, like: Tensor) -> Tensor:
-        """The filter of short signals as a matrix; kept, as making it takes longer than using it.
+        """The filter of short signals as a matrix, made anew in a trace, which it must not outlive.
 
-        A trace makes its own: what is made in one must not outlive it.
+        Shape:
+            - output: ``[num_kept + length - 1, num_kept]``
         """
+        kernel = self._edges[length].kernel
         if torch.compiler.is_compiling():
-            return overlap_matrix(self._edges[length][1].to(like), num_kept)
-        key = (length, num_kept, like.dtype, like.device)
-        matrix = self._matrices.get(key)
-        if matrix is None:
-            if len(self._matrices) >= _MOST_MATRICES:
-                self._matrices.clear()
-            with torch.inference_mode(False):  # it may be needed for a gradient later
-                matrix = overlap_matrix(self._edges[length][1].to(like), num_kept)
-            self._matrices[key] = matrix
-        return matrix
+            return overlap_matrix(kernel.to(like), num_kept)
+        return _matrix_of(tuple(kernel.tolist()), num_kept, like.dtype, like.device)
 
 
 def extended(samples: Tensor, channel_filter: ChannelFilter) -> Tensor:

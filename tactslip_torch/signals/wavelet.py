@@ -247,8 +247,9 @@ def branch_matrix(
     Raises:
         ValueError: as ``wavelet_branches``.
     """
-    identity = torch.eye(num_samples, dtype=torch.float64)
-    return wavelet_branches(identity, wavelet, level, mode).movedim(0, -1).contiguous()
+    with torch.inference_mode(False):  # it may be needed for a gradient later
+        identity = torch.eye(num_samples, dtype=torch.float64)
+        return wavelet_branches(identity, wavelet, level, mode).movedim(0, -1).contiguous()
 
 
 class WaveletSteps(NamedTuple):

@@ -36,6 +36,8 @@ Key = tuple[str | int, ...]
 Interval = tuple[float, float]
 """Start and end in seconds."""
 
+_TONES = 4  # sines of a wave that wanders
+
 
 def _philox_key(key: Key) -> NDArray[np.uint64]:
     """128 bits of the SHA-256 of the key's JSON text (typed: 1 and "1" differ)."""
@@ -136,8 +138,27 @@ class Grid:
         since = np.maximum(self.time_s[rows] - start_s, 0.0)
         return rows, np.exp(-decay * since) * np.sin(omega * since)
 
-    def tones(self, sizes: Array, hertz: Array, phases: Array, num_nodes: int) -> Array:
-        """A sum of slow sines, joined by straight lines between nodes of each block, ``[K, B]``."""
+    def wander(
+        self,
+        rng: np.random.Generator,
+        hertz_range: tuple[float, float],
+        num_nodes: int,
+        *,
+        size: float = 1.0,
+        spread: float = 0.0,
+    ) -> Array:
+        """A slow random wave, ``[K, B]``: a few sines, straight between nodes of each block.
+
+        Args:
+            rng: of frequencies, phases and sizes.
+            hertz_range: of its frequencies.
+            num_nodes: of each block.
+            size: rms of the wave, where the sines are of one size.
+            spread: of the sines' sizes.
+        """
+        hertz = log_uniform(rng, hertz_range, _TONES)
+        phases = 2 * np.pi * rng.random(_TONES)
+        sizes = size * (np.sqrt(2.0 / _TONES) * lognormal(rng, spread, _TONES))
         nodes = self.blocks[:, None] + np.arange(num_nodes + 1) / num_nodes
         time_s = nodes * (self.block_samples / self.sample_rate_hz)
         values = np.sin(2 * np.pi * hertz * time_s[..., None] + phases) @ sizes

@@ -20,6 +20,7 @@ alone, and nothing moves by what is switched on beside it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from tactslip_torch.simulation._blocks import (
     Array,
     Grid,
     Interval,
+    Key,
     causal_response,
     generator,
     log_uniform,
@@ -37,7 +39,7 @@ from tactslip_torch.simulation._blocks import (
 from tactslip_torch.simulation._contact import ElementContact, Grasp
 from tactslip_torch.simulation._sensors import (
     Vibration,
-    band_responses,
+    band_noises,
     is_slow,
     steady_vibration_v,
 )
@@ -61,7 +63,6 @@ _PICKUP_COUPLING_SPREAD = 0.7  # of the channels (ours)
 _SG_PICKUP = 0.1  # coupling of a strain gauge's bridge, of low resistance, over a film's (ours)
 _LEVEL_SPREAD = 0.5  # of levels of pick-up and local noise over time, and between elements (ours)
 _WANDER_HZ = (0.1, 2.0)  # where levels wander
-_WANDER_TONES = 4
 _WANDER_NODES = 16  # per block
 
 
@@ -134,10 +135,8 @@ def _mains(scene: Scene, grid: Grid) -> Array:
 
 def mains_bursts(scene: Scene) -> list[Interval]:
     """When the mains is stronger; bursts may overlap, and then add."""
-    rng = generator(*scene.key("mains bursts"))
-    num = rng.poisson(scene.disturbances.mains_bursts_per_s * scene.end_s)
-    starts_s = scene.end_s * rng.random(num)
-    return [(float(at), float(at + log_uniform(rng, _MAINS_BURST_S))) for at in starts_s]
+    per_s = scene.disturbances.mains_bursts_per_s
+    return _at_random(scene, scene.key("mains bursts"), per_s, _MAINS_BURST_S)
 
 
 def _motor_level_mv(scene: Scene) -> float:
@@ -259,17 +258,21 @@ def _pickup_v(scene: Scene, grid: Grid) -> Array:
     """Broadband pick-up at a film of coupling 1; its level wanders, ``[K, B]``."""
     f = grid.frequency_hz
     response = causal_response(f / (f + 20.0) / (1 + f / 200.0))
-    level = np.exp(_LEVEL_SPREAD * _wander(generator(*scene.key("pick-up level")), grid))
+    level = _wandering(_LEVEL_SPREAD, generator(*scene.key("pick-up level")), grid)
     noise = grid.coloured_noise(scene.key("pick-up"), response)
     return np.asarray(1e-3 * scene.imperfections.pickup_mv * level * noise)
 
 
-def _wander(rng: np.random.Generator, grid: Grid) -> Array:
-    """A slow random wave of unit variance, ``[K, B]``."""
-    hertz = log_uniform(rng, _WANDER_HZ, _WANDER_TONES)
-    phases = 2 * np.pi * rng.random(_WANDER_TONES)
-    sizes = np.full(_WANDER_TONES, np.sqrt(2 / _WANDER_TONES))
-    return grid.tones(sizes, hertz, phases, _WANDER_NODES)
+def _wandering(spread: float, rng: np.random.Generator, grid: Grid) -> Array:
+    """A factor whose logarithm wanders slowly, ``[K, B]``."""
+    return np.asarray(np.exp(spread * grid.wander(rng, _WANDER_HZ, _WANDER_NODES)))
+
+
+def _at_random(scene: Scene, key: Key, per_s: float, lengths_s: Interval) -> list[Interval]:
+    """Intervals at random times of a recording, which may overlap; lengths are log-uniform."""
+    rng = generator(*key)
+    starts_s = scene.end_s * rng.random(rng.poisson(per_s * scene.end_s))
+    return [(float(at), float(at + log_uniform(rng, lengths_s))) for at in starts_s]
 
 
 # --- handling -------------------------------------------------------------------------------------
@@ -487,21 +490,11 @@ _PARTIAL_MM_S = 10.0  # speed of a partial slip (ours)
 _PARTIAL_RAMP_S = 0.01
 
 
-def load_factor(scene: Scene, element: int, grid: Grid) -> Array:
-    """What an element's load wanders by, ``[K, B]``."""
-    spread = scene.imperfections.share_wander
-    return _wandering(spread, generator(*scene.key("share"), element), grid)
-
-
-def gain_factor(scene: Scene, index: int, grid: Grid) -> Array:
-    """What a channel's gain drifts by, ``[K, B]``."""
-    spread = scene.imperfections.gain_drift
-    return _wandering(spread, generator(*scene.key("gain"), index), grid)
-
-
-def _wandering(spread: float, rng: np.random.Generator, grid: Grid) -> Array:
-    """A factor whose logarithm wanders; 1 without a spread."""
-    return np.exp(spread * _wander(rng, grid)) if spread > 0 else np.ones(grid.time_s.shape)
+def drift_factor(scene: Scene, what: Literal["share", "gain"], number: int, grid: Grid) -> Any:
+    """What an element's load share or a channel's gain drifts by, ``[K, B]``; 1 without a drift."""
+    of = scene.imperfections
+    spread = of.share_wander if what == "share" else of.gain_drift
+    return _wandering(spread, generator(*scene.key(what), number), grid) if spread > 0 else 1.0
 
 
 def add_imperfections(
@@ -536,22 +529,16 @@ def add_imperfections(
 
 def partial_intervals(scene: Scene, finger: str) -> list[Interval]:
     """When a finger slips or sticks on its own; intervals may overlap."""
-    rng = generator(*scene.key("partial slips"), finger)
-    num = rng.poisson(scene.imperfections.partial_slips_per_s * scene.end_s)
-    starts_s = scene.end_s * rng.random(num)
-    return [(float(at), float(at + log_uniform(rng, _PARTIAL_S))) for at in starts_s]
+    per_s = scene.imperfections.partial_slips_per_s
+    return _at_random(scene, (*scene.key("partial slips"), finger), per_s, _PARTIAL_S)
 
 
 def _bands(scene: Scene, grasp: Grasp, element: int, grid: Grid, purpose: str) -> list[Array]:
     """Noise with the high and the low band's fraction of friction's power, of unit rms in all."""
-    low = scene.contact.friction_noise_low_share
-    responses = band_responses(grasp, element, grid.sample_rate_hz)
-    return [
-        np.sqrt(fraction) * grid.coloured_noise((*scene.key(purpose), element, name), response)
-        for fraction, name, response in zip(
-            (1.0 - low, low), ("high", "low"), responses, strict=True
-        )
-    ]
+    low_fraction = scene.contact.friction_noise_low_share
+    keys = ((*scene.key(purpose), element, band) for band in ("high", "low"))
+    high, low = band_noises(grasp, element, grid, keys)
+    return [np.sqrt(1.0 - low_fraction) * high, np.sqrt(low_fraction) * low]
 
 
 # --- faults ---------------------------------------------------------------------------------------

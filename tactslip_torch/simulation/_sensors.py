@@ -12,8 +12,10 @@ converter with rails. Last links of the chain in PHYSICS.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,10 +23,10 @@ from tactslip_torch.simulation._blocks import (
     Array,
     Flags,
     Grid,
+    Key,
     Spectrum,
     causal_response,
     generator,
-    log_uniform,
     lognormal,
 )
 from tactslip_torch.simulation._contact import ElementContact, Grasp
@@ -36,7 +38,6 @@ _LINE_DAMPING = 0.5  # ratio with which lines meet the skin: a patch is many bri
 _SG_VIBRATION = 0.08  # of a film's vibration, what an SG channel sees (prior, ours)
 _FORCE_FLUCTUATION = 0.03  # slow, of friction over its mean while sliding, rms (prior, ours)
 _DRIFT_HZ = (0.05, 2.0)  # where a channel's drift lies
-_DRIFT_TONES = 4
 _DRIFT_NODES = 8  # per block
 _WARMING_TIMES = 2.0  # time constants of warming that a recording lasts (prior, ours)
 _PVDF_WARMING = 0.02  # of an SG channel's warming, what passes a film's high-pass (prior, ours)
@@ -59,11 +60,10 @@ class Vibration:
     fluctuation: Array
 
 
-@dataclass(frozen=True, eq=False)
-class SharedVibration:
+class SharedVibration(NamedTuple):
     """What all elements of a recording share on a grid.
 
-    Args:
+    Attributes:
         friction_v: rms of friction noise at mu = 1 and 1 N, ``[K, B]``.
         texture_v: rms of texture at 1 N, ``[K, B]``.
         lines: sine and cosine of every line, ``[2, L, K, B]``; L may be 0.
@@ -73,10 +73,11 @@ class SharedVibration:
     texture_v: Array
     lines: Array
 
-    @classmethod
-    def of(cls, scene: Scene, grasp: Grasp, motion: Motion) -> SharedVibration:
-        """Levels and lines as the arm's speed and position make them."""
-        return cls(*_levels_v(scene, grasp, motion.speed_mm_s), _lines(scene, grasp, motion))
+
+def shared_vibration(scene: Scene, grasp: Grasp, motion: Motion) -> SharedVibration:
+    """Levels and lines as the arm's speed and position make them."""
+    levels_v = _levels_v(scene, grasp, motion.speed_mm_s)
+    return SharedVibration(*levels_v, _lines(scene, grasp, motion))
 
 
 def _levels_v(scene: Scene, grasp: Grasp, speed_mm_s: Array) -> tuple[Array, Array]:
@@ -118,28 +119,28 @@ def _resonance(frequency_hz: Array, resonance_hz: float, damping: float) -> Arra
     return 2 * damping / np.sqrt((1 - ratio) ** 2 + 4 * damping**2 * ratio)
 
 
-def band_responses(grasp: Grasp, element: int, sample_rate_hz: float) -> Spectrum:
-    """Filters of the high and of the low part, of unit power, ``[2, B + 1]``.
-
-    The high part: rate of a height spectrum ``k^-a``, so ``f^(1 - a/2)``, behind the skin. They
-    belong to the session, so its recordings share them.
-    """
-    resonance_hz, damping = float(grasp.resonance_hz[element]), float(grasp.damping[element])
-    return _band_responses(grasp.spectral_exponent, resonance_hz, damping, sample_rate_hz)
-
-
 @lru_cache(maxsize=256)
 def _band_responses(
     exponent: float, resonance_hz: float, damping: float, sample_rate_hz: float
 ) -> Spectrum:
+    """Filters of the high and of the low part, of unit power, ``[2, B + 1]``; not to be changed.
+
+    The high part: rate of a height spectrum ``k^-a`` with ``a`` the exponent, so ``f^(1 - a/2)``,
+    behind the skin. All of it belongs to the session, so its recordings share them.
+    """
     f = Grid(np.zeros(0, np.int64), sample_rate_hz).frequency_hz
     step = (f / _LOW_BAND_HZ) ** 4
     high = (f / _LOW_BAND_HZ) ** (1.0 - 0.5 * exponent) * np.sqrt(step / (1 + step))
     high *= _resonance(f, resonance_hz, damping)
     low = np.sqrt(f**2 / (f**2 + 4.0) / (1 + step))
-    responses = causal_response(np.stack([high, low]))
-    responses.flags.writeable = False
-    return responses
+    return causal_response(np.stack([high, low]))
+
+
+def band_noises(grasp: Grasp, element: int, grid: Grid, keys: Iterable[Key]) -> list[Array]:
+    """Noise of the high and of the low part, of unit rms, by the key of each."""
+    skin = float(grasp.resonance_hz[element]), float(grasp.damping[element])
+    responses = _band_responses(grasp.spectral_exponent, *skin, grid.sample_rate_hz)
+    return [grid.coloured_noise(key, part) for key, part in zip(keys, responses, strict=True)]
 
 
 def element_vibration(
@@ -152,17 +153,15 @@ def element_vibration(
 ) -> Vibration:
     """One touching element's vibration over the whole grid; work only in blocks that slide."""
     material = grasp.material
-    low_fraction, line_fraction = scene.contact.friction_noise_low_share, material.line_share
+    low_fraction = scene.contact.friction_noise_low_share
+    line_fraction = material.line_share if material.wavelength_mm else 0.0
     root_load = np.sqrt(grasp.load_n[element])
     mixture = generator(*scene.key("line mixture"), element).standard_normal(shared.lines.shape[:2])
-    vibration = Vibration(grid.zeros() + contact.release_v, grid.zeros(), grid.zeros())
+    vibration = Vibration(contact.release_v.copy(), grid.zeros(), grid.zeros())
     for rows in _runs(np.asarray(contact.slide.any(axis=-1))):
         slide, part = contact.slide[rows], grid.only(rows)
-        responses = band_responses(grasp, element, grid.sample_rate_hz)
-        high, low = (
-            part.coloured_noise((*scene.key(band), element), response)
-            for band, response in zip(("high", "low"), responses, strict=True)
-        )
+        keys = ((*scene.key(band), element) for band in ("high", "low"))
+        high, low = band_noises(grasp, element, part, keys)
         if scene.fidelity == "bristles":  # a speed of its own, with the sound of that speed
             friction_gate = _powered(slide, scene.contact.friction_noise_exponent)
             texture_gate = _powered(slide, grasp.texture_exponent)
@@ -200,11 +199,10 @@ def _runs(chosen: Flags) -> list[slice]:
 # --- sensors --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Front:
+class Front(NamedTuple):
     """Parameters of every channel in one recording, ``[C]`` each.
 
-    Args:
+    Attributes:
         gain: factor on what the element feels.
         white_v: rms of white noise.
         offset_v: constant.
@@ -280,10 +278,7 @@ def _drift_v(scene: Scene, index: int, grid: Grid) -> Array:
     """Slow drift of one channel: a few slow sines, ``[K, B]``."""
     sensors, rng = scene.sensors, generator(*scene.key("drift"), index)
     size_mv = sensors.sg_drift_mv if index in scene.hand.slow else sensors.pvdf_drift_mv
-    hertz = log_uniform(rng, _DRIFT_HZ, _DRIFT_TONES)
-    phases = 2 * np.pi * rng.random(_DRIFT_TONES)
-    sizes = np.sqrt(2.0 / _DRIFT_TONES) * lognormal(rng, 0.3, _DRIFT_TONES)
-    return grid.tones(1e-3 * size_mv * sizes, hertz, phases, _DRIFT_NODES)
+    return grid.wander(rng, _DRIFT_HZ, _DRIFT_NODES, size=1e-3 * size_mv, spread=0.3)
 
 
 def _warming_v(scene: Scene, index: int, grid: Grid) -> Array:

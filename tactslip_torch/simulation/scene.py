@@ -16,7 +16,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -515,16 +515,16 @@ class Material:
     Args:
         title: the name in words.
         mu_s: static friction coefficient, the centre of its lognormal prior; dimensionless.
-        mu_ratio: lowest and highest kinetic over static friction, dimensionless.
         ra_um: lowest and highest roughness Ra; with ``texture_mv`` it sets how strongly the
             material vibrates (a session rougher than the middle of its range vibrates more).
+        texture_mv: rms of the texture's vibration at 40 mm/s and 1 N at a PVDF film (prior, ours).
+        character: see ``Character``.
         wavelength_mm: shortest and longest dominant wavelength, or ``None`` without one. For a
             tacky material: travel per stick-slip cycle.
         line_bandwidth: relative spread of the wavelengths around the dominant one.
-        line_share: share of the texture's power at the dominant wavelength; the rest is the
-            broad ``k^-a`` part.
-        texture_mv: rms of the texture's vibration at 40 mm/s and 1 N at a PVDF film (prior, ours).
-        character: see ``Character``.
+        line_share: share of the texture's power at the dominant wavelength, if there is one; the
+            rest is the broad ``k^-a`` part.
+        mu_ratio: lowest and highest kinetic over static friction, dimensionless.
         stribeck_mm_s: speed over which static becomes kinetic friction of bristles;
             near the speeds of sliding it makes a material stick and slip (PHYSICS.md).
         fast_ratio: kinetic over static friction far above that speed, of bristles, where
@@ -538,13 +538,13 @@ class Material:
 
     title: str
     mu_s: float
-    mu_ratio: tuple[float, float]
     ra_um: tuple[float, float]
-    wavelength_mm: tuple[float, float] | None
-    line_bandwidth: float
-    line_share: float
     texture_mv: float
-    character: Character
+    character: Character = "smooth"
+    wavelength_mm: tuple[float, float] | None = None
+    line_bandwidth: float = 0.1
+    line_share: float = 0.4
+    mu_ratio: tuple[float, float] = (0.75, 0.95)
     stribeck_mm_s: float = 10.0
     fast_ratio: tuple[float, float] | None = None
 
@@ -557,46 +557,32 @@ class Material:
             )
 
 
-def _prior(
-    title: str,
-    mu_s: float,
-    ra_um: tuple[float, float],
-    texture_mv: float,
-    character: Character = "smooth",
-    wavelength_mm: tuple[float, float] | None = None,
-    line_bandwidth: float = 0.1,
-) -> Material:
-    """A row of the table; the kinetic ratio is .75 to .95 for every material."""
-    line_share = 0.0 if wavelength_mm is None else (0.5 if character == "tacky" else 0.4)
-    return Material(
-        title,
-        mu_s,
-        (0.75, 0.95),
-        ra_um,
-        wavelength_mm,
-        line_bandwidth,
-        line_share,
-        texture_mv,
-        character,
-        *((50.0, (0.4, 0.55)) if character == "tacky" else (10.0, None)),
-    )
-
-
 # Friction, Ra and wavelengths: PHYSICS.md's table, as priors: none was measured on this hand.
 # Each session draws its own from the ranges. Texture levels: rough 150 mV and smooth 10 mV
 # (its starting values), the materials between by roughness and softness (prior, ours). The tacky
 # fast_ratio: with it the force oscillates by about a quarter (prior, ours).
 MATERIALS: dict[str, Material] = {
-    "M1": _prior("ABS", 0.8, (5.0, 12.0), 150.0, "rough", (0.18, 0.22), 0.05),
-    "M2": _prior("aluminium foil", 0.7, (0.15, 0.25), 10.0),
-    "M3": _prior("fibreglass aluminium foil", 0.7, (2.5, 3.5), 14.0, "textured", (0.5, 1.5)),
-    "M4": _prior("oil paper", 0.5, (3.0, 5.0), 12.0, "textured", (0.05, 0.5), 0.5),
-    "M5": _prior("acrylic", 1.0, (0.02, 0.1), 8.0),
-    "M6": _prior("PVC tape", 1.1, (1.0, 2.0), 120.0, "tacky", (0.8, 2.0), 0.03),
-    "iron": _prior("iron", 0.7, (0.8, 3.0), 12.0),
-    "cloth": _prior("duct tape", 0.8, (10.0, 20.0), 60.0, "rough", (0.5, 1.0)),
-    "copper": _prior("copper", 0.6, (0.2, 0.8), 10.0),
-    "wood": _prior("wood", 0.6, (3.0, 10.0), 25.0, "textured", (0.1, 1.0), 0.3),
+    "M1": Material("ABS", 0.8, (5.0, 12.0), 150.0, "rough", (0.18, 0.22), 0.05),
+    "M2": Material("aluminium foil", 0.7, (0.15, 0.25), 10.0),
+    "M3": Material("fibreglass aluminium foil", 0.7, (2.5, 3.5), 14.0, "textured", (0.5, 1.5)),
+    "M4": Material("oil paper", 0.5, (3.0, 5.0), 12.0, "textured", (0.05, 0.5), 0.5),
+    "M5": Material("acrylic", 1.0, (0.02, 0.1), 8.0),
+    "M6": Material(
+        "PVC tape",
+        1.1,
+        (1.0, 2.0),
+        120.0,
+        "tacky",
+        (0.8, 2.0),
+        0.03,
+        0.5,
+        stribeck_mm_s=50.0,
+        fast_ratio=(0.4, 0.55),
+    ),
+    "iron": Material("iron", 0.7, (0.8, 3.0), 12.0),
+    "cloth": Material("duct tape", 0.8, (10.0, 20.0), 60.0, "rough", (0.5, 1.0)),
+    "copper": Material("copper", 0.6, (0.2, 0.8), 10.0),
+    "wood": Material("wood", 0.6, (3.0, 10.0), 25.0, "textured", (0.1, 1.0), 0.3),
 }
 """Every known material by the short id used everywhere else."""
 
@@ -622,16 +608,6 @@ MAX_PRESLIDING_FACTOR = 1.5
 
 PAPER_STROKES = (Stroke(20.0), Stroke(40.0), Stroke(60.0))
 """100 mm at 20, 40 and 60 mm/s after 2 s of rest each; the strokes run on without return."""
-
-_GROUPS: dict[str, type[Any]] = {
-    "contact": Contact,
-    "sensors": Sensors,
-    "disturbances": Disturbances,
-    "handling": Handling,
-    "faults": Faults,
-    "dynamics": Dynamics,
-    "imperfections": Imperfections,
-}
 
 PAPER = "paper"
 """The scene that the paper recorded, by the name of its configuration."""
@@ -760,17 +736,14 @@ class Scene:
         A stroke at speed v over the distance d lasts ``d/v + v/a``, so the paper's nominal onsets
         of 2, 9 and 13.5 s become arm starts at 2, 9.04 and 13.62 s.
         """
-        arm, now_s, here_mm = [], 0.0, 0.0
-        a = 1000.0 * self.acceleration_m_s2
+        arm: list[ArmStroke] = []
+        now_s, here_mm, a = 0.0, 0.0, 1000.0 * self.acceleration_m_s2
         for stroke in self.strokes:
-            distance_mm = stroke.distance_mm
-            peak = min(stroke.speed_mm_s, math.sqrt(a * distance_mm))
+            peak = min(stroke.speed_mm_s, math.sqrt(a * stroke.distance_mm))
             start_s = now_s + stroke.pause_s
-            now_s = start_s + distance_mm / peak + peak / a
-            arm.append(
-                ArmStroke(start_s, here_mm, a, peak, peak / a, now_s, distance_mm, stroke.moves)
-            )
-            here_mm += distance_mm if stroke.slides else 0.0
+            arm.append(ArmStroke(start_s, here_mm, a, peak, stroke.distance_mm, stroke.moves))
+            now_s = arm[-1].stop_s
+            here_mm += stroke.distance_mm if stroke.slides else 0.0
         return tuple(arm)
 
     @property
@@ -803,19 +776,10 @@ class Scene:
             TypeError: if a key is unknown.
         """
         beside = ("simulation_version", "integrator")
-        values = {k: v for k, v in plain.items() if k not in beside}
+        values = _grouped({k: v for k, v in plain.items() if k not in beside})
         if "hand" in values:
             values["hand"] = HandLayout.from_rows(values["hand"])
-        if "strokes" in values:
-            values["strokes"] = _strokes(values["strokes"])
-        for name, group in _GROUPS.items():
-            if name in values:
-                values[name] = group(**values[name])
         return cls(**values)
-
-
-def _strokes(given: Iterable[Stroke | Mapping[str, Any]]) -> tuple[Stroke, ...]:
-    return tuple(one if isinstance(one, Stroke) else Stroke(**one) for one in given)
 
 
 def paper_scenes(
@@ -850,6 +814,12 @@ def paper_scenes(
     if cycles < 1:
         raise ValueError(f"cycles must be at least 1, got {cycles}")
     values = _grouped(overrides)
+    known = {f.name for f in fields(Scene)} - {"material", "hand", "seed", "cycle"}
+    if unknown := sorted(set(values) - known):
+        raise ValueError(
+            f"unknown override {', '.join(unknown)}; a scene has {', '.join(sorted(known))} "
+            f"and the fields of {', '.join(group.__name__ for group in _GROUPS.values())}"
+        )
     return [
         Scene(material, hand or HandLayout.paper24(), seed=seed, cycle=cycle, **values)
         for material in materials
@@ -857,22 +827,22 @@ def paper_scenes(
     ]
 
 
-def _grouped(overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Overrides as fields of ``Scene``, the groups' own fields sorted into their groups."""
-    values = dict(overrides)
+_GROUPS: dict[str, Any] = {
+    each.name: each.default_factory for each in fields(Scene) if is_dataclass(each.default_factory)
+}
+"""The groups of parameters of a scene, by name."""
+
+
+def _grouped(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of ``Scene``: mappings become groups and strokes, fields of groups go into theirs."""
+    values = dict(given)
     if "strokes" in values:
-        values["strokes"] = _strokes(values["strokes"])
+        made = (s if isinstance(s, Stroke) else Stroke(**s) for s in values["strokes"])
+        values["strokes"] = tuple(made)
     for name, group in _GROUPS.items():
-        given = values.pop(name, {})
-        base = given if isinstance(given, group) else group(**(given or {}))
+        own = values.pop(name, None) or {}
         inner = {f.name: values.pop(f.name) for f in fields(group) if f.name in values}
-        values[name] = replace(base, **inner)
-    known = {f.name for f in fields(Scene)} - {"material", "hand", "seed", "cycle"}
-    if unknown := sorted(set(values) - known):
-        raise ValueError(
-            f"unknown override {', '.join(unknown)}; a scene has {', '.join(sorted(known))} "
-            f"and the fields of {', '.join(group.__name__ for group in _GROUPS.values())}"
-        )
+        values[name] = replace(own if isinstance(own, group) else group(**own), **inner)
     return values
 
 
@@ -885,8 +855,6 @@ class ArmStroke:
         origin_mm: how far the hand has slid before.
         acceleration_mm_s2: of both ramps.
         peak_mm_s: highest speed, the steady one unless the stroke is short.
-        ramp_s: duration of each ramp.
-        stop_s: when the arm is at rest again.
         distance_mm: travel.
         moves: who does: see ``Stroke``.
     """
@@ -895,8 +863,6 @@ class ArmStroke:
     origin_mm: float
     acceleration_mm_s2: float
     peak_mm_s: float
-    ramp_s: float
-    stop_s: float
     distance_mm: float
     moves: Moves = "hand"
 
@@ -909,6 +875,16 @@ class ArmStroke:
     def drives(self) -> bool:
         """Whether the arm moves."""
         return self.moves != "object"
+
+    @cached_property
+    def ramp_s(self) -> float:
+        """Duration of each ramp."""
+        return self.peak_mm_s / self.acceleration_mm_s2
+
+    @cached_property
+    def stop_s(self) -> float:
+        """When the arm is at rest again."""
+        return self.start_s + self.distance_mm / self.peak_mm_s + self.ramp_s
 
     def travel_mm(self, time_s: Array) -> Array:
         """Distance from the stroke's origin, clamped before and after the stroke."""

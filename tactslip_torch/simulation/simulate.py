@@ -34,18 +34,17 @@ from tactslip_torch.simulation._disturbances import (
     Handled,
     add_imperfections,
     common_volts,
-    gain_factor,
+    drift_factor,
     held_samples,
-    load_factor,
     recorded_channels,
     stuck_volts,
 )
 from tactslip_torch.simulation._sensors import (
-    SharedVibration,
     converted,
     draw_front,
     element_vibration,
     fast_volts,
+    shared_vibration,
     slow_volts,
 )
 from tactslip_torch.simulation.scene import SIMULATION_VERSION, Motion, Scene
@@ -267,7 +266,7 @@ def _volts(
 ) -> list[Array]:
     """Volts of the channels asked for on the grid, ``[K, B]`` each."""
     history, _, now = grid.history
-    front, shared = draw_front(scene), SharedVibration.of(scene, grasp, Motion(scene.slides, grid))
+    front, shared = draw_front(scene), shared_vibration(scene, grasp, Motion(scene.slides, grid))
     motion, handled = Motion(scene.slides, history), Handled(scene, grasp)
     volts = dict(zip(indices, common_volts(scene, grid, indices), strict=True))
     elements = set(grasp.element_of_channel[indices].tolist()) & set(grasp.touching.tolist())
@@ -277,7 +276,7 @@ def _volts(
         add_imperfections(scene, grasp, state, element, grid, vibration)
         normal_n, shear_n, press_n = state.normal_n, state.friction_n, history.zeros()
         if scene.imperfections.share_wander > 0:
-            factor = load_factor(scene, element, history)
+            factor = drift_factor(scene, "share", element, history)
             normal_n, shear_n = normal_n * factor, shear_n * factor
             for band in (vibration.high, vibration.low):
                 band *= np.sqrt(factor[now])
@@ -292,7 +291,7 @@ def _volts(
                 sensed = slow_volts(scene, (normal_n + press_n)[now], shear_n[now], vibration)
             else:  # what presses is felt like friction (prior, ours)
                 sensed = fast_volts(scene, grid, shear_n + press_n, vibration)
-            volts[index] += front.gain[index] * gain_factor(scene, index, grid) * sensed
+            volts[index] += front.gain[index] * drift_factor(scene, "gain", index, grid) * sensed
     return [converted(scene, front, index, grid, volts[index]) for index in indices]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 from tactslip_torch.data.recording import Recording, RecordingId
@@ -72,15 +73,11 @@ class SimulatedRecordings:
         ]
         materials = tuple(materials)
         self._scenes: dict[RecordingId, Scene] = {}
-        for number in range(1, sessions + 1):
-            for kind in kinds:
-                for scene_of in paper_scenes(
-                    seed=seed, materials=materials, hand=self.hand, **kind
-                ):
-                    session = "" if number == 1 else str(number)
-                    mounted = _in_session(scene_of, session)
-                    name = RecordingId(mounted.material, mounted.cycle, mounted.name, session)
-                    self._scenes[name] = mounted
+        for session, kind in product(["", *map(str, range(2, sessions + 1))], kinds):
+            for one in paper_scenes(seed=seed, materials=materials, hand=self.hand, **kind):
+                mounting = f"{one.session}/{session}" if session else one.session
+                name = RecordingId(one.material, one.cycle, one.name, session)
+                self._scenes[name] = replace(one, session=mounting)
         self.ids = tuple(self._scenes)
         first = next(iter(self._scenes.values()), None)
         self.sample_rate_hz = 2000.0 if first is None else first.sample_rate_hz
@@ -101,8 +98,3 @@ class SimulatedRecordings:
     ) -> Recording:
         """Simulate the recording, or the intervals of it that are asked for."""
         return simulate(self._scenes[recording], windows=windows)
-
-
-def _in_session(scene: Scene, session: str) -> Scene:
-    """The scene in a further session of its material, or as it is in the first."""
-    return replace(scene, session=f"{scene.session}/{session}") if session else scene

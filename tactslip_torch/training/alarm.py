@@ -268,7 +268,7 @@ def threshold_curve(
     for value in dict.fromkeys(falling[ranks].tolist()):
         alarms = alarm_counts(
             statistics,
-            [value],
+            value,
             rearm=settings.decisions(settings.rearm_s, timing.sample_rate_hz),
             refractory=settings.decisions(settings.refractory_s, timing.sample_rate_hz),
         )
