@@ -52,11 +52,6 @@ def test_poisson_interval_of_nonsense(count: float, level: float) -> None:
 # ------------------------------------------------------------------------------------ the rate
 
 
-def test_one_recording_has_the_poisson_interval() -> None:
-    found = alarm_rate([7], [2.0])
-    assert (2 * found.low, 2 * found.high) == pytest.approx(poisson_interval(7))
-
-
 def bootstrap(counts: np.ndarray, hours: np.ndarray, level: float) -> np.ndarray:
     source = np.random.default_rng(5)
     drawn = source.integers(len(counts), size=(20_000, len(counts)))
@@ -86,18 +81,6 @@ def test_bootstrap_alone_sets_an_end_that_it_reaches_farther() -> None:
     found = alarm_rate(counts.tolist(), hours.tolist())
     assert found.high == pytest.approx(bootstrap(counts, hours, 0.95)[1], rel=0.01)
     assert found.high == pytest.approx(40_000)  # four short ones, one time in sixteen
-
-
-def test_interval_by_seed_level_and_unit() -> None:
-    counts, hours = [0, 4, 1, 0, 9, 0], [1.0, 1.0, 2.0, 1.0, 1.5, 1.0]
-    found = alarm_rate(counts, hours, seed=3)
-    assert found == alarm_rate(counts, hours, seed=3)
-    wider = alarm_rate(counts, hours, level=0.99, seed=3)
-    assert wider.low < found.low < found.high < wider.high
-    halved = alarm_rate(counts, [2 * h for h in hours], seed=3)
-    assert (halved.per_hour, halved.low, halved.high) == pytest.approx(
-        (found.per_hour / 2, found.low / 2, found.high / 2)
-    )
 
 
 def test_recordings_not_watched_at_all_are_not_drawn() -> None:
@@ -176,14 +159,14 @@ def brute(statistics: list[list[float]], allowed: int, how: dict[str, int]) -> t
     return best, alarms
 
 
-@pytest.mark.parametrize("seed", range(30))
-def test_threshold_is_that_of_brute_force(seed: int) -> None:
+@given(
+    recordings=st.lists(drawn_values, min_size=1, max_size=4),
+    allowed=st.integers(0, 8),
+    how=drawn_times,
+)
+def test_threshold_is_that_of_brute_force(recordings, allowed: int, how) -> None:
     # whole numbers, so that many values are equal
-    source = np.random.default_rng(seed)
-    lengths = source.integers(1, 26, size=source.integers(1, 5))
-    recordings = [source.integers(-3, 7, size=length).tolist() for length in lengths]
-    allowed = int(source.integers(0, 9))
-    how = {"rearm": int(source.integers(0, 5)), "refractory": int(source.integers(0, 7))}
+    lengths = list(map(len, recordings))
     statistics = [torch.tensor(row, dtype=torch.float32) for row in recordings]
     hop_s = 3600 / sum(lengths)  # an hour in all
     found = choose_threshold(statistics, RAW, hop_s, allowed + 0.5, **how)
@@ -205,11 +188,11 @@ def test_threshold_in_long_streams(dtype: torch.dtype) -> None:
     every = torch.cat(statistics).unique()
     tried = every[(every >= found.value) & (every <= top)]
     assert len(tried) > 1000
-    counts = alarm_counts(statistics, tried[:: len(tried) // 10], **how).sum(-1)
     hours = sum(map(len, statistics)) * hop_s / 3600
-    assert bool((counts <= target * hours).all())
+    for level in tried[:: len(tried) // 10].tolist():
+        assert int(alarm_counts(statistics, level, **how).sum()) <= target * hours
     assert found.rate.per_hour <= target
-    below = every[every < found.value][-1:]
+    below = float(every[every < found.value][-1])
     assert int(alarm_counts(statistics, below, **how).sum()) > target * hours
 
 
@@ -217,7 +200,7 @@ def test_a_lower_threshold_with_fewer_alarms_is_not_taken() -> None:
     # at 1 the two peaks are one alarm, at 2 two
     statistics = [torch.tensor([0.0, 2, 1, 2, 0, 0, 0, 0])]
     hop_s = 3600 / 8
-    assert alarm_counts(statistics, [1.0, 2.0], **PLAIN).tolist() == [[1], [2]]
+    assert [alarm_counts(statistics, at, **PLAIN).tolist() for at in (1.0, 2.0)] == [[1], [2]]
     found = choose_threshold(statistics, RAW, hop_s, 1, **PLAIN)
     assert found.value == np.nextafter(np.float32(2), np.float32(3))
     assert found.rate.alarms == 0
@@ -302,22 +285,6 @@ def test_what_no_threshold_can_be_set_on(statistics, hop_s, target, said: str) -
     assert "\n" not in str(error.value)
 
 
-# ------------------------------------------------------------------------- counts in recordings
-@given(
-    recordings=st.lists(drawn_values, min_size=1, max_size=4),
-    threshold=st.integers(-3, 5),
-    how=drawn_times,
-)
-def test_counts_in_recordings_are_those_of_the_latch(recordings, threshold: int, how) -> None:
-    statistics = [torch.tensor(row, dtype=torch.float32) for row in recordings]
-    counts = alarm_counts(statistics, [float(threshold), float(threshold) - 1], **how)
-    assert counts.dtype == torch.int64
-    assert counts.tolist() == [
-        [sum(by_hand(row, level, **how)[0]) for row in recordings]
-        for level in (threshold, threshold - 1)
-    ]
-
-
 # ------------------------------------------------------------------------------- fresh streams
 HOW = {"rearm": 5, "refractory": 20}
 
@@ -343,8 +310,8 @@ def test_fresh_streams_have_the_target_rate(rule: Rule, memory: int) -> None:
         found = choose_threshold(list(chosen_on), rule, 0.01, 60.0, **HOW)
         assert found.reached
         assert found.rate.alarms <= 10
-        counts = alarm_counts(list(others), [found.value], **HOW)
-        fresh.append(alarm_rate(counts[0], torch.full((30,), 20 / 3600)))
+        counts = alarm_counts(list(others), found.value, **HOW)
+        fresh.append(alarm_rate(counts, torch.full((30,), 20 / 3600)))
     assert sum(one.low <= 60 <= one.high for one in fresh) >= 30
     mean = np.mean([one.per_hour for one in fresh])
     assert mean == pytest.approx(60, abs=13)  # a standard error is 60 sqrt(2 / 10 / 40) = 4
