@@ -25,7 +25,7 @@ SMALL = (
 
 
 def tiny(*overrides):
-    few = ("seeds=[1000]", "fact_cycles=1", "most_points=2", "step=1.5")
+    few = ("seeds=[1000]", "check_cycles=1", "most_points=2", "step=1.5")
     return composed(*SMALL, *few, *overrides, name="calibrate")
 
 
@@ -36,7 +36,7 @@ def searched(accuracy, *, holds=lambda d: True, bounds=(-3.0, 3.0), **options):
     """Every point that the search tries on a curve, in order, and the one that is kept."""
 
     def evaluate(d):
-        return {"difficulty": d, "accuracy": accuracy(d), "holds": holds(d), "facts": []}
+        return {"difficulty": d, "accuracy": accuracy(d), "holds": holds(d), "signal_checks": []}
 
     points = search(evaluate, 0.96, 0.001, bounds, most_points=30, **options)
     places = [point["difficulty"] for point in points]
@@ -139,29 +139,32 @@ def test_the_command_leaves_all_it_tried(found):
     assert [point["difficulty"] for point in content["points"]] == [0.0, -1.5]
     for point in content["points"]:
         assert point["parameters"] == parameters_at(point["difficulty"])
-        assert {check["name"] for check in point["facts"]} >= {"sg_rise", "pvdf_slide_over_rest"}
+        assert {check["name"] for check in point["signal_checks"]} >= {
+            "sg_rise",
+            "pvdf_slide_over_rest",
+        }
     assert content["values"] == content["points"][1]["parameters"]  # closer to the target than d=0
     assert content["target"]["accuracy"] == 0.9639
     assert "no point tried is closer" in content["verdict"]
     assert (folder / "calibration.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "config.yaml").exists()
     assert str(folder) not in (folder / "calibration.json").read_text()
-    protocol = {name: content["protocol"][name] for name in ("step", "most_points", "fact_cycles")}
-    assert protocol == {"step": 1.5, "most_points": 2, "fact_cycles": 1}
+    protocol = {name: content["protocol"][name] for name in ("step", "most_points", "check_cycles")}
+    assert protocol == {"step": 1.5, "most_points": 2, "check_cycles": 1}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("among", [(), ("recipe.feature_filter={kind:PVDF,domain:freq}",)])
-def test_accuracy_is_what_train_reports_for_the_same_parameters_and_seed(tmp_path, found, among):
-    if among:
-        point = command.evaluate_point(tiny(*among), 0.0)
+@pytest.mark.parametrize("limits", [(), ("recipe.feature_filter={kind:PVDF,domain:freq}",)])
+def test_accuracy_is_what_train_reports_for_the_same_parameters_and_seed(tmp_path, found, limits):
+    if limits:
+        point = command.evaluate_point(tiny(*limits), 0.0)
         assert point["accuracy"] != found[0]["points"][0]["accuracy"]
     else:
         point = found[0]["points"][1]
     values = {name: str(value).replace(" ", "") for name, value in point["parameters"].items()}
     scene = [f"+scene.{name}={value}" for name, value in values.items()]
     rest = ("data.materials=[M1,M5]", "recipe=paper", "seed=1000", "cache=off", "export=false")
-    config = composed(*SMALL, *scene, *among, "+exp=random_bins", *rest)
+    config = composed(*SMALL, *scene, *limits, "+exp=random_bins", *rest)
     assert train(config, tmp_path)["test/accuracy"] == point["accuracy"] < 1
     assert point["accuracy_by_seed"] == [point["accuracy"]]
 
@@ -202,7 +205,7 @@ def put_in(monkeypatch, tmp_path):
                 "accuracy": accuracy,
                 "accuracy_by_seed": [accuracy] * len(config.seeds),
                 "holds": holds,
-                "facts": [{**CHECK, "holds": holds}],
+                "signal_checks": [{**CHECK, "holds": holds}],
             }
 
         monkeypatch.setattr(command, "evaluate_point", point)
@@ -274,7 +277,7 @@ def test_another_protocol_is_not_frozen(tmp_path, put_in, override, section):
         ("tolerance=nan", "tolerance must be a positive finite number, got nan"),
         ("step=null", "step must be a positive finite number, got None"),
         ("most_points=1.5", "most_points must be a positive whole number, got 1.5"),
-        ("fact_cycles=true", "fact_cycles must be a positive whole number, got True"),
+        ("check_cycles=true", "check_cycles must be a positive whole number, got True"),
     ],
 )
 def test_what_is_no_calibration_is_refused(tmp_path, override, message):
@@ -287,7 +290,7 @@ def test_the_table_has_all_points_by_difficulty_and_what_became_of_it(tmp_path, 
     put_in(accuracy=0.99)
     content = calibrate(tiny("most_points=3", "step=0.75"), tmp_path)
     assert content["verdict"] == "+2.61 points from the target: no point tried is closer"
-    content["points"][2] |= {"holds": False, "facts": [{**CHECK, "holds": False}]}
+    content["points"][2] |= {"holds": False, "signal_checks": [{**CHECK, "holds": False}]}
     lines = calibration_table(content).splitlines()
     assert lines[0].startswith("SIMULATED")
     rows = [line.split() for line in lines]

@@ -161,7 +161,7 @@ def evaluate_point(config: DictConfig, difficulty: float) -> dict[str, Any]:
         data = SlipDataModule(maker, split, of_seed.num_workers)
         accuracies.append(seen_accuracy(maker, data, recipe, f"d {difficulty:+.2f}, seed {seed}"))
         for recording in source.ids:
-            if recording.cycle < config.fact_cycles:
+            if recording.cycle < config.check_cycles:
                 signals = filtered(source.load(recording), source.hand)
                 recordings.setdefault(recording.material, []).append(signals)
     checks = check_signals(recordings)
@@ -171,7 +171,7 @@ def evaluate_point(config: DictConfig, difficulty: float) -> dict[str, Any]:
         "accuracy": sum(accuracies) / len(accuracies),
         "accuracy_by_seed": accuracies,
         "holds": all(check["holds"] for check in checks),
-        "facts": checks,
+        "signal_checks": checks,
     }
 
 
@@ -202,10 +202,9 @@ def calibrate(config: DictConfig, folder: Path) -> dict[str, Any]:
     )
     kept = best_point(points, target)
     if kept is None:
-        failed = [check["name"] for check in points[0]["facts"] if not check["holds"]]
         raise ValueError(
-            f"the signal checks {', '.join(failed)} do not hold at the starting values, so there "
-            "is no point to calibrate from; raise fact_cycles, or mend the simulation"
+            f"the signal checks {', '.join(_failed(points[0]))} do not hold at the starting values, so there "
+            "is no point to calibrate from; raise check_cycles, or mend the simulation"
         )
     content: dict[str, Any] = plain(_content(config, points, kept, target))
     leave_results(folder, "calibration", content, calibration_figure, calibration_table(content))
@@ -238,7 +237,7 @@ def _check(config: DictConfig) -> None:
         raise ValueError(f"bounds must hold 0, the starting values; got {bounds}")
     for name in ("tolerance", "step"):
         check_number(name, config[name])
-    for name in ("most_points", "fact_cycles"):
+    for name in ("most_points", "check_cycles"):
         check_number(name, config[name], whole=True)
     if config.write and (changed := _changed_sections(config)):
         raise ValueError(
@@ -263,7 +262,7 @@ def _content(
     """The content of ``calibration.json``: no time and no path, so that its bytes repeat."""
     protocol: Any = OmegaConf.to_container(config, resolve=True)
     groups = ("data", "labels", "split", "features", "recipe")
-    numbers = ("tolerance", "bounds", "step", "most_points", "fact_cycles")
+    numbers = ("tolerance", "bounds", "step", "most_points", "check_cycles")
     return {
         "simulated": True,
         "provenance": (
@@ -281,7 +280,7 @@ def _content(
         "verdict": _outcome(config, points, kept, target),
         "seeds": list(config.seeds),
         "priors": {name: asdict(prior) for name, prior in PRIORS.items()},
-        "facts": kept["facts"],
+        "signal_checks": kept["signal_checks"],
         "points": points,
         "protocol": {name: protocol[name] for name in groups + numbers},
         "versions": {
@@ -306,13 +305,19 @@ def _outcome(config: DictConfig, points: Sequence[Point], kept: Point, target: f
     ]
     if failing:
         nearest = min(failing, key=lambda point: abs(point["difficulty"] - kept["difficulty"]))
-        failed = ", ".join(check["name"] for check in nearest["facts"] if not check["holds"])
+        failed = ", ".join(
+            check["name"] for check in nearest["signal_checks"] if not check["holds"]
+        )
         why = f"cut back: at d {nearest['difficulty']:+.2f} the checks {failed} do not hold"
     elif kept["difficulty"] in tuple(config.bounds):
         why = "the bound of d is reached"
     else:
         why = "no point tried is closer"
     return f"{100 * missing:+.2f} points from the target: {why}"
+
+
+def _failed(point: Point) -> list[str]:
+    return [check["name"] for check in point["signal_checks"] if not check["holds"]]
 
 
 main = entry_point("calibrate", calibrate)

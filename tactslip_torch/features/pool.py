@@ -34,7 +34,6 @@ from tactslip_torch.signals.wavelet import (
     Wavelet,
     WaveletFilters,
     as_wavelet,
-    wavelet_fact,
     wavelet_steps,
 )
 
@@ -170,7 +169,7 @@ class FeaturePool(nn.Module):
         return {
             "sample_rate_hz": self.sample_rate_hz,
             "bin_samples": self.bin_samples,
-            "wavelet": wavelet_fact(self.wavelet),
+            "wavelet": self.wavelet if isinstance(self.wavelet, str) else self.wavelet.to_dict(),
             "level": self.level,
             "spectrum": self.spectrum,
             "arithmetic": self.arithmetic,

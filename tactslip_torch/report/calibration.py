@@ -44,9 +44,9 @@ def calibration_table(content: Mapping[str, Any]) -> str:
         ),
         table(rows),
     ]
-    if content["facts"]:
+    if content["signal_checks"]:
         checks = []
-        for check in content["facts"]:
+        for check in content["signal_checks"]:
             low, high = f"{check['low']:g}", check["high"]
             span = f"above {low}" if high is None else f"{low} to {high:g}"
             values = " ".join(f"{value:.3g}" for value in check["values"].values())
@@ -107,7 +107,7 @@ def _by_difficulty(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def _checks(point: Mapping[str, Any]) -> str:
-    failing = ", ".join(check["name"] for check in point["facts"] if not check["holds"])
+    failing = ", ".join(check["name"] for check in point["signal_checks"] if not check["holds"])
     return "hold" if point["holds"] else f"fail: {failing}"
 
 

@@ -89,23 +89,8 @@ class WaveletFilters:
         return self.name
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able, and exact: a float comes back as it was."""
+        """JSON-able, for ``as_wavelet``, and exact: a float comes back as it was."""
         return {key: value if key == "name" else list(value) for key, value in asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, filters: Mapping[str, Any]) -> WaveletFilters:
-        """What ``to_dict`` gave.
-
-        Raises:
-            ValueError: if a key is missing or unknown, or as the constructor.
-        """
-        expected = ("name", *_FILTERS)
-        if set(filters) != set(expected):
-            raise ValueError(
-                f"a wavelet's filters have the keys {', '.join(expected)}, got "
-                f"{', '.join(map(str, filters)) or 'none'}"
-            )
-        return cls(**filters)
 
 
 Wavelet: TypeAlias = str | WaveletFilters
@@ -118,16 +103,17 @@ def as_wavelet(wavelet: Wavelet | Mapping[str, Any]) -> Wavelet:
     Raises:
         ValueError: if it is neither a name nor filters, or as ``WaveletFilters``.
     """
-    if isinstance(wavelet, (str, WaveletFilters)):
-        return wavelet
     if isinstance(wavelet, Mapping):
-        return WaveletFilters.from_dict(wavelet)
-    raise ValueError(f"a wavelet is a name or its filters, got {type(wavelet).__name__}")
-
-
-def wavelet_fact(wavelet: Wavelet) -> str | dict[str, Any]:
-    """The same as a JSON-able value, for ``as_wavelet``."""
-    return wavelet if isinstance(wavelet, str) else wavelet.to_dict()
+        expected = ("name", *_FILTERS)
+        if set(wavelet) != set(expected):
+            raise ValueError(
+                f"a wavelet's filters have the keys {', '.join(expected)}, got "
+                f"{', '.join(map(str, wavelet)) or 'none'}"
+            )
+        return WaveletFilters(**wavelet)
+    if not isinstance(wavelet, (str, WaveletFilters)):
+        raise ValueError(f"a wavelet is a name or its filters, got {type(wavelet).__name__}")
+    return wavelet
 
 
 def _numbers(name: str, values: Sequence[float]) -> tuple[float, ...]:

@@ -96,7 +96,7 @@ KEYS = {
     "experiment": "+exp",
     "export": "export",
     "extremes": "extremes",
-    "fact_cycles": "fact_cycles",
+    "fact_cycles": "check_cycles",
     "figure": "figure",
     "folder": "hydra.run.dir",
     "force": "force",
