@@ -202,9 +202,10 @@ def calibrate(config: DictConfig, folder: Path) -> dict[str, Any]:
     )
     kept = best_point(points, target)
     if kept is None:
+        failed = ", ".join(_failed(points[0]))
         raise ValueError(
-            f"the signal checks {', '.join(_failed(points[0]))} do not hold at the starting values, so there "
-            "is no point to calibrate from; raise check_cycles, or mend the simulation"
+            f"the signal checks {failed} do not hold at the starting values, so there is no point "
+            "to calibrate from; raise check_cycles, or mend the simulation"
         )
     content: dict[str, Any] = plain(_content(config, points, kept, target))
     leave_results(folder, "calibration", content, calibration_figure, calibration_table(content))
