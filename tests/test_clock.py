@@ -75,15 +75,6 @@ def test_what_was_dropped_is_found_and_filled(gaps, jitter, seed):
         torch.testing.assert_close(part, torch.stack([ramp, -ramp])[:, first:stop])
 
 
-def test_long_gaps_are_not_bridged():
-    seconds, left = ticks(100, {30, 31, 60})
-    found = clock_of(seconds)
-    assert found.gaps == (Gap(30, 2, 30), Gap(60, 1, 58))
-    read = EvenSamples(Kept(left.double()[None]), found, most_bridged=1).read(0, 100)[0]
-    assert read[60] == 60
-    assert read[30:32].isnan().all()
-
-
 @pytest.mark.parametrize(("rate", "unit"), ROUNDED)
 def test_stamps_neither_round_the_rate_nor_lose_or_invent_samples(rate, unit):
     num = int(12 * rate)

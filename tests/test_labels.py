@@ -1,5 +1,6 @@
 """Which bins of a recording are slip, which are not, and which windows of time they need."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -27,7 +28,6 @@ ONSETS = (2.0, 9.0, 13.5)  # REFERENCE.md section 1, with slides of 100 mm at 20
 SLIDES = ((2.0, 7.0), (9.0, 11.5), (13.5, 13.5 + 100 / 60))
 DURATION = 15.5
 HALF = LabelRule(layout="half_second")
-both_layouts = pytest.mark.parametrize("layout", ["whole_slide", "half_second"])
 
 
 def lay(rule=None, onsets=ONSETS, slides=SLIDES, duration_s=DURATION, rate=RATE, **stretches):
@@ -65,137 +65,77 @@ def test_bins_of_the_papers_protocol(rule, lead, shift, counts):
     assert len(lay(rule, slides=shorter).starts) == num
 
 
-@both_layouts
-@pytest.mark.parametrize("hop_ms", [25.0, 100.0, 150.0])
-def test_hops_lay_bins_further_apart_or_over_each_other(layout, hop_ms):
-    plain = lay(LabelRule(layout=layout))
-    dense = lay(LabelRule(layout=layout, hop_ms=hop_ms))
-    assert dense.bin_samples == 100
-    for stroke in range(3):
-        for is_slip in (False, True):
-            every = of_stroke(dense, stroke, is_slip)
-            assert set(np.diff(every)) <= {round(2 * hop_ms)}
-            assert every[0] == of_stroke(plain, stroke, is_slip)[0]
-        quiet, slip = ((dense.stroke == stroke) & (dense.is_slip == s) for s in (False, True))
-        assert (int(dense.position[quiet].max()), int(dense.position[slip].min())) == (-1, 0)
-        assert set(np.diff(dense.position[quiet | slip])) == {1}
-    if hop_ms == 25.0:
-        assert len(of_stroke(dense, 0, False)) == 2 * len(of_stroke(plain, 0, False)) - 1
-
-
-@given(
-    onset=st.floats(1.1, 3.0),
-    length=st.floats(0.0, 4.0),
-    hop_ms=st.sampled_from([None, 10.0, 50.0, 70.0]),
-)
-def test_no_bin_straddles_the_onset_or_the_end(onset, length, hop_ms):
-    bins = lay(LabelRule(hop_ms=hop_ms), (onset,), ((onset, onset + length),), 8.0)
-    ends = bins.starts + bins.bin_samples
-    edge = round((onset - 0.010) * RATE)
-    quiet, slip = ~bins.is_slip, bins.is_slip
-    assert int(bins.starts[quiet].min()) == edge - 2000
-    assert bool((ends[quiet] <= edge).all())
-    assert bool((bins.starts[slip] >= edge).all())
-    assert bool((ends[slip] <= (onset + length) * RATE + 1e-6).all())
-    hop = 100 if hop_ms is None else round(2 * hop_ms)
-    fits = int((onset + length) * RATE) - edge - 100
-    assert int(slip.sum()) == (fits // hop + 1 if fits >= 0 else 0)  # not one bin less
-
-
-def test_short_slides_pauses_and_recordings():
-    short = lay(onsets=(2.0,), slides=((2.0, 2.03),))
-    assert (len(short.starts), bool(short.is_slip.any())) == (20, False)
-    half = lay(HALF, (2.0,), ((2.0, 2.23),), 5.0)
-    ends = (half.starts[half.is_slip] + half.bin_samples) / RATE
-    assert (len(ends), float(ends.max()) <= 2.23) == (4, True)
-    for rule in (LabelRule(), HALF):  # a pause of 0.3 s leaves less than the layout asks for
-        bins = lay(rule, (2.0, 3.3), ((2.0, 3.0), (3.3, 4.3)), 5.0)
-        quiet = ~bins.is_slip & (bins.stroke == 1)
-        assert float(bins.starts[quiet].min()) / RATE >= 3.0
-        num = int(quiet.sum())
-        assert bins.position[quiet].tolist() == list(range(-num, 0))
-        assert num in (5, 6)
-    whole = lay(HALF, (0.5,), ((0.5, 1.0),), 1.0)  # bins touch both ends
-    assert (int(whole.starts[0]), int(whole.starts[-1]) + 100) == (0, 2000)
-
-
-# Stretches -----------------------------------------------------------------------------------
-
-
-def by_hand(strokes, slides, stretches, bin_samples, hop, num_samples):
-    """Starts in stretches, sample by sample: nothing of a stroke, a slide or a bin is met."""
-    taken = np.zeros(num_samples, dtype=bool)
-    for start in strokes:
-        taken[start : start + bin_samples] = True
-    for start, end in slides:
-        taken[start:end] = True
-    found = []
-    for first, last in stretches:
-        own = [
-            start
-            for start in range(first, last, hop)
-            if start + bin_samples <= last and not taken[start : start + bin_samples].any()
-        ]
-        for start in own:
-            taken[start : start + bin_samples] = True
-        found += own
+def by_hand(rule, onsets, slides, duration_s, rate, non_slip_s=(), slip_s=()):
+    """Start, label, stroke and position of every bin, laid one by one."""
+    size = round(rule.bin_ms * rate / 1000)
+    hop = size if rule.hop_ms is None else round(rule.hop_ms * rate / 1000)
+    is_half = rule.layout == "half_second"
+    lead, shift_s, previous = round((0.5 if is_half else 1.0) * rate), 0.01 * (not is_half), 0
+    found, taken = [], np.zeros(round(duration_s * rate), dtype=bool)
+    for stroke, (onset, (start, end)) in enumerate(zip(onsets, slides, strict=True)):
+        edge = round((onset - shift_s) * rate)
+        last = min(int(end * rate), edge + lead if is_half else len(taken))
+        quiet = [s for s in range(edge - lead, edge, hop) if previous <= s <= edge - size]
+        found += [(s, False, stroke, n - len(quiet)) for n, s in enumerate(quiet)]
+        slip = [s for s in range(edge, last, hop) if s + size <= last]
+        found += [(s, True, stroke, n) for n, s in enumerate(slip)]
+        previous = math.ceil(end * rate)
+        taken[min(edge, int(start * rate)) : previous] = True
+    for start, *_ in found:
+        taken[start : start + size] = True
+    for is_slip, (start, end) in [(False, s) for s in non_slip_s] + [(True, s) for s in slip_s]:
+        last = round(end * rate)
+        for s in range(round(start * rate), last, hop):
+            if s + size <= last and not taken[s : s + size].any():
+                found.append((s, is_slip, -1, NO_POSITION))
+        for s, *_ in found:
+            taken[s : s + size] = True
     return found
 
 
-@pytest.mark.parametrize(
-    ("layout", "hop_ms"), [("whole_slide", None), ("half_second", 25.0), ("whole_slide", 70.0)]
+stretch = st.tuples(st.integers(0, 15_000), st.integers(1, 4500)).map(
+    lambda pair: (pair[0] / RATE, min(sum(pair), 16_000) / RATE)
 )
+stroke = st.tuples(st.floats(0.3, 1.5), st.floats(0.0, 2.0))  # a pause, and a slide behind it
+
+
 @given(
-    stretches=st.lists(
-        st.tuples(st.integers(0, 30999), st.integers(1, 9000)).map(
-            lambda pair: (pair[0], min(sum(pair), 31000))
-        ),
-        max_size=3,
-    ),
-    jitter=st.floats(-0.045, 0.045),
+    layout=st.sampled_from(["whole_slide", "half_second"]),
+    hop_ms=st.sampled_from([None, 10.0, 25.0, 70.0, 150.0]),
+    strokes=st.lists(stroke, max_size=2),
+    late_s=st.floats(-0.045, 0.045),
+    non_slip_s=st.lists(stretch, max_size=3),
+    slip_s=st.lists(stretch, max_size=2),
 )
-def test_bins_of_stretches_meet_no_other_bin_and_no_slide(layout, hop_ms, stretches, jitter):
-    rule = LabelRule(layout=layout, hop_ms=hop_ms)
-    annotated = tuple(onset + jitter for onset in ONSETS)
-    seconds = tuple((start / RATE, end / RATE) for start, end in stretches)
-    plain, bins = lay(rule, annotated), lay(rule, annotated, non_slip_s=seconds)
-    num = len(plain.starts)
-    for name in ("starts", "is_slip", "stroke", "position"):  # strokes are laid as ever
-        assert torch.equal(getattr(bins, name)[:num], getattr(plain, name)), name
-    shift = 0.01 if layout == "whole_slide" else 0.0
-    slides = [
-        (min(round((mark - shift) * RATE), int(start * RATE)), int(np.ceil(end * RATE)))
-        for mark, (start, end) in zip(annotated, SLIDES, strict=True)
-    ]
-    hop = 100 if hop_ms is None else round(2 * hop_ms)
-    expected = by_hand(plain.starts.tolist(), slides, stretches, 100, hop, 31000)
-    assert bins.starts[num:].tolist() == expected
-    assert not bool(bins.is_slip[num:].any())
-    assert set(bins.stroke[num:].tolist()) <= {-1}
-    assert set(bins.position[num:].tolist()) <= {NO_POSITION}
+def test_bins_are_those_laid_by_hand(layout, hop_ms, strokes, late_s, non_slip_s, slip_s):
+    rule, slides, now = LabelRule(layout=layout, hop_ms=hop_ms), [], 0.8
+    for pause_s, length_s in strokes:
+        slides.append((now + pause_s, now + pause_s + length_s))
+        now = slides[-1][1]
+    marked = [start + late_s for start, _ in slides]
+    told = (rule, marked, slides, 8.0, RATE, non_slip_s, slip_s)
+    expected, bins = by_hand(*told), label_bins(*told)
+    columns = bins.starts, bins.is_slip, bins.stroke, bins.position
+    assert [*zip(*(column.tolist() for column in columns), strict=True)] == expected
+    dtypes = torch.int64, torch.bool, torch.int64, torch.int64
+    assert (*(column.dtype for column in columns), bins.bin_samples) == (*dtypes, 100)
+    ends = (bins.starts + 100) / RATE
+    for number, (start, (_, end)) in enumerate(zip(marked, slides, strict=True)):
+        own = bins.stroke == number  # no bin straddles the onset or the end of its slide
+        assert bool((ends[own & ~bins.is_slip] <= start + 5e-4).all())
+        assert bool((bins.starts[own & bins.is_slip] / RATE >= start - 0.011).all())
+        assert bool((ends[own & bins.is_slip] <= end + 1e-6).all())
 
 
-@both_layouts
-def test_a_recording_without_onsets_has_the_bins_of_its_stretches(layout):
-    rule = LabelRule(layout=layout)
-    bins = lay(rule, (), (), 3.0, non_slip_s=((0.0, 1.0), (1.2 + 0.1, 3.0)))
-    assert bins.starts.tolist() == [*range(0, 2000, 100), *range(2600, 6000, 100)]
-    assert bins.starts.dtype == bins.stroke.dtype == bins.position.dtype == torch.int64
-    assert (bins.is_slip.dtype, bool(bins.is_slip.any())) == (torch.bool, False)
-    assert needed_windows(bins, 25, 3.0, RATE) == [(0.0, 2025 / RATE), (2575 / RATE, 3.0)]
-    nothing = lay(rule, (), ())
+def test_a_recording_may_be_filled_by_its_stroke_or_hold_nothing():
+    whole = lay(HALF, (0.5,), ((0.5, 1.0),), 1.0)  # bins touch both ends
+    assert (int(whole.starts[0]), int(whole.starts[-1]) + 100) == (0, 2000)
+    nothing = lay(None, (), ())
     assert len(nothing.starts) == len(nothing.is_slip) == len(nothing.position) == 0
     assert needed_windows(nothing, 25, DURATION, RATE) == []
-
-
-def test_stretches_of_slip_come_last_and_belong_to_no_stroke():
-    stretches = {"non_slip_s": ((0.0, 0.2),), "slip_s": ((1.0, 1.1),)}
-    bins = lay(LabelRule(hop_ms=25.0), (), (), 3.0, **stretches)
-    assert bins.is_slip.tolist() == [False] * 7 + [True] * 3
-    assert bins.starts[-3:].tolist() == [round(s * RATE) for s in (1.0, 1.025, 1.05)]
-    assert set(bins.stroke.tolist()) == {-1}
-    twice = lay(None, (), (), 3.0, non_slip_s=((0.0, 1.0),), slip_s=((0.0, 2.0),))
-    assert (twice.starts / RATE)[twice.is_slip].min() == 1.0  # said to be no slip, it stays so
+    bins = lay(None, (), (), 3.0, non_slip_s=((0.0, 1.0), (1.2 + 0.1, 3.0)))
+    assert bins.starts.tolist() == [*range(0, 2000, 100), *range(2600, 6000, 100)]
+    assert needed_windows(bins, 25, 3.0, RATE) == [(0.0, 2025 / RATE), (2575 / RATE, 3.0)]
 
 
 def test_bins_that_need_missing_samples_are_left_out():

@@ -140,13 +140,13 @@ def convert(config: DictConfig) -> list[Written]:
 def label_template(config: DictConfig) -> Path:
     """Write a manifest of all that can be read in a folder, to be filled in."""
     output = None if config.output is None else Path(str(config.output))
-    written = write_template(Path(str(config.root)), str(config.pattern), output)
+    path, num_files, num_told = write_template(Path(str(config.root)), str(config.pattern), output)
     print(
-        f"{written.path} lists {written.num_files} recordings, {written.num_guessed} of them with "
-        f"what pattern={config.pattern} tells; fill in onsets_s, sliding_s, slip_s and non_slip_s "
+        f"{path} lists {num_files} recordings, {num_told} of them with what "
+        f"pattern={config.pattern} tells; fill in onsets_s, sliding_s, slip_s and non_slip_s "
         "(as 2.0; 9.0 and 2-7; 9-11.5) or label (slip, non-slip), then action=check"
     )
-    return written.path
+    return path
 
 
 ACTIONS: dict[str, Callable[[DictConfig], object]] = {

@@ -229,20 +229,6 @@ _TEMPLATE_COLUMNS = (
 _BETWEEN = "-_. "
 
 
-class _Template(NamedTuple):
-    """A manifest that was written.
-
-    Args:
-        path: of it.
-        num_files: it lists.
-        num_guessed: of which the pattern told anything.
-    """
-
-    path: Path
-    num_files: int
-    num_guessed: int
-
-
 def guessed(file: str, pattern: str) -> dict[str, str]:
     """What a pattern tells of a file by its name, or by its path if the pattern has a stroke.
 
@@ -277,8 +263,11 @@ def guessed(file: str, pattern: str) -> dict[str, str]:
     return found.groupdict() if found else {}
 
 
-def write_template(root: Path, pattern: str, path: Path | None = None) -> _Template:
+def write_template(root: Path, pattern: str, path: Path | None = None) -> tuple[Path, int, int]:
     """Write a manifest of all recordings of a folder, its label columns empty.
+
+    Returns:
+        Its path, how many files it lists, and of how many of them the pattern told anything.
 
     Args:
         root: the folder.
@@ -301,4 +290,4 @@ def write_template(root: Path, pattern: str, path: Path | None = None) -> _Templ
     guesses = {file: guessed(file, pattern) for file in files}
     rows = [dict.fromkeys(_TEMPLATE_COLUMNS, "") | {"file": f, **own} for f, own in guesses.items()]
     write_table(path, _TEMPLATE_COLUMNS, rows)
-    return _Template(path, len(guesses), sum(map(bool, guesses.values())))
+    return path, len(guesses), sum(map(bool, guesses.values()))

@@ -13,6 +13,7 @@ import itertools
 import json
 import math
 import re
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -534,16 +535,14 @@ def _file_problem(root: Path, file: str) -> str | None:
 
 def _numbered(drafts: Sequence[Entry]) -> Iterator[Entry]:
     """Entries; an empty trial gets the next number free for its material, scene and session."""
-    names = [replace(draft.recording, cycle=0) for draft in drafts]
-    used: dict[RecordingId, set[int]] = {name: set() for name in names}
-    for name, draft in zip(names, drafts, strict=True):
-        used[name].add(draft.recording.cycle)
-    for name, draft in zip(names, drafts, strict=True):
-        trial = draft.recording.cycle
-        if trial < 0:
-            trial = next(number for number in itertools.count() if number not in used[name])
-            used[name].add(trial)
-        yield replace(draft, recording=replace(name, cycle=trial))
+    taken = {draft.recording for draft in drafts}
+    counts: dict[RecordingId, Iterator[int]] = defaultdict(itertools.count)
+    for draft in drafts:
+        name = draft.recording
+        if name.cycle < 0:
+            numbered = (replace(name, cycle=number) for number in counts[name])
+            name = next(each for each in numbered if each not in taken)
+        yield replace(draft, recording=name)
 
 
 def _twice(entries: Iterable[Entry]) -> list[Problem]:

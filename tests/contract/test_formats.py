@@ -31,6 +31,7 @@ from message_bags import (
     write_mcap,
 )
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tactslip_torch import HandLayout, Recording
 
@@ -777,6 +778,60 @@ def test_blocks_of_samples(tmp_path):
     assert read(single)[2] is None
     since = read(single, Reading(sample_rate_hz=100.0))[2]
     np.testing.assert_allclose(since, np.arange(9) / 100)
+
+
+TAXELS = "hand_msgs/msg/Taxels"
+
+
+def taxels(count, text="std_msgs/Header header\nfloat32[4] volts\nint16 number\n", **how):
+    """Messages of a type that ROS does not bring, and that only their file defines."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    own = "std_msgs/Header header\nfloat32[4] volts\nint16 number\n"
+    store.register(get_types_from_msg(own, TAXELS))
+    stamp, header = (store.types[n] for n in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header"))
+    messages = []
+    for number in range(count):
+        stamped = header(stamp(0, number * STEP_NS), "hand")
+        message = store.types[TAXELS](stamped, np.arange(4, dtype="f4") + number, number)
+        messages.append((7, bytes(store.serialize_cdr(message, TAXELS))))
+    return Sent("/taxels", TAXELS, messages, schema=text, **how)
+
+
+def test_types_that_a_file_defines(tmp_path):
+    samples, names, since, _ = read(write_mcap(tmp_path / "a.mcap", [taxels(9)]))
+    assert names == ("volts[0]", "volts[1]", "volts[2]", "volts[3]", "number")
+    assert samples.tolist() == [[n + k for n in range(9)] for k in range(4)] + [list(range(9))]
+    assert since.tolist() == [n * STEP_NS / 1e9 for n in range(9)]
+
+
+@pytest.mark.parametrize(
+    ("sent", "said"),
+    [
+        (taxels(3, "float32 __class__\n"), "a definition of hand_msgs/msg/Taxels"),
+        (taxels(3, "float32 import\n"), "with unusual names or sizes"),
+        (taxels(3, "float32[100000] volts\n"), "with unusual names or sizes"),
+        (taxels(3, "no { definition"), "that is no ros2msg"),
+        (taxels(3, schema_encoding=""), "no definition of hand_msgs/msg/Taxels as ros2msg"),
+        (
+            Sent("/b", FLOATS, [(1, array(np.ones(6), ("samples", "ch"), (7, 7)))]),
+            "6 numbers in a layout of [7, 7]",
+        ),
+        (
+            Sent("/b", FLOATS, [(n, array(np.ones(n))) for n in (3, 4)]),
+            "other channels than the first: 4 numbers",
+        ),
+        (
+            Sent("/j", "x", [(1, json_message({"a.b": 1, "a": {"b": 2}}))], "json", "", ""),
+            "two numbers of one name",
+        ),
+        (
+            Sent("/j", "x", [(1, json_message({"a": [0] * 5000}))], "json", "", ""),
+            "numbers an instant, 1 to 4096 are read",
+        ),
+    ],
+)
+def test_messages_that_are_no_samples_are_named(tmp_path, sent, said):
+    assert said in refused(write_mcap(tmp_path / "a.mcap", [sent]))
 
 
 def test_messages_go_by_their_times(tmp_path):

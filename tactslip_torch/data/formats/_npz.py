@@ -87,8 +87,7 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
                 if member.filename.endswith(".npy")
             }
         if "format" in stored and how.samples in (None, "samples"):
-            values = stored["samples"]
-            return opened_from(_header(path, values.shape, values.dtype), path, values, 1)
+            return opened_from(_header(stored), path, stored["samples"], 1)
         if how.samples is None and "samples" in stored:
             how = replace(how, samples="samples", time_first=how.time_first is True)
     whys = {name: why_not_numbers(kept.dtype, kept.shape) for name, kept in stored.items()}
@@ -96,29 +95,29 @@ def read(path: Path, how: Reading, stack: ExitStack) -> Opened:
     return choose(path, arrays, {n: why for n, why in whys.items() if why is not None}, how)
 
 
-def _header(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
-    with np.load(path, allow_pickle=False) as content:
-        if (form := str(content["format"])) != FORM:
-            raise Refused(f"must be of format {FORM!r}, got {form[:80]!r}")
-        columns = [column for column in _COLUMNS if f"channel_{column}" in content]
-        words = [content[f"channel_{column}"].tolist() for column in columns]
-        if len(shape) != 2 or shape[0] > MOST_CHANNELS or any(len(w) != shape[0] for w in words):
-            raise ValueError("a name for every row of samples")
-        rows = [dict(zip(columns, row, strict=True)) for row in zip(*words, strict=True)]
-        return {
-            "format": form,
-            "dtype": str(dtype),
-            "shape": list(shape),
-            "sample_rate_hz": float(content["sample_rate_hz"]),
-            **{name: str(content[name]) for name in _WORDS},
-            **{name: content[name].tolist() for name in MOMENTS},
-            **{name: content[name].tolist() if name in content else [] for name in STRETCHES},
-            **{name: json.loads(str(content[name])) for name in ("provenance", "key")},
-            "channels": [
-                {name: word for name, word in row.items() if word or name != "adapting"}
-                for row in rows
-            ],
-        }
+def _header(content: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """The header of a file of ours, from its arrays."""
+    if (form := str(content["format"])) != FORM:
+        raise Refused(f"must be of format {FORM!r}, got {form[:80]!r}")
+    shape = content["samples"].shape
+    columns = [column for column in _COLUMNS if f"channel_{column}" in content]
+    words = [content[f"channel_{column}"].tolist() for column in columns]
+    if len(shape) != 2 or shape[0] > MOST_CHANNELS or any(len(w) != shape[0] for w in words):
+        raise ValueError("a name for every row of samples")
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*words, strict=True)]
+    return {
+        "format": form,
+        "dtype": str(content["samples"].dtype),
+        "shape": list(shape),
+        "sample_rate_hz": float(content["sample_rate_hz"]),
+        **{name: str(content[name]) for name in _WORDS},
+        **{name: content[name].tolist() for name in MOMENTS},
+        **{name: content[name].tolist() if name in content else [] for name in STRETCHES},
+        **{name: json.loads(str(content[name])) for name in ("provenance", "key")},
+        "channels": [
+            {name: word for name, word in row.items() if word or name != "adapting"} for row in rows
+        ],
+    }
 
 
 def _checked(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
