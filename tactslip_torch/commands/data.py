@@ -102,7 +102,7 @@ def convert(config: DictConfig) -> list[Written]:
     for name in ("to", "output"):
         if config[name] is None:
             raise ValueError(f"no value for {name}; give to=FORMAT and output=FOLDER")
-    source = _source(config, skip_failed=bool(config.skip_failed or config.data.skip_failed))
+    source = _source(config, skip_failed=bool(config.skip_failed or config.data.get("skip_failed")))
     output = Path(str(config.output))
     if output.resolve() == source.root.resolve():
         raise ValueError("output must be another folder than root, which stays as it is")
