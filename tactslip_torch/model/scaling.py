@@ -6,11 +6,12 @@ quantiles are ours, for features whose tails are heavy on real recordings.
 
 from __future__ import annotations
 
-import numpy as np
+import math
+
 import torch
 from torch import Tensor, nn
 
-from tactslip_torch.features.ops import signed_log
+from tactslip_torch.features.ops import ascending, signed_log
 from tactslip_torch.runtime import is_concrete
 
 _COLUMNS = 128  # sorted at a time, which keeps memory small
@@ -113,21 +114,26 @@ class FeatureScaler(nn.Module):
 
 
 def _ranges_of(columns: Tensor, compress: bool, tail: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Minimum, maximum and knee of some features ``[N, k]``; ``[k]`` each."""
-    knee = torch.ones_like(columns[0])
+    """Minimum, maximum and knee of some features ``[N, k]``; ``[k]`` each, with gradients."""
+    ordered = ascending(columns.mT, len(columns))
+    knee = torch.ones_like(ordered[:, 0])
     if compress:
-        middle, largest = _quantiles(columns.abs(), 0.5)[0], columns.abs().amax(0)
+        size = ascending(columns.mT.abs(), len(columns))
+        middle, largest = _quantile(size, 0.5), size[:, -1]
         knee = torch.where(middle > 0, middle, torch.where(largest > 0, largest, knee))
-        columns = signed_log(columns, knee)
-    low, high = _quantiles(columns, tail, 1 - tail)
+        ordered = signed_log(ordered, knee[:, None])
+    low, high = _quantile(ordered, tail), -_quantile(-ordered.flip(1), tail)
     is_range = low < high
     return (
-        torch.where(is_range, low, columns.amin(0)),
-        torch.where(is_range, high, columns.amax(0)),
+        torch.where(is_range, low, ordered[:, 0]),
+        torch.where(is_range, high, ordered[:, -1]),
         knee,
     )
 
 
-def _quantiles(columns: Tensor, *shares: float) -> Tensor:
-    found: Tensor = torch.from_numpy(np.quantile(columns.numpy(force=True), shares, axis=0))
-    return found.to(columns)
+def _quantile(ordered: Tensor, share: float) -> Tensor:
+    """``numpy.quantile`` of ascending rows, for a share below 1."""
+    position = share * (ordered.shape[1] - 1)
+    index = math.floor(position)
+    above = ordered[:, min(index + 1, ordered.shape[1] - 1)]
+    return torch.lerp(ordered[:, index], above, position - index)

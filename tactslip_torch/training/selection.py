@@ -62,6 +62,7 @@ MOST_DUAL_BINS = 2500
 fold, so its cost grows with the bins."""
 MOST_EXTENSIONS = 3
 """Decades by which a grid of penalties that ends at its edge is extended, at either end."""
+_SCALED_BINS = 256  # at a time, which fits the cache of a processor
 
 
 # Held validation --------------------------------------------------------------------------
@@ -453,8 +454,10 @@ class _Columns:
         self._scalers: dict[str, FeatureScaler] = {}
         self._scaled: dict[str, Tensor] = {}
         for name, x in columns.items():
-            scaler = FeatureScaler.fit(x[self.train].double(), **options)
-            self._scalers[name], self._scaled[name] = scaler, scaler(x.double())
+            x = x.double()
+            scaler = FeatureScaler.fit(x[self.train], **options)
+            self._scalers[name] = scaler
+            self._scaled[name] = torch.cat([scaler(part) for part in x.split(_SCALED_BINS)])
         self._ranks: dict[str, Tensor] = {}
         self._products: dict[str, Tensor] = {}
 
