@@ -320,11 +320,6 @@ def test_the_same_recording_of_two_detectors_is_drawn_as_one():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"speeds_mm_s": (20.0, 40.0)}, "speeds_mm_s has 2 entries for 1 onsets and 2 alarms"),
-        ({"sliding_s": ()}, "sliding_s has 0 entries"),
-        ({"onset_estimates_s": (1.0,)}, "onset_estimates_s has 1 entries"),
-        ({"alarm_ends_s": (1.0,)}, "alarm_ends_s has 1 entries"),
-        ({"first_positive_s": (1.0, 2.0)}, "first_positive_s has 2 entries"),
         ({"alarms_s": (1.2, 1.1)}, "alarms_s must ascend"),
         ({"alarms_s": (1.2, math.nan)}, "alarms_s must ascend"),
         ({"watched_s": ((2.0, 1.0),)}, "watched_s must ascend"),

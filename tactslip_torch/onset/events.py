@@ -81,7 +81,7 @@ class Watched:
             and an alarm then holds until the next.
 
     Raises:
-        ValueError: if two of them disagree in their number, or times do not ascend.
+        ValueError: if times do not ascend.
     """
 
     recording: str
@@ -98,19 +98,6 @@ class Watched:
     alarm_ends_s: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        onsets, alarms = len(self.onsets_s), len(self.alarms_s)
-        for name, allowed in (
-            ("sliding_s", {onsets}),
-            ("speeds_mm_s", {onsets}),
-            ("first_positive_s", {0, onsets}),
-            ("onset_estimates_s", {0, alarms}),
-            ("alarm_ends_s", {0, alarms}),
-        ):
-            if len(getattr(self, name)) not in allowed:
-                raise ValueError(
-                    f"{self.recording}: {name} has {len(getattr(self, name))} entries for {onsets} "
-                    f"onsets and {alarms} alarms; give one each"
-                )
         ends = tuple(end for _, end in self.sliding_s)
         edges = tuple(edge for stretch in self.watched_s for edge in stretch)
         for name, times in (
@@ -378,7 +365,6 @@ def pooled_metrics(
     *,
     level: float = 0.95,
     num_resamples: int = 1000,
-    seed: int = 0,
 ) -> dict[str, Any]:
     """All recordings together, in JSON-able numbers; their order does not matter.
 
@@ -402,7 +388,6 @@ def pooled_metrics(
         events: of ``recording_events``; of several detectors if they are to be pooled.
         level: of the intervals.
         num_resamples: draws.
-        seed: of the draws.
 
     Raises:
         ValueError: if the level is not between 0 and 1, or nothing is to be drawn.
@@ -412,7 +397,7 @@ def pooled_metrics(
     counted = [one for one in events if is_one or one.scene == PAPER_SCENE]
 
     def summary(own: Sequence[RecordingEvents], *, is_group: bool = True) -> dict[str, Any]:
-        numbers = _summary(own, level, num_resamples, seed)
+        numbers = _summary(own, level, num_resamples)
         if is_group and numbers["delay_ms"]:
             del numbers["delay_ms"]["quantiles"]
         return numbers
@@ -441,12 +426,10 @@ def pooled_metrics(
     }
 
 
-def _summary(
-    events: Sequence[RecordingEvents], level: float, num_resamples: int, seed: int
-) -> dict[str, Any]:
+def _summary(events: Sequence[RecordingEvents], level: float, num_resamples: int) -> dict[str, Any]:
     """The numbers of ``pooled_metrics`` but for its groups."""
     names = {name: place for place, name in enumerate(dict.fromkeys(map(_name, events)))}
-    bootstrap = Bootstrap(len(names), level, num_resamples, seed)
+    bootstrap = Bootstrap(len(names), level, num_resamples)
 
     def total(of: Callable[[RecordingEvents], float]) -> list[float]:
         """Of every recording, by its place."""
@@ -479,13 +462,16 @@ def _summary(
             "p95": bootstrap.quantile(delay, recording, 0.95),
             "quantiles": delay.quantile(steps).tolist(),
         }
-        compute = [latency.compute_s for _, latency, _ in found if latency.compute_s is not None]
+        parts = {
+            "look_ahead": [latency.look_ahead_s for _, latency, _ in found],
+            "bin_fill": [onset.bin_fill_s for _, _, onset in found],
+            "decision": [onset.decision_s for _, _, onset in found],
+            "delay": [onset.delay_s for _, _, onset in found],
+            "compute": [of.compute_s for _, of, _ in found if of.compute_s is not None],
+        }
         latency_ms = {
-            "look_ahead": _mean_ms([latency.look_ahead_s for _, latency, _ in found]),
-            "bin_fill": _mean_ms([onset.bin_fill_s for _, _, onset in found]),
-            "decision": _mean_ms([onset.decision_s for _, _, onset in found]),
-            "delay": _mean_ms([onset.delay_s for _, _, onset in found]),
-            "compute": _mean_ms(compute) if compute else None,
+            name: 1000 * math.fsum(seconds) / len(seconds) if seconds else None
+            for name, seconds in parts.items()
         }
         error = 1000 * torch.tensor([onset.error_s for _, _, onset in found], dtype=torch.float64)
         is_known = ~error.isnan()
@@ -510,10 +496,6 @@ def _summary(
         "latency_ms": latency_ms,
         "onset_error_ms": error_ms,
     }
-
-
-def _mean_ms(seconds: Sequence[float]) -> float:
-    return 1000 * math.fsum(seconds) / len(seconds)
 
 
 def _name(one: RecordingEvents) -> tuple[str, str, str]:

@@ -85,7 +85,6 @@ def alarm_rate(
     counts: Tensor | Sequence[int],
     hours: Tensor | Sequence[float],
     level: float = 0.95,
-    seed: int = 0,
 ) -> AlarmRate:
     """The rate of alarms over recordings, with an interval that knows of clusters.
 
@@ -99,7 +98,6 @@ def alarm_rate(
         counts: alarms of each recording, ``[R]``.
         hours: how long each was watched, ``[R]``.
         level: of the interval.
-        seed: of the resampling.
 
     Raises:
         ValueError: if these are not two rows of equal length, none is longer than 0 hours, or a
@@ -125,7 +123,7 @@ def alarm_rate(
         low, high = poisson_interval(total / cluster, level)
         ends.append((low * cluster, high * cluster))
         tails = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
-        generator, rates = torch.Generator().manual_seed(seed), []
+        generator, rates = torch.Generator().manual_seed(0), []
         has_time = watched > 0
         size = int(has_time.sum())
         for first in range(0, _NUM_RESAMPLES, rows := max(1, 2**20 // size)):
@@ -184,7 +182,6 @@ def choose_threshold(
     refractory: int,
     ceiling: float = math.inf,
     level: float = 0.95,
-    seed: int = 0,
 ) -> Threshold:
     """The lowest threshold that keeps recordings without slip at or below a target rate.
 
@@ -208,7 +205,6 @@ def choose_threshold(
         refractory: shortest distance of two alarms, in decisions.
         ceiling: what the statistic cannot exceed, where calibration bounds it but not the rule.
         level: of the interval of the rate.
-        seed: of its resampling.
 
     Raises:
         ValueError: if there is no decision, a statistic is not a row of finite numbers, or the hop
@@ -242,7 +238,7 @@ def choose_threshold(
             most = step // 2
     value = min(value, float(torch.tensor(min(rule.ceiling, ceiling), dtype=statistics[0].dtype)))
     counts = alarm_counts(statistics, value, rearm=rearm, refractory=refractory)
-    rate = alarm_rate(counts, hours, level, seed)
+    rate = alarm_rate(counts, hours, level)
     return Threshold(value, false_alarms_per_hour, rate, int(counts.sum()) <= allowed)
 
 

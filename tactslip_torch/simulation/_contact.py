@@ -30,7 +30,7 @@ channels are asked for.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
@@ -53,7 +53,6 @@ from tactslip_torch.simulation._bristles import (
     LaneState,
     hertz_pressure,
     integrate,
-    integrator,
     stage_times_s,
 )
 from tactslip_torch.simulation.scene import (
@@ -285,10 +284,7 @@ class KinematicContact:
 
     Attributes:
         slips: when each element slides, over all strokes that do.
-        integrator: nothing.
     """
-
-    integrator: Mapping[str, str] = {}
 
     def __init__(self, scene: Scene, grasp: Grasp) -> None:
         self.slips = quasi_static_slips(grasp, scene.slides)
@@ -367,7 +363,6 @@ class StrokeTrace:
             ``[num + 1, E]`` float32.
         start_s: when gross sliding begins, NaN where it never does, ``[E]``.
         end_s: when it ends for good, ``[E]``.
-        integrator: what integrated it: see ``_bristles.integrator``.
     """
 
     first: int
@@ -377,7 +372,6 @@ class StrokeTrace:
     slide: NDArray[np.float32]
     start_s: Array
     end_s: Array
-    integrator: Mapping[str, str]
 
 
 class BristleContact:
@@ -391,7 +385,6 @@ class BristleContact:
 
     Attributes:
         slips: when each element slides grossly, over all strokes that do.
-        integrator: what integrated it; empty if there is no stroke.
 
     Raises:
         ValueError: if no whole number of steps makes a sample, or the hand never slides.
@@ -402,7 +395,6 @@ class BristleContact:
     ) -> None:
         self._scene, self._grasp = scene, grasp
         self._traces = scene_traces(scene) if traces is None else traces
-        self.integrator = self._traces[0].integrator if self._traces else {}
         rest = quasi_static_slips(grasp, scene.slides)
         start_s, end_s = np.full_like(rest.start_s, np.nan), np.full_like(rest.end_s, np.nan)
         load = grasp.load_n[grasp.touching]
@@ -644,12 +636,10 @@ def _integrated(
     start = np.stack([shear_n.double().cpu().numpy(), *np.zeros((2, len(shear_n)))])
     whole = np.concatenate([start[:, None], whole], axis=1)
     ends = np.cumsum([len(slide.shear) for slide in slides])[:-1]
-    by = integrator(backend, dtype, device)
-    pieces = np.split(whole, ends, axis=2)
-    return [_trace(slide, values, by) for slide, values in zip(slides, pieces, strict=True)]
+    return list(map(_trace, slides, np.split(whole, ends, axis=2)))
 
 
-def _trace(slide: _Slide, values: Array, by: Mapping[str, str]) -> StrokeTrace:
+def _trace(slide: _Slide, values: Array) -> StrokeTrace:
     """What is kept of a stroke's friction, inertia and slip speed, ``[3, num + 1, E]``."""
     friction, inertia, slip = values
     rate_hz = slide.scene.sample_rate_hz
@@ -667,7 +657,6 @@ def _trace(slide: _Slide, values: Array, by: Mapping[str, str]) -> StrokeTrace:
         relative.astype(np.float32),
         start_s,
         end_s,
-        by,
     )
 
 

@@ -11,7 +11,7 @@ elements that carry half of it stick again. Both are read from the contact, not 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from tactslip_torch.data.recording import Recording
 from tactslip_torch.native import BackendName
 from tactslip_torch.simulation._blocks import Array, Grid, generator
+from tactslip_torch.simulation._bristles import integrator
 from tactslip_torch.simulation._contact import (
     Contacts,
     Grasp,
@@ -129,7 +130,8 @@ def simulate(
     """
     if not dtype.is_floating_point:
         raise ValueError(f"dtype must be floating, got {dtype}")
-    return _recording(scene, None, windows, channels, dtype)
+    by = integrator() if scene.fidelity == "bristles" else {}
+    return _recording(scene, None, by, windows, channels, dtype)
 
 
 def simulate_many(
@@ -184,8 +186,9 @@ def simulate_many(
             distinct = list(dict.fromkeys(one for one in some if one.fidelity == "bristles"))
             integrated = traces_of(distinct, device=device, dtype=dtype, backend=backend)
             traces = dict(zip(distinct, integrated, strict=True))
+            by = integrator(backend, dtype, device) if distinct else {}
             for scene, intervals in zip(some, wanted[start : start + at_once], strict=True):
-                yield _recording(scene, traces.get(scene), intervals, channels)
+                yield _recording(scene, traces.get(scene), by, intervals, channels)
 
     return made()
 
@@ -193,11 +196,12 @@ def simulate_many(
 def _recording(
     scene: Scene,
     traces: tuple[StrokeTrace, ...] | None,
+    by: Mapping[str, str],
     windows: Sequence[tuple[float, float]] | None = None,
     channels: Iterable[str] | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Recording:
-    """``simulate`` with the traces of bristles that are integrated already, or ``None``."""
+    """``simulate`` with the traces of bristles, ``None`` to integrate, and the ``integrator``."""
     grasp = draw_grasp(scene)
     contact = scene_contact(scene, grasp, traces)
     truth = _timeline(scene, grasp, contact.slips)
@@ -226,7 +230,7 @@ def _recording(
         sliding_s=truth.sliding_s,
         annotated_onsets_s=truth.annotated_onsets_s,
         non_slip_s=truth.non_slip_s,
-        provenance=_provenance(scene, contact),
+        provenance=_provenance(scene, by),
     )
 
 
@@ -324,7 +328,7 @@ def _channel_indices(scene: Scene, channels: Iterable[str] | None) -> list[int]:
     return [index for index, name in enumerate(names) if name in asked]
 
 
-def _provenance(scene: Scene, contact: Contacts) -> dict[str, object]:
+def _provenance(scene: Scene, by: Mapping[str, str]) -> dict[str, object]:
     """Where the recording comes from."""
     provenance: dict[str, object] = {
         "simulated": True,
@@ -337,6 +341,6 @@ def _provenance(scene: Scene, contact: Contacts) -> dict[str, object]:
         "simulation_version": SIMULATION_VERSION,
         "numpy_version": np.__version__,
     }
-    if contact.integrator:
-        provenance["integrator"] = dict(contact.integrator)
+    if scene.fidelity == "bristles" and scene.slides:
+        provenance["integrator"] = dict(by)
     return provenance
