@@ -171,7 +171,7 @@ def is_concrete(x: Tensor) -> bool:
     Not so where a gradient or a tangent is carried along, a graph is recorded, ``x`` is transformed
     (vmap), or lies on another device than the CPU.
     """
-    if x.device.type != "cpu" or is_traced() or (x.requires_grad and torch.is_grad_enabled()):
+    if not x.is_cpu or is_traced() or (x.requires_grad and torch.is_grad_enabled()):
         return False
     try:
         x.detach().numpy()  # under vmap and other transforms there is no memory to look at

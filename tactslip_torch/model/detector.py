@@ -177,22 +177,20 @@ class SlipDetector(nn.Module):
             bins: in volts.
             nonfinite: what to do about NaN and Inf. ``"mask"``: the channel counts as missing, the
                 score is the one expected without it, and not valid. ``"raise"``: refuse.
-            given: dtype of the samples that the bins were filtered from, by default theirs; that of
-                the score, and what a sensor must resolve to be trusted.
+            given: dtype of the samples that the bins were filtered from, float32 or float64, by
+                default theirs; that of the score, and what a sensor must resolve to be trusted.
             masked_channels: channels that count as missing whatever they say.
 
         Shape:
             - bins: ``[*, C, n]``
 
         Raises:
-            ValueError: if the number of channels or samples is another, for a dead channel that the
-                hand does not have, or under ``"raise"`` for a NaN or Inf, naming where it is.
+            ValueError: if the number of channels or samples is another, for another dtype, for a
+                dead channel that the hand does not have, or under ``"raise"`` for a NaN or Inf,
+                naming where it is.
         """
         self.pool.check(bins)
-        check_nonfinite(nonfinite, bins, self.pool.hand.names)
-        bins = without(bins, masked_channels, self.pool.hand.names)
-        dtype = given or bins.dtype
-        return predict_in_parts(lambda part: self._predict(part, False, dtype), bins)
+        return self._predict_in_parts(bins, False, nonfinite, given, masked_channels)
 
     def predict_raw(
         self,
@@ -210,10 +208,7 @@ class SlipDetector(nn.Module):
             ValueError: as ``predict``.
         """
         self._check_raw(samples)
-        check_nonfinite(nonfinite, samples, self.pool.hand.names)
-        samples = without(samples, masked_channels, self.pool.hand.names)
-        dtype = given or samples.dtype
-        return predict_in_parts(lambda part: self._predict(part, True, dtype), samples)
+        return self._predict_in_parts(samples, True, nonfinite, given, masked_channels)
 
     def validity(self, bins: Tensor) -> Tensor:
         """Whether every channel in use can be trusted (``FeaturePool.validity``), as ``predict``.
@@ -254,14 +249,14 @@ class SlipDetector(nn.Module):
         return scaled.to(self.imputation.dtype)
 
     def _check_raw(self, samples: Tensor) -> None:
-        self.channel_filter.check(samples)
+        (channel_filter := self.channel_filter).check(samples)
         if samples.dtype not in _DTYPES:
             raise ValueError(f"expected float32 or float64 samples in volts, got {samples.dtype}")
-        wanted = self.context_before + self.pool.bin_samples + self.context_after
-        if samples.shape[-1] != wanted:
+        before, after = channel_filter.context_before, channel_filter.context_after
+        if samples.shape[-1] != (wanted := before + self.pool.bin_samples + after):
             raise ValueError(
-                f"expected bins of {wanted} samples, {self.context_before} of context before and "
-                f"{self.context_after} behind, got {samples.shape[-1]}"
+                f"expected bins of {wanted} samples, {before} of context before and {after} "
+                f"behind, got {samples.shape[-1]}"
             )
 
     def _score(self, x: Tensor, is_raw: bool) -> Tensor:
@@ -273,6 +268,24 @@ class SlipDetector(nn.Module):
     def _score_by_torch(self, x: Tensor, is_raw: bool) -> Tensor:
         features = self._features(self._filter(x) if is_raw else x)
         return saturating(self.score_features(features), x.dtype)
+
+    def _predict_in_parts(
+        self,
+        x: Tensor,
+        is_raw: bool,
+        nonfinite: Nonfinite,
+        given: torch.dtype | None,
+        masked_channels: ChannelMask | None,
+    ) -> Prediction:
+        names, dtype = self.pool.hand.names, given or x.dtype
+        if dtype not in _DTYPES:
+            raise ValueError(
+                f"given must be torch.float32 or torch.float64, got {dtype}; use torch.float32 for "
+                "samples of less"
+            )
+        check_nonfinite(nonfinite, x, names)
+        x = without(x, masked_channels, names)
+        return predict_in_parts(lambda part: self._predict(part, is_raw, dtype), x)
 
     def _predict(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
         """The same, valid by the dtype they were given in, which is the score's."""
@@ -500,21 +513,15 @@ class _Engine:
 
     def scores(self, x: Tensor, is_raw: bool) -> Tensor:
         """As ``SlipDetector._score``."""
-        flat, filters = _rows(x), self._filters if is_raw else None
-        found = self._engines[x.dtype].score(self._machine, flat, filters)
-        score = self._score(found, x.dtype)
+        flat, found, score = self._run(x, is_raw, x.dtype, None)
         for row in found.is_odd.nonzero()[0].tolist():  # torch has no limits
             score[row] = self._of._score_by_torch(torch.from_numpy(flat[row : row + 1]), is_raw)[0]
         return torch.from_numpy(score.reshape(x.shape[:-2]))
 
     def predict(self, x: Tensor, is_raw: bool, given: torch.dtype) -> Prediction:
         """As ``SlipDetector._predict``."""
-        flat, filters = _rows(x), self._filters if is_raw else None
-        engine, of_numpy = self._engines[x.dtype], _DTYPES[given]
-        found = engine.score(self._machine, flat, filters, self._inverse[given], of_numpy)
-        score = self._score(found, given)
-        variance = np.zeros_like(score)
-        is_valid = found.is_valid & np.isfinite(score)
+        flat, found, score = self._run(x, is_raw, given, self._inverse[given])
+        is_valid, variance = found.is_valid & np.isfinite(score), np.zeros(len(score), score.dtype)
         arrays = (score, is_valid, found.is_missing, variance)
         parts = Prediction(*map(torch.from_numpy, arrays))
         if found.is_missing.any():
@@ -531,20 +538,20 @@ class _Engine:
             return parts
         return Prediction(*(each.reshape((*x.shape[:-2], *each.shape[1:])) for each in parts))
 
-    def _score(self, found: Scores, given: torch.dtype) -> Any:
-        if found.score is None:
-            score = self._of.head(torch.from_numpy(found.scaled).to(self._of.imputation)).numpy()
-        else:
-            score = found.score
-        most = np.finfo(_DTYPES[given]).max
-        return score.clip(-most, most).astype(_DTYPES[given], copy=False)
+    def _run(
+        self, x: Tensor, is_raw: bool, given: torch.dtype, inverse: Any
+    ) -> tuple[Any, Scores, Any]:
+        """Bins ``[M, C, n]`` whose samples lie side by side, what is found of them, and scores."""
+        flat = x.detach().numpy().reshape(-1, *x.shape[-2:])
+        if flat.strides[-1] != flat.itemsize:
+            flat = np.ascontiguousarray(flat)
+        engine, filters = self._engines[x.dtype], self._filters if is_raw else None
+        found = engine.score(self._machine, flat, filters, _DTYPES[given], inverse)
+        if found.score is not None:
+            return flat, found, found.score
+        score = self._of.head(torch.from_numpy(found.scaled).to(self._of.imputation))
+        return flat, found, saturating(score, given).numpy()
 
 
 _KNOWN_TO_ENGINE = (ChannelPooling, FeatureScaler, ChannelFilter, FeaturePool)
 _DTYPES: dict[torch.dtype, Any] = {torch.float32: np.float32, torch.float64: np.float64}
-
-
-def _rows(x: Tensor) -> Any:
-    """``[*, C, n]`` as an array ``[M, C, n]``, samples of a channel side by side."""
-    rows = x.detach().numpy().reshape(-1, *x.shape[-2:])
-    return rows if rows.strides[-1] == rows.itemsize else np.ascontiguousarray(rows)

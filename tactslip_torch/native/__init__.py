@@ -16,6 +16,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -121,7 +122,7 @@ class _Kept:
         return array.ctypes.data
 
     def _run(self, plan: Any, machine: Any, bins: _Bins) -> None:
-        pointers = (each if each is None else ctypes.byref(each) for each in (plan, machine, bins))
+        pointers = (each and ctypes.byref(each) for each in (plan, machine, bins))
         if self._library.tactslip_features(self._level, *pointers):
             raise MemoryError("the native engine found no memory to work in")
 
@@ -218,18 +219,17 @@ class FeatureEngine(_Kept):
         """
         is_odd = np.zeros(len(bins), np.bool_)
         _check_floats(out)
-        call = _bins_of(bins, is_odd)
-        call.features, call.features_are_float = out.ctypes.data, out.dtype == np.float32
-        self._run(self._plan, None, call)
+        to = (out.ctypes.data, out.dtype == np.float32, is_odd.ctypes.data)
+        self._run(self._plan, None, _Bins(*_samples_of(bins), None, *to))
         return is_odd
 
     def score(
         self,
         machine: Machine,
         bins: Array,
-        filters: Filters | None = None,
+        filters: Filters | None,
+        given: Any,
         inverse_span: Array | None = None,
-        given: Any = np.float64,
     ) -> Scores:
         """Scores of bins, all in one call.
 
@@ -237,34 +237,38 @@ class FeatureEngine(_Kept):
             machine: from features to the score.
             bins: with the context that the filters need.
             filters: of the channels; None: bins are filtered.
+            given: dtype of the score, in which extremes are compared as well.
             inverse_span: one over the least span of a channel that can be trusted, as a part of its
                 magnitude; channels with a NaN or Inf are then left out (``Scores.is_missing``).
                 Without, they make a score NaN.
-            given: dtype in which extremes are compared for that.
 
         Shape:
             - bins: ``[M, C, n + context]``, float32 or float64; samples of a channel lie side by
               side; inverse_span: ``[C]``, float64
         """
         num, leaves_out = len(bins), inverse_span is not None
-        found = Scores(
-            np.zeros(num, np.bool_),
-            np.empty((num, machine.num_columns if leaves_out or not machine.has_head else 0)),
-            np.empty(num) if machine.has_head else None,
-            np.ones(num, np.bool_),
-            np.zeros((num, self.num_channels), np.bool_),
-        )
-        call = _bins_of(bins, found.is_odd)
-        call.filters = None if filters is None else filters.address
-        call.scaled = found.scaled.ctypes.data if found.scaled.size else None
-        call.score = None if found.score is None else found.score.ctypes.data
+        width = machine.num_columns if leaves_out or not machine.has_head else 0
+        ends = [*accumulate((8 * num, 8 * num * width, num, num, num * self.num_channels))]
+        memory = np.zeros(ends[-1], np.uint8)  # of all that is found: one address to ask for
+        start = memory.ctypes.data
+        call = _Bins(
+            *_samples_of(bins), filters and filters.address, None, False, start + ends[1],
+            start + ends[0] if width else None, start if machine.has_head else None,
+        )  # fmt: skip
+        call.given_as_float = given == np.float32
         if inverse_span is not None:
-            call.is_missing = found.is_missing.ctypes.data
-            call.is_valid = found.is_valid.ctypes.data
+            call.is_valid, call.is_missing = start + ends[2], start + ends[3]
             call.inverse_span = inverse_span.ctypes.data
-            call.given_as_float = given == np.float32
         self._run(self._plan, machine.of, call)
-        return found
+        flags = memory[ends[1] :].view(np.bool_)
+        score = memory[: ends[0]].view(np.float64)
+        return Scores(
+            flags[:num],
+            memory[ends[0] : ends[1]].view(np.float64).reshape(num, width),
+            score.astype(given, copy=False) if machine.has_head else None,
+            flags[num : 2 * num],
+            flags[2 * num :].reshape(num, self.num_channels),
+        )
 
     def _matrices(self, matrices: Sequence[Array], rows: int, dtype: Any) -> int:
         """Matrices in blocks of rows, each with the columns that are not zero in it."""
@@ -391,12 +395,11 @@ class Machine(_Kept):
         """Columns of bins, scaled if there is a scaling, ``[M, K]``.
 
         Shape:
-            - inputs: ``[M, inputs]``, float32 or float64, values of a bin side by side
+            - inputs: ``[M, inputs]``, float32 or float64
             - is_missing: ``[M, C]``, bool, channels that are left out of their pools
         """
         found = np.empty((len(inputs), self.num_columns))
-        call = _bins_of(inputs, None)
-        call.scaled = found.ctypes.data
+        call = _Bins(*_samples_of(np.asarray(inputs, np.float64)), scaled=found.ctypes.data)
         if is_missing is not None:
             is_missing = np.ascontiguousarray(is_missing)
             call.is_missing = is_missing.ctypes.data
@@ -409,8 +412,8 @@ class Scores(NamedTuple):
 
     Attributes:
         is_odd: magnitudes are out of range, and all else is of no meaning, ``[M]``.
-        scaled: columns, ``[M, K]``; of no bin where there is a score and nothing is left out.
-        score: ``[M]``; None without a head.
+        scaled: columns, ``[M, K]``; K is 0 where there is a score and nothing is left out.
+        score: ``[M]``, finite or NaN; None without a head.
         is_valid: every channel that is read can be trusted, ``[M]``.
         is_missing: channels that were left out, ``[M, C]``.
     """
@@ -422,17 +425,13 @@ class Scores(NamedTuple):
     is_missing: Array
 
 
-def _bins_of(array: Array, is_odd: Array | None) -> _Bins:
-    """A call on an array, whose last axis must be contiguous."""
+def _samples_of(array: Array) -> tuple[int, bool, int, int, int]:
+    """Address, precision, length and strides of an array, whose last axis must be contiguous."""
     _check_floats(array)
-    size = array.itemsize
-    if array.size and array.shape[-1] > 1 and array.strides[-1] != size:
-        raise ValueError(f"expected an array whose last axis is contiguous, got {array.strides}")
-    call = _Bins(array.ctypes.data, array.dtype == np.float32, len(array))
-    call.bin_stride = array.strides[0] // size
-    call.channel_stride = array.strides[1] // size
-    call.is_odd = None if is_odd is None else is_odd.ctypes.data
-    return call
+    size, strides = array.itemsize, array.strides
+    if array.size and array.shape[-1] > 1 and strides[-1] != size:
+        raise ValueError(f"expected an array whose last axis is contiguous, got {strides}")
+    return array.ctypes.data, size == 4, len(array), strides[0] // size, strides[1] // size
 
 
 def _check_floats(array: Array) -> None:

@@ -21,8 +21,9 @@ constexpr double CV_FLOOR = 1e-6;       // part of the rms that the mean counts 
 constexpr double CV_ZERO = 1e-12;       // part of it within which a mean has no sign
 constexpr double CROWDED = 2e-3;        // part of a row's span; float rounds to 3e-8 of it
 constexpr double LEVELS = 255;          // of entropy's histogram, less one
-constexpr double SMALLEST = 0x1p-320, LARGEST = 0x1p448;  // between them squares are in range
+constexpr double SMALLEST_USUAL = 0x1p-320, LARGEST_USUAL = 0x1p448;  // squares are in range
 constexpr double LARGEST_SAMPLE = 0x1.fffffffffffffp1017;  // volts; beyond it a channel is missing
+constexpr double LARGEST = 0x1.fffffffffffffp1023, LARGEST_FLOAT = 0x1.fffffep127;
 constexpr int USUAL = 100;              // values of a row whose sort is straight-line code
 constexpr int CHUNK = 32;               // bins whose features are made before they are scored
 
@@ -44,6 +45,10 @@ template <> struct Lanes<float> {
   typedef uint8_t Few __attribute__((vector_size(VECTOR_BYTES / 4)));
 };
 typedef uint8_t Bytes __attribute__((vector_size(VECTOR_BYTES)));
+
+// NaN stays NaN.
+INLINE double clamped(double x, double most) { return x > most ? most : x < -most ? -most : x; }
+INLINE D clamped(D x, double most) { return x > most ? D{} + most : x < -most ? D{} - most : x; }
 
 // -- Sorting -------------------------------------------------------------------------------------
 
@@ -366,10 +371,10 @@ template <class T> struct Group : Describe<T> {
       bool finite = true;
       for (int64_t i = 0; i < span; ++i) {
         double size = fabs((double)from[i]);
-        finite &= size <= 1.7976931348623157e308;
+        finite &= size <= LARGEST;
         most = size > most ? size : most;
       }
-      bool usual = most == 0 || (SMALLEST <= most && most <= LARGEST);
+      bool usual = most == 0 || (SMALLEST_USUAL <= most && most <= LARGEST_USUAL);
       is_broken[k] = !finite;
       bins.is_odd[bin[k]] |= finite && !usual;
       bool is_read = finite && usual;
@@ -429,7 +434,7 @@ template <class T> struct Group : Describe<T> {
       int64_t base = (bin[k] - first_bin) * plan.num_features;
       for (int64_t w = plan.first[at]; w < plan.first[at + 1]; ++w) {
         double v = ((const double*)values[plan.descriptor[w]])[k];
-        v = v > limit ? limit : v < -limit ? -limit : v;
+        v = clamped(v, limit);
         v = is_broken[k] && !bins.is_missing ? (double)NAN : v;
         if (out_is_float)
           ((float*)out)[base + plan.column[w]] = (float)v;
@@ -702,7 +707,7 @@ INLINE D log1p_of(D x) {
 // sign(x) knee log(1 + |x| / knee)
 INLINE D signed_log(D x, D knee) {
   D size = x < 0 ? -x : x, ratio = size / knee, bent = knee * log1p_of(ratio);
-  auto is_far = ratio > 1.7976931348623157e308;
+  auto is_far = ratio > LARGEST;
   if (any(is_far))
     for (int k = 0; k < DL; ++k)
       if (is_far[k]) bent[k] = knee[k] * fmax(log(fmax(size[k], knee[k])) - log(knee[k]), 0x1.62e42fefa39efp9);
@@ -713,7 +718,8 @@ INLINE D signed_log(D x, D knee) {
 struct Judge {
   const Machine& machine;
   D *x, *z, *values, *sorted, *in_use;  // [inputs], [columns], three times [channels]
-  int64_t at;  // the first of a few bins
+  double most;  // of a score
+  int64_t at;   // the first of a few bins
   int few;
   const uint8_t* is_missing;  // of these bins
 
@@ -730,8 +736,8 @@ struct Judge {
   }
 
   // Of inputs of bins from `start` on.
-  template <class X>
-  void judge(const X* inputs, int64_t stride, int64_t start, int64_t num, const Bins& bins) {
+  void judge(const double* inputs, int64_t stride, int64_t start, int64_t num, const Bins& bins) {
+    most = bins.given_as_float ? LARGEST_FLOAT : LARGEST;
     for (int64_t b = 0; b < num; b += DL) {
       at = start + b;
       few = (int)(num - b < DL ? num - b : DL);
@@ -740,18 +746,17 @@ struct Judge {
     }
   }
 
-  template <class X>
-  void judge_few(const X* inputs, int64_t stride, double* scaled, double* score) {
+  void judge_few(const double* inputs, int64_t stride, double* scaled, double* score) {
     const Machine& m = machine;
     for (int64_t i = 0; i < m.num_inputs; ++i)
-      for (int k = 0; k < DL; ++k) x[i][k] = (double)inputs[(k < few ? k : 0) * stride + i];
+      for (int k = 0; k < DL; ++k) x[i][k] = inputs[(k < few ? k : 0) * stride + i];
     for (int64_t i = 0; i < m.num_singles; ++i) z[m.single_columns[i]] = x[m.single_inputs[i]];
     for (int64_t p = 0; p < m.num_pools; ++p) pool(m.pools[p]);
     if (m.minimum)
       for (int64_t i = 0; i < m.num_columns; ++i) z[i] = scale(i, z[i]);
     for (int k = 0; scaled && k < few; ++k)
       for (int64_t i = 0; i < m.num_columns; ++i) scaled[(at + k) * m.num_columns + i] = z[i][k];
-    D sums = score ? head() : D{};
+    D sums = score ? clamped(head(), most) : D{};
     for (int k = 0; score && k < few; ++k) score[at + k] = sums[k];
   }
 
@@ -808,7 +813,7 @@ struct Judge {
     double width = machine.maximum[i] - machine.minimum[i];
     if (!(width > 0)) return value - value;  // 0; NaN stays NaN
     value = 2 * ((value - machine.minimum[i]) / width) - 1;
-    return value < -1 ? D{} - 1 : value > 1 ? D{} + 1 : value;
+    return clamped(value, 1);
   }
 
   D head() {
@@ -847,7 +852,7 @@ template <class T> int run(const Plan& plan, const Machine* machine, const Bins&
   judge.place(at += of_group);
   double* features = (double*)(at + of_judge);
   group.out_is_float = !machine && bins.features_are_float;
-  group.limit = group.out_is_float ? 3.4028234663852886e38 : 1.7976931348623157e308;
+  group.limit = group.out_is_float ? LARGEST_FLOAT : LARGEST;
   const int64_t* channels[2] = {plan.slow, plan.fast};
   const int64_t counts[2] = {plan.num_slow, plan.num_fast};
   for (int64_t start = 0; start < bins.num_bins; start += CHUNK) {
@@ -899,6 +904,7 @@ template <class X> void note_unused(const Plan& plan, const Bins& bins) {
 // Without a plan, samples are the machine's inputs.
 extern "C" int FEATURES_ENTRY(const Plan* plan, const Machine* machine, const Bins* bins) {
   if (plan && bins->is_missing) {
+    memset(bins->is_valid, 1, bins->num_bins);
     if (bins->is_float)
       note_unused<float>(*plan, *bins);
     else
@@ -910,10 +916,7 @@ extern "C" int FEATURES_ENTRY(const Plan* plan, const Machine* machine, const Bi
   char* memory = (char*)malloc(judge.place(nullptr) + 2 * VECTOR_BYTES);
   if (!memory) return 1;
   judge.place(aligned(memory));
-  if (bins->is_float)
-    judge.judge((const float*)bins->samples, bins->bin_stride, 0, bins->num_bins, *bins);
-  else
-    judge.judge((const double*)bins->samples, bins->bin_stride, 0, bins->num_bins, *bins);
+  judge.judge((const double*)bins->samples, bins->bin_stride, 0, bins->num_bins, *bins);
   free(memory);
   return 0;
 }

@@ -37,7 +37,7 @@ struct Filter {
 
 // Bins to be described, and where what is found is written; a null pointer: it is not wanted.
 struct Bins {
-  const void* samples;  // those of a channel lie side by side; without a plan: inputs of a machine
+  const void* samples;  // those of a channel lie side by side; without a plan: inputs of a machine, double
   int64_t is_float, num_bins, bin_stride, channel_stride;  // in samples
   const Filter* filters;  // [channels]; null: samples are filtered
   void* features;         // [M, features]

@@ -304,8 +304,8 @@ class Decider:
     def reset(self) -> None:
         """Forget everything; the next decision is number 0 of a stream that begins at 0."""
         self._number = 0  # Python's integers do not end
-        # of the rule; of the latch, one a stream; where the run began
-        self._state: tuple[Tensor, list[Latch], Array] | None = None
+        # of the rule (of one stream plain numbers); of the latch, one a stream; where the run began
+        self._state: tuple[Any, list[Latch], Array] | None = None
 
     def decide(
         self,
@@ -329,8 +329,8 @@ class Decider:
         settings = self.settings
         if self._state is None:
             like = score.new_zeros(score.shape[:-1])
-            none = np.zeros(like.shape, np.int64)
-            self._state = settings.rule.start(like), [Latch()] * like.numel(), none
+            none, start = np.zeros(like.shape, np.int64), settings.rule.start(like)
+            self._state = start if like.ndim else start.tolist(), [Latch()] * like.numel(), none
         of_rule, latches, run = self._state
         if variance is None:
             llr = settings.calibration.llr(score)
@@ -339,17 +339,21 @@ class Decider:
         tells = is_valid if is_usable is None else is_usable
         ratios = llr.detach().numpy()
         ratios = np.where(tells.numpy() & np.isfinite(ratios), ratios, ratios.dtype.type(NEUTRAL))
+        one = ratios.dtype.type
         llr = torch.from_numpy(ratios)
-        statistic, of_rule = settings.rule.scan(llr, of_rule)
-        least = float(ratios.dtype.type(settings.threshold))
+        if score.ndim == 1:
+            row, of_rule = settings.rule.scan_row(ratios.tolist(), of_rule, one)
+            statistic, rows = torch.from_numpy(np.array(row, one)), [row]
+        else:
+            statistic, of_rule = settings.rule.scan(llr, of_rule)
+            rows = statistic.flatten(0, -2).tolist()
         times = {"rearm": self._rearm, "refractory": self._refractory}
-        rows = statistic.reshape(len(latches), statistic.shape[-1]).tolist()
         made = [
-            latch(row, least, **times, state=state)
+            latch(row, float(one(settings.threshold)), **times, state=state)
             for row, state in zip(rows, latches, strict=True)
         ]
         is_alarm, is_on = (
-            torch.tensor([of_row[part] for of_row in made], dtype=torch.bool).view(statistic.shape)
+            torch.from_numpy(np.array([of_row[part] for of_row in made], bool).reshape(score.shape))
             for part in (0, 1)
         )
         latches = [state for _, _, state in made]

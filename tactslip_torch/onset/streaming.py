@@ -187,11 +187,6 @@ class StreamingDetector:
         self._number = 0  # of the next decision
         self._nothing = self._decide(-1)
 
-    def _samples_for(self, number: Array) -> Array:
-        """Samples that must have come before decisions can be made, ``[m]``."""
-        samples: Array = number * self.settings.hop_samples + self._first
-        return samples.clip(min=self._frame)  # which may be longer than a bin
-
     def _read(self, samples: ArrayLike | Tensor) -> Array:
         """Samples ``[n, C]`` as a copy ``[C, n]`` in the stream's dtype."""
         if not isinstance(samples, Tensor):
@@ -234,8 +229,10 @@ class StreamingDetector:
         """Filter and decide, once the next decision has all its samples."""
         self._clock.take(x.shape[-1], places, times_s)
         self._append(x)
-        num_samples, due = self._clock.num_samples, int(self._samples_for(np.array(self._number)))
-        return self._nothing if num_samples < due else self._decide(num_samples - self._first)
+        num_samples, start = self._clock.num_samples, self._number * self.settings.hop_samples
+        if num_samples < max(start + self._first, self._frame):
+            return self._nothing
+        return self._decide(num_samples - self._first)
 
     def _append(self, x: Array) -> None:
         self._held = np.concatenate([self._held, x], -1, dtype=self._held.dtype)
@@ -267,21 +264,16 @@ class StreamingDetector:
             whole = before + length + detector.context_after
             stop = start + (count - 1) * hop + whole
             held = self._held[:, start:stop]
-            padded = np.zeros(
-                (len(held), stop - start), held.dtype
-            )  # where no channel in use looks
-            padded[:, : held.shape[-1]] = held
+            padded = np.zeros((len(held), stop - start), held.dtype)
+            padded[:, : held.shape[-1]] = held  # behind it no channel in use looks
             windows = torch.from_numpy(padded).unfold(-1, whole, hop).transpose(0, 1)
             scores = detector.predict_raw(
                 windows, given=self.dtype, masked_channels=self._masked_channels or None
             )
-            is_whole = not scores.is_missing.numpy().any()
-            tells = (
-                scores.score.isfinite()
-                if is_whole
-                else is_usable(scores.score, scores.is_missing, detector.needed_index)
-            )
-            variance = None if is_whole else scores.variance
+            tells, variance = scores.is_valid, None
+            if not tells.numpy().all():
+                tells = is_usable(scores.score, scores.is_missing, detector.needed_index)
+                variance = scores.variance
             decisions = self._decider.decide(scores.score, scores.is_valid, tells, variance)
         self._number += count
         self._drop()
@@ -291,8 +283,8 @@ class StreamingDetector:
         """The same by the times of the samples, and no earlier than the first frame."""
         if not self._clock.is_timed and self._frame <= self._first:
             return decisions
-        samples = self._samples_for(decisions.number.numpy())
-        available_s = torch.from_numpy(self._clock.end_s(samples))
+        samples = decisions.number.numpy() * self.settings.hop_samples + self._first
+        available_s = torch.from_numpy(self._clock.end_s(samples.clip(min=self._frame)))
         onset_s = available_s - (decisions.available_s - decisions.onset_s)
         return decisions._replace(available_s=available_s, onset_s=onset_s)
 
