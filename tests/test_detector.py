@@ -116,6 +116,14 @@ def test_the_score_has_the_dtype_of_the_bins(detector, dtype):
     assert torch.equal(samples, before)
 
 
+@pytest.mark.parametrize("method", ["predict", "predict_raw"])
+@pytest.mark.parametrize("given", [torch.float16, torch.bfloat16, torch.int64])
+def test_samples_given_in_another_dtype_are_refused(method, given, detector):
+    bins = noise(1, num_samples=150 if method == "predict_raw" else 100)
+    with pytest.raises(ValueError, match="^given must be torch.float32 or torch.float64, got"):
+        getattr(detector, method)(bins, given=given)
+
+
 @pytest.mark.parametrize("bad", [float("nan"), -float("inf")])
 @pytest.mark.parametrize("kind", ["SG", "PVDF"])
 @pytest.mark.parametrize("variant", VARIANTS)

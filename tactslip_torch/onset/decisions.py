@@ -329,8 +329,9 @@ class Decider:
         settings = self.settings
         if self._state is None:
             like = score.new_zeros(score.shape[:-1])
-            none, start = np.zeros(like.shape, np.int64), settings.rule.start(like)
-            self._state = start if like.ndim else start.tolist(), [Latch()] * like.numel(), none
+            start: Any = settings.rule.start(like)
+            of_rule, none = start if like.ndim else start.tolist(), np.zeros(like.shape, np.int64)
+            self._state = of_rule, [Latch()] * like.numel(), none
         of_rule, latches, run = self._state
         if variance is None:
             llr = settings.calibration.llr(score)
