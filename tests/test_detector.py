@@ -120,7 +120,7 @@ def test_the_score_has_the_dtype_of_the_bins(detector, dtype):
 @pytest.mark.parametrize("given", [torch.float16, torch.bfloat16, torch.int64])
 def test_samples_given_in_another_dtype_are_refused(method, given, detector):
     bins = noise(1, num_samples=150 if method == "predict_raw" else 100)
-    with pytest.raises(ValueError, match="^given must be torch.float32 or torch.float64, got"):
+    with pytest.raises(ValueError, match=r"^given must be torch\.float32 or "):
         getattr(detector, method)(bins, given=given)
 
 
