@@ -936,10 +936,9 @@ class FileRecordings:
         one = self._files[recording]
         found = Inspected([], [], {})
         for part, samples in self._opened(one):
-            rate_hz = part.rate_hz
+            rate_hz, above = part.rate_hz, len(found.least)
             low = torch.full((samples.num_channels,), torch.inf, dtype=torch.float64)
-            high, count = -low, torch.zeros(len(low), dtype=torch.int64)
-            first = torch.full_like(count, -1)
+            high = -low
             is_missing = torch.zeros(samples.num_samples, dtype=torch.bool)
             for start_s, end_s in one.times.missing_s:
                 is_missing[round(start_s * rate_hz) : round(end_s * rate_hz)] = True
@@ -949,12 +948,10 @@ class FileRecordings:
                 low = torch.minimum(low, values.where(is_fine, torch.inf).amin(-1))
                 high = torch.maximum(high, values.where(is_fine, -torch.inf).amax(-1))
                 is_bad = ~is_fine & ~is_missing[seen : seen + piece.shape[-1]]
-                is_first = (first < 0) & is_bad.any(-1)
-                first = torch.where(is_first, seen + is_bad.int().argmax(-1), first)
-                count += is_bad.sum(-1)
-            for row in count.nonzero().flatten().tolist():
-                place = len(found.least) + row
-                found.broken[place] = (int(count[row]), int(first[row]) / rate_hz)
+                for row in is_bad.any(-1).nonzero().flatten().tolist():
+                    first_s = (seen + int(is_bad[row].int().argmax())) / rate_hz
+                    count, first_s = found.broken.get(above + row, (0, first_s))
+                    found.broken[above + row] = count + int(is_bad[row].sum()), first_s
             is_known = low <= high
             found.least.extend(low.where(is_known, torch.nan).tolist())
             found.greatest.extend(high.where(is_known, torch.nan).tolist())
@@ -996,7 +993,7 @@ class Inspected(NamedTuple):
         odd = [
             f"{names[row]} is not finite in {count} samples, first at {first_s:.4f} s; leave the "
             "stretch out as missing_s, or repair it"
-            for row, (count, first_s) in self.broken.items()
+            for row, (count, first_s) in sorted(self.broken.items())
         ]
         ranges = zip(names, self.least, self.greatest, strict=True)
         still = [(name, least) for name, least, greatest in ranges if least == greatest]

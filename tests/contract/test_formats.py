@@ -394,11 +394,11 @@ def test_a_text_table_is_found_out(tmp_path, content):
     assert_rows(read(tmp_path / "a.txt"), ("a", "b") if TABLES[content] else None)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
-def test_encodings(tmp_path, encoding):
-    content = "t;Kraft °;b\n0;1,5;-2\n0,5;2,5;4e-3\n1;;5\n"
-    (tmp_path / "a.txt").write_bytes(content.encode(encoding))
-    assert_rows(read(tmp_path / "a.txt"), ("Kraft °", "b"))
+def test_encodings(tmp_path):
+    for encoding in ("utf-8", "utf-8-sig", "latin-1", "utf-16"):
+        content = "t;Kraft °;b\n0;1,5;-2\n0,5;2,5;4e-3\n1;;5\n"
+        (tmp_path / "a.txt").write_bytes(content.encode(encoding))
+        assert_rows(read(tmp_path / "a.txt"), ("Kraft °", "b"))
 
 
 LVM = (
@@ -529,106 +529,115 @@ def test_numpy_arrays(tmp_path, dtype):
         assert (names, since, rate) == (None, None, None)
 
 
-def test_archives_with_names_times_and_rates(tmp_path):
-    volts = np.arange(18, dtype=np.int16).reshape(9, 2)
-    np.savez(tmp_path / "a.npz", volts=volts, stamp=np.arange(9) * 500_000 + 10**18, fs=2000.0)
-    samples, _, since, rate = read(tmp_path / "a.npz", Reading(samples="volts", time_unit="ns"))
-    assert samples.tolist() == volts.T.tolist()
-    assert since.tolist() == pytest.approx(np.arange(9) * 0.0005, abs=1e-15)
-    assert rate == 2000.0
-    assert "'clock'" in refused(tmp_path / "a.npz", Reading(samples="volts", time="clock"))
-    np.savez(tmp_path / "square.npz", volts=np.zeros((3, 3)))
-    assert "reading.time_first" in refused(tmp_path / "square.npz", Reading(samples="volts"))
-    np.save(tmp_path / "b.npy", volts.T)
-    assert read(tmp_path / "b.npy", Reading(time_first=False))[0].tolist() == volts.T.tolist()
+def stored(path, **content):
+    """The same content as any format of arrays has it; a stroke in a name is a group."""
+    if path.suffix == ".npz":
+        np.savez(path, **content)
+    elif path.suffix == ".h5":
+        made_hdf5(path, **content)
+    elif path.name == "73.mat":
+        made_73(path, **content)
+    else:
+        whole = {}
+        for name, values in content.items():
+            *groups, leaf = name.split("/")
+            place = whole
+            for group in groups:
+                place = place.setdefault(group, {})
+            place[leaf] = np.array(values, "O") if isinstance(values, list) else values
+        scipy.io.savemat(path, whole, do_compression=path.stem == "packed")
+    return path
 
 
-def test_hdf5_matrices_and_columns(tmp_path):
-    volts, path = noise(60, 3).astype(np.float32), tmp_path / "a.h5"
+def of_arrays(*names):
+    return pytest.mark.parametrize("name", names)
+
+
+@of_arrays("a.npz", "a.h5", "a.mat", "packed.mat", "73.mat")
+def test_matrices_and_their_rate(tmp_path, name):
+    volts = noise(60, 3).astype(np.float32)
     for values in (volts, volts.T):
-        made_hdf5(path, **{"trial/volts": values, "fs": 250, "note": "hello"})
+        path = stored(tmp_path / name, volts=values, Fs=250.0, note="hello")
         samples, names, since, rate = read(path)
         np.testing.assert_array_equal(samples, volts.T)
-        assert (names, since, rate) == (None, None, 250.0)
-    made_hdf5(path, **{"imu/x": np.arange(9.0), "imu/y": np.arange(9, dtype="i2")})
+        assert (names, since, rate, samples.dtype) == (None, None, 250.0, torch.float32)
+    assert read(path, Reading(time_first=False))[0].shape == (3, 60)
+    assert "volts'" in refused(path, Reading(samples="clock"))
+    assert "'clock'" in refused(path, Reading(time="clock"))
+    square = stored(tmp_path / name, volts=np.zeros((3, 3)))
+    assert "reading.time_first" in refused(square)
+
+
+@of_arrays("a.npz", "a.h5", "a.mat", "73.mat")
+def test_columns_and_their_times(tmp_path, name):
+    columns = {"x": np.arange(9.0), "y": np.arange(9, dtype="i2")}
+    columns |= {"Timestamp": 10**15 + 2000 * np.arange(9.0)}
+    samples, names, since, rate = read(
+        stored(tmp_path / name, **columns, Rate=500.0), Reading(time_unit="us")
+    )
+    assert (names, rate, samples.tolist()) == (("x", "y"), 500.0, [list(range(9))] * 2)
+    assert since.tolist() == [2000 * i * 1e-6 for i in range(9)]
+    path = tmp_path / name
+    samples, names, since, _ = read(path, Reading(channels=("y",), time=None))
+    assert (names, since, samples.dtype) == (("y",), None, torch.float32)
+    assert "say reading.channels" in refused(stored(path, x=np.zeros(9), y=np.zeros(8)))
+    assert read(path, Reading(channels=("y",)))[0].shape == (1, 8)
+
+
+@of_arrays("a.h5", "a.mat", "73.mat")
+def test_groups_of_arrays_and_words(tmp_path, name):
+    mark = "/" if name == "a.h5" else "."
+    groups = {"a/volts": np.zeros((60, 3)), "b/volts": np.ones((50, 2)), "b/Rate": 500.0}
+    path = stored(tmp_path / name, **groups, t=np.zeros(7), rate=1.0)
+    said = refused(path)
+    assert f"a{mark}volts" in said
+    assert "say reading.samples" in said
+    for one in ("b", f"b{mark}volts"):  # a group may be named as well
+        samples, _, _, rate = read(path, Reading(samples=one))
+        assert (samples.shape, rate) == ((2, 50), 500.0)  # what is said nearest
+    assert "'c'" in refused(path, Reading(samples="c"))
+    assert "7" in refused(path, Reading(samples=f"a{mark}volts", time="t"))
+    assert "3" in refused(path, Reading(samples=f"a{mark}volts", channels=(0, 3)))
+    words = ["left", "right", "time_ms"]  # the third column is times by its name
+    path = stored(tmp_path / name, **{"in/volts": noise(60, 3)}, labels=words)
+    assert read(path)[1] == ("left", "right")
+    found, names, *_ = read(path, Reading(channels=("right", 0), time=None))
+    np.testing.assert_array_equal(found, noise(60, 3).T[[1, 0]])
+    assert names == ("right", "left")
+
+
+def test_hdf5_says_more_in_attributes(tmp_path):
+    path = made_hdf5(tmp_path / "a.h5", **{"imu/x": np.arange(9.0), "imu/y": np.arange(9)})
     with h5py.File(path, "a") as file:  # nanoseconds since 1970: no float64 holds them
         file["imu/Timestamp"] = 10**18 + 2_000_000 * np.arange(9)
         file["imu"].attrs["Rate"] = 500.0
         file.attrs["rate"] = 1.0
-    samples, names, since, rate = read(path, Reading(time_unit="ns"))
-    assert (names, rate) == (("x", "y"), 500.0)  # what is said nearest
+    _, names, since, rate = read(path, Reading(time_unit="ns"))
+    assert (names, rate) == (("x", "y"), 500.0)
     assert since.tolist() == [2_000_000 * i * 1e-9 for i in range(9)]
-    assert read(path, Reading(channels=("y",), time=None))[0].dtype == torch.float32
-    made_hdf5(path, volts=np.zeros((60, 3)), labels=["a", "b", "time_ms"])
-    assert read(path)[1] == ("a", "b")  # the third column is times by its name
-    with h5py.File(path, "a") as file:
+    with h5py.File(path, "w") as file:
+        packed = {"chunks": (500, 3), "compression": "gzip"}
+        file.create_dataset("volts", data=noise(9000, 3), **packed)
         file["volts"].attrs["channel_name"] = ["q", "r", "s"]
+    np.testing.assert_array_equal(read(path)[0], noise(9000, 3).T)
     assert read(path, Reading(channels=("s", 0)))[1] == ("s", "q")
 
 
-def test_compressed_hdf5_is_read_by_stretches(tmp_path):
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("x", data=noise(9000, 3), chunks=(500, 3), compression="gzip")
-    np.testing.assert_array_equal(read(tmp_path / "a.h5")[0], noise(9000, 3).T)
-
-
-def test_several_arrays_are_named_and_one_is_chosen(tmp_path):
-    arrays = {"a/volts": np.zeros((60, 3)), "b/volts": np.ones((50, 2)), "square": np.zeros((4, 4))}
-    made_hdf5(tmp_path / "a.h5", **arrays, t=np.zeros(7))
-    plain = {name.replace("/", "_"): values for name, values in arrays.items()}
-    scipy.io.savemat(tmp_path / "a.mat", plain | {"t": np.zeros(7)})
-    for path, separator in ((tmp_path / "a.h5", "/"), (tmp_path / "a.mat", "_")):
-        said = refused(path)
-        assert f"a{separator}volts" in said
-        assert "say reading.samples" in said
-        assert read(path, Reading(samples=f"b{separator}volts"))[0].shape == (2, 50)
-        assert "reading.time_first" in refused(path, Reading(samples="square"))
-        assert "'c'" in refused(path, Reading(samples="c"))
-        assert "7" in refused(path, Reading(samples=f"a{separator}volts", time="t"))
-        assert "3" in refused(path, Reading(samples=f"a{separator}volts", channels=(0, 3)))
-    assert read(tmp_path / "a.h5", Reading(samples="b"))[0].shape == (2, 50)  # a group
-    made_hdf5(tmp_path / "b.h5", x=np.zeros(9), y=np.zeros(8))
-    assert "say reading.channels" in refused(tmp_path / "b.h5")
-    assert read(tmp_path / "b.h5", Reading(channels=("y",)))[0].shape == (1, 8)
-
-
-@pytest.mark.parametrize("is_compressed", [False, True])
-def test_mat_files_of_version_5(tmp_path, is_compressed):
-    path, volts = tmp_path / "a.mat", noise(60, 3).astype(np.float32)
-    for values in (volts, volts.T):
-        content = {"volts": values, "Fs": 250.0, "note": "hello"}
-        scipy.io.savemat(path, content, do_compression=is_compressed)
-        samples, names, since, rate = read(path)
-        np.testing.assert_array_equal(samples, volts.T)
-        assert (names, since, rate, samples.dtype) == (None, None, 250.0, torch.float32)
-    trial = {"x": np.arange(50.0), "y": np.arange(50, dtype="i2")[:, None]}
-    trial |= {"time_ms": np.arange(50.0) * 2, "sampling_rate": 500.0, "deep": {"z": np.ones(50)}}
+def test_mat_files_hold_more_than_numbers(tmp_path):
+    trial = {"x": np.arange(50.0), "deep": {"z": np.ones((50, 1))}}
     other = {"when": "today", "parts": np.array([1, "a"], dtype=object)}
-    scipy.io.savemat(path, {"trial": trial, "other": other}, do_compression=is_compressed)
-    samples, names, since, rate = read(path)
-    assert (names, rate) == (("x", "y", "z"), 500.0)
-    assert since.tolist() == [2 * i * 1e-3 for i in range(50)]
-    assert read(path, Reading(samples="trial.deep.z"))[1] == ("z",)
-    assert read(path, Reading(channels=("trial.y",)))[0].dtype == torch.float32
-    assert "cell" in refused(path, Reading(samples="other.parts"))
-    for words in (np.array(["left", "right", "Mitte"]), np.array(["left", "right", "Mitte"], "O")):
-        scipy.io.savemat(path, {"volts": np.zeros((60, 3)), "channels": words})
-        assert read(path)[1] == ("left", "right", "Mitte")
+    scipy.io.savemat(tmp_path / "a.mat", {"trial": trial, "other": other})
+    assert read(tmp_path / "a.mat", Reading(time=None))[1] == ("x", "z")
+    assert read(tmp_path / "a.mat", Reading(samples="trial.deep.z", time=None))[1] == ("z",)
+    assert "cell" in refused(tmp_path / "a.mat", Reading(samples="other.parts"))
+    words = np.array(["left", "right", "Mitte"])  # characters, where others have cells
+    scipy.io.savemat(tmp_path / "a.mat", {"volts": np.zeros((60, 3)), "channels": words})
+    assert read(tmp_path / "a.mat")[1] == ("left", "right", "Mitte")
+    path = made_73(tmp_path / "b.mat", x=np.arange(9.0), word="hello", is_on=np.ones(9, "?"))
+    assert read(path)[1] == ("x",)
 
 
-def test_mat_files_of_version_73(tmp_path):
-    volts = noise(60, 3).astype("f4")
-    variables = {"data/volts": volts, "data/t": np.arange(60.0)[:, None], "data/fs": np.float64(9)}
-    path = made_73(tmp_path / "a.mat", labels=["a", "bc", "d"], is_on=np.ones(3, "?"), **variables)
-    samples, names, since, rate = read(path)
-    np.testing.assert_array_equal(samples, volts.T)
-    assert (names, since.tolist(), rate) == (("a", "bc", "d"), list(range(60)), 9.0)
-    named = Reading(samples="data.volts", channels=("d", 0))
-    np.testing.assert_array_equal(read(path, named)[0], volts.T[[2, 0]])
-    path = made_73(tmp_path / "b.mat", x=np.arange(9.0), y=np.arange(9, dtype="i2"), word="hello")
-    assert read(path)[1] == ("x", "y")
-
-
+@of_arrays("a.npz", "a.h5", "a.mat")
 @pytest.mark.parametrize(
     ("values", "said"),
     [
@@ -638,10 +647,8 @@ def test_mat_files_of_version_73(tmp_path):
         (3.0, "no samples"),
     ],
 )
-def test_what_is_no_samples_is_named(tmp_path, values, said):
-    assert said in refused(made_hdf5(tmp_path / "a.h5", it=values))
-    scipy.io.savemat(tmp_path / "a.mat", {"it": values})
-    assert said in refused(tmp_path / "a.mat")
+def test_what_is_no_samples_is_named(tmp_path, values, said, name):
+    assert said in refused(stored(tmp_path / name, it=values))
 
 
 @pytest.mark.parametrize("rows", [4, 1000])

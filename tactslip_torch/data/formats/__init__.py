@@ -12,8 +12,6 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import secrets
-import shutil
 import signal
 import subprocess
 import sys
@@ -228,15 +226,12 @@ def _whole_folder(path: Path) -> Iterator[Path]:
     if path.exists() and not _is_only_bag(path):
         raise Refused(f"{path} is there and no folder of rosbag2; give another name")
     path.parent.mkdir(parents=True, exist_ok=True)
-    around = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    around.mkdir()
-    try:
-        yield around / path.name
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as around:
+        made = Path(around, path.name)
+        yield made
         if path.exists():
-            path.rename(around / f"{path.name}.before")
-        (around / path.name).rename(path)
-    finally:
-        shutil.rmtree(around)
+            path.rename(Path(around, f"{path.name}.before"))
+        made.rename(path)
 
 
 def _is_only_bag(path: Path) -> bool:
