@@ -201,7 +201,7 @@ def _evaluated(bins: _Bins, score: Tensor, stated: Tensor) -> dict[str, float]:
     is_right = (score >= 0) == bins.is_slip
     recalls = [is_right[bins.is_slip].double().mean(), is_right[~bins.is_slip].double().mean()]
     calibration = reliability(stated, bins.is_slip, weights=_class_weights(bins.is_slip))
-    return {"balanced_accuracy": float(sum(recalls)) / 2, "ece": calibration.ece}
+    return {"balanced_accuracy": float(sum(recalls)) / 2, "ece": calibration["ece"]}
 
 
 def _class_weights(is_slip: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from contract.names import STREAM_OUTPUTS
 from test_detector import random_detector
 
 from tactslip_torch import Scene, SlipDetector, simulate
@@ -27,7 +28,6 @@ from tactslip_torch.onset.streaming import StreamingDetector
 
 EXPORT = Path(__file__).parents[1] / "export"
 RATE = 2000.0
-NUM_CHANNELS = 24
 HOP = 20
 
 
@@ -178,18 +178,8 @@ def truth(samples: np.ndarray, threshold: float | None = None) -> list[dict[str,
     if threshold is not None:
         settings = AlarmSettings.from_dict(settings.to_dict() | {"threshold": threshold})
     decisions = StreamingDetector(detector, settings, dtype=torch.float64).push(samples)
-    columns = {
-        "time_s": decisions.available_s,
-        "onset_s": decisions.onset_s,
-        "score": decisions.score,
-        "probability": decisions.probability,
-        "valid": decisions.is_valid,
-        "statistic": decisions.statistic,
-        "alarm": decisions.is_alarm,
-        "on": decisions.is_on,
-    }
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    return [dict(zip(columns, row, strict=True)) for row in rows]
+    columns = [getattr(decisions, field).tolist() for field in STREAM_OUTPUTS.values()]
+    return [dict(zip(STREAM_OUTPUTS, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
 ALARM_KEYS = ("time_s", "onset_s", "score", "probability", "valid")

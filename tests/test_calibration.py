@@ -277,16 +277,16 @@ def test_cells_and_errors_are_the_definitions(weighted, levels, rng):
     w = rng.uniform(0.2, 3, 800) if weighted else np.ones(800)
     found = reliability(*tensors(p, y), num_cells=10, weights=torch.from_numpy(w))
     stated, happened, count = plain_reliability(p, y, w, 10)
-    np.testing.assert_allclose(found.probabilities, stated, rtol=1e-12)
-    np.testing.assert_allclose(found.slip_shares, happened, atol=1e-12)
-    np.testing.assert_allclose(found.counts, count, rtol=1e-12)
+    np.testing.assert_allclose(found["probabilities"], stated, rtol=1e-12)
+    np.testing.assert_allclose(found["slip_shares"], happened, atol=1e-12)
+    np.testing.assert_allclose(found["counts"], count, rtol=1e-12)
     gap = np.abs(stated - happened)
-    assert found.ece == pytest.approx((gap * count).sum() / w.sum(), rel=1e-12)
-    assert found.mce == pytest.approx(gap.max(), rel=1e-12)
-    assert found.brier == pytest.approx(brier_score_loss(y, p, sample_weight=w), rel=1e-12)
+    assert found["ece"] == pytest.approx((gap * count).sum() / w.sum(), rel=1e-12)
+    assert found["mce"] == pytest.approx(gap.max(), rel=1e-12)
+    assert found["brier"] == pytest.approx(brier_score_loss(y, p, sample_weight=w), rel=1e-12)
     inside = np.clip(p, 1e-9, 1 - 1e-9)
     found = reliability(*tensors(inside, y), weights=torch.from_numpy(w))
-    assert found.log_loss == pytest.approx(log_loss(y, inside, sample_weight=w), rel=1e-9)
+    assert found["log_loss"] == pytest.approx(log_loss(y, inside, sample_weight=w), rel=1e-9)
 
 
 def test_reliability_of_no_probabilities_is_refused():

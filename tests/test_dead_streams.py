@@ -41,20 +41,6 @@ def test_a_dead_channel_of_a_stream_is_as_one_of_nan(detector, samples):
     assert not found.is_valid.any()
 
 
-def test_a_channel_that_no_feature_needs_may_die(samples):
-    """Once refused by torch, which lists no patterns of no bins."""
-    detector = alarming_with_gaussians(seed=4)
-    assert "SG1" not in {name.channel for name in detector.selected_names}
-    whole = StreamingDetector(detector, dtype=torch.float64).push(samples.T)
-    found = StreamingDetector(detector, dtype=torch.float64, masked_channels=["SG1"]).push(
-        samples.T
-    )
-    assert torch.equal(found.score, whole.score)
-    assert torch.equal(found.llr, whole.llr)
-    assert torch.equal(found.is_valid, whole.is_valid)
-    assert whole.is_valid.any()
-
-
 def test_probability_and_statistic_are_of_the_widened_ratio(detector, samples):
     found = StreamingDetector(detector, dtype=torch.float64, masked_channels="PVDF1").push(
         samples.T

@@ -192,8 +192,6 @@ def test_the_certificate_of_this_detector_is_handed_on_and_no_other(tmp_path):
     [
         ({"graphs": ["both"]}, "graphs must be bin or stream, or both, got both"),
         ({"graphs": []}, "got none"),
-        ({"precision": "float16"}, "precision must be one of float32, float64, got 'float16'"),
-        ({}, "this detector has no alarm threshold"),
     ],
 )
 def test_another_choice_is_refused(tmp_path, arguments, message):
@@ -264,9 +262,7 @@ def test_the_command_leaves_what_the_detector_can_give(monkeypatch, capsys, tmp_
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("graph=all", "graph must be bin, stream or both, got 'all'"),
         ("precision=float16", "precision must be one of float32, float64"),
-        ("graph=stream", "this detector has no alarm threshold; train with +exp=onset"),
         ("output=small.onnx", "output must be a folder, got small.onnx"),
     ],
 )

@@ -146,53 +146,48 @@ def test_derivatives_are_right_once_and_twice(num_features, rng):
 # Refusals -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("penalty", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_penalty_must_be_positive_and_finite(penalty, rng):
-    for num_bins in (12, 60):
-        bins, groups = draw(rng, num_bins, 4), torch.arange(num_bins) % 3
-        with pytest.raises(ValueError, match=r"positive and finite penalty .*, got"):
-            HeldOut(bins, groups).at(penalty)
-        with pytest.raises(ValueError, match=r"positive and finite penalty .*, got"):
-            held_out_scores(bins.features, bins.is_slip, groups, penalty)
+def held_out(bins, groups, *numbers, **more):
+    return held_out_scores(bins.features, bins.is_slip, groups, *numbers, **more)
+
+
+def with_all_of(value, bins):
+    """Groups of which number 9 has all bins of a class."""
+    return torch.where(bins.is_slip == value, 9, torch.arange(len(bins.is_slip)) % 3)
+
+
+def twice(bins):
+    return TrainingBins(bins.features.repeat(2, 1), bins.is_slip.repeat(2))
 
 
 @pytest.mark.parametrize(
-    ("groups", "message"),
+    ("fit", "message"),
     [
-        (torch.zeros(19, dtype=torch.int64), r"each of 20 bins, got \(19,\)"),
-        (torch.zeros(20), r"whole number .*, got \(20,\) torch.float32"),
-        (torch.full((20,), 7), r"at least two groups, all 20 bins are in \[7\]"),
+        *(
+            (lambda b, g, f=f, c=c: f(b, g, c), r"positive and finite penalty .*, got")
+            for f in (held_out, lambda b, g, c: HeldOut(b, g).at(c))
+            for c in (0.0, -1.0, float("inf"), float("nan"))
+        ),
+        (lambda b, g: held_out(b, g[:19], 1.0), r"each of 20 bins, got \(19,\)"),
+        (lambda b, g: HeldOut(b, g[:19]), r"each of 20 bins, got \(19,\)"),
+        (lambda b, g: HeldOut(b, g.float()), r"whole number .*, got \(20,\) torch.float32"),
+        (lambda b, g: HeldOut(b, 0 * g + 7), r"at least two groups, all 20 bins are in \[7\]"),
+        (lambda b, g: HeldOut(b, with_all_of(True, b)), "without group 9 no slip bin is left"),
+        (lambda b, g: HeldOut(b, with_all_of(False, b)), "without group 9 no non-slip bin is left"),
+        (
+            lambda b, g: HeldOut(b, g, RADIAL, "primal"),
+            r"RadialBasis.* has no primal",
+        ),
+        (lambda b, g: held_out(b, g, 1.0, -0.5), r"offset .* at least 0, got -0.5"),
+        (lambda b, g: held_out(b, g, 1.0, weights=torch.zeros(20)), "weights must be positive"),
+        (
+            lambda b, g: held_out(twice(b), g.repeat(2), 1e12),
+            r"condition .*, wanted up to 1e\+10",
+        ),
     ],
 )
-def test_groups_must_be_two_or_more_and_one_whole_number_a_bin(groups, message, rng):
-    bins = draw(rng, 20)
+def test_what_has_no_held_out_scores_is_refused(fit, message, rng):
     with pytest.raises(ValueError, match=message):
-        HeldOut(bins, groups)
-    with pytest.raises(ValueError, match=message):
-        held_out_scores(bins.features, bins.is_slip, groups, 1.0)
-
-
-@pytest.mark.parametrize(("value", "kind"), [(True, "slip"), (False, "non-slip")])
-def test_a_group_with_all_of_a_class_is_named(value, kind, rng):
-    bins = draw(rng, 20)
-    groups = torch.where(bins.is_slip == value, 9, torch.arange(20) % 3)
-    with pytest.raises(ValueError, match=f"without group 9 no {kind} bin is left"):
-        HeldOut(bins, groups)
-
-
-def test_other_bad_input_is_refused(rng):
-    bins, groups = draw(rng, 20), torch.arange(20) % 4
-    z, is_slip = bins.features, bins.is_slip
-    with pytest.raises(ValueError, match=r"RadialBasis.* has no primal of fixed size"):
-        HeldOut(bins, groups, RADIAL, route="primal")
-    with pytest.raises(ValueError, match=r"one N, got \(20, 3\), \(19,\)"):
-        held_out_scores(z, is_slip[1:], groups, 1.0)
-    with pytest.raises(ValueError, match=r"offset .* at least 0, got -0.5"):
-        held_out_scores(z, is_slip, groups, 1.0, -0.5)
-    with pytest.raises(ValueError, match="weights must be positive"):
-        held_out_scores(z, is_slip, groups, 1.0, weights=torch.zeros(20))
-    with pytest.raises(ValueError, match=r"condition .*, wanted up to 1e\+10; lower"):
-        held_out_scores(z.repeat(2, 1), is_slip.repeat(2), groups.repeat(2), 1e12)
+        fit(draw(rng, 20), torch.arange(20) % 4)
 
 
 @pytest.mark.parametrize("penalty", [1e7, 1e8])

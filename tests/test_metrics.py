@@ -229,6 +229,6 @@ def test_weights_bring_bins_to_the_balance_of_a_stream(rng):
     assert weights[is_slip].sum() / weights.sum() == pytest.approx(share)
     assert len(weights.unique()) == 2
     weighted = reliability(p, is_slip, weights=weights)
-    assert weighted.ece < 0.01
-    assert weighted.brier == pytest.approx(reliability(*stated(share)).brier, abs=0.005)
-    assert reliability(p, is_slip).ece > 0.2
+    assert weighted["ece"] < 0.01
+    assert weighted["brier"] == pytest.approx(reliability(*stated(share))["brier"], abs=0.005)
+    assert reliability(p, is_slip)["ece"] > 0.2

@@ -126,15 +126,6 @@ def test_the_machine_is_that_of_scikit_learn(penalty, offset, degree, used, bala
     assert form.num_features == (used or NUM)
 
 
-def test_an_infinite_penalty_is_least_squares(rng):
-    z = torch.from_numpy(rng.uniform(-1, 1, (200, NUM)))
-    is_slip = torch.from_numpy(rng.uniform(size=200) < 0.5)
-    form = stats_of([("one", z, is_slip)]).solve(np.inf, balance="none")
-    x = Polynomial(2).monomials(z).numpy()
-    expected = x @ np.linalg.lstsq(x, np.where(is_slip, 1.0, -1.0), rcond=None)[0]
-    np.testing.assert_allclose(form(z).numpy(), expected, rtol=0, atol=1e-9)
-
-
 # Refusals -------------------------------------------------------------------------------------
 
 

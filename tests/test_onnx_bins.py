@@ -127,12 +127,6 @@ def test_features_whose_range_is_a_point_weigh_nothing():
     )
 
 
-@pytest.mark.parametrize("batch", [0, 1, 7])
-def test_any_number_of_bins(batch):
-    got = assert_scores(small_detector(), "float64", raw_bins(8)[:batch], spread=1.0)
-    assert got["score"].shape == got["valid"].shape == (batch,)
-
-
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_a_sensor_that_fails_is_replaced_as_in_torch(precision):
     detector = small_detector()

@@ -6,22 +6,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from sklearn.preprocessing import MinMaxScaler as Reference
 
 from tactslip_torch.features.ops import signed_log
 from tactslip_torch.model.scaling import FeatureScaler
-
-
-@pytest.mark.parametrize("num_bins", [2, 50])
-def test_equals_sklearn(num_bins, rng):
-    train = rng.standard_normal((num_bins, 6)) * 10.0 ** rng.integers(-6, 7, 6) + 3
-    new = train.mean(0) + 2 * rng.standard_normal((80, 6)) * train.std(0)
-    reference = Reference(feature_range=(-1, 1), clip=True).fit(train)
-    scaler = FeatureScaler.fit(torch.from_numpy(train))
-    for features in (train, new):
-        actual = scaler(torch.from_numpy(features))
-        np.testing.assert_allclose(actual, reference.transform(features), rtol=1e-9, atol=1e-9)
-    assert (scaler(torch.from_numpy(new)).abs() == 1).any(), "nothing was clipped"
 
 
 def test_what_leaves_the_range_is_clipped():
@@ -231,3 +218,9 @@ def test_scaled_values_are_finite_and_bounded_up_to_the_largest_float(dtype):
     beyond = torch.tensor([[math.inf, -math.inf, math.nan]], dtype=dtype)
     assert scaler(beyond)[0, :2].tolist() == [1, -1]
     assert scaler(beyond)[0, 2].isnan()
+
+
+def test_a_value_far_below_its_knee_is_itself():
+    """Found by hypothesis: 3.8e-11 beside 1.3e29 is bent away from zero, by 3e-6 of itself."""
+    value, knee = torch.tensor([math.exp(-24)]), torch.tensor([math.exp(67)])
+    torch.testing.assert_close(signed_log(value, knee), value, rtol=4 * 2.0**-23, atol=0)

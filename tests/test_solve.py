@@ -248,19 +248,11 @@ def test_a_light_bin_is_no_noise():
         solve_symmetric(twice, torch.tensor([1.0, -1.0, 1.0]).double(), np.inf, weights)
 
 
-def test_single_precision_is_solved_in_double_or_refused(rng):
-    right = rng.standard_normal(30).astype(np.float32)
-    matrix = with_spectrum(rng, np.geomspace(1e-2, 1, 30)).astype(np.float32)
-    for penalty in (10.0, np.inf):
-        x, report, _ = solve_symmetric(*tensors(matrix, right), penalty)
-        assert (x.dtype, report.dtype) == (torch.float32, "float32")
-        system = matrix.astype(np.float64) + np.eye(30) / penalty
-        close(x.double(), np.linalg.solve(system, right), 2.0**-22)
-    steep = with_spectrum(rng, np.geomspace(1e-7, 1, 30)).astype(np.float32)
-    for penalty in (1e6, np.inf):
-        with pytest.raises(ValueError, match=r"condition|semi-definite"):
-            solve_symmetric(*tensors(steep, right), penalty)
-    with pytest.raises(ValueError, match=r"solution for gram leaves float32: an entry is 1e\+44;"):
-        solve_symmetric(1e-39 * torch.eye(2), torch.tensor([1e5, -1e5]), np.inf, name="gram")
-    with pytest.raises(ValueError, match=r"too much for a matrix in float32; make it in float64"):
-        solve_symmetric(torch.ones(2, 2), torch.ones(2), 1e9)
+def test_what_leaves_float64_or_is_none_is_refused():
+    right = torch.tensor([1e5, -1e5]).double()
+    with pytest.raises(
+        ValueError, match=r"solution for gram leaves float64: an entry is (inf|nan);"
+    ):
+        solve_symmetric(1e-307 * torch.eye(2).double(), right, np.inf, name="gram")
+    with pytest.raises(ValueError, match=r"expected gram in float64, got torch.float32"):
+        solve_symmetric(torch.eye(2), right, 1.0, name="gram")

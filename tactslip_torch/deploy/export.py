@@ -72,10 +72,14 @@ def export_detector(
             beside = files.enter_context(whole_file(sidecar_path(path)))
             temporary = files.enter_context(whole_file(path))
             try:
-                model, metadata = _checked(detector, kind, precision)
+                if kind == "bin":
+                    model = bin_graph(detector, precision).model()
+                else:
+                    model = stream_graph(detector, AlarmSettings.of(detector), precision).model()
+                check = check_model(model, detector, kind, precision)
             except ValueError as error:
                 raise ValueError(f"{path} was not written: {error}") from error
-            metadata |= origin
+            metadata = plain({**_metadata(detector, kind, precision), "check": check}) | origin
             props = {name: json.dumps(value, allow_nan=False) for name, value in metadata.items()}
             helper.set_model_props(model, props)
             onnx.save(model, temporary)
@@ -85,19 +89,6 @@ def export_detector(
             metadata["onnx_bytes"] = len(content)
             beside.write_text(json.dumps(metadata, indent=1, allow_nan=False) + "\n")
     return paths
-
-
-def _checked(
-    detector: SlipDetector, kind: GraphKind, precision: Precision
-) -> tuple[onnx.ModelProto, dict[str, Any]]:
-    """A model that passed its check, and its metadata."""
-    if kind == "bin":
-        model = bin_graph(detector, precision).model()
-    else:
-        model = stream_graph(detector, AlarmSettings.of(detector), precision).model()
-    check = check_model(model, detector, kind, precision)
-    metadata: dict[str, Any] = plain({**_metadata(detector, kind, precision), "check": check})
-    return model, metadata
 
 
 def _metadata(detector: SlipDetector, kind: GraphKind, precision: Precision) -> dict[str, Any]:

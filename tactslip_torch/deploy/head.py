@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,11 @@ from tactslip_torch.deploy.value import F32, F64, I64, Value
 from tactslip_torch.features.pooling import over_channels
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import Head, KernelSum, Polynomial, QuadraticForm
-from tactslip_torch.model.missing_channels import ClassGaussians
+from tactslip_torch.model.missing_channels import (
+    ClassGaussians,
+    added_by_missing,
+    score_of_mixture,
+)
 from tactslip_torch.model.scaling import FeatureScaler
 
 _LARGEST = float(np.finfo(np.float64).max)
@@ -153,7 +156,10 @@ def _expected_scores(
         def missing() -> list[Value]:
             is_same = (own_lost - before[0]).abs().amax(0) <= 0.0
             mask = graph.if_(is_same, lambda: before, lambda: _swept(own_lost, head, gaussians))
-            return [*mask, *_expected(own_z, mask, head, gaussians)]
+            of_mask: list[Any] = [mask[1:3], mask[3:]]
+            bins: list[Any] = [own_z.unsqueeze(0), own_lost > 0.0]  # [1, K] and [K]
+            found: list[Any] = list(score_of_mixture(head, gaussians, *bins, *of_mask))
+            return [*mask, *(each.squeeze(0) for each in found)]
 
         def whole() -> list[Value]:
             return [*before, own_score, graph.constant(0.0, F64)]
@@ -189,31 +195,9 @@ def _swept(is_lost: Value, head: QuadraticForm, gaussians: ClassGaussians) -> li
     start = [_float64(is_lost, precision), _float64(is_lost, -log_det_of_all)]
     shapes = [(2, len(count), len(count)), (2,), ()]
     (swept, log_det), _ = graph.scan(on_one, start, [places], shapes)
-    bend = _float64(is_lost, head.dense_quadratic) * is_lost.unsqueeze(1) * is_lost
-    bent = bend @ swept
-    spread = (bent * bent.transpose(0, 2, 1)).sum(2).sum(1) * 2.0
-    return [is_lost, swept, log_det, -(bend * swept).sum(2).sum(1), spread]
-
-
-def _expected(
-    z: Value, mask: Sequence[Value], head: QuadraticForm, gaussians: ClassGaussians
-) -> list[Value]:
-    """Mean and variance of the score of one bin, both ``[]``."""
-    is_lost, swept, log_det, lift, spread = mask
-    is_seen = 1.0 - is_lost
-    middle, linear = _float64(z, gaussians.mean), _float64(z, head.linear)
-    away = (z - middle) * is_seen  # [2, K]
-    turned = (swept @ away.unsqueeze(2)).squeeze(2)
-    filled = z * is_seen + (middle - turned) * is_lost
-    evidence = ((turned * away).sum(1) + log_det) * -0.5
-    pull = filled @ _float64(z, head.dense_quadratic)
-    mean = ((pull + linear) * filled).sum(1) + float(head.constant) + lift
-    slope = (pull * 2.0 + linear) * is_lost
-    variance = spread - ((swept @ slope.unsqueeze(2)).squeeze(2) * slope).sum(1)
-    weight = evidence.softmax(0)
-    total = (weight * mean).sum(0)
-    apart = mean - total
-    return [total, (weight * (variance + apart * apart)).sum(0)]
+    pair: list[Any] = [is_lost.unsqueeze(1) * is_lost, swept]
+    added: list[Any] = list(added_by_missing(head, *pair))
+    return [is_lost, swept, log_det, *added]
 
 
 def _float64(like: Value, x: Tensor) -> Value:

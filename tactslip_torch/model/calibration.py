@@ -227,30 +227,19 @@ def widened_llr(calibration: Calibration, score: Tensor, variance: Tensor) -> Te
     return (llr / (spread * spread * (math.pi / 8) + 1.0).sqrt()).type_as(score)
 
 
-@dataclass(frozen=True)
-class Reliability:
-    """Stated probabilities beside what happened, by cells and in all."""
-
-    probabilities: tuple[float, ...]  # mean of each cell, rising
-    slip_shares: tuple[float, ...]  # of each cell
-    counts: tuple[float, ...]  # bins of each cell, or their weight
-    ece: float  # mean distance of the two over bins: expected calibration error
-    mce: float  # largest distance of a cell
-    brier: float  # mean squared error
-    log_loss: float  # mean of -log of the probability of what was true, of a bin at most 100
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
-
-
 def reliability(
     probability: Tensor, is_slip: Tensor, num_cells: int = 15, weights: Tensor | None = None
-) -> Reliability:
+) -> dict[str, Any]:
     """How far probabilities ``[N]`` are from what happened, in cells of equal weight.
 
     Equal probabilities share a cell, so there may be fewer. Chance alone gives a perfect detector
     an error of about ``sqrt(2 / pi * num_cells * p (1 - p) / N)``.
+
+    Returns:
+        ``probabilities``, the mean of each cell, rising, its ``slip_shares`` and ``counts`` (of
+        bins, or their weight); ``ece``, the mean distance of the first two over bins (expected
+        calibration error), ``mce``, the largest of a cell, ``brier``, the mean squared error, and
+        ``log_loss``, the mean of -log of the probability of what was true, of a bin at most 100.
 
     Raises:
         ValueError: if lengths differ, no bin weighs anything, a weight is negative or a probability
@@ -269,15 +258,15 @@ def reliability(
     sums.index_add_(0, cell, torch.stack([w, w * p, w * truth], dim=-1))
     count, stated, happened = sums[sums[:, 0] > 0].unbind(-1)
     gap = (stated - happened).abs()
-    return Reliability(
-        probabilities=tuple((stated / count).tolist()),
-        slip_shares=tuple((happened / count).tolist()),
-        counts=tuple(count.tolist()),
-        ece=float(gap.sum() / w.sum()),
-        mce=float((gap / count).max()),
-        brier=float((w * (p - truth).square()).sum() / w.sum()),
-        log_loss=float(binary_cross_entropy(p, truth, w, reduction="sum") / w.sum()),
-    )
+    return {
+        "probabilities": (stated / count).tolist(),
+        "slip_shares": (happened / count).tolist(),
+        "counts": count.tolist(),
+        "ece": float(gap.sum() / w.sum()),
+        "mce": float((gap / count).max()),
+        "brier": float((w * (p - truth).square()).sum() / w.sum()),
+        "log_loss": float(binary_cross_entropy(p, truth, w, reduction="sum") / w.sum()),
+    }
 
 
 def _logistic(x: Tensor, target: Tensor, w: Tensor, offset: float) -> tuple[float, float]:

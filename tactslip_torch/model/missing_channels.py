@@ -360,26 +360,69 @@ def _expected(
     head: QuadraticForm, gaussians: ClassGaussians, z: Tensor, is_missing: Tensor, swept: _Swept
 ) -> tuple[Tensor, Tensor]:
     """Of bins ``[*, n, K]``, those of a row missing the same features ``[*, K]``."""
+    is_both = is_missing[..., None, :, None] & is_missing[..., None, None, :]
+    added = added_by_missing(head, is_both.double(), swept.matrix)
+    z, is_missing = z[..., None, :, :], is_missing[..., None, None, :]
+    return score_of_mixture(head, gaussians, z, is_missing, swept, added)
+
+
+def added_by_missing(head: QuadraticForm, is_both: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """What the missing features of a mask add to the mean and the variance of a score.
+
+    ``tr(Q_mm S)`` and ``2 tr((Q_mm S)^2)`` of both classes, in operations that values of an ONNX
+    graph have too, like ``score_of_mixture``.
+
+    Args:
+        head: the machine.
+        is_both: 1 where both features of a pair are missing, else 0.
+        matrix: of the mask.
+
+    Shape:
+        - is_both: ``[*, 1, K, K]``, float64; matrix: ``[*, 2, K, K]``; output: ``[*, 2]`` each
+    """
+    bend = is_both * head.dense_quadratic.detach().double()
+    squares = (bend @ matrix) * (matrix @ bend)
+    return -(bend * matrix).sum(-1).sum(-1), squares.sum(-1).sum(-1) * 2.0
+
+
+def score_of_mixture(
+    head: QuadraticForm,
+    gaussians: ClassGaussians,
+    z: Tensor,
+    is_missing: Tensor,
+    swept: tuple[Tensor, Tensor],
+    added: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Mean and variance of the scores of bins that miss the same features, ``[*, n]`` each.
+
+    Args:
+        head: the machine.
+        gaussians: of its features.
+        z: features, anything finite where missing.
+        is_missing: which they are.
+        swept: matrix and log determinant of the mask (``_Swept``).
+        added: by ``added_by_missing``.
+
+    Shape:
+        - z: ``[*, 1, n, K]`` or ``[n, K]``; is_missing: ``[*, 1, 1, K]`` or ``[K]``
+    """
+    (matrix, log_det), (lift, spread) = swept, added
     quadratic, linear, constant = (
         part.detach().double() for part in (head.dense_quadratic, head.linear, head.constant)
     )
-    is_both = is_missing[..., None, :, None] & is_missing[..., None, None, :]
-    bent = quadratic @ torch.where(is_both, -swept.matrix, 0.0)  # Q S, [*, 2, K, K]
-    lift = bent.diagonal(dim1=-2, dim2=-1).sum(-1)  # tr(Q_mm S)
-    spread = 2 * (bent * bent.mT).sum((-2, -1))
-    z, is_missing = z[..., None, :, :], is_missing[..., None, None, :]
     middle = gaussians.mean[:, None]
     away = torch.where(is_missing, 0.0, z - middle)  # [*, 2, n, K]
-    turned = away @ swept.matrix
-    filled = torch.where(is_missing, middle - turned, z)
-    evidence = -((turned * away).sum(-1) + swept.log_det[..., None]) / 2
+    turned = away @ matrix
+    filled = torch.where(is_missing, -(turned - middle), z)
+    evidence = ((turned * away).sum(-1) + log_det[..., None]) * -0.5
     bend = filled @ quadratic
-    slope = torch.where(is_missing, 2 * bend + linear, 0.0)
+    slope = torch.where(is_missing, bend * 2.0 + linear, 0.0)
     mean = ((bend + linear) * filled).sum(-1) + constant + lift[..., None]
-    variance = spread[..., None] - ((slope @ swept.matrix) * slope).sum(-1)
+    variance = spread[..., None] - ((slope @ matrix) * slope).sum(-1)
     weight = evidence.softmax(-2)
     total = (weight * mean).sum(-2)
-    return total, (weight * (variance + (mean - total[..., None, :]).square())).sum(-2)
+    apart = mean - total.unsqueeze(-2)
+    return total, (weight * (variance + apart * apart)).sum(-2)
 
 
 def _log_det(factor: Tensor) -> Tensor:

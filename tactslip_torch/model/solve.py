@@ -39,7 +39,7 @@ class SolveReport:
 
     Attributes:
         method: by which factorisation.
-        dtype: of the matrix as it was given; the arithmetic is float64's always.
+        dtype: of the arithmetic, ``"float64"``.
         size: number of unknowns.
         penalty: the paper's ``C``.
         condition: estimate for the system scaled to a diagonal of ones; of the components kept
@@ -88,7 +88,7 @@ class Solution(NamedTuple):
     """Of a system, and how it was come by.
 
     Attributes:
-        x: ``[n]``, in the dtype of the matrix.
+        x: ``[n]``, float64.
         report: on the solve.
         factor: ``[n, n]``, float64, the lower Cholesky factor of ``A + diag(1 / (C w))``; ``None``
             if the method was another.
@@ -111,8 +111,7 @@ def solve_symmetric(
 ) -> Solution:
     """``(matrix + diag(1 / (penalty weights)))^-1 right`` in float64, and a report.
 
-    Needs one more matrix of that size, the eigendecomposition four. A float32 matrix carries an
-    error of ``eps32``: refused if that times the condition exceeds 1e-2. Not differentiable.
+    Needs one more matrix of that size, the eigendecomposition four. Not differentiable.
 
     Args:
         matrix: symmetric, positive semi-definite; kept.
@@ -124,11 +123,12 @@ def solve_symmetric(
         most_condition: raise an error instead of leaving Cholesky, or above this condition.
 
     Shape:
-        - matrix: ``[n, n]``; right, weights: ``[n]``
+        - matrix: ``[n, n]``, float64; right, weights: ``[n]``
 
     Raises:
-        ValueError: if a number is not finite, the matrix is not positive semi-definite, its
-            rounding drowns the solution, or eigenvectors are needed and not allowed.
+        ValueError: for another dtype, if a number is not finite, the matrix is not positive
+            semi-definite, its rounding drowns the solution, or eigenvectors are needed and not
+            allowed.
 
     Example:
         >>> twice = torch.ones(2, 2, dtype=torch.float64)  # one bin, twice
@@ -136,8 +136,9 @@ def solve_symmetric(
         >>> x, report.method, report.rank
         (tensor([0.5000, 0.5000], dtype=torch.float64), 'eigen', 1)
     """
-    given, eps = matrix.dtype, torch.finfo(matrix.dtype).eps
-    matrix, right = matrix.detach().double(), right.detach().double()
+    if matrix.dtype != torch.float64:
+        raise ValueError(f"expected {name} in float64, got {matrix.dtype}; promote it first")
+    matrix, right = matrix.detach(), right.detach().double()
     weights = torch.ones_like(right) if weights is None else weights.detach().double()
     ridge = 1 / (penalty * weights)
     if not (penalty > 0 and bool(ridge.isfinite().all())):
@@ -156,11 +157,10 @@ def solve_symmetric(
         raise ValueError(f"{name} overflows float64; scale the features")
     least = float((ridge / whole).min())
     bound = norm / least if least > 0 else math.inf
-    size, dtype = len(right), str(given).removeprefix("torch.")
-    known = bound if math.isfinite(bound) else None
-    report = SolveReport("cholesky", dtype, size, penalty, math.inf, known, size, math.inf)
+    size, known = len(right), bound if math.isfinite(bound) else None
+    report = SolveReport("cholesky", "float64", size, penalty, math.inf, known, size, math.inf)
     # bins that a cut at rounding would lose for their weights
-    own, cutoff = matrix.diagonal() * weights, size * eps
+    own, cutoff = matrix.diagonal() * weights, size * _EPS
     is_faint = matrix.diagonal() <= cutoff * matrix.diagonal().max()
     is_light = (own <= cutoff * own.max()) & ~is_faint
     if not math.isinf(penalty) or bool(is_light.any()):
@@ -169,17 +169,13 @@ def solve_symmetric(
         torch.linalg.cholesky_ex(factor, out=(factor, info))
         condition = math.inf if info else min(bound, _condition(factor, norm))
         limit = min(_MOST_CONDITION, 1 / (size * _EPS))
-        limit = limit if eps <= _EPS else min(limit, _LARGEST_ERROR / eps)
         if condition <= (limit if most_condition is None else min(limit, most_condition)):
             factor.mul_(scale[:, None])
             x = torch.cholesky_solve(right[:, None], factor)[:, 0]
-            error = math.sqrt(size) * eps * condition
+            error = math.sqrt(size) * _EPS * condition
             report = replace(report, condition=condition, error=error)
-            return Solution(_in_dtype(x, given, name), report, factor)
+            return Solution(_finite(x, name), report, factor)
         reason = f"{name} + I/C at penalty={penalty:g} has condition {condition:.1e}"
-        if eps > _EPS:
-            wanted = "make it in float64, or lower the penalty"
-            raise ValueError(f"{reason}, too much for a matrix in {dtype}; {wanted}")
         if most_condition is not None:
             raise ValueError(f"{reason}, wanted up to {most_condition:.0e}; lower the penalty")
         log.warning("%s, too much for Cholesky in float64", reason)
@@ -190,10 +186,10 @@ def solve_symmetric(
             f"{float(weights.min()):.1e} to {float(weights.max()):.1e} too far apart to leave only "
             "noise out; bring them closer, or lower the penalty"
         )
-    x, report = _truncated(matrix, right, report, weights.sqrt(), eps, in_span, name)
+    x, report = _truncated(matrix, right, report, weights.sqrt(), in_span, name)
     if not math.isinf(penalty) or (report.left_out or 0.0) > _LARGEST_UNSAID:
         log.warning("%s: solved by %s", name, report)
-    return Solution(_in_dtype(x, given, name), report, None)
+    return Solution(_finite(x, name), report, None)
 
 
 def solve_by_autograd(system: Tensor, right: Tensor) -> Tensor:
@@ -223,7 +219,6 @@ def _truncated(
     right: Tensor,
     report: SolveReport,
     roots: Tensor,
-    eps: float,
     in_span: bool,
     name: str,
 ) -> tuple[Tensor, SolveReport]:
@@ -236,7 +231,7 @@ def _truncated(
     penalty = report.penalty
     values, vectors = torch.linalg.eigh(roots * matrix * roots[:, None])
     top, low, num = float(values[-1]), float(values[0]), len(values)
-    rounding, cutoff = eps * max(top, -low), num * eps * top
+    rounding, cutoff = _EPS * max(top, -low), num * _EPS * top
     if low < -max(10 * cutoff, 0.0):
         raise ValueError(
             f"{name} is not positive semi-definite: it has the eigenvalue {low:.3g} beside "
@@ -302,12 +297,12 @@ def _check_finite(matrix: Tensor, right: Tensor, name: str) -> None:
             )
 
 
-def _in_dtype(x: Tensor, given: torch.dtype, name: str) -> Tensor:
-    """A solution as it is handed out: refused where the dtype has no room for it."""
-    cast = x.to(given)
-    if not bool(cast.isfinite().all()):
+def _finite(x: Tensor, name: str) -> Tensor:
+    """A solution as it is handed out: refused where float64 has no room for it."""
+    if not bool(x.isfinite().all()):
+        worst = float(x[~x.isfinite()][0])
         raise ValueError(
-            f"the solution for {name} leaves {str(given)[6:]}: an entry is "
-            f"{float(x[~cast.isfinite()][0]):.3g}; scale the features or the penalty"
+            f"the solution for {name} leaves float64: an entry is {worst:.3g}; scale the features "
+            "or the penalty"
         )
-    return cast
+    return x

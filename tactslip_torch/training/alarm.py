@@ -300,7 +300,7 @@ def _reliability(
         if bool(is_slip.any()) and not bool(is_slip.all()):
             stated = probability(settings.calibration.llr(scores), settings.slip_share)
             weights = weights_at_share(is_slip, settings.slip_share)
-            by_material[name or ""] = reliability(stated, is_slip, weights=weights).to_dict()
+            by_material[name or ""] = reliability(stated, is_slip, weights=weights)
     everything = by_material.pop("", None)
     return {} if everything is None else everything | {"per_material": by_material}
 
