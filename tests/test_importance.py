@@ -96,22 +96,15 @@ def by_hand(is_right, bins, recordings):
     return sum(means) / len(means)
 
 
-def test_accuracy_is_the_mean_over_groups_bin_by_bin():
-    bins = sampled(3, {})
-    is_right = torch.rand(len(bins.is_slip), generator=torch.Generator().manual_seed(0)) < 0.7
-    every = range(len(bins.recording_names))
-    assert float(balanced_accuracy(count_right(is_right, bins))) == pytest.approx(
-        by_hand(is_right, bins, every)
-    )
-
-
-def test_a_draw_counts_a_recording_as_often_as_it_was_drawn():
+def test_accuracy_is_the_mean_over_groups_bin_by_bin_in_every_draw():
     bins = sampled(4, {})
     is_right = torch.rand(len(bins.is_slip), generator=torch.Generator().manual_seed(1)) < 0.7
     counts = count_right(is_right, bins)
-    times = torch.tensor([[2.0, 0, 1, 1] * 3, [1, 3, 0, 0] * 3], dtype=torch.float64)
-    for draw, accuracy in zip(times, balanced_accuracy(counts, times), strict=True):
-        drawn = [r for r, count in enumerate(draw.tolist()) for _ in range(int(count))]
+    times = [[1.0] * 12, [2.0, 0, 1, 1] * 3, [1, 3, 0, 0] * 3]
+    found = balanced_accuracy(counts, torch.tensor(times, dtype=torch.float64))
+    assert float(balanced_accuracy(counts)) == float(found[0])
+    for draw, accuracy in zip(times, found, strict=True):
+        drawn = [r for r, count in enumerate(draw) for _ in range(int(count))]
         assert float(accuracy) == pytest.approx(by_hand(is_right, bins, drawn))
 
 
@@ -184,11 +177,8 @@ def test_bins_of_other_roles_choose_nothing():
     before, after = refit([0, 1]), spoilt([0, 1])
     assert (before.penalty, before.merit) == (after.penalty, after.merit)
     assert before.accuracies["unseen"] != after.accuracies["unseen"]
-
-
-def test_without_a_feature_every_bin_is_slip():
-    result = refit_of({})([])
-    assert result.accuracies == dict.fromkeys((HELD_OUT, "test", "unseen"), 0.5)
+    without_a_feature = dict.fromkeys((HELD_OUT, "test", "unseen"), 0.5)
+    assert refit([]).accuracies == without_a_feature  # every bin is slip
 
 
 # Sets of channels --------------------------------------------------------------------------------
@@ -206,30 +196,20 @@ def test_units_are_every_channel_once_by_channel_finger_and_kind():
 
 
 def test_a_ranking_takes_the_largest_scores_of_the_channels_it_may():
-    refit = refit_of({5: 2.0, 3: 1.5, 1: 1.0})
-    ranking = ranking_of(refit, num_features=2)
-    assert ranking(frozenset("abc")) == [5, 3]
-    assert ranking(frozenset("ab")) == [3, 1]
-    allowed = torch.tensor([True] * 4 + [False] * 2)
-    assert ranking_of(refit, 6, allowed)(frozenset("c")) == []
-    assert ranking_of(refit, 6, allowed)(frozenset("bc"))[0] == 3
-    assert without([5, 3, 1, 0], {"a", "c"}, OF_FEATURE) == [3]
-
-
-def test_a_ranking_passes_over_what_repeats():
-    refit = refit_of({5: 2.0, 3: 1.5})
-    refit.train.features[:, 4] = 3 * refit.train.features[:, 5]
-    assert ranking_of(refit, 2)(frozenset("abc")) == [4, 5]
-    assert ranking_of(refit, 2, most_correlation=0.99)(frozenset("abc")) == [4, 3]
-
-
-def test_a_shared_ranking_takes_as_many_of_each_channel():
     refit = refit_of({5: 3.0, 4: 2.5, 3: 1.0, 1: 0.5})
-    shared = replace(ranking_of(refit, num_features=3), is_shared=True)
-    assert ranking_of(refit, num_features=3)(frozenset("abc")) == [5, 4, 3]
-    assert shared(frozenset("abc")) == [5, 3, 1]
-    assert shared(frozenset("c")) == [5, 4]
-    assert replace(shared, num_features=1)(frozenset("bc")) == [5, 3]  # one of each at least
+    ranking = ranking_of(refit, num_features=3)
+    assert ranking("abc") == [5, 4, 3]
+    assert ranking("ab")[:2] == [3, 1]
+    allowed = torch.tensor([True] * 4 + [False] * 2)
+    assert ranking_of(refit, 6, allowed)("c") == []
+    assert ranking_of(refit, 6, allowed)("bc")[0] == 3
+    assert without([5, 3, 1, 0], {"a", "c"}, OF_FEATURE) == [3]
+    shared = replace(ranking, is_shared=True)  # as many of each channel
+    assert [shared(channels) for channels in ("abc", "c")] == [[5, 3, 1], [5, 4]]
+    assert replace(shared, num_features=1)("bc") == [5, 3]  # one of each at least
+    refit.train.features[:, 4] = 3 * refit.train.features[:, 5]
+    assert ranking_of(refit, 2)("abc") == [4, 5]
+    assert ranking_of(refit, 2, most_correlation=0.99)("abc") == [4, 3]  # passes over a repetition
 
 
 def test_the_best_few_begin_with_what_tells_most_and_end_with_all():
@@ -242,13 +222,9 @@ def test_the_best_few_begin_with_what_tells_most_and_end_with_all():
     assert steps[0][1].merit == max(alone.values())
     assert steps[-1][1].counts["test"].right.equal(refit(ranking("abc")).counts["test"].right)
     assert len(best_first(refit, ranking, UNITS, 2, "")) == 2
-
-
-def test_a_unit_without_a_feature_never_joins():
-    refit = refit_of({2: 1.5})
     allowed = torch.tensor([False] * 2 + [True] * 4)
     steps = best_first(refit, ranking_of(refit, 6, allowed), UNITS, 9, "")
-    assert sorted(name for name, _ in steps) == ["b", "c"]
+    assert sorted(name for name, _ in steps) == ["b", "c"]  # no feature, no part
 
 
 # Gradients ---------------------------------------------------------------------------------------
@@ -264,15 +240,8 @@ def test_gradients_are_those_of_finite_differences():
     ahead, back = (detector.score_raw(samples + sign * step * way) for sign in (1, -1))
     slope = (ahead - back) / (2 * step)
     torch.testing.assert_close((gradients * way).sum((1, 2)), slope, rtol=1e-6, atol=0)
-
-
-def test_a_channel_that_is_not_in_use_moves_nothing():
-    detector = small_detector()
-    samples = raw_bins(4)
-    _, gradients = score_gradients(detector, samples)
     used = {name.channel for name in detector.selected_names}
-    for index, name in enumerate(HAND.names):
-        assert bool(gradients[:, index].any()) is (name in used)
+    assert [bool(part.any()) for part in gradients.unbind(1)] == [n in used for n in HAND.names]
 
 
 def test_first_order_of_a_linear_score_is_the_spread_of_its_parts():
@@ -340,15 +309,11 @@ def found(run, tmp_path_factory):
 # What it leaves ----------------------------------------------------------------------------------
 
 
-def test_the_files_of_a_run(found):
-    folder, _ = found
+def test_every_channel_finger_and_kind_has_its_row(found):
+    folder, content = found
     names = {path.name for path in folder.iterdir()}
     assert names == {"config.yaml", "sensors.json", "sensors.csv", "sensors.png"}
     assert_png(folder / "sensors.png")
-
-
-def test_every_channel_finger_and_kind_has_its_row(found):
-    _, content = found
     named = [(row["unit"], row["name"]) for row in content["units"]]
     assert named == [
         *(("channel", name) for name in CHANNELS),
@@ -465,8 +430,8 @@ def biotac_like():
     )
 
 
-@pytest.mark.parametrize("hand", [HandLayout.paper24(), biotac_like()])
-def test_any_hand_can_be_drawn(drawn, hand, tmp_path):
+def test_any_hand_can_be_drawn(drawn, tmp_path):
+    hand = biotac_like()
     sensors_figure(content_of(hand), tmp_path / "a.png")
     assert_png(tmp_path / "a.png")
     assert "SIMULATED" in drawn[0].get_suptitle()
@@ -490,17 +455,17 @@ def refused(monkeypatch, capsys, *arguments):
     return errors[0]
 
 
-def test_bad_input_is_one_line(monkeypatch, capsys, run, tmp_path):
-    here = f"hydra.run.dir={tmp_path / 'out'}"
-    model = f"model={run / 'detector.pt'}"
-    assert "no value for model" in refused(monkeypatch, capsys, here)
-    assert "nothing.pt" in refused(monkeypatch, capsys, here, "model=nothing.pt")
-    wrong = refused(monkeypatch, capsys, here, model, "bins=1")
-    assert "bins must be a whole number of at least 2, got 1" in wrong
-    wrong = refused(monkeypatch, capsys, here, model, "num_features=0")
-    assert "num_features must be a positive whole number, got 0" in wrong
-    wrong = refused(monkeypatch, capsys, here, model, "reselect=equal")
-    assert "reselect must be ranked or shared, got 'equal'" in wrong
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("bins=1", "bins must be a whole number of at least 2, got 1"),
+        ("num_features=0", "num_features must be a positive whole number, got 0"),
+        ("reselect=equal", "reselect must be ranked or shared, got 'equal'"),
+    ],
+)
+def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, override, words):
+    here, model = f"hydra.run.dir={tmp_path / 'out'}", "model=nothing.pt"
+    assert words in refused(monkeypatch, capsys, here, model, override)
 
 
 def moved(run, folder, *, change=None):
