@@ -17,6 +17,7 @@ from tactslip_torch.analysis.certificate import (
     certify,
     compare,
     coverage,
+    pipelines,
 )
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.rounding import rounding_bound
@@ -30,7 +31,7 @@ from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 def test_both_scores_are_those_of_the_pipelines(head, arithmetic):
     detector, samples = small_detector(head=head, arithmetic=arithmetic), raw_bins(16)
     samples[3] = 2.0  # dead sensors
-    compared = compare(detector, samples)
+    compared = compare(*pipelines(detector), samples)
     single = copy.deepcopy(detector).float()
     with torch.no_grad():
         assert torch.equal(compared.exact, detector.predict_raw(samples).score)
@@ -48,11 +49,13 @@ def test_both_scores_are_those_of_the_pipelines(head, arithmetic):
 
 def test_an_error_is_laid_to_the_stage_that_makes_it():
     samples = raw_bins(32).float()
-    double, native = (compare(small_detector(arithmetic=a), samples) for a in ("double", "native"))
+    double, native = (
+        compare(*pipelines(small_detector(arithmetic=a)), samples) for a in ("double", "native")
+    )
     assert double.stages["features"].abs().max() == 0
     assert native.stages["features"].abs().max() > 1e-7
     detector = lying_detector(-2.0)  # whatever the feature
-    lied = compare(detector, samples)
+    lied = compare(*pipelines(detector), samples)
     torch.testing.assert_close(lied.stages["head"], -2 * lied.exact, rtol=1e-4, atol=1e-5)
     assert lied.flips.all()
 
@@ -186,7 +189,7 @@ def test_a_spike_is_flagged_where_the_filter_leaves_none_of_it():
     places = [i for i, name in enumerate(detector.pool.hand.names) if name in used]
     is_gone = (filtered[:, places] == 0).all(-1).any(-1)
     assert 0 < is_gone.sum() < 60
-    assert (~compare(detector, spikes).is_valid.numpy() == is_gone).all()
+    assert (~compare(*pipelines(detector), spikes).is_valid.numpy() == is_gone).all()
 
 
 def test_condition_numbers_are_those_of_finite_differences():
@@ -194,7 +197,7 @@ def test_condition_numbers_are_those_of_finite_differences():
     detector.info["solve"] = {"condition": 12.5, "method": "Cholesky"}
     numbers = certify(detector, samples, simulated=True, extremes=1).content["condition_numbers"]
     assert numbers["solve"] == {"condition": 12.5, "method": "Cholesky"}
-    scaled = compare(detector, samples).scaled
+    scaled = compare(*pipelines(detector), samples).scaled
     norms = []
     for z in scaled:
         steps = 1e-6 * torch.eye(NUM_FEATURES, dtype=torch.float64)
@@ -224,7 +227,7 @@ def test_held_out_bins_that_turn_refute():
     """The lie is met beyond what calibration bins reach alone."""
     samples = raw_bins(200)
     detector = small_detector()
-    first = compare(detector, samples).scaled[:, 0]
+    first = compare(*pipelines(detector), samples).scaled[:, 0]
     known, new = samples[first <= 0], samples[first > 0]
     assert min(len(known), len(new)) > 5
     liar = lying_detector(0.0)

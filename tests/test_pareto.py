@@ -289,7 +289,7 @@ def test_neither_threads_nor_test_cycles_change_what_is_found(searched):
     assert described(searching(loud, **few).candidates()) != quiet
 
 
-def test_each_finger_goes_that_is_missed_least(monkeypatch, searched):
+def test_each_finger_goes_that_is_missed_least(monkeypatch):
     made = searching(rankings=["t"], components=["all"])
     made.pool = FeaturePool(HAND)
     made._channel_of = [HAND.names.index(name.channel) for name in made.pool.names]
@@ -299,7 +299,6 @@ def test_each_finger_goes_that_is_missed_least(monkeypatch, searched):
         gone = group.channels.split(" without ")[1].split(" and ")
         names = zip(made.pool.names, group.mask, strict=True)
         assert {HAND.channel(n.channel).finger for n, m in names if m} == set(worth) - set(gone)
-        assert degrees == [1]
         return [at(60.0, 100.0, 0.9 - sum(worth[finger] for finger in gone))]
 
     monkeypatch.setattr(made, "_of_channels", played)
@@ -307,9 +306,9 @@ def test_each_finger_goes_that_is_missed_least(monkeypatch, searched):
     best = at(60.0, 100.0, 0.9, 5)
     best = replace(best, selection=replace(best.selection, selected=one_of_each))
     found = made.without_fingers(best)
-    assert len(found) == 5 + 4 + 3 + 2
     kept = [max(c.balanced_accuracy for c in part) for part in (found[:5], found[5:9], found[9:12])]
     assert kept == pytest.approx([0.89, 0.87, 0.77])  # little, then middle, then the thumb
+    assert len(found) == 5 + 4 + 3 + 2
 
 
 # The front ---------------------------------------------------------------------------------------
@@ -344,18 +343,19 @@ def test_a_detector_found_twice_is_one_candidate():
 
 
 def test_landmarks_are_the_best_the_cheap_and_the_small():
-    def timed(accuracy, us, size):
-        return at(60.0, us, accuracy, size)
-
     def found(*rows):
         return list(landmarks(rows).values())
 
-    best, third, poor = timed(0.99, 300.0, 100), timed(0.981, 100.0, 60), timed(0.979, 10.0, 30)
-    few, fewer = timed(0.95, 200.0, 20), timed(0.94, 90.0, 8)
+    best, third, poor, few, fewer, quick = (
+        at(60.0, us, accuracy, size)
+        for accuracy, us, size in (
+            *((0.99, 300.0, 100), (0.981, 100.0, 60), (0.979, 10.0, 30)),
+            *((0.95, 200.0, 20), (0.94, 90.0, 8), (0.99, 200.0, 100)),
+        )
+    )
     assert found(poor, few, third, best, fewer) == [best, third, few]
     assert found(best, third, poor) == [best, third, None]
-    quick = timed(0.99, 200.0, 100)  # of the same accuracy: the quickest
-    assert found(best, quick, third) == [quick, None, None]
+    assert found(best, quick, third) == [quick, None, None]  # as accurate: the quickest
     assert found() == [None, None, None]
     made = [at(60.0, 100.0, accuracy) for accuracy in (0.8, 0.9, 0.7)]
     pooled = [replace(each, columns="pooled mean") for each in made]
@@ -560,7 +560,6 @@ def fails(monkeypatch, capsys, tmp_path, *arguments):
             "deadline_ms=57.5 cannot be met: bin 50 ms, shortest hop 5 ms and least look-ahead 2.5 "
             "ms are 57.5 ms before any compute; give more, or a shorter",
         ),
-        ("compute_us=0", "compute_us must be a positive finite number, got 0"),
         ("tries=0", "tries must be a positive whole number, got 0"),
         ("search.hops_ms=[5.3]", "search.hops_ms: 5.3 ms are 10.6 samples at 2000 Hz"),
         ("headroom=0.5", "headroom must be a finite number of at least 1, got 0.5"),

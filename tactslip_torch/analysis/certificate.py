@@ -111,8 +111,15 @@ class Comparison:
         return (self.rounded >= 0) != (self.exact >= 0)
 
 
-def compare(detector: SlipDetector, samples: Tensor, what: str = "bins") -> Comparison:
-    """Score bins in float32 and in float64, stage by stage.
+def pipelines(detector: SlipDetector) -> tuple[SlipDetector, SlipDetector]:
+    """Copies of a detector in float64 and in float32."""
+    return copy.deepcopy(detector).double(), copy.deepcopy(detector).float()
+
+
+def compare(
+    double: SlipDetector, single: SlipDetector, samples: Tensor, what: str = "bins"
+) -> Comparison:
+    """Score bins in float32 and in float64, stage by stage; takes ``*pipelines(detector)``.
 
     Shape:
         - samples: ``[N, C, n + 2 * context]``, volts, finite
@@ -122,8 +129,7 @@ def compare(detector: SlipDetector, samples: Tensor, what: str = "bins") -> Comp
     """
     if samples.ndim != 3 or not len(samples):
         raise ValueError(f"expected {what} [N, C, n], at least one, got {tuple(samples.shape)}")
-    refuse_nonfinite(samples, detector.pool.hand.names, "leave the recording out, or repair it")
-    double, single = copy.deepcopy(detector).double(), copy.deepcopy(detector).float()
+    refuse_nonfinite(samples, double.pool.hand.names, "leave the recording out, or repair it")
     chunks = bar(samples.split(_CHUNK_BINS), what, f"x{_CHUNK_BINS} bins")
     with torch.no_grad():
         parts = [_compared(double, single, chunk) for chunk in chunks]
@@ -223,20 +229,20 @@ def certify(
     given = {"calibration": calibration} | dict(held_out or {})
     if taken := sorted({"calibration", *EXTREMES} & {*(held_out or {})}):
         raise ValueError(f"a held-out set may not be named {taken[0]!r}, a name of our own; rename")
-    sets = {name: compare(detector, bins, name) for name, bins in given.items()}
+    double, single = pipelines(detector)
+    sets = {name: compare(double, single, bins, name) for name, bins in given.items()}
     base = sets["calibration"]
     sd = score_sd(base.exact)
     generator = torch.Generator().manual_seed(seed)
     size = (extremes, *calibration.shape[1:])
     kinds = {
-        kind: compare(detector, extreme_bins(kind, size, generator, torch.float32), kind)
+        kind: compare(double, single, extreme_bins(kind, size, generator, torch.float32), kind)
         for kind in EXTREMES
     }
     head = head_facts(detector.head, base.scaled, seed)
     worst = float(base.error.max())
     margin = (head["bound"] or 0.0) + FACTOR * worst
     known = _least_by_kind(base.covers, detector)
-    double = copy.deepcopy(detector).double()
     thinned = calibration[:: -(-len(calibration) // _GRADIENT_BINS)].double()
     content: dict[str, Any] = {
         "simulated": simulated,

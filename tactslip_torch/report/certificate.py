@@ -98,6 +98,7 @@ def _scatter(axes: Axes, content: Mapping[str, Any], points: Points) -> None:
         flipped = np.asarray(own["flips"], dtype=bool)
         axes.scatter(x[flipped], y[flipped], s=34, marker="x", color=_BAD, zorder=4)
     axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(floor / 2, top))
+    axes.minorticks_off()  # of hundreds of decades they take seconds
     axes.plot([low, high], [low, high], color=GREY, linewidth=0.9, linestyle=":")
     if margin:
         axes.axvspan(low, margin, color="#F3E3D3", zorder=0)
@@ -131,6 +132,7 @@ def _bars(axes: Axes, extremes: Mapping[str, Mapping[str, Any]]) -> None:
         colour = _BAD if flips or kind["not_finite"] else GREY
         axes.text(1.25 * end, place, ", ".join(notes), va="center", color=colour, fontsize=8)
     axes.set(xscale="log", xlim=(floor, 60 * max(*ends, floor)))
+    axes.minorticks_off()
     lanes(axes, list(extremes))
     axes.set_xlabel("error of the float32 score: bar worst, tick median", color=GREY)
 
