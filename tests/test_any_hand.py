@@ -1,6 +1,7 @@
 """Hands of other channels, kinds, rates, bins and wavelets: from noise to an exported detector."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -26,6 +27,9 @@ from tactslip_torch.training.experiment import feature_maker
 from tactslip_torch.training.recipe import Recipe
 
 any_hand = pytest.mark.parametrize("name", HANDS)
+UNLIKE = ("24 electrodes at 100 Hz", "one slow", "40 at 1 kHz", "own filters, causal")
+"""Hands that differ in everything, for what takes long."""
+unlike_hand = pytest.mark.parametrize("name", UNLIKE)
 
 
 def stream_of(name, num_bins=12, seed=3):
@@ -70,13 +74,14 @@ def test_a_detector_tells_slip_and_comes_back_from_its_file(name, tmp_path):
     loaded = SlipDetector.load(path, backend="auto")
     assert loaded.pool.hand == detector.pool.hand == hand.layout()
     assert loaded.pool.facts() == detector.pool.facts()
+    assert loaded.channel_filter.config() == detector.channel_filter.config()
     assert torch.equal(loaded.score_raw(samples), score)
     again = tmp_path / "again.pt"
     loaded.save(again)
     assert again.read_bytes() == path.read_bytes()
 
 
-@any_hand
+@unlike_hand
 @given(data=st.data())
 def test_a_stream_in_pieces_is_the_recording_scored_whole(name, data):
     detector, samples = detector_of(name), stream_of(name)
@@ -84,7 +89,7 @@ def test_a_stream_in_pieces_is_the_recording_scored_whole(name, data):
     cuts = data.draw(st.lists(st.integers(0, num), max_size=8))
     hop = data.draw(st.integers(1, 2 * HANDS[name].bin_samples))
     settings = AlarmSettings.of(detector)
-    settings = AlarmSettings(**{**vars(settings), "hop_samples": hop})
+    settings = replace(settings, hop_samples=hop)
     stream = StreamingDetector(detector, settings, dtype=torch.float64)
     pieces = [samples[:, a:b].T for a, b in pairwise([0, *sorted(cuts), num])]
     found = [stream.push(piece) for piece in pieces] + [stream.flush()]
@@ -96,7 +101,7 @@ def test_a_stream_in_pieces_is_the_recording_scored_whole(name, data):
 
 
 @pytest.mark.onnx
-@any_hand
+@unlike_hand
 def test_exported_graphs_give_the_detectors_scores(name, tmp_path):
     hand, detector = HANDS[name], detector_of(name)
     bin_path, stream_path = export_detector(detector, tmp_path)  # checks itself, too
@@ -131,11 +136,12 @@ def session(path):
 @pytest.mark.parametrize(
     ("name", "units", "changes"),
     [
-        (
+        pytest.param(
             "24 electrodes at 100 Hz",
             "counts",
             ("labels.bin_ms=640", "labels.hop_ms=320", "features.level=null",
              "+features.frames.electrode=3"),
+            marks=pytest.mark.slow,
         ),
         (
             "five slow",
@@ -143,11 +149,12 @@ def session(path):
             ("labels.bin_ms=100", "features.level=null", "features.frames.SG=7",
              "+features.frames.force=null"),
         ),
-        (
+        pytest.param(
             "40 at 1 kHz",
             "kPa",
             ("labels.bin_ms=30", "+features.frames.taxel=5", "+features.frames.thermistor=1",
              "features.wavelet=db3", "features.level=2", "features.align=causal"),
+            marks=pytest.mark.slow,
         ),
     ],
 )  # fmt: skip

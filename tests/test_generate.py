@@ -162,20 +162,13 @@ def test_finished_files_are_kept_and_lost_or_damaged_ones_made_again(tmp_path):
     assert not any(one.made for one in run(tmp_path))
 
 
-def test_files_of_another_scene_are_made_anew(tmp_path):
-    run(tmp_path)
-    before, change = contents(tmp_path), "+data.scene.slide_s=0.7"
-    assert all(one.made for one in run(tmp_path, change))
-    after = contents(tmp_path)
-    assert all(after[name] != before[name] for name in before)
-    assert not any(one.made for one in run(tmp_path, change))
-
-
-def test_files_of_other_code_are_made_anew_and_more_cycles_added(tmp_path, monkeypatch):
+def test_files_of_another_scene_or_code_are_made_anew_and_cycles_added(tmp_path, monkeypatch):
     run(tmp_path, "cycles=1")
     made = [one.made for one in run(tmp_path)]
     assert made == [False, True, True] * 2
     assert len(manifest(tmp_path)) == 6
+    change = "+data.scene.slide_s=0.7"
+    assert [one.made for one in run(tmp_path, "cycles=1", change)] == [True] * 2
     monkeypatch.setattr(module, "source_digest", lambda: "changed")
     assert all(one.made for one in run(tmp_path))
     assert {FORMATS["npz"].load(p).key["code"] for p in tmp_path.glob("*.npz")} == {"changed"}

@@ -1,21 +1,8 @@
 """Gradients from the score and the alarm's statistic back to raw volts, through a fit as well.
 
-Which test holds the derivatives of each stage against finite differences:
-
-======================================  =====================================================
-filter of recordings, and of bins       here; ``savgol_filter``: test_filtering
-wavelet branches, amplitude spectra     test_wavelet, test_spectrum
-each descriptor, first and second       test_descriptors, test_descriptors_mended
-the whole pool                          test_pool
-scaling, with its knee                  test_scaling; the fit of the scaler: here
-kernels, both solves, quadratic form    test_kernels, test_solve
-the fit, its settings, held-out scores  test_fit, test_leave_one_group_out
-log likelihood ratio, each rule         test_calibration, test_sequential
-probability                             here
-all of it at once                       here: training volts and stream to statistic, twice
-======================================  =====================================================
-
-Mode and entropy step: they are left out by name.
+Here: filters, the fit of the scaler, and all of it at once. Spectra, branches, the pool, kernels,
+solves, the fit, held-out scores and rules have theirs in their own tests. The features in use are
+those without steps: mode and entropy are left out by name.
 """
 
 import pytest
@@ -39,7 +26,6 @@ from tactslip_torch.onset.decisions import (
 from tactslip_torch.onset.rules import Cusum, KOfN
 from tactslip_torch.signals.filtering import ChannelFilter
 
-STEPPING = ("mode", "entropy")
 SAMPLES, HOP = 12, 4
 HAND = HandLayout.from_rows(
     {"name": f"{kind}1", "kind": kind, "finger": "index", "segment": "distal"}
@@ -107,10 +93,6 @@ def volts():
     raw = torch.randn(6, 2, SAMPLES + 2 * FILTER.context, generator=generator, dtype=torch.float64)
     stream = torch.randn(2, SAMPLES + 3 * HOP, generator=generator, dtype=torch.float64)
     return raw.requires_grad_(), stream.requires_grad_()
-
-
-def test_none_of_the_features_in_use_steps():
-    assert {POOL.names[i].descriptor for i in SELECTED}.isdisjoint(STEPPING)
 
 
 def test_from_training_volts_and_stream_to_statistic(volts):

@@ -2,8 +2,7 @@
 
 import pytest
 import torch
-from any_hands import own_kernels, own_wavelet
-from small_detector import HAND, raw_bins, small_detector
+from any_hands import detector_of, own_kernels, own_wavelet
 from small_set import SMALL_HAND, SmallSet
 
 from tactslip_torch.data.labels import LabelRule
@@ -56,36 +55,6 @@ def test_other_filters_are_another_entry_of_the_cache(tmp_path):
     assert source.loads == len(choices)
 
 
-@pytest.fixture
-def detector():
-    plain = small_detector(backend="auto")
-    pool = FeaturePool(HAND, wavelet=WAVELET)
-    layer = ChannelFilter([51, 51, 11, 11], kernels=KERNELS)
-    return SlipDetector(pool, layer, plain.selected, plain.scaler, plain.head, plain.info)
-
-
-@pytest.mark.parametrize("backend", ["torch", "native"])
-def test_a_detector_comes_back_with_its_filters_in_any_engine(tmp_path, detector, backend):
-    detector.save(tmp_path / "detector.pt")
-    loaded = SlipDetector.load(tmp_path / "detector.pt", backend=backend)
-    assert loaded.extractor.backend == backend
-    assert loaded.pool.wavelet == detector.pool.wavelet
-    assert loaded.channel_filter.kernels == detector.channel_filter.kernels
-    samples = raw_bins(30, seed=1)
-    expected = small_detector(backend="auto").score_raw(samples)
-    score = loaded.score_raw(samples)
-    torch.testing.assert_close(score, detector.score_raw(samples), rtol=1e-9, atol=1e-9)
-    assert not torch.allclose(score, expected, rtol=1e-3)
-
-
-def test_a_file_without_own_filters_has_none(tmp_path):
-    small_detector().save(tmp_path / "detector.pt")
-    facts, _ = load_table(tmp_path / "detector.pt", FORMAT)
-    assert "kernels" not in facts
-    assert facts["pool"]["wavelet"] == "rbio2.2"
-    assert SlipDetector.load(tmp_path / "detector.pt").channel_filter.kernels == {}
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -96,9 +65,9 @@ def test_a_file_without_own_filters_has_none(tmp_path):
     ],
     ids=["kernel sum", "kernel length", "no wavelet", "no name"],
 )
-def test_damaged_filters_are_named_in_one_line(tmp_path, detector, change):
+def test_damaged_filters_are_named_in_one_line(tmp_path, change):
     path = tmp_path / "detector.pt"
-    detector.save(path)
+    detector_of("own filters").save(path)
     facts, tensors = load_table(path, FORMAT)
     change(facts)
     save_table(path, FORMAT, facts, tensors)
