@@ -17,7 +17,7 @@ from tactslip_torch.commands.entry import folder_problem, one_line
 from tactslip_torch.commands.generate import generate
 from tactslip_torch.data.file_recordings import FileRecordings
 from tactslip_torch.data.folder import RecordingFolder, Written
-from tactslip_torch.data.formats import FORMATS, Format
+from tactslip_torch.data.formats import FORMATS
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.report.recordings import written_table
 from tactslip_torch.simulation.scene import Scene
@@ -308,15 +308,3 @@ def test_simulated_recordings_are_called_so_with_their_fidelity(tmp_path, drawn)
     for row, (start, end) in zip(rows, views, strict=True):
         assert start == pytest.approx(max(0.0, row.non_slip_s[1][0] - 2.0))
         assert end - start <= 5.0
-
-
-# Formats -------------------------------------------------------------------------------------
-
-
-def test_a_further_format_is_one_line(tmp_path, monkeypatch):
-    """What a new format has to give, shown with one that keeps everything in another file."""
-    monkeypatch.setitem(FORMATS, "copy", Format("npz", ("copy",), "_npz"))
-    found = run(tmp_path, "format=copy", "cycles=1")
-    assert [one.line["file"] for one in found] == ["A_paper_00.copy", "B_paper_00.copy"]
-    assert FORMATS["npz"].load(tmp_path / "A_paper_00.copy").recording.material == "A"
-    assert not any(one.made for one in run(tmp_path, "format=copy", "cycles=1"))
