@@ -20,7 +20,7 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.harness import COLORS, LIGHT, Benchmark, Job, Report, Table, percent, say
+from benchmarks.harness import COLORS, LIGHT, Benchmark, Job, Report, Table, by, percent, say
 from benchmarks.subjects import SEEN_ROLE, FittedMachine, composed, small_recipe, statistics_from
 from tactslip_torch.model.abstention import ABSTAIN, NON_SLIP, SLIP, Abstention
 from tactslip_torch.model.calibration import fit_platt
@@ -123,22 +123,17 @@ class Abstaining(Benchmark[Sizes]):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Means over splits by role."""
-        rows = numbers["rows"]
+        num = len({tuple(row["held_out"]) for row in numbers["rows"]})
         found = {}
         for role, words in SEEN_ROLE.items():
             cells = []
-            for way, asked in dict.fromkeys((row["way"], row["asked"]) for row in rows):
-                these = [
-                    row for row in rows
-                    if (row["way"], row["asked"], row["role"]) == (way, asked, role)
-                ]  # fmt: skip
-                values = [mean(row[name] for row in these) for name in MEASURES]
-                least = min(row["covered"] for row in these)
-                cells.append([way, f"{100 * asked:g}", *map(percent, values), percent(least)])
-            num = len({tuple(row["held_out"]) for row in rows})
+            own = [row for row in numbers["rows"] if row["role"] == role]
+            for (way, asked), of in by(own, "way", "asked").items():
+                row: dict[str, object] = {"thresholds by": way, "asked %": f"{100 * asked:g}"}
+                row |= {title: percent(mean(one[n] for one in of)) for n, title in MEASURES.items()}
+                cells.append(row | {"least coverage %": percent(min(r["covered"] for r in of))})
             note = f"Means over {num} choices of held-out materials."
-            header = ["thresholds by", "asked %", *MEASURES.values(), "least coverage %"]
-            found[f"{role}: {words}"] = Table(header, cells, note)
+            found[f"{role}: {words}"] = Table(cells, note)
         return found
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
@@ -146,12 +141,9 @@ class Abstaining(Benchmark[Sizes]):
         panels = drawing.subplots(1, len(SEEN_ROLE), sharey=True)
         for axes, (role, words) in zip(panels, SEEN_ROLE.items(), strict=True):
             rows = [row for row in numbers["rows"] if row["role"] == role]
-            for color, way in zip(COLORS, dict.fromkeys(row["way"] for row in rows), strict=False):
-                asked = sorted({row["asked"] for row in rows})
-                kept = [
-                    mean(r["covered"] for r in rows if (r["way"], r["asked"]) == (way, of))
-                    for of in asked
-                ]
+            asked = sorted({row["asked"] for row in rows})
+            for color, ((way,), own) in zip(COLORS, by(rows, "way").items(), strict=False):
+                kept = [mean(row["covered"] for row in of) for of in by(own, "asked").values()]
                 axes.plot(asked, kept, "o-", color=color, label=way)
             axes.plot(asked, asked, "--", color=LIGHT)
             axes.set_title(words, fontsize=10)

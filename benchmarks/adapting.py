@@ -24,6 +24,7 @@ from benchmarks.harness import (
     Job,
     Report,
     Table,
+    by,
     limit,
     limits,
     percent,
@@ -144,47 +145,34 @@ class Adapting(Benchmark[Sizes]):
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Limits, new and old materials, and how the weight was chosen."""
         rows = numbers["rows"]
-        materials = list(dict.fromkeys(row["material"] for row in rows))
         found = {}
         for key, title in (("new", "New material"), ("old", "Old materials' test recordings")):
             cells = []
-            for way, count in dict.fromkeys((row["way"], row["count"]) for row in rows):
-                texts = []
-                for material in materials:
-                    at = (material, way, count)
-                    values = [
-                        row[key] for row in rows
-                        if (row["material"], row["way"], row["count"]) == at
-                    ]  # fmt: skip
-                    lowest, highest = (
-                        percent(min(values, default=0)),
-                        percent(max(values, default=0)),
-                    )
-                    middle = percent(median(values)) if values else "-"
-                    texts.append(f"{middle} ({lowest} to {highest})" if len(values) > 1 else middle)
-                cells.append([way, str(count), *texts])
+            for (way, count), of in by(rows, "way", "count").items():
+                row = {"way": way, "recordings": count}
+                for (material,) in by(rows, "material"):
+                    row[material] = _cell([one[key] for one in of if one["material"] == material])
+                cells.append(row)
             note = "Balanced accuracy, %, median of draws (lowest to highest)."
-            found[title] = Table(["way", "recordings", *materials], cells, note)
-        factors = dict.fromkeys(row["factor"] for row in numbers["weights"])
-        cells = []
-        for factor in factors:
-            these = [row for row in numbers["weights"] if row["factor"] == factor]
-            cells.append(
-                [f"{factor:g}", *(percent(mean(row[key] for row in these)) for key in _KEYS)]
-            )
+            found[title] = Table(cells, note)
+        weights = []
+        for (factor,), these in by(numbers["weights"], "factor").items():
+            means = {f"{key} %": percent(mean(row[key] for row in these)) for key in _KEYS}
+            weights.append({"weight of a new bin": f"{factor:g}"} | means)
         note = "Where each training material in turn is new; means over them."
-        weights = Table(["weight of a new bin", "new %", "old %"], cells, note)
         before = mean(row["old"] for row in rows if row["way"] == "before")
-        limited = [
-            row["old"] for row in rows if (row["way"], row["count"]) == (AUTO, numbers["limited"])
-        ]
+        limited = mean(row["old"] for row in by(rows, "way", "count")[AUTO, numbers["limited"]])
         goals = [
             limit(f"old materials lose, points, auto, {numbers['limited']} recordings",
-                  100 * (before - mean(limited)), 100 * numbers["margin"]),
+                  100 * (before - limited), 100 * numbers["margin"]),
             limit(f"s to add {numbers['limited']} recordings whose features are there",
                   numbers["add_s"], 10.0),
         ]  # fmt: skip
-        return {"Limits": limits(goals), **found, "How the weight was chosen": weights}
+        return {
+            "Limits": limits(goals),
+            **found,
+            "How the weight was chosen": Table(weights, note),
+        }
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """New and old against the number of recordings."""
@@ -192,9 +180,9 @@ class Adapting(Benchmark[Sizes]):
         rows = numbers["rows"]
         for axes, key, title in zip(panels, _KEYS, ("new material", "old materials"), strict=True):
             for place, way in enumerate((AUTO, SLIP_FREE, ONE, SHIFT)):
-                these = [row for row in rows if row["way"] in (way, "before")]
-                counts = sorted({row["count"] for row in these})
-                means = [mean(100 * r[key] for r in these if r["count"] == of) for of in counts]
+                these = by((row for row in rows if row["way"] in (way, "before")), "count")
+                means = [mean(100 * row[key] for row in of) for of in these.values()]
+                counts = [count for (count,) in these]
                 axes.plot(counts, means, "o-", color=COLORS[place], label=way)
             axes.set_title(title, fontsize=10)
             axes.set_xlabel("recordings added")
@@ -203,6 +191,13 @@ class Adapting(Benchmark[Sizes]):
 
 
 _KEYS = ("new", "old")
+
+
+def _cell(values: Sequence[float]) -> str:
+    if not values:
+        return "-"
+    spread = f" ({percent(min(values))} to {percent(max(values))})" if len(values) > 1 else ""
+    return percent(median(values)) + spread
 
 
 def _jobs(sizes: Sizes) -> Iterator[tuple[str, int, int]]:

@@ -1,25 +1,23 @@
 """Recipes on every choice of held-out materials: ``python -m benchmarks.crossval [key=value ...]``.
 
-Runs ``tactslip crossval`` and puts its tables into docs/recipes.md.
+Runs ``tactslip crossval`` with each seed and puts its tables into docs/recipes.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from matplotlib.figure import Figure
-
-from benchmarks.harness import Benchmark, Job, Report, Table, result_of, take_figures
+from benchmarks.harness import Benchmark, Job, Report, Table, code_digest, percent, result_of
 from tactslip_torch.report.crossval import material_rows, split_rows
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Overrides of ``tactslip crossval``, before those of the command line."""
+    """Overrides of ``tactslip crossval``, before those of the command line, and its seeds."""
 
     overrides: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = (0,)
 
 
 class Crossval(Benchmark[Sizes]):
@@ -43,38 +41,63 @@ class Crossval(Benchmark[Sizes]):
             "recipes.robust.penalties=[0.001]",
         )
     )
+    drawn: ClassVar = {"crossval.png": ""}
 
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
-        """What the command leaves, and where."""
-        overrides = [*job.sizes.overrides, *job.overrides]
-        found = result_of("crossval", overrides, job.folder, "crossval.json")
-        return found | {"folder": str(job.folder), "overrides": overrides}
+        """What the command leaves with each seed; with ``seed=...`` given, with that one alone."""
+        given = [each for each in job.overrides if each.startswith("seed=")]
+        runs = []
+        for seed in given[-1:] or [f"seed={seed}" for seed in job.sizes.seeds]:
+            overrides = [*job.sizes.overrides, *job.overrides, *([] if given else [seed])]
+            folder = job.folder / seed.replace("=", "-")
+            found = result_of("crossval", overrides, folder, "crossval.json")
+            runs.append(found | {"code": code_digest(), "folder": str(folder)})
+        return {"runs": runs, "simulated": runs[0]["simulated"], "folder": runs[0]["folder"]}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
-        """By choice and by material."""
-        note = (
-            f"Balanced accuracy, %, seed {numbers['seed']}; machines fitted on "
-            f"{numbers['train_bins']} bins of each material and class."
+        """By choice and by material with each seed, and the worst of both where seeds are many."""
+        runs, found = numbers["runs"], {}
+        for run in runs:
+            seed = f", seed {run['seed']}" if len(runs) > 1 else ""
+            note = (
+                f"Balanced accuracy, %, seed {run['seed']}; machines fitted on "
+                f"{run['train_bins']} bins of each material and class; code {run['code']}."
+            )
+            found[f"By choice{seed}"] = Table(split_rows(run), note)
+            found[f"By material{seed}"] = Table(material_rows(run), f"Seed {run['seed']}.")
+        if len(runs) > 1:
+            found["By seed"] = Table([row for run in runs for row in _worst_rows(run)])
+        return found
+
+
+def _worst_rows(run: Report) -> list[dict[str, object]]:
+    """Mean over choices, the worst choice and the worst single material, of each recipe."""
+    rows: list[dict[str, object]] = []
+    for recipe, splits in run["splits"].items():
+        known = [split for split in splits if split["unseen"] is not None]
+        if not known:
+            continue
+        worst = min(known, key=lambda split: float(split["unseen"]))
+        material, score, beside = min(
+            (
+                (material, score, split["materials"])
+                for split in known
+                for material, score in split["per_material"].items()
+                if score is not None
+            ),
+            key=lambda of: float(of[1]),
         )
-        return {
-            "By choice": Table.of(split_rows(numbers), note),
-            "By material": Table.of(material_rows(numbers)),
-        }
-
-    def section(self, report: Report) -> str:
-        """The tables alone: docs/recipes.md says the rest."""
-        shown = [f"'{each}'" for each in report["overrides"]]
-        command = f"`{' '.join([f'python -m benchmarks.{self.name}', *shown])}`"
-        tables = [table.markdown() for table in self.tables(report["numbers"]).values()]
-        kind = "Simulated" if report["simulated"] else "Recorded"
-        return "\n\n".join([f"{kind} ({command}, code {report['code']}):", *tables])
-
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """The command has drawn it."""
-
-    def figures(self, report: Report, path: Path) -> None:
-        """That of the command."""
-        take_figures(Path(report["numbers"]["folder"]), {"crossval.png": path})
+        rows.append(
+            {
+                "held-out materials": f"{recipe}, seed {run['seed']}",
+                "mean %": percent(sum(split["unseen"] for split in known) / len(known)),
+                "worst choice %": percent(worst["unseen"]),
+                "which": ", ".join(worst["materials"]),
+                "worst single material %": percent(score),
+                "which of which choice": f"{material} of {', '.join(beside)}",
+            }
+        )
+    return rows
 
 
 if __name__ == "__main__":

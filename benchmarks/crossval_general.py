@@ -12,7 +12,7 @@ class CrossvalGeneral(Crossval):
     """The general recipe alone."""
 
     name = "crossval_general"
-    sizes = Sizes(("~recipes.paper", "~recipes.robust"))
+    sizes = Sizes(("~recipes.paper", "~recipes.robust"), seeds=(0, 4))
 
 
 if __name__ == "__main__":

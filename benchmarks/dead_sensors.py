@@ -7,6 +7,7 @@ again without the lost features.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import mean
 from typing import Any
@@ -15,7 +16,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.harness import Benchmark, Job, Report, Table, bars, percent, say
+from benchmarks.harness import Benchmark, Job, Report, Table, bars, by, percent, say
 from benchmarks.subjects import SEEN_ROLE, Trained
 from tactslip_torch import HandLayout
 from tactslip_torch.model.calibration import (
@@ -111,36 +112,39 @@ class DeadSensors(Benchmark[Sizes]):
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Means over losses of a kind, by role."""
         found = {}
-        rows = numbers["rows"]
-        ways = dict.fromkeys(row["way"] for row in rows)
         for role, words in SEEN_ROLE.items():
-            cells = []
-            for kind in dict.fromkeys(row["kind"] for row in rows):
-                these = [row for row in rows if (row["kind"], row["role"]) == (kind, role)]
-                by_way = [[row for row in these if row["way"] == way] for way in ways]
-                values = [mean(r["balanced_accuracy"] for r in of) for of in by_way]
-                errors = [mean(r["ece"] for r in of) for of in by_way]
-                texts = [f"{percent(v)} ({e:.3f})" for v, e in zip(values, errors, strict=True)]
-                cells.append([f"a {kind}", str(len(by_way[0])), *texts])
+            rows = []
+            for (kind,), of in by(_of_role(numbers, role), "kind").items():
+                ways = by(of, "way")
+                row = {"without": f"a {kind}", "losses": len(next(iter(ways.values())))}
+                rows.append(row | {way: _cell(own) for (way,), own in ways.items()})
             note = "Balanced accuracy, %, in brackets the expected calibration error; means."
-            header = ["without", "losses", *ways]
-            found[f"{role}: {words}"] = Table(header, cells, note)
+            found[f"{role}: {words}"] = Table(rows, note)
         return found
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Mean accuracy by kind of loss and way, held-out cycles."""
-        rows = [row for row in numbers["rows"] if row["role"] == "test"]
-        kinds = list(dict.fromkeys(row["kind"] for row in rows))
+        rows = _of_role(numbers, "test")
+        kinds = [kind for (kind,) in by(rows, "kind")]
         series = {
             way: [
-                mean(100 * r["balanced_accuracy"] for r in rows if (r["way"], r["kind"]) == at)
-                for at in ((way, kind) for kind in kinds)
+                mean(100 * row["balanced_accuracy"] for row in of)
+                for of in by(own, "kind").values()
             ]
-            for way in dict.fromkeys(row["way"] for row in rows)
+            for (way,), own in by(rows, "way").items()
         }
         axes = drawing.subplots()
         bars(axes, kinds, series, "balanced accuracy, %, held-out cycles", is_log=False)
         axes.set_xlim(left=45)
+
+
+def _of_role(numbers: Report, role: str) -> list[Report]:
+    return [row for row in numbers["rows"] if row["role"] == role]
+
+
+def _cell(rows: Sequence[Report]) -> str:
+    accuracy = percent(mean(row["balanced_accuracy"] for row in rows))
+    return f"{accuracy} ({mean(row['ece'] for row in rows):.3f})"
 
 
 def _bins_of(trained: Trained, role: str) -> _Bins:

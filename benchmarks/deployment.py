@@ -177,45 +177,45 @@ class Deployment(Benchmark[Sizes]):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Bins, streams, files, starts."""
-        sizes = sorted({int(size) for row in numbers["bins"] for size in row["us"]})
         bins = [
-            [
-                row["way"],
-                *(Spread(*row["us"][str(size)]).text() for size in sizes),
-                number(row["error"]),
-                str(row["flips"]),
-            ]
+            {"way": row["way"]}
+            | {f"us a bin, {of} at once": Spread(*us).text() for of, us in row["us"].items()}
+            | {"error": number(row["error"]), "flips": row["flips"]}
             for row in numbers["bins"]
         ]
         streams = [
-            [row["way"], Spread.of(row["seconds"], 1e6).text(), number(row["error"])]
+            {
+                "way": row["way"],
+                f"us a push of {numbers['push']} samples": Spread.of(row["seconds"], 1e6).text(),
+                "error": number(row["error"]),
+            }
             for row in numbers["streams"]
         ]
         files = [
-            [row["file"], f"{row['bytes'] / 1e3:,.0f}", f"{row['seconds']:.1f}"]
+            {
+                "file": row["file"],
+                "kB": f"{row['bytes'] / 1e3:,.0f}",
+                "s to make both and check them": f"{row['seconds']:.1f}",
+            }
             for row in numbers["files"]
         ]
         starts = [
-            [
-                row["way"],
-                *(f"{median(row[part]):.2f}" for part in ("import_s", "load_s", "first_s")),
-            ]
+            {"way": row["way"]}
+            | {
+                f"{part} s": f"{median(row[f'{part}_s']):.2f}"
+                for part in ("import", "load", "first")
+            }
             for row in numbers["starts"]
         ]
-        header = ["way", *(f"us a bin, {size} at once" for size in sizes), "error", "flips"]
         note = (
             "Error of scores in standard deviations of the reference's; flips: bins that are "
             "decided otherwise."
         )
-        pushes = ["way", f"us a push of {numbers['push']} samples", "error"]
-        making = ["file", "kB", "s to make both and check them"]
         return {
-            "Bins": Table(header, bins, note),
-            "A stream": Table(pushes, streams),
-            "Files": Table(making, files),
-            "A first score in a fresh process": Table(
-                ["way", "import s", "load s", "first s"], starts
-            ),
+            "Bins": Table(bins, note),
+            "A stream": Table(streams),
+            "Files": Table(files),
+            "A first score in a fresh process": Table(starts),
         }
 
     def draw(self, numbers: Report, drawing: Figure) -> None:

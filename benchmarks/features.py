@@ -108,24 +108,23 @@ class Features(Benchmark[Sizes]):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Time of a bin and error of each way."""
-        rows = [
-            [
-                row["way"],
-                str(row["features"]),
-                Spread.of(row["seconds"], 1e6 / row["bins"]).text(),
-                str(row["bins"]),
-                "-" if row["error"] is None else number(row["error"]),
-            ]
-            for row in numbers["rows"]
-        ]
         note = (
             f"{numbers['threads']} threads where a way takes threads. Error: the largest, over "
             "the larger of the reference's magnitude and its column's standard deviation; of "
             "entropy and mode, which step, the 99th percentile. NaN of the loop, which has no "
             "rule for constants, is left out."
         )
-        header = ["way", "features", "us a bin", "bins a call", "error"]
-        return {"Time and error": Table(header, rows, note)}
+        rows = [
+            {
+                "way": row["way"],
+                "features": row["features"],
+                "us a bin": Spread.of(row["seconds"], 1e6 / row["bins"]).text(),
+                "bins a call": row["bins"],
+                "error": number(row["error"]),
+            }
+            for row in numbers["rows"]
+        ]
+        return {"Time and error": Table(rows, note)}
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Time of a bin."""

@@ -108,38 +108,40 @@ class Formats(Benchmark[Sizes]):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Limits, reading and writing."""
-        rows = numbers["rows"]
+        rows, reading, writing = numbers["rows"], [], []
+        for row in rows:
+            ms = {way: Spread.of(of, 1e3).text() for way, of in row["seconds"].items()}
+            ratio = paired_ratio(row["seconds"][LIBRARY], row["seconds"][LOAD]).median
+            reading.append(
+                {
+                    "file": f".{row['ending']}",
+                    "whole, ms": ms[LOAD],
+                    "by stretches, ms": ms[STRETCHES],
+                    "library": row["library"],
+                    "its ms": ms[LIBRARY],
+                    "library / whole": number(ratio),
+                }
+            )
+            writing.append(
+                {
+                    "file": f".{row['ending']}",
+                    "ms": ms[SAVE],
+                    "kB": f"{row['bytes'] / 1e3:,.0f}",
+                    "bytes / samples": number(row["bytes"] / numbers["sample_bytes"]),
+                }
+            )
         goals = [
-            limit(f".{row['ending']} {way}", Spread.of(row["seconds"][way], 1e3).median, 100, "ms")
+            limit(
+                f".{row['ending']} {way}, median",
+                Spread.of(row["seconds"][way], 1e3).median,
+                100,
+                "ms",
+            )
             for row in rows
             if row["format"] in LIMITED
             for way in (LOAD, STRETCHES)
         ]
-        reading = [
-            [
-                f".{row['ending']}",
-                *(Spread.of(row["seconds"][way], 1e3).text() for way in (LOAD, STRETCHES)),
-                row["library"],
-                Spread.of(row["seconds"][LIBRARY], 1e3).text(),
-                number(paired_ratio(row["seconds"][LIBRARY], row["seconds"][LOAD]).median),
-            ]
-            for row in rows
-        ]
-        writing = [
-            [
-                f".{row['ending']}",
-                Spread.of(row["seconds"][SAVE], 1e3).text(),
-                f"{row['bytes'] / 1e3:,.0f}",
-                number(row["bytes"] / numbers["sample_bytes"]),
-            ]
-            for row in rows
-        ]
-        header = ["file", "whole, ms", "by stretches, ms", "library", "its ms", "library / whole"]
-        return {
-            "Limits": limits(goals, "median"),
-            "Reading": Table(header, reading),
-            "Writing": Table(["file", "ms", "kB", "bytes / samples"], writing),
-        }
+        return {"Limits": limits(goals), "Reading": Table(reading), "Writing": Table(writing)}
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Three bars a format."""

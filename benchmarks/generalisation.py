@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import json
 import math
-import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -33,6 +33,7 @@ from benchmarks.harness import (
     Table,
     between_markers,
     code_digest,
+    mean_sd,
     trained,
     write_text,
 )
@@ -40,6 +41,7 @@ from benchmarks.subjects import composed
 from tactslip_torch.data.recording import RecordingId, RecordingSource
 from tactslip_torch.data.splits import Split, unseen4
 from tactslip_torch.features.bin_sample import bin_keys
+from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import calibration_of
 from tactslip_torch.report.results import BASELINES, splits_table
@@ -97,19 +99,20 @@ class Generalisation(Benchmark[Sizes]):
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
         """All measures of each seed, and what the main job prints."""
         found: dict[str, Any] = {"code": {}, "experiments": {}, "hard": {}}
-        small, cache = [*job.sizes.overrides, *job.overrides], job.folder / "cache"
+        cache = job.folder / "cache"
         for name in ("unseen4", "deploy", "hard"):
             for seed in getattr(job.sizes, name):
                 kept = job.folder / f"measures-{name}-{seed}.json"
                 of = json.loads(kept.read_text()) if kept.exists() else {}
                 if of.get("code") != code_digest():
+                    given = [f"seed={seed}", *job.sizes.overrides, *job.overrides]
                     run = hard_run if name == "hard" else seed_run
-                    of = {"code": code_digest(), "of": run(name, seed, job.folder, cache, small)}
+                    of = {"code": code_digest(), "of": run(name, given, job.folder, cache)}
                     write_text(kept, json.dumps(of) + "\n")
                 place = found if name == "hard" else found["experiments"]
                 place.setdefault(name, {})[str(seed)] = of["of"]
                 found["code"][name] = of["code"]
-        metrics = json.loads((job.folder / "unseen4-0" / "metrics.json").read_text())
+        metrics = json.loads((job.folder / "unseen4-seed-0" / "metrics.json").read_text())
         return found | {"main job": splits_table(metrics)}
 
     def tables(self, numbers: Report) -> dict[str, Table]:
@@ -118,13 +121,13 @@ class Generalisation(Benchmark[Sizes]):
         for name, own in numbers["experiments"].items():
             chosen = "; ".join(f"seed {seed}: {of['chosen']}" for seed, of in own.items())
             note = f"{_about(numbers, name)} Chosen: {chosen}."
-            found[f"`+exp={name}`"] = Table.of(_measures(own, name), note)
-            found[f"`+exp={name}`, seed by seed"] = Table.of(_by_seed(own), _validation(own, name))
+            found[f"`+exp={name}`"] = Table(_measures(own, name), note)
+            found[f"`+exp={name}`, seed by seed"] = Table(_by_seed(own), _validation(own))
             baselines = [of["baselines"] for of in own.values()]
-            found[f"`+exp={name}`, baselines"] = Table.of(_rows(baselines, ("test", "unseen")))
+            found[f"`+exp={name}`, baselines"] = Table(_rows(baselines, ("test", "unseen")))
         if hard := numbers["hard"]:
             rows = _rows(list(hard.values()), ("nested validation", "test", "unseen"))
-            found["`+exp=hard`"] = Table.of(rows, f"{_about(numbers, 'hard')} {_ahead(hard)}")
+            found["`+exp=hard`"] = Table(rows, f"{_about(numbers, 'hard')} {_ahead(hard)}")
         return found
 
     def section(self, report: Report) -> str:
@@ -149,20 +152,19 @@ class Generalisation(Benchmark[Sizes]):
         if report["quick"]:
             return
         numbers = report["numbers"]
-        rows = {
-            row["measure"]: row for row in summary(numbers["experiments"]["unseen4"], "unseen4")
-        }
+        own = numbers["experiments"]["unseen4"]
         told = []
         for measure in ("test", "held-out materials", "another session"):
-            seeds = ", ".join(f"{value:.2f}" for value in rows[measure]["by_seed"])
-            told.append({"": measure, "mean ± sd": rows[measure]["mean ± sd"], "by seed": seeds})
+            values = [of[measure] for of in own.values()]
+            by_seed = ", ".join(f"{value:.2f}" for value in values)
+            told.append({"": measure, "mean ± sd": mean_sd(values), "by seed": by_seed})
         lines = [
             "It prints among others (seed 0, `python -m benchmarks.generalisation`, code "
             f"{numbers['code']['unseen4']}):\n",
             f"```\n{numbers['main job']}\n```\n",
-            f"Balanced accuracy, %, {len(rows['test']['by_seed'])} seeds, **simulated**. *Unseen*",
+            f"Balanced accuracy, %, {len(own)} seeds, **simulated**. *Unseen*",
             "are held-out materials, *another session* another mounting of the six seen ones:\n",
-            Table.of(told).markdown(),
+            Table(told).markdown(),
         ]
         path = ROOT / "README.md"
         text = between_markers(path.read_text(encoding="utf-8"), "first result", "\n".join(lines))
@@ -174,17 +176,17 @@ class Generalisation(Benchmark[Sizes]):
         found, called, by_seed = drawing.subplots(1, 3)
         labels = ["test", "held-out materials", "another session"]
         for (name, own), color in zip(numbers["experiments"].items(), (OURS, PEER), strict=False):
-            rows = {row["measure"]: row for row in summary(own, name)}
             for axes, measure in (
                 (found, "slips at {:g} mV found"),
                 (called, "moving arm at {:g} mV called slip"),
             ):
                 for side, style in (("seen", "--"), ("held out", "-")):
-                    means = [rows[f"{measure.format(mv)}, {side}"]["mean"] for mv in LEVELS_MV]
+                    keys = [f"{measure.format(mv)}, {side}" for mv in LEVELS_MV]
+                    means = [fmean(of[key] for of in own.values()) for key in keys]
                     text = f"{name}, {side}"
                     axes.plot(LEVELS_MV, means, style, marker="o", color=color, label=text)
             for place, label in enumerate(labels):
-                values = rows[label]["by_seed"]
+                values = [of[label] for of in own.values()]
                 at = place + (0.12 if color == PEER else -0.12)
                 by_seed.plot([at] * len(values), values, "o", color=color, alpha=0.7)
         by_seed.set_xticks(range(3), [label.replace(" ", "\n") for label in labels])
@@ -208,12 +210,7 @@ class Scored:
     recording: RecordingId
     truth: Tensor
     score: Tensor
-    probability: Tensor | None
-
-
-def is_at_most(measure: str) -> bool:
-    """Whether a measure is better when it is smaller."""
-    return "called slip" in measure or "error" in measure
+    probability: Tensor
 
 
 def recordings(
@@ -242,13 +239,11 @@ def scored(detector: SlipDetector, made: RecordingFeatures, *, half: bool = Fals
         is_missing = is_missing.expand(len(features), num)
     with torch.no_grad():
         score = detector.head(detector.scaler(detector.columns(features, is_missing)))
-    found = calibration_of(detector)
-    probability = None
-    if found is not None:
-        calibration, slip_share = found
-        llr = calibration.llr(score)
-        probability = torch.sigmoid(llr + math.log(slip_share / (1 - slip_share)))
-    return Scored(made.recording, made.is_slip, score, probability)
+    calibrated = calibration_of(detector)
+    assert calibrated is not None  # as trained
+    calibration, slip_share = calibrated
+    stated = probability(calibration.llr(score), slip_share)
+    return Scored(made.recording, made.is_slip, score, stated)
 
 
 def balanced(parts: Sequence[Scored]) -> float:
@@ -265,44 +260,39 @@ def called_slip(parts: Sequence[Scored], *, truth: bool) -> float:
     return 100 * float(says.double().mean())
 
 
-def calibration_error(parts: Sequence[Scored], num_bins: int = 15) -> float:
-    """Expected calibration error of the probability of slip, %, classes weighed as stated."""
-    probability = torch.cat([p.probability for p in parts if p.probability is not None])
-    truth = torch.cat([p.truth for p in parts if p.probability is not None]).double()
-    if not len(probability):
-        return math.nan
-    places = (probability * num_bins).long().clamp(max=num_bins - 1)
-    total = 0.0
-    for place in range(num_bins):
-        mine = places == place
-        if bool(mine.any()):
-            total += abs(float((truth[mine] - probability[mine]).sum()))
-    return 100 * total / len(truth)
+def calibration_error(parts: Sequence[Scored], num_cells: int = 15) -> float:
+    """Expected calibration error of the probability of slip, in cells of equal width, %."""
+    stated = torch.cat([part.probability for part in parts]).double()
+    truth = torch.cat([part.truth for part in parts]).double()
+    cell = (stated * num_cells).long().clamp(max=num_cells - 1)
+    gaps = stated.new_zeros(num_cells).index_add(0, cell, truth - stated)
+    return 100 * float(gaps.abs().sum()) / len(truth)
 
 
-def first_of(source: RecordingSource, role: str, seed: int, num: int) -> list[RecordingId]:
-    """The first recordings of each material with a role in ``unseen4``."""
-    held_out = [m for m in dict.fromkeys(r.material for r in source.ids) if m not in SEEN]
-    split = unseen4(source.ids, seen=SEEN, unseen=held_out, seed=seed)[0]
-    found: list[RecordingId] = []
-    for material in dict.fromkeys(r.material for r in source.ids):
-        own = [r for r in split.having(role) if r.material == material]
-        found += own[:num]
-    return found
+def first_of(
+    role: str, overrides: Sequence[str], num: int
+) -> Callable[[RecordingSource], list[RecordingId]]:
+    """What takes the first recordings of each material with a role in ``unseen4``."""
+    seed = composed("train", overrides).seed
+
+    def keep(source: RecordingSource) -> list[RecordingId]:
+        materials = list(dict.fromkeys(recording.material for recording in source.ids))
+        held_out = [material for material in materials if material not in SEEN]
+        (split,) = unseen4(source.ids, seen=SEEN, unseen=held_out, seed=seed)
+        having = split.having(role)
+        return [r for m in materials for r in [one for one in having if one.material == m][:num]]
+
+    return keep
 
 
-def seed_run(
-    name: str, seed: int, folder: Path, cache: Path, small: Sequence[str]
-) -> dict[str, Any]:
-    """All measures of an experiment with one seed."""
-    place = folder / f"{name}-{seed}"
-    overrides = [f"+exp={name}", f"seed={seed}", *small]
-    metrics = trained(f"{name}, seed {seed}", overrides, place, cache)
-    detector = SlipDetector.load(place / "detector.pt")
-    nested = metrics.get("nested_validation") or {}
+def seed_run(name: str, given: Sequence[str], folder: Path, cache: Path) -> dict[str, Any]:
+    """All measures of an experiment with the overrides that give its seed and size."""
+    what = f"{name}-{given[0]}".replace("=", "-")
+    metrics = trained(what, [f"+exp={name}", *given], folder / what, cache)
+    detector = SlipDetector.load(folder / what / "detector.pt")
     chosen = next(row for row in metrics["validation"] if row.get("chosen"))
     found: dict[str, Any] = {
-        "nested validation": 100 * nested.get("mean", math.nan),
+        "nested validation": _nested(metrics),
         "chosen": f"{chosen['use']}, {chosen['num_features'] or 'all'}, degree "
         f"{chosen['kernel']['degree']}, C={chosen['penalty']:g}",
         "numbers": len(metrics["selected"]),
@@ -315,37 +305,28 @@ def seed_run(
         },
     }
 
-    def on(what: str, over: Sequence[str], keep: Any, *, half: bool = False) -> list[Scored]:
-        config = composed("train", ["+exp=unseen4", f"seed={seed}", *small, *over])
-        made = recordings(config, cache, keep, f"seed {seed}, {what}")
+    def on(what: str, keep: Any, *over: str, half: bool = False) -> list[Scored]:
+        config = composed("train", ["+exp=unseen4", *given, *over])
+        made = recordings(config, cache, keep, f"{given[0]}, {what}")
         return [scored(detector, each, half=half) for each in made]
 
-    def having(role: str, num: int) -> Callable[[RecordingSource], list[RecordingId]]:
-        return lambda source: first_of(source, role, seed, num)
-
     for role, label in (("test", "test"), ("unseen", "held out")):
-        keep = having(role, 99)
-        whole = on(f"{label}", [], keep)
+        keep = first_of(role, given, 99)
+        whole = on(label, keep)
         found["test" if role == "test" else "held-out materials"] = balanced(whole)
         found[f"calibration error, {label}"] = calibration_error(whole)
-        missing = on(f"{label}, half missing", [], keep, half=True)
+        missing = on(f"{label}, half missing", keep, half=True)
         found[f"half of the channels missing, {label}"] = balanced(missing)
         found[f"calibration error, half missing, {label}"] = calibration_error(missing)
     over = [f"data.materials=[{','.join(SEEN)}]", "data.sessions=3", "data.cycles=5"]
-    sessions = on("sessions", over, lambda source: [r for r in source.ids if r.session])
+    sessions = on("sessions", lambda source: [r for r in source.ids if r.session], *over)
     found["another session"] = balanced(sessions)
-    pairs = sorted({(p.recording.material, p.recording.session) for p in sessions})
-    found["sessions by pair"] = by_pair = {
-        f"{material}, session {session}": balanced(
-            [
-                p
-                for p in sessions
-                if (p.recording.material, p.recording.session) == (material, session)
-            ]
-        )
-        for material, session in pairs
-    }
-    found["another session, worst pair"] = min(by_pair.values())
+    by_pair: dict[str, list[Scored]] = {}
+    for one in sorted(sessions, key=lambda one: one.recording):
+        pair = f"{one.recording.material}, session {one.recording.session}"
+        by_pair.setdefault(pair, []).append(one)
+    found["sessions by pair"] = {pair: balanced(parts) for pair, parts in by_pair.items()}
+    found["another session, worst pair"] = min(found["sessions by pair"].values())
 
     def later(first: int) -> Callable[[RecordingSource], list[RecordingId]]:
         return lambda source: [r for r in source.ids if r.cycle >= first]
@@ -355,42 +336,40 @@ def seed_run(
             own = [p for p in parts if (p.recording.material in SEEN) == is_seen]
             found[f"{measure}, {label}"] = called_slip(own, truth=truth)
 
-    arm = on("moving arm", ["scene=arm_motion", "data.cycles=10"], later(6))
+    def some(source: RecordingSource) -> list[RecordingId]:
+        return [*first_of("test", given, 2)(source), *first_of("unseen", given, 3)(source)]
+
+    arm = on("moving arm", later(6), "scene=arm_motion", "data.cycles=10")
     by_side(arm, "moving arm called slip", truth=False)
-    pulled = on("pulled", ["scene=pulled", "data.cycles=8"], later(4))
+    pulled = on("pulled", later(4), "scene=pulled", "data.cycles=8")
     by_side(pulled, "pulled object found", truth=True)
-    for level in LEVELS_MV:
-        over = [f"+scene.motor_vibration_mv={level}"]
-
-        def some(source: RecordingSource) -> list[RecordingId]:
-            return [*having("test", 2)(source), *having("unseen", 3)(source)]
-
-        slips = on(f"slips, {level:g} mV", over, some)
-        by_side(slips, f"slips at {level:g} mV found", truth=True)
-        over = ["scene=arm_motion", "data.cycles=8", f"scene.motor_vibration_mv={level}"]
-        arm = on(f"moving arm, {level:g} mV", [over[0], over[1], f"+{over[2]}"], later(6))
-        by_side(arm, f"moving arm at {level:g} mV called slip", truth=False)
+    for mv in LEVELS_MV:
+        loud = f"+scene.motor_vibration_mv={mv}"
+        by_side(on(f"slips, {mv:g} mV", some, loud), f"slips at {mv:g} mV found", truth=True)
+        arm = on(f"arm, {mv:g} mV", later(6), "scene=arm_motion", "data.cycles=8", loud)
+        by_side(arm, f"moving arm at {mv:g} mV called slip", truth=False)
     return found
 
 
-def hard_run(
-    name: str, seed: int, folder: Path, cache: Path, small: Sequence[str]
-) -> dict[str, Any]:
-    """Balanced accuracies of recipes and baselines on ``+exp=hard`` with one seed, %."""
-    found: dict[str, Any] = {}
+def hard_run(name: str, given: Sequence[str], folder: Path, cache: Path) -> dict[str, Any]:
+    """Balanced accuracies of recipes and baselines on ``+exp=hard``, %."""
+    found, baselines = {}, {}
     for recipe in HARD_RECIPES:
-        over = [f"+exp={name}", f"recipe={recipe}", f"seed={seed}", *small]
-        place = folder / f"{name}-{recipe}-{seed}"
-        metrics = trained(f"{name}, {recipe}, seed {seed}", over, place, cache)
+        over = [f"+exp={name}", f"recipe={recipe}", *given]
+        what = f"{name}-{recipe}-{given[0]}".replace("=", "-")
+        metrics = trained(what, over, folder / what, cache)
         found[f"recipe={recipe}"] = _by_role(metrics["splits"])
         if recipe == HARD_RECIPES[0]:
-            nested = metrics.get("nested_validation") or {}
-            found[f"recipe={recipe}"]["nested validation"] = 100 * nested.get("mean", math.nan)
-            of_baselines = {
+            found[f"recipe={recipe}"]["nested validation"] = _nested(metrics)
+            baselines = {
                 BASELINES.get(label, label): _by_role(baseline["splits"])
                 for label, baseline in metrics["baselines"].items()
             }
-    return found | of_baselines
+    return found | baselines
+
+
+def _nested(metrics: Mapping[str, Any]) -> float:
+    return 100 * float((metrics.get("nested_validation") or {}).get("mean", math.nan))
 
 
 def _by_role(splits: Mapping[str, Any]) -> dict[str, float]:
@@ -403,44 +382,46 @@ def _by_role(splits: Mapping[str, Any]) -> dict[str, float]:
 
 
 # Tables ------------------------------------------------------------------------------------------
-def summary(own: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
-    """Mean and worst over seeds of each measure of an experiment, beside what was wanted."""
-    rows = []
-    by_seed = list(own.values())
-    for measure in (key for key, value in by_seed[0].items() if isinstance(value, float)):
-        values = [of[measure] for of in by_seed]
-        at_most = "called slip" in measure or "error" in measure  # is better when it is smaller
-        mean, worst = statistics.fmean(values), (max if at_most else min)(values)
-        wanted, wanted_worst = LIMITS[name].get(measure, (None, None))
-        sign = -1 if at_most else 1
-        asked = [(mean, wanted), (worst, wanted_worst)]
-        met = all(sign * value >= sign * limit for value, limit in asked if limit is not None)
-        spread = statistics.stdev(values) if len(values) > 1 else 0.0
-        row: dict[str, Any] = {"measure": measure, "mean": mean, "by_seed": values, "worst": worst}
-        row |= {"mean ± sd": f"{mean:.2f} ± {spread:.2f}", "met": None if wanted is None else met}
-        rows.append(row | {"wanted": wanted, "wanted_worst": wanted_worst})
-    return rows
-
-
 def _measures(own: Mapping[str, Any], name: str) -> list[dict[str, object]]:
+    """Mean and worst over seeds of each measure of an experiment, beside what was wanted."""
     rows: list[dict[str, object]] = []
-    for row in summary(own, name):
-        wanted = "" if row["wanted"] is None else f"{row['wanted']:g}"
-        wanted += "" if row["wanted_worst"] is None else f" ({row['wanted_worst']:g})"
-        met = {None: "", True: "met", False: "**missed**"}[row["met"]]
-        cells = {"measure": row["measure"], "mean ± sd": row["mean ± sd"]}
-        rows.append(cells | {"worst": f"{row['worst']:.2f}", "wanted (worst)": wanted, "": met})
+    every = list(own.values())
+    for measure in (key for key, value in every[0].items() if isinstance(value, float)):
+        values = [of[measure] for of in every]
+        at_most = "called slip" in measure or "error" in measure  # is better when it is smaller
+        worst, sign = (max(values), -1) if at_most else (min(values), 1)
+        limits = LIMITS[name].get(measure, (None, None))
+        asked = [
+            (value, wanted)
+            for value, wanted in zip((fmean(values), worst), limits, strict=True)
+            if wanted is not None
+        ]
+        met = all(sign * value >= sign * wanted for value, wanted in asked)
+        texts = [f"({of:g})" if place else f"{of:g}" for place, (_, of) in enumerate(asked)]
+        rows.append(
+            {
+                "measure": measure,
+                "mean ± sd": mean_sd(values),
+                "worst": f"{worst:.2f}",
+                "wanted (worst)": " ".join(texts),
+                "": ("met" if met else "**missed**") if asked else "",
+            }
+        )
     return rows
 
 
-def _validation(own: Mapping[str, Any], name: str) -> str:
+def _validation(own: Mapping[str, Any]) -> str:
     """Nested validation beside held-out materials, and slips beside a vibrating motor."""
-    rows = {row["measure"]: row["mean"] for row in summary(own, name)}
-    below = rows["held-out materials"] - rows["nested validation"]
-    loud = (f"{rows[f'slips at {mv:g} mV found, held out']:.1f} % at {mv:g} mV" for mv in LEVELS_MV)
+
+    def over_seeds(measure: str) -> float:
+        return fmean(of[measure] for of in own.values())
+
+    below = over_seeds("held-out materials") - over_seeds("nested validation")
+    found = {mv: over_seeds(f"slips at {mv:g} mV found, held out") for mv in LEVELS_MV}
+    loud = ", ".join(f"{of:.1f} % at {mv:g} mV" for mv, of in found.items())
     return (
         f"Nested validation is {below:.2f} points below held-out ones (wanted: -0.5 to 2). Slips "
-        f"found on held-out materials beside motor vibration: {', '.join(loud)}."
+        f"found on held-out materials beside motor vibration: {loud}."
     )
 
 
@@ -465,7 +446,7 @@ def _rows(by_seed: Sequence[Mapping[str, Any]], roles: Sequence[str]) -> list[di
         row: dict[str, object] = {"": BASELINES.get(label, label)}
         for role in roles:
             known = [of[label][role] for of in by_seed if role in of[label]]
-            text = f"{statistics.fmean(known):.2f} (worst {min(known):.2f})" if known else ""
+            text = f"{fmean(known):.2f} (worst {min(known):.2f})" if known else ""
             row["held-out materials" if role == "unseen" else role] = text
         rows.append(row)
     return rows
@@ -479,9 +460,7 @@ def _about(numbers: Report, name: str) -> str:
 def _ahead(hard: Mapping[str, Any]) -> str:
     """Which baselines the default recipe is behind."""
     labels, ours = next(iter(hard.values())), f"recipe={HARD_RECIPES[0]}"
-    means = {
-        label: statistics.fmean(of[label]["unseen"] for of in hard.values()) for label in labels
-    }
+    means = {label: fmean(of[label]["unseen"] for of in hard.values()) for label in labels}
     ahead = [label for label in means if "recipe" not in label and means[label] >= means[ours]]
     told = f"behind {', '.join(ahead)}" if ahead else "ahead of every baseline"
     return f"On held-out materials `{ours}` is {told}."

@@ -109,38 +109,34 @@ class Gradients(Benchmark[Sizes]):
         for row in numbers["rows"]:
             rounds, first = row["rounds"], row["rounds"][0]
             peer = _row(numbers, row["problem"], PEER)
-            differs = "-"
+            differs = None
             if peer is not None and row["way"] == OURS:
-                both = (first["gradient"], peer["rounds"][0]["gradient"])
-                ours, theirs = (torch.tensor(of, dtype=torch.float64) for of in both)
-                off = ours - theirs
-                differs = number(float((off.abs() / theirs.abs()).max()))
-            backward = [of["backward_s"] for of in rounds if of["backward_s"] is not None]
+                theirs = peer["rounds"][0]["gradient"]
+                pairs = zip(first["gradient"], theirs, strict=True)
+                differs = number(max(abs((ours - other) / other) for ours, other in pairs))
+            seconds = [of["backward_s"] for of in rounds if of["backward_s"] is not None]
             cells.append(
-                [
-                    f"{row['problem']}: {row['way']}",
-                    Spread.of([of["forward_s"] for of in rounds]).text(),
-                    Spread.of(backward).text() if backward else "-",
-                    number(median(of["bytes"] for of in rounds) / 1e6),
-                    differs,
-                ]
+                {
+                    "bins x features": f"{row['problem']}: {row['way']}",
+                    "forward, s": Spread.of([of["forward_s"] for of in rounds]).text(),
+                    "backward, s": Spread.of(seconds).text() if seconds else None,
+                    "memory, MB": number(median(of["bytes"] for of in rounds) / 1e6),
+                    "off autograd": differs,
+                }
             )
-        header = ["bins x features", "forward, s", "backward, s", "memory, MB", "off autograd"]
         note = f"{numbers['threads']} threads; memory: the most beyond what was held before."
-        return {"Forward and back": Table(header, cells, note)}
+        return {"Forward and back": Table(cells, note)}
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Seconds of forward and back."""
         rows = numbers["rows"]
-        series = {
-            way: [
-                median(of["forward_s"] + (of["backward_s"] or 0.0) for of in row["rounds"])
-                for row in rows
-            ]
-            for way in ("forward and back",)
-        }
+        seconds = [
+            median(of["forward_s"] + (of["backward_s"] or 0.0) for of in row["rounds"])
+            for row in rows
+        ]
         names = [f"{row['problem']}: {row['way']}" for row in rows]
-        bars(drawing.subplots(), names, series, "s, with a way back: forward and back")
+        about = "s, with a way back: forward and back"
+        bars(drawing.subplots(), names, {"seconds": seconds}, about)
 
 
 def one_way(problem: Report, way: str, threads: int) -> dict[str, Any]:

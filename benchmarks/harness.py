@@ -20,12 +20,12 @@ import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from statistics import mean, median, quantiles
+from statistics import mean, median, quantiles, stdev
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -201,6 +201,12 @@ def versions(more: Sequence[str] = ()) -> dict[str, str]:
     return found | {"BLAS": " and ".join([*known, *sorted(blas)])}
 
 
+def ran_on(report: Report) -> str:
+    """Machine, versions and code of a report, in words."""
+    used = ", ".join(f"{name} {of}" for name, of in report["versions"].items())
+    return f"on {', '.join(report['machine'].values())}; {used}; code {report['code']}"
+
+
 # ------------------------------------------------------------------------------------- trainings
 def trained(name: str, overrides: Sequence[str], folder: Path, cache: Path) -> dict[str, Any]:
     """The metrics of a training, from its folder if this code finished it there, else made now.
@@ -249,14 +255,6 @@ def result_of(command: str, overrides: Sequence[str], folder: Path, name: str) -
     return found
 
 
-def take_figures(folder: Path, figures: Mapping[str, Path]) -> None:
-    """Copy figures of a run's folder, by their name there, to where they go."""
-    for name, path in figures.items():
-        if (folder / name).exists():
-            with whole_file(path) as temporary:
-                shutil.copy(folder / name, temporary)
-
-
 # ------------------------------------------------------------------------------------- tables
 class Spread(NamedTuple):
     """The median of some numbers and their quartiles."""
@@ -289,51 +287,55 @@ class Table(NamedTuple):
     """A table that a terminal and a Markdown file show alike.
 
     Attributes:
-        header: of the columns; the first heads the names of the rows.
-        rows: cells.
+        rows: cells by column, the same columns in each; the first names the row.
         note: a line below it.
     """
 
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Mapping[str, object]]
     note: str = ""
-
-    @classmethod
-    def of(cls, rows: Sequence[Mapping[str, object]], note: str = "") -> Table:
-        """Of rows as the reports of the package have them, cells by column."""
-        header, *texts = style.cells(rows)
-        return cls(header, texts, note)
 
     def text(self) -> str:
         """Aligned columns."""
-        return "\n".join(
-            filter(
-                None,
-                [
-                    style.table([dict(zip(self.header, row, strict=True)) for row in self.rows]),
-                    self.note,
-                ],
-            )
-        )
+        return "\n".join(filter(None, [style.table(self.rows), self.note]))
 
     def markdown(self) -> str:
         """A table of Markdown, columns of numbers to the right and of words to the left."""
-        is_number = [
-            place > 0 and all(re.match(r"[+-]?\d|-?$", cell) for cell in column)
-            for place, column in enumerate(zip(*self.rows, strict=True))
-        ] or [False] * len(self.header)
-        rule = ["---:" if of else "---" for of in is_number]
-        lines = [f"| {' | '.join(cells)} |" for cells in (self.header, rule, *self.rows)]
+        header, *rows = style.cells(self.rows)
+        rule = [
+            "---:" if place and all(re.match(r"[+-]?\d|-?$", cell) for cell in column) else "---"
+            for place, column in enumerate(zip(*rows, strict=True))
+        ]
+        lines = [f"| {' | '.join(cells)} |" for cells in (header, rule, *rows)]
         return "\n".join([*lines, *(["", self.note] if self.note else [])])
 
 
-def number(value: float, digits: int = 3) -> str:
-    """A number to some significant digits, without an exponent where it is short.
+def by(rows: Iterable[Report], *keys: str) -> dict[tuple[Any, ...], list[Report]]:
+    """Rows by the values of these keys, in order of appearance.
+
+    Example:
+        >>> by([{"a": 1, "b": 2}, {"a": 1, "b": 3}], "a")
+        {(1,): [{'a': 1, 'b': 2}, {'a': 1, 'b': 3}]}
+    """
+    found: dict[tuple[Any, ...], list[Report]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return found
+
+
+def listed(about: str, values: Mapping[str, object]) -> Table:
+    """Values below each other, a row each."""
+    return Table([{about: name, "": value} for name, value in values.items()])
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number to some significant digits, without an exponent where it is short; or ``-``.
 
     Example:
         >>> [number(value) for value in (0.01234, 12.345, 123456.0, 1.2e-11)]
         ['0.0123', '12.3', '123,456', '1.2e-11']
     """
+    if value is None:
+        return "-"
     if value and abs(value) < 1e-4:
         return f"{value:.1e}"
     if abs(value) >= 10**digits:
@@ -341,29 +343,36 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}"
 
 
-def percent(value: float) -> str:
-    """A fraction in percent."""
-    return f"{100 * value:.2f}"
+percent = style.percent
+
+
+def mean_sd(values: Iterable[float], digits: int = 2, sign: str = "") -> str:
+    """``mean ± sd`` over seeds, the mean alone of one, or ``-`` of nothing.
+
+    Example:
+        >>> mean_sd([1.0, 2.0, 3.0])
+        '2.00 ± 1.00'
+    """
+    every = list(values)
+    if not every:
+        return "-"
+    spread = f" ± {stdev(every):.{digits}f}" if len(every) > 1 else ""
+    return f"{mean(every):{sign}.{digits}f}{spread}"
 
 
 def limit(what: str, measured: float, most: float, unit: str = "") -> dict[str, Any]:
     """A row of ``limits``: what was measured, and the most that was set for it."""
-    text = f"{number(measured)} {unit}".strip()
-    bound = f"<= {number(most)} {unit}".strip()
-    return {"what": what, "measured": text, "limit": bound, "ok": bool(measured <= most)}
+    text, bound = (f"{number(value)} {unit}".strip() for value in (measured, most))
+    return {"limits": what, "measured": text, "limit": f"<= {bound}", "": measured <= most}
 
 
-def limits(rows: Sequence[Mapping[str, Any]], measured: str = "measured") -> Table:
+def limits(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Every limit beside what was measured, met or missed.
 
     Args:
-        rows: with ``what``, ``measured``, ``limit`` and ``ok``, which is ``None`` where there is
-            nothing to judge.
-        measured: heads the second column.
+        rows: whose last cell, headed by nothing, says whether the limit is met.
     """
-    words = {True: "met", False: "MISSED", None: "-"}
-    cells = [[row["what"], row["measured"], row["limit"], words[row["ok"]]] for row in rows]
-    return Table(["limits", measured, "limit", ""], cells)
+    return Table([{**row, "": "met" if row[""] else "MISSED"} for row in rows])
 
 
 # ------------------------------------------------------------------------------------ figures
@@ -472,6 +481,13 @@ S = TypeVar("S")
 
 
 @dataclass(frozen=True)
+class Overrides:
+    """Sizes of a subject that runs one command: its overrides, before those of the command line."""
+
+    overrides: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Job(Generic[S]):
     """What a benchmark is asked to measure.
 
@@ -499,8 +515,10 @@ class Benchmark(ABC, Generic[S]):
         quick: sizes that only show that it runs.
         libraries: whose versions matter besides those of all benchmarks.
         markers: between which its section stands.
-        page: that holds them.
+        page: that holds them; one of docs says the rest itself, and gets the tables alone.
         is_simulated: whether its data are.
+        drawn: figures that a command leaves in the folder ``numbers["folder"]``, and what their
+            names end in here; they stand for one drawn here.
     """
 
     name: ClassVar[str]
@@ -512,6 +530,7 @@ class Benchmark(ABC, Generic[S]):
     page: ClassVar[str] = "BENCHMARKS.md"
     markers: ClassVar[str] = ""
     is_simulated: ClassVar[bool] = True
+    drawn: ClassVar[Mapping[str, str]] = {}
 
     @abstractmethod
     def measure(self, job: Job[S]) -> dict[str, Any]:
@@ -521,28 +540,37 @@ class Benchmark(ABC, Generic[S]):
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Tables by title."""
 
-    @abstractmethod
     def draw(self, numbers: Report, drawing: Figure) -> None:
-        """Fill the figure."""
+        """Fill the figure, where no command has drawn it."""
 
     def figures(self, report: Report, path: Path) -> None:
-        """Write the figure."""
-        drawing = Figure(figsize=(8.2, 4.8), layout="constrained")
-        self.draw(report["numbers"], drawing)
-        finish(drawing, report, self.title, path)
+        """Write the figure, or take those of a command."""
+        for name, ending in self.drawn.items():
+            if (drawn := Path(report["numbers"]["folder"], name)).exists():
+                with whole_file(path.with_stem(f"{path.stem}{ending}")) as temporary:
+                    shutil.copy(drawn, temporary)
+        if not self.drawn:
+            drawing = Figure(figsize=(8.2, 4.8), layout="constrained")
+            self.draw(report["numbers"], drawing)
+            finish(drawing, report, self.title, path)
 
     def section(self, report: Report) -> str:
         """What stands between the markers of the page, in Markdown."""
-        ran_on = ", ".join(report["machine"].values())
-        used = ", ".join(f"{name} {of}" for name, of in report["versions"].items())
+        tables = self.tables(report["numbers"])
+        command = " ".join([f"python -m benchmarks.{self.name}", *map(repr, report["overrides"])])
+        if self.page.startswith("docs/"):
+            is_simulated = report["numbers"].get("simulated", report["simulated"])
+            kind = "Simulated" if is_simulated else "Recorded"
+            parts = [f"{kind} (`{command}`, code {report['code']}):"]
+            return "\n\n".join([*parts, *(table.markdown() for table in tables.values())])
         parts = [
             f"## {self.title}",
-            f"`python -m benchmarks.{self.name}`, on {ran_on}; {used}; code {report['code']}.",
+            f"`python -m benchmarks.{self.name}`, {ran_on(report)}.",
             *([f"**{QUICK_LINE}.**"] if report["quick"] else []),
             f"{self.about[:1].upper()}{self.about[1:]}.",
             f"![{self.title}](benchmarks/results/{self.name}.png)",
         ]
-        for title, table in self.tables(report["numbers"]).items():
+        for title, table in tables.items():
             parts += [f"### {title}", table.markdown()]
         return "\n\n".join(parts)
 

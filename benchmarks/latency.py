@@ -146,19 +146,18 @@ class Latency(Benchmark[Sizes]):
         rows = numbers["rows"]
         ours = next(row for row in rows if row["way"] == OURS)
         cells = [
-            [
-                row["way"],
-                number(1e6 * row["p50_s"]),
-                number(1e6 * row["p99_s"]),
-                f"{number(row['p50_s'] / ours['p50_s'])} x",
-                "-" if row["error"] is None else number(row["error"]),
-            ]
+            {
+                "way": row["way"],
+                "median, us": number(1e6 * row["p50_s"]),
+                "99th percentile, us": number(1e6 * row["p99_s"]),
+                "of ours": f"{number(row['p50_s'] / ours['p50_s'])} x",
+                "error": number(row["error"]),
+            }
             for row in rows
         ]
-        header = ["way", "median, us", "99th percentile, us", "of ours", "error"]
         note = "Error of scores in standard deviations of the reference's; - another machine."
         goal = limit("a bin to its score, float32", 1e3 * ours["p50_s"], 1e3 * MOST_S, "ms")
-        return {"Limits": limits([goal]), "One bin to its score": Table(header, cells, note)}
+        return {"Limits": limits([goal]), "One bin to its score": Table(cells, note)}
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Median and tail of every way."""

@@ -28,6 +28,7 @@ from benchmarks.harness import (
     bars,
     in_fresh_process,
     interleaved,
+    listed,
     number,
     on_threads,
     peak_bytes,
@@ -92,30 +93,31 @@ class Model(Benchmark[Sizes]):
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Fits, folds and any size."""
         fits = [
-            [
-                f"{row['way']}, {row['num_bins']:,} bins",
-                Spread.of(row["fit_s"]).text(),
-                number(1e6 * row["score_s"]),
-                percent(row["accuracy"]),
-                "-" if row["off"] is None else number(row["off"]),
-            ]
+            {
+                "machine": f"{row['way']}, {row['num_bins']:,} bins",
+                "fit, s": Spread.of(row["fit_s"]).text(),
+                "a score, us": number(1e6 * row["score_s"]),
+                "accuracy %": percent(row["accuracy"]),
+                "off KernelRidge": number(row["off"]),
+            }
             for row in numbers["fits"]
         ]
-        folds = [[name, Spread.of(of).text()] for name, of in numbers["folds"]["seconds"].items()]
+        seconds = numbers["folds"]["seconds"].items()
         of = numbers["any_size"]
-        whole = [
-            ["bins", f"{of['num_bins']:,}"],
-            ["bins a second", f"{of['num_bins'] / of['add_s']:,.0f}"],
-            ["s to solve", number(of["solve_s"])],
-            ["peak memory, MB", f"{of['peak_bytes'] / 1e6:,.0f}"],
-        ]
-        header = ["machine", "fit, s", "a score, us", "accuracy %", "off KernelRidge"]
+        whole = {
+            "bins": f"{of['num_bins']:,}",
+            "bins a second": f"{of['num_bins'] / of['add_s']:,.0f}",
+            "s to solve": number(of["solve_s"]),
+            "peak memory, MB": f"{of['peak_bytes'] / 1e6:,.0f}",
+        }
         note = "A score: one bin on 1 thread. Off: the largest difference of scores."
         folded = f"Largest difference of held-out scores: {number(numbers['folds']['off'])}."
         return {
-            "Fits": Table(header, fits, note),
-            "Folds": Table(["folds", "s"], folds, folded),
-            "Any number of bins": Table(["statistics in a process of its own", ""], whole),
+            "Fits": Table(fits, note),
+            "Folds": Table(
+                [{"folds": way, "s": Spread.of(one).text()} for way, one in seconds], folded
+            ),
+            "Any number of bins": listed("statistics in a process of its own", whole),
         }
 
     def draw(self, numbers: Report, drawing: Figure) -> None:

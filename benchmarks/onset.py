@@ -64,10 +64,12 @@ QUICK_TRAINING = (
     "recipe.num_features=20",
     "recipe.penalties=[0.003]",
 )
+_SCENES = ("arm_motion", "taps", "grips", "machine", "mains_bursts", "pulled", "dead_channel")
 QUICK_STREAMS = (
     "onset.streams.cycles=4",
     "onset.streams.extra_scenes.held.cycles=4",
     "onset.streams.extra_scenes.held.tail_s=5",
+    *(f"onset.streams.extra_scenes.{scene}.cycles=4" for scene in _SCENES),
 )
 
 
@@ -167,27 +169,25 @@ class Onset(Benchmark[Sizes]):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Delay, slips found and false alarms on both kinds of materials, and compute."""
-        header = ["method", "false alarms an hour", "found %", "early %", "delay ms", "p95 ms"]
         found = {}
         for role, words in ROLES.items():
             rows = []
             for row in numbers["rows"]:
                 events = row["events"][role]
-                delay = events["delay_ms"]
-                rate = events["false_alarms_per_hour"]
-                rows.append(
-                    [
-                        row["way"],
-                        "-" if rate is None else number(rate["value"]),
-                        *(percent(events[name]["value"]) for name in ("found", "early")),
-                        *("-" if delay is None else f"{delay[q]['value']:.1f}" for q in _DELAYS),
-                        f"{row['look_ahead_ms']:g}",
-                        number(1e5 * row["push_s"] / row["hop_ms"]),
-                    ]
-                )
+                delay, rate = events["delay_ms"], events["false_alarms_per_hour"]
+                cells = {
+                    "method": row["way"],
+                    "false alarms an hour": number(rate and rate["value"]),
+                }
+                cells |= {
+                    f"{name} %": percent(events[name]["value"]) for name in ("found", "early")
+                }
+                for title, of in (("delay ms", "median"), ("p95 ms", "p95")):
+                    cells[title] = f"{delay[of]['value']:.1f}" if delay else "-"
+                cells["look-ahead ms"] = f"{row['look_ahead_ms']:g}"
+                rows.append(cells | {"% of a core": number(1e5 * row["push_s"] / row["hop_ms"])})
             note = f"Thresholds were set for {numbers['per_hour']:g} false alarms an hour."
-            columns = [*header, "look-ahead ms", "% of a core"]
-            found[f"On {words}"] = Table(columns, rows, note)
+            found[f"On {words}"] = Table(rows, note)
         return found
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
@@ -207,9 +207,6 @@ class Onset(Benchmark[Sizes]):
         panels[0].set_ylabel("slips not found, %")
         handles = panels[0].get_legend_handles_labels()
         drawing.legend(*handles, loc="outside lower center", ncols=3, frameon=False, fontsize=7)
-
-
-_DELAYS = ("median", "p95")
 
 
 def _stage(overrides: list[str], hop_ms: float, sizes: Sizes) -> CalibratedAlarm:

@@ -80,19 +80,21 @@ class Realism(Benchmark[Sizes]):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Every statistic of every set: rest, then slip."""
-        sets = numbers["sets"].values()
+        sets = numbers["sets"].items()
         rows = [
-            [text, *(f"{one['rest'][name]:.2f} / {one['slip'][name]:.2f}" for one in sets)]
+            {"statistic": text}
+            | {of: f"{one['rest'][name]:.2f} / {one['slip'][name]:.2f}" for of, one in sets}
             for name, text in STATISTICS.items()
         ]
         rows += [
-            [text, *(f"{one['areas'][name]:.2f}" for one in sets)] for name, text in AREAS.items()
+            {"statistic": text} | {of: f"{one['areas'][name]:.2f}" for of, one in sets}
+            for name, text in AREAS.items()
         ]
         note = (
             f"Rest / slip, windows of {WINDOW_S:g} s. Real: electrodes of one fingertip; "
             "simulated: films of five fingers. Spreads and wander are of natural logarithms."
         )
-        return {"Channels": Table(["statistic", *numbers["sets"]], rows, note)}
+        return {"Channels": Table(rows, note)}
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Statistics of slip."""

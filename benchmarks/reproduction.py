@@ -7,13 +7,15 @@ Writes the tables of REPRODUCTION.md and of README.md between their markers, and
 from __future__ import annotations
 
 import json
-import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
@@ -29,6 +31,8 @@ from benchmarks.harness import (
     Table,
     between_markers,
     finish,
+    mean_sd,
+    percent,
     trained,
     write_text,
 )
@@ -36,7 +40,7 @@ from tactslip_torch.analysis.signal_checks import check_signals, filtered
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.hand import HandLayout
 from tactslip_torch.report import published
-from tactslip_torch.report.metrics import split_metrics, summed_metrics
+from tactslip_torch.report.metrics import split_metrics
 from tactslip_torch.report.results import BASELINES
 from tactslip_torch.simulation.scene import CALIBRATED_PATH, SEEN_MATERIALS
 from tactslip_torch.simulation.source import SimulatedRecordings
@@ -121,17 +125,36 @@ class Reproduction(Benchmark[Sizes]):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """All of REPRODUCTION.md, and what was run."""
-        rows = [
-            [
-                name,
-                f"`train {numbers['commands'][name]}`",
-                str(len(of)),
-                f"{sum(run['seconds'] for run in of) / 60:.1f}",
-            ]
-            for name, of in numbers["runs"].items()
+        runs, calibrated = numbers["runs"], numbers["calibrated"]
+        scores = Scores(runs)
+        found = {
+            title: _beside(numbers, scores, name)
+            for name, (title, _) in SETTINGS.items()
+            if name in runs
+        }
+        found |= {
+            "Selected features": _selected(runs),
+            "Signals": _signals(numbers["signals"]),
+            "Beside the onset": _places(runs, scores),
+            "By stroke": _strokes(scores),
+            "With less": _ablations(runs, scores),
+            "Baselines": _baselines(runs, scores),
+            "Recipes": _validation(runs),
+            "Leakage": _leakage(scores),
+            **(_confound(runs, scores) if "confound" in runs else {}),
+            "What was calibrated": _parameters(calibrated),
+        }
+        ran = [
+            {
+                "experiment": name,
+                "command": f"`train {numbers['commands'][name]}`",
+                "seeds": len(of),
+                "minutes": f"{sum(run['seconds'] for run in of) / 60:.1f}",
+            }
+            for name, of in runs.items()
         ]
-        ran = Table(["experiment", "command", "seeds", "minutes"], rows)
-        return {**all_tables(numbers), "What was run": ran}
+        found["What was run"] = Table(ran)
+        return {title: table for title, table in found.items() if table.rows}
 
     def publish(self, report: Report, folder: Path) -> None:
         """The page, and the table between the markers of README.md."""
@@ -143,14 +166,13 @@ class Reproduction(Benchmark[Sizes]):
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Balanced accuracy of every seed, the paper's as a bar."""
-        runs, axes = numbers["runs"], drawing.subplots()
-        names = [(name, role) for name in runs for role in roles_of(runs, name)]
-        beside = {("random_bins", "test"), ("unseen4", "unseen")}
+        scores, axes = Scores(numbers["runs"]), drawing.subplots()
+        names = [(name, role) for name in numbers["runs"] for role in scores.roles(name)]
         for place, (name, role) in enumerate(names):
-            for baseline, marker, color in ((POOLED, "|", PEER), (None, "o", OURS)):
-                values = percent(runs, name, role, "balanced_accuracy", baseline=baseline)
+            for baseline, marker, color in ((POOLED, "|", PEER), ("", "o", OURS)):
+                values = list(scores.of(name, role, baseline=baseline).values())
                 axes.plot(values, [place] * len(values), marker, color=color, alpha=0.7, ms=5)
-            if (name, role) in beside:
+            if (name, role) in COMPARED:
                 x = 100 * (published.SPLITS[role].balanced_accuracy or 0)
                 axes.plot([x, x], [place - 0.4, place + 0.4], color="black", lw=2)
         for marker, color, label in (
@@ -168,18 +190,16 @@ class Reproduction(Benchmark[Sizes]):
     def figures(self, report: Report, path: Path) -> None:
         """Every seed, recall beside the onset, scenes, and the pipeline."""
         super().figures(report, path)
-        runs = report["numbers"]["runs"]
+        scores = Scores(report["numbers"]["runs"])
         drawing = Figure(figsize=(8.4, 3.6), layout="constrained")
         axes = drawing.subplots()
-        for name, color in (("unseen4", OURS), ("unseen4 robust", PEER)):
+        for name, color in zip(BY_CYCLE, (OURS, PEER), strict=True):
             for role, style in (("test", "o-"), ("unseen", "s--")):
-                found = {
-                    place: recall_beside_onset(
-                        runs, name, role, [str(place) if place < 20 else "20+"]
-                    )
-                    for place in range(-20, 21)
-                }
-                means = {place: mean(values) for place, values in found.items() if values}
+                means = {}
+                for place in range(-20, 21):
+                    label = str(place) if place < 20 else "20+"
+                    if found := scores.beside_onset(name, role, [label]):
+                        means[place] = mean(found)
                 label = f"{name}, {role}"
                 axes.plot(list(means), list(means.values()), style, color=color, ms=3, label=label)
         axes.axvline(-0.5, color=GREY, ls="--", lw=1)
@@ -187,13 +207,13 @@ class Reproduction(Benchmark[Sizes]):
         axes.set_ylabel("recall, %, mean of seeds")
         axes.legend(frameon=False, fontsize=8)
         finish(drawing, report, "Recall beside the onset", path.with_stem(f"{path.stem}_places"))
-        if "confound" in runs:
+        if scenes := scenes_of(scores):
             drawing = Figure(figsize=(9.2, 4.4), layout="constrained")
-            panels, scenes = drawing.subplots(1, 2, sharey=True), scenes_of(runs)
+            panels = drawing.subplots(1, 2, sharey=True)
             for axes, role in zip(panels, ("test", "unseen"), strict=True):
                 for fold, color in zip(FOLDS, (PEER, OURS), strict=True):
                     for place, scene in enumerate(scenes):
-                        values = list(scene_recalls(runs, fold, role, scene).values())
+                        values = list(scene_recalls(scores, fold, role, scene).values())
                         words = f"trained on {FOLDS[fold]}" if place == 0 else None
                         axes.plot(values, [place] * len(values), "o", color=color, label=words)
                 axes.set_xlabel(f"mean recall of the classes there are, %, {role}")
@@ -265,7 +285,7 @@ def _counts(scores: Mapping[str, Any]) -> dict[str, Any]:
 
 
 Runs = Mapping[str, Sequence[Mapping[str, Any]]]
-"""Of each experiment, one a seed, as ``runs.kept`` has them."""
+"""Of each experiment, one a seed, as ``kept`` has them."""
 SCORES = {
     "accuracy": "accuracy",
     "balanced_accuracy": "balanced accuracy",
@@ -273,81 +293,80 @@ SCORES = {
     "slip_recall": "slip recall",
 }
 POOLED = "best_pooled_number"
+BySeed = dict[int, float]
 
 
-def mean_sd(values: Sequence[float], digits: int = 2, sign: str = "") -> str:
-    """``mean ± sd`` over seeds, the mean alone of one, or ``-`` of nothing.
-
-    Example:
-        >>> mean_sd([1.0, 2.0, 3.0])
-        '2.00 ± 1.00'
-    """
-    if not values:
-        return "-"
-    spread = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
-    return f"{statistics.mean(values):{sign}.{digits}f}{spread}"
-
-
-def runs_of(runs: Runs, experiment: str) -> list[Mapping[str, Any]]:
-    """Of an experiment; ``"confound: protocol"`` is the fold ``protocol`` of ``confound``."""
-    name, _, fold = experiment.partition(": ")
-    found = runs.get(name, [])
-    return [run["folds"][fold] | {"seed": run["seed"]} for run in found] if fold else list(found)
-
-
-def roles_of(runs: Runs, experiment: str) -> list[str]:
-    """Roles that an experiment evaluates."""
-    return [role for run in runs_of(runs, experiment)[:1] for role in run.get("splits", {})]
-
-
-def labels_of(runs: Runs, experiment: str, role: str, kind: str) -> list[str]:
-    """Labels of the groups of a kind, such as speeds."""
-    splits = [run["splits"].get(role, {}) for run in runs_of(runs, experiment)]
-    return list(dict.fromkeys(label for split in splits for label in split.get(kind, {})))
-
-
-def by_seed(
-    runs: Runs,
-    experiment: str,
-    role: str,
-    score: str,
-    *,
-    group: tuple[str, str] | None = None,
-    baseline: str | None = None,
-) -> dict[int, float]:
-    """A score in percent by seed; seeds without any are left out.
+class Scores:
+    """Every score of every run, in percent.
 
     Args:
-        runs: stored.
-        experiment: its name.
-        role: ``"train"``, ``"test"`` or ``"unseen"``.
-        score: a key of ``SCORES``.
-        group: such as ``("per_speed", "20")``: of these bins alone.
-        baseline: of this in the place of the detector.
+        runs: stored; of several folds each counts as an experiment ``"name: fold"`` of its own.
     """
-    found = {}
-    for run in runs_of(runs, experiment):
-        judged = run if baseline is None else run.get("baselines", {}).get(baseline, {})
-        split = judged.get("splits", {}).get(role)
-        if split is None:
-            continue
-        if group is None:
-            value = split_metrics(split["confusion"])[score]
-        elif group[1] in split.get(group[0], {}):
-            value = summed_metrics([{"confusion": split[group[0]][group[1]]}])[score]
-        else:
-            continue
-        if value is not None:
-            found[run["seed"]] = 100 * value
-    return found
+
+    def __init__(self, runs: Runs) -> None:
+        self._scores: dict[tuple[str, str, str, str, str], dict[str, BySeed]] = {}
+        self._places: dict[tuple[str, str, str], list[Mapping[str, Sequence[int]]]] = {}
+        for name, of in runs.items():
+            for run in of:
+                for fold, one in run.get("folds", {"": run}).items():
+                    experiment = f"{name}: {fold}" if fold else name
+                    self._take(experiment, run["seed"], "", one["splits"])
+                    for baseline, found in one.get("baselines", {}).items():
+                        self._take(experiment, run["seed"], baseline, found["splits"])
+
+    def _take(self, experiment: str, seed: int, way: str, splits: Mapping[str, Any]) -> None:
+        for role, split in splits.items():
+            found = {("", ""): split_metrics(split["confusion"])}
+            for kind in GROUPS:
+                for label, confusion in split.get(kind, {}).items():
+                    found[kind, label] = split_metrics(confusion)
+            places = self._places.setdefault((experiment, way, role), [])
+            places.append(split.get("per_position", {}))
+            for group, scores in found.items():
+                by_score = self._scores.setdefault((experiment, way, role, *group), {})
+                for score, value in scores.items():
+                    if score in SCORES and value is not None:
+                        by_score.setdefault(score, {})[seed] = 100 * value
+
+    def of(
+        self,
+        experiment: str,
+        role: str,
+        score: str = "balanced_accuracy",
+        *,
+        group: tuple[str, str] = ("", ""),
+        baseline: str = "",
+    ) -> BySeed:
+        """A score by seed; seeds without any are left out.
+
+        Args:
+            experiment: its name.
+            role: ``"train"``, ``"test"`` or ``"unseen"``.
+            score: a key of ``SCORES``.
+            group: such as ``("per_speed", "20")``: of these bins alone.
+            baseline: of this in the place of the detector.
+        """
+        return self._scores.get((experiment, baseline, role, *group), {}).get(score, {})
+
+    def beside_onset(self, experiment: str, role: str, places: Sequence[str]) -> list[float]:
+        """Recall of bins at these places beside their onsets; a number a seed."""
+        found = []
+        for counts in self._places.get((experiment, "", role), []):
+            if own := [counts[place] for place in places if place in counts]:
+                found.append(100 * sum(right for right, _ in own) / sum(num for _, num in own))
+        return found
+
+    def roles(self, experiment: str) -> list[str]:
+        """Roles that an experiment evaluates."""
+        return [role for name, way, role in self._places if (name, way) == (experiment, "")]
+
+    def labels(self, experiment: str, role: str, kind: str) -> list[str]:
+        """Labels of the groups of a kind, such as speeds."""
+        wanted = (experiment, "", role, kind)
+        return [label for *of, label in self._scores if tuple(of) == wanted]
 
 
-def percent(runs: Runs, experiment: str, role: str, score: str, **of: Any) -> list[float]:
-    """As ``by_seed``, the numbers alone."""
-    return list(by_seed(runs, experiment, role, score, **of).values())
-
-
-def gains(after: Mapping[int, float], before: Mapping[int, float]) -> list[float]:
+def gains(after: BySeed, before: BySeed) -> list[float]:
     """What each seed that both have gains.
 
     Example:
@@ -355,19 +374,6 @@ def gains(after: Mapping[int, float], before: Mapping[int, float]) -> list[float
         [11.0]
     """
     return [value - before[seed] for seed, value in after.items() if seed in before]
-
-
-def recall_beside_onset(
-    runs: Runs, experiment: str, role: str, places: Sequence[str]
-) -> list[float]:
-    """Recall, in percent, of bins at these places beside their onsets; a number a seed."""
-    found = []
-    for run in runs_of(runs, experiment):
-        counts = run["splits"].get(role, {}).get("per_position", {})
-        own = [counts[place] for place in places if place in counts]
-        if own:
-            found.append(100 * sum(right for right, _ in own) / sum(num for _, num in own))
-    return found
 
 
 # ------------------------------------------------------------------------------------- tables
@@ -408,6 +414,10 @@ FOLDS = {"protocol": "the protocol alone", "with_scenes": "such scenes as well"}
 PAPER_SCENE = "paper"
 CLEARLY, NO_WORSE = 2.0, 0.5
 """Points that scenes must gain in every seed, and that the protocol may lose in the mean."""
+BY_CYCLE = ("unseen4", "unseen4 robust")
+COMPARED = (("random_bins", "test"), ("unseen4", "unseen"))
+"""Experiments and roles that the paper has too."""
+CLASS_RECALLS = {"non-slip": "non_slip_recall", "slip": "slip_recall"}
 SHORT = {
     "random_bins": ("test",),
     "unseen4": ("train", "test", "unseen"),
@@ -418,59 +428,42 @@ SHORT = {
 """Experiments and roles of the table in README.md."""
 
 
-def all_tables(numbers: Mapping[str, Any]) -> dict[str, Table]:
-    """Every table by title."""
-    runs: Runs = numbers["runs"]
-    found = {
-        SETTINGS[name][0]: _beside(runs, name, numbers["calibrated"])
-        for name in SETTINGS
-        if name in runs
-    }
-    found["Selected features"] = _selected(runs)
-    found["Signals"] = _signals(numbers["signals"])
-    found["Beside the onset"] = _places(runs)
-    found["By stroke"] = _strokes(runs)
-    found["With less"] = _ablations(runs)
-    found["Baselines"] = _baselines(runs)
-    found["Recipes"] = _validation(runs)
-    found["Leakage"] = _leakage(runs)
-    if "confound" in runs:
-        found |= _confound(runs)
-    found["What was calibrated"] = _parameters(numbers["calibrated"])
-    return {title: table for title, table in found.items() if table.rows}
-
-
-def _beside(runs: Runs, experiment: str, calibrated: Mapping[str, Any]) -> Table:
+def _beside(numbers: Report, scores: Scores, experiment: str) -> Table:
     """Every published score beside ours, marked."""
-    rows = []
+    rows: list[dict[str, object]] = []
+
+    def row(
+        what: str, paper: float, values: Collection[float], digits: int, role: str, of: str
+    ) -> None:
+        mark, why = _mark(experiment, role, of, numbers["calibrated"])
+        rows.append(
+            {
+                "published": what,
+                "paper": f"{paper:.{digits}f}",
+                "ours, simulated": mean_sd(values, digits),
+                "ours - paper": f"{mean(values) - paper:+.{digits}f}",
+                "": mark,
+                "why": why,
+            }
+        )
+
     for role, paper in published.SPLITS.items():
         for score, words in SCORES.items():
-            value, ours = getattr(paper, score), percent(runs, experiment, role, score)
-            if value is None or not ours:
-                continue
-            mark = _mark(experiment, role, score, calibrated)
-            rows.append(_row(f"{words}, {WHERE[role]}, %", 100 * value, ours, 2, mark))
-        quiet = percent(runs, experiment, role, "non_slip_recall")
+            value, ours = getattr(paper, score), scores.of(experiment, role, score)
+            if value is not None and ours:
+                row(f"{words}, {WHERE[role]}, %", 100 * value, ours.values(), 2, role, score)
+        quiet = scores.of(experiment, role, "non_slip_recall").values()
         if paper.non_slip_recall is not None and quiet:
             alarms = (1 - paper.non_slip_recall) * published.BINS_PER_MINUTE
-            ours = [(100 - value) / 100 * published.BINS_PER_MINUTE for value in quiet]
-            mark = _mark(experiment, role, "", calibrated)
+            ours_a_minute = [(100 - value) / 100 * published.BINS_PER_MINUTE for value in quiet]
             what = f"false slips a minute of non-slip, {WHERE[role]}"
-            rows.append(_row(what, alarms, ours, 0, mark))
-    classes = [[sum(c) for c in r["splits"]["test"]["confusion"]] for r in runs[experiment]]
+            row(what, alarms, ours_a_minute, 0, role, "")
+    runs = numbers["runs"][experiment]
+    classes = [[sum(of) for of in run["splits"]["test"]["confusion"]] for run in runs]
     larger = [100 * max(of) / sum(of) for of in classes]
-    mark = _mark(experiment, "labels", "", calibrated)
     what = "fraction of the larger class, test bins, %"
-    rows.append(_row(what, 100 * published.LARGER_CLASS, larger, 2, mark))
-    header = ["published", "paper", "ours, simulated", "ours - paper", "", "why"]
-    return Table(header, rows, f"{len(runs[experiment])} seeds.")
-
-
-def _row(
-    what: str, paper: float, ours: Sequence[float], digits: int, mark: tuple[str, str]
-) -> list[str]:
-    values = [f"{paper:.{digits}f}", mean_sd(ours, digits), f"{mean(ours) - paper:+.{digits}f}"]
-    return [what, *values, *mark]
+    row(what, 100 * published.LARGER_CLASS, larger, 2, "labels", "")
+    return Table(rows, f"{len(runs)} seeds.")
 
 
 def _mark(experiment: str, role: str, score: str, calibrated: Mapping[str, Any]) -> tuple[str, str]:
@@ -489,201 +482,209 @@ def _mark(experiment: str, role: str, score: str, calibrated: Mapping[str, Any])
 
 def _selected(runs: Runs) -> Table:
     """Where selected features come from: mean counts over seeds."""
-    recipes = {"random_bins": "the paper's recipe", "unseen4 robust": "`robust`"}
-    recipes = {name: words for name, words in recipes.items() if name in runs}
-    hand = HandLayout.paper24()
-    ranks = {name: f"rank {at}" for at, name in enumerate(published.DESCRIPTORS_RANKED, 1)}
-    ranks |= dict.fromkeys(published.DESCRIPTORS_NEVER, "0")
-    wanted: list[tuple[str, str, Callable[[list[str]], bool]]] = []
-
-    def count(what: str, paper: object, is_one: Callable[[list[str]], bool]) -> None:
-        wanted.append((what, str(paper), is_one))
-
+    paper: dict[str, object] = {}
     for kind, num in published.SELECTED_BY_KIND.items():
-        count(kind, num, lambda f, kind=kind: hand.channel(f[0]).kind == kind)  # type: ignore[misc]
-        for finger, of in published.SELECTED_BY_FINGER[kind].items():
-            at = (kind, finger)
-            count(f"{kind}, {finger}", of, lambda f, at=at: _place(hand, f[0]) == at)  # type: ignore[misc]
-    for letter, words, paper in (("A", "approximations", "more"), ("D", "details", "fewer")):
-        count(words, paper, lambda f, letter=letter: f[1][0] == letter)  # type: ignore[misc]
-    count("D1", 0, lambda f: f[1] == "D1")
-    count("PVDF, of spectra", "more", lambda f: f[2] == "freq" and f[0].startswith("PVDF"))
-    count("PVDF, in time", "fewer", lambda f: f[2] == "time" and f[0].startswith("PVDF"))
-    for name, rank in ranks.items():
-        count(name, rank, lambda f, name=name: f[3] == name)  # type: ignore[misc]
-    rows = []
-    for what, paper, is_one in wanted:
-        cells = [what.replace("_", " "), paper]
-        for name in recipes:
-            of_seeds = [[feature.split() for feature in run["selected"]] for run in runs[name]]
-            cells.append(mean_sd([float(sum(map(is_one, of))) for of in of_seeds], 1))
-        rows.append(cells)
+        by_finger = published.SELECTED_BY_FINGER[kind].items()
+        paper |= {kind: num} | {f"{kind}, {finger}": of for finger, of in by_finger}
+    paper |= {"approximations": "more", "details": "fewer", "D1": 0}
+    paper |= {"PVDF, of spectra": "more", "PVDF, in time": "fewer"}
+    paper |= {name: f"rank {at}" for at, name in enumerate(published.DESCRIPTORS_RANKED, 1)}
+    paper |= dict.fromkeys(published.DESCRIPTORS_NEVER, "0")
+    recipes = {"random_bins": "the paper's recipe", "unseen4 robust": "`robust`"}
+    counts = {
+        f"{words}, simulated": [_kinds_of(run["selected"]) for run in runs[name]]
+        for name, words in recipes.items()
+        if name in runs
+    }
+    rows = [
+        {"selected": what.replace("_", " "), "paper": of}
+        | {words: mean_sd([seed[what] for seed in seeds], 1) for words, seeds in counts.items()}
+        for what, of in paper.items()
+    ]
     note = (
         f"Counts; the paper selects {published.NUM_SELECTED}, and prints of descriptors an order "
         "only. Its features were ranked on all bins, ours on training bins."
     )
-    return Table(["selected", "paper", *(f"{w}, simulated" for w in recipes.values())], rows, note)
+    return Table(rows, note)
 
 
-def _place(hand: HandLayout, channel: str) -> tuple[str, str]:
-    of = hand.channel(channel)
-    return of.kind, of.finger
+def _kinds_of(selected: Sequence[str]) -> Counter[str]:
+    """How many features are of a kind of channel, finger, component, domain and descriptor."""
+    hand, counts = HandLayout.paper24(), Counter[str]()
+    branches = {"A": "approximations", "D": "details"}
+    for channel, component, domain, descriptor in map(str.split, selected):
+        of = hand.channel(channel)
+        counts.update([of.kind, f"{of.kind}, {of.finger}", component, descriptor])
+        counts[branches.get(component[0], "")] += 1
+        counts[f"{of.kind}, {'of spectra' if domain == 'freq' else 'in time'}"] += 1
+    return counts
 
 
 def _signals(signals: Sequence[Sequence[Mapping[str, Any]]]) -> Table:
     """What the paper says its signals look like, and whether the simulated ones do."""
     rows = []
-    for facts in zip(*signals, strict=True):
-        values = [value for fact in facts for value in fact["values"].values()]
-        low, high = facts[0]["low"], facts[0]["high"]
-        asked = f"above {low:g}" if high is None else f"{low:g} to {high:g}"
-        holds = f"{sum(bool(fact['holds']) for fact in facts)} of {len(facts)}"
-        rows.append([facts[0]["says"], f"{min(values):.3g} to {max(values):.3g}", asked, holds])
-    note = "Least to largest over materials and seeds."
-    return Table(["the paper's signals", "ours, simulated", "asked", "holds, seeds"], rows, note)
+    for checks in zip(*signals, strict=True):
+        values = [value for check in checks for value in check["values"].values()]
+        low, high = checks[0]["low"], checks[0]["high"]
+        rows.append(
+            {
+                "the paper's signals": checks[0]["says"],
+                "ours, simulated": f"{min(values):.3g} to {max(values):.3g}",
+                "asked": f"above {low:g}" if high is None else f"{low:g} to {high:g}",
+                "holds, seeds": f"{sum(map(bool, (c['holds'] for c in checks)))} of {len(checks)}",
+            }
+        )
+    return Table(rows, "Least to largest over materials and seeds.")
 
 
-def _places(runs: Runs) -> Table:
-    names = [name for name in ("unseen4", "unseen4 robust") if name in runs]
-    columns = [(name, role) for name in names for role in ("test", "unseen")]
-    rows = []
-    for words, places in PLACES.items():
-        found = [recall_beside_onset(runs, *column, places) for column in columns]
-        label = "non-slip" if words.startswith("-") else "slip"
-        rows.append([f"{words} ({label})", *map(mean_sd, found)])
-    header = ["bin beside its onset", *(", ".join(column) for column in columns)]
-    return Table(header, rows, "Recall, %. A bin is 50 ms; 0 is the first that is labelled slip.")
+def _places(runs: Runs, scores: Scores) -> Table:
+    columns = [(name, role) for name in BY_CYCLE if name in runs for role in ("test", "unseen")]
+    rows = [
+        {"bin beside its onset": f"{words} ({'non-slip' if words.startswith('-') else 'slip'})"}
+        | {", ".join(of): mean_sd(scores.beside_onset(*of, places)) for of in columns}
+        for words, places in PLACES.items()
+    ]
+    return Table(rows, "Recall, %. A bin is 50 ms; 0 is the first that is labelled slip.")
 
 
-def _strokes(runs: Runs) -> Table:
-    rows = []
-    for name in ("unseen4", "unseen4 robust"):
-        for role in ("test", "unseen"):
-            for speed in labels_of(runs, name, role, "per_speed"):
-                group = ("per_speed", speed)
-                cells = [mean_sd(percent(runs, name, role, of, group=group)) for of in SCORES]
-                rows.append([f"{name}, {role}, {speed} mm/s", *cells])
-    return Table(["stroke", *(f"{name}, %" for name in SCORES.values())], rows)
+def _strokes(scores: Scores) -> Table:
+    rows = [
+        {"stroke": f"{name}, {role}, {speed} mm/s"}
+        | {
+            f"{words}, %": mean_sd(scores.of(name, role, of, group=("per_speed", speed)).values())
+            for of, words in SCORES.items()
+        }
+        for name in BY_CYCLE
+        for role in ("test", "unseen")
+        for speed in scores.labels(name, role, "per_speed")
+    ]
+    return Table(rows)
 
 
-def _ablations(runs: Runs) -> Table:
+def _ablations(runs: Runs, scores: Scores) -> Table:
     """With a part of the signals or of the scene, and the best pooled number with a threshold."""
     rows = []
-    ways: list[tuple[str, str, str | None]]
-    ways = [(name, words, None) for name, words in ABLATIONS.items() if name in runs]
+    ways = [(name, words, "") for name, words in ABLATIONS.items() if name in runs]
     if "unseen4" in runs:
         ways.insert(1, ("unseen4", "the best single pooled number with a threshold", POOLED))
     for name, words, baseline in ways:
-        cells = []
+        row: dict[str, object] = {"trained and evaluated with": words}
         for role in ("test", "unseen"):
-            own = by_seed(runs, name, role, "balanced_accuracy", baseline=baseline)
-            whole = by_seed(runs, "unseen4", role, "balanced_accuracy")
-            cells += [mean_sd(list(own.values())), mean_sd(gains(own, whole), sign="+")]
-        rows.append([words, *cells, str(len(runs[name]))])
-    header = ["trained and evaluated with", "test %", "to everything", "unseen %", "to everything"]
+            own, whole = scores.of(name, role, baseline=baseline), scores.of("unseen4", role)
+            row[f"{role} %"] = mean_sd(own.values())
+            row[f"{role}: to everything"] = mean_sd(gains(own, whole), sign="+")
+        rows.append(row | {"seeds": len(runs[name])})
     note = "Balanced accuracy; differences in points at the same seeds; the paper's recipe."
-    return Table([*header, "seeds"], rows, note)
+    return Table(rows, note)
 
 
-def _baselines(runs: Runs) -> Table:
-    rows = []
-    for name in runs:
-        for role in roles_of(runs, name):
-            cells = [
-                mean_sd(percent(runs, name, role, "balanced_accuracy", baseline=baseline))
-                for baseline in (None, *BASELINES)
-            ]
-            rows.append([f"{name}, {role}", *cells])
+def _baselines(runs: Runs, scores: Scores) -> Table:
+    rows = [
+        {"balanced accuracy, %": f"{name}, {role}"}
+        | {
+            words: mean_sd(scores.of(name, role, baseline=baseline).values())
+            for baseline, words in {"": "detector", **BASELINES}.items()
+        }
+        for name in runs
+        for role in scores.roles(name)
+    ]
     note = "All are fitted on the same training recordings; baselines on a sample of their bins."
-    return Table(["balanced accuracy, %", "detector", *BASELINES.values()], rows, note)
+    return Table(rows, note)
 
 
 def _validation(runs: Runs) -> Table:
     rows = []
-    for name in ("unseen4", "unseen4 robust"):
+    for name in BY_CYCLE:
         values = [run.get("validation") for run in runs.get(name, [])]
         if values and None not in values:
             percents = [100 * value for value in values if value is not None]
-            rows.append([name, mean_sd(percents), ", ".join(f"{of:.2f}" for of in percents)])
+            row = {"recipe": name, "left-out training materials, %": mean_sd(percents)}
+            rows.append(row | {"by seed": ", ".join(f"{of:.2f}" for of in percents)})
     note = "Balanced accuracy of the best choice of K and C; no test and no held-out bin is in it."
-    return Table(["recipe", "left-out training materials, %", "by seed"], rows, note)
+    return Table(rows, note)
 
 
-def _leakage(runs: Runs) -> Table:
+def _leakage(scores: Scores) -> Table:
     rows = []
-    for layout, (at_random, by_cycle) in LAYOUTS.items():
+    for layout, experiments in LAYOUTS.items():
         for score, name in SCORES.items():
-            both = [by_seed(runs, of, "test", score) for of in (at_random, by_cycle)]
-            if found := gains(*both):
-                cells = [mean_sd(list(of.values())) for of in both]
-                cells += [mean_sd(found, sign="+"), str(len(found))]
-                rows.append([f"{name}, {layout}", *cells])
-    header = ["test bins", "at random over bins, %", "by cycle, %", "leak, points", "seeds"]
-    return Table(header, rows, "The leak is that of each seed, then mean and spread.")
+            at_random, by_cycle = (scores.of(of, "test", score) for of in experiments)
+            if found := gains(at_random, by_cycle):
+                rows.append(
+                    {
+                        "test bins": f"{name}, {layout}",
+                        "at random over bins, %": mean_sd(at_random.values()),
+                        "by cycle, %": mean_sd(by_cycle.values()),
+                        "leak, points": mean_sd(found, sign="+"),
+                        "seeds": len(found),
+                    }
+                )
+    return Table(rows, "The leak is that of each seed, then mean and spread.")
 
 
-def scene_gains(runs: Runs, role: str, scene: str) -> list[float]:
-    """Points of mean recall that a scene gains when such scenes are trained on, by seed."""
-    before, after = (scene_recalls(runs, fold, role, scene) for fold in FOLDS)
-    return gains(after, before)
-
-
-def scene_recalls(runs: Runs, fold: str, role: str, scene: str) -> dict[int, float]:
+def scene_recalls(scores: Scores, fold: str, role: str, scene: str) -> BySeed:
     """Mean recall of the classes that a scene has, in percent by seed."""
-    name, group = f"confound: {fold}", ("per_scene", scene)
-    classes = ("non_slip_recall", "slip_recall")
-    both = [by_seed(runs, name, role, score, group=group) for score in classes]
+    both = [
+        scores.of(f"confound: {fold}", role, score, group=("per_scene", scene))
+        for score in ("non_slip_recall", "slip_recall")
+    ]
     there = [of for of in both if of]
     return {seed: mean(of[seed] for of in there) for seed in (there[0] if there else {})}
 
 
-def scenes_of(runs: Runs) -> list[str]:
+def scenes_of(scores: Scores) -> list[str]:
     """Scenes that both detectors are evaluated on, the protocol first."""
-    found = labels_of(runs, "confound: protocol", "test", "per_scene")
+    found = scores.labels("confound: protocol", "test", "per_scene")
     return sorted(found, key=lambda scene: scene != PAPER_SCENE)
 
 
-def _confound(runs: Runs) -> dict[str, Table]:
+def _confound(runs: Runs, scores: Scores) -> dict[str, Table]:
     """Slip or the arm: recalls on each scene, and what training on such scenes does."""
-    trained = set(runs["confound"][0]["trained_scenes"])
+    trained_on = set(runs["confound"][0]["trained_scenes"])
     roles = ("test", "unseen")
     rows = []
-    for scene, fold in ((scene, fold) for scene in scenes_of(runs) for fold in FOLDS):
-        is_known = scene == PAPER_SCENE or (fold == "with_scenes" and scene in trained)
-        cells = [
-            mean_sd(percent(runs, f"confound: {fold}", role, score, group=("per_scene", scene)))
-            for role in roles
-            for score in ("non_slip_recall", "slip_recall")
-        ]
+    for scene, fold in product(scenes_of(scores), FOLDS):
+        is_known = scene == PAPER_SCENE or (fold == "with_scenes" and scene in trained_on)
         mark = " (trained on)" if is_known else ""
-        rows.append([f"{scene}, trained on {FOLDS[fold]}{mark}", *cells])
-    header = ["scene", *(f"{role}: {of}, %" for role in roles for of in ("non-slip", "slip"))]
-    others = [scene for scene in scenes_of(runs) if scene != PAPER_SCENE]
-    on_scenes = [
-        mean(of) for of in zip(*(scene_gains(runs, "test", s) for s in others), strict=True)
-    ]
-    changes = {role: scene_gains(runs, role, PAPER_SCENE) for role in roles}
-    is_better = min(on_scenes) > CLEARLY
+        row = {"scene": f"{scene}, trained on {FOLDS[fold]}{mark}"}
+        for role, (words, score) in product(roles, list(CLASS_RECALLS.items())):
+            found = scores.of(f"confound: {fold}", role, score, group=("per_scene", scene))
+            row[f"{role}: {words}, %"] = mean_sd(found.values())
+        rows.append(row)
+
+    def scene_gains(role: str, scene: str) -> list[float]:
+        """Points of mean recall that a scene gains when such scenes are trained on, by seed."""
+        before, after = (scene_recalls(scores, fold, role, scene) for fold in FOLDS)
+        return gains(after, before)
+
+    others = [scene_gains("test", scene) for scene in scenes_of(scores) if scene != PAPER_SCENE]
+    on_scenes = [mean(of) for of in zip(*others, strict=True)]
+    changes = {role: scene_gains(role, PAPER_SCENE) for role in roles}
     is_no_worse = min(mean(values) for values in changes.values()) >= -NO_WORSE
-    gained = [
-        ["scenes, test cycles, mean of all but the protocol", mean_sd(on_scenes, sign="+")],
-        *([f"the protocol, {role}", mean_sd(changes[role], sign="+")] for role in roles),
-        ["clearly better on scenes", "yes" if is_better else "no"],
-        ["no worse on the protocol", "yes" if is_no_worse else "no"],
-    ]
+    gained: dict[str, object] = {
+        "scenes, test cycles, mean of all but the protocol": mean_sd(on_scenes, sign="+"),
+        **{f"the protocol, {role}": mean_sd(changes[role], sign="+") for role in roles},
+        "clearly better on scenes": min(on_scenes) > CLEARLY,
+        "no worse on the protocol": is_no_worse,
+    }
     note = (
         f"Clearly better: more than {CLEARLY:g} points in every seed; no worse: a mean loss of at "
         f"most {NO_WORSE:g}. Both are asked for before training on such scenes is recommended."
     )
     return {
-        "Slip or the arm": Table(header, rows, "Recalls; - where a scene has no bin of a class."),
-        "What training on such scenes gains": Table(["points", "gain"], gained, note),
+        "Slip or the arm": Table(rows, "Recalls; - where a scene has no bin of a class."),
+        "What training on such scenes gains": Table(
+            [{"points": name, "gain": gain} for name, gain in gained.items()], note
+        ),
     }
 
 
 def _parameters(calibrated: Mapping[str, Any]) -> Table:
     rows = [
-        [name, " to ".join(f"{of:g}" for of in (value if isinstance(value, list) else [value]))]
+        {
+            "parameter": name,
+            "frozen value": " to ".join(f"{of:g}" for of in np.atleast_1d(value)),
+        }
         for name, value in calibrated["values"].items()
     ]
     note = f"Provenance: {calibrated['provenance'].rstrip('.')}."
@@ -693,29 +694,28 @@ def _parameters(calibrated: Mapping[str, Any]) -> Table:
             f" Aim: {100 * target['accuracy']:.2f} % ({target['row']}); reached: "
             f"{100 * calibrated['accuracy']:.2f} %, mean over other seeds: {calibrated['verdict']}."
         )
-    return Table(["parameter", "frozen value"], rows, note)
+    return Table(rows, note)
 
 
 def short_table(runs: Runs) -> Table:
     """The table of README.md."""
+    rows, scores = [], Scores(runs)
+    for name, roles in SHORT.items():
+        for role in roles if name in runs else ():
+            cells = {of: mean_sd(scores.of(name, role, of).values()) for of in SCORES}
+            pooled = mean_sd(scores.of(name, role, baseline=POOLED).values())
+            rows.append((f"`{name}` {role}, simulated, {len(runs[name])} seeds", cells, pooled))
+            if (name, role) in COMPARED:
+                paper = {of: percent(getattr(published.SPLITS[role], of)) for of in SCORES}
+                rows.append((f"paper, real hand, {role}", paper, ""))
     return Table(
-        ["experiment", *(f"{of} %" for of in SCORES.values()), "best pooled number, balanced %"],
-        list(_short_rows(runs)),
+        [
+            {"experiment": what}
+            | {f"{words} %": cells[of] for of, words in SCORES.items()}
+            | {"best pooled number, balanced %": pooled}
+            for what, cells, pooled in rows
+        ]
     )
-
-
-def _short_rows(runs: Runs) -> Iterator[list[str]]:
-    compared = {("random_bins", "test"), ("unseen4", "unseen")}
-    for name, role in ((name, role) for name, roles in SHORT.items() for role in roles):
-        if name not in runs:
-            continue
-        cells = [mean_sd(percent(runs, name, role, score)) for score in SCORES]
-        pooled = mean_sd(percent(runs, name, role, "balanced_accuracy", baseline=POOLED))
-        yield [f"`{name}` {role}, simulated, {len(runs[name])} seeds", *cells, pooled]
-        if (name, role) in compared:
-            values = [getattr(published.SPLITS[role], score) for score in SCORES]
-            of_paper = ["" if value is None else f"{100 * value:.2f}" for value in values]
-            yield [f"paper, real hand, {role}", *of_paper, ""]
 
 
 if __name__ == "__main__":

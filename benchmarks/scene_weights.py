@@ -79,7 +79,7 @@ class SceneWeights(Benchmark[Sizes]):
     def tables(self, numbers: Report) -> dict[str, Table]:
         """All of them."""
         rows = [{name: f"{of:.3g}" for name, of in row.items()} for row in numbers["rows"]]
-        return {self.title: Table.of(rows)}
+        return {self.title: Table(rows)}
 
     def section(self, report: Report) -> str:
         """How they were chosen, and the table."""

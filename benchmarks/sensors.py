@@ -7,12 +7,9 @@ anew in both ways, by the recipe's ranking and as many of each channel.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from matplotlib.figure import Figure
-
-from benchmarks.harness import Benchmark, Job, Report, Table, result_of, take_figures, trained
+from benchmarks.harness import Benchmark, Job, Report, Table, result_of, trained
 from tactslip_torch.report.importance import (
     RESELECT_WORDS,
     best_rows,
@@ -44,6 +41,7 @@ class Sensors(Benchmark[Sizes]):
         ("+exp=quick", "recipe=robust", "recipe.num_features=12", "recipe.penalties=[0.001]"),
         ("bins=20", "cache=off", "num_workers=0"),
     )
+    drawn: ClassVar = {"sensors.png": ""}
 
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
         """What the command leaves, by way of selection."""
@@ -60,23 +58,13 @@ class Sensors(Benchmark[Sizes]):
         """One by one and the best few, by way of selection and by unit."""
         found = {}
         for way, content in numbers["ways"].items():
-            words = RESELECT_WORDS[way]
             for unit in content["best"]:
-                is_first = unit == "kind"
-                found[f"Without one {unit}, features {words}"] = Table.of(
-                    unit_rows(content, unit), "; ".join(lines_about(content)) if is_first else ""
-                )
-                found[f"The best few by {unit}, features {words}"] = Table.of(
-                    best_rows(content, unit), with_all_line(content) if is_first else ""
-                )
+                words, is_first = f"{unit}, features {RESELECT_WORDS[way]}", unit == "kind"
+                about = "; ".join(lines_about(content)) if is_first else ""
+                found[f"Without one {words}"] = Table(unit_rows(content, unit), about)
+                about = with_all_line(content) if is_first else ""
+                found[f"The best few by {words}"] = Table(best_rows(content, unit), about)
         return found
-
-    def draw(self, numbers: Report, drawing: Figure) -> None:
-        """The command has drawn it."""
-
-    def figures(self, report: Report, path: Path) -> None:
-        """That of the command, features by the recipe's ranking."""
-        take_figures(Path(report["numbers"]["folder"]), {"sensors.png": path})
 
 
 if __name__ == "__main__":

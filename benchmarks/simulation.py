@@ -90,29 +90,29 @@ class Simulation(Benchmark[Sizes]):
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Costs and accuracies."""
         costs = [
-            [
-                row["level"],
-                "-" if row["step_us"] is None else f"{row['step_us']:g}",
-                Spread.of(row["seconds"]).text(),
-                *("-" if row[key] is None else number(row[key]) for key in ("off", "onset_ms")),
-            ]
+            {
+                "level": row["level"],
+                "step, us": row["step_us"] and f"{row['step_us']:g}",
+                "s a minute of 24 channels": Spread.of(row["seconds"]).text(),
+                "samples off": number(row["off"]),
+                "onset off, ms": number(row["onset_ms"]),
+            }
             for row in numbers["costs"]
         ]
-        levels = list(numbers["accuracies"])
+        levels = numbers["accuracies"]
         accuracies = [
-            [f"trained on {level}", *(percent(of[other]) for other in levels)]
-            for level, of in numbers["accuracies"].items()
+            {"balanced accuracy, %": f"trained on {level}"}
+            | {f"on {other}": percent(of[other]) for other in levels}
+            for level, of in levels.items()
         ]
-        header = ["level", "step, us", "s a minute of 24 channels", "samples off", "onset off, ms"]
         note = (
             "Off: the root mean square difference of samples to those of the smallest step, over "
             "their standard deviation, the worst kind of channel; and the largest of onsets."
         )
-        columns = ["balanced accuracy, %", *(f"on {level}" for level in levels)]
         about = "Held-out cycles of seen materials; the same cycles on every level."
         return {
-            "Levels and steps": Table(header, costs, note),
-            "Trained on one level, evaluated on another": Table(columns, accuracies, about),
+            "Levels and steps": Table(costs, note),
+            "Trained on one level, evaluated on another": Table(accuracies, about),
         }
 
     def draw(self, numbers: Report, drawing: Figure) -> None:

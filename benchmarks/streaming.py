@@ -28,6 +28,7 @@ from benchmarks.harness import (
     interleaved,
     limit,
     limits,
+    listed,
     number,
     on_threads,
     say,
@@ -120,26 +121,25 @@ class Streaming(Benchmark[Sizes]):
             limit("resident memory, growth after it has settled", growth, MOST_GROWTH_MB, "MB"),
         ]  # fmt: skip
         speed = [
-            [
-                f"{row['way']}, hop {_ms(row['hop'])} ms, pushes of {_ms(row['push'])} ms",
-                _times(row).text(),
-                number(1e6 * row["p50_s"]),
-                number(1e6 * row["p99_s"]),
-            ]
+            {
+                "way": f"{row['way']}, hop {_ms(row['hop'])} ms, pushes of {_ms(row['push'])} ms",
+                "times faster": _times(row).text(),
+                "median push, us": number(1e6 * row["p50_s"]),
+                "99th percentile, us": number(1e6 * row["p99_s"]),
+            }
             for row in numbers["rows"]
         ]
         memory = numbers["memory"]
-        cells = [
-            ["stream watched, s", number(memory["at_s"][-1])],
-            ["resident at its end, MB", number(memory["resident_bytes"][-1] / 1e6)],
-            ["growth since it settled, MB", number(growth)],
-            ["held by the stream itself, kB", number(memory["state_bytes"] / 1e3)],
-        ]
-        header = ["way", "times faster", "median push, us", "99th percentile, us"]
+        held = {
+            "stream watched, s": number(memory["at_s"][-1]),
+            "resident at its end, MB": number(memory["resident_bytes"][-1] / 1e6),
+            "growth since it settled, MB": number(growth),
+            "held by the stream itself, kB": number(memory["state_bytes"] / 1e3),
+        }
         return {
             "Limits": limits(goals),
-            "Speed": Table(header, speed, "naive: a bin with all its context for every decision."),
-            "Memory": Table(["memory", ""], cells),
+            "Speed": Table(speed, "naive: a bin with all its context for every decision."),
+            "Memory": listed("memory", held),
         }
 
     def draw(self, numbers: Report, drawing: Figure) -> None:

@@ -21,7 +21,7 @@ from typing import Any
 import psutil
 from matplotlib.figure import Figure
 
-from benchmarks.harness import COLORS, Benchmark, Job, Report, Table, limit, limits, say
+from benchmarks.harness import COLORS, Benchmark, Job, Report, Table, by, limit, limits, say
 
 KINDS = ("cold", "warm")
 SAMPLE_S = 0.1
@@ -65,44 +65,46 @@ class Train(Benchmark[Sizes]):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """Limits, stages and totals."""
-        by_kind = {kind: [run for run in numbers["runs"] if run["kind"] == kind] for kind in KINDS}
+        by_kind = {kind: of for (kind,), of in by(numbers["runs"], "kind").items()}
         stages = dict.fromkeys(stage for run in numbers["runs"] for stage in run["stages"])
         rows = []
         for stage in stages:
-            cells = [stage]
-            for kind in KINDS:
-                seconds = median(run["stages"].get(stage, 0.0) for run in by_kind[kind])
-                whole = median(run["wall_s"] for run in by_kind[kind])
-                cells += [f"{seconds:.2f}", f"{100 * seconds / whole:.1f}"]
-            rows.append(cells)
+            row = {"stage": stage}
+            for kind, runs in by_kind.items():
+                seconds = median(run["stages"].get(stage, 0.0) for run in runs)
+                whole = median(run["wall_s"] for run in runs)
+                row |= {
+                    f"{kind}, s": f"{seconds:.2f}",
+                    f"{kind}, %": f"{100 * seconds / whole:.1f}",
+                }
+            rows.append(row)
         for name, key, factor in (
             ("whole process, s", "wall_s", 1.0),
             ("peak memory, GB", "peak_bytes", 1e-9),
             ("workers, s in all", "worker_s", 1.0),
             ("bins a second of its passes", "bins_a_second", 1.0),
         ):
-            cells = [name]
-            for kind in KINDS:
-                cells += [f"{factor * median(run[key] for run in by_kind[kind]):.2f}", ""]
-            rows.append(cells)
+            row = {"stage": name}
+            for kind, runs in by_kind.items():
+                value = factor * median(run[key] for run in runs)
+                row |= {f"{kind}, s": f"{value:.2f}", f"{kind}, %": ""}
+            rows.append(row)
         first = numbers["runs"][0]
         note = (
             f"`train {' '.join(numbers['overrides'])}`, medians of {len(by_kind['cold'])} "
             f"repeats; {first['num_bins']} bins; start-up: imports, configuration and figures; "
             f"memory: {first['memory'].upper()}."
         )
-        found = {
-            "Stages": Table(["stage", "cold, s", "%", "warm, s", "%"], rows, note),
-        }
+        found = {"Stages": Table(rows, note)}
         if numbers["overrides"] != ["+exp=unseen4"]:
             return found
         goals = [
-            limit(f"{kind}, s", max(run["wall_s"] for run in by_kind[kind]), LIMITS[kind])
+            limit(f"{kind}, s, worst", max(run["wall_s"] for run in by_kind[kind]), LIMITS[kind])
             for kind in KINDS
         ]
         most = max(run["peak_bytes"] for run in by_kind["cold"]) / 1e9
-        goals.append(limit("cold, peak memory, GB", most, MOST_GB))
-        return {"Limits": limits(goals, "worst"), **found}
+        goals.append(limit("cold, peak memory, GB, worst", most, MOST_GB))
+        return {"Limits": limits(goals), **found}
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Stages of both kinds, stacked."""
@@ -110,8 +112,7 @@ class Train(Benchmark[Sizes]):
         stages = dict.fromkeys(stage for run in numbers["runs"] for stage in run["stages"])
         left = dict.fromkeys(KINDS, 0.0)
         for place, stage in enumerate(stages):
-            for kind in KINDS:
-                runs = [run for run in numbers["runs"] if run["kind"] == kind]
+            for (kind,), runs in by(numbers["runs"], "kind").items():
                 seconds = median(run["stages"].get(stage, 0.0) for run in runs)
                 color = COLORS[place % len(COLORS)]
                 label = stage if kind == KINDS[0] else None

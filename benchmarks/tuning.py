@@ -6,13 +6,12 @@ training materials held out from it and, as a detector, on test and held-out mat
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from statistics import mean
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from benchmarks.harness import Benchmark, Job, Report, Table, bars, percent, trained
+from benchmarks.harness import Benchmark, Job, Overrides, Report, Table, bars, percent, trained
 
 LEARNED = {
     "C and c": "[penalty,offset]",
@@ -21,21 +20,14 @@ LEARNED = {
 GRID = {"recipe": "grid, by balanced accuracy", "grid": "grid, by loss"}
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Overrides of ``tactslip_torch.train``, before those of the command line."""
-
-    overrides: tuple[str, ...] = ("+exp=tuned",)
-
-
-class Tuning(Benchmark[Sizes]):
+class Tuning(Benchmark[Overrides]):
     """Tuned by gradient, beside the grid of the recipe."""
 
     name = "tuning"
     title = "Tuned by gradient"
     about = "the kernel machine of the simulated hand tuned by gradient, beside its recipe's grid"
-    sizes = Sizes()
-    quick = Sizes(
+    sizes = Overrides(("+exp=tuned",))
+    quick = Overrides(
         (
             "+exp=quick",
             "tuning=gradient",
@@ -46,7 +38,7 @@ class Tuning(Benchmark[Sizes]):
         )
     )
 
-    def measure(self, job: Job[Sizes]) -> dict[str, Any]:
+    def measure(self, job: Job[Overrides]) -> dict[str, Any]:
         """A training for each way."""
         found = {}
         for place, (name, learn) in enumerate(LEARNED.items()):
@@ -65,13 +57,12 @@ class Tuning(Benchmark[Sizes]):
                 rows.append(_row(words, found, way, found["splits"][way], seconds))
             splits = found["tuned_splits"]
             rows.append(_row(f"{name} tuned", found, "tuned", splits, found["seconds"]))
-        header = ["settings", "held-out loss", "held-out %", "test %", "unseen %", "seconds"]
         note = (
             "Held out: mean log loss (nats) and balanced accuracy of each training material under "
             "settings chosen without it; ranking and ranges met it. Seconds: of tuning, and of the "
             "whole first fit for the grid."
         )
-        return {"Beside the grid": Table(header, rows, note)}
+        return {"Beside the grid": Table(rows, note)}
 
     def draw(self, numbers: Report, drawing: Figure) -> None:
         """Held-out losses."""
@@ -82,14 +73,16 @@ class Tuning(Benchmark[Sizes]):
         bars(drawing.subplots(), list(losses), values, "held-out loss", is_log=False)
 
 
-def _row(name: str, found: Report, way: str, splits: Report, seconds: float | None) -> list[str]:
-    return [
-        name,
-        f"{_held_mean(found, way, 'loss'):.4f}",
-        percent(_held_mean(found, way, "balanced_accuracy")),
-        *(percent(splits[role]["balanced_accuracy"]) for role in ("test", "unseen")),
-        "-" if seconds is None else f"{seconds:.0f}",
-    ]
+def _row(
+    name: str, found: Report, way: str, splits: Report, seconds: float | None
+) -> dict[str, object]:
+    row: dict[str, object] = {
+        "settings": name,
+        "held-out loss": f"{_held_mean(found, way, 'loss'):.4f}",
+        "held-out %": percent(_held_mean(found, way, "balanced_accuracy")),
+    }
+    row |= {f"{of} %": percent(splits[of]["balanced_accuracy"]) for of in ("test", "unseen")}
+    return row | {"seconds": None if seconds is None else round(seconds)}
 
 
 def _held_mean(found: Report, way: str, measure: str) -> float:
