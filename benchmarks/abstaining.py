@@ -45,7 +45,7 @@ class Sizes:
         num_held_out: materials left out of a split.
         splits: how many choices of them, the paper's first.
         train_bins: of each seen material and class to fit and calibrate on.
-        judged_bins: of each material and class, at most, to evaluate on.
+        scored_bins: of each material and class, at most, to evaluate on.
         num_features: K.
         penalties: to choose C from.
         coverages: that are asked for.
@@ -55,7 +55,7 @@ class Sizes:
     num_held_out: int = 4
     splits: int = 8
     train_bins: int = 200
-    judged_bins: int = 600
+    scored_bins: int = 600
     num_features: int = 60
     penalties: tuple[float, ...] = (1e-4, 1e-3, 1e-2)
     coverages: tuple[float, ...] = (0.8, 0.9, 0.95, 0.97, 0.99)
@@ -85,7 +85,7 @@ class Abstaining(Benchmark[Sizes]):
         num_held_out=1,
         splits=2,
         train_bins=30,
-        judged_bins=40,
+        scored_bins=40,
         num_features=20,
         penalties=(1e-3,),
         coverages=(0.5, 0.8),
@@ -99,7 +99,7 @@ class Abstaining(Benchmark[Sizes]):
         names = sorted({recording.material for recording in source.ids})
         share, seed = config.train_fraction, config.seed
         materials = statistics_from(
-            source, config, names, sizes.train_bins, sizes.judged_bins, share, seed
+            source, config, names, sizes.train_bins, sizes.scored_bins, share, seed
         )
         recipe = small_recipe(config, sizes.train_bins, sizes.num_features, sizes.penalties)
         rows = []

@@ -3,7 +3,7 @@
 Held-out materials are brought to a trained detector, recording by recording. Ways: ``auto`` (the
 weight that old materials allow), ``slip-free`` (the same, of bins without slip alone), ``weight 1``
 (what fitting again on everything gives, features and scaling kept), ``threshold`` (the machine
-stays, its threshold moves) and ``ceiling`` (trained on the whole training share of the new material
+stays, its threshold moves) and ``ceiling`` (trained on the whole training part of the new material
 too, features ranked and scaled anew).
 """
 

@@ -7,20 +7,21 @@ and a first score in a fresh process.
 
 from __future__ import annotations
 
-import json
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
-import onnxruntime
 import torch
 from matplotlib.figure import Figure
 
+from benchmarks import ROOT
 from benchmarks.harness import (
     Benchmark,
     Job,
@@ -62,7 +63,7 @@ class Sizes:
 
     Args:
         recordings: simulated, to whose bins the machine is fitted.
-        judged: bins whose scores are held against the reference.
+        evaluated: bins whose scores are held against the reference.
         rounds: of every way.
         bulk: bins at once.
         push: samples of a push of a stream.
@@ -71,7 +72,7 @@ class Sizes:
     """
 
     recordings: int = 33
-    judged: int = 2000
+    evaluated: int = 2000
     rounds: int = 20
     bulk: tuple[int, ...] = (16, 256)
     push: int = 200
@@ -79,60 +80,28 @@ class Sizes:
     starts: int = 3
 
 
-class BinSession:
-    """A bin graph in onnxruntime.
-
-    Args:
-        path: of its file.
-        threads: it may use.
-    """
-
-    def __init__(self, path: Path, threads: int) -> None:
-        self._session = session_of(path, threads)
-        metadata = self._session.get_modelmeta().custom_metadata_map
-        context = ChannelFilter(WINDOW_LENGTHS).context
-        before, after = (json.loads(metadata[f"context_{s}_samples"]) for s in ("before", "after"))
-        self._cut = (context - before, context - after)  # the file takes no more than it needs
-        self._dtype = np.dtype(json.loads(metadata["precision"]))
-
-    def scores(self, samples: torch.Tensor) -> Array:
-        """Of raw bins with all context ``[N, C, n + 2 * context]``; flags are made as well."""
-        first, last = self._cut
-        x = samples[..., first : samples.shape[-1] - last].numpy().astype(self._dtype, copy=False)
-        scores: Array = self._session.run(["score", "valid"], {"samples": np.ascontiguousarray(x)})[
-            0
-        ]
-        return scores
+def host(module: str) -> Any:
+    """A module of ``export/python``, the host that is shipped: onnxruntime on one thread."""
+    folder = str(ROOT / "export" / "python")
+    if folder not in sys.path:
+        sys.path.append(folder)
+    return import_module(module)
 
 
-class StreamSession:
-    """A stream graph in onnxruntime, with what a host keeps between two pushes."""
+def bin_scores(path: Path) -> Callable[[torch.Tensor], Array]:
+    """What scores raw bins with all context ``[N, C, n + 2 * context]`` by a bin graph."""
+    session, facts = host("files").load_model(path, "bin")
+    context = ChannelFilter(WINDOW_LENGTHS).context
+    first = context - facts["context_before_samples"]  # the file takes no more than it needs
+    unused = context - facts["context_after_samples"]
 
-    def __init__(self, path: Path) -> None:
-        self._session = session_of(path, 1)
-        inputs = {given.name: given for given in self._session.get_inputs()}
-        is_double = inputs["samples"].type == "tensor(double)"
-        self._dtype = np.float64 if is_double else np.float32
-        self._tail = np.zeros((0, inputs["tail"].shape[1]), self._dtype)
-        self._state, self._threshold = np.zeros(0), np.zeros(0)
-        names = [output.name for output in self._session.get_outputs()]
-        self._outputs = ["next_tail", "next_state", "score"]
-        self._outputs += [name for name in names if name not in self._outputs]
+    def scores(samples: torch.Tensor) -> Array:
+        cut = samples[..., first : samples.shape[-1] - unused].numpy()
+        x = np.ascontiguousarray(cut, facts["precision"])
+        found: Array = session.run(["score", "valid"], {"samples": x})[0]
+        return found
 
-    def push(self, samples: Array) -> Array:
-        """The scores that the next samples ``[n, C]`` make possible; all outputs are made."""
-        given = {"samples": samples.astype(self._dtype, copy=False), "tail": self._tail}
-        given |= {"state": self._state, "threshold": self._threshold}
-        self._tail, self._state, score, *_ = self._session.run(self._outputs, given)
-        return np.asarray(score)
-
-
-def session_of(path: Path, threads: int) -> Any:
-    """A file loaded to run on so many threads."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 3  # errors alone: it warns of how it rewrites graphs
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    return scores
 
 
 class Deployment(Benchmark[Sizes]):
@@ -145,7 +114,9 @@ class Deployment(Benchmark[Sizes]):
         "1 thread"
     )
     sizes = Sizes()
-    quick = Sizes(recordings=1, judged=16, rounds=2, bulk=(4,), push=100, streamed_s=2.0, starts=1)
+    quick = Sizes(
+        recordings=1, evaluated=16, rounds=2, bulk=(4,), push=100, streamed_s=2.0, starts=1
+    )
     libraries = ("onnxruntime", "onnx")
 
     @torch.inference_mode()
@@ -233,8 +204,7 @@ class Deployment(Benchmark[Sizes]):
 def _bins(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str, Any]]:
     ways: dict[str, Callable[[torch.Tensor], Any]] = {}
     for precision in PRECISIONS:
-        session = BinSession(folder / precision / "model.onnx", 1)
-        ways[f"onnxruntime, {precision}"] = session.scores
+        ways[f"onnxruntime, {precision}"] = bin_scores(folder / precision / "model.onnx")
         detector = main.detector(DTYPES[precision])
         ways[f"tactslip_torch, {precision}"] = partial(_score, detector, DTYPES[precision])
     ways[REFERENCE] = partial(_score, main.detector(FLOAT64, "torch"), FLOAT64)
@@ -245,8 +215,8 @@ def _bins(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str, A
         timings = interleaved({n: partial(way, bins) for n, way in ways.items()}, sizes.rounds)
         for name, timing in timings.items():
             us[name][str(size)] = Spread.of(timing.per_round, 1e6 / size)
-    judged = raw_bins(sizes.judged, min(sizes.recordings, 12))
-    scores = {n: np.asarray(way(judged), np.float64).ravel() for n, way in ways.items()}
+    evaluated = raw_bins(sizes.evaluated, min(sizes.recordings, 12))
+    scores = {n: np.asarray(way(evaluated), np.float64).ravel() for n, way in ways.items()}
     exact = scores[REFERENCE]
     return [
         {
@@ -272,7 +242,7 @@ def _streams(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str
         dtype = DTYPES[precision]
         file = folder / precision / "stream.onnx"
         ways: dict[str, Callable[[], Any]] = {
-            f"onnxruntime, {precision}": partial(StreamSession, file),
+            f"onnxruntime, {precision}": partial(host("stream").Stream, file),
             f"tactslip_torch, {precision}": partial(
                 StreamingDetector, main.detector(dtype), dtype=dtype
             ),
@@ -300,7 +270,7 @@ def _streams(main: MainJobDetector, folder: Path, sizes: Sizes) -> list[dict[str
 
 
 def _scores_of(pushed: Any) -> Array:
-    score = pushed if isinstance(pushed, np.ndarray) else pushed.score
+    score = [row["score"] for row in pushed] if isinstance(pushed, list) else pushed.score
     return np.asarray(score, np.float64).ravel()
 
 

@@ -170,7 +170,7 @@ def say(text: str) -> None:
 
 
 # ------------------------------------------------------------------------------------ machine
-def machine_facts() -> dict[str, str]:
+def machine_description() -> dict[str, str]:
     """Processor, cores this process may use, and how busy the machine is already."""
     every = os.cpu_count() or 1
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else every
@@ -640,7 +640,7 @@ class Benchmark(ABC, Generic[S]):
         return 0
 
     def _report(self, job: Job[S]) -> dict[str, Any]:
-        machine = machine_facts()  # before the load of the measurement
+        machine = machine_description()  # before the load of the measurement
         numbers = self.measure(job)
         return {
             "code": code_digest(),

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.svm import SVC
 
-from benchmarks.deployment import BinSession
+from benchmarks.deployment import bin_scores
 from benchmarks.harness import (
     Benchmark,
     Job,
@@ -128,13 +128,13 @@ class Latency(Benchmark[Sizes]):
         with TemporaryDirectory(prefix="tactslip-bench-") as folder:
             say("latency: export to ONNX")
             export_detector(exact, Path(folder), ("bin",), "float32")
-            session = BinSession(Path(folder) / "model.onnx", threads=1)
+            exported = bin_scores(Path(folder) / "model.onnx")
         return {
             OURS: fast.score_raw,
             "tactslip_torch, float32, with validity": lambda x: fast.predict_raw(x).score,
             "tactslip_torch, float64": lambda x: exact.score_raw(x.double()),
             REFERENCE: lambda x: slow.score_raw(x.double()),
-            ORT: session.scores,
+            ORT: exported,
             "SciPy and PyWavelets, a loop, kernel sum": _loop(main),
             "MiniRocket and ridge": _rocket(sizes),
             "tactslip_torch, float64, SVC head": lambda x: svc.decision_function(scaled(x)),

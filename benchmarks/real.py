@@ -8,11 +8,13 @@ with ridge. All that is fitted or chosen is so inside the fold. Writes REAL_DATA
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -45,12 +47,13 @@ from benchmarks.harness import (
     Job,
     Report,
     Table,
-    finish,
     interleaved,
     limits,
     number,
     on_threads,
     paired_ratio,
+    percent,
+    ran_on,
 )
 from benchmarks.peers.rockets import MINI_ROCKET, MULTI_ROCKET_HYDRA
 from benchmarks.peers.rockets import fit as fit_rocket
@@ -73,12 +76,6 @@ Array = NDArray[Any]
 EXPERIMENT = "+exp=biotacsp_dos"
 RECIPES = ("general", "robust", "paper")
 """Of ours; the first is the one that limits are for."""
-SOURCE = "github.com/yayaneath/BioTacSP-DoS"
-CITATION = (
-    'B. S. Zapata-Impata, P. Gil, F. Torres, "Learning Spatio Temporal Tactile Features with a '
-    'ConvLSTM for the Direction Of Slip Detection", Sensors 19(3):523, 2019, '
-    "doi:10.3390/s19030523"
-)
 SCENES = {
     "n": "north",
     "s": "south",
@@ -256,23 +253,15 @@ class Fitted(NamedTuple):
     detector: SlipDetector | None = None
 
 
-class Method(NamedTuple):
-    """A method.
-
-    Attributes:
-        name: for tables.
-        fit: to the training windows of a fold, a mask ``[N]``, and the detector that the first
-            method fitted to the same.
-        describe_s: seconds that describing a window took beforehand.
-    """
-
-    name: str
-    fit: Callable[[Array, SlipDetector | None], Fitted]
-    describe_s: float = 0.0
+Fit = Callable[[Array, SlipDetector | None], Fitted]
+"""To the training windows of a fold, a mask ``[N]``, and the detector that the first method fitted
+to the same."""
 
 
-def methods_of(windows: Windows, recipes: Sequence[Recipe], sizes: Sizes) -> list[Method]:
-    """All methods, ours first."""
+def methods_of(
+    windows: Windows, recipes: Sequence[Recipe], sizes: Sizes
+) -> dict[str, tuple[Fit, float]]:
+    """All methods, ours first, and the seconds that describing a window took beforehand."""
     started = time.perf_counter()
     simple = simple_statistics(windows.samples)
     simple_s = (time.perf_counter() - started) / len(simple)
@@ -283,34 +272,24 @@ def methods_of(windows: Windows, recipes: Sequence[Recipe], sizes: Sizes) -> lis
         for leaf in sizes.leaves
     }
     regressions = _regressions(sizes, {"as they are, ": None, "with logs, ": _with_logs()})
+    found: dict[str, tuple[Fit, float]] = {
+        f"ours, recipe={recipe.name}": (partial(_ours, windows, recipe), windows.pool_s)
+        for recipe in recipes
+    }
+    same = partial(_same_features, windows, sizes)
+    found["our features, logistic regression"] = (same, windows.pool_s)
+    for name, grid in (("logistic regression", regressions), ("random forest", forests)):
+
+        def fit(train: Array, _: Any, grid: Mapping[str, Any] = grid) -> Fitted:
+            return _best_of(grid, windows, sizes, simple, train, simple_statistics)
+
+        found[f"simple statistics, {name}"] = (fit, simple_s)
     rockets = [(MINI_ROCKET, seed, sizes.rocket_kernels) for seed in sizes.rocket_seeds]
     rockets += [(MULTI_ROCKET_HYDRA, sizes.rocket_seeds[0], sizes.multi_rocket_kernels)]
-    return [
-        *(
-            Method(f"ours, recipe={recipe.name}", partial(_ours, windows, recipe), windows.pool_s)
-            for recipe in recipes
-        ),
-        Method(
-            "our features, logistic regression",
-            partial(_same_features, windows, sizes),
-            windows.pool_s,
-        ),
-        *(
-            Method(
-                f"simple statistics, {name}",
-                partial(_simple, windows, sizes, simple, grid),
-                simple_s,
-            )
-            for name, grid in {
-                "logistic regression": regressions,
-                "random forest": forests,
-            }.items()
-        ),
-        *(
-            Method(f"{name}, seed {seed}", partial(_rocket, windows, sizes, name, seed, kernels))
-            for name, seed, kernels in rockets
-        ),
-    ]
+    for name, seed, kernels in rockets:
+        rocket = partial(_rocket, windows, sizes, name, seed, kernels)
+        found[f"{name}, seed {seed}"] = (rocket, 0.0)
+    return found
 
 
 def _ours(windows: Windows, recipe: Recipe, train: Array, _: SlipDetector | None) -> Fitted:
@@ -363,17 +342,6 @@ def _same_features(
         return detector.scaled(features).numpy()
 
     return _best_of(grid, windows, sizes, rows, train, describe)
-
-
-def _simple(
-    windows: Windows,
-    sizes: Sizes,
-    rows: Array,
-    grid: Mapping[str, Any],
-    train: Array,
-    _: SlipDetector | None,
-) -> Fitted:
-    return _best_of(grid, windows, sizes, rows, train, simple_statistics)
 
 
 def _rocket(
@@ -482,24 +450,24 @@ class OnFolds:
 
 
 def on_folds(
-    windows: Windows, folds: Sequence[Split], methods: Sequence[Method]
+    windows: Windows, folds: Sequence[Split], methods: Mapping[str, tuple[Fit, float]]
 ) -> dict[str, OnFolds]:
     """Fit every method to the training windows of every fold, and score the others.
 
     Raises:
         ValueError: if a score is not finite.
     """
-    found = {method.name: OnFolds(np.full(len(windows.is_slip), np.nan)) for method in methods}
-    for place in bar(range(len(folds) * len(methods)), "fits, fold by fold", "fit"):
-        fold, method = folds[place // len(methods)], methods[place % len(methods)]
+    found = {name: OnFolds(np.full(len(windows.is_slip), np.nan)) for name in methods}
+    first = next(iter(found.values()))
+    for fold, name in bar(list(product(folds, methods)), "fits, fold by fold", "fit"):
         held, train = windows.of(fold.having("unseen")), windows.of(fold.having("train"))
-        first, of = found[methods[0].name], found[method.name]
+        (fit, describe_s), of = methods[name], found[name]
         started = time.perf_counter()
-        fitted = method.fit(train, first.detectors[-1] if first.detectors else None)
-        of.fit_s.append(time.perf_counter() - started + method.describe_s * int(train.sum()))
+        fitted = fit(train, first.detectors[-1] if first.detectors else None)
+        of.fit_s.append(time.perf_counter() - started + describe_s * int(train.sum()))
         of.scores[held] = fitted.score(held.nonzero()[0])
         if not np.isfinite(of.scores[held]).all():
-            raise ValueError(f"{method.name} gave scores that are not finite")
+            raise ValueError(f"{name} gave scores that are not finite")
         of.chosen.append(fitted.chosen)
         of.detectors.append(fitted.detector)
         of.last = fitted
@@ -704,12 +672,12 @@ class Real(Benchmark[Sizes]):
 
     def tables(self, numbers: Report) -> dict[str, Table]:
         """All tables, by the heading that they stand under."""
+        objects = {name: name for name in numbers["data"]["objects"]}
         return {
+            "The recordings": Table(_data_rows(numbers)),
             "Limits": limits(_limit_rows(numbers)),
-            "Scores": _scores_table(numbers),
-            "Each object, left out of everything": _groups_table(
-                numbers, "objects", {name: name for name in numbers["data"]["objects"]}
-            ),
+            "Scores": Table(_score_rows(numbers)),
+            "Each object, left out of everything": _groups_table(numbers, "objects", objects),
             "Each direction of slip": _groups_table(numbers, "scenes", SCENES),
             "As streams": _streams_table(numbers),
             "How sure the differences are": _differences_table(numbers),
@@ -718,10 +686,8 @@ class Real(Benchmark[Sizes]):
         }
 
     def section(self, report: Report) -> str:
-        """The whole page: what the data are, how methods are evaluated, and what came out."""
+        """All that is measured; what the data are and how methods are evaluated the page says."""
         numbers = report["numbers"]
-        ran_on = ", ".join(report["machine"].values())
-        used = ", ".join(f"{name} {of}" for name, of in report["versions"].items())
         texts = {
             "Limits": _limits_text(numbers),
             "How sure the differences are": _differences_text(numbers),
@@ -730,12 +696,9 @@ class Real(Benchmark[Sizes]):
             f"medians of {numbers['settings']['rounds']} rounds. For one window alone the calls "
             "themselves weigh most. A fit counts the description of its training windows.",
         }
-        parts = [
-            f"`python -m benchmarks.real data.root=FOLDER`. Nothing here is simulated. All was "
-            f"measured in one run, on {ran_on}; {used}; code {report['code']}.",
-            *([f"**{QUICK_LINE}.**"] if report["quick"] else []),
-            *("## The data", _data_text(numbers), "## Protocol", _protocol_text(numbers)),
-        ]
+        parts = [f"Measured in one run, {ran_on(report)}."]
+        if report["quick"]:
+            parts.append(f"**{QUICK_LINE}.**")
         for title, table in self.tables(numbers).items():
             parts += [f"## {title}", *([texts[title]] if title in texts else []), table.markdown()]
             if title == "Scores":
@@ -769,13 +732,31 @@ class Real(Benchmark[Sizes]):
 
     def figures(self, report: Report, path: Path) -> None:
         """Ours, and what ``detect`` has drawn of one recording."""
-        drawing = Figure(layout="constrained")
-        self.draw(report["numbers"], drawing)
-        finish(drawing, report, self.about[:1].upper() + self.about[1:], path)
+        super().figures(report, path)
         drawn = next(Path(report["numbers"]["streams"]["folder"]).glob("*.png"), None)
         if drawn is not None:
             with whole_file(path.with_name("real_watched.png")) as temporary:
-                temporary.write_bytes(drawn.read_bytes())
+                shutil.copy(drawn, temporary)
+
+
+def _data_rows(numbers: Report) -> list[dict[str, object]]:
+    """What was read, and what the run was set to."""
+    data, settings = numbers["data"], numbers["settings"]
+    rows = {
+        "recordings": data["recordings"],
+        "objects": len(data["objects"]),
+        "channels": data["channels"],
+        "samples in a window": data["samples"],
+        "windows": data["windows"]["all"],
+        "of them slip": data["windows"]["slip"],
+        "features in the pool": data["pool"],
+        "groups of objects that choose classifiers on simple statistics": settings["inner"],
+        "kernels of MiniRocket": f"{settings['rocket_kernels']:,}",
+        "kernels of MultiRocket": f"{settings['multi_rocket_kernels']:,}",
+        "groups of Hydra's kernels": settings["hydra_groups"],
+        "trees of the forest": settings["trees"],
+    }
+    return [{"": name, "number": of} for name, of in rows.items()]
 
 
 def _limit_rows(numbers: Report) -> list[dict[str, Any]]:
@@ -784,16 +765,16 @@ def _limit_rows(numbers: Report) -> list[dict[str, Any]]:
     ours, found = rows[numbers["ours"]], []
 
     def row(what: str, measured: str, limit: str, ok: bool) -> None:
-        found.append({"what": what, "measured": measured, "limit": limit, "ok": ok})
+        found.append({"limits": what, "measured": measured, "limit": limit, "": ok})
 
-    aims = [("balanced accuracy", "balanced_accuracy", AIM_BALANCED), ("AUC", "auc", AIM_AUC)]
     for rocket in numbers["rockets"]:
         other = rows[rocket]["balanced_accuracy"]
         gap = ours["balanced_accuracy"] - other
-        measured = f"{100 * ours['balanced_accuracy']:.2f} %, {100 * gap:+.2f} points"
-        row(f"balanced accuracy above {rocket}", measured, f"above {100 * other:.2f} %", gap > 0)
+        measured = f"{percent(ours['balanced_accuracy'])} %, {100 * gap:+.2f} points"
+        row(f"balanced accuracy above {rocket}", measured, f"above {percent(other)} %", gap > 0)
+    aims = [("balanced accuracy", "balanced_accuracy", AIM_BALANCED), ("AUC", "auc", AIM_AUC)]
     for name, key, aim in aims:
-        measured = f"{100 * ours[key]:.2f} %, {100 * (ours[key] - aim):+.2f} points"
+        measured = f"{percent(ours[key])} %, {100 * (ours[key] - aim):+.2f} points"
         row(f"{name}, the aim", measured, f"at least {100 * aim:g} %", ours[key] >= aim)
     for how, words in (("batched", "many windows at once"), ("alone", "one window alone")):
         ratio, what = ours["time"][f"{how}_times_faster"]["median"], numbers["rockets"][0]
@@ -803,7 +784,7 @@ def _limit_rows(numbers: Report) -> list[dict[str, Any]]:
 
 
 def _limits_text(numbers: Report) -> str:
-    met = [row["ok"] for row in _limit_rows(numbers)]
+    met = [row[""] for row in _limit_rows(numbers)]
     rows = {name: row["balanced_accuracy"] for name, row in numbers["methods"].items()}
     above = [name for name, value in rows.items() if value > rows[numbers["ours"]]]
     return (
@@ -821,34 +802,40 @@ _SCORES = {
 }
 
 
-def _scores_table(numbers: Report) -> Table:
-    cells = []
-    for name, row in numbers["methods"].items():
-        worst = f"{row['worst']['object']} {100 * row['worst']['balanced_accuracy']:.1f}"
-        cells.append([name, *(f"{100 * row[key]:.2f}" for key in _SCORES), worst])
-    return Table(["method", *_SCORES.values(), "worst object %"], cells)
+def _score_rows(numbers: Report) -> list[dict[str, object]]:
+    rows = []
+    for name, of in numbers["methods"].items():
+        worst = f"{of['worst']['object']} {percent(of['worst']['balanced_accuracy'], 1)}"
+        scores = {title: percent(of[key]) for key, title in _SCORES.items()}
+        rows.append({"method": name} | scores | {"worst object %": worst})
+    return rows
 
 
 def _groups_table(numbers: Report, kind: str, names: Mapping[str, str]) -> Table:
     """Balanced accuracy on each object, or the part of windows told right in each scene."""
-    rows = numbers["methods"]
-    there = [name for name in names if name in rows[numbers["ours"]][kind]]
-    cells = [
-        [method, *(f"{100 * row[kind][name]:.1f}" for name in there)]
-        for method, row in rows.items()
-    ]
     head = "balanced accuracy %" if kind == "objects" else "windows told right, %"
-    return Table([head, *(names[name] for name in there)], cells)
+    return Table(
+        [
+            {head: method}
+            | {names[name]: percent(row[kind][name], 1) for name in names if name in row[kind]}
+            for method, row in numbers["methods"].items()
+        ]
+    )
 
 
 def _streams_table(numbers: Report) -> Table:
     found = numbers["streams"]["by_scene"]
-    cells = [
-        [SCENES[name], str(found[name]["recordings"]), str(found[name]["with_alarm"])]
-        for name in SCENES
-        if name in found
-    ]
-    return Table(["whole recordings as streams", "recordings", "with an alarm"], cells)
+    return Table(
+        [
+            {
+                "whole recordings as streams": words,
+                "recordings": found[name]["recordings"],
+                "with an alarm": found[name]["with_alarm"],
+            }
+            for name, words in SCENES.items()
+            if name in found
+        ]
+    )
 
 
 def _streams_text(numbers: Report) -> str:
@@ -867,17 +854,18 @@ def _differences_table(numbers: Report) -> Table:
         value, low, high = (100 * found[name] for name in ("value", "low", "high"))
         return f"{value:+.2f} ({low:+.2f} to {high:+.2f})"
 
-    cells = [
+    head = f"{numbers['ours']} minus"
+    return Table(
         [
-            name,
-            words(found["balanced_accuracy"]),
-            f"{100 * found['balanced_accuracy']['share']:.1f} % of draws",
-            words(found["auc"]),
+            {
+                head: name,
+                "balanced accuracy, points": words(found["balanced_accuracy"]),
+                "above in": f"{percent(found['balanced_accuracy']['share'], 1)} % of draws",
+                "AUC, points": words(found["auc"]),
+            }
+            for name, found in numbers["differences"].items()
         ]
-        for name, found in numbers["differences"].items()
-    ]
-    head = [f"{numbers['ours']} minus", "balanced accuracy, points", "above in", "AUC, points"]
-    return Table(head, cells)
+    )
 
 
 def _differences_text(numbers: Report) -> str:
@@ -897,16 +885,14 @@ def _times_table(numbers: Report) -> Table:
     cells = []
     for name, row in numbers["methods"].items():
         found = row["time"]
-        times = ["-"] * 5
-        if found is not None:
-            times = [str(found["batch"])]
-            for how in ("batched", "alone"):
-                faster = found[f"{how}_times_faster"]["median"]
-                times += [number(1e6 * found[f"{how}_s"]), f"{number(faster)} x"]
-        cells.append([name, number(row["fit_s"]), *times])
-    head = ["method", "fit of a fold, s", "batch", "us a window, batched", "faster"]
+        times: dict[str, object] = {"batch": found and found["batch"]}
+        for how in ("batched", "alone"):
+            faster = f"{number(found[f'{how}_times_faster']['median'])} x" if found else None
+            times[f"us a window, {how}"] = number(1e6 * found[f"{how}_s"]) if found else None
+            times[f"faster, {how}"] = faster
+        cells.append({"method": name, "fit of a fold, s": number(row["fit_s"])} | times)
     note = f"Faster: than {numbers['rockets'][0]}, round by round; below 1 is slower."
-    return Table([*head, "us a window, alone", "faster "], cells, note)
+    return Table(cells, note)
 
 
 def _choices_table(numbers: Report) -> Table:
@@ -920,58 +906,8 @@ def _choices_table(numbers: Report) -> Table:
             for chosen in row["chosen"]
         )
         text = "; ".join(f"{choice} ({times}x)" for choice, times in counts.most_common())
-        cells.append([name, text])
-    return Table(["method", "chosen inside the folds"], cells)
-
-
-def _data_text(numbers: Report) -> str:
-    data, windows = numbers["data"], numbers["data"]["windows"]
-    return (
-        f"BioTac SP direction of slip, {SOURCE}: {CITATION}. Please cite it. **The repository "
-        "states no licence, so nothing of it is copied here**: fetch it yourself and point "
-        f"`data.root` at it.\n\n{data['recordings']} recordings of one fingertip on "
-        f"{len(data['objects'])} objects ({', '.join(data['objects'])}): {data['channels']} "
-        "electrodes in counts, about 92 Hz by the rows (100 Hz nominal), about three seconds each. "
-        f"They make {windows['all']} windows, {windows['slip']} of slip in six directions and "
-        f"{windows['all'] - windows['slip']} of stable touch. A label is of a whole recording: no "
-        "onset is known, so delays cannot be told, and a window of a slip recording may hold "
-        "little slip. Speeds and forces were not recorded, and there is no pressure channel, so "
-        "nothing above some 45 Hz is in it. The set's own paper tells the direction (seven classes "
-        "from 50 ms), which is another task: none of its numbers compares with those below.\n\n"
-        "**This is development data: it was looked at while this software was planned.** How "
-        "windows are tared, which kinds of features and scaling there are, and what may be chosen "
-        "from, for ours and for baselines alike, were settled with all objects in sight. So "
-        "results are optimistic for every method whose grid and preprocessing we picked. One "
-        "sensor, one laboratory and few objects say little about another hand."
-    )
-
-
-def _protocol_text(numbers: Report) -> str:
-    data, settings = numbers["data"], numbers["settings"]
-    lines = [
-        "The first half second of a recording is skipped, and its mean taken off each channel; no "
-        f"method sees the absolute level. Windows of {data['samples']} samples, every half window.",
-        "Each object is left out in turn; a method is fitted to the windows of the others and "
-        "scores those of that object. Scores of all folds are pooled as they are, with the "
-        "decision at 0: no threshold is set afterwards.",
-        "Everything is fitted and chosen inside the fold, by balanced accuracy on training objects "
-        "that are left out in turn. `recipe=general` ranks, scales and forms its constants anew "
-        "without each of them, and takes the simplest machine within half a point of the best; "
-        "`robust` and `paper` hold ranking and scaling. Classifiers on simple statistics leave out "
-        f"{settings['inner']} groups of objects. All methods balance the classes.",
-        f"Ours: `recipe=general`, `robust` and `paper` on the pool of {data['pool']} features, by "
-        "the functions that `tactslip_torch.train` uses; `general` has the values of each feature "
-        "in ascending order over the electrodes beside them (`features.pooling=sorted`).",
-        f"MiniRocket (aeon, {settings['rocket_kernels']:,} kernels, standardised) and "
-        f"MultiRocketHydra (aeon, {settings['multi_rocket_kernels']:,} kernels of MultiRocket and "
-        f"{settings['hydra_groups']} groups of Hydra's, each with the scaler that aeon gives it), "
-        "with ridge. Features and scalers are fitted to the training windows. They draw at "
-        f"random, so MiniRocket is shown with {len(settings['rocket_seeds'])} seeds.",
-        "Logistic regression on the columns of our first detector of the same fold, and on mean, "
-        "standard deviation, rms, range and mean size of differences of each channel, with or "
-        f"without their logs; a random forest of {settings['trees']} trees on these.",
-    ]
-    return "\n".join(f"- {line}" for line in lines)
+        cells.append({"method": name, "chosen inside the folds": text})
+    return Table(cells)
 
 
 def _draw_objects(axes: Axes, rows: Mapping[str, Any], colors: Mapping[str, str]) -> None:

@@ -203,7 +203,7 @@ def statistics_from(
     config: DictConfig,
     seen: Sequence[str],
     train_bins: int,
-    judged_bins: int,
+    scored_bins: int,
     train_fraction: float,
     seed: int,
 ) -> Materials:
@@ -211,7 +211,7 @@ def statistics_from(
     rule = instantiate(config.labels)
     by_cycle = seen6(source.ids, seen=list(seen), train_fraction=train_fraction, seed=seed)[0]
     maker = feature_maker(source, rule, **config.features)
-    materials = Materials(maker.pool, train_bins, judged_bins)
+    materials = Materials(maker.pool, train_bins, scored_bins)
     for place, recording in enumerate(source.ids):
         if place % 20 == 0:
             say(f"features of recording {place} of {len(source.ids)}")

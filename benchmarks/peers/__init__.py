@@ -1,6 +1,6 @@
 """What else there is to make features and scores with; nothing in here imports the package.
 
-``loop`` is the obvious SciPy and PyWavelets loop, ``arrays`` the same features in batched NumPy,
-in the slow way or the quick one of ``hard``; all three agree with ``FeaturePool``. ``others`` are
-tools that make other features, ``heads`` those of scikit-learn.
+``loop`` is the obvious SciPy and PyWavelets loop, ``arrays`` the same features in batched NumPy;
+both agree with ``FeaturePool``. ``rockets`` are MiniRocket and MultiRocket with Hydra, ``others``
+tools that make other features.
 """

@@ -85,22 +85,6 @@ def savgol(samples: Array, window_lengths: Sequence[int], polyorder: int, contex
     return np.stack(rows)[:, context : samples.shape[-1] - context]
 
 
-def savgol_in_groups(
-    samples: Array, window_lengths: Sequence[int], polyorder: int, context: int
-) -> Array:
-    """As ``savgol``, with one call for all channels of a length, as gauges and films have one.
-
-    Shape:
-        - samples: ``[C, n + 2 * context]``
-        - output: ``[C, n]``
-    """
-    lengths, filtered = np.asarray(window_lengths), np.empty_like(samples)
-    for length in dict.fromkeys(window_lengths):
-        mine = lengths == length
-        filtered[mine] = signal.savgol_filter(samples[mine], length, polyorder)
-    return filtered[:, context : samples.shape[-1] - context]
-
-
 def kernel_score(z: Array, support: Array, beta: Array, offset: float, degree: int) -> float:
     """The sum over training bins of a polynomial kernel."""
     return float(np.dot((support @ z + offset) ** degree, beta))
