@@ -57,6 +57,9 @@ def test_unseen4_stratifies_by_material_and_gives_every_recording_one_role():
     for material in UNSEEN:
         assert len(of_role(split, "unseen", material)) == 28
     assert set(split.roles) == set(recordings())
+    for recording, role in split.roles.items():  # never divided
+        masks = split.bin_roles(recording, 7)
+        assert {name: int(mask.sum()) for name, mask in masks.items() if mask.any()} == {role: 7}
     both = split.having("train", "test")
     assert both == sorted(recordings(SEEN))
     assert split.having("unseen") == sorted(recordings(UNSEEN))
@@ -90,15 +93,6 @@ def test_both_sides_have_a_cycle_if_there_are_two(cycles, fraction, num_train):
     for material in SEEN:
         counts = [len(of_role(split, role, material)) for role in ("train", "test")]
         assert counts == [num_train, cycles - num_train]
-
-
-def test_grouped_splits_never_divide_a_recording():
-    for split in (drawn(), *leave_one_material_out(recordings(), materials=SEEN)):
-        for recording, role in split.roles.items():
-            masks = split.bin_roles(recording, 7)
-            assert {name: int(mask.sum()) for name, mask in masks.items() if mask.any()} == {
-                role: 7
-            }
 
 
 # Scenes --------------------------------------------------------------------------------------
@@ -256,6 +250,7 @@ def left_out(whole=None, **options):
     return leave_one_material_out(whole or recordings(), **options)
 
 
+SET = {"recordings": recordings()}
 KNOWN = r"no recording of material 'M9'; the set has M1, M2, M3, iron, wood"
 
 
@@ -274,6 +269,10 @@ KNOWN = r"no recording of material 'M9'; the set has M1, M2, M3, iron, wood"
         (left_out, {"materials": ["M1"]}, r"at least two, each named once, got \['M1'\]"),
         (left_out, {"materials": ["M1", "M1", "M2"]}, "at least two, each named once"),
         (left_out, {"whole": recordings(["M1"])}, r"at least two, .* got \['M1'\]"),
+        (seen6, {"recordings": [], "seen": ["M1"]}, "the set has none"),
+        (random_bins, SET | {"seen": []}, "split random_bins: no recording has the role 'train'"),
+        (random_bins, SET | {"seen": SEEN, "train_fraction": 1.5}, r"train_fraction must lie betw"),
+        (leave_one_session_out, SET | {"seen": SEEN}, r"at least two, got 1; .*data\.sessions=2"),
         (confounded, {"trained_scenes": []}, r"must name a scene .* got \[\]; the set has paper"),
         (confounded, {"trained_scenes": ["paper"]}, r"must name a scene beside the paper's"),
         (confounded, {"trained_scenes": ["taps", "wet"]}, "scene wet; the set has paper, taps"),
@@ -287,14 +286,3 @@ KNOWN = r"no recording of material 'M9'; the set has M1, M2, M3, iron, wood"
 def test_what_cannot_be_split_is_said(make, options, said):
     with pytest.raises(ValueError, match=said):
         make(**options)
-
-
-def test_what_random_bins_and_sessions_need_is_said():
-    with pytest.raises(ValueError, match="the set has none"):
-        seen6([], seen=["M1"])
-    with pytest.raises(ValueError, match="split random_bins: no recording has the role 'train'"):
-        random_bins(recordings(), seen=[])
-    with pytest.raises(ValueError, match=r"split\.train_fraction must lie between 0 and 1"):
-        random_bins(recordings(), seen=SEEN, train_fraction=1.5)
-    with pytest.raises(ValueError, match=r"needs at least two, got 1; .*data\.sessions=2"):
-        leave_one_session_out(recordings(SEEN), seen=SEEN)
