@@ -102,7 +102,7 @@ def test_the_numbers_are_those_of_the_errors():
         }
     sd = np.std(exact["calibration"], ddof=1)
     worst = np.abs(rounded["calibration"] - exact["calibration"]).max()
-    margin = rounding_bound(detector.head).error + FACTOR * worst
+    margin = rounding_bound(detector.head) + FACTOR * worst
     assert facts["score_sd"] == pytest.approx(sd, rel=1e-12)
     assert facts["margin"]["score"] == pytest.approx(margin, rel=1e-12)
     assert facts["margin"]["sd"] == pytest.approx(margin / sd, rel=1e-12)

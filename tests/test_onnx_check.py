@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from contract.names import STREAM_OUTPUTS
 from small_detector import HAND, alarming_detector, raw_bins, small_detector
 from test_dead_streams import alarming_with_gaussians
 from torch.nn.functional import pad
@@ -178,9 +179,7 @@ class StreamRun:
                 self.detector, settings, dtype=torch.float32, masked_channels=masked
             )
         made = self.stream.push(inputs["samples"])
-        fields = {"valid": "is_valid", "alarm": "is_alarm", "on": "is_on", "time_s": "available_s"}
-        fields |= {n: n for n in ("score", "probability", "statistic", "onset_s")}
-        out = {name: getattr(made, field).numpy() for name, field in fields.items()}
+        out = {name: getattr(made, field).numpy() for name, field in STREAM_OUTPUTS.items()}
         out["next_tail"] = np.zeros((self.timing.tail, 4), np.float32)
         out["next_state"] = np.zeros(self.timing.state_size)
         return self.change(out)

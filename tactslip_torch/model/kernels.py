@@ -98,8 +98,10 @@ class Polynomial:
             - z: ``[N, K]``; shares: ``[N]``; output: ``[P]``, float64
         """
         variables = _with_one(z)
-        left = variables if self.degree == 2 else variables[:, :1]
-        products = left.mT @ (variables * shares[:, None])
+        if self.degree == 1:
+            products = (shares @ variables)[None]
+        else:
+            products = variables.mT @ (variables * shares[:, None])
         return products[*self._pairs(z.shape[-1])] * self.scale(z.shape[-1])
 
     def head(self, weights: Tensor, num_features: int) -> QuadraticForm:

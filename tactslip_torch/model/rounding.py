@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,29 +23,18 @@ _CHUNK = 16  # points that are differentiated together
 _WIDE = 2.0**-52  # twice the unit roundoff of the float64 sums below
 
 
-class RoundingBound(NamedTuple):
-    """What a score may be off by.
-
-    Args:
-        error: largest possible difference to the exact score; infinite where it overflows.
-        overflows: whether a coefficient or a sum may pass the largest number of the dtype.
-    """
-
-    error: float
-    overflows: bool
-
-
 def gamma(count: int, dtype: torch.dtype) -> float:
     """``n u / (1 - n u)`` for ``n`` roundings, ``u`` half an eps; infinite from ``n u = 1`` on."""
     share = count * torch.finfo(dtype).eps / 2  # exact: a whole number times a power of 2
     return math.nextafter(share / (1 - share), math.inf) if share < 1 else math.inf
 
 
-def rounding_bound(head: QuadraticForm, dtype: torch.dtype = torch.float32) -> RoundingBound:
+def rounding_bound(head: QuadraticForm, dtype: torch.dtype = torch.float32) -> float:
     """How far a head may be off, computed in ``dtype``, for any z of that dtype in ``[-1, 1]^K``.
 
-    Its own coefficients are taken as exact, so that storing them in ``dtype`` counts. Underflow
-    counts as well, also where the processor flushes subnormal numbers to 0.
+    Infinite where a coefficient or a sum may pass the largest number of the dtype. Its own
+    coefficients are taken as exact, so that storing them in ``dtype`` counts. Underflow counts as
+    well, also where the processor flushes subnormal numbers to 0.
 
     Args:
         head: the quadratic form, as fitted.
@@ -60,7 +49,7 @@ def rounding_bound(head: QuadraticForm, dtype: torch.dtype = torch.float32) -> R
     Example:
         >>> one = torch.ones(1, 1, dtype=torch.float64)
         >>> head = QuadraticForm(one, one[0], one[0, 0])
-        >>> f"{rounding_bound(head).error / 2**-24:.3f}"  # 5 + 4 + 2 roundings
+        >>> f"{rounding_bound(head) / 2**-24:.3f}"  # 5 + 4 + 2 roundings
         '11.000'
     """
     num = head.num_features
@@ -77,11 +66,11 @@ def rounding_bound(head: QuadraticForm, dtype: torch.dtype = torch.float32) -> R
     underflow = (3 * num * (num + 1) + 1) * facts.tiny * (1 + most)
     largest = ((quadratic + linear + constant) * (1 + most) + underflow) * outward
     if not largest < facts.max:
-        return RoundingBound(math.inf, True)
+        return math.inf
     rounded = (
         most * quadratic + gamma(2 * num + 2, dtype) * linear + gamma(num + 1, dtype) * constant
     )
-    return RoundingBound((rounded + underflow) * outward, False)
+    return (rounded + underflow) * outward
 
 
 def worst_error(
@@ -158,12 +147,12 @@ def head_facts(head: nn.Module, also: Tensor | None = None, seed: int = 0) -> di
         return facts | dict.fromkeys(absent) | {"overflows": False, "note": note}
     bound, seen = rounding_bound(head), worst_error(head, seed=seed, also=also)
     return facts | {
-        "bound": bound.error,
+        "bound": bound,
         "worst_seen": seen,
-        "ratio": bound.error / seen if seen else None,
-        "reference_bound": rounding_bound(head, torch.float64).error,
-        "overflows": bound.overflows,
-        "note": "a coefficient or a sum may pass the largest float32" if bound.overflows else "",
+        "ratio": bound / seen if seen else None,
+        "reference_bound": rounding_bound(head, torch.float64),
+        "overflows": math.isinf(bound),
+        "note": "a coefficient or a sum may pass the largest float32" if math.isinf(bound) else "",
     }
 
 
