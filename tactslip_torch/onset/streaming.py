@@ -88,6 +88,8 @@ class StreamingDetector:
         self._wide = pool.widen(torch.empty(0, dtype=dtype)).dtype
         lengths = detector.channel_filter.window_lengths
         self._frame = max(lengths[channel] for channel in detector.needed_index.tolist())
+        self._before = detector.context_before
+        self._whole = self._before + pool.bin_samples + detector.context_after
         self._first = pool.bin_samples + detector.look_ahead
         parts = (pool.sample_rate_hz, pool.bin_samples, detector.look_ahead)
         self._decider = Decider(self.settings, *parts)
@@ -239,7 +241,7 @@ class StreamingDetector:
 
     def _drop(self) -> None:
         """Forget what is before the next bin and is no longer needed."""
-        kept = max(self.detector.context_before, self._frame)
+        kept = max(self._before, self._frame)
         start = self._number * self.settings.hop_samples - kept
         surplus = min(start - self._start_of_held, self._held.shape[-1])
         if surplus > 0:
@@ -248,8 +250,7 @@ class StreamingDetector:
 
     def _decide(self, last_start: int) -> Decisions:
         """The decisions on bins that begin no later than this sample."""
-        detector, hop = self.detector, self.settings.hop_samples
-        before, length = detector.context_before, detector.pool.bin_samples
+        detector, hop, whole = self.detector, self.settings.hop_samples, self._whole
         count = last_start // hop + 1 - self._number
         if count <= 0:
             none = torch.empty(0, dtype=self.dtype)
@@ -259,9 +260,8 @@ class StreamingDetector:
                 first = torch.from_numpy(self._held)
                 past = past_of(first, detector.channel_filter, detector.needed_index.tolist())
                 self._held = np.concatenate([past.numpy(), self._held], -1)
-                self._start_of_held = -before
-            start = self._number * hop - before - self._start_of_held
-            whole = before + length + detector.context_after
+                self._start_of_held = -self._before
+            start = self._number * hop - self._before - self._start_of_held
             stop = start + (count - 1) * hop + whole
             held = self._held[:, start:stop]
             padded = np.zeros((len(held), stop - start), held.dtype)
