@@ -127,6 +127,18 @@ class _Kept:
             raise MemoryError("the native engine found no memory to work in")
 
 
+class Filters(_Kept):
+    """Filters of channels: weights, and where the frame of a bin's first sample begins."""
+
+    def __init__(self, weights: Sequence[Array], starts: Sequence[int]) -> None:
+        super().__init__()
+        made = (_Filter * len(weights))()
+        for to, own, start in zip(made, weights, starts, strict=True):
+            to.weights, to.length, to.start = self._array(own, np.float64), len(own), start
+        self._held.append(made)
+        self.address = ctypes.addressof(made)
+
+
 class FeatureEngine(_Kept):
     """Features of bins by the native engine; called from several threads at once.
 
@@ -183,6 +195,7 @@ class FeatureEngine(_Kept):
         need = np.zeros(num_channels * self._num_rows, np.uint32)
         np.bitwise_or.at(need, place, np.uint32(1) << descriptor.astype(np.uint32))
         self.num_channels, self.num_features = num_channels, len(wanted)
+        self._none = Filters([np.ones(1)] * num_channels, [0] * num_channels)
         self._plan = _Plan(
             dtype is np.float32,
             num_channels,
@@ -220,7 +233,7 @@ class FeatureEngine(_Kept):
         is_odd = np.zeros(len(bins), np.bool_)
         _check_floats(out)
         to = (out.ctypes.data, out.dtype == np.float32, is_odd.ctypes.data)
-        self._run(self._plan, None, _Bins(*_samples_of(bins), None, *to))
+        self._run(self._plan, None, _Bins(*_samples_of(bins), self._none.address, *to))
         return is_odd
 
     def score(
@@ -252,7 +265,7 @@ class FeatureEngine(_Kept):
         memory = np.zeros(ends[-1], np.uint8)  # of all that is found: one address to ask for
         start = memory.ctypes.data
         call = _Bins(
-            *_samples_of(bins), filters and filters.address, None, False, start + ends[1],
+            *_samples_of(bins), (filters or self._none).address, None, False, start + ends[1],
             start + ends[0] if width else None, start if machine.has_head else None,
         )  # fmt: skip
         call.given_as_float = given == np.float32
@@ -288,18 +301,6 @@ class FeatureEngine(_Kept):
             to.num_blocks, to.num_columns, to.width = num, matrix.shape[1], width
         self._held.append(made)
         return ctypes.addressof(made)
-
-
-class Filters(_Kept):
-    """Filters of channels: weights, and where the frame of a bin's first sample begins."""
-
-    def __init__(self, weights: Sequence[Array], starts: Sequence[int]) -> None:
-        super().__init__()
-        made = (_Filter * len(weights))()
-        for to, own, start in zip(made, weights, starts, strict=True):
-            to.weights, to.length, to.start = self._array(own, np.float64), len(own), start
-        self._held.append(made)
-        self.address = ctypes.addressof(made)
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,9 @@ constexpr int CHUNK = 32;               // bins whose features are made before t
 constexpr uint32_t ORDERED = 1u << MEDIAN | 1u << MODE | 1u << IQR | 1u << ENTROPY;
 constexpr uint32_t WEIGHTED = 1u << SPECTRAL_CENTROID | 1u << SPECTRAL_SPREAD;
 
-// Vectors of double, and the T that describe as many lanes: W lanes of T are H vectors of double.
-template <class T> struct Lanes;
-template <> struct Lanes<double> {
-  typedef D V;
-  typedef D Part;
+// Vectors of T, of as many T as there are lanes of double, and of whole numbers, one a lane of T.
+template <class T> struct Lanes {
+  typedef D V, Part;
   typedef int32_t Whole __attribute__((vector_size(VECTOR_BYTES / 2)));
   typedef uint8_t Few __attribute__((vector_size(VECTOR_BYTES / 8)));
 };
@@ -133,19 +131,20 @@ INLINE Extent extent(const D* row, int64_t n) {
 
 // Sums over a row, in the unit of d.
 template <class V> struct Sums {
-  V first, second, third, fourth, both;
+  V first, second, third, fourth, both, other;
 };
 
 // What descriptors are made of, for half of the lanes: row = centre + span * d.
-struct Half {
-  D centre, span, top, energy, first, second, third, fourth, both, other;
+struct Half : Sums<D> {
+  D centre, span, top, energy;
   double n;
 };
 
+// By vectors of W lanes of T, which are H vectors of double.
 template <class T> struct Describe {
+  static constexpr int W = VECTOR_BYTES / sizeof(T), H = W / DL;
   typedef typename Lanes<T>::V V;
   typedef typename Lanes<T>::Part Part;
-  static constexpr int W = VECTOR_BYTES / sizeof(T), H = W / DL;
   typedef typename Lanes<T>::Whole Whole;
   typedef typename Lanes<T>::Few Few;
 
@@ -327,7 +326,7 @@ template <class T> struct Group : Describe<T> {
   Group(const Plan& plan, const Bins& bins)
       : plan(plan), bins(bins), n(plan.num_samples), num_lines(plan.num_lines),
         num_branches(plan.num_branches), most_taps(1) {
-    for (int64_t c = 0; bins.filters && c < plan.num_channels; ++c)
+    for (int64_t c = 0; c < plan.num_channels; ++c)
       if (bins.filters[c].length > most_taps) most_taps = bins.filters[c].length;
   }
 
@@ -360,10 +359,9 @@ template <class T> struct Group : Describe<T> {
   // Filtered samples less the first of each pair, and its magnitude. What is broken or odd is read
   // as zeros.
   template <class X> void read() {
-    const Filter none = {nullptr, 1, 0};
     int64_t taps = 1;
     for (int k = 0; k < W; ++k) {
-      const Filter& filter = bins.filters ? bins.filters[channel[k]] : none;
+      const Filter& filter = bins.filters[channel[k]];
       const X* from = (const X*)bins.samples + bin[k] * bins.bin_stride +
                       channel[k] * bins.channel_stride + filter.start;
       int64_t span = n + filter.length - 1;
@@ -383,7 +381,7 @@ template <class T> struct Group : Describe<T> {
       for (int64_t i = span; i < n + most_taps - 1; ++i) to[i * DL] = 0;
       to = (double*)weights[k / DL] + k % DL;
       for (int64_t i = 0; i < most_taps; ++i)
-        to[i * DL] = i >= filter.length ? 0 : filter.weights ? filter.weights[i] : 1;
+        to[i * DL] = i < filter.length ? filter.weights[i] : 0;
       taps = filter.length > taps ? filter.length : taps;
     }
     for (int h = 0; h < H; ++h) {
@@ -448,15 +446,11 @@ template <class T> struct Group : Describe<T> {
   void describe(uint32_t wanted, int64_t count, Half* halves, const V* with, const double* gain,
                 bool in_time) {
     Sums<V> s = Base::sums(d, with, count);
+    s.other = other;
     for (int h = 0; h < H; ++h) {
       Half& half = halves[h];
       half.n = (double)count;
-      half.first = get(&s.first, h);
-      half.second = get(&s.second, h);
-      half.third = get(&s.third, h);
-      half.fourth = get(&s.fourth, h);
-      half.both = get(&s.both, h);
-      half.other = get(&other, h);
+      for (int i = 0; i < 6; ++i) ((D*)&half)[i] = get((const V*)&s + i, h);
       if (in_time)
         half.energy = half.span * half.span * half.second + half.n * half.centre * half.centre;
       if (wanted & 1u << MEAN) values[MEAN][h] = Base::mean(half);
@@ -624,6 +618,9 @@ template <class T> struct Group : Describe<T> {
       }
     D energies[MAX_BRANCHES][H];
     bool has_total = false;  // the spectrum of the approximation last formed
+    int64_t finest = levels_wanted;  // level whose approximation's spectrum is wanted
+    for (int64_t m = levels_wanted - 1; m >= 0; --m)
+      if (need[num_branches + 2 * m] || shares) finest = m;
     for (int64_t m = levels_wanted - 1; m >= 0; --m) {
       const uint32_t *in_time = need + 2 * m, *in_lines = need + num_branches + 2 * m;
       bool wants_a = in_lines[0] || shares, wants_d = in_lines[1] || shares;
@@ -634,7 +631,7 @@ template <class T> struct Group : Describe<T> {
         describe_lines(in_lines[0], total, true, energies[2 * m], num_branches + 2 * m);
       }
       if (in_time[1] || wants_d) form(2 * m + 1, coefficients, starts[m], in_time[1]);
-      bool is_added = has_total && m > 0 && wants_finer(m, shares);
+      bool is_added = has_total && finest < m;
       if (wants_d || is_added) spectrum_of(2 * m + 1, coefficients, starts[m], lines);
       if (is_added)
         for (int64_t i = 0; i < 2 * num_lines; ++i) total[i] += lines[i];
@@ -642,13 +639,6 @@ template <class T> struct Group : Describe<T> {
         describe_lines(in_lines[1], lines, false, energies[2 * m + 1], num_branches + 2 * m + 1);
     }
     if (shares) band_energy_ratio(energies);
-  }
-
-  // Is the spectrum of an approximation finer than level m wanted?
-  bool wants_finer(int64_t m, uint32_t shares) {
-    uint32_t any_wanted = shares;
-    for (int64_t b = 0; b < 2 * m; b += 2) any_wanted |= need[num_branches + b];
-    return any_wanted != 0;
   }
 
   void form(int64_t branch, D* const* from, int64_t start, uint32_t wanted) {
@@ -718,8 +708,7 @@ INLINE D signed_log(D x, D knee) {
 struct Judge {
   const Machine& machine;
   D *x, *z, *values, *sorted, *in_use;  // [inputs], [columns], three times [channels]
-  double most;  // of a score
-  int64_t at;   // the first of a few bins
+  int64_t at;  // the first of a few bins
   int few;
   const uint8_t* is_missing;  // of these bins
 
@@ -737,27 +726,23 @@ struct Judge {
 
   // Of inputs of bins from `start` on.
   void judge(const double* inputs, int64_t stride, int64_t start, int64_t num, const Bins& bins) {
-    most = bins.given_as_float ? LARGEST_FLOAT : LARGEST;
+    const Machine& m = machine;
     for (int64_t b = 0; b < num; b += DL) {
       at = start + b;
       few = (int)(num - b < DL ? num - b : DL);
-      is_missing = bins.is_missing ? bins.is_missing + at * machine.num_channels : nullptr;
-      judge_few(inputs + b * stride, stride, bins.scaled, bins.score);
+      is_missing = bins.is_missing ? bins.is_missing + at * m.num_channels : nullptr;
+      for (int64_t i = 0; i < m.num_inputs; ++i)
+        for (int k = 0; k < DL; ++k) x[i][k] = inputs[(b + (k < few ? k : 0)) * stride + i];
+      for (int64_t i = 0; i < m.num_singles; ++i) z[m.single_columns[i]] = x[m.single_inputs[i]];
+      for (int64_t p = 0; p < m.num_pools; ++p) pool(m.pools[p]);
+      for (int64_t i = 0; m.minimum && i < m.num_columns; ++i) z[i] = scale(i, z[i]);
+      for (int k = 0; bins.scaled && k < few; ++k)
+        for (int64_t i = 0; i < m.num_columns; ++i)
+          bins.scaled[(at + k) * m.num_columns + i] = z[i][k];
+      if (!bins.score) continue;
+      D score = clamped(head(), bins.given_as_float ? LARGEST_FLOAT : LARGEST);
+      for (int k = 0; k < few; ++k) bins.score[at + k] = score[k];
     }
-  }
-
-  void judge_few(const double* inputs, int64_t stride, double* scaled, double* score) {
-    const Machine& m = machine;
-    for (int64_t i = 0; i < m.num_inputs; ++i)
-      for (int k = 0; k < DL; ++k) x[i][k] = inputs[(k < few ? k : 0) * stride + i];
-    for (int64_t i = 0; i < m.num_singles; ++i) z[m.single_columns[i]] = x[m.single_inputs[i]];
-    for (int64_t p = 0; p < m.num_pools; ++p) pool(m.pools[p]);
-    if (m.minimum)
-      for (int64_t i = 0; i < m.num_columns; ++i) z[i] = scale(i, z[i]);
-    for (int k = 0; scaled && k < few; ++k)
-      for (int64_t i = 0; i < m.num_columns; ++i) scaled[(at + k) * m.num_columns + i] = z[i][k];
-    D sums = score ? clamped(head(), most) : D{};
-    for (int k = 0; score && k < few; ++k) score[at + k] = sums[k];
   }
 
   void pool(const Pool& p) {
@@ -834,10 +819,6 @@ struct Judge {
 
 // -- What the door calls -----------------------------------------------------------------------------
 
-char* aligned(char* memory) {
-  return (char*)(((uintptr_t)memory + VECTOR_BYTES - 1) / VECTOR_BYTES * VECTOR_BYTES);
-}
-
 template <class T> int run(const Plan& plan, const Machine* machine, const Bins& bins) {
   constexpr int W = Group<T>::W;
   alignas(VECTOR_BYTES) Group<T> group(plan, bins);
@@ -847,7 +828,7 @@ template <class T> int run(const Plan& plan, const Machine* machine, const Bins&
   size_t of_features = machine ? CHUNK * plan.num_features * sizeof(double) : 0;
   char* memory = (char*)malloc(of_group + of_judge + of_features + 2 * VECTOR_BYTES);
   if (!memory) return 1;
-  char* at = aligned(memory);
+  char* at = (char*)(((uintptr_t)memory + VECTOR_BYTES - 1) / VECTOR_BYTES * VECTOR_BYTES);
   group.place(at);
   judge.place(at += of_group);
   double* features = (double*)(at + of_judge);
@@ -879,7 +860,9 @@ template <class T> int run(const Plan& plan, const Machine* machine, const Bins&
           group.describe_fast();
       }
     }
-    if (machine) judge.judge(features, plan.num_features, start, num_bins, bins);
+    int64_t stride = plan.num_features ? plan.num_features : bins.bin_stride;
+    const double* given = (const double*)bins.samples + start * stride;
+    if (machine) judge.judge(plan.num_features ? features : given, stride, start, num_bins, bins);
   }
   free(memory);
   return 0;
@@ -889,11 +872,11 @@ template <class T> int run(const Plan& plan, const Machine* machine, const Bins&
 template <class X> void note_unused(const Plan& plan, const Bins& bins) {
   for (int64_t b = 0; b < bins.num_bins; ++b)
     for (int64_t u = 0; u < plan.num_unused; ++u) {
-      int64_t c = plan.unused[u], length = bins.filters ? bins.filters[c].length : 1;
+      int64_t c = plan.unused[u];
       const X* from = (const X*)bins.samples + b * bins.bin_stride + c * bins.channel_stride +
-                      (bins.filters ? bins.filters[c].start : 0);
+                      bins.filters[c].start;
       bool is_there = true;
-      for (int64_t i = 0; i < plan.num_samples + length - 1; ++i)
+      for (int64_t i = 0; i < plan.num_samples + bins.filters[c].length - 1; ++i)
         is_there &= fabs((double)from[i]) <= LARGEST_SAMPLE;
       bins.is_missing[b * plan.num_channels + c] = !is_there;
     }
@@ -903,20 +886,14 @@ template <class X> void note_unused(const Plan& plan, const Bins& bins) {
 
 // Without a plan, samples are the machine's inputs.
 extern "C" int FEATURES_ENTRY(const Plan* plan, const Machine* machine, const Bins* bins) {
-  if (plan && bins->is_missing) {
+  const Plan nothing = {};
+  if (!plan) return run<double>(nothing, machine, *bins);
+  if (bins->is_missing) {
     memset(bins->is_valid, 1, bins->num_bins);
     if (bins->is_float)
       note_unused<float>(*plan, *bins);
     else
       note_unused<double>(*plan, *bins);
   }
-  if (plan)
-    return plan->is_float ? run<float>(*plan, machine, *bins) : run<double>(*plan, machine, *bins);
-  Judge judge(*machine);
-  char* memory = (char*)malloc(judge.place(nullptr) + 2 * VECTOR_BYTES);
-  if (!memory) return 1;
-  judge.place(aligned(memory));
-  judge.judge((const double*)bins->samples, bins->bin_stride, 0, bins->num_bins, *bins);
-  free(memory);
-  return 0;
+  return plan->is_float ? run<float>(*plan, machine, *bins) : run<double>(*plan, machine, *bins);
 }

@@ -39,7 +39,7 @@ struct Filter {
 struct Bins {
   const void* samples;  // those of a channel lie side by side; without a plan: inputs of a machine, double
   int64_t is_float, num_bins, bin_stride, channel_stride;  // in samples
-  const Filter* filters;  // [channels]; null: samples are filtered
+  const Filter* filters;  // [channels]
   void* features;         // [M, features]
   int64_t features_are_float;
   uint8_t* is_odd;  // [M] a magnitude is out of range: what is found is of no meaning
