@@ -31,8 +31,8 @@ from tactslip_torch.features.bin_sample import BinSample, SampledBins
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.training.experiment import feature_maker
+from tactslip_torch.training.plan import candidates, fitted_selection
 from tactslip_torch.training.recipe import Recipe, sample_groups, sample_weight
-from tactslip_torch.training.selection import candidates, fitted_selection
 
 WEIGHTS = {
     "arm_motion": (0.3, 1.0, 3.0, 10.0),

@@ -29,20 +29,13 @@ def test_features_are_those_of_the_filtered_bins():
     assert made.speed_mm_s.tolist() == [20.0] * 37
 
 
-def test_the_cache_saves_the_work_and_changes_nothing(tmp_path):
+def test_the_cache_saves_the_work_and_a_damaged_entry_is_made_anew(tmp_path, caplog):
     source = SmallSet()
     maker = small_maker(source, FeatureCache(tmp_path))
-    first = maker(RecordingId("a", 0), split_of(source))
-    second = maker(RecordingId("a", 0), split_of(source))
+    first, second = (maker(RecordingId("a", 0), split_of(source)) for _ in range(2))
     assert source.loads == 1
     assert torch.equal(first.features, second.features)
     assert set(second.seconds) == {"read_cache"}
-
-
-def test_a_damaged_cache_entry_is_made_anew(tmp_path, caplog):
-    source = SmallSet()
-    maker = small_maker(source, FeatureCache(tmp_path))
-    first = maker(RecordingId("a", 0), split_of(source))
     (path,) = tmp_path.glob("*/*.npz")
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1

@@ -19,18 +19,11 @@ BINS = ("recipe.num_features=40",)  # 861 monomials: fewer bins, so bins are kep
 pytestmark = pytest.mark.slow
 
 
-def launched(folder, *overrides, torchrun=0):
+def launched(folder, *overrides, torchrun=0, tiny=(*TINY, *MANY)):
     start = [sys.executable, "-m"]
     if torchrun:
         start += ["torch.distributed.run", f"--nproc_per_node={torchrun}", "--standalone", "-m"]
-    command = [
-        *start,
-        "tactslip_torch.train",
-        *TINY,
-        *MANY,
-        f"hydra.run.dir={folder}",
-        *overrides,
-    ]
+    command = [*start, "tactslip_torch.train", *tiny, f"hydra.run.dir={folder}", *overrides]
     environment = {k: v for k, v in os.environ.items() if k != "TACTSLIP_TRACEBACK"}
     environment |= {"PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"}
     return subprocess.run(
@@ -85,11 +78,8 @@ def test_folds_with_uneven_shares_under_several_processes(cache, tmp_path):
     folds += ("data.cycles=5", "split.train_fraction=0.6")
     plain = [o for o in TINY if not o.startswith("split.")]
     _, alone = run_train(tmp_path / "alone", *plain, *folds, cache)
-    command = [sys.executable, "-m", "tactslip_torch.train", *plain, *folds]
-    command += [cache, f"hydra.run.dir={tmp_path / 'ddp'}", "trainer.strategy=ddp"]
-    environment = dict(os.environ) | {"PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([*command, "trainer.devices=4"], cwd=tmp_path, env=environment,
-                          capture_output=True, text=True, timeout=300)  # fmt: skip
+    four = ("trainer.strategy=ddp", "trainer.devices=4")
+    done = launched(tmp_path / "ddp", cache, *four, tiny=(*plain, *folds))
     assert done.returncode == 0, done.stderr[-2000:]
     together = json.loads((tmp_path / "ddp" / "metrics.json").read_text())
     assert together["splits"] == alone["splits"]

@@ -182,6 +182,22 @@ def test_bad_recipes_are_refused(change, message):
         Recipe(**change)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"degree": 3}, "^tuning needs recipe.kernel=polynomial recipe.degree=2, got Polynomial"),
+        ({"kernel": "rbf", "gamma": 0.1}, "needs recipe.kernel=polynomial recipe.degree=2"),
+        ({"validation": "nested"}, "needs a machine of degree 2 .* recipe=paper does not always"),
+        ({"penalties": float("inf")}, "needs finite recipe.penalties, got inf"),
+    ],
+    ids=str,
+)
+def test_what_needs_a_quadratic_machine_refuses_another(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Recipe(**changes).check_quadratic("tuning")
+    Recipe().check_quadratic("tuning")
+
+
 # Plans -----------------------------------------------------------------------------------------
 
 

@@ -4,7 +4,7 @@ For each alignment of the filter, over groups of channels and of components, fea
 several ways; heads of several sizes and degrees are scored by closed-form validation, a material
 left out at a time, on a bounded sample of training bins. Ranking and scaling saw that material.
 Beside them, features pooled over channels, all or the best of them, validated by
-``training.selection``: everything is learned without the material left out. These scores choose, so
+``training.plan``: everything is learned without the material left out. These scores choose, so
 that of the one chosen is a little too good. Costs are modelled (``analysis.latency``) until the few
 that are left are timed, fitted and evaluated.
 """
@@ -58,19 +58,21 @@ from tactslip_torch.model.kernels import Polynomial
 from tactslip_torch.runtime import Ticker, bar, check_number, in_parts, one_thread
 from tactslip_torch.signals.filtering import Align
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
-from tactslip_torch.training.plan import TrainingPass, plan_detector, solve_metadata
+from tactslip_torch.training.plan import (
+    Structure,
+    TrainingPass,
+    choose_model,
+    fitted_selection,
+    plan_detector,
+    solve_metadata,
+    validate,
+)
 from tactslip_torch.training.recipe import (
     FeatureSelection,
     Recipe,
     balanced_accuracy,
     sample_weight,
     scaled_selection,
-)
-from tactslip_torch.training.selection import (
-    Structure,
-    choose_model,
-    fitted_selection,
-    validate,
 )
 
 _MODEL_ERRS = (1.5, 1.0, 1 / 1.5)  # modelled compute over what will be measured
@@ -275,7 +277,7 @@ class Search:
         pooled_components: groups, as above, of what is pooled over channels.
         statistics: over channels, each a list of ``pooling.STATISTICS``; none: nothing is pooled.
         pooled_sizes: numbers of pooled columns; ``None`` takes all: of many training bins
-            with degree 1 alone (``training.selection.candidates``).
+            with degree 1 alone (``training.plan.candidates``).
 
     Raises:
         ValueError: for a name that is none, an empty list, or a number out of range.

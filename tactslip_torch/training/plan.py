@@ -1,26 +1,46 @@
-"""A plan: what is decided before the second pass, and the machine that its training bins make.
+"""A plan: what is chosen before the second pass, and the machine that its training bins make.
 
 ``plan_detector`` decides from the statistics of the first pass; ``TrainingPass`` gathers the bins
-of the second in any order and solves; ``Abstaining`` sets the thresholds for abstaining.
+of the second in any order and solves; ``Abstaining`` sets the thresholds for abstaining. Features,
+K, degree, c and C are chosen by groups of recordings that are left out.
+
+**Held** (``choose_held``): features are ranked and scaled once; a held-out score is that of the
+machine refitted without the bin's group, in closed form (``HeldOut``). Ranking and scaling have
+seen the group, so these scores choose, and are not what may be reported.
+
+**Nested** (``choose_model``): a candidate is a set of features (of channels, pooled, or both; all
+or the best K), a degree and a penalty C. In each fold everything that is learned, compression
+constants, ranking and scaling included, is learned without the group that is left out. Of the
+candidates within a tolerance of the best, the simplest machine with the strongest penalty is taken:
+penalties over several decades tie in validation and differ by far on a material that was not
+trained on. The choice itself is evaluated by leaving out two groups: for each group the same choice
+is made without it, and that machine is evaluated on it. This nested score may be reported.
+
+Reference:
+    Cawley and Talbot (2010), Journal of Machine Learning Research 11, 2079-2107.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from functools import partial
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
 from tactslip_torch.data.splits import PAPER_SCENE
 from tactslip_torch.features.bin_sample import SampledBins, bin_keys
+from tactslip_torch.features.names import FeatureName
 from tactslip_torch.features.pool import FeaturePool
 from tactslip_torch.features.pooling import ChannelPooling
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.abstention import Abstention, check_coverage
+from tactslip_torch.model.calibration import fit_platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.fit import TrainingBins, fit_machine
 from tactslip_torch.model.kernels import Head, Kernel, Polynomial, kernel_from_dict
@@ -29,11 +49,13 @@ from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
 from tactslip_torch.model.scaling import FeatureScaler
 from tactslip_torch.native import BackendName
-from tactslip_torch.runtime import SeenBatches, content_digest
+from tactslip_torch.runtime import SeenBatches, Ticker, bar, content_digest, for_each
 from tactslip_torch.signals.filtering import ChannelFilter
+from tactslip_torch.training.baselines import best_threshold
 from tactslip_torch.training.recipe import (
     FeatureSelection,
     Recipe,
+    balanced_accuracy,
     class_fractions,
     number_of_bins,
     sample_groups,
@@ -41,20 +63,575 @@ from tactslip_torch.training.recipe import (
     scene_weights,
     select_features,
 )
-from tactslip_torch.training.selection import (
-    candidates,
-    choose_held,
-    choose_model,
-    fitted_selection,
-)
 
 log = logging.getLogger(__name__)
 
+TRAINING_BINS = 100
+"""Bins of each stratum and class that a validation fold is fitted to, at most, so that machines
+with more columns than bins can be solved; it is scored on all sampled ones. Where every candidate
+is of pooled features at degree 1, all sampled bins are taken."""
+MOST_TRAINING_BINS = 2000
+"""Of all strata together: many kinds of scenes have fewer bins each."""
+MOST_DUAL_BINS = 2500
+"""Up to so many training bins a machine of degree 2 on all features is a candidate: it does not
+fold, so its cost grows with the bins."""
+MOST_EXTENSIONS = 3
+"""Decades by which a grid of penalties that ends at its edge is extended, at either end."""
+_SCALED_BINS = 256  # at a time, which fits the cache of a processor
 MOST_GAUSSIAN = 256
 """So many features at most have the expected score where channels are missing: its matrices are of
 their number squared."""
 MOST_KEPT_BINS = 8192
 """So many bins at most for a kernel that does not fold: its machine is a matrix of bins by bins."""
+
+
+# Held validation --------------------------------------------------------------------------
+
+
+def choose_held(
+    recipe: Recipe,
+    selection: FeatureSelection,
+    sample: SampledBins,
+    *,
+    is_settled: bool = False,
+    show: bool = False,
+) -> tuple[list[dict[str, Any]], int, Kernel, float]:
+    """Rows of the validation, and the K, kernel and C of the best of them.
+
+    Args:
+        recipe: what to choose from.
+        selection: features ranked and scaled, as many as the largest K.
+        sample: of the training bins.
+        is_settled: whether to validate a single choice too.
+        show: a progress bar.
+    """
+    sizes = sorted({min(size, selection.size) for size in recipe.sizes})
+    if sizes[-1] < recipe.sizes[-1]:
+        log.warning(
+            "recipe.num_features=%d is cut to %d: no more match", recipe.sizes[-1], sizes[-1]
+        )
+    penalties = recipe.penalties_ascending
+    choices = list(itertools.product(sizes, recipe.kernels, penalties))
+    if len(sample.group_names) < 2 or not (len(choices) > 1 or is_settled):
+        # of the most features and the last kernel
+        chosen = choices[len(choices) - len(penalties) + len(penalties) // 2]
+        if len(choices) > 1:
+            log.warning("K=%d, %s, C=%g are taken unvalidated: one group", *chosen)
+        return [], *chosen
+    bins = TrainingBins(selection(sample.features), sample.is_slip, sample_weight(recipe, sample))
+    rows = validate(bins, sample.group, sample.group_names, choices, show=show)
+    place = max(range(len(rows)), key=lambda i: rows[i]["mean"])
+    rows[place]["chosen"] = True
+    return rows, *choices[place]
+
+
+def validate(
+    bins: TrainingBins,
+    groups: Tensor,
+    names: Sequence[str],
+    choices: Sequence[tuple[int, Kernel, float]],
+    *,
+    show: bool = False,
+) -> list[dict[str, Any]]:
+    """Balanced accuracy of each held-out group for each choice of K, kernel and C, in order.
+
+    Args:
+        bins: training bins, as many features as the largest K, best first.
+        groups: ``[N]``, which group each bin is of, an index into ``names``.
+        names: of the groups.
+        choices: in any order; those of one K and kernel that stand together cost least.
+        show: a progress bar.
+
+    Returns:
+        One row per choice; ``mean`` is over the groups that have bins of both classes.
+
+    Raises:
+        ValueError: if no group has, or held-out scores cannot be told (``HeldOut``).
+    """
+    rows = []
+    machine, made_of = None, None
+    for size, kernel, penalty in bar(choices, "choose C on held-out groups", show=show):
+        if machine is None or made_of != (size, kernel):
+            few = TrainingBins(bins.features[:, :size], bins.is_slip, bins.weights)
+            machine, made_of = HeldOut(few, groups, kernel), (size, kernel)
+        scores = machine.at(penalty).scores
+        by_group = {
+            name: balanced_accuracy(scores[groups == index] >= 0, bins.is_slip[groups == index])
+            for index, name in enumerate(names)
+        }
+        known = [value for value in by_group.values() if value is not None]
+        if not known:
+            raise ValueError(
+                "no validation group has bins of both classes; take another recipe.group_by, or "
+                "one value of recipe.penalties"
+            )
+        rows.append(
+            {
+                "num_features": size,
+                "kernel": kernel.to_dict(),
+                "penalty": penalty,
+                "mean": sum(known) / len(known),
+                "balanced_accuracy": by_group,
+                "calibration": _calibration(scores, bins.is_slip, bins.weights),
+            }
+        )
+    return rows
+
+
+def _calibration(scores: Tensor, is_slip: Tensor, weights: Tensor | None) -> dict[str, Any] | None:
+    """What held-out scores tell of slip, as plain values; None if they tell it backwards."""
+    try:
+        return fit_platt(scores, is_slip, weights).to_dict()
+    except ValueError as error:
+        log.warning("scores are not calibrated: %s", error)
+        return None
+
+
+# Nested validation ------------------------------------------------------------------------
+
+
+class Structure(NamedTuple):
+    """A candidate without its penalty.
+
+    Attributes:
+        use: ``"channel"``, ``"pooled"`` or ``"both"``.
+        num_features: the best so many of them; ``None``: all.
+        kernel: of degree 1 or 2.
+    """
+
+    use: str
+    num_features: int | None
+    kernel: Polynomial
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The kinds of columns it takes."""
+        return ("channel", "pooled") if self.use == "both" else (self.use,)
+
+
+Candidate = tuple[Structure, float]
+"""A structure and its penalty."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What validation found.
+
+    Args:
+        structure: that was chosen.
+        penalty: that was chosen.
+        rows: one for each candidate, JSON-able: ``use``, ``num_features``, ``kernel``, ``penalty``,
+            ``mean``, ``balanced_accuracy`` by group, and ``worst``: the group with the least
+            balanced accuracy, and what it would be at that group's best threshold.
+        nested: balanced accuracy of the whole procedure on each group that it did not see, and
+            their mean; ``None`` with fewer than three groups.
+        edge: what to say of a grid of penalties that ended at its edge; empty if it did not.
+    """
+
+    structure: Structure
+    penalty: float
+    rows: list[dict[str, Any]]
+    nested: dict[str, Any] | None
+    edge: str
+
+
+def candidates(recipe: Recipe, num_bins: int) -> list[Structure]:
+    """All structures of a recipe for a machine of so many training bins, the simplest first.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    sizes: list[int | None] = [None] if recipe.takes_all else []
+    may_grow = num_bins <= MOST_DUAL_BINS
+    found = [
+        Structure(use, size, kernel)
+        for size in [*sizes, *recipe.sizes]
+        for kernel in recipe.kernels
+        if isinstance(kernel, Polynomial)
+        for use in recipe.uses
+        if kernel.degree == 1 or may_grow or (size is not None and not recipe.scene_weights)
+    ]
+    if not found:
+        raise ValueError(
+            "no candidate is left: degree 2 needs recipe.num_features and no scene_weights; add "
+            "degree 1"
+        )
+    return found
+
+
+def choose_model(
+    recipe: Recipe,
+    pool: FeaturePool,
+    sample: SampledBins,
+    allowed: Tensor | None = None,
+    *,
+    is_nested: bool = True,
+    show: bool = False,
+) -> Choice:
+    """Choose among the candidates of a recipe.
+
+    Args:
+        recipe: with ``validation="nested"``.
+        pool: the features of the sampled bins.
+        sample: of the training bins.
+        allowed: which features may be used, ``[F]``, bool; by default those the recipe allows.
+        is_nested: whether to evaluate the choice itself by leaving out two groups.
+        show: a progress bar.
+
+    Raises:
+        ValueError: if no group has bins of both classes, or there is one group only.
+    """
+    bins = _Bins(recipe, pool, sample, allowed)
+    groups = bins.whole_groups()
+    structures = candidates(recipe, number_of_bins(recipe, sample))
+    if not all(each.use == "pooled" and each.kernel.degree == 1 for each in structures):
+        bins.thin_out()
+    folds = [frozenset([group]) for group in groups]
+    if is_nested := is_nested and len(groups) > 2:
+        folds += [frozenset(pair) for pair in itertools.combinations(groups, 2)]
+    with Ticker("validation, groups left out", "step", len(folds), show=show) as ticker:
+
+        def leave_out(fold: frozenset[int]) -> None:
+            bins.leave_out(fold, structures, recipe.penalties_ascending)
+            ticker.tick()
+
+        for_each(leave_out, folds)
+    edge = _extend_grid(bins)
+    accuracy = bins.accuracies(groups)
+    chosen = _best(accuracy, recipe.tolerance)
+    order = sorted(accuracy[groups[0]], key=lambda key: (structures.index(key[0]), key[1]))
+    rows = []
+    for key in order:
+        by_group = {group: of[key] for group, of in accuracy.items()}
+        rows.append(_row(bins, key, by_group))
+        if key == chosen:
+            scores = torch.cat([bins.scores[frozenset([group])][group][key] for group in groups])
+            places = torch.cat([bins.of(group) for group in groups])
+            calibration = _calibration(scores, bins.is_slip[places], bins.weights[places])
+            rows[-1] |= {"chosen": True, "calibration": calibration}
+    nested = None
+    if is_nested:
+        by_name = {}
+        for group in groups:
+            inner = bins.accuracies([other for other in groups if other != group], group)
+            by_name[bins.names[group]] = accuracy[group][_best(inner, recipe.tolerance)]
+        nested = {"mean": sum(by_name.values()) / len(by_name), "balanced_accuracy": by_name}
+    return Choice(*chosen, rows, nested, edge)
+
+
+def fitted_selection(
+    recipe: Recipe,
+    pool: FeaturePool,
+    sample: SampledBins,
+    structure: Structure,
+    allowed: Tensor | None = None,
+) -> FeatureSelection:
+    """Compression, ranking and scaling of a structure, learned from a sample of training bins.
+
+    ``allowed`` as in ``choose_model``.
+    """
+    bins = _Bins(recipe, pool, sample, allowed)
+    columns = _Columns(bins, torch.ones_like(bins.is_slip), bins.is_slip | True, structure.parts)
+    places = columns.ranked(structure)
+    names = columns.names(structure.parts)
+    names = [names[place] for place in places.tolist()]
+    scaler, layer = columns.scaler(structure, places), columns.pooling
+    index = {name: place for place, name in enumerate(pool.names)}
+    if layer is None or not any(name.is_pooled for name in names):
+        return FeatureSelection(tuple(index[name] for name in names), scaler)
+    if structure.use == "both":
+        layer = layer.with_channels(bins.feature_names)
+    layer = layer.select([layer.names.index(name) for name in names])
+    return FeatureSelection(tuple(index[name] for name in layer.inputs), scaler, layer)
+
+
+def group_scores(columns: Tensor, is_slip: Tensor, groups: Tensor) -> Tensor:
+    """How well each feature separates the classes in every group, ``[F]``: larger is better.
+
+    ``|mean effect| / sqrt(within-class variance + variance of the effect + of the level)``, the
+    last two between groups: a feature whose threshold moves from material to material is worth
+    less, which a t-test does not know. 0 for a constant feature.
+
+    Shape:
+        - columns: ``[N, F]``; is_slip: ``[N]``, bool; groups: ``[N]``, whole numbers
+    """
+    effects, levels, spreads = [], [], []
+    for group in groups.unique().tolist():
+        mine = groups == group
+        quiet, slip = columns[mine & ~is_slip], columns[mine & is_slip]
+        if not len(quiet) or not len(slip):
+            continue
+        effects.append(slip.mean(0) - quiet.mean(0))
+        levels.append((slip.mean(0) + quiet.mean(0)) / 2)
+        spreads.append((slip.var(0, correction=0) + quiet.var(0, correction=0)) / 2)
+    effect, level = torch.stack(effects), torch.stack(levels)
+    square = torch.stack(spreads).mean(0)
+    if len(effects) > 1:
+        square = square + effect.var(0) + level.var(0)
+    found = effect.mean(0).abs() / square.sqrt()
+    return torch.where(square > 0, found, 0.0)
+
+
+class _Bins:
+    """The sampled bins of the features that may be used, in their validation groups."""
+
+    def __init__(
+        self, recipe: Recipe, pool: FeaturePool, sample: SampledBins, allowed: Tensor | None
+    ) -> None:
+        self.recipe, self.hand = recipe, pool.hand
+        self.is_slip, self.weights = sample.is_slip, sample_weight(recipe, sample)
+        self.groups, self.names = sample_groups(sample)
+        allowed = recipe.allowed(pool) if allowed is None else allowed
+        places = torch.arange(len(pool.names)) if allowed is None else allowed.nonzero().flatten()
+        self.feature_names = [pool.names[place] for place in places.tolist()]
+        self.features = sample.features[:, places]
+        self.is_kept = torch.ones_like(sample.is_slip)
+        self.scores: dict[frozenset[int], dict[int, dict[Candidate, Tensor]]] = {}
+        self._stratum = 2 * sample.group + sample.is_slip.long()
+
+    def of(self, group: int) -> Tensor:
+        """Places of the bins of a group."""
+        return (self.groups == group).nonzero().flatten()
+
+    def accuracies(self, groups: Sequence[int], *others: int) -> _Table:
+        """Balanced accuracy on each group, by the machines without it and without the others."""
+        table = {}
+        for group in groups:
+            is_slip = self.is_slip[self.of(group)]
+            scores = self.scores[frozenset([group, *others])][group]
+            found = {key: balanced_accuracy(own >= 0, is_slip) for key, own in scores.items()}
+            table[group] = {key: value for key, value in found.items() if value is not None}
+        return table
+
+    def whole_groups(self) -> list[int]:
+        """The groups with bins of both classes.
+
+        Raises:
+            ValueError: if there are not two.
+        """
+        whole = [
+            group
+            for group in range(len(self.names))
+            if len(self.is_slip[self.of(group)].unique()) == 2
+        ]
+        if len(whole) < 2:
+            raise ValueError(
+                "validation leaves out groups and needs two with bins of both classes, got "
+                f"{len(whole)} of {', '.join(self.names)}; add recordings or take another "
+                "recipe.group_by"
+            )
+        return whole
+
+    def thin_out(self) -> None:
+        """Fit to fewer bins of each stratum; those that stay weigh more."""
+        strata = self._stratum.unique().tolist()
+        most = min(TRAINING_BINS, max(MOST_TRAINING_BINS // len(strata), 10))
+        for one in strata:
+            mine = (self._stratum == one).nonzero().flatten()
+            # bins are sorted by recording; spread those that are kept over all of them
+            kept = torch.linspace(0, len(mine) - 1, min(len(mine), most)).round().long()
+            self.is_kept[mine] = False
+            self.is_kept[mine[kept]] = True
+            self.weights[mine] *= len(mine) / len(kept)
+
+    def leave_out(
+        self, fold: frozenset[int], structures: Sequence[Structure], penalties: Sequence[float]
+    ) -> None:
+        """Score each group of a fold by machines that saw no group of it."""
+        is_out = torch.isin(self.groups, torch.tensor(sorted(fold)))
+        train = self.is_kept & ~is_out
+        parts = sorted({part for structure in structures for part in structure.parts})
+        columns = _Columns(self, train | is_out, train, parts)
+        targets = torch.where(self.is_slip, 1.0, -1.0).double()[train]
+        member = self.groups[is_out]
+        found = self.scores.setdefault(fold, {group: {} for group in fold})
+        for structure in structures:
+            by_penalty = _ridge_scores(columns, structure, targets, self.weights[train], penalties)
+            for penalty, scores in zip(penalties, by_penalty, strict=True):
+                for group in fold:
+                    found[group][structure, penalty] = scores[member == group]
+
+
+class _Columns:
+    """Scaled columns of some sampled bins, with what the training bins among them taught."""
+
+    def __init__(self, bins: _Bins, rows: Tensor, train: Tensor, parts: Sequence[str]) -> None:
+        self._bins, self.train = bins, train[rows]
+        self._is_slip, self._groups = bins.is_slip[train], bins.groups[train]
+        features = bins.features[rows]
+        self.pooling: ChannelPooling | None = None
+        columns = {"channel": features} if "channel" in parts else {}
+        if "pooled" in parts:
+            setting = bins.recipe.pooling
+            assert setting is not None  # recipe
+            own = features[self.train]
+            layer = ChannelPooling.fit(bins.hand, bins.feature_names, own, setting)
+            place = {name: index for index, name in enumerate(bins.feature_names)}
+            inputs = torch.tensor([place[name] for name in layer.inputs])
+            self.pooling = layer
+            columns["pooled"] = layer(features.index_select(1, inputs).double())
+        options: dict[str, Any] = {"compress": bins.recipe.compress, "tail": bins.recipe.tail}
+        self._scalers: dict[str, FeatureScaler] = {}
+        self._scaled: dict[str, Tensor] = {}
+        for name, x in columns.items():
+            x = x.double()
+            scaler = FeatureScaler.fit(x[self.train], **options)
+            self._scalers[name] = scaler
+            self._scaled[name] = torch.cat([scaler(part) for part in x.split(_SCALED_BINS)])
+        self._ranks: dict[str, Tensor] = {}
+        self._products: dict[str, Tensor] = {}
+
+    def names(self, parts: Sequence[str]) -> list[FeatureName]:
+        """Of the columns of these kinds."""
+        pooled = () if self.pooling is None else self.pooling.names
+        of = {"channel": self._bins.feature_names, "pooled": pooled}
+        return [name for part in parts for name in of[part]]
+
+    def num(self, structure: Structure) -> int:
+        """K of a structure."""
+        num = sum(self._scaled[name].shape[1] for name in structure.parts)
+        return min(num, structure.num_features or num)
+
+    def of(self, structure: Structure) -> Tensor:
+        """Scaled columns of a structure, best first, ``[n, K]``."""
+        z = torch.cat([self._scaled[name] for name in structure.parts], 1)
+        return z if structure.num_features is None else z[:, self.ranked(structure)]
+
+    def products(self, structure: Structure) -> Tensor:
+        """Inner products of all bins with the training bins, ``[n, train]``."""
+        if structure.num_features is not None:
+            z = self.of(structure)
+            return z @ z[self.train].mT
+        for name in structure.parts:
+            if name not in self._products:
+                z = self._scaled[name]
+                self._products[name] = z @ z[self.train].mT
+        first, *others = (self._products[name] for name in structure.parts)
+        return sum(others, first)
+
+    def scaler(self, structure: Structure, places: Tensor) -> FeatureScaler:
+        """Of some columns of a structure."""
+        scalers = [self._scalers[name] for name in structure.parts]
+        knees = [scaler.knee for scaler in scalers if scaler.knee is not None]
+        return FeatureScaler(
+            torch.cat([scaler.minimum for scaler in scalers])[places],
+            torch.cat([scaler.maximum for scaler in scalers])[places],
+            torch.cat(knees)[places] if knees else None,
+        )
+
+    def ranked(self, structure: Structure) -> Tensor:
+        """Places of the columns of a structure, best first; all in their order."""
+        if structure.num_features is None:
+            return torch.arange(self.num(structure))
+        for name in structure.parts:
+            if name not in self._ranks:
+                z = self._scaled[name][self.train]
+                self._ranks[name] = group_scores(z, self._is_slip, self._groups)
+        scores = torch.cat([self._ranks[name] for name in structure.parts])
+        return scores.argsort(descending=True, stable=True)[: structure.num_features]
+
+
+def _ridge_scores(
+    columns: _Columns,
+    structure: Structure,
+    targets: Tensor,
+    weights: Tensor,
+    penalties: Sequence[float],
+) -> Tensor:
+    """Scores of the left-out bins by kernel ridge regression, ``[penalties, bins]``.
+
+    Through the primal or the dual, whichever has fewer unknowns.
+    """
+    kernel, is_train = structure.kernel, columns.train
+    if kernel.degree == 1 and columns.num(structure) < len(targets):
+        z = columns.of(structure)
+        x = torch.cat([z, torch.full_like(z[:, :1], math.sqrt(kernel.offset))], 1)
+        system = x[is_train].mT @ (x[is_train] * weights[:, None])
+        right, others, each = x[is_train].mT @ (weights * targets), x[~is_train], torch.ones(())
+    else:
+        gram = (columns.products(structure) + kernel.offset) ** kernel.degree
+        system, right, others, each = gram[is_train], targets, gram[~is_train], 1 / weights
+    solved = []
+    for penalty in penalties:
+        ridged = system.clone()
+        ridged.diagonal().add_(each / penalty)
+        factor, info = torch.linalg.cholesky_ex(ridged)
+        if int(info):  # a weak penalty on columns that repeat each other
+            found = torch.linalg.lstsq(ridged, right[:, None], driver="gelsd").solution
+        else:
+            found = torch.cholesky_solve(right[:, None], factor)
+        solved.append(found)
+    return (others @ torch.cat(solved, 1)).mT
+
+
+_Table = Mapping[int, Mapping[Candidate, float]]
+"""Balanced accuracy by group and candidate."""
+
+
+def _means(table: _Table) -> dict[Candidate, float]:
+    first = next(iter(table.values()))
+    return {key: sum(of[key] for of in table.values()) / len(table) for key in first}
+
+
+def _best(table: _Table, tolerance: float) -> Candidate:
+    """Of those within the tolerance: no selection, the lower degree, fewer features, least C."""
+    means = _means(table)
+    least = max(means.values()) - tolerance
+    uses = ("pooled", "channel", "both")  # by their number, of the paper's hand
+
+    def order(key: Candidate) -> tuple[bool, int, int, int, float]:
+        (use, size, kernel), penalty = key
+        return size is not None, kernel.degree, size or 0, uses.index(use), penalty
+
+    return min((key for key, mean in means.items() if mean >= least), key=order)
+
+
+def _extend_grid(bins: _Bins) -> str:
+    """Extend a grid of penalties whose end was chosen, or is best; says what was done."""
+    groups, tolerance = bins.whole_groups(), bins.recipe.tolerance
+    if len(bins.recipe.penalties_ascending) < 2:
+        return ""
+    said = []
+    for is_low in (True, False):
+        for _ in range(MOST_EXTENSIONS):
+            table = bins.accuracies(groups)
+            means = _means(table)
+            best = _best(table, tolerance) if is_low else max(means, key=means.__getitem__)
+            own = [penalty for structure, penalty in means if structure == best[0]]
+            if best[1] != (min(own) if is_low else max(own)):
+                break
+            beyond = best[1] / 10 if is_low else best[1] * 10
+            for_each(partial(bins.leave_out, structures=best[:1], penalties=[beyond]), bins.scores)
+            said.append(f"{beyond:g}")
+    if not said:
+        return ""
+    return f"recipe.penalties ended at its edge and was extended by {', '.join(said)}"
+
+
+def _row(bins: _Bins, key: Candidate, by_group: Mapping[int, float]) -> dict[str, Any]:
+    """What a file says of a candidate."""
+    structure, penalty = key
+    worst = min(by_group, key=by_group.__getitem__)
+    scores = bins.scores[frozenset([worst])][worst][key][:, None]
+    is_slip = bins.is_slip[bins.of(worst)]
+    rule = best_threshold(scores, is_slip)
+    return {
+        "use": structure.use,
+        "num_features": structure.num_features,
+        "kernel": structure.kernel.to_dict(),
+        "penalty": penalty,
+        "mean": sum(by_group.values()) / len(by_group),
+        "balanced_accuracy": {bins.names[group]: value for group, value in by_group.items()},
+        "worst": {
+            "group": bins.names[worst],
+            "balanced_accuracy": by_group[worst],
+            "best_threshold": rule.threshold,
+            "at_best_threshold": balanced_accuracy(rule(scores), is_slip),
+        },
+    }
+
+
+# The plan -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

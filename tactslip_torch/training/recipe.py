@@ -1,6 +1,6 @@
 """How a detector is made: how features are ranked and scaled, and what is chosen from.
 
-A ``Recipe`` is the choice of methods; ``training.selection`` applies it to the statistics that the
+A ``Recipe`` is the choice of methods; ``training.plan`` applies it to the statistics that the
 first pass over the training recordings gathered.
 """
 
@@ -89,7 +89,7 @@ class Recipe:
             ``group_scores``).
         validation: ``"held"``: features are ranked and scaled once for all validation folds;
             ``"nested"``: anew in each fold, and the choice is evaluated by leaving out two groups
-            (``training.selection``).
+            (``training.plan``).
         tolerance: choices within so much of the best balanced accuracy are as good: of them, the
             simplest machine with the strongest penalty is taken. For ``"nested"``.
         scene_weights: weight of a kind of scene beside the paper's: of all its bins of a class
