@@ -318,8 +318,6 @@ def test_two_programs_do_not_change_a_detector_at_once(run, files):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["action=learn"], "action must be one of add, forget, undo, list, got 'learn'"),
-        ([], "no value for recordings"),
         (["recordings=nowhere"], "no folder at nowhere"),
         (["weight=heavy"], "weight must be auto or a positive number below 8000, got 'heavy'"),
         (["weight=true"], "weight must be auto or a positive number below 8000, got True"),
@@ -327,7 +325,6 @@ def test_two_programs_do_not_change_a_detector_at_once(run, files):
         (["weight=nan"], "weight must be auto or a positive number below 8000, got nan"),
         (["action=forget", "material=D"], "action=forget needs material= one that was added"),
         (["action=forget"], "action=forget needs material= one that was added (none was), or rec"),
-        (["action=undo"], "nothing to undo"),
     ],
 )
 def test_bad_input_is_one_line(run, overrides, message):

@@ -173,41 +173,27 @@ def test_hours_bound_the_slip_free_recordings_of_each_role_and_too_few_are_told(
 
 
 @pytest.mark.parametrize(
-    ("changes", "match", "made"),
+    ("made", "changes", "match"),
     [
-        (*row, stage)
-        for row in [
-            ({"rule": "best"}, r"onset\.rule must be one of cusum, k_of_n, got 'best'"),
-            (
-                {"calibration": "none"},
-                r"onset\.calibration must be one of platt, isotonic, got 'none'",
-            ),
-            ({"hop_ms": 0.0}, r"onset\.hop_ms must be a positive finite number, got 0"),
-            ({"hop_ms": 0.3}, r"onset\.hop_ms=0\.3 is 0\.6 samples at 2000 Hz"),
-            ({"hours": math.inf}, r"onset\.hours must be a positive finite number, got inf"),
-            ({"rules": {"cusum": {"name": "sum"}}}, "no sequential rule is called 'sum'"),
-            ({"rules": {"cusum": {"drift": 1.0}}}, "no sequential rule is called None"),
-            ({"level": 2.0}, r"onset\.level must lie between 0 and 1, got 2"),
-            ({"slip_share": 0.0}, r"onset\.slip_share must lie between 0 and 1, got 0"),
-            ({"rearm_s": -1.0}, r"onset\.rearm_s must be a finite number of at least 0, got -1"),
-            (
-                {"slip_free": "heldd"},
-                "onset.slip_free must be a scene of .* held, paper, taps, got",
-            ),
-        ]
-    ]
-    + [
-        (*row, DebouncedAlarm)
-        for row in [
-            ({"k": 4}, "k must lie between 1 and n"),
-            ({"k": "a"}, "onset.k must be a positive whole number, got 'a'"),
-            ({"n": 2.5}, "onset.n must be a positive whole number, got 2.5"),
-            ({"probability": "abc"}, "onset.probability must lie between 0 and 1, got 'abc'"),
-            ({"hop_ms": "abc"}, "onset.hop_ms must be a positive finite number, got 'abc'"),
-        ]
+        (stage, {"rule": "best"}, "onset.rule must be one of cusum, k_of_n, got 'best'"),
+        (stage, {"calibration": "none"}, "calibration must be one of platt, isotonic, got 'none'"),
+        (stage, {"hop_ms": 0.0}, "onset.hop_ms must be a positive finite number, got 0"),
+        (stage, {"hop_ms": 0.3}, r"onset\.hop_ms=0\.3 is 0\.6 samples at 2000 Hz"),
+        (stage, {"hours": math.inf}, "onset.hours must be a positive finite number, got inf"),
+        (stage, {"rules": {"cusum": {"name": "sum"}}}, "no sequential rule is called 'sum'"),
+        (stage, {"rules": {"cusum": {"drift": 1.0}}}, "no sequential rule is called None"),
+        (stage, {"level": 2.0}, "onset.level must lie between 0 and 1, got 2"),
+        (stage, {"slip_share": 0.0}, "onset.slip_share must lie between 0 and 1, got 0"),
+        (stage, {"rearm_s": -1.0}, "onset.rearm_s must be a finite number of at least 0, got -1"),
+        (stage, {"slip_free": "heldd"}, "onset.slip_free must be a scene of .* held, paper, taps"),
+        (DebouncedAlarm, {"k": 4}, "k must lie between 1 and n"),
+        (DebouncedAlarm, {"k": "a"}, "onset.k must be a positive whole number, got 'a'"),
+        (DebouncedAlarm, {"n": 2.5}, "onset.n must be a positive whole number, got 2.5"),
+        (DebouncedAlarm, {"probability": "abc"}, "onset.probability must lie .*, got 'abc'"),
+        (DebouncedAlarm, {"hop_ms": "abc"}, "onset.hop_ms must be a positive .*, got 'abc'"),
     ],
 )
-def test_bad_settings_are_refused_in_one_line(changes, match, made):
+def test_bad_settings_are_refused_in_one_line(made, changes, match):
     with pytest.raises(ValueError, match=match) as caught:
         made(**changes)
     assert "\n" not in str(caught.value)

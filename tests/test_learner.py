@@ -1,24 +1,18 @@
 """What the learner learns from, and that it learns from nothing else."""
 
-from collections import Counter
 from dataclasses import replace
 
 import lightning as L
-import numpy as np
 import pytest
 import torch
 from small_set import RATE_HZ, SmallSet, small_maker, small_recipe
 
-from tactslip_torch.data.labels import LabelRule
 from tactslip_torch.data.recording import RecordingId
 from tactslip_torch.data.splits import random_bins, seen6, unseen4
 from tactslip_torch.features.cache import FeatureCache
-from tactslip_torch.features.pool import FeaturePool
-from tactslip_torch.signals.filtering import ChannelFilter
-from tactslip_torch.simulation.source import SimulatedRecordings
+from tactslip_torch.onset.events import LatencyParts
 from tactslip_torch.training.datamodule import FeatureMaker, SlipDataModule
-from tactslip_torch.training.learner import SlipLearner
-from tactslip_torch.training.recipe import Recipe
+from tactslip_torch.training.learner import SlipLearner, evaluated_bins, events_by_rule
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*isinstance.treespec, LeafSpec.*",
@@ -81,25 +75,6 @@ def assert_same(left, right):
 
 
 # What is learned from ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("role", ["held out", "train"])
-def test_training_recordings_change_what_is_learned_and_held_out_ones_nothing(plain, cache, role):
-    split = unseen_c(SmallSet())
-    held_out = [*split.having("test"), RecordingId("c", 3)]
-    perturbed = held_out if role == "held out" else split.having("train")[:1]
-    source = SmallSet(gains=dict.fromkeys(perturbed, 7.0))
-    after = learn(source, split, small_maker(source, cache))
-    before, found = learned_state(plain), learned_state(after)
-    if role == "held out":
-        assert_same(before, found)
-        assert plain.metrics["splits"]["train"] == after.metrics["splits"]["train"]
-        assert plain.metrics["splits"] != after.metrics["splits"]  # but it is evaluated by them
-        return
-    assert before["selected"] != found["selected"]
-    for name in ("scaler.maximum", "head.quadratic", "head.linear"):
-        assert not torch.equal(before[name], found[name]), name
-    assert before["validation"] != found["validation"]
 
 
 def test_held_out_bins_of_the_random_split_are_not_learned_from(cache):
@@ -200,8 +175,6 @@ def test_bins_of_no_stroke_have_no_position_but_a_scene():
 
 
 def test_events_are_of_the_detectors_own_decisions_and_the_exact_onset():
-    """By hand: alarms of its decisions in order, at the end of their bin and the look-ahead."""
-
     class Apart(SmallSet):
         """A person marked the onset 20 ms late."""
 
@@ -209,44 +182,22 @@ def test_events_are_of_the_detectors_own_decisions_and_the_exact_onset():
             return replace(super().timeline(recording), annotated_onsets_s=(1.12,))
 
     source = Apart()
-    learner = learn(source, unseen_c(source))
-    maker = small_maker(source)
-    ahead_s = learner.detector.look_ahead / RATE_HZ
+    learner, maker, split = learn(source, unseen_c(source)), small_maker(source), unseen_c(source)
+    latency = LatencyParts(learner.detector.look_ahead / RATE_HZ, 0.05)
     for role in ("test", "unseen"):
-        outcomes, delays, false, right = Counter(), [], 0, []
-        for recording in unseen_c(source).having(role):
+        parts, right = [], []
+        for recording in split.having(role):
             bins, labels = maker.filtered_bins(recording)
-            decisions = learner.detector(bins) >= 0
-            right.append(decisions == labels.is_slip)
-            says_slip, ends_s = decisions.tolist(), (labels.starts + 100) / RATE_HZ + ahead_s
-            alarms = [
-                (float(end), next((float(e) for e, s in after if not s), 9.0))
-                for i, end in enumerate(ends_s)
-                if says_slip[i] and not (i and says_slip[i - 1])
-                for after in [list(zip(ends_s[i:], says_slip[i:], strict=True))]
-            ]
-            false += sum(alarm < 0.9 for alarm, _ in alarms)
-            found = [alarm for alarm, _ in alarms if 1.1 <= alarm <= 1.6]
-            if any(0.9 <= alarm < 1.1 < end for alarm, end in alarms):
-                outcomes["early"] += 1
-            elif found:
-                outcomes["found"] += 1
-                delays.append(1000 * (found[0] - 1.1))
-            else:
-                outcomes["missed"] += 1
-        accuracy = float(torch.cat(right).double().mean())
-        assert learner.metrics["splits"][role]["accuracy"] == pytest.approx(accuracy)
-        events = learner.metrics["events"][role]["first_transition"]
-        for name in ("found", "early", "missed"):
-            assert events[f"num_{name}"] == outcomes[name], name
-        assert events["num_false_alarms"] == false
-        assert events["delay_ms"]["median"]["value"] == pytest.approx(float(np.median(delays)))
-        assert events["quiet_hours"] * 3600 == pytest.approx(
-            sum(outcomes.values()) * (0.9 - 0.11 - ahead_s)  # from 1.12 - 0.01 - 1 on
-        )
-        of_two = learner.metrics["events"][role]["two_of_three"]
-        assert of_two["num_onsets"] == sum(outcomes.values())
-    assert len(learner.events["unseen"]["two_of_three"]) == 5
+            says_slip = learner.detector(bins) >= 0
+            right.append(says_slip == labels.is_slip)
+            parts.append(evaluated_bins(maker(recording, split), says_slip, {})[role])
+        scores = learner.metrics["splits"][role]
+        assert scores["accuracy"] == pytest.approx(float(torch.cat(right).double().mean()))
+        assert str(learner.events[role]) == str(events_by_rule(parts, latency))
+        assert learner.metrics["events"][role]["two_of_three"]["num_onsets"] == len(parts)
+        assert {part.bins.times.onsets_s for part in parts} == {(1.1,)}
+        for found in learner.events[role]["first_transition"]:  # from 1.12 - 0.01 - 1 on
+            assert found.quiet_s == pytest.approx(0.9 - 0.11 - latency.look_ahead_s)
 
 
 def test_the_solve_is_reported_with_its_condition(plain):
@@ -271,18 +222,3 @@ def test_shuffled_labels_are_not_learned():
     events = shuffled.metrics["events"]["test"]["first_transition"]
     assert events["num_onsets"] == 18
     assert events["num_false_alarms"] > 18  # whatever comes: it decides by nothing
-
-
-@pytest.mark.slow
-def test_on_the_simulated_hand_the_score_is_neither_trivial_nor_perfect(tmp_path):
-    seen = ["M1", "M2", "M3", "M4", "M5", "M6"]
-    source = SimulatedRecordings(cycles=4, materials=seen)
-    pool, cache = FeaturePool(source.hand), FeatureCache(tmp_path)
-    frames = [51 if channel.kind == "SG" else 11 for channel in source.hand.channels]
-    maker = FeatureMaker(source, pool, ChannelFilter(frames), LabelRule(), cache)
-    split = seen6(source.ids, seen=seen)[0]
-    recipe = Recipe(penalties=(0.1, 1.0), sample_bins=100)
-    learner = learn(source, split, maker, recipe, with_baselines=True)
-    ours = learner.metrics["splits"]["test"]["balanced_accuracy"]
-    pooled = learner.metrics["baselines"]["best_pooled_number"]["splits"]["test"]
-    assert pooled["balanced_accuracy"] < ours < 1.0

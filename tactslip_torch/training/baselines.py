@@ -19,7 +19,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -360,14 +360,17 @@ class PooledNumber:
         return cls(layer, tuple(_places(pool, layer)), rule)
 
 
+Method = LogisticRegression | RandomForest | PooledNumber
+
+
 class Baselines:
     """Fitted baselines.
 
     Args:
         pool: of the features.
         pooled: the best pooled number.
-        scaled: a baseline of the scaled columns of the detector, by name.
-        simple: baselines of simple statistics, by name.
+        others: by name which columns each takes, ``"scaled"`` ones of the detector or those of
+            ``"simple"`` statistics, and the baseline.
         num_bins: that all were fitted on.
     """
 
@@ -375,13 +378,12 @@ class Baselines:
         self,
         pool: FeaturePool,
         pooled: PooledNumber,
-        scaled: Mapping[str, LogisticRegression] | None = None,
-        simple: Mapping[str, LogisticRegression | RandomForest] | None = None,
+        others: Mapping[str, tuple[Literal["scaled", "simple"], Method]] | None = None,
         num_bins: int | None = None,
     ) -> None:
         self.pooled, self.num_bins = pooled, num_bins
-        self._scaled, self._simple = dict(scaled or {}), dict(simple or {})
-        self._statistics = SimpleStatistics(pool) if self._simple else None
+        self._others = dict(others or {})
+        self._statistics = SimpleStatistics(pool) if self._others else None
 
     @classmethod
     def fit(cls, pool: FeaturePool, scaled: Tensor, sample: SampledBins) -> Baselines:
@@ -395,18 +397,16 @@ class Baselines:
         Raises:
             ValueError: if a class is absent.
         """
-        check_classes(sample.is_slip)
         x = SimpleStatistics(pool)(sample.features)
-        return cls(
-            pool,
-            PooledNumber.fit(pool, sample),
-            {"logistic_regression": LogisticRegression.fit(scaled, sample)},
-            {
-                "logistic_regression_simple": LogisticRegression.fit(x, sample, with_logs=True),
-                "random_forest_simple": RandomForest(x, sample),
-            },
-            len(sample.is_slip),
-        )
+        others: dict[str, tuple[Literal["scaled", "simple"], Method]] = {
+            "logistic_regression": ("scaled", LogisticRegression.fit(scaled, sample)),
+            "logistic_regression_simple": (
+                "simple",
+                LogisticRegression.fit(x, sample, with_logs=True),
+            ),
+            "random_forest_simple": ("simple", RandomForest(x, sample)),
+        }
+        return cls(pool, PooledNumber.fit(pool, sample), others, len(sample.is_slip))
 
     def __call__(self, features: Tensor, scaled: Tensor) -> dict[str, Tensor]:
         """Decisions by name.
@@ -416,18 +416,17 @@ class Baselines:
             - scaled: ``[N, K]``, columns of the detector
             - output: each ``[N]``, bool
         """
-        found = {POOLED_NUMBER: self.pooled(features)}
-        found |= {name: made(scaled) for name, made in self._scaled.items()}
+        columns = {"scaled": scaled}
         if self._statistics is not None:
-            x = self._statistics(features)
-            found |= {name: made(x) for name, made in self._simple.items()}
-        return found
+            columns["simple"] = self._statistics(features)
+        found = {name: made(columns[kind]) for name, (kind, made) in self._others.items()}
+        return {POOLED_NUMBER: self.pooled(features)} | found
 
     def metadata(self) -> dict[str, dict[str, Any]]:
         """What each is, by name, JSON-able."""
-        made = {POOLED_NUMBER: self.pooled, **self._scaled, **self._simple}
         bins = {} if self.num_bins is None else {"num_bins": self.num_bins}
-        return {name: own.metadata() | bins for name, own in made.items()}
+        others = {name: made.metadata() | bins for name, (_, made) in self._others.items()}
+        return {POOLED_NUMBER: self.pooled.metadata() | bins} | others
 
     def to_dict(self) -> dict[str, Any]:
         """What a detector keeps: the best pooled number, JSON-able; the others are too large."""
