@@ -114,7 +114,7 @@ class Adapting(Benchmark[Sizes]):
         overrides = [*sizes.training, *job.overrides, "statistics=true"]
         trained = Trained.by(overrides, job.folder, job.folder / "cache")
         statistics = statistics_of(job.folder / "detector.pt", trained.detector)
-        bins = recording_bins(trained.detector, trained.maker)
+        bins = recording_bins(trained.detector, trained.maker, statistics, is_new=False)
         subject = _Subject(trained, statistics, solve(statistics), bins)
         old = [subject.of(trained.recordings("test", m)) for m in trained.materials("test")]
         rows: list[dict[str, Any]] = []

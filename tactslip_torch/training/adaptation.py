@@ -571,6 +571,12 @@ class AccuracyChange:
     before: Mapping[str, float]
     after: Mapping[str, float]
 
+    @classmethod
+    def of(cls, before: Mapping[str, float], after: Mapping[str, float]) -> AccuracyChange:
+        """Of the materials in both."""
+        both = sorted(before.keys() & after.keys())
+        return cls({n: before[n] for n in both}, {n: after[n] for n in both})
+
     @property
     def mean_fall(self) -> float:
         """How much they lose on average; 0 if there is none."""
@@ -602,12 +608,6 @@ class AccuracyChange:
                 "points are allowed of one material"
             )
         return None
-
-
-def _change_of(before: Mapping[str, float], after: Mapping[str, float]) -> AccuracyChange:
-    """Of the materials in both."""
-    both = sorted(before.keys() & after.keys())
-    return AccuracyChange({n: before[n] for n in both}, {n: after[n] for n in both})
 
 
 # Steps -------------------------------------------------------------------------------------------
@@ -651,9 +651,9 @@ class Change:
         """
         solved = solve(after)
         both = set(before.known.recordings) & set(solved.known.recordings)
-        old = _change_of(before.accuracies(both), solved.accuracies(both))
+        old = AccuracyChange.of(before.accuracies(both), solved.accuracies(both))
         first = statistics.steps[0].entry.get("old", {}).get("before") if statistics.steps else None
-        since_training = _change_of(first or old.before, old.after)
+        since_training = AccuracyChange.of(first or old.before, old.after)
         return cls(after, solved, old, since_training, weight)
 
     def problem(self, margin: float, fraction: float = 1.0) -> str | None:
@@ -893,7 +893,7 @@ def _thresholds(
 def recording_bins(
     detector: SlipDetector,
     maker: FeatureMaker,
-    statistics: Statistics | None = None,
+    statistics: Statistics,
     *,
     material: str | None = None,
     slip_free: bool = False,
@@ -906,7 +906,7 @@ def recording_bins(
     Args:
         detector: whose features are made.
         maker: of the recordings, with the detector's pool and filter.
-        statistics: of the detector, if names matter.
+        statistics: of the detector.
         material: to call new recordings, whatever they are called; they are numbered then in their
             order, on from those that there are.
         slip_free: take the bins without slip alone.
@@ -916,18 +916,16 @@ def recording_bins(
         ValueError: if a recording cannot be read, or is to come in twice, by whatever name.
     """
     trained: Mapping[str, str] = detector.info.get("train_recordings", {})
-    names_in = {} if statistics is None else _names(statistics, trained, is_in=True)
-    names = names_in
+    names = names_in = _names(statistics, trained, is_in=True)
     if is_new:
-        ever = {} if statistics is None else _names(statistics, trained, is_in=False)
+        ever = _names(statistics, trained, is_in=False)
         names = {key: name for key, name in ever.items() if name[1] == material}
-    taken = {} if statistics is None else statistics.materials
     everyone = Split("adapt", dict.fromkeys(maker.source.ids, "train"))
     found: dict[str, RecordingBins] = {}
     numbers, first = itertools.count(), dict[str, str]()
     for recording in bar(maker.source.ids, "features, new recordings", "recording"):
         key = cache_key(maker.source.key(recording))
-        name, called = names.get(key) or _named(recording, material, numbers, taken)
+        name, called = names.get(key) or _named(recording, material, numbers, statistics.materials)
         made = maker(recording, everyone)
         kept = ~made.is_slip if slip_free else made.is_slip | True
         z = detector.scaler(made.features[kept][:, list(detector.selected)].double())

@@ -11,7 +11,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -309,19 +309,11 @@ def feature_rows(names: Sequence[FeatureName], hand: HandLayout) -> list[dict[st
     """Features as plain rows, with the kind and finger of their channel, for tables and figures."""
     rows = []
     for name in names:
-        kind = name.channel if name.is_pooled else hand.channel(name.channel).kind
-        rows.append(
-            {
-                "name": str(name),
-                "channel": "all" if name.is_pooled else name.channel,
-                "component": name.component,
-                "domain": name.domain,
-                "descriptor": name.descriptor,
-                "statistic": name.statistic,
-                "kind": kind,
-                "finger": "all" if name.is_pooled else hand.channel(name.channel).finger,
-            }
-        )
+        about = {"channel": "all", "kind": name.channel, "finger": "all"}
+        if not name.is_pooled:
+            channel = hand.channel(name.channel)
+            about = {"kind": channel.kind, "finger": channel.finger}
+        rows.append({"name": str(name), **asdict(name), **about})
     return rows
 
 
