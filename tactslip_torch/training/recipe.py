@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any, Literal
 
 import torch
@@ -482,10 +483,9 @@ def sample_groups(sample: SampledBins) -> tuple[Tensor, tuple[str, ...]]:
 def _all_pass(value: Any, is_right: Callable[[float], bool], *, may_be_none: bool) -> bool:
     """Whether the numbers of a setting, at least one but of a mapping, are such."""
     values = list(value.values()) if isinstance(value, Mapping) else _several(value)
-    try:
-        passed = [(may_be_none and x is None) or is_right(float(x)) for x in values]
-    except (TypeError, ValueError):  # no number
-        return False
+    passed = [
+        (may_be_none and x is None) or (isinstance(x, Real) and is_right(float(x))) for x in values
+    ]
     return all(passed) and (bool(passed) or isinstance(value, Mapping))
 
 
