@@ -7,7 +7,6 @@ their kind, the deeper the larger the number.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
 from tactslip_torch.report.style import (
@@ -26,15 +24,16 @@ from tactslip_torch.report.style import (
     SMALL,
     VERMILION,
     clean,
+    csv_writer,
     kind_colours,
     lanes,
     marked,
+    new_figure,
     percent,
     save,
     table,
     words,
 )
-from tactslip_torch.runtime import whole_file
 
 Row = Mapping[str, str]
 """A channel as ``HandLayout.to_rows`` has it."""
@@ -145,10 +144,8 @@ def sensors_csv(content: Mapping[str, Any], path: str | Path) -> None:
                 flat |= {f"{what}_{role}_{end}": value for end, value in numbers.items()}
         flat |= {f"alone_{role}": value for role, value in row["alone"].items()}
         rows.append(flat | {"simulated": content["simulated"]})
-    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    with csv_writer(path, list(rows[0])) as write:
+        write(row.values() for row in rows)
 
 
 def _interval(lost: Mapping[str, float]) -> str:
@@ -163,9 +160,7 @@ def sensors_figure(content: Mapping[str, Any], path: str | Path) -> None:
         content: of ``sensors.json``.
         path: the PNG to write, replaced as a whole if it exists.
     """
-    figure = Figure(figsize=(13.6, 11.4), layout="constrained")
-    kind = " (SIMULATED hand and recordings)" if content["simulated"] else ""
-    figure.suptitle(f"Which sensors matter{kind}", fontsize=13)
+    figure = new_figure(13.6, 11.4, "Which sensors matter", simulated=content["simulated"])
     grid = figure.add_gridspec(2, 3, width_ratios=[1, 1, 0.62], height_ratios=[1.45, 1])
     units = {row["name"]: row for row in content["units"] if row["unit"] == "channel"}
     moved = {}

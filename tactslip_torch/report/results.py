@@ -246,17 +246,16 @@ def _confusion_panel(
     axes: Axes, name: str, scores: _Metrics, paper: published.PublishedSplit | None
 ) -> None:
     """One split's 2 x 2 cells, coloured by the percentage of their row."""
-    counts = np.asarray(scores["confusion"], dtype=float)
+    counts = np.asarray(scores["confusion"])
     fractions = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     axes.imshow(fractions, cmap="Blues", vmin=0, vmax=1.15)
     for row, column in np.ndindex(2, 2):
         style: dict[str, Any] = {"ha": "center", "va": "center"}
         style["color"] = "white" if fractions[row, column] > 0.6 else INK
-        value = percent(fractions[row, column] if counts[row].sum() else None)
+        value = percent(fractions[row, column] if counts[row].any() else None)
         axes.text(column, row - 0.06, f"{value} %", fontsize=13, **style)
-        axes.text(
-            column, row + 0.16, f"{grouped(float(counts[row, column]))} bins", fontsize=9, **style
-        )
+        number = f"{grouped(int(counts[row, column]))} bins"
+        axes.text(column, row + 0.16, number, fontsize=9, **style)
     names = ["non-slip", "slip"]
     axes.set_xticks([0, 1], names, fontsize=10)
     axes.set_yticks([0, 1], names, fontsize=10, rotation=90, va="center")
@@ -436,9 +435,8 @@ def validation_table(metrics: _Metrics) -> str:
     for row in sorted(choices, key=lambda row: -row["mean"]):
         best.setdefault(_structure(row), row)
     rows: list[_Row] = []
-    for row in choices:
-        if is_nested and row is not chosen and row is not best[_structure(row)]:
-            continue
+    shown = [row for row in choices if row in (chosen, best[_structure(row)])]
+    for row in shown if is_nested else choices:
         scores = {group: s for group, s in row["balanced_accuracy"].items() if s is not None}
         worst = min(scores, key=lambda group: scores[group])
         titles = [*(["features"] if is_nested else []), "K", "kernel"]
