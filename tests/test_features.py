@@ -154,13 +154,6 @@ def test_a_hand_may_have_channels_of_one_kind_only(kind, rng):
     torch.testing.assert_close(alone(bins[:, [0 if kind == "slow" else 1]]), expected)
 
 
-def test_a_selection_has_the_values_of_the_pool(paper_pool, rng):
-    bins = torch.from_numpy(rng.standard_normal((3, 24, 100)))
-    chosen = [int(i) for i in rng.permutation(len(PAPER))[:50]] + [7, 7]
-    found = paper_pool.select(chosen, "torch")(bins)
-    torch.testing.assert_close(found, paper_pool(bins)[:, chosen], rtol=1e-12, atol=1e-13)
-
-
 @pytest.mark.parametrize("num", [99, 100, 101, 102])
 @pytest.mark.parametrize("wanted", [{"median"}, {"iqr"}, {"median", "iqr"}, {"median", "mode"}])
 def test_order_statistics_alone_sort_no_more_than_they_need(wanted, num, rng):
@@ -216,6 +209,10 @@ def test_extremes_equal_the_oracle_and_have_finite_gradients(kind, dtype):
     assert features.isfinite().all()
     features.sum().backward()
     assert bins.grad.isfinite().all()
+    if dtype == torch.float32:  # as in float64, rounded once
+        most, pool = torch.finfo(dtype).max, FeaturePool(HAND)
+        exact = pool(bins.detach().double()).clamp(-most, most).float()
+        assert torch.equal(pool(bins.detach()), exact)
     size = bins.detach().double().abs().amax((0, 2), keepdim=True).clamp(min=1e-320)
     x = bins.detach().double() / size
     kept = np.arange(len(NAMES))
@@ -230,8 +227,7 @@ def test_extremes_equal_the_oracle_and_have_finite_gradients(kind, dtype):
     assert_close(found[:, kept], expected[:, kept], [NAMES[i] for i in kept], 1e-9, least=1.0)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("channel", range(3))
+@pytest.mark.parametrize(("bad", "channel"), [(math.nan, 0), (math.inf, 1), (-math.inf, 2)])
 def test_nan_and_inf_spoil_their_channel_and_no_other(bad, channel, rng):
     pool = FeaturePool(HAND, backend="torch")
     bins = torch.from_numpy(rng.standard_normal((2, 3, 100)))
@@ -248,12 +244,6 @@ def test_nan_and_inf_spoil_their_channel_and_no_other(bad, channel, rng):
     valid = [[True] * 3, [i != channel for i in range(3)]]
     assert pool.validity(bins.detach()).tolist() == valid
     assert pool.is_missing(bins.detach()).tolist() == [[not v for v in row] for row in valid]
-
-
-def test_an_energy_beyond_the_dtype_is_its_largest_number():
-    bins = torch.full((3, 100), 1e25, dtype=torch.float32)
-    energy = FeaturePool(HAND)(bins)[columns(NAMES, "SG1", "energy")]
-    assert energy.item() == torch.finfo(torch.float32).max
 
 
 @pytest.mark.parametrize(
@@ -343,11 +333,15 @@ def test_forward_mode_and_vmap(rng):
 # Errors --------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("backend", ["auto", "torch"])
 @pytest.mark.parametrize("shape", [(3, 99), (2, 100), (5, 4, 100), (100,), (100, 3)])
-def test_errors_name_the_shape(shape):
-    for method in (FeaturePool(HAND), FeaturePool(HAND).validity):
+def test_errors_name_shape_and_dtype(shape, backend):
+    pool = FeaturePool(HAND, backend=backend)
+    for method in (pool, pool.validity):
         with pytest.raises(ValueError, match=rf"3, 100.*{', '.join(map(str, shape))}"):
             method(torch.zeros(shape))
+        with pytest.raises(ValueError, match=r"float32 or float64 .*int64"):
+            method(torch.zeros(3, 100, dtype=torch.int64))
 
 
 @pytest.mark.parametrize(
@@ -361,8 +355,3 @@ def test_errors_name_the_shape(shape):
 def test_errors_at_construction(options, message):
     with pytest.raises(ValueError, match=message):
         FeaturePool(HAND, **options)
-
-
-def test_integers_are_refused():
-    with pytest.raises(ValueError, match=r"float32 or float64 .*int64"):
-        FeaturePool(HAND)(torch.zeros(3, 100, dtype=torch.int64))

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from tactslip_torch import FeaturePool, HandLayout
-from tactslip_torch.simulation.extremes import EXTREMES, extreme_bins
 
 SHAPES = ("cv", "skewness", "kurtosis", "peak_factor", "correlation", "entropy")
 SHAPES += ("spectral_centroid", "spectral_spread", "band_energy_ratio")
@@ -59,26 +58,6 @@ def test_a_branch_far_smaller_than_its_bin_is_kept_or_flagged(pool):
     assert native.validity(bins)[list(native.hand.indices("SG"))].all()
     assert native.validity(bins - 1e3)[films].all()
     assert native.validity(bins.double()).all()
-
-
-@pytest.mark.parametrize("kind", EXTREMES)
-def test_float32_bins_give_what_they_give_in_float64_rounded_once(kind, pool):
-    bins = extreme_bins(kind, (6, 24, 100), torch.Generator().manual_seed(7), torch.float32)
-    most = torch.finfo(torch.float32).max
-    single = pool(bins)
-    assert single.dtype == torch.float32
-    assert bool(single.isfinite().all())
-    assert torch.equal(single, pool(bins.double()).clamp(-most, most).float())
-
-
-@pytest.mark.parametrize("kind", EXTREMES)
-def test_gradients_of_float32_bins_are_finite(kind, pool):
-    bins = extreme_bins(kind, (2, 24, 100), torch.Generator().manual_seed(8), torch.float32)
-    bins.requires_grad_()
-    pool(bins).sum().backward()
-    assert bins.grad is not None
-    assert bins.grad.dtype == torch.float32
-    assert bool(bins.grad.isfinite().all())
 
 
 def test_what_leaves_float64_on_its_way_counts_as_missing(pool):
