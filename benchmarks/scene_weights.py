@@ -58,7 +58,15 @@ class SceneWeights(Benchmark[Sizes]):
     about = "errors on training materials left out, by weights of scenes"
     page = "docs/generalisation.md"
     sizes = Sizes()
-    quick = Sizes((0,), ("data.cycles=5",))
+    quick = Sizes(
+        (0,),
+        (
+            "data.cycles=5",
+            "data.materials=[M1,M6,iron]",
+            "split.seen=[M1,M6]",
+            "split.unseen=[iron]",
+        ),
+    )
 
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
         """Errors of each set of weights, the least mean error first."""
