@@ -634,7 +634,21 @@ class Real(Benchmark[Sizes]):
     is_simulated = False
     libraries = ("aeon",)
     sizes = Sizes()
-    quick = Sizes(3, 1, 2, (0, 1), 168, 84, 4, 5, (1,), (0.1, 1.0), 50, 2, 8)
+    quick = Sizes(
+        objects=3,
+        each=1,
+        inner=2,
+        rocket_seeds=(0, 1),
+        rocket_kernels=168,
+        multi_rocket_kernels=84,
+        hydra_groups=4,
+        trees=5,
+        leaves=(1,),
+        regression_penalties=(0.1, 1.0),
+        draws=50,
+        rounds=2,
+        batch=8,
+    )
 
     def measure(self, job: Job[Sizes]) -> dict[str, Any]:
         """Scores, times, and what follows from them."""
