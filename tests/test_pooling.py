@@ -64,6 +64,8 @@ def test_equals_plain_numpy_where_channels_are_missing_too(rng, setting):
     for backend in ("auto", "torch"):
         found = layer(inputs_of(layer, features), is_missing, backend)
         torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-12)
+        single = layer(inputs_of(layer, features).float(), is_missing, backend)
+        torch.testing.assert_close(single, wanted.float(), rtol=1e-4, atol=1e-4)
         whole = layer(inputs_of(layer, features[:6]), backend=backend)
         torch.testing.assert_close(whole, found[:6], rtol=1e-12, atol=1e-13)
 

@@ -400,7 +400,8 @@ class Machine(_Kept):
             - is_missing: ``[M, C]``, bool, channels that are left out of their pools
         """
         found = np.empty((len(inputs), self.num_columns))
-        call = _Bins(*_samples_of(np.asarray(inputs, np.float64)), scaled=found.ctypes.data)
+        inputs = np.asarray(inputs, np.float64)  # has a name, or it is gone before it is read
+        call = _Bins(*_samples_of(inputs), scaled=found.ctypes.data)
         if is_missing is not None:
             is_missing = np.ascontiguousarray(is_missing)
             call.is_missing = is_missing.ctypes.data
