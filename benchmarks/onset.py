@@ -153,8 +153,9 @@ class Onset(Benchmark[Sizes]):
                 is_ours = method == found["rule"]
                 if not of["calibrated"] or (of["scorer"] == "detector" and not is_ours):
                     continue
-                scorer = cast(SlipDetector, peers.get(of["scorer"], detector))
-                live = StreamingDetector(scorer, AlarmSettings.of(detector))
+                peer = peers.get(of["scorer"])
+                pushed = cast(SlipDetector, _PushedPeer(peer)) if peer else detector
+                live = StreamingDetector(pushed, AlarmSettings.of(detector))
                 name = f"{align}, hop {hop_ms:g} ms" + ("" if is_ours else f", {method}")
                 pushes[name] = _next_hop(live, samples)
                 events = {role: found["events"][role][method] for role in ROLES}
@@ -236,6 +237,21 @@ def _next_hop(live: StreamingDetector, samples: Tensor) -> Callable[[], Any]:
     while not len(live.push(next(pieces)).number):
         pass
     return lambda: live.push(next(pieces))
+
+
+class _PushedPeer:
+    """A peer where a stream takes a ``SlipDetector``: it filters raw bins, then scores them."""
+
+    def __init__(self, scorer: Scorer) -> None:
+        self.pool, self.channel_filter = scorer.pool, scorer.channel_filter
+        self.needed_index, self.look_ahead = scorer.needed_index, scorer.look_ahead
+        self.context_before = self.channel_filter.context_before
+        self.context_after = self.channel_filter.context_after
+        self._predict = scorer.predict
+
+    def predict_raw(self, samples: Tensor, *, given: torch.dtype, **_: object) -> Prediction:
+        """Score raw bins with their context ``[N, C, n + 2 * context]``."""
+        return self._predict(self.channel_filter.valid(samples), given=given)
 
 
 @dataclass(frozen=True, eq=False)
