@@ -86,7 +86,8 @@ def test_traces_take_what_is_in_view_and_the_status_it_begins_with(rng, view):
     seen = (times > view[0] - 0.006) & (times < view[1])
     decided_s, decided = traces.decisions()
     np.testing.assert_allclose(decided_s, times[seen])
-    np.testing.assert_array_equal(decided, columns[:, seen])
+    np.testing.assert_array_equal(decided[[0, 1, 3]], columns[[0, 1, 3]][:, seen])
+    np.testing.assert_array_equal(decided[2], 1 - columns[2, seen])
 
 
 @pytest.mark.parametrize(
@@ -224,6 +225,20 @@ def test_marks_stand_where_things_happened(draw):
     np.testing.assert_allclose(chance.lines[0].get_ydata().max(), 0.95)
     assert chance.lines[0].get_drawstyle() == "steps-post"  # a decision holds until the next
     assert legend_of(figure) >= {"decided: slip", "onset, true", "not valid", "abstains"}
+
+
+@pytest.mark.parametrize("name", ["slip", "invalid", "abstains"])
+def test_a_status_of_one_decision_is_seen_in_a_long_recording(draw, name):
+    num = 20_000
+    traces = Traces({"PVDF1": 0}, 10.0, HOP_S, (0.0, num * HOP_S))
+    times, is_on = HOP_S * np.arange(1, num + 1), np.arange(num) == 7003
+    off = np.zeros(num)
+    given = {"slip": off, "invalid": off, "abstains": off} | {name: is_on}
+    traces.add_samples(np.zeros((1, num // 10)))
+    traces.add_decisions(times, off, given["slip"], 1 - given["invalid"], given["abstains"])
+    marks = marks_of(draw(traces))
+    ((first, last),) = marks[2 if name == "abstains" else 0, name]
+    assert first <= times[7003] < last < first + 0.5
 
 
 def test_what_is_out_of_view_or_not_known_is_not_drawn(draw, films):

@@ -391,7 +391,7 @@ class EvenSamples(Samples):
         found = torch.full((self._inner.num_channels, len(ticks)), torch.nan, dtype=self.dtype)
         if len(places):
             read = self._inner.read(int(places[0]), int(places[-1]) + 1)
-            found[:, torch.from_numpy(is_there)] = read
+            found[:, slice(None) if is_there.all() else torch.from_numpy(is_there)] = read
         for number in np.unique(behind[~is_there]):
             gap = self._gaps[number - 1]
             if gap.missing <= self._most:

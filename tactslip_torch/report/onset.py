@@ -139,18 +139,20 @@ class Traces:
         self._num_samples += samples.shape[1]
         self._samples.add(samples[list(self.channels.values()), first:stop])
 
-    def add_decisions(self, available_s: Array, *columns: Array) -> None:
-        """Take the next decisions, each ``[m]``.
-
-        Args:
-            available_s: when they were known.
-            columns: probability of slip, contact status (0 or 1), whether the decision can be
-                relied on, and whether the detector abstains.
-        """
+    def add_decisions(
+        self,
+        available_s: Array,
+        probability: Array,
+        is_slip: Array,
+        is_valid: Array,
+        abstains: Array,
+    ) -> None:
+        """Take the next decisions, each ``[m]``."""
         since_s = self.view[0] - self._hop_s  # the one before the view tells the status there
         is_seen = (available_s > since_s) & (available_s <= self.view[1])
         if self._first_s is None and is_seen.any():
             self._first_s = float(available_s[is_seen][0])
+        columns = (probability, is_slip, 1 - is_valid, abstains)  # what is on anywhere stays seen
         self._decisions.add(np.stack(columns)[:, is_seen])
 
     def samples(self) -> tuple[NDArray[np.floating], Array]:
@@ -159,7 +161,7 @@ class Traces:
         return (self._first + numbers) / self._sample_rate_hz, values
 
     def decisions(self) -> tuple[NDArray[np.floating], Array]:
-        """Times in seconds, ``[M]``, and the columns of ``add_decisions``, ``[4, M]``."""
+        """Times in seconds, ``[M]``; probability, slip, not valid and abstaining, ``[4, M]``."""
         numbers, values = self._decisions.points()
         return (self._first_s or 0.0) + numbers * self._hop_s, values
 
@@ -389,10 +391,8 @@ def onset_figure(
     panels = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": heights})
     first, last = traces.view
     onsets_s = [onset["onset_s"] for onset in truth["onsets"]] if truth else []
-    decided_s, (probability, is_slip, is_valid, abstains) = traces.decisions()
-    slips, invalid, doubtful = (
-        _spans(decided_s, status, last) for status in (is_slip, 1 - is_valid, abstains)
-    )
+    decided_s, (probability, *statuses) = traces.decisions()
+    slips, invalid, doubtful = (_spans(decided_s, status, last) for status in statuses)
     for axes in panels:
         clean(axes, "y")
         _shade(axes, invalid, "invalid", **_INVALID)

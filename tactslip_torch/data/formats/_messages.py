@@ -17,6 +17,7 @@ from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -190,14 +191,15 @@ def _rows_of(message: Any) -> NDArray[Any]:
 
 
 def _numbers(part: Any, name: str = "", depth: int = _MOST_DEPTH) -> Iterator[tuple[str, Any]]:
-    """Every number in a message by name, such as ``wrench.force.x`` or ``position[2]``.
+    """All numbers in a message by name, such as ``wrench.force.x``; arrays are one list.
 
     Times and texts are none, ``null`` is NaN.
     """
     if depth < 0:
         raise Refused(f"messages nested deeper than {_MOST_DEPTH}")
-    part = part.reshape(-1).tolist() if isinstance(part, np.ndarray) else part
-    if isinstance(part, list):
+    if isinstance(part, np.ndarray):
+        yield name, part.reshape(-1)[: _MOST_NUMBERS + 1].tolist()
+    elif isinstance(part, list):
         for place, value in enumerate(part):
             yield from _numbers(value, f"{name}[{place}]", depth - 1)
     elif part is None or isinstance(part, (int, float)):
@@ -205,6 +207,12 @@ def _numbers(part: Any, name: str = "", depth: int = _MOST_DEPTH) -> Iterator[tu
     elif _clock(part) is None:
         for inner, value in _fields(part).items():
             yield from _numbers(value, f"{name}.{inner}" if name else inner, depth - 1)
+
+
+@lru_cache(maxsize=64)
+def _places(name: str, count: int) -> tuple[str, ...]:
+    """Names of an array's numbers, kept: every message of a topic has the same."""
+    return tuple(f"{name}[{place}]" for place in range(count))
 
 
 def _fields(part: Any) -> dict[str, Any]:
@@ -282,8 +290,16 @@ class _TopicSamples:
         if self._is_array:
             return _rows_of(content), None, None
         found = list(islice(_numbers(content), _MOST_NUMBERS + 1))
-        rows = np.array([[value for _, value in found]], object)
-        return rows, tuple(name for name, _ in found), _stamp(content)
+        values: list[Any] = []
+        names: list[str] = []
+        for name, value in found:
+            if isinstance(value, list):
+                values += value
+                names += _places(name, len(value))
+            else:
+                values.append(value)
+                names.append(name)
+        return np.array([values], object), tuple(names), _stamp(content)
 
     def add(self, message: Message) -> None:
         """Keep a message.
