@@ -345,10 +345,11 @@ def _check(name: str, value: Any, hint: Any, least: float | None = None) -> None
             raise ValueError(f"{name} must be a list in brackets, got {value!r}")
         if not value and get_origin(words[0]) is not Sequence:
             raise ValueError(f"{name} is empty, expected at least one value")
+        inner = f"each of {name}" if get_origin(words[0]) is Sequence else name
         for each in value:
-            _check(name, each, words[0])
+            _check(inner, each, words[0])
     elif hint is str or get_origin(hint) is Literal:
-        if value not in words:
+        if type(value) is not type(words[0]) or value not in words:  # 2.0 and True are no degree
             known = ", ".join(map(str, words))
             raise ValueError(f"{name}: unknown {value!r}, expected some of {known}")
     elif type(None) in words:
