@@ -159,6 +159,8 @@ def test_groups_are_materials_or_fifths_of_the_cycles():
         ({"penalties": "strong"}, r"recipe.penalties must be positive, got \['strong'\]"),
         ({"offsets": -1.0}, r"recipe.offsets must not be negative"),
         ({"tail": 0.5}, r"recipe.tail must lie in \[0, 0.5\)"),
+        ({"tail": "0.1"}, r"recipe.tail must lie in \[0, 0.5\), got '0.1'"),  # text is no number
+        ({"tail": [0.1]}, r"recipe.tail must lie in \[0, 0.5\), got \[0.1\]"),  # nor is a list
         ({"most_correlation": 0.0}, r"recipe.most_correlation must lie in \(0, 1\]"),
         ({"sample_bins": 1}, r"recipe.sample_bins must be at least 2"),
         ({"degree": 0}, r"degree of the kernel must be a whole number"),

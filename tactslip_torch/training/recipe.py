@@ -45,6 +45,8 @@ _NUMBERS: Mapping[str, tuple[str, Callable[[float], bool]]] = {
     "drop_channels": ("lie in [0, 1)", lambda part: 0 <= part < 1),
     "scene_weights": ("be positive", lambda weight: 0 < weight < math.inf),
 }
+_LISTS = ("num_features", "offsets", "penalties", "use", "degree")
+"""Of these there may be several values."""
 _CHOICES = {
     "use": ("channel", "pooled", "both"),
     "score_variance": ("pooled", "welch"),
@@ -128,7 +130,7 @@ class Recipe:
     drop_channels: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("num_features", "offsets", "penalties", "use", "degree"):
+        for name in _LISTS:
             object.__setattr__(self, name, _several(getattr(self, name)))
         for name in ("pooling", "descriptors"):  # lists of a configuration
             value = getattr(self, name)
@@ -153,9 +155,10 @@ class Recipe:
                     yield f".{name} must be one of {', '.join(known)}, got {value!r}"
         for name, (wanted, is_right) in _NUMBERS.items():
             value = getattr(self, name)
-            if not _all_pass(value, is_right, may_be_none=name == "num_features"):
+            values = value if name in _LISTS or isinstance(value, Mapping) else (value,)
+            if not _all_pass(values, is_right, may_be_none=name == "num_features"):
                 shown = list(value) if isinstance(value, tuple) else value
-                yield f".{name} must {wanted}, got {shown}"
+                yield f".{name} must {wanted}, got {shown!r}"
         if len(self.penalties_ascending) > 1 and not math.isfinite(self.penalties_ascending[-1]):
             yield ".penalties: validation needs finite values; give inf alone, or leave it out"
         if self.kernel == "rbf" and self.gamma is None:
@@ -480,13 +483,13 @@ def sample_groups(sample: SampledBins) -> tuple[Tensor, tuple[str, ...]]:
     return index[sample.group], names
 
 
-def _all_pass(value: Any, is_right: Callable[[float], bool], *, may_be_none: bool) -> bool:
+def _all_pass(values: Any, is_right: Callable[[float], bool], *, may_be_none: bool) -> bool:
     """Whether the numbers of a setting, at least one but of a mapping, are such."""
-    values = list(value.values()) if isinstance(value, Mapping) else _several(value)
     passed = [
-        (may_be_none and x is None) or (isinstance(x, Real) and is_right(float(x))) for x in values
+        (may_be_none and x is None) or (isinstance(x, Real) and is_right(float(x)))
+        for x in (values.values() if isinstance(values, Mapping) else values)
     ]
-    return all(passed) and (bool(passed) or isinstance(value, Mapping))
+    return all(passed) and (bool(passed) or isinstance(values, Mapping))
 
 
 def _several(value: Any) -> tuple[Any, ...]:
