@@ -270,7 +270,8 @@ def _matrix_of(
 ) -> Tensor:
     """``overlap_matrix`` of a kernel, kept: making it takes longer than using it."""
     with torch.inference_mode(False):  # it may be needed for a gradient later
-        return overlap_matrix(torch.tensor(kernel, dtype=torch.float64).to(device, dtype), num_kept)
+        weights = torch.tensor(kernel, dtype=torch.float64, device="cpu").to(device, dtype)
+        return overlap_matrix(weights, num_kept)
 
 
 class _Group(NamedTuple):
