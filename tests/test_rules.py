@@ -33,6 +33,7 @@ LIST = (
     KOfN(7, 20),
     Cusum(),
     Cusum(drift=0.3, evidence=0.2, ceiling=3.0),
+    Cusum(np.float64(0.13), np.float64(0.37), 5.3),
 )
 RULE = pytest.mark.parametrize("rule", LIST, ids=lambda rule: str(rule))
 DTYPE = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["f32", "f64"])
@@ -111,6 +112,9 @@ def test_any_cut_gives_the_same_bits(rule: Rule, dtype: torch.dtype, data: st.Da
         pieces.append(piece)
     assert bytes_of(torch.cat(pieces, -1)) == bytes_of(whole)
     assert bytes_of(state) == bytes_of(end)
+    if not shape:
+        start = rule.start(llr[0]).tolist()
+        assert rule.scan_row(llr.tolist(), start, llr.numpy().dtype.type)[0] == whole.tolist()
 
 
 @RULE

@@ -144,7 +144,7 @@ class Cusum:
         """``scan`` of one stream, in plain numbers of a NumPy dtype: quicker than small tensors."""
         sums = list(state)
         for llr in llrs:
-            step = float(self.evidence * (dtype(llr) - self.drift))
+            step = float(dtype(self.evidence) * (dtype(llr) - dtype(self.drift)))
             sums.append(float(dtype(min(max(dtype(sums[-1] + step), 0.0), self.ceiling))))
         return sums[1:], sums[-1:]
 
