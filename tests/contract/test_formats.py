@@ -354,6 +354,9 @@ def test_theirs_is_not_loaded_as_ours(tmp_path):
     np.savez(tmp_path / "later.npz", **later)
     with pytest.raises(ValueError, match="must be of format 'tactslip_torch recording 1', got"):
         format_of(tmp_path / "later.npz").load(tmp_path / "later.npz")
+    np.savez(tmp_path / "cut.npz", format=np.array("tactslip_torch recording 1"))
+    with pytest.raises(ValueError, match=r"cut.npz .*no array samples, sample_rate_hz, units"):
+        format_of(tmp_path / "cut.npz").load(tmp_path / "cut.npz")
 
 
 # Text ------------------------------------------------------------------------------------------

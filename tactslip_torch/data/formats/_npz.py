@@ -99,6 +99,9 @@ def _header(content: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """The header of a file of ours, from its arrays."""
     if (form := str(content["format"])) != FORM:
         raise Refused(f"must be of format {FORM!r}, got {form[:80]!r}")
+    needed = ("samples", "sample_rate_hz", *_WORDS, *MOMENTS, "provenance", "key")
+    if missing := [name for name in needed if name not in content]:
+        raise ValueError(f"no array {', '.join(missing)} in the archive")
     shape = content["samples"].shape
     columns = [column for column in _COLUMNS if f"channel_{column}" in content]
     words = [content[f"channel_{column}"].tolist() for column in columns]
