@@ -127,6 +127,14 @@ def test_steps_are_sklearns_isotonic_regression(levels, weighted, rng):
         assert max(weights[below].sum(), weights[above].sum()) <= weights[own].sum() / 2 + 1e-9
 
 
+@pytest.mark.parametrize("weight", [0.3, 0.7, 1.0])
+def test_equal_odds_are_one_step_whatever_their_rounding(weight):
+    inner = [True] * 3 + [False]  # at scores of 1 and, twice, of 2
+    is_slip = [False] * 2 + 3 * inner + [True] * 2
+    scores = np.repeat([0.0, 1.0, 2.0, 3.0], [2, 4, 8, 2])
+    assert fit_isotonic(*tensors(scores, is_slip, np.full(16, weight))).scores == (0.0, 2.0, 3.0)
+
+
 def test_between_knots_a_line_and_outside_flat():
     fitted = Isotonic((-1.0, 0.0, 2.0), (-3.0, 1.0, 2.0))
     x = np.concatenate([np.linspace(-3, 4, 71), [-1e30, 1e30, np.inf, -np.inf]])

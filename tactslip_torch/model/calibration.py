@@ -182,7 +182,9 @@ def fit_isotonic(scores: Tensor, is_slip: Tensor, weights: Tensor | None = None)
     for end in (0, -1):
         mass[end] += _END_WEIGHT * torch.stack([share, 1 - share])
     weight = mass.sum(-1).cpu().numpy()
-    steps = isotonic_regression(mass[:, 0].cpu().numpy() / weight, weights=weight).blocks
+    rates = isotonic_regression(mass[:, 0].cpu().numpy() / weight, weights=weight).x
+    is_rise = np.diff(rates) > 1e-12 * rates[1:]  # equal but for rounding is one step
+    steps = np.flatnonzero([True, *is_rise, True])
     odds = torch.from_numpy(np.add.reduceat(mass.cpu().numpy(), steps[:-1])).log()
     llrs = (odds[:, 0] - odds[:, 1] - torch.logit(share).cpu()).cummax(0).values
     edges = torch.cat([below.new_zeros(1), below])[torch.from_numpy(steps)]
