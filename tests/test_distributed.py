@@ -44,8 +44,13 @@ def test_processes_learn_what_one_does(cache, tmp_path):  # 3 share the recordin
     together = json.loads((tmp_path / "ddp" / "metrics.json").read_text())
     assert together["splits"] == alone["splits"]
     assert done.stdout.count("results in") == 1
-    trained = [SlipDetector.load(tmp_path / n / "detector.pt").info for n in ("alone", "ddp")]
-    assert trained[0] == trained[1]
+    one, three = (SlipDetector.load(tmp_path / n / "detector.pt").info for n in ("alone", "ddp"))
+    same, other = one.pop("solve"), three.pop("solve")
+    assert same.keys() == other.keys()
+    for name, value in same.items():  # sums are rounded by the order of their parts
+        is_number = isinstance(value, float)
+        assert value == (pytest.approx(other[name], rel=1e-6) if is_number else other[name])
+    assert one == three
 
 
 def test_torchrun_starts_it_as_well(cache, tmp_path):

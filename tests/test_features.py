@@ -123,7 +123,8 @@ def test_every_feature_equals_the_oracle(options, backend, rng):
 
 @pytest.mark.slow
 def test_every_column_of_the_paper_equals_the_oracle(paper_pool, rng):
-    bins = np.concatenate([rng.standard_normal((20, 24, 100)), oracles.plausible_bins(rng, 20)])
+    # more of noise, as the median over bins is the scale that rounding is held against
+    bins = np.concatenate([rng.standard_normal((24, 24, 100)), oracles.plausible_bins(rng, 16)])
     found = paper_pool(torch.from_numpy(bins)).numpy()
     assert_close(found, np.stack([oracles.pool(one) for one in bins]), PAPER, 1e-10)
 

@@ -98,6 +98,7 @@ def test_compiled_it_holds_for_other_bins(detector, monkeypatch):
         return bins.index_select(-2, detector.channel_index)[..., 7]
 
     monkeypatch.setattr(detector, "_features", samples)
+    monkeypatch.setattr(detector.extractor, "backend", "torch")  # the engine would ask for none
     torch.compiler.reset()
     compiled = torch.compile(detector.predict, backend="eager")  # capture alone, without a compiler
     for bins in (healthy_bins(detector), broken_bins(detector)):
