@@ -306,6 +306,8 @@ def test_small_steps_together_keep_the_margin(old, before):
         (recordings("a", 1, 0), 1.0, "a/0 is in already"),
         ({"d/0": recording("d", 0, num_bins=0)}, 1.0, "no labelled bin"),
         ({}, 1.0, "no labelled bin"),
+        (recordings("d", 1, 0), -1.0, "weight must be auto or a positive number"),
+        (recordings("d", 1, 0), float("nan"), "weight must be auto or a positive number"),
     ],
 )
 def test_what_cannot_be_added_is_refused(old, before, bins, weight, message):

@@ -690,10 +690,11 @@ def add(
         margin: that the old materials' mean may fall by.
 
     Raises:
-        ValueError: if a recording is in already, there are several materials or no bins, or as
-            ``solve``; of ``auto``, at the smallest weight.
+        ValueError: if a recording is in already, there are several materials or no bins, the weight
+            is not positive, or as ``solve``; of ``auto``, at the smallest weight.
     """
     _check_new(statistics, bins)
+    checked_weight("auto" if weight is None else weight)
     material = next(iter(bins.values())).material
     mine = dict(bins) | {
         name: own
