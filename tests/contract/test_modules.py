@@ -4,8 +4,8 @@ import pytest
 
 from .modules import counted, of_push, of_training
 
-MOST_OF_TRAINING = 45
-MOST_OF_A_PUSH = 10
+MOST_OF_TRAINING = 42
+MOST_OF_A_PUSH = 9
 """Today's counts, without what the issue behind this one replaces. To be lowered: 40 and 8."""
 
 
