@@ -46,7 +46,6 @@ from tactslip_torch.features.pool import Arithmetic, FeaturePool
 from tactslip_torch.features.pooling import STATISTICS
 from tactslip_torch.features.selection import (
     rank_distinct,
-    rank_features,
     rank_per_cost,
     rank_weighted,
     t_scores,
@@ -591,9 +590,7 @@ class ParetoSearch:
         features, most = sample.features[:, places], self.recipe.most_correlation
         if ranking == "ccweighting":
             return rank_weighted(scores, features, num, self.search.alpha)
-        if most < 1:
-            return rank_distinct(scores, features, sample.is_slip, num, most)
-        return rank_features(scores, num)
+        return rank_distinct(scores, features, sample.is_slip, num, most)
 
     def timed(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Detectors of the candidates, fitted to the sample, in every arithmetic, by the clock."""

@@ -224,7 +224,9 @@ def rank_distinct(
         raise ValueError(
             f"expected features [{len(is_slip)}, {len(scores)}], got {tuple(features.shape)}"
         )
-    rank_features(scores, num)  # refuses a num out of range
+    best = rank_features(scores, num)
+    if most_correlation == 1:
+        return best
     taken = torch.empty(num, len(features), dtype=torch.float64)
     chosen: list[int] = []
     skipped: list[int] = []

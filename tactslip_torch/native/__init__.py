@@ -278,7 +278,7 @@ class FeatureEngine(_Kept):
         return Scores(
             flags[:num],
             memory[ends[0] : ends[1]].view(np.float64).reshape(num, width),
-            score.astype(given, copy=False) if machine.has_head else None,
+            score.astype(given) if machine.has_head else None,
             flags[num : 2 * num],
             flags[2 * num :].reshape(num, self.num_channels),
         )

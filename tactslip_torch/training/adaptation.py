@@ -42,7 +42,6 @@ from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.leave_one_group_out import MOST_CONDITION, HeldOut, residuals_without
 from tactslip_torch.model.missing_channels import ClassGaussians
 from tactslip_torch.model.moments import SufficientStats
-from tactslip_torch.model.solve import solve_symmetric
 from tactslip_torch.onset.decisions import KEY as ALARM
 from tactslip_torch.runtime import SeenBatches, bar, content_digest, load_table, save_table
 from tactslip_torch.training.datamodule import FeatureMaker
@@ -504,17 +503,8 @@ def solve(statistics: Statistics) -> Solved:
     sums, machine, known = statistics.sums, statistics.machine, statistics.known()
     kernel = Polynomial(2, machine.offset)
     normal, moment = sums.normal_equations(machine.offset, balance=machine.balance)
-    weights, report, factor = solve_symmetric(
-        normal,
-        moment,
-        machine.penalty,
-        name="X'WX",
-        in_span=True,
-        most_condition=MOST_CONDITION,
-    )
+    head, factor = kernel.solve(normal, moment, machine.penalty, sums.num_features, MOST_CONDITION)
     assert factor is not None  # as most_condition is given
-    head = kernel.head(weights, sums.num_features)
-    head.solved = report
     roots = (class_scales(statistics)[known.is_slip.long()] * known.weight).sqrt()
     targets = torch.where(known.is_slip, 1.0, -1.0).double()
     right = roots * (targets - head(known.z))

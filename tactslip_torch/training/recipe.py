@@ -22,7 +22,7 @@ from tactslip_torch.features.descriptors import SPECTRUM_DESCRIPTORS, TIME_DESCR
 from tactslip_torch.features.groups import checked_attributes, matching
 from tactslip_torch.features.pool import FeaturePool, is_rounding
 from tactslip_torch.features.pooling import ChannelPooling
-from tactslip_torch.features.selection import ScoreVariance, rank_distinct, rank_features, t_scores
+from tactslip_torch.features.selection import ScoreVariance, rank_distinct, t_scores
 from tactslip_torch.features.statistics import TrainingStatistics
 from tactslip_torch.model.kernels import Kernel, Polynomial, RadialBasis
 from tactslip_torch.model.scaling import FeatureScaler
@@ -348,10 +348,7 @@ def select_features(
     if allowed is not None:
         places = allowed.nonzero().flatten()
         scores, features, most = scores[places], features[:, places], min(most, len(places))
-    if recipe.most_correlation < 1:
-        order = rank_distinct(scores, features, sample.is_slip, most, recipe.most_correlation)
-    else:
-        order = rank_features(scores, most)
+    order = rank_distinct(scores, features, sample.is_slip, most, recipe.most_correlation)
     return scaled_selection(recipe, statistics, places[order].tolist())
 
 
