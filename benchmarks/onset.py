@@ -185,6 +185,8 @@ class Onset(Benchmark[Sizes]):
                 }
                 for title, of in (("delay ms", "median"), ("p95 ms", "p95")):
                     cells[title] = f"{delay[of]['value']:.1f}" if delay else "-"
+                slid = events.get("slid_mm")
+                cells["mm slid"] = f"{slid['median']['value']:.1f}" if slid else "-"
                 cells["look-ahead ms"] = f"{row['look_ahead_ms']:g}"
                 rows.append(cells | {"% of a core": number(1e5 * row["push_s"] / row["hop_ms"])})
             note = f"Thresholds were set for {numbers['per_hour']:g} false alarms an hour."

@@ -220,6 +220,7 @@ class AnyRecordings:
             non_slip_s=((bin_s, 5 * bin_s), (14 * bin_s, 17 * bin_s)),
             slip_s=(),
             missing_s=(),
+            released_s=(),
         )
 
     def key(self, recording: RecordingId) -> dict[str, str]:

@@ -35,6 +35,7 @@ class SmallTimeline:
     non_slip_s: tuple[tuple[float, float], ...] = ()
     slip_s: tuple[tuple[float, float], ...] = ()
     missing_s: tuple[tuple[float, float], ...] = ()
+    released_s: tuple[tuple[float, float], ...] = ()
 
 
 class SmallSet:

@@ -49,12 +49,13 @@ TRAINED = [RecordingId(m, 0, s) for m in ("a", "b") for s in ("paper", "held")]
 TIMING = Timing(RATE_HZ, 20, 100, 25)
 
 
-def times_of(duration_s=3.0, slides=()):
+def times_of(duration_s=3.0, slides=(), released_s=()):
     return SimpleNamespace(
         duration_s=duration_s,
         onsets_s=tuple(start for start, _ in slides),
         sliding_s=tuple(slides),
         speeds_mm_s=(20.0,) * len(slides),
+        released_s=released_s,
     )
 
 
@@ -371,9 +372,12 @@ def test_bins_over_the_edge_of_a_slide_have_no_label():
     assert dict(zip(kept.tolist(), is_slip.tolist(), strict=True)) == expected
 
 
+SLIDES = [(0.3, 0.5), (0.8, 1.0)]
+
+
 def test_alarms_their_ends_and_first_slip_decisions_by_a_plain_loop():
     rng = np.random.default_rng(2)
-    stream = stream_of(np.repeat(rng.standard_normal(40), 3), [(0.3, 0.5), (0.8, 1.0)])
+    stream = stream_of(np.repeat(rng.standard_normal(40), 3), SLIDES)
     ((_, made),) = decide([stream], settings_of(), TIMING)
     seen = watched(stream, made)
     alarms = [i for i in range(120) if made.is_alarm[i]]
@@ -385,6 +389,11 @@ def test_alarms_their_ends_and_first_slip_decisions_by_a_plain_loop():
     decisions = list(zip(made.available_s.tolist(), made.llr.tolist(), strict=True))
     for onset, first in zip((0.3, 0.8), seen.first_positive_s, strict=True):
         assert first == next(t for t, llr in decisions if t >= onset and llr > 0)
+    released_s = ((0.1, 0.35), (0.62, 0.8))
+    told = watched(stream._replace(times=times_of(2.0, SLIDES, released_s)), made)
+    assert told.released_s == released_s
+    for (release, _), first in zip(released_s, told.first_positive_s, strict=True):
+        assert first == next(t for t, llr in decisions if t >= release and llr > 0)
 
 
 # ------------------------------------------------------------------------------ without a rate

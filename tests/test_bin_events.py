@@ -24,7 +24,15 @@ RATE_HZ = 2000.0
 LATENCY = LatencyParts(look_ahead_s=0.0125, bin_s=0.05)
 
 
-def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), recording=None, roles=None, **rule):
+def batch_of(
+    onsets=(2.0, 6.0),
+    ends=(4.0, 8.0),
+    stretches=(),
+    recording=None,
+    roles=None,
+    released_s=(),
+    **rule,
+):
     """What the learner sees of a recording without disturbances, features left out."""
     rule = LabelRule(**rule)
     slides = tuple(zip(onsets, ends, strict=True))
@@ -39,7 +47,12 @@ def batch_of(onsets=(2.0, 6.0), ends=(4.0, 8.0), stretches=(), recording=None, r
         bins.position,
         bins.stroke,
         (bins.starts + bins.bin_samples).double() / RATE_HZ,
-        SimpleNamespace(onsets_s=onsets, sliding_s=slides, speeds_mm_s=speeds[: len(onsets)]),
+        SimpleNamespace(
+            onsets_s=onsets,
+            sliding_s=slides,
+            speeds_mm_s=speeds[: len(onsets)],
+            released_s=released_s,
+        ),
         (rule.hop_ms or rule.bin_ms) / 1000,
         roles or {"test": torch.ones(num, dtype=torch.bool)},
         {},
@@ -187,6 +200,12 @@ def test_where_no_decision_speaks_for_slip_there_is_no_first():
     spoke_before = says(batch, wrong=[(0, -5)])  # what is said before the onset is not of it
     (onset,) = events_of(batch, spoke_before)["first_transition"].onsets
     assert (onset.bin_fill_s, onset.decision_s) == pytest.approx((0.04, 0.0))
+    let_go = says(batch_of((2.0,), (4.0,)), wrong=[(0, -1)])  # its bin ends 10 ms before the onset
+    batch = batch_of((2.0,), (4.0,), released_s=((1.98, 2.1),))
+    (onset,) = events_of(batch, let_go)["first_transition"].onsets
+    found = (onset.outcome, onset.delay_s, onset.delay_first_s, onset.slid_mm)
+    assert found == ("found", *map(pytest.approx, (0.0025, 0.0225, 0.05)))
+    assert (onset.bin_fill_s, onset.decision_s) == pytest.approx((-0.01, 0.0))
     (onset,) = events_of(batch, says(batch, right=False))["first_transition"].onsets
     assert onset.outcome == "missed"
     assert math.isnan(onset.delay_s)

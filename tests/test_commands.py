@@ -66,6 +66,7 @@ class TinyRecordings:
             non_slip_s=(),
             slip_s=(),
             missing_s=(),
+            released_s=tuple((onset - 0.04, onset + 0.02) for onset in onsets),
         )
 
     def key(self, recording):
@@ -91,6 +92,7 @@ class TinyRecordings:
             times.speeds_mm_s,
             times.onsets_s,
             times.sliding_s,
+            released_s=times.released_s,
         )
 
 

@@ -162,6 +162,19 @@ def test_an_alarm_that_stands_before_the_slip_and_to_the_end_is_early(model, tmp
     assert [onset["outcome"] for onset in entry["truth"]["onsets"]] == ["early"]
 
 
+def test_an_alarm_behind_the_first_release_is_not_early(model, tmp_path):
+    samples = volts(4.0, ((1.9, 4.0),))
+    truth = {"onsets_s": (2.0,), "sliding_s": ((2.0, 4.0),), "speeds_mm_s": (20.0,)}
+    save(tmp_path / "a.npz", recording(samples, released_s=((1.9, 2.1),), **truth))
+    (entry,) = detected(model, tmp_path, tmp_path / "out", "threshold=3")["recordings"]
+    (onset,), last = entry["truth"]["onsets"], entry["alarms"][-1]
+    assert 1.9 < last["alarm_s"] < 2.0
+    assert (last["outcome"], onset["outcome"], onset["slid_mm"]) == ("found", "found", 0.0)
+    assert onset["first_release_s"] == 1.9
+    assert [onset["delay_s"], last["delay_s"]] == pytest.approx([last["alarm_s"] - 2.0] * 2)
+    assert onset["delay_first_s"] == pytest.approx(last["alarm_s"] - 1.9)
+
+
 def test_every_word_about_the_origin_is_there(run):
     _, content = run
     assert content["format"] == "tactslip_torch onsets 1"

@@ -66,7 +66,12 @@ def random_recording(rng, number=0):
         cuts = np.sort(rng.choice(duration, 4, replace=False)).tolist()
         stretches = [(cuts[0], cuts[1]), (cuts[2], cuts[3])]
     speeds = rng.choice([20.0, 40.0, 60.0], len(slides)).tolist()
+    firsts = [start for start, _ in slides]
+    if told := rng.random() < 0.5:
+        firsts = [start - int(rng.integers(0, 50)) for start in firsts]
+        firsts = [max(first, end) for first, end in zip(firsts, [0, *edges[1::2]], strict=False)]
     made = {"alarms": alarms, "ends": ends, "slides": slides, "stretches": stretches}
+    made |= {"firsts": [int(first) for first in firsts], "told": told}
     return made | {"duration": duration, "speeds": speeds, "number": number}
 
 
@@ -88,6 +93,11 @@ def as_watched(made, shift_s=0.0):
         speeds_mm_s=tuple(made["speeds"]),
         watched_s=tuple(s(stretch) for stretch in made["stretches"] or ()),
         alarm_ends_s=() if made["ends"] is None else s(made["ends"]),
+        released_s=tuple(
+            s((first, start + 30))
+            for first, (start, _) in zip(made["firsts"], made["slides"], strict=True)
+            if made["told"]
+        ),
     )
 
 
@@ -97,7 +107,11 @@ def by_loops(made, found=500, early=200, settle=100):
     def is_seen(t):
         return made["stretches"] is None or any(a <= t <= b for a, b in made["stretches"])
 
-    windows = [(start - early, stop + settle) for start, stop in made["slides"]]
+    firsts = made["firsts"]
+    windows = [
+        (first - early, stop + settle)
+        for first, (_, stop) in zip(firsts, made["slides"], strict=True)
+    ]
     alarms = [
         (alarm, None if made["ends"] is None else made["ends"][place])
         for place, alarm in enumerate(made["alarms"])
@@ -114,17 +128,17 @@ def by_loops(made, found=500, early=200, settle=100):
     for i, (onset, _) in enumerate(made["slides"]):
         if not is_seen(onset):
             continue
-        before = [(alarm, end) for alarm, end in alarms if alarm < onset]
+        before = [(alarm, end) for alarm, end in alarms if alarm < firsts[i]]
         is_early = False
         if before:
             alarm, end = before[-1]
-            is_early = onset - alarm <= early and (end is None or end > onset)
+            is_early = firsts[i] - alarm <= early and (end is None or end > firsts[i])
         hits = [
             alarm
             for alarm, _ in alarms
-            if onset <= alarm <= onset + found
+            if firsts[i] <= alarm <= onset + found
             and alarm <= windows[i][1]
-            and not any(onset < other <= alarm for other, _ in made["slides"])
+            and not any(firsts[i] < other <= alarm for other in firsts)
         ]
         outcome = "early" if is_early else "found" if hits else "missed"
         told.append((outcome, of[i], hits[0] - onset if outcome == "found" else None))
@@ -209,6 +223,35 @@ def test_an_alarm_at_an_edge(alarm):
     assert false_alarms([alarm]) == ((alarm,) if is_false else ())
 
 
+RELEASED_EDGES = {  # the skin lets go from 0.94 to 1.02 s, half of the load at 1.0 s
+    0.739: ("missed", True),
+    0.74: ("early", False),
+    0.939: ("early", False),
+    0.94: ("found", False),
+    1.5: ("found", False),
+    1.5000001: ("missed", False),
+}
+
+
+@pytest.mark.parametrize("alarm", RELEASED_EDGES)
+def test_early_is_before_the_first_release_and_late_is_counted_from_the_onset(alarm):
+    outcome, is_false = RELEASED_EDGES[alarm]
+    assert outcomes([alarm], released_s=((0.94, 1.02),)) == [outcome]
+    assert false_alarms([alarm], released_s=((0.94, 1.02),)) == ((alarm,) if is_false else ())
+
+
+def test_a_status_that_ends_before_the_first_release_leaves_the_slip_to_be_found():
+    for end, outcome in ((0.93, "found"), (0.95, "early")):
+        several = outcomes([0.9, 0.97], alarm_ends_s=(end, 2.0), released_s=((0.94, 1.02),))
+        assert several == [outcome]
+
+
+def test_an_alarm_behind_the_first_release_of_the_next_slip_is_not_of_this_one():
+    slips = {"onsets": (1.0, 1.4), "slides": ((1.0, 1.2), (1.4, 3.0))}
+    assert outcomes([1.3], **slips) == ["found", "early"]
+    assert outcomes([1.3], **slips, released_s=((1.0, 1.0), (1.3, 1.5))) == ["missed", "found"]
+
+
 def test_rounding_moves_no_alarm_over_an_edge():
     assert 0.9 < 1.1 - 0.2  # as floats see it
     assert outcomes([0.9], [1.1]) == ["early"]
@@ -232,7 +275,8 @@ def test_nothing_to_say_is_none_and_never_a_quotient_of_zeros():
     no_onset = watched([1.1, 2.2], ())
     metrics = event_metrics([no_onset], RULES, LATENCY)
     names = ("found", "early", "missed", "alarms_per_slip", "delay_ms", "latency_ms")
-    assert [metrics[name] for name in (*names, "onset_error_ms")] == [None] * 7
+    names += ("onset_error_ms", "delay_first_ms", "slid_mm")
+    assert [metrics[name] for name in names] == [None] * 9
     assert metrics["false_alarms_per_minute"]["value"] == pytest.approx(12.0)
     assert metrics["per_speed"] == {}
     missed = event_metrics([watched()], RULES, LATENCY)
@@ -270,6 +314,49 @@ def test_without_a_decision_before_the_alarm_all_of_the_delay_is_bin_fill(positi
     (onset,) = recording_events(one, RULES, LATENCY).onsets
     assert (onset.delay_s, onset.decision_s) == (0.3, 0.0)
     assert onset.bin_fill_s == pytest.approx(0.3 - 0.0125)
+
+
+@pytest.mark.parametrize(
+    ("alarm", "positive", "delay", "first", "slid", "fill", "decision"),
+    [
+        (1.05, 1.03, 0.05, 0.11, 2.0, 0.0175, 0.02),  # behind the onset: 40 mm/s for 50 ms
+        (0.97, 0.96, -0.03, 0.03, 0.0, -0.0525, 0.01),  # between the first release and the onset
+        (0.97, 1.03, -0.03, 0.03, 0.0, -0.0425, 0.0),
+    ],
+)
+def test_delays_from_the_onset_and_the_first_release(
+    alarm, positive, delay, first, slid, fill, decision
+):
+    one = watched([alarm], speeds=(40.0,), first_positive_s=(positive,), released_s=((0.94, 1.02),))
+    events = recording_events(one, RULES, LATENCY)
+    (onset,) = events.onsets
+    assert (onset.outcome, onset.first_release_s) == ("found", 0.94)
+    found = [onset.delay_s, onset.delay_first_s, onset.slid_mm, onset.bin_fill_s, onset.decision_s]
+    assert found == pytest.approx([delay, first, slid, fill, decision], abs=1e-12)
+    assert LATENCY.look_ahead_s + fill + decision == pytest.approx(delay)
+    metrics = pooled_metrics([events], **QUICK)
+    for name, value in (("delay_ms", 1000 * delay), ("delay_first_ms", 1000 * first)):
+        assert metrics[name]["median"]["value"] == pytest.approx(value)
+    assert metrics["slid_mm"]["p95"]["value"] == pytest.approx(slid, abs=1e-12)
+    parts = metrics["latency_ms"]
+    whole = parts["look_ahead"] + parts["bin_fill"] + parts["decision"]
+    assert parts["delay"] == pytest.approx(whole)
+
+
+def test_what_is_not_known_of_a_slip_is_left_out():
+    many = [
+        watched([1.05], released_s=((0.95, 1.0),), recording="a"),
+        watched([1.1], speeds=(0.0,), recording="b"),
+    ]
+    events = [recording_events(one, RULES, LATENCY) for one in many]
+    assert math.isnan(events[1].onsets[0].first_release_s)
+    metrics = pooled_metrics(events, **QUICK)
+    assert metrics["delay_ms"]["median"]["value"] == pytest.approx(75.0)
+    assert metrics["delay_first_ms"]["median"]["value"] == pytest.approx(100.0)
+    assert metrics["slid_mm"]["median"]["value"] == pytest.approx(1.0)
+    nothing = pooled_metrics(events[1:], **QUICK)
+    assert nothing["delay_first_ms"] is nothing["slid_mm"] is None
+    json.dumps(metrics, allow_nan=False)
 
 
 def test_estimates_are_held_against_the_onsets_found(rng):
@@ -323,6 +410,7 @@ def test_the_same_recording_of_two_detectors_is_drawn_as_one():
         ({"alarms_s": (1.2, 1.1)}, "alarms_s must ascend"),
         ({"alarms_s": (1.2, math.nan)}, "alarms_s must ascend"),
         ({"watched_s": ((2.0, 1.0),)}, "watched_s must ascend"),
+        ({"released_s": ((0.9, 1.0), (0.8, 1.0))}, "first releases must ascend"),
     ],
 )
 def test_what_does_not_fit_together_is_refused(changes, words):

@@ -23,7 +23,7 @@ from tactslip_torch.report.recordings import written_table
 from tactslip_torch.simulation.scene import Scene
 
 PAPER = HandLayout.paper24()
-TRUTH = ("onsets_s", "annotated_onsets_s", "sliding_s", "non_slip_s", "speeds_mm_s")
+TRUTH = ("onsets_s", "annotated_onsets_s", "sliding_s", "non_slip_s", "speeds_mm_s", "released_s")
 TINY = ("data._target_=test_generate.CountedRecordings", "materials=[A,B]", "cycles=3")
 CARRIED = ("scene=arm_motion", "materials=[M2]", "cycles=1")
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactslip_torch.data.file_recordings import FileTimeline, on_time
+from tactslip_torch.data.file_recordings import FileTimeline, on_time, scaled
 from tactslip_torch.data.manifest import (
     Truth,
     manifest_of,
@@ -174,6 +174,9 @@ def test_other_columns_are_said_not_to_be_read_and_likely_twins_are_named(root):
         ({"slip_s": "0-3", "sliding_s": "2-4"}, "sliding_s and slip_s overlap: 2-4 and 0-3"),
         ({"onsets_s": "2; 9", "sliding_s": "2-7"}, "1 sliding_s for 2 onsets"),
         ({"onsets_s": "2; 9", "speeds_mm_s": "1; 2; 3"}, "3 speeds_mm_s for 2 onsets"),
+        ({"onsets_s": "2; 9", "released_s": "1.9-2.1"}, "1 released_s for 2 onsets"),
+        ({"onsets_s": "2", "released_s": "2.1-2.2"}, "2 s is not within its released_s, 2.1-2.2"),
+        ({"onsets_s": "2", "released_s": "2.1-1.9"}, "must end behind its start"),
         ({"onsets_s": "8", "sliding_s": "2-7"}, "the onset at 8 s is not before the end"),
         ({"label": "slip", "onsets_s": "2"}, "label slip says all of it"),
         ({"label": ["slip", "slip"]}, "must be slip, non-slip or empty"),
@@ -292,6 +295,13 @@ def test_onsets_are_taken_from_slides_or_annotations_where_there_are_no_others()
     assert times.speeds_mm_s == (20.0, 20.0)
     marked, _ = truth_of({"annotated_onsets_s": "2.5"})
     assert on_time(marked, 12.0)[0].onsets_s == (2.5,)
+
+
+def test_releases_around_an_onset_are_kept():
+    truth, wrong = truth_of({"onsets_s": "2; 9", "released_s": "1.96-2.1; 9-9"})
+    assert not wrong
+    assert on_time(truth, 10.0)[0].released_s == ((1.96, 2.1), (9.0, 9.0))
+    assert on_time(scaled(truth, 0.5), 5.0)[0].released_s == ((0.98, 1.05), (4.5, 4.5))
 
 
 def test_what_leaves_the_recording_is_named_and_what_is_off_by_a_sample_is_cut():

@@ -251,6 +251,11 @@ def test_what_is_out_of_view_or_not_known_is_not_drawn(draw, films):
     unknown = draw(traces_of(films, num_decisions=20), truth=None)
     assert [text.get_text() for text in unknown.axes[1].get_yticklabels()] == ["decided"]
     assert not {"onset, true", "abstains", "not valid"} & legend_of(unknown)
+    assert "first release, true" not in legend_of(figure)
+    released = [{"onset_s": 0.42, "first_release_s": 0.4}]
+    released = draw(truth={"onsets": released, "sliding_s": [(0.42, 1.1)]})
+    assert marks_of(released)[0, "first release"] == [0.4]
+    assert "first release, true" in legend_of(released)
     without_slip = draw(truth={"onsets": [], "sliding_s": []})
     assert "truth" in [text.get_text() for text in without_slip.axes[1].get_yticklabels()]
 
@@ -316,6 +321,16 @@ def test_every_alarm_has_its_outcome():
     ]
 
 
+def test_an_alarm_between_the_first_release_and_the_onset_is_not_early():
+    onsets = [
+        {"onset_s": 1.0, "first_release_s": 0.95, "outcome": "found", "delay_s": -0.03},
+        {"onset_s": 3.0, "first_release_s": 2.95, "outcome": "early", "delay_s": None},
+    ]
+    truth = {"onsets": onsets, "false_alarms_s": [], "early_s": 0.2}
+    wanted = {0.94: "early", 0.97: "found", 0.99: "repeated", 2.75: "early", 2.98: "repeated"}
+    assert {alarm: alarm_outcome(alarm, truth)["outcome"] for alarm in wanted} == wanted
+
+
 def test_rows_are_alarms_and_missed_onsets_in_order_of_time():
     rows = onset_rows(content(entry(), entry("b.npy", truth=False)))
     told = ["false", "found", "repeated", "early", "missed", "late"]
@@ -343,14 +358,16 @@ def test_summary_and_title_say_how_well_and_of_what():
     assert "0.5 % of the decisions are not valid" in said
     events = dict.fromkeys(("num_found", "num_early", "num_missed", "num_false_alarms"), 1)
     events |= {"num_onsets": 3, "quiet_hours": 0.05, "delay_ms": {"median": {"value": 50.0}}}
+    events |= {"slid_mm": {"median": {"value": 1.52}}}
     whole = entry(decisions={"number": 600, "invalid": 0})
     said = onsets_summary(content(whole, events=events), 0.5)
     assert "not valid" not in said
     assert (
-        "of 3 slips 1 found, median delay 50.0 ms, 1 early, 1 missed; 1 false alarms in 3.00"
-        in said
+        "of 3 slips 1 found, median delay 50.0 ms (1.5 mm slid), 1 early, 1 missed; "
+        "1 false alarms in 3.00" in said
     )
-    late = onsets_summary(content(whole, events=events | {"delay_ms": None}), 0.5)
+    none = {"delay_ms": None, "slid_mm": None}
+    late = onsets_summary(content(whole, events=events | none), 0.5)
     assert "delay" not in late
     assert onsets_title(entry(), of_simulated=True) == (
         "SIMULATED recording a.npz, material M1, 5 alarms, 1 of 3 slips found, 1 false, "

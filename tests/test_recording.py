@@ -24,6 +24,9 @@ def test_what_follows_from_what_is_said():
     assert recording(annotated_onsets_s=(0.06, 0.14)).annotated_onsets_s == (0.06, 0.14)
     rest = recording(speeds_mm_s=(), onsets_s=(), sliding_s=())
     assert rest.annotated_onsets_s == ()
+    assert recording().released_s == ()
+    released_s = ((0.04, 0.05), (0.15, 0.15))
+    assert recording(released_s=released_s).released_s == released_s
 
 
 @pytest.mark.parametrize(
@@ -36,6 +39,9 @@ def test_what_follows_from_what_is_said():
         ({"speeds_mm_s": (20.0,)}, r"as many speeds as onsets.*got \[.*1.*\]"),
         ({"onsets_s": (0.05,)}, r"as many speeds as onsets.*got \[.*1.*\]"),
         ({"sliding_s": ((0.05, 0.1),)}, r"as many speeds as onsets.*got \[.*1.*\]"),
+        ({"released_s": ((0.04, 0.06),)}, "empty or one of each of 2 onsets, got 1"),
+        ({"released_s": ((0.04, 0.06), (0.16, 0.2))}, r"at 0\.15 s must .* releases, 0\.16-0\.2 s"),
+        ({"released_s": ((0.04, 0.06), (0.14, float("nan")))}, r"at 0\.15 s must lie between"),
         ({"annotated_onsets_s": (0.05,)}, r"as many speeds as onsets.*got \[.*1.*\]"),
     ],
 )

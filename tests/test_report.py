@@ -314,6 +314,8 @@ def test_events_have_a_row_for_each_role_and_rule():
                 str(numbers["num_onsets"]),
                 *(f"{100 * numbers[name]['value']:.1f}" for name in ("found", "early", "missed")),
                 *(f"{numbers['delay_ms'][name]['value']:.1f}" for name in ("median", "p95")),
+                "-",  # the first release is not known
+                f"{numbers['slid_mm']['median']['value']:.1f}",
                 f"{rate['value']:.1f} /min [{rate['low']:.1f}, {rate['high']:.1f}]",
                 f"{60 * numbers['quiet_hours']:.1f} min",
                 f"{numbers['alarms_per_slip']['value']:.2f}",
@@ -326,7 +328,7 @@ def test_events_have_a_row_for_each_role_and_rule():
     assert sum(parts[:3]) == pytest.approx(parts[3], abs=0.2)
     nothing = {role: {"a": no_events(), "b": no_events()} for role in ("train", "test")}
     lines = events_table(metrics_of(events=nothing)).splitlines()
-    assert rows_of(lines[2])[0][2:] == ["0", *["-"] * 8]
+    assert rows_of(lines[2])[0][2:] == ["0", *["-"] * 10]
     assert [line for line in lines if REASON in line] == [f"no events: {REASON}"]
 
 

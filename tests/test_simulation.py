@@ -111,6 +111,8 @@ def assert_truth_is_the_contacts(scene: Scene) -> None:
     assert truth.speeds_mm_s == tuple(s.speed_mm_s for s in scene.strokes if s.moves != "both")
     assert len(truth.onsets_s) == len(truth.sliding_s) == len(truth.annotated_onsets_s)
     assert len(truth.onsets_s) == len(truth.speeds_mm_s)
+    for onset_s, (first_s, last_s) in zip(truth.onsets_s, truth.released_s, strict=True):
+        assert first_s < onset_s <= last_s
     for start_s, end_s in truth.sliding_s:
         within = sliding[round(2000 * start_s) + 2 : round(2000 * end_s) - 2]
         assert (within >= 0.5 - 1e-12).mean() > (0.7 if scene.material == "M6" else 0.95)
@@ -152,7 +154,8 @@ def test_a_recording_carries_truth_and_provenance_and_the_dtype_asked_for():
     scene = Scene("copper", seed=3, cycle=7, strokes=SHORT)
     truth, double = timeline(scene), simulate(scene, dtype=torch.float64)
     assert double.samples.shape == (24, truth.num_samples)
-    for name in ("onsets_s", "annotated_onsets_s", "sliding_s", "speeds_mm_s", "non_slip_s"):
+    names = ("onsets_s", "annotated_onsets_s", "sliding_s", "speeds_mm_s", "non_slip_s")
+    for name in (*names, "released_s"):
         assert getattr(double, name) == getattr(truth, name)
     stated = {"simulated": True, "fidelity": "kinematic", "seed": 3, "cycle": 7, "scene": "paper"}
     assert stated.items() <= double.provenance.items()

@@ -74,6 +74,32 @@ def test_onset_comes_after_the_arm_and_by_the_presliding_travel(material):
         assert later_mm < 0.65 * fresh_mm  # the pause left most of the shear
 
 
+def test_elements_let_go_one_after_the_other_each_after_its_own_travel():
+    scene = Scene("M1", contact=Contact(presliding_mm=(0.1, 0.1)))  # at most 0.15 mm
+    truth, grasp, arm = timeline(scene), draw_grasp(scene), scene.arm
+    travel_mm = grasp.presliding_mm[grasp.touching]  # the arm speeds up with 500 mm/s^2 until 0.4
+    ends_mm = np.array([travel_mm.min(), travel_mm.max()])
+    expected = arm[0].start_s + np.sqrt(2 * ends_mm / 500)
+    np.testing.assert_allclose(truth.released_s[0], expected, rtol=1e-9)
+    for (first_s, last_s), onset_s in zip(truth.released_s, truth.onsets_s, strict=True):
+        assert first_s < onset_s < last_s
+    stiff = Contact(presliding_mm=(0.1, 0.1), presliding_spread=0.0, relaxation=(0.2, 0.2))
+    truth = timeline(replace(scene, contact=stiff))  # all let go at once
+    assert truth.released_s == tuple(zip(truth.onsets_s, truth.onsets_s, strict=True))
+
+
+@pytest.mark.parametrize("model", BRISTLES)
+def test_bristles_release_the_first_element_before_the_onset(model):
+    scene = scene_on(model, "M3", strokes=SHORT)
+    (states, time_s), truth = contacts(scene), timeline(scene)
+    for (first_s, last_s), onset_s in zip(truth.released_s, truth.onsets_s, strict=True):
+        assert first_s < onset_s < last_s
+    first_s, last_s = truth.released_s[0]
+    gross = [time_s[np.argmax(contact.slide > 0.5)] for contact in states.values()]
+    assert min(gross) == pytest.approx(first_s, abs=2e-3)
+    assert max(gross) == pytest.approx(last_s, abs=2e-3)
+
+
 def test_annotations_jitter_by_what_is_asked():
     truths = [timeline(Scene("M2", cycle=cycle)) for cycle in range(60)]
     offsets_ms = 1e3 * np.array(

@@ -32,6 +32,7 @@ from tactslip_torch.onset.events import (
     LatencyParts,
     RecordingEvents,
     Watched,
+    first_releases,
     pooled_metrics,
     recording_events,
 )
@@ -146,7 +147,8 @@ def _detect_in(
         drawn = {hand.names[i]: i for i in hand.fast or range(len(hand))}
         view = view_of(config.view, entry["duration_s"])
         traces = Traces(drawn, rate, stream.hop_s, view, context.units)
-        counts = DecisionCounts(archived.recording.onsets_s if archived else ())
+        truth = archived.recording if archived else None
+        counts = DecisionCounts(first_releases(truth.onsets_s, truth.released_s) if truth else ())
 
         def take(decisions: Decisions) -> None:
             columns = decisions._asdict() | {"answer": answer_of(detector, decisions)}
@@ -194,15 +196,18 @@ def _with_truth(
         speeds_mm_s=truth.speeds_mm_s,
         first_positive_s=tuple(counts.first_positive_s),
         alarm_ends_s=tuple(math.inf if end is None else end for end in ends),
+        released_s=truth.released_s,
     )
     events = recording_events(watched, _RULES, LatencyParts(stream.look_ahead_s, stream.bin_s))
-    known = {
-        "onsets": [onset._asdict() for onset in events.onsets],
-        "sliding_s": [list(slide) for slide in truth.sliding_s],
-        "false_alarms_s": list(events.false_alarms_s),
-        "quiet_s": events.quiet_s,
-        **asdict(_RULES),
-    }
+    known = plain(
+        {
+            "onsets": [onset._asdict() for onset in events.onsets],
+            "sliding_s": truth.sliding_s,
+            "false_alarms_s": events.false_alarms_s,
+            "quiet_s": events.quiet_s,
+            **asdict(_RULES),
+        }
+    )
     alarms = [alarm | alarm_outcome(alarm["alarm_s"], known) for alarm in alarms]
     return entry | {"truth": known, "alarms": alarms}, events
 

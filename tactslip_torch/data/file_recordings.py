@@ -898,6 +898,7 @@ class FileRecordings:
             own.recording.provenance if own else {"simulated": False, "file": one.entry.file},
             slip_s=times.slip_s,
             units=self.units,
+            released_s=times.released_s,
         )
 
     def _read(self, one: _File, windows: Sequence[tuple[float, float]] | None) -> Iterator[Tensor]:

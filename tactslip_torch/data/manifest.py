@@ -185,7 +185,7 @@ def _column(text: str) -> str:
 Stretch = tuple[float, float]
 Label = Literal["slip", "non-slip"]
 MOMENTS = ("onsets_s", "annotated_onsets_s", "speeds_mm_s")
-STRETCHES = ("sliding_s", "slip_s", "non_slip_s", "missing_s")
+STRETCHES = ("sliding_s", "slip_s", "non_slip_s", "missing_s", "released_s")
 _TRUTH_COLUMNS = (*MOMENTS, *STRETCHES, "label")
 _LABELS: dict[str, Label] = {"slip": "slip", "nonslip": "non-slip", "noslip": "non-slip"}
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -205,6 +205,7 @@ class Truth:
         slip_s: stretches that are slip, begun nobody knows when.
         non_slip_s: stretches that are not.
         missing_s: stretches whose samples are not to be used.
+        released_s: of each onset, when the first and the last element of the skin let go.
         label: of all of the recording.
     """
 
@@ -215,6 +216,7 @@ class Truth:
     slip_s: tuple[Stretch, ...] = ()
     non_slip_s: tuple[Stretch, ...] = ()
     missing_s: tuple[Stretch, ...] = ()
+    released_s: tuple[Stretch, ...] = ()
     label: Label | None = None
 
 
@@ -260,7 +262,7 @@ def _contradictions(truth: Truth) -> list[str]:
             found.append(f"{name} must not lie before the start, got {_shown(moments)}")
     if any(speed < 0 for speed in truth.speeds_mm_s):
         found.append(f"speeds_mm_s must not be negative, got {_shown(truth.speeds_mm_s)}")
-    for name in ("annotated_onsets_s", "sliding_s", "speeds_mm_s"):
+    for name in ("annotated_onsets_s", "sliding_s", "speeds_mm_s", "released_s"):
         values = getattr(truth, name)
         if values and len(values) != len(truth.onsets_s):
             found.append(
@@ -268,7 +270,8 @@ def _contradictions(truth: Truth) -> list[str]:
             )
     for name in STRETCHES:
         for start, end in getattr(truth, name):
-            if not 0 <= start < end:
+            is_moment = name == "released_s" and start == end  # all let go at once
+            if not (0 <= start < end or is_moment):
                 found.append(f"{name}: {start:g}-{end:g} must end behind its start, from 0 on")
     found = found or _overlaps(truth)
     if truth.label and (truth.onsets_s or truth.slip_s or truth.non_slip_s):
@@ -289,6 +292,11 @@ def _overlaps(truth: Truth) -> list[str]:
         found.append(f"slip and non-slip overlap: {clash}")
     for clash in _clashes(truth.sliding_s, truth.slip_s):
         found.append(f"sliding_s and slip_s overlap: {clash}")
+    for onset, (first, last) in zip(truth.onsets_s, truth.released_s, strict=False):
+        if not first <= onset <= last:
+            found.append(
+                f"the onset at {onset:g} s is not within its released_s, {first:g}-{last:g} s"
+            )
     if len(truth.sliding_s) == len(truth.onsets_s):
         for onset, (_, end) in zip(truth.onsets_s, truth.sliding_s, strict=True):
             if onset >= end:

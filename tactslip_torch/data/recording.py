@@ -60,10 +60,13 @@ class Recording:
         provenance: where it comes from; simulated recordings say ``{"simulated": True, ...}``.
         slip_s: ``(start, end)`` of stretches that are slip though nobody knows when it began.
         units: of the samples.
+        released_s: of each onset, when the first and when the last element of the skin lets go;
+            at the onset half of the load has. Empty where that is not known.
 
     Raises:
-        ValueError: if samples are not ``[C, T]``, the rate is not positive, or the number of
-            onsets differs from that of speeds, sliding stretches or annotations.
+        ValueError: if samples are not ``[C, T]``, the rate is not positive, the number of onsets
+            differs from that of speeds, sliding stretches, annotations or known releases, or an
+            onset does not lie between its releases.
     """
 
     samples: Tensor
@@ -77,6 +80,7 @@ class Recording:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     slip_s: tuple[tuple[float, float], ...] = ()
     units: str = "V"
+    released_s: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         if self.samples.ndim != 2:
@@ -96,6 +100,16 @@ class Recording:
                 "a recording has as many speeds as onsets, sliding stretches and annotated "
                 f"onsets, got {counts}"
             )
+        if self.released_s and len(self.released_s) != len(self.onsets_s):
+            raise ValueError(
+                f"released_s must be empty or one of each of {len(self.onsets_s)} onsets, got "
+                f"{len(self.released_s)}"
+            )
+        for onset, (first, last) in zip(self.onsets_s, self.released_s, strict=False):
+            if not first <= onset <= last:
+                raise ValueError(
+                    f"the onset at {onset:g} s must lie between its releases, {first:g}-{last:g} s"
+                )
 
     @property
     def duration_s(self) -> float:
@@ -126,6 +140,10 @@ class Timeline(Protocol):
     @property
     def sliding_s(self) -> tuple[tuple[float, float], ...]:
         """Start and end of each slide."""
+
+    @property
+    def released_s(self) -> tuple[tuple[float, float], ...]:
+        """When the first and the last element let go, of each onset; empty if not known."""
 
     @property
     def speeds_mm_s(self) -> tuple[float, ...]:

@@ -50,7 +50,7 @@ class EventRules:
 
     Args:
         found_within_s: an alarm this long behind the onset still finds the slip.
-        early_s: an alarm this long before the onset is early, not false.
+        early_s: an alarm this long before the first release is early, not false.
         settle_s: an alarm this long behind the end of a slide still belongs to it. None is for as
             long as a decision can rest on samples of the slide, and 50 ms: bin, look-ahead, 50 ms.
     """
@@ -71,14 +71,16 @@ class Watched:
         duration_s: length of the recording.
         alarms_s: when an alarm was raised, ascending.
         onset_estimates_s: of each alarm, when its slip is thought to have begun; may be empty.
-        onsets_s: exact onsets, ascending.
+        onsets_s: exact onsets, ascending: half of the load has let go.
         sliding_s: of each onset, start and end of its slide.
         speeds_mm_s: of each onset, the steady speed of its stroke.
-        first_positive_s: of each onset, the first decision behind it that speaks for slip, NaN
-            where there is none; may be empty.
+        first_positive_s: of each onset, the first decision behind its first release that speaks
+            for slip, NaN where there is none; may be empty.
         watched_s: start and end of stretches that were watched; empty is the whole recording.
         alarm_ends_s: of each alarm, when its status ended, infinity if it did not; may be empty,
             and an alarm then holds until the next.
+        released_s: of each onset, when the first and when the last element of the skin let go; may
+            be empty, and the onset then stands for the first release.
 
     Raises:
         ValueError: if times do not ascend.
@@ -96,6 +98,7 @@ class Watched:
     first_positive_s: tuple[float, ...] = ()
     watched_s: tuple[tuple[float, float], ...] = ()
     alarm_ends_s: tuple[float, ...] = ()
+    released_s: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         ends = tuple(end for _, end in self.sliding_s)
@@ -103,6 +106,7 @@ class Watched:
         for name, times in (
             ("alarms_s", self.alarms_s),
             ("onsets_s", self.onsets_s),
+            ("first releases", first_releases(self.onsets_s, self.released_s)),
             ("ends of sliding_s", ends),
             ("watched_s", edges),
         ):
@@ -110,21 +114,42 @@ class Watched:
                 raise ValueError(f"{self.recording}: {name} must ascend, got {times[:4]}..")
 
 
-class OnsetEvent(NamedTuple):
-    """One onset: what became of it, and of a found one the parts of its delay (else NaN).
+def first_releases(
+    onsets_s: Sequence[float], released_s: Sequence[tuple[float, float]]
+) -> tuple[float, ...]:
+    """When the first element of each slip lets go, seconds; the onsets where that is not known."""
+    return tuple(first for first, _ in released_s) or tuple(onsets_s)
 
-    ``num_alarms`` counts those that belong to its slip, early ones too. ``error_s`` is the estimate
-    minus the onset.
+
+class OnsetEvent(NamedTuple):
+    """One onset: what became of it, and of a found one its delay and the parts of it (else NaN).
+
+    Args:
+        onset_s: when half of the load had let go.
+        first_release_s: when the first element let go; NaN if not known.
+        speed_mm_s: steady speed of the stroke, 0 if not known.
+        outcome: found, early or missed.
+        num_alarms: those that belong to its slip, early ones too.
+        delay_s: alarm minus onset, negative where the alarm came before half of the load let go.
+        delay_first_s: alarm minus first release; NaN if that is not known.
+        slid_mm: way slid from the onset to the alarm at the steady speed. An upper bound: the arm
+            may still be speeding up. NaN if no speed is known.
+        bin_fill_s: part of the delay, as ``decision_s``; see ``recording_events``.
+        decision_s: from the first decision for slip to the alarm.
+        error_s: the estimate minus the onset.
     """
 
     onset_s: float
+    first_release_s: float
     speed_mm_s: float
     outcome: str
     num_alarms: int
-    delay_s: float
-    bin_fill_s: float
-    decision_s: float
-    error_s: float
+    delay_s: float = math.nan
+    delay_first_s: float = math.nan
+    slid_mm: float = math.nan
+    bin_fill_s: float = math.nan
+    decision_s: float = math.nan
+    error_s: float = math.nan
 
 
 class RecordingEvents(NamedTuple):
@@ -142,19 +167,22 @@ class RecordingEvents(NamedTuple):
 def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts) -> RecordingEvents:
     """What became of each onset that was watched, and which alarms were false.
 
-    The *window* of a slip reaches from ``early_s`` before its onset to ``settle_s`` behind the end
-    of its slide; an alarm belongs to the last window that holds it, and in none it is false. Of
-    each onset exactly one is true:
+    A slip has three instants: its first element lets go, half of the load has let go (the onset),
+    its last element lets go. Its *window* reaches from ``early_s`` before the first release to
+    ``settle_s`` behind the end of its slide; an alarm belongs to the last window that holds it, and
+    in none it is false. Of each onset exactly one is true:
 
-    - *early*: the last alarm before it is no more than ``early_s`` old and its status holds still;
-    - *found*: not early, and an alarm at or behind it, before the next onset, within
-      ``found_within_s`` and within its window. Its delay is that alarm's time minus the onset;
+    - *early*: the last alarm before the first release is no more than ``early_s`` old and its
+      status holds still;
+    - *found*: not early, and an alarm at or behind the first release, before that of the next slip,
+      at most ``found_within_s`` behind the onset and within its window. Its delay is that alarm's
+      time minus the onset;
     - *missed*: neither. A status that has held for longer than ``early_s`` finds nothing.
 
-    A delay is look-ahead, bin fill (until the bin of the first decision behind the onset that
-    speaks for slip is full) and decision (from that one to the alarm). Where no such decision is
-    known to come before the alarm, it is bin fill. Alarms outside the stretches watched are not
-    counted.
+    A delay is look-ahead, bin fill (until the bin of the first decision behind the first release
+    that speaks for slip is full) and decision (from that one to the alarm). Bin fill counts from
+    the onset and is negative where that bin was full before it. Where no such decision is known to
+    come before the alarm, all is bin fill. Alarms outside the stretches watched are not counted.
 
     Reference:
         REFERENCE.md section 7.
@@ -164,9 +192,11 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
         settle_s = latency.bin_s + latency.look_ahead_s + 0.05
     look_ahead, settle, early = (_ns(x) for x in (latency.look_ahead_s, settle_s, rules.early_s))
     onsets = [_ns(time) for time in watched.onsets_s]
+    releases_s = first_releases(watched.onsets_s, watched.released_s)
+    releases = [_ns(time) for time in releases_s]
     windows = [
-        (onset - early, max(onset, _ns(end)) + settle)
-        for onset, (_, end) in zip(onsets, watched.sliding_s, strict=True)
+        (release - early, max(onset, _ns(end)) + settle)
+        for release, onset, (_, end) in zip(releases, onsets, watched.sliding_s, strict=True)
     ]
     spans = [(_ns(start), _ns(end)) for start, end in watched.watched_s]
 
@@ -188,25 +218,28 @@ def recording_events(watched: Watched, rules: EventRules, latency: LatencyParts)
         if not is_watched(onset):
             continue
         num_alarms = sum(alarm.window == place for alarm in raised)
-        speed = watched.speeds_mm_s[place]
-        event = OnsetEvent(watched.onsets_s[place], speed, "missed", num_alarms, *(math.nan,) * 4)
-        before = [alarm for alarm in raised if alarm.at < onset]
-        after = [alarm for alarm in raised if alarm.at >= onset]
+        speed, release = watched.speeds_mm_s[place], releases[place]
+        known_s = releases_s[place] if watched.released_s else math.nan
+        event = OnsetEvent(watched.onsets_s[place], known_s, speed, "missed", num_alarms)
+        before = [alarm for alarm in raised if alarm.at < release]
+        after = [alarm for alarm in raised if alarm.at >= release]
         first, last = windows[place]
-        until = min(onset + _ns(rules.found_within_s), last, *(t - 1 for t in onsets[place + 1 :]))
-        if before and before[-1].at >= first and before[-1].end > onset:
+        later = (time - 1 for time in releases[place + 1 :])
+        until = min(onset + _ns(rules.found_within_s), last, *later)
+        if before and before[-1].at >= first and before[-1].end > release:
             event = event._replace(outcome="early")
         elif after and after[0].at <= until:
             alarm = after[0]
             positive = watched.first_positive_s[place] if watched.first_positive_s else math.nan
             spoke = alarm.at if math.isnan(positive) else min(_ns(positive), alarm.at)
-            fill = max(0, spoke - onset - look_ahead)  # one that spoke before had no need of it
-            estimates = watched.onset_estimates_s
+            estimates, delay_s = watched.onset_estimates_s, (alarm.at - onset) / 1e9
             event = event._replace(
                 outcome="found",
-                delay_s=(alarm.at - onset) / 1e9,
-                bin_fill_s=fill / 1e9,
-                decision_s=(alarm.at - onset - look_ahead - fill) / 1e9,
+                delay_s=delay_s,
+                delay_first_s=(alarm.at - release) / 1e9 if watched.released_s else math.nan,
+                slid_mm=speed * max(delay_s, 0.0) if speed > 0 else math.nan,
+                bin_fill_s=(spoke - onset - look_ahead) / 1e9,
+                decision_s=(alarm.at - spoke) / 1e9,
                 error_s=(_ns(estimates[alarm.number]) - onset) / 1e9 if estimates else math.nan,
             )
         events.append(event)
@@ -374,9 +407,11 @@ def pooled_metrics(
       belong to a slip, by onsets. None without onsets.
     - ``false_alarms_per_minute``, ``false_alarms_per_hour``: None without such time.
     - ``delay_ms`` of the slips found: ``median``, ``p95``, and ``quantiles`` from least to most in
-      steps of 5 %. ``latency_ms``: means of its parts, which add up to ``delay``, and ``compute``
-      (None where not measured). ``onset_error_ms``: ``median``, ``sd`` (of the population) and
-      ``mean_abs`` of the estimates. None where there is nothing to say this of.
+      steps of 5 %. ``delay_first_ms``, from the first release, and ``slid_mm``, at most slid until
+      the alarm: ``median`` and ``p95``. ``latency_ms``: means of the delay's parts, which add up to
+      ``delay``, and ``compute`` (None where not measured). ``onset_error_ms``: ``median``, ``sd``
+      (of the population) and ``mean_abs`` of the estimates. None where there is nothing to say
+      this of.
     - ``per_material``, ``per_scene``, ``per_speed``: the same of groups, without groups, level and
       quantiles; a false alarm has no speed. Of several scenes, materials and speeds are of the
       paper's alone.
@@ -452,16 +487,23 @@ def _summary(events: Sequence[RecordingEvents], level: float, num_resamples: int
         for onset in one.onsets
         if onset.outcome == "found"
     ]
-    delay_ms = latency_ms = error_ms = None
-    if found:
-        recording = torch.tensor([place for place, _, _ in found])
-        delay = 1000 * torch.tensor([onset.delay_s for _, _, onset in found], dtype=torch.float64)
+    places = torch.tensor([place for place, _, _ in found])
+
+    def known(of: Callable[[OnsetEvent], float]) -> tuple[Tensor, Tensor]:
+        """What is known of the onsets found, and the place of their recordings."""
+        values = torch.tensor([of(onset) for _, _, onset in found], dtype=torch.float64)
+        return values[~values.isnan()], places[~values.isnan()]
+
+    def spread(of: Callable[[OnsetEvent], float]) -> dict[str, Any] | None:
+        values, own = known(of)
+        shares = {"median": 0.5, "p95": 0.95} if len(values) else {}
+        return {n: bootstrap.quantile(values, own, share) for n, share in shares.items()} or None
+
+    delay_ms, latency_ms, error_ms = spread(lambda onset: 1000 * onset.delay_s), None, None
+    if delay_ms:
         steps = torch.linspace(0, 1, _STEPS + 1, dtype=torch.float64)
-        delay_ms = {
-            "median": bootstrap.quantile(delay, recording, 0.5),
-            "p95": bootstrap.quantile(delay, recording, 0.95),
-            "quantiles": delay.quantile(steps).tolist(),
-        }
+        delay, _ = known(lambda onset: 1000 * onset.delay_s)
+        delay_ms["quantiles"] = delay.quantile(steps).tolist()
         parts = {
             "look_ahead": [latency.look_ahead_s for _, latency, _ in found],
             "bin_fill": [onset.bin_fill_s for _, _, onset in found],
@@ -473,10 +515,8 @@ def _summary(events: Sequence[RecordingEvents], level: float, num_resamples: int
             name: 1000 * math.fsum(seconds) / len(seconds) if seconds else None
             for name, seconds in parts.items()
         }
-        error = 1000 * torch.tensor([onset.error_s for _, _, onset in found], dtype=torch.float64)
-        is_known = ~error.isnan()
-        if bool(is_known.any()):
-            error, recording = error[is_known], recording[is_known]
+        error, recording = known(lambda onset: 1000 * onset.error_s)
+        if len(error):
             error_ms = {
                 "median": bootstrap.quantile(error, recording, 0.5),
                 "sd": bootstrap.deviation(error, recording),
@@ -493,6 +533,8 @@ def _summary(events: Sequence[RecordingEvents], level: float, num_resamples: int
         "false_alarms_per_minute": bootstrap.rate(false, hours, per=1 / 60),
         "false_alarms_per_hour": bootstrap.rate(false, hours),
         "delay_ms": delay_ms,
+        "delay_first_ms": spread(lambda onset: 1000 * onset.delay_first_s),
+        "slid_mm": spread(lambda onset: onset.slid_mm),
         "latency_ms": latency_ms,
         "onset_error_ms": error_ms,
     }

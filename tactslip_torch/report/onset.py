@@ -54,6 +54,7 @@ _INVALID: dict[str, Any] = {
 }  # fmt: skip
 _ABSTAINS: dict[str, Any] = {"facecolor": "#DDD6E8", "edgecolor": "none", "zorder": 0.2}
 _ONSET: dict[str, Any] = {"color": INK, "linestyle": "-."}
+_RELEASE: dict[str, Any] = {"color": GREY, "linestyle": ":"}
 _ALARM: dict[str, Any] = {"color": ALARM, "linestyle": "-"}
 _ESTIMATE: dict[str, Any] = {"color": ALARM, "linestyle": ":"}
 
@@ -170,7 +171,7 @@ class DecisionCounts:
     """Adds up decisions on a stream: counts, and alarms with their ends.
 
     Args:
-        onsets_s: true onsets, as far as they are known.
+        onsets_s: when true slips begin, as far as that is known.
 
     Attributes:
         num_decisions: so far.
@@ -242,11 +243,12 @@ def alarm_outcome(alarm_s: float, truth: Mapping[str, Any]) -> dict[str, Any]:
     if alarm_s in truth["false_alarms_s"]:
         return {"outcome": "false", "true_onset_s": None, "delay_s": None}
     for onset in truth["onsets"]:  # onsets ascend: the last one that has begun stays
-        delay_s = alarm_s - onset["onset_s"]
+        delay_s, first_s = alarm_s - onset["onset_s"], onset.get("first_release_s")
+        since_s = delay_s if first_s is None else alarm_s - first_s
         is_found = onset["outcome"] == "found" and abs(delay_s - onset["delay_s"]) < _SAME_S
-        if is_found or delay_s > -truth["early_s"] - _SAME_S:
+        if is_found or since_s > -truth["early_s"] - _SAME_S:
             after = "late" if onset["outcome"] == "missed" else "repeated"
-            outcome = "found" if is_found else "early" if delay_s < 0 else after
+            outcome = "found" if is_found else "early" if since_s < 0 else after
             result = {"outcome": outcome, "true_onset_s": onset["onset_s"], "delay_s": delay_s}
         if is_found:
             break
@@ -343,6 +345,8 @@ def onsets_summary(content: Mapping[str, Any], seconds: float) -> str:
     if events := content["events"]:
         delay = events["delay_ms"]
         median = f", median delay {delay['median']['value']:.1f} ms" if delay else ""
+        if slid := events["slid_mm"]:
+            median += f" ({slid['median']['value']:.1f} mm slid)"
         lines.append(
             f"of {events['num_onsets']} slips {events['num_found']} found{median}, "
             f"{events['num_early']} early, {events['num_missed']} missed; "
@@ -390,7 +394,9 @@ def onset_figure(
     figure = new_figure(12.0, sum(heights) + 1.3, title)
     panels = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": heights})
     first, last = traces.view
-    onsets_s = [onset["onset_s"] for onset in truth["onsets"]] if truth else []
+    onsets = truth["onsets"] if truth else []
+    onsets_s = [onset["onset_s"] for onset in onsets]
+    first_s = [s for onset in onsets if (s := onset.get("first_release_s")) is not None]
     decided_s, (probability, *statuses) = traces.decisions()
     slips, invalid, doubtful = (_spans(decided_s, status, last) for status in statuses)
     for axes in panels:
@@ -407,6 +413,7 @@ def onset_figure(
     panels[0].set_xlim(first, last)
     raised_s, estimates_s = ([alarm[which] for alarm in alarms] for which in (0, 1))
     for axes, times, name, style in (
+        (panels[0], first_s, "first release", _RELEASE),
         (panels[0], onsets_s, "onset", _ONSET),
         (panels[0], raised_s, "alarm", _ALARM),
         (panels[2], onsets_s, "onset", _ONSET),
@@ -420,6 +427,7 @@ def onset_figure(
         Line2D([], [], marker="v", label="alarm", **_ALARM),
         Line2D([], [], label="onset, detected", **_ESTIMATE),
     ]
+    handles += [Line2D([], [], label="first release, true", **_RELEASE)] if first_s else []
     handles += [Line2D([], [], label="onset, true", **_ONSET)] if onsets_s else []
     handles += [Patch(label="abstains", **_ABSTAINS)] if doubtful else []
     handles += [Patch(label="not valid", **_INVALID)] if invalid else []

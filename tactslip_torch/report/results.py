@@ -896,13 +896,16 @@ _LATENCY_PARTS = {
 
 
 def _event_cells(numbers: Mapping[str, Any], digits: int = 1) -> _Row:
-    """Slips, percent found, early and missed, and two quantiles of the delay in ms."""
-    delay = numbers["delay_ms"] or {"median": None, "p95": None}
+    """Slips, percent found, early and missed; delay in ms, from the first release, mm slid."""
+    none = {"median": None, "p95": None}
+    delay, first, slid = (numbers.get(n) or none for n in ("delay_ms", "delay_first_ms", "slid_mm"))
     return {
         "slips": numbers["num_onsets"],
         **{f"{outcome} %": _value(numbers[outcome], 1, 100) for outcome in _OUTCOMES},
         "delay ms": _value(delay["median"], digits),
         "p95 ms": _value(delay["p95"], digits),
+        "from first release ms": _value(first["median"], digits),
+        "mm slid": _value(slid["median"], 1),
     }
 
 
@@ -923,10 +926,10 @@ def _false_alarms(numbers: Mapping[str, Any]) -> str:
 def events_table(metrics: _Metrics) -> str:
     """One row for each role and rule; brackets hold intervals.
 
-    ``delay`` is the median from the exact onset to the alarm, look-ahead within; ``slip-free`` is
-    how long an alarm would have been false. Rates are by the hour where that is at least an hour,
-    else by the minute. Where compute was measured, the parts of the mean delay follow in a second
-    table.
+    ``delay`` is the median from the exact onset to the alarm, look-ahead within, ``mm slid`` the
+    way slid meanwhile at most; ``slip-free`` is how long an alarm would have been false. Rates are
+    by the hour where that is at least an hour, else by the minute. Where compute was measured, the
+    parts of the mean delay follow in a second table.
 
     Args:
         metrics: the content of ``metrics.json``, with ``events``.
@@ -989,7 +992,7 @@ def events_figure(metrics: _Metrics, path: str | Path) -> None:
     figure = new_figure(11.0, 1.3 + sum(heights), title, simulated=metrics["simulated"])
     ratios = {"width_ratios": [1.25, 1.0], "height_ratios": heights}
     panels = figure.subplots(len(events), 2, sharex="col", squeeze=False, gridspec_kw=ratios)
-    latest = _REFLEX_MS[1]
+    earliest, latest = 0.0, _REFLEX_MS[1]
     for (role, by_rule), (left, right) in zip(events.items(), panels, strict=True):
         clean(left)
         clean(right, "x")
@@ -1002,6 +1005,7 @@ def events_figure(metrics: _Metrics, path: str | Path) -> None:
                 left.plot(delay["quantiles"], fractions, lw=2, zorder=3, **styles[rule])
                 middle = (delay["median"]["value"], found / 2)
                 left.plot(*middle, "o", color=styles[rule]["color"], ms=6, zorder=4)
+                earliest = min(earliest, delay["quantiles"][0])
                 latest = max(latest, delay["p95"]["value"])
             _draw_outcomes(right, lane, numbers)
             right.get_yticklabels()[lane].set_color(styles[rule]["color"])
@@ -1009,7 +1013,7 @@ def events_figure(metrics: _Metrics, path: str | Path) -> None:
         left.set_ylabel("slips found, %", fontsize=TEXT)
         left.set_title(role, loc="left", fontsize=11, fontweight="bold")
         right.set_xlim(0, 100)
-    left.set_xlim(0, 1.5 * latest)
+    left.set_xlim(earliest, 1.5 * latest)
     left.set_xlabel("time since the exact onset, ms (look-ahead within)", fontsize=TEXT)
     right.set_xlabel("of all slips, %", fontsize=TEXT)
     handles: list[Any] = [Line2D([], [], lw=2, label=rule, **styles[rule]) for rule in rules]
@@ -1114,7 +1118,7 @@ def scene_rows(metrics: _Metrics) -> list[_Row]:
             row |= {"quiet min": f"{60 * numbers['quiet_hours']:.0f}"}
             rate = _value(numbers["false_alarms_per_hour"], 1)
             row |= {f"{words(alarm['rule'])} /h": rate} | _event_cells(numbers, digits=0)
-            del row["p95 ms"]
+            del row["p95 ms"], row["from first release ms"]
             for name in beside:
                 row[f"{name} /h"] = _value(by_role[role][name]["false_alarms_per_hour"], 1)
             rows.append(row)

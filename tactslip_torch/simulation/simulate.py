@@ -4,8 +4,9 @@ Arm motion, contact, handling, vibration, imperfections, sensors, faults. Only t
 intervals of time that are asked for are computed; elements out of contact cost no friction.
 
 The hand's elements do not let go together. Its *onset* is when elements that carry half of the
-normal load have let go (the load-weighted median of their breakaways); its sliding ends when
-elements that carry half of it stick again. Both are read from the contact, not from the arm.
+normal load have let go (the load-weighted median of their breakaways), between the releases of the
+first and of the last one; its sliding ends when elements that carry half of it stick again. All are
+read from the contact, not from the arm.
 """
 
 from __future__ import annotations
@@ -63,6 +64,8 @@ class Timeline:
         annotated_onsets_s: the same as a person would mark it, with jitter.
         sliding_s: ``(onset, end)`` of each slide. With bristles a slide of a tacky material
             includes its stick phases.
+        released_s: of each slide, when its first and when its last element lets go. Bristles may
+            hold an element that carries little load: it never lets go and does not count.
         arm_s: ``(start, stop)`` of every stroke that the arm drives, sliding or not.
         non_slip_s: intervals without slip in which the hand is handled, ascending and apart: what
             a detector of motors or knocks would call slip.
@@ -76,6 +79,7 @@ class Timeline:
     onsets_s: tuple[float, ...]
     annotated_onsets_s: tuple[float, ...]
     sliding_s: tuple[tuple[float, float], ...]
+    released_s: tuple[tuple[float, float], ...]
     arm_s: tuple[tuple[float, float], ...]
     non_slip_s: tuple[tuple[float, float], ...] = ()
     slip_s: tuple[tuple[float, float], ...] = ()
@@ -231,6 +235,7 @@ def _recording(
         annotated_onsets_s=truth.annotated_onsets_s,
         non_slip_s=truth.non_slip_s,
         provenance=_provenance(scene, by),
+        released_s=truth.released_s,
     )
 
 
@@ -238,7 +243,8 @@ def _timeline(scene: Scene, grasp: Grasp, slips: Slips) -> Timeline:
     """The timeline of a scene whose contact is known."""
     touching = grasp.touching
     load_n = grasp.load_n[touching]
-    onsets_s = [_weighted_median(row[touching], load_n) for row in slips.start_s]
+    starts_s = slips.start_s[:, touching]
+    onsets_s = [_weighted_median(row, load_n) for row in starts_s]
     never = -np.inf  # for elements that did not slide
     ends_s = [_weighted_median(np.nan_to_num(r[touching], nan=never), load_n) for r in slips.end_s]
     jitter_s = 1e-3 * scene.disturbances.label_jitter_ms
@@ -253,6 +259,7 @@ def _timeline(scene: Scene, grasp: Grasp, slips: Slips) -> Timeline:
         onsets_s=tuple(onsets_s),
         annotated_onsets_s=tuple(np.maximum(np.minimum(marks_s, ends_s), 0.0).tolist()),
         sliding_s=tuple(zip(onsets_s, ends_s, strict=True)),
+        released_s=tuple((float(np.nanmin(row)), float(np.nanmax(row))) for row in starts_s),
         arm_s=tuple((stroke.start_s, stroke.stop_s) for stroke in scene.arm if stroke.drives),
         non_slip_s=Handled(scene, grasp).intervals_s(duration_s),
     )

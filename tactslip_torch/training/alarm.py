@@ -54,6 +54,7 @@ from tactslip_torch.onset.events import (
     EventRules,
     LatencyParts,
     Watched,
+    first_releases,
     pooled_metrics,
     recording_events,
 )
@@ -227,7 +228,8 @@ def watched(stream: Stream, decisions: Decisions) -> Watched:
     off = np.append(np.flatnonzero(~decisions.is_on.numpy()), len(available_s))
     ends = off[np.searchsorted(off, raised)]
     says_slip = available_s[np.flatnonzero(decisions.llr.numpy() > 0)]
-    first = np.append(says_slip, math.nan)[np.searchsorted(says_slip, times.onsets_s)]
+    releases_s = first_releases(times.onsets_s, times.released_s)
+    first = np.append(says_slip, math.nan)[np.searchsorted(says_slip, releases_s)]
     return Watched(
         recording=str(stream.recording),
         material=stream.recording.material,
@@ -240,6 +242,7 @@ def watched(stream: Stream, decisions: Decisions) -> Watched:
         speeds_mm_s=times.speeds_mm_s,
         first_positive_s=tuple(first.tolist()),
         alarm_ends_s=tuple(np.append(available_s, math.inf)[ends].tolist()),
+        released_s=times.released_s,
     )
 
 

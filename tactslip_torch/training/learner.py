@@ -32,6 +32,7 @@ from tactslip_torch.onset.events import (
     LatencyParts,
     RecordingEvents,
     Watched,
+    first_releases,
     pooled_metrics,
     recording_events,
 )
@@ -178,8 +179,8 @@ def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Watc
         before = seen[-1][1] if seen else -math.inf  # a hop may be longer than a bin
         seen.append((max(float(hops_s[0]) - bins.hop_s, before), float(hops_s[-1])))
     first = []
-    for number, onset_s in enumerate(times.onsets_s):
-        is_later = says_slip & (stroke == number) & (available_s >= onset_s)
+    for number, release_s in enumerate(first_releases(times.onsets_s, times.released_s)):
+        is_later = says_slip & (stroke == number) & (available_s >= release_s)
         first.append(next(iter(available_s[is_later].tolist()), math.nan))
     return Watched(
         recording=str(bins.recording),
@@ -196,6 +197,7 @@ def _watched(part: EvaluatedBins, k: int, n: int, latency: LatencyParts) -> Watc
         first_positive_s=tuple(first),
         watched_s=tuple(seen),
         alarm_ends_s=tuple(end for _, end in alarms),
+        released_s=times.released_s,
     )
 
 

@@ -64,6 +64,7 @@ TRUTH = (
     "sliding_s",
     "non_slip_s",
     "slip_s",
+    "released_s",
     "units",
     "provenance",
 )
@@ -88,6 +89,7 @@ def recording(samples=None, **changes):
         "annotated_onsets_s": (0.06, 1 / 3),
         "non_slip_s": ((0.01, 0.02),),
         "slip_s": ((0.25, 0.3),),
+        "released_s": ((0.3, 1 / 3), (0.1, 0.2)),
         "provenance": {"simulated": True, "note": 'a\nb: [c, {d}] & *e \\ "f" \''},
         "units": "mV",
     }
@@ -172,6 +174,21 @@ def test_what_goes_in_comes_out(tmp_path, ending, dtype):
             assert bits(torch.cat(parts, 1)) == bits(samples.contiguous())
             part = opened.samples.read(1500, 1600)
             assert bits(part) == bits(samples[:, 1500:1600].contiguous())
+
+
+@pytest.mark.parametrize("ending", ["npz", "csv"])
+def test_a_file_that_says_nothing_of_releases_is_read_as_before(tmp_path, ending):
+    form, path = named_format(ending), tmp_path / f"a.{ending}"
+    wanted, hand = recording(released_s=()), hand_of(["SG1", "SG2"])
+    form.save(path, wanted, hand, KEY)
+    if ending == "npz":
+        with np.load(path) as file:
+            assert "released_s" not in file
+    else:
+        text, said = path.read_text("utf-8"), '"released_s": [], '
+        assert text.count(said) == 1
+        path.write_text(text.replace(said, ""), "utf-8")
+    assert_truth(form.load(path), wanted, hand)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

@@ -47,16 +47,17 @@ def write(path: Path, samples: NDArray[Any], header: Mapping[str, Any]) -> None:
     """Write ``samples`` ``[C, T]`` and everything else as arrays of their own.
 
     Beside them: ``sample_rate_hz``, ``units``, ``material``, ``speeds_mm_s``, ``onsets_s``,
-    ``annotated_onsets_s``; ``sliding_s``, ``non_slip_s`` and, if there is any, ``slip_s`` (rows of
-    start and end); ``channel_name``, ``_kind``, ``_finger``, ``_segment`` and, if a kind does not
-    say it, ``_adapting`` (one per row of samples); ``provenance`` and ``key`` as JSON text.
+    ``annotated_onsets_s``; ``sliding_s``, ``non_slip_s`` and, if there are any, ``slip_s`` (rows of
+    start and end) and ``released_s`` (rows of first and last); ``channel_name``, ``_kind``,
+    ``_finger``, ``_segment`` and, if a kind does not say it, ``_adapting`` (one per row of
+    samples); ``provenance`` and ``key`` as JSON text.
     """
     content: dict[str, Any] = {"format": np.array(FORM), "samples": samples}
     content |= {name: np.array([header[name]], np.str_)[0] for name in _WORDS}
     content["sample_rate_hz"] = np.float64(header["sample_rate_hz"])
     content |= {name: np.array(header[name], np.float64) for name in MOMENTS}
     for name in STRETCHES:
-        if header[name] or name != "slip_s":
+        if header[name] or name not in ("slip_s", "released_s"):
             content[name] = np.array(header[name], np.float64).reshape(-1, 2)
     for name in ("provenance", "key"):
         content[name] = np.array(json.dumps(header[name], sort_keys=True))

@@ -345,7 +345,7 @@ MOST_HEADER = 16 * 2**20
 """Bytes of header text; a longer one is no header of ours."""
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 MOMENTS = ("speeds_mm_s", "onsets_s", "annotated_onsets_s")
-STRETCHES = ("sliding_s", "non_slip_s", "slip_s")
+STRETCHES = ("sliding_s", "non_slip_s", "slip_s", "released_s")
 
 
 def header_of(recording: Recording, hand: HandLayout, key: Mapping[str, Any]) -> dict[str, Any]:
@@ -450,6 +450,7 @@ def opened_from(
         if len(hand) != samples.num_channels:
             raise ValueError(f"{len(hand)} rows of channels for {samples.num_channels} channels")
         truth: dict[str, Any] = {name: tuple(map(float, header[name])) for name in MOMENTS}
+        header = {"released_s": (), **header}  # older files lack it
         for name in STRETCHES:
             truth[name] = tuple((float(start), float(end)) for start, end in header[name])
         recording = Recording(
