@@ -9,6 +9,7 @@ import json
 import shutil
 import subprocess
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from contract.names import STREAM_OUTPUTS
+from streams import onset_of
 from test_detector import random_detector
 
 from tactslip_torch import Scene, SlipDetector, simulate
@@ -48,8 +50,11 @@ def slipping_stream() -> np.ndarray:
 
 
 @cache
-def alarming_detector() -> SlipDetector:
-    """A detector nobody trained, of a seed and settings by which the stream raises some alarms."""
+def alarming_detector(with_onset: bool = False) -> SlipDetector:
+    """A detector nobody trained, of a seed and settings by which the stream raises some alarms.
+
+    With an onset classifier some are raised by it, and some by bins.
+    """
     detector = random_detector(seed=32)
     samples = torch.from_numpy(slipping_stream().T.copy()).double()
     scores = score_stream(detector, samples, HOP).score
@@ -63,6 +68,7 @@ def alarming_detector() -> SlipDetector:
         rearm_s=0.03,
         refractory_s=0.1,
         lead_s=0.02,
+        onset=onset_of(samples, detector.pool.hand, quantile=0.8) if with_onset else None,
     )
     detector.info[KEY] = settings.to_dict()
     return detector
@@ -80,23 +86,24 @@ def saved(path: Path, samples: np.ndarray) -> Path:
     return path
 
 
-_EXPORTED: dict[str, Path] = {}
+_EXPORTED: dict[tuple[str, bool], Path] = {}
 
 
-def exported(folder_factory: Any, precision: str = "float32") -> Path:
+def exported(folder_factory: Any, precision: str = "float32", *, with_onset: bool = False) -> Path:
     """A folder with ``model.onnx``, ``stream.onnx`` and their sidecars, made once in a session.
 
     Args:
         folder_factory: pytest's ``tmp_path_factory``.
         precision: of the graphs.
+        with_onset: whether the detector has an onset classifier.
     """
-    if precision not in _EXPORTED:
+    if (precision, with_onset) not in _EXPORTED:
         folder: Path = folder_factory.mktemp(f"exported_{precision}")
         with pytest.MonkeyPatch.context() as patch:  # the hosts are asked here, not the graph
             patch.setattr(export, "check_model", lambda *given: {"worst_sd": 0.0})
-            export.export_detector(alarming_detector(), folder, precision=precision)
-        _EXPORTED[precision] = folder
-    return _EXPORTED[precision]
+            export.export_detector(alarming_detector(with_onset), folder, precision=precision)
+        _EXPORTED[precision, with_onset] = folder
+    return _EXPORTED[precision, with_onset]
 
 
 def copied(model: Path, folder: Path) -> Path:
@@ -171,15 +178,24 @@ def _refuse(word: str) -> None:
 # The truth -------------------------------------------------------------------------------------
 
 
-def truth(samples: np.ndarray, threshold: float | None = None) -> list[dict[str, Any]]:
+def truth(
+    samples: np.ndarray, threshold: float | None = None, *, with_onset: bool = False
+) -> list[dict[str, Any]]:
     """Every decision of the detector on samples ``[T, C]``, as a host is to print it."""
-    detector = alarming_detector()
+    detector = alarming_detector(with_onset)
     settings = AlarmSettings.of(detector)
-    if threshold is not None:
-        settings = AlarmSettings.from_dict(settings.to_dict() | {"threshold": threshold})
+    if threshold is not None and settings.onset:
+        settings = replace(settings, onset=replace(settings.onset, threshold=threshold))
+    elif threshold is not None:
+        settings = replace(settings, threshold=threshold)
     decisions = StreamingDetector(detector, settings, dtype=torch.float64).push(samples)
     columns = [getattr(decisions, field).tolist() for field in STREAM_OUTPUTS.values()]
-    return [dict(zip(STREAM_OUTPUTS, row, strict=True)) for row in zip(*columns, strict=True)]
+    rows = [dict(zip(STREAM_OUTPUTS, row, strict=True)) for row in zip(*columns, strict=True)]
+    if with_onset:
+        kinds = {alarm.alarm_s: alarm.raised_by for alarm in decisions.alarms}
+        for row, score in zip(rows, decisions.onset_score.tolist(), strict=True):
+            row |= {"onset_score": score, "raised_by": kinds.get(row["time_s"])}
+    return rows
 
 
 ALARM_KEYS = ("time_s", "onset_s", "score", "probability", "valid")
@@ -201,7 +217,10 @@ def assert_same(ran: Ran, expected: list[dict[str, Any]], *, exact: bool = False
             assert line[name] is row[name], (name, line, row)
         for name in ("time_s", "onset_s"):
             assert abs(line[name] - row[name]) < 1e-9, (name, line, row)
+        assert line.get("raised_by") == row.get("raised_by"), (line, row)
+        assert abs(line.get("onset_score", 0) - row.get("onset_score", 0)) < 1e-9, (line, row)
         for name, bound in bounds.items():
-            assert abs(line[name] - row[name]) <= bound, (name, line, row)
+            nearly = bound + 1e-7 * abs(row[name])  # before the first bin the statistic is -1e30
+            assert abs(line[name] - row[name]) <= nearly, (name, line, row)
     assert ran.summary["decisions"] == len(expected)
     assert ran.summary["alarms"] == sum(row["alarm"] for row in expected)

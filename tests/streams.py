@@ -2,11 +2,12 @@
 
 import numpy as np
 import torch
-from small_detector import small_detector
+from small_detector import HAND, small_detector
 
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.signals.filtering import ChannelFilter
 
 
@@ -34,3 +35,19 @@ def detector_of(kind="all", align="centred", backend="auto"):
     ranges = FeatureScaler(scaler.minimum[kept], scaler.maximum[kept])
     selected = [whole.selected[i] for i in kept]
     return SlipDetector(whole.pool, layer, selected, ranges, part, backend=backend)
+
+
+def onset_of(samples, hand=HAND, seed=0, quantile=0.9, rate_hz=2000.0, hop=10):
+    """A classifier of fast evidence, drawn, that so many hops of ``samples [C, T]`` speak against.
+
+    The mains are such that the comb has a part of a sample.
+    """
+    rng = np.random.default_rng(seed)
+    evidence = OnsetEvidence(hand, rate_hz, hop, (1e-4,) * 4, (1e-3,) * 6, 60.0, 2)
+    columns, _ = evidence.columns(evidence.blocks_of_recording(samples))
+    scaler, num = FeatureScaler.fit(columns), evidence.num_columns
+    bend, linear = rng.standard_normal((num, num)) / num, rng.standard_normal(num)
+    numbers = bend + bend.T, linear, np.array(0.1)
+    head = QuadraticForm(*map(torch.from_numpy, numbers))
+    threshold = float(head(scaler(columns)).quantile(quantile))
+    return OnsetClassifier(evidence, scaler, head, threshold, lead_s=0.004)

@@ -1,4 +1,4 @@
-"""The stages behind the fit: who calibrates, which rate is kept; evaluated streams set nothing."""
+"""Stages behind the fit: who calibrates, which budgets are kept; evaluated streams set nothing."""
 
 import json
 import math
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
+from scipy.stats import beta, chi2
 from small_detector import small_detector
 from small_set import RATE_HZ, SMALL_HAND
 from test_commands import composed
@@ -21,13 +22,15 @@ from tactslip_torch.model.calibration import Isotonic, Platt
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.kernels import QuadraticForm
 from tactslip_torch.model.scaling import FeatureScaler
-from tactslip_torch.onset.decisions import KEY, AlarmSettings, Decider
+from tactslip_torch.onset.decisions import KEY, AlarmSettings, Decider, score_stream
+from tactslip_torch.onset.events import EventRules, LatencyParts, recording_events
+from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.onset.rules import Cusum, KOfN
-from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.report.results import alarm_figure, alarm_table, scene_rows
 from tactslip_torch.signals.filtering import ChannelFilter
 from tactslip_torch.training.alarm import (
     FIRST_TRANSITION,
+    JOINT,
     LEAST,
     MOST,
     OURS,
@@ -40,18 +43,21 @@ from tactslip_torch.training.alarm import (
     score_streams,
     watched,
 )
+from tactslip_torch.training.onset import OnsetTraining
 
-RULES = {
-    "cusum": {"name": "cusum", "drift": 0.5, "evidence": 0.4},
-    "k_of_n": {"name": "k_of_n", "k": 2, "n": 3},
-}
+RULE = {"name": "cusum", "drift": 0.5, "evidence": 0.4}
+LEARNED = OnsetTraining(penalties=(1.0,), comb_periods=(1,))
 TRAINED = [RecordingId(m, 0, s) for m in ("a", "b") for s in ("paper", "held")]
 TIMING = Timing(RATE_HZ, 20, 100, 25)
+SCENES = ("paper", "held", "taps")
+BARE = {"held": 1e6}
 
 
-def times_of(duration_s=3.0, slides=(), released_s=()):
+def times_of(duration_s=3.0, slides=(), released_s=(), non_slip_s=()):
     return SimpleNamespace(
         duration_s=duration_s,
+        non_slip_s=non_slip_s,
+        slip_s=(),
         onsets_s=tuple(start for start, _ in slides),
         sliding_s=tuple(slides),
         speeds_mm_s=(20.0,) * len(slides),
@@ -60,7 +66,7 @@ def times_of(duration_s=3.0, slides=(), released_s=()):
 
 
 class Streams:
-    """Noise that is louder in slides, with a knock now and then; two materials seen, one not."""
+    """Noise with a burst at onsets, louder in slides, with two knocks in taps; one material new."""
 
     is_simulated = True
     hand = SMALL_HAND
@@ -76,7 +82,9 @@ class Streams:
         self.gain_of = gain_of or (lambda recording: 1.0)
 
     def timeline(self, recording):
-        return times_of(slides=((2.1, 2.9),) if recording.scene == "paper" else ())
+        knocks = ((1.2, 1.3), (2.0, 2.1)) if recording.scene == "taps" else ()
+        slides = ((2.1, 2.9),) if recording.scene == "paper" else ()
+        return times_of(slides=slides, non_slip_s=knocks)
 
     def key(self, recording):
         return {"id": str(recording)}
@@ -86,9 +94,12 @@ class Streams:
         generator = torch.Generator().manual_seed(sum(str(recording).encode()) * 7919)
         noise = torch.randn(2, round(times.duration_s * RATE_HZ), generator=generator)
         for start_s, end_s in times.sliding_s:
-            noise[:, round(start_s * RATE_HZ) : round(end_s * RATE_HZ)] *= 2.0
-        knock = int(torch.randint(300, 4000, (1,), generator=generator))
-        noise[1, knock : knock + 60] *= 3.0
+            onset = round(start_s * RATE_HZ)
+            noise[:, onset : round(end_s * RATE_HZ)] *= 2.0
+            noise[:, onset : onset + 60] *= 2.0
+        for start_s, _ in times.non_slip_s:
+            knock = round(start_s * RATE_HZ) + 20
+            noise[1, knock : knock + 60] *= 3.0
         noise *= self.gain_of(recording)
         return Recording(
             noise, RATE_HZ, recording.material, times.speeds_mm_s, times.onsets_s, times.sliding_s
@@ -111,18 +122,24 @@ def loudness_detector() -> SlipDetector:
 def stage(streams=None, **changes) -> CalibratedAlarm:
     values = {
         "streams": streams or Streams(),
+        "classifier": LEARNED,
+        "learn_scenes": ["paper", "held"],
+        "learn_cycles": 1,
+        "budget": {"held": 2000.0, "taps_share": 0.6},
+        "hours": {"held": 11 / 3600, "taps": 8 / 3600},
+        "check_hours": 10.0,
+        "check_slip_free_hours": 10.0,
         "hop_ms": 25.0,
-        "false_alarms_per_hour": 300.0,
-        "hours": 10.0,
         "slip_free": "held",
-        "rules": RULES,
-        "rule": "cusum",
+        "rule": RULE,
     }
     return CalibratedAlarm(**(values | changes))
 
 
-class Backwards:
-    """A baseline that scores low in slips."""
+class Louder:
+    """A baseline: the same score, at a hop of its own."""
+
+    hop_samples = 25
 
     def __init__(self, detector: SlipDetector) -> None:
         self.pool, self.channel_filter = detector.pool, detector.channel_filter
@@ -130,63 +147,97 @@ class Backwards:
         self._detector = detector
 
     def predict(self, bins, *, given=None):
-        found = self._detector.predict(bins, given=given)
-        return found._replace(score=-found.score)
+        return self._detector.predict(bins, given=given)
 
 
 @pytest.fixture(scope="module")
 def calibrated():
-    """A detector with its alarm, and the report; a baseline that is backwards is left out."""
+    """A detector with its alarm, and the report."""
     detector = loudness_detector()
-    found = stage()(detector, {"quiet": Backwards(loudness_detector())}, num_workers=0)
-    assert "quiet" not in found["methods"]
+    found = stage()(detector, {"loud": Louder(loudness_detector())}, num_workers=0)
     return detector, found
 
 
-def quiet_of(detector):
-    return [r for r in stage().roles(detector)["calibrate"] if r.scene == "held"]
-
-
 # ------------------------------------------------------------------------------- who calibrates
-def test_half_of_the_fresh_cycles_calibrate_and_nothing_trained_on_has_a_role():
-    roles = stage().roles(loudness_detector())
-    assert not set(TRAINED) & {r for own in roles.values() for r in own}
-    calibrate, test, unseen = roles["calibrate"], roles["test"], roles["unseen"]
-    assert {r.scene for r in calibrate} == {"paper", "held"}
-    assert {r.material for r in unseen} == {"new"}
-    assert len(unseen) == 18
-    for material in ("a", "b"):
-        for scene in ("paper", "held"):
-            own = sorted(r.cycle for r in calibrate if (r.material, r.scene) == (material, scene))
-            others = sorted(r.cycle for r in test if (r.material, r.scene) == (material, scene))
-            assert (own, others) == ([1, 3, 5], [2, 4])
-    assert sum(r.scene == "taps" for r in test) == 12
+def test_fresh_recordings_learn_then_calibrate_then_test_and_held_out_ones_test_alone():
+    """Of 3 s each: 4 of held make up 11 s, and 3 of taps 8 s; the first cycle was trained on."""
+    made = stage(check_hours=17 / 3600, check_slip_free_hours=8 / 3600)
+    roles = made.roles(loudness_detector())
+    of = {
+        role: {scene: [(r.cycle, r.material) for r in own if r.scene == scene] for scene in SCENES}
+        for role, own in roles.items()
+    }
+
+    def pairs(*cycles):
+        return [(cycle, material) for cycle in cycles for material in "ab"]
+
+    new = [(cycle, "new") for cycle in range(6)]
+    assert (
+        of
+        == {
+            "learn": {"paper": pairs(1), "held": pairs(1), "taps": []},
+            "calibrate": {"paper": pairs(2, 4), "held": pairs(2, 3), "taps": pairs(0, 1)[:3]},
+            "test": {
+                "paper": pairs(3, 5),  # every other cycle
+                "held": pairs(4, 5)[:3],  # until 8 s are there
+                "taps": [(1, "b"), *pairs(2, 3), (4, "a")],  # until 17 s are there
+            },
+            "unseen": {"paper": new, "held": new[:3], "taps": new},
+        }
+    )
 
 
-def test_hours_bound_the_slip_free_recordings_of_each_role_and_too_few_are_told(caplog):
-    roles = stage(hours=4.5 / 3600).roles(loudness_detector())  # recordings of 3 s
-    assert [sum(r.scene == "held" for r in own) for own in roles.values()] == [2, 2, 2]
+def test_too_few_hours_are_told_and_a_scene_without_any_is_refused(caplog):
+    stage().roles(loudness_detector())
     assert not caplog.text
-    stage(hours=1.0).roles(loudness_detector())
-    assert "calibrate has 0.01 h of held, onset.hours=1 were asked for" in caplog.text
+    stage(hours={"held": 1.0, "taps": 8 / 3600}).roles(loudness_detector())
+    assert "0.01 h of held are left to calibrate on, onset.hours asks for 1: give" in caplog.text
     with pytest.raises(ValueError, match="no recording of scene paper that was not trained on"):
-        stage(Streams(cycles=1)).roles(loudness_detector())
+        stage(Streams(cycles=2), budget=BARE, learn_scenes=["paper"]).roles(loudness_detector())
+
+
+class Unread(Streams):
+    def load(self, recording, windows=None):
+        raise AssertionError("nothing is to be read")
+
+
+@pytest.mark.parametrize(
+    ("budget", "match"),
+    [
+        ({"held": 10.0}, r"0\.00333 h of held cannot show a rate of at most 10 .* 0\.3 h"),
+        ({"held": 2000.0, "taps_share": 0.1}, "6 knocks of taps cannot .* give at least 29 knocks"),
+        ({"held": 2000.0, "paper": 5.0}, "0.00333 h of paper cannot show a rate of at most 5"),
+    ],
+)
+def test_a_budget_that_cannot_be_shown_is_refused_before_anything_is_read(budget, match):
+    with pytest.raises(ValueError, match=match) as caught:
+        stage(Unread(), budget=budget)(loudness_detector(), num_workers=0)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("made", "changes", "match"),
     [
-        (stage, {"rule": "best"}, "onset.rule must be one of cusum, k_of_n, got 'best'"),
         (stage, {"calibration": "none"}, "calibration must be one of platt, isotonic, got 'none'"),
         (stage, {"hop_ms": 0.0}, "onset.hop_ms must be a positive finite number, got 0"),
         (stage, {"hop_ms": 0.3}, r"onset\.hop_ms=0\.3 is 0\.6 samples at 2000 Hz"),
-        (stage, {"hours": math.inf}, "onset.hours must be a positive finite number, got inf"),
-        (stage, {"rules": {"cusum": {"name": "sum"}}}, "no sequential rule is called 'sum'"),
-        (stage, {"rules": {"cusum": {"drift": 1.0}}}, "no sequential rule is called None"),
-        (stage, {"level": 2.0}, "onset.level must lie between 0 and 1, got 2"),
+        (stage, {"check_hours": math.inf}, "onset.check_hours must be a positive finite number"),
+        (stage, {"learn_cycles": 0}, "onset.learn_cycles must be a positive whole number, got 0"),
+        (stage, {"rule": {"name": "sum"}}, "no sequential rule is called 'sum'"),
+        (stage, {"rule": {"drift": 1.0}}, "no sequential rule is called None"),
+        (stage, {"level": 2.0}, "onset.level must lie between 0 and 1"),
+        (stage, {"found": 1.0}, "onset.found must lie between 0 and 1"),
+        (stage, {"confidence": 1.0}, "onset.confidence must lie between 0 and 1, got 1"),
         (stage, {"slip_share": 0.0}, "onset.slip_share must lie between 0 and 1, got 0"),
         (stage, {"rearm_s": -1.0}, "onset.rearm_s must be a finite number of at least 0, got -1"),
-        (stage, {"slip_free": "heldd"}, "onset.slip_free must be a scene of .* held, paper, taps"),
+        (stage, {"slip_free": "heldd"}, "no scene 'heldd', it has held, paper, taps; take it out"),
+        (stage, {"hours": {"tap": 1.0}}, "onset.streams has no scene 'tap'"),
+        (stage, {"learn_scenes": ["tap"]}, "onset.streams has no scene 'tap'"),
+        (stage, {"budget": BARE | {"tap": 1.0}}, "onset.streams has no scene 'tap'"),
+        (stage, {"budget": BARE | {"taps": 0.0}}, "onset.budget of taps must be positive, got 0"),
+        (stage, {"budget": BARE | {"taps_share": 1.5}}, "taps must be between 0 and 1, got 1.5"),
+        (stage, {"budget": {"taps": 1.0}}, "onset.budget must say what held may have, an hour"),
+        (stage, {"budget": {"held_share": 0.5}}, "onset.budget must say what held may have"),
         (DebouncedAlarm, {"k": 4}, "k must lie between 1 and n"),
         (DebouncedAlarm, {"k": "a"}, "onset.k must be a positive whole number, got 'a'"),
         (DebouncedAlarm, {"n": 2.5}, "onset.n must be a positive whole number, got 2.5"),
@@ -200,61 +251,98 @@ def test_bad_settings_are_refused_in_one_line(made, changes, match):
     assert "\n" not in str(caught.value)
 
 
-# ------------------------------------------------------------------------------ which rate is kept
-def test_alarms_of_calibrating_streams_are_those_of_the_curve_and_keep_the_rate(calibrated):
+# --------------------------------------------------------------------------- budgets of the file
+def recounted(detector, settings, scene):
+    """False alarms and quiet hours of what calibrates, one by one, by the rules of events."""
+    alarms, hours, source = 0, 0.0, Streams()
+    latency = LatencyParts(detector.look_ahead / RATE_HZ, 0.05)
+    for recording in stage().roles(detector)["calibrate"]:
+        if recording.scene == scene:
+            samples = source.load(recording).samples
+            scores = score_stream(detector, samples, settings.hop_samples)
+            decider = Decider(settings, RATE_HZ, 100, detector.look_ahead)
+            bins = decider.decide(scores.score, scores.is_valid)
+            made = decider.join(bins, settings.onset.score_recording(samples))
+            none = torch.empty(0)
+            stream = Stream(recording, source.timeline(recording), none, none, none, none)
+            found = recording_events(watched(stream, made), EventRules(), latency)
+            alarms, hours = alarms + len(found.false_alarms_s), hours + found.quiet_s / 3600
+    return alarms, hours
+
+
+def test_the_alarm_of_the_file_keeps_every_budget_and_bins_at_most_half_of_each(calibrated):
+    detector, _ = calibrated
+    settings = AlarmSettings.of(detector)
+    bins_alone = replace(settings, onset=replace(settings.onset, threshold=math.inf))
+    rows = {row["scene"]: row for row in settings.metadata["budget"]}
+    # 12 s at 2000 an hour are 6.67 alarms, and 2 show up to 6.30; of 6 knocks one shows 0.58
+    assert {scene: row["allowed"] for scene, row in rows.items()} == {"held": 2, "taps": 1}
+    assert rows["held"]["amount"] == pytest.approx(12 / 3600)
+    assert rows["taps"]["amount"] == 6
+    for scene, row in rows.items():
+        alarms, hours = recounted(detector, settings, scene)
+        assert row["alarms"] == alarms <= row["allowed"]
+        assert row["bound"] <= row["limit"]
+        assert recounted(detector, bins_alone, scene)[0] <= row["allowed"] // 2
+    assert hours == pytest.approx(9 / 3600)
+    told = settings.metadata["calibrated"]
+    assert (told["rate"]["alarms"], told["reached"]) == (rows["held"]["alarms"], True)
+
+
+def test_thresholds_of_the_curve_give_its_rates(calibrated):
     detector, found = calibrated
     settings = AlarmSettings.of(detector)
     curve = settings.metadata["threshold_curve"]
     assert found["settings"]["metadata"]["threshold_curve"] == curve
-    assert 3 <= len(curve) <= 25
+    assert 1 <= len(curve) <= 25
     thresholds, rates = zip(*curve, strict=True)
     assert list(thresholds) == sorted(set(thresholds))
     assert list(rates) == sorted(set(rates), reverse=True)
     assert LEAST <= rates[-1] <= rates[0] <= MOST
-    rate = found["settings"]["metadata"]["calibrated"]["rate"]
-    assert rate["alarms"] <= math.floor(300.0 * rate["hours"])
-    middle = curve[len(curve) // 2]
-    for threshold, expected in (middle, (settings.threshold, rate["per_hour"])):
-        rule = replace(settings.rule, ceiling=max(settings.rule.ceiling, threshold))
-        alarms = hours = 0
-        for recording in quiet_of(detector):
-            live = StreamingDetector(detector, replace(settings, rule=rule, threshold=threshold))
-            for made in (live.push(Streams().load(recording).samples.T), live.flush()):
-                alarms += len(made.alarms)
-                hours += len(made.number) * live.hop_s / 3600
-        assert alarms / hours == pytest.approx(expected)
+    for threshold, rate in curve:
+        at = replace(settings, onset=replace(settings.onset, threshold=threshold))
+        alarms, hours = recounted(detector, at, "held")
+        assert alarms / hours == pytest.approx(rate)
 
 
 def test_evaluated_streams_set_nothing():
-    few, plain = {"rules": {"cusum": RULES["cusum"]}}, loudness_detector()
-    roles = stage(Streams(cycles=3)).roles(plain)
-    evaluated, calibrating = {*roles["test"], *roles["unseen"]}, set(roles["calibrate"])
-    thresholds = []
-    for louder in (set(), evaluated, calibrating):
-        source = Streams(lambda r, of=louder: 1.3 if r in of else 1.0, cycles=3)
-        stage(source, **few)(plain, num_workers=0)
-        thresholds.append(plain.info[KEY]["threshold"])
-    assert thresholds[0] == thresholds[1] != thresholds[2]
+    plain, made = loudness_detector(), []
+    roles = stage().roles(plain)
+    evaluated = {*roles["test"], *roles["unseen"]}
+    for louder in (set(), evaluated, set(roles["calibrate"]), set(roles["learn"])):
+        source = Streams(lambda r, of=louder: 1.3 if r in of else 1.0)
+        stage(source)(plain, num_workers=0)
+        made.append(plain.info[KEY])
+    none, of_evaluated, of_calibrating, of_learning = made
+    assert of_evaluated == none
+    assert of_calibrating["threshold"] != none["threshold"] == of_learning["threshold"]
+    assert of_calibrating["onset"]["linear"] == none["onset"]["linear"]
+    assert of_learning["onset"]["linear"] != none["onset"]["linear"]
 
 
 def test_slips_are_found_in_time_and_all_is_told_in_plain_json(calibrated, tmp_path):
     detector, found = calibrated
     assert json.loads(json.dumps(found, allow_nan=False)) == found
-    ours = found["events"]["test stream"]["cusum"]
+    assert (found["rule"], found["methods"][JOINT]["onset"]) == (JOINT, True)
+    ours = found["events"]["test stream"][JOINT]
     assert ours["num_onsets"] == ours["num_found"] + ours["num_early"] == 4
-    assert 0 < ours["delay_ms"]["median"]["value"] < 500
-    assert set(found["events"]["unseen stream"]) == {*RULES, FIRST_TRANSITION}
+    assert 0 < ours["delay_ms"]["median"]["value"] < 60  # a bin with its look-ahead
+    assert set(found["events"]["unseen stream"]) == {JOINT, "cusum", FIRST_TRANSITION, "loud"}
     assert found["scenes"]["taps"]["trained"] is False
-    assert found["scenes"]["taps"]["test"]["cusum"]["quiet_hours"] == pytest.approx(36 / 3600)
+    assert set(found["scenes"]["taps"]) == {"trained", "test", "unseen"}
+    assert found["scenes"]["taps"]["test"][JOINT]["quiet_hours"] == pytest.approx(27 / 3600)
     assert found["streams"]["calibrate"]["held"] == pytest.approx(
-        {"recordings": 6, "hours": 18 / 3600, "slips": 0}
+        {"recordings": 4, "hours": 12 / 3600, "slips": 0}
     )
+    assert set(found["streams"]) == {"learn", "calibrate", "test", "unseen"}
+    assert found["classifier"]["tried"][0]["found"] > 0
     assert found["reliability"]["test stream"]["ece"] < 0.2
     assert set(found["reliability"]["test stream"]["per_material"]) == {"a", "b"}
     settings = AlarmSettings.of(detector)
     assert settings.rule.ceiling == pytest.approx(1.5 * settings.threshold)
     detector.save(tmp_path / "detector.pt")
-    assert AlarmSettings.of(SlipDetector.load(tmp_path / "detector.pt")) == settings
+    read = AlarmSettings.of(SlipDetector.load(tmp_path / "detector.pt"))
+    assert read.to_dict() == settings.to_dict() == found["settings"]
     with pytest.raises(ValueError, match=r"no alarm threshold; train with \+exp=onset"):
         AlarmSettings.of(loudness_detector())
     metrics = {"simulated": True, "events": found["events"], "alarm": found}
@@ -265,26 +353,68 @@ def test_slips_are_found_in_time_and_all_is_told_in_plain_json(calibrated, tmp_p
     assert (tmp_path / "alarm.png").stat().st_size > 10_000
 
 
+def test_rows_of_budgets_are_alarms_beside_hours_or_knocks_with_intervals(calibrated):
+    _, found = calibrated
+    for row in found["budget"]:
+        role, alarms = row["role"], row["alarms"]
+        if row["is_share"]:
+            numbers, amount = found["scenes"]["taps"][role], 2 * {"test": 9, "unseen": 6}[role]
+        else:
+            numbers = found["events"][f"{role} stream"]
+            numbers = {name: own["per_scene"]["held"] for name, own in numbers.items()}
+            amount = 3 / 3600 * {"test": 4, "unseen": 6}[role]
+        assert row["amount"] == pytest.approx(amount)
+        assert alarms == numbers[row["method"]]["num_false_alarms"]
+        if row["is_share"]:
+            low = beta.ppf(0.025, alarms, amount - alarms + 1) if alarms else 0.0
+            high = beta.ppf(0.975, alarms + 1, amount - alarms) if alarms < amount else 1.0
+        else:
+            low = chi2.ppf(0.025, 2 * alarms) / 2 / amount if alarms else 0.0
+            high = chi2.ppf(0.975, 2 * alarms + 2) / 2 / amount
+        if not row["is_share"] or alarms <= amount:
+            assert (row["low"], row["high"]) == pytest.approx((low, high))
+    kinds = {(row["role"], row["scene"], row["method"]) for row in found["budget"]}
+    assert len(kinds) == len(found["budget"]) == 2 * 2 * 4
+
+
 def test_the_papers_rule_is_left_out_where_its_hop_cannot_be():
     detector, timing = loudness_detector(), Timing(RATE_HZ, 40, 100, 25)
-    made = stage(hop_ms=20.0)
-    own = score_streams(made.streams, made.roles(detector)["calibrate"], {OURS: detector}, 40, 0)
-    assert set(made.methods(own, {OURS: timing})) == set(RULES)
+    made, onset = stage(hop_ms=20.0), onset_of()
+    calibrate = made.roles(detector)["calibrate"]
+    own = score_streams(made.streams, calibrate, {OURS: detector}, {OURS: 40}, onset, 0)
+    assert set(made.methods(own, {OURS: timing}, onset)) == {JOINT, "cusum"}
 
 
 def test_evidence_left_open_is_hop_by_bin():
-    rules = {"open": {"name": "cusum", "evidence": None}, "cusum": RULES["cusum"]}
-    made = stage(rules=rules).made_rules(100)
-    assert (made["open"].evidence, made["cusum"].evidence) == (0.5, 0.4)
+    assert stage(rule={"name": "cusum", "evidence": None}).made_rule(100).evidence == 0.5
+    assert stage().made_rule(100).evidence == 0.4
 
 
 # -------------------------------------------------------------------------- streams and decisions
-def stream_of(score, slides=(), number=0, duration_s=2.0, is_usable=None) -> Stream:
+def onset_of() -> OnsetClassifier:
+    """A machine that nobody trained."""
+    evidence = OnsetEvidence(SMALL_HAND, RATE_HZ, 10)
+    ones = torch.ones(evidence.num_columns, dtype=torch.float64)
+    head = QuadraticForm(torch.zeros(0, 0).double(), ones, torch.tensor(0.0).double())
+    return OnsetClassifier(evidence, FeatureScaler(-ones, ones), head, math.inf)
+
+
+def stream_of(
+    score,
+    slides=(),
+    number=0,
+    duration_s=2.0,
+    is_usable=None,
+    scene="held",
+    onset=(),
+    **times,
+) -> Stream:
     score = torch.as_tensor(score, dtype=torch.float32)
     valid = torch.ones(len(score), dtype=torch.bool)
     usable = valid if is_usable is None else torch.tensor(is_usable)
-    recording = RecordingId("a", number, "held")
-    return Stream(recording, times_of(duration_s, slides), score, valid, usable)
+    recording = RecordingId("a", number, scene)
+    hops = torch.as_tensor(onset, dtype=torch.float64)
+    return Stream(recording, times_of(duration_s, slides, **times), score, valid, usable, hops)
 
 
 def settings_of(rule=None, hop=20, **changes) -> AlarmSettings:
@@ -305,7 +435,7 @@ def knocked(number: int) -> Stream:
 def test_the_rule_of_the_file_keeps_the_rate_not_one_like_it():
     """A sum that gets its ceiling after its threshold was set re-arms sooner, and alarms more."""
     streams = [knocked(number) for number in range(30)]
-    made = stage(false_alarms_per_hour=100.0, rearm_s=0.05, refractory_s=0.0)
+    made = stage(budget={"held": 100.0}, rearm_s=0.05, refractory_s=0.0)
     settings = made.calibrated(Cusum(1.0, 0.2), Platt(2.0, 0.0), streams, TIMING)
 
     def alarms(settings):
@@ -318,13 +448,74 @@ def test_the_rule_of_the_file_keeps_the_rate_not_one_like_it():
 
 def test_a_calibration_that_ends_bounds_the_threshold():
     flat = Isotonic((-1.0, 0.4), (-3.0, 2.0))  # every knock is beyond its last knot
-    made = stage(false_alarms_per_hour=1.0, rearm_s=0.05, refractory_s=0.0)
+    made = stage(budget={"held": 1.0}, rearm_s=0.05, refractory_s=0.0)
     streams = [knocked(number) for number in range(5)]
     settings = made.calibrated(KOfN(2, 3), flat, streams, TIMING)
     assert settings.threshold <= 2.0  # slips can still be found,
     told = settings.metadata["calibrated"]
     assert told["reached"] is False  # and it is told that the rate is not kept
     assert told["rate"]["alarms"] > 0
+
+
+def joint_streams(num=24):
+    """Double knocks in held and taps, noise of fast evidence, and slips that it finds late."""
+    streams, rng = [], np.random.default_rng(5)
+    for number in range(num):
+        scene = ("held", "taps", "paper")[number % 3]
+        slides, times, onset = [], {}, rng.standard_normal(2000)
+        if scene == "taps":
+            times = {"non_slip_s": ((1.0, 1.1),) * 5}
+            onset[rng.integers(0, 2000, 5)] += 3
+        if scene == "paper":
+            slides = [(4.0, 5.0)]
+            onset[802] = 30.0  # the hop that ends at 4.015 s
+        score = knocked(number).score
+        streams.append(stream_of(score, slides, number, 10.0, None, scene, onset, **times))
+    return streams
+
+
+@pytest.mark.parametrize("rule", [Cusum(1.0, 0.2), KOfN(2, 3)], ids=lambda rule: rule.name)
+def test_joint_thresholds_are_the_lowest_that_keep_every_budget(rule):
+    streams = joint_streams()
+    made = stage(
+        budget={"held": 400.0, "taps_share": 0.3, "paper": 500.0}, rearm_s=0.05, refractory_s=0.0
+    )
+    settings = made.joined(rule, Platt(2.0, 0.0), onset_of(), streams, TIMING)
+    latency = LatencyParts(25 / RATE_HZ, 0.05)
+
+    def alarms(settings):
+        counts = dict.fromkeys(SCENES, 0)
+        for stream in streams:
+            decider = Decider(settings, RATE_HZ, 100, 25)
+            bins = decider.decide(stream.score, stream.is_valid)
+            seen = watched(stream, decider.join(bins, stream.onset_score))
+            found = recording_events(seen, EventRules(), latency)
+            counts[stream.recording.scene] += len(found.false_alarms_s)
+        return counts
+
+    def is_kept(counts, share=1.0):
+        return all(counts[scene] <= int(share * most) for scene, most in allowed.items())
+
+    # 80 s at 400 an hour: 8.9, 4 show 9.15 and 3 show 7.75; 40 knocks at 0.3: 6 show 0.28, 7 0.31
+    # 80 s less the slips' windows (3.8 to 5.11 s) at 500: 9.6, and 4 show 9.15
+    allowed = {"held": 3, "taps": 6, "paper": 4}
+    assert {row["scene"]: row["allowed"] for row in settings.metadata["budget"]} == allowed
+    told = {row["scene"]: row["alarms"] for row in settings.metadata["budget"]}
+    assert told == alarms(settings)
+    assert is_kept(told)
+    onset = settings.onset
+    assert is_kept(alarms(replace(settings, onset=replace(onset, threshold=math.inf))), share=0.5)
+    values = torch.cat([stream.onset_score for stream in streams])
+    below = float(values[values < onset.threshold].max())
+    assert not is_kept(alarms(replace(settings, onset=replace(onset, threshold=below))))
+    assert onset.lead_s == pytest.approx(0.015)
+
+
+def test_a_sum_that_is_never_positive_in_quiet_does_not_stand_for_ever():
+    quiet = [stream_of(np.full(194, -5.0), number=n, onset=np.zeros(400)) for n in range(2)]
+    made = stage(budget={"held": 1e5})
+    settings = made.joined(Cusum(1.0, 0.2), Platt(2.0, 0.0), onset_of(), quiet, TIMING)
+    assert settings.threshold > 0
 
 
 def test_a_threshold_that_is_never_reached_is_refused():
@@ -425,7 +616,7 @@ def test_a_debounced_hop_is_half_a_bin_or_so_many_milliseconds():
 
 # --------------------------------------------------------------------------------- the experiment
 @pytest.mark.slow
-def test_the_experiment_has_ten_hours_to_set_the_alarm_and_as_many_to_check_it():
+def test_the_experiment_has_ten_hours_to_set_the_alarm_and_all_scenes_to_check_it(caplog):
     config = composed("+exp=onset")
     source: RecordingSource = instantiate(config.data, _convert_="all")
     (fold,) = instantiate(config.split, _convert_="all")(source.ids)
@@ -436,15 +627,17 @@ def test_the_experiment_has_ten_hours_to_set_the_alarm_and_as_many_to_check_it()
     }
     whole: CalibratedAlarm = instantiate(config.onset, _convert_="all")
     roles = whole.roles(SimpleNamespace(info=info))
+    assert not caplog.text  # there are as many hours as were asked for
     assert {r.material for r in roles["unseen"]} == {"iron", "cloth", "copper", "wood"}
     used = {recording for own in roles.values() for recording in own}
     assert len(used) == sum(map(len, roles.values()))
     for recording in used.intersection(trained):  # of the same name, but another recording
         assert cache_key(whole.streams.key(recording)) != cache_key(source.key(recording))
-    for own in roles.values():
-        quiet = [r for r in own if r.scene == "held"]
-        assert sum(whole.streams.timeline(r).duration_s for r in quiet) >= 36_000
-    assert {"taps", "machine", "mains_bursts", "dead_channel"} <= {r.scene for r in roles["test"]}
+    quiet = [r for r in roles["calibrate"] if r.scene == "held"]
+    assert sum(whole.streams.timeline(r).duration_s for r in quiet) >= 36_000
+    scenes = {role: {r.scene for r in own} for role, own in roles.items()}
+    assert scenes["learn"] == set(whole.learn_scenes)
+    assert {"taps", "machine", "mains_bursts", "dead_channel"} <= scenes["test"]
 
 
 def test_one_alarm_for_several_detectors_is_refused_before_the_fit(tmp_path):
@@ -455,7 +648,8 @@ def test_one_alarm_for_several_detectors_is_refused_before_the_fit(tmp_path):
 
 @pytest.mark.slow
 def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
-    dropped = ("taps", "grips", "machine", "mains_bursts", "pulled", "arm_motion")
+    dropped = ("taps", "grips", "machine", "mains_bursts", "pulled", "arm_motion", "knocked")
+    budgets = ("taps_share", "grips", "machine", "mains_bursts", "arm_motion")
     config = composed(
         "onset=alarms",
         "data.cycles=2",
@@ -470,7 +664,13 @@ def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
         "onset.streams.extra_scenes.held.cycles=2",
         "onset.streams.extra_scenes.held.tail_s=4.0",
         "onset.streams.extra_scenes.dead_channel.cycles=1",
-        "onset.hop_ms=25.0",
+        "onset.learn_scenes=[paper,held]",
+        "onset.learn_cycles=1",
+        "onset.classifier.comb_periods=[1]",
+        "onset.budget.held=5000",
+        "onset.hours.held=0.001",
+        *(f"~onset.budget.{name}" for name in budgets),
+        *(f"~onset.hours.{name.removesuffix('_share')}" for name in budgets),
         *(f"~onset.streams.extra_scenes.{name}" for name in dropped),
         "cache=off",
         "num_workers=0",
@@ -482,6 +682,6 @@ def test_training_sets_the_alarm_of_the_file_it_leaves(tmp_path, capsys):
     assert metrics["alarm"]["settings"] == settings.to_dict()
     assert settings.metadata["simulated"] is True
     assert {"test", "unseen", "test stream", "unseen stream"} <= set(metrics["events"])
-    assert metrics["alarm"]["scenes"]["dead_channel"]["test"]["cusum"]["num_onsets"] > 0
-    assert "asked for: 1 false alarms an hour of held" in capsys.readouterr().out
+    assert metrics["alarm"]["scenes"]["dead_channel"]["test"][JOINT]["num_onsets"] > 0
+    assert "budget of false alarms, at 95 % confidence: held 5000 " in capsys.readouterr().out
     assert {"alarm.png", "events.png"} <= {path.name for path in tmp_path.iterdir()}

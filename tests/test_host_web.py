@@ -114,6 +114,18 @@ def test_the_page_decides_what_the_package_decides_and_sends_nothing_out(seen):
 
 @pytest.mark.onnx
 @pytest.mark.slow
+def test_an_onset_classifier_is_drawn_and_named(script, recording, tmp_path_factory):
+    folder = exported(tmp_path_factory, with_onset=True)
+    picture = folder / "page.png"
+    files = ["--model", folder / "stream.onnx", "--recording", recording, "--output", picture]
+    done = script("shot.mjs", *files)
+    assert done.returncode == 0, done.stderr
+    assert_same(ran(done.stdout.splitlines()), truth(slipping_stream(), with_onset=True))
+    assert picture.stat().st_size > 10_000
+
+
+@pytest.mark.onnx
+@pytest.mark.slow
 def test_it_is_used_by_keyboard_alone(seen):
     assert seen["keyboard"]["playing"] == "Pause"
     assert seen["keyboard"]["paused"] == seen["keyboard"]["after"] > 0

@@ -78,6 +78,11 @@ def model(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def fast_model(tmp_path_factory):
+    return hosts.exported(tmp_path_factory, with_onset=True) / "stream.onnx"
+
+
+@pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     return saved(tmp_path_factory.mktemp("recording") / "recording.npy", slipping_stream())
 
@@ -98,6 +103,36 @@ def test_alarms_alone_are_printed_unless_asked(host, model, recording):
     assert len(expected) > 1
     assert [list(line) for line in ran.lines] == [list(ALARM_KEYS)] * len(expected)
     assert [line["time_s"] for line in ran.lines] == [row["time_s"] for row in expected]
+
+
+@pytest.mark.parametrize("chunk", [1, 10, 333, 2000])
+def test_an_onset_classifier_raises_alarms_and_is_named(host, fast_model, recording, chunk):
+    expected = truth(slipping_stream(), with_onset=True)
+    assert {row["raised_by"] for row in expected} == {None, "onset", "status"}
+    ran = run_host(host, fast_model, recording, "--decisions", "--chunk", chunk)
+    assert_same(ran, expected)
+    assert ran.stderr == ""  # nothing is known before the first bin, and nothing is dead
+    alarms = run_host(host, fast_model, recording, "--chunk", chunk)
+    assert [list(line) for line in alarms.lines] == [[*ALARM_KEYS, "raised_by"]] * len(alarms.lines)
+    assert [line["raised_by"] for line in alarms.lines] == [
+        row["raised_by"] for row in expected if row["alarm"]
+    ]
+
+
+def test_a_threshold_is_that_of_the_onset_classifier(host, fast_model, recording):
+    expected = truth(slipping_stream(), 1e9, with_onset=True)
+    assert {row["raised_by"] for row in expected} == {None, "status"}
+    assert_same(run_host(host, fast_model, recording, "--decisions", "--threshold", 1e9), expected)
+
+
+def test_an_onset_hop_that_is_none_is_refused(host, fast_model, tmp_path):
+    mine = copied(fast_model, tmp_path)
+    told = json.loads(sidecar_of(mine).read_text()) | {"onset_hop_samples": 0}
+    sidecar_of(mine).write_text(json.dumps(told))
+    ran = run_host(host, mine, _recording(tmp_path))
+    assert ran.status == 1
+    assert "onset_hop_samples 0" in ran.stderr
+    assert len(ran.stderr.splitlines()) == 1
 
 
 @pytest.mark.slow
@@ -372,8 +407,9 @@ def test_c_prints_what_python_prints(make, model, recording):
 
 
 @NEEDS_GCC
-def test_parts_hold_chunks_agree_and_a_push_takes_no_memory(make, model):
-    assert "parts and pushes hold" in make("test", f"MODEL={model}")
+def test_parts_hold_chunks_agree_and_a_push_takes_no_memory(make, model, fast_model):
+    for each in (model, fast_model):
+        assert "parts and pushes hold" in make("test", f"MODEL={each}")
 
 
 @NEEDS_GCC

@@ -8,6 +8,7 @@ import pytest
 import torch
 from contract.names import STREAM_OUTPUTS
 from small_detector import HAND, alarming_detector, raw_bins, small_detector
+from streams import onset_of
 from test_dead_streams import alarming_with_gaussians
 from torch.nn.functional import pad
 
@@ -244,6 +245,29 @@ def test_a_threshold_that_is_not_listened_to_is_refused(detector):
     right, own = StreamRun(detector), np.array([AlarmSettings.of(detector).threshold])
     with pytest.raises(ValueError, match=r"another threshold: .* differs"):
         check_stream(lambda inputs: right(inputs | {"threshold": own}), detector, "float32")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        (None, None, None),
+        ("onset_score", lambda x: x + 1e-8, "onset_score differs from torch by 1.0e-08"),
+        ("by_onset", np.zeros_like, "another threshold: by_onset differs"),
+        ("onset_score", np.float32, "gives onset_score float32"),
+    ],
+)
+def test_onset_scores_are_checked(detector, name, change, message):
+    joint, samples = copy.deepcopy(detector), simulated_stream(HAND, 2000.0, torch.float64)
+    onset = onset_of(torch.cat([samples] * 2, 1), quantile=0.999)
+    settings = replace(AlarmSettings.of(detector), onset=replace(onset, threshold=1e9))
+    joint.info[KEY] = settings.to_dict()
+    run = runner(session_of(stream_graph(joint, settings).model()))
+    if name is None:
+        found = check_stream(run, joint, "float32")
+        assert found["decisions"] > 400
+        return
+    with pytest.raises(ValueError, match=message):
+        check_stream(lambda x: changed(name, change)(run(x)), joint, "float32")
 
 
 @pytest.mark.parametrize("hop", [20, 70, 3000])

@@ -1,18 +1,21 @@
 """The graph of a stream against ``StreamingDetector``, push by push; rules, latch, calibration."""
 
 import math
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from engine_bins import some_hand
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from streams import detector_of, signal
+from streams import detector_of, onset_of, signal
 
 from tactslip_torch.deploy.check import runner, session_of
+from tactslip_torch.deploy.onset import memory_size, onset_scores
 from tactslip_torch.deploy.stream import (
     LATCH_START,
     Timing,
@@ -21,9 +24,10 @@ from tactslip_torch.deploy.stream import (
     statistic_of,
     stream_graph,
 )
-from tactslip_torch.deploy.value import F32, F64, Graph
+from tactslip_torch.deploy.value import BOOL, F32, F64, I64, Graph
 from tactslip_torch.model.calibration import LARGEST_LLR, Isotonic, Platt, probability
 from tactslip_torch.onset.decisions import AlarmSettings, score_stream
+from tactslip_torch.onset.evidence import OnsetStream
 from tactslip_torch.onset.rules import Cusum, KOfN, Latch, latch
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.signals.filtering import ChannelFilter
@@ -32,12 +36,21 @@ pytestmark = pytest.mark.onnx
 KINDS = ("all", "PVDF", "long")  # long: a frame that a causal bin does not hold
 ALIGNMENTS = ("centred", "causal", "trailing")
 RULES = {rule.name: rule for rule in (KOfN(2, 3), Cusum(0.5, 0.5, 2))}
+ONSET = onset_of(signal(6000, 5))
 EXACT = {"valid": "is_valid", "alarm": "is_alarm", "on": "is_on", "time_s": "available_s"}
 CLOSE = {"float64": 1e-9, "float32": 1e-3}  # of scores, in standard deviations
 
 
 @cache
-def watching(kind="all", align="centred", rule="k_of_n", hop=20, threshold=1.0, isotonic=False):
+def watching(
+    kind="all",
+    align="centred",
+    rule="k_of_n",
+    hop=20,
+    threshold=1.0,
+    isotonic=False,
+    onset=None,
+):
     """A detector, and settings by which about half of its decisions speak for slip."""
     detector = detector_of("all" if kind == "long" else kind, align)
     if kind == "long":
@@ -58,6 +71,7 @@ def watching(kind="all", align="centred", rule="k_of_n", hop=20, threshold=1.0, 
         rearm_s=0.02,
         refractory_s=0.05,
         lead_s=0.03,
+        onset=onset,
     )
     return detector, settings, spread
 
@@ -94,11 +108,13 @@ def assert_same_stream(samples, cuts=(), precision="float64", **options):
     dtype, host = getattr(torch, precision), Host(precision, **options)
     stream = StreamingDetector(detector, settings, dtype=dtype)
     timing, num, close = Timing.of(detector, settings), 0, CLOSE[precision]
+    raised = set[str]()
     places = [0, *sorted(min(cut, samples.shape[-1]) for cut in cuts), samples.shape[-1]]
     for start, stop in pairwise(places):
         piece = samples[:, start:stop].T.to(dtype)
         expected, found = stream.push(piece), host.push(piece.numpy())
-        for name, attribute in EXACT.items():
+        joined = {"by_onset": "by_onset"} if settings.onset else {}
+        for name, attribute in (EXACT | joined).items():
             wanted = getattr(expected, attribute).numpy()
             np.testing.assert_array_equal(found[name], wanted, err_msg=name)
         np.testing.assert_allclose(found["onset_s"], expected.onset_s, rtol=0, atol=1e-12)
@@ -107,9 +123,15 @@ def assert_same_stream(samples, cuts=(), precision="float64", **options):
             wanted = getattr(expected, name)
             np.testing.assert_allclose(found[name], wanted, rtol=close, atol=9 * close)
             assert found[name].dtype == host.dtype
+        if settings.onset:
+            np.testing.assert_allclose(found["onset_score"], expected.onset_score, atol=1e-9)
+            assert found["onset_score"].dtype == np.float64
         assert (host.tail.shape, host.state.shape) == ((timing.tail, 4), (timing.state_size,))
         assert (host.tail.dtype, host.state.dtype) == (host.dtype, np.float64)
         num += len(expected.alarms)
+        raised.update(alarm.raised_by for alarm in expected.alarms)
+    if settings.onset and len(places) > 100:
+        assert len(raised) == 2
     return num
 
 
@@ -132,6 +154,62 @@ def test_any_cut_gives_what_the_detector_gives(
         samples[place % 4, place] = value
     options = {"kind": kind, "align": align, "rule": rule, "isotonic": isotonic, "hop": hop}
     assert_same_stream(samples[:, :num_samples], cuts, **options)
+
+
+@given(
+    num_samples=st.integers(0, 4000),
+    cuts=st.lists(st.integers(0, 4000), max_size=30),
+    kind=st.sampled_from(KINDS),
+    rule=st.sampled_from(list(RULES)),
+    hop=st.sampled_from([7, 20, 120]),
+    precision=st.sampled_from(list(CLOSE)),
+    bad=st.lists(st.tuples(st.integers(0, 3999), st.sampled_from([np.nan, np.inf])), max_size=2),
+)
+@settings(max_examples=20)
+def test_fast_evidence_in_any_cut_is_that_of_the_detector(
+    num_samples, cuts, kind, rule, hop, precision, bad
+):
+    samples = signal(4000, 6)
+    for place, value in bad:
+        samples[place % 4, place] = value
+    options = {"kind": kind, "rule": rule, "hop": hop, "onset": ONSET}
+    assert_same_stream(samples[:, :num_samples], cuts, precision, **options)
+
+
+@pytest.mark.parametrize("precision", CLOSE)
+def test_fast_evidence_raises_the_same_alarms_in_small_pieces(precision):
+    cuts = [*range(150), *range(150, 6000, 7)]
+    samples = signal(6000, 6)
+    samples[1, 3000:3005] = torch.nan
+    assert assert_same_stream(samples, cuts, precision, onset=ONSET) >= 5
+
+
+@pytest.mark.parametrize("kinds", ["F", "FF", "GF", "GGF"])
+def test_onset_scores_of_any_hand_and_mask(kinds):
+    hand = some_hand(kinds)
+    names = [{"G": 0, "F": 2}[kind] + i % 2 for i, kind in enumerate(kinds)]
+    samples = signal(4000, 6)[names]
+    samples[-1, 3500:] = samples[-1, 3500]  # stuck
+    classifier = onset_of(samples[:, :3400], hand)
+    for masked in ([False] * len(hand), [False, *[True] * (len(hand) - 1)]):
+        graph = Graph()
+        x, memory = graph.input("x", F64, ("n", len(hand))), graph.input("memory", F64, ("m",))
+        mask, places = graph.input("mask", BOOL, (len(hand),)), graph.input("places", I64, ("k",))
+        made = onset_scores(x, places, memory, classifier, mask)
+        for name, value in zip("sm", made, strict=True):
+            graph.output(name, value, ("j",))
+        run, evidence = runner(session_of(graph.model())), classifier.evidence
+        memory = np.full(memory_size(evidence), np.nan)
+        before = np.full((evidence.context, len(hand)), np.nan)
+        held, found = np.concatenate([before, samples.T.numpy()]), []
+        for start, stop in pairwise([0, 1, 2, 100, 350, 398, 400]):
+            piece = held[10 * start : 10 * stop + evidence.context]
+            feeds = {"x": piece, "places": np.arange(stop - start), "memory": memory}
+            made = run(feeds | {"mask": np.array(masked)})
+            found.append(made["s"])
+            memory = made["m"]
+        expected = OnsetStream(classifier).push(samples, torch.tensor(masked))
+        np.testing.assert_allclose(np.concatenate(found), expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -170,6 +248,16 @@ def test_a_decision_that_nothing_reaches_says_nothing():
     assert_same_stream(samples)
 
 
+def test_a_threshold_that_is_given_is_that_of_onset_scores():
+    host, samples = Host(onset=ONSET), signal(6000, 8).T.numpy()
+    for threshold in (0.3, ONSET.threshold, -np.inf, np.inf):
+        own = Host(onset=replace(ONSET, threshold=threshold))
+        expected, found = own.push(samples), host.push(samples, [threshold])
+        for name, value in expected.items():
+            np.testing.assert_array_equal(found[name], value, err_msg=name)
+        host.tail, host.state = host.tail[:0], host.state[:0]
+
+
 def test_a_threshold_that_is_given_counts_for_that_push():
     host, samples = Host(), signal(1200, 8).T.numpy()
     for threshold in (0.3, 2.0, -np.inf, np.inf):
@@ -180,9 +268,11 @@ def test_a_threshold_that_is_given_counts_for_that_push():
             np.testing.assert_array_equal(found[name], value, err_msg=name)
 
 
+@pytest.mark.parametrize("onset", [None, ONSET])
 @pytest.mark.parametrize("rule", RULES)
-def test_a_stream_that_ran_for_years_goes_on(rule):
-    young, old, samples = Host(rule=rule), Host(rule=rule), signal(2000, 5).T.numpy()
+def test_a_stream_that_ran_for_years_goes_on(rule, onset):
+    young, old = Host(rule=rule, onset=onset), Host(rule=rule, onset=onset)
+    samples = signal(3500, 5).T.numpy()
     young.push(samples[:700])
     num = 10**12  # decisions
     old.tail, old.state = young.tail, young.state.copy()

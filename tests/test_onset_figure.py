@@ -74,7 +74,7 @@ def test_an_envelope_of_pieces_has_every_extreme_in_order(num_samples, num_segme
 def test_traces_take_what_is_in_view_and_the_status_it_begins_with(rng, view):
     """Of pieces of any length; ``b`` and ``a`` are two of three channels."""
     samples, times = rng.standard_normal((3, 4000)), 0.065 + HOP_S * np.arange(190)
-    columns = np.stack([rng.random(190), *(rng.random((3, 190)) < 0.5)])
+    columns = np.stack([rng.random(190), *(rng.random((3, 190)) < 0.5), rng.random(190)])
     traces = Traces({"b": 2, "a": 0}, RATE_HZ, HOP_S, view)
     for piece in pieces(rng, 4000, 300):
         traces.add_samples(samples[:, piece])
@@ -86,7 +86,7 @@ def test_traces_take_what_is_in_view_and_the_status_it_begins_with(rng, view):
     seen = (times > view[0] - 0.006) & (times < view[1])
     decided_s, decided = traces.decisions()
     np.testing.assert_allclose(decided_s, times[seen])
-    np.testing.assert_array_equal(decided[[0, 1, 3]], columns[[0, 1, 3]][:, seen])
+    np.testing.assert_array_equal(decided[[0, 1, 3, 4]], columns[[0, 1, 3, 4]][:, seen])
     np.testing.assert_array_equal(decided[2], 1 - columns[2, seen])
 
 
@@ -149,7 +149,8 @@ def traces_of(films, view=(0.0, 1.4), num_decisions=130):
     names = {f"PVDF{i}": i - 1 for i in range(1, 1 + len(films))}
     traces = Traces(names, RATE_HZ, HOP_S, view)
     traces.add_samples(films)
-    traces.add_decisions(times - 1e-9, 0.9 * slip + 0.05, slip, valid, abstains)
+    score = np.where(times < 0.2, math.nan, 2.0 * slip)  # not before there is a floor
+    traces.add_decisions(times - 1e-9, 0.9 * slip + 0.05, slip, valid, abstains, score)
     return traces
 
 
@@ -162,9 +163,9 @@ def films(rng):
 def draw(drawn, tmp_path, films):
     """Draws traces; their figure."""
 
-    def drawing(traces=None, *, alarms=ALARMS, truth=TRUTH, title=""):
+    def drawing(traces=None, *, alarms=ALARMS, truth=TRUTH, title="", **options):
         path, traces = tmp_path / "onsets.png", traces or traces_of(films)
-        onset_figure(traces, path, alarms=alarms, truth=truth, title=title)
+        onset_figure(traces, path, alarms=alarms, truth=truth, title=title, **options)
         assert_png(path)
         return drawn[-1]
 
@@ -227,6 +228,13 @@ def test_marks_stand_where_things_happened(draw):
     assert legend_of(figure) >= {"decided: slip", "onset, true", "not valid", "abstains"}
 
 
+def test_an_onset_classifier_has_a_panel_with_its_threshold(draw):
+    score, threshold = draw(onset_threshold=1.5).axes[3].lines
+    times, values = (np.asarray(x) for x in (score.get_xdata(), score.get_ydata()))
+    assert np.nanmin(times[np.isfinite(values)]) == pytest.approx(0.2, abs=HOP_S)
+    assert (np.nanmax(values), list(threshold.get_ydata())) == (2.0, [1.5, 1.5])
+
+
 @pytest.mark.parametrize("name", ["slip", "invalid", "abstains"])
 def test_a_status_of_one_decision_is_seen_in_a_long_recording(draw, name):
     num = 20_000
@@ -235,7 +243,8 @@ def test_a_status_of_one_decision_is_seen_in_a_long_recording(draw, name):
     off = np.zeros(num)
     given = {"slip": off, "invalid": off, "abstains": off} | {name: is_on}
     traces.add_samples(np.zeros((1, num // 10)))
-    traces.add_decisions(times, off, given["slip"], 1 - given["invalid"], given["abstains"])
+    columns = given["slip"], 1 - given["invalid"], given["abstains"], off
+    traces.add_decisions(times, off, *columns)
     marks = marks_of(draw(traces))
     ((first, last),) = marks[2 if name == "abstains" else 0, name]
     assert first <= times[7003] < last < first + 0.5
@@ -288,7 +297,7 @@ def entry(name="a.npz", *, truth=True, **changes):
     known = {"onsets": onsets, "false_alarms_s": [0.3], "early_s": 0.2}
     alarms = [
         {"alarm_s": t, "onset_s": t - 0.01, "end_s": t + 0.1, "score": 1.0}
-        | {"probability": 0.9, "statistic": 2.0, "is_valid": t != 1.5}
+        | {"probability": 0.9, "statistic": 2.0, "is_valid": t != 1.5, "raised_by": "onset"}
         for t in (0.3, 1.05, 1.5, 2.9, 5.7)
     ]
     if truth:
@@ -342,10 +351,10 @@ def test_rows_are_alarms_and_missed_onsets_in_order_of_time():
 def test_the_table_says_what_is_simulated_what_is_wrong_and_what_it_leaves_out():
     lines = onsets_table(content(entry())).splitlines()
     assert lines[0].startswith("SIMULATED")
-    assert lines[2].split() == ["a.npz", "0.300", "0.290", "0.90", "yes", "-", "-", "false"]
-    assert lines[3].split() == ["1.050", "1.040", "0.90", "yes", "1.000", "0.050", "found"]
-    assert lines[4].split()[3] == "NO"
-    assert lines[6].split() == ["-", "-", "-", "-", "5.000", "-", "missed"]
+    assert lines[2].split() == ["a.npz", "0.300", "0.290", "0.90", "onset", "yes", *"--", "false"]
+    assert lines[3].split() == ["1.050", "1.040", "0.90", "onset", "yes", "1.000", "0.050", "found"]
+    assert lines[4].split()[4] == "NO"
+    assert lines[6].split() == [*"-----", "5.000", "-", "missed"]
     many = onsets_table(content(*[entry()] * 20, simulated=False)).splitlines()
     assert many[-1] == "and 80 more, see onsets.csv"
     assert "SIMULATED" not in many[0]

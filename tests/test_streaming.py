@@ -3,6 +3,7 @@
 import copy
 import logging
 import pickle
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from streams import detector_of, signal
+from streams import detector_of, onset_of, signal
 
 from tactslip_torch.model.calibration import Platt
 from tactslip_torch.onset.decisions import (
@@ -126,6 +127,55 @@ def test_bins_shorter_than_a_frame_wait_for_the_first_frame(start_s):
         said += found.available_s.tolist()
     assert came == [151, 151, 151, 160, 180, 200]
     assert said == pytest.approx([(start_s or 0.0) + num / RATE for num in came], abs=1e-12)
+
+
+# Fast evidence ---------------------------------------------------------------------------------
+
+ONSET = onset_of(signal(6000, 5), quantile=0.75)
+
+
+def with_onset(**options):
+    return replace(settings_of(**options), onset=ONSET)
+
+
+def joined_offline(settings, samples, masked=None):
+    """Decisions on a whole recording, all hops at once."""
+    detector, evidence = DETECTOR, ONSET.evidence
+    scores = score_stream(detector, samples, settings.hop_samples)
+    decider = Decider(settings, RATE, 100, detector.look_ahead, 51)
+    tells = is_usable(scores.score, scores.is_missing, detector.needed_index)
+    bins = decider.decide(scores.score, scores.is_valid, tells)
+    alone = torch.full((samples.shape[-1] // 10 + 2,), torch.nan, dtype=torch.float64)
+    alone[evidence.first_hop + 2 :] = ONSET.score(evidence.blocks_of_recording(samples), masked)
+    onset_score = alone.unfold(0, 3, 1).mean(-1).nan_to_num(-1e30)
+    return decider.join(bins, onset_score)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("kind", ["", "nan", "all nan", "now and then", "dead", "rail"])
+def test_fast_evidence_in_any_cut_is_that_of_the_whole_recording(kind, dtype):
+    samples = spoilt(kind, signal(6000, 6).to(dtype))
+    samples = torch.cat([samples, signal(3000, 7).to(dtype)], -1)
+    settings = with_onset()
+    expected = joined_offline(settings, samples)
+    assert 0 < int(expected.by_onset.sum()) < int(expected.by_onset.numel()) / 2
+    assert len({alarm.raised_by for alarm in expected.alarms}) == 2
+    for cuts in ([], range(7, 9000, 7), range(0, 9000, 10), [5, 3000, 3001, 8000]):
+        found = in_pieces(stream_of(settings=settings, dtype=dtype), samples, cuts)
+        assert_same(found, expected)
+        torch.testing.assert_close(found.onset_score, expected.onset_score, rtol=0, atol=1e-12)
+        assert torch.equal(found.by_onset, expected.by_onset)
+
+
+@pytest.mark.parametrize("masked", [["PVDF1"], ["SG1", "SG2"], ["PVDF1", "PVDF2"]])
+def test_fast_evidence_leaves_out_channels_that_are_masked(masked):
+    samples = signal(6000, 6)
+    stream = stream_of(settings=with_onset(), masked_channels=masked)
+    is_masked = torch.tensor([name in masked for name in DETECTOR.pool.hand.names])
+    expected = joined_offline(stream.settings, samples, is_masked).onset_score
+    found = in_pieces(stream, samples, range(0, 6000, 10)).onset_score
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    assert bool((found > -1e30).any()) == (len(masked) < 2 or masked[0] == "SG1")
 
 
 # What is missing or broken ---------------------------------------------------------------------

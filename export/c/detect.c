@@ -107,7 +107,9 @@ static void print_flag(const char *before, const char *name, bool flag) {
     printf("%s\"%s\": %s", before, name, flag ? "true" : "false");
 }
 
-static void print_decision(const struct slip_decision *decision, bool is_single, bool is_whole) {
+static void print_decision(const struct slip_decision *decision, const struct slip_facts *facts,
+                           bool is_whole) {
+    bool is_single = !facts->is_double;
     print_number("{", "time_s", decision->time_s, false);
     print_number(", ", "onset_s", decision->onset_s, false);
     print_number(", ", "score", decision->score, is_single);
@@ -118,16 +120,23 @@ static void print_decision(const struct slip_decision *decision, bool is_single,
         print_flag(", ", "alarm", decision->alarm);
         print_flag(", ", "on", decision->on);
     }
+    if (facts->has_onset) {
+        if (is_whole) print_number(", ", "onset_score", decision->onset_score, false);
+        const char *by = decision->by_onset ? "\"onset\"" : "\"status\"";
+        printf(", \"raised_by\": %s", decision->alarm ? by : "null");
+    }
     puts("}");
 }
 
 static void take(const struct slip_decision *decision, const struct options *options,
-                 bool is_single, struct tally *tally) {
+                 const struct slip_facts *facts, struct tally *tally) {
     tally->decisions++;
     tally->alarms += decision->alarm;
-    if (!decision->valid && !tally->not_valid++) tally->first_not_valid_s = decision->time_s;
+    bool is_known = decision->time_s >= facts->first_bin_s; /* what a bin says */
+    if (is_known && !decision->valid && !tally->not_valid++)
+        tally->first_not_valid_s = decision->time_s;
     if (options->all_decisions || decision->alarm)
-        print_decision(decision, is_single, options->all_decisions);
+        print_decision(decision, facts, options->all_decisions);
 }
 
 static int watch(struct slip *slip, struct npy *recording, const struct options *options) {
@@ -149,7 +158,7 @@ static int watch(struct slip *slip, struct npy *recording, const struct options 
         int num = recording->is_double ? slip_push_double(slip, samples, n, decisions)
                                        : slip_push(slip, samples, n, decisions);
         if (num < 0) status = refuse(WRONG, "%s: %s", options->model, slip_error(slip));
-        for (int i = 0; i < num; i++) take(decisions + i, options, !facts->is_double, &tally);
+        for (int i = 0; i < num; i++) take(decisions + i, options, facts, &tally);
     }
     free(samples);
     free(decisions);

@@ -67,6 +67,11 @@ static const char *wrong_fact(struct model *model, const char *json, const char 
     *wanted = "a positive whole number";
     if (!read_count(json, "hop_samples", &model->hop_samples) || !model->hop_samples)
         return "hop_samples";
+    sidecar_said(json, "onset_hop_samples", text, sizeof text);
+    if (strcmp(text, "nothing") &&
+        (!read_count(json, "onset_hop_samples", &model->onset_hop_samples) ||
+         !model->onset_hop_samples))
+        return "onset_hop_samples";
     *wanted = "a whole number";
     if (!read_count(json, "first_samples", &model->first_samples)) return "first_samples";
     if (!read_count(json, "frame_samples", &model->frame_samples)) return "frame_samples";

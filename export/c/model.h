@@ -9,6 +9,7 @@ struct model {
     void *bytes; /* of the .onnx file */
     size_t size;
     size_t num_channels, hop_samples, first_samples, frame_samples, tail_samples, state_size;
+    size_t onset_hop_samples; /* 0: no onset classifier */
     double sample_rate_hz;
     bool is_double;
 };

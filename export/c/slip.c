@@ -14,11 +14,12 @@
 enum { SAMPLES, TAIL, STATE, THRESHOLD, NUM_INPUTS };
 static const char *const INPUTS[NUM_INPUTS] = {"samples", "tail", "state", "threshold"};
 
-enum { SCORE, PROBABILITY, STATISTIC, TIME, ONSET, VALID, ALARM, ON, NUM_COLUMNS };
-enum { NEXT_TAIL = NUM_COLUMNS, NEXT_STATE, NUM_OUTPUTS };
-static const char *const OUTPUTS[NUM_OUTPUTS] = {
-    "score", "probability", "statistic", "time_s",    "onset_s",
-    "valid", "alarm",       "on",        "next_tail", "next_state"};
+enum { NEXT_TAIL, NEXT_STATE, FIRST_COLUMN };
+enum { SCORE, PROBABILITY, STATISTIC, TIME, ONSET, VALID, ALARM, ON, ONSET_SCORE, BY_ONSET };
+enum { NUM_BIN_COLUMNS = ONSET_SCORE, NUM_COLUMNS = BY_ONSET + 1 };
+static const char *const OUTPUTS[FIRST_COLUMN + NUM_COLUMNS] = {
+    "next_tail", "next_state", "score", "probability", "statistic",   "time_s",
+    "onset_s",   "valid",      "alarm", "on",          "onset_score", "by_onset"};
 
 enum { NOTHING, ONE, OTHER, NUM_HELD }; /* what is remembered: nothing yet, or one of two copies */
 
@@ -51,15 +52,21 @@ static bool fine(struct slip *slip, OrtStatus *status) {
     return false;
 }
 
+/* Samples after which the first bin is known. */
+static size_t first_bin(const struct model *model) {
+    size_t first = model->first_samples, frame = model->frame_samples;
+    return first > frame ? first : frame;
+}
+
 static uint64_t decisions_after(const struct model *model, uint64_t count) {
-    if (count < model->first_samples || count < model->frame_samples) return 0;
+    if (model->onset_hop_samples) return count / model->onset_hop_samples;
+    if (count < first_bin(model)) return 0;
     return (count - model->first_samples) / model->hop_samples + 1;
 }
 
 /* Most decisions of n samples: those that a first frame, longer than a bin, kept waiting too. */
 static size_t most_decisions(const struct model *model, size_t n) {
-    size_t first = model->first_samples, frame = model->frame_samples;
-    size_t start = first > frame ? first : frame;
+    size_t start = model->onset_hop_samples ? model->onset_hop_samples : first_bin(model);
     return n ? (size_t)decisions_after(model, start + n - 1) : 0;
 }
 
@@ -68,7 +75,8 @@ static size_t size_of(int type) {
 }
 
 static int column_type(const struct slip *slip, int column) {
-    return column >= VALID ? ORT_BOOL : column >= TIME ? ORT_DOUBLE : slip->type;
+    if (column >= VALID && column != ONSET_SCORE) return ORT_BOOL;
+    return column >= TIME ? ORT_DOUBLE : slip->type;
 }
 
 /* A value [rows, columns], or [rows] where columns is 0. */
@@ -150,11 +158,14 @@ struct slip *slip_open(const char *model, size_t max_samples, char error[SLIP_ER
         slip->type = slip->model.is_double ? ORT_DOUBLE : ORT_FLOAT;
         slip->facts = (struct slip_facts){
             .num_channels = slip->model.num_channels,
-            .hop_samples = slip->model.hop_samples,
+            .hop_samples = slip->model.onset_hop_samples ? slip->model.onset_hop_samples
+                                                         : slip->model.hop_samples,
             .sample_rate_hz = slip->model.sample_rate_hz,
             .max_samples = max_samples,
             .max_decisions = most_decisions(&slip->model, max_samples),
             .is_double = slip->model.is_double,
+            .has_onset = slip->model.onset_hop_samples > 0,
+            .first_bin_s = (double)first_bin(&slip->model) / slip->model.sample_rate_hz,
         };
         is_open = open_session(slip) && take_memory(slip) && make_values(slip);
         model_free(&slip->model); /* the session has what it needs of the bytes */
@@ -197,12 +208,11 @@ static int run(struct slip *slip, size_t n, struct slip_decision *out) {
     const OrtValue *inputs[NUM_INPUTS] = {
         slip->samples_of[n], slip->tail_of[slip->held], slip->state_of[slip->held],
         slip->threshold_of[slip->has_threshold]};
-    OrtValue *outputs[NUM_OUTPUTS];
-    for (int i = 0; i < NUM_COLUMNS; i++) outputs[i] = slip->columns_of[i][k];
-    outputs[NEXT_TAIL] = slip->tail_of[next];
-    outputs[NEXT_STATE] = slip->state_of[next];
+    OrtValue *outputs[FIRST_COLUMN + NUM_COLUMNS] = {slip->tail_of[next], slip->state_of[next]};
+    int num = slip->facts.has_onset ? NUM_COLUMNS : NUM_BIN_COLUMNS;
+    for (int i = 0; i < num; i++) outputs[FIRST_COLUMN + i] = slip->columns_of[i][k];
     if (!fine(slip, slip->api->Run(slip->session, NULL, INPUTS, inputs, NUM_INPUTS, OUTPUTS,
-                                   NUM_OUTPUTS, outputs)))
+                                   (size_t)(FIRST_COLUMN + num), outputs)))
         return -1;
     slip->held = next;
     slip->count += n;
@@ -216,6 +226,8 @@ static int run(struct slip *slip, size_t n, struct slip_decision *out) {
             .valid = flag(slip, VALID, i),
             .alarm = flag(slip, ALARM, i),
             .on = flag(slip, ON, i),
+            .onset_score = number(slip, ONSET_SCORE, i),
+            .by_onset = flag(slip, BY_ONSET, i),
         };
     }
     return (int)k;

@@ -18,6 +18,8 @@ struct slip_facts {
     size_t max_samples;   /* of one push */
     size_t max_decisions; /* that one push can bring */
     bool is_double;       /* the graph computes in float64 */
+    bool has_onset;       /* an onset classifier raises alarms too */
+    double first_bin_s;   /* from when on decisions speak of a bin */
 };
 
 struct slip_decision {
@@ -29,6 +31,8 @@ struct slip_decision {
     bool valid;       /* false: a channel in use is dead or broken */
     bool alarm;       /* raised by this decision */
     bool on;          /* stands after it */
+    double onset_score; /* of fast evidence, -1e30 for none; 0 without an onset classifier */
+    bool by_onset;      /* it reaches its threshold: then it raised the alarm, else the statistic */
 };
 
 /* Opens an exported stream graph with its sidecar beside it.
@@ -44,7 +48,8 @@ int slip_push(struct slip *slip, const float *samples, size_t n, struct slip_dec
 int slip_push_double(struct slip *slip, const double *samples, size_t n, struct slip_decision *out);
 const char *slip_error(const struct slip *slip);
 
-/* From now on alarms are raised at this statistic instead of the model's own threshold. */
+/* From now on alarms are raised at this statistic, or onset score where there is one, instead of the
+ * model's own threshold. */
 void slip_set_threshold(struct slip *slip, double threshold);
 
 /* Forgets the stream: another begins, or this one anew behind a gap. */

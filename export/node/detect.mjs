@@ -53,6 +53,7 @@ function chunk(name, word) {
 async function detect({ model, recording, rate, chunk, threshold, decisions: isWhole }) {
   const stream = await SlipStream.open(model);
   const { channels, precision, sample_rate_hz: wanted } = stream.facts;
+  const firstBinS = Math.max(stream.facts.first_samples, stream.facts.frame_samples) / wanted;
   if (rate !== null && rate !== wanted) {
     throw new Error(
       `the recording has ${rate} samples a second, the model wants ${wanted}: ` +
@@ -68,7 +69,7 @@ async function detect({ model, recording, rate, chunk, threshold, decisions: isW
     for (const decision of await stream.push(volts)) {
       count.decisions += 1;
       if (decision.alarm) count.alarms += 1;
-      if (!decision.valid) {
+      if (!decision.valid && decision.time_s >= firstBinS) {
         count.invalid += 1;
         firstInvalid ??= decision.time_s;
       }

@@ -21,11 +21,13 @@ export async function checkedFacts(model, sidecar, name) {
     throw new Error(`${name} holds a bin graph, wanted a stream graph: export with graph=stream`);
   }
   const { channels, sample_rate_hz: rate, hop_samples: hop, precision } = facts;
+  const { onset_hop_samples: fast } = facts; // of a model with an onset classifier
   const wrong = [
     ["graph", facts.graph === "stream", "bin or stream"],
     ["channels", Array.isArray(channels) && channels.length > 0, "a list of names"],
     ["sample_rate_hz", Number.isFinite(rate) && rate > 0, "a positive number"],
     ["hop_samples", isCount(hop) && hop > 0, "a positive whole number"],
+    ["onset_hop_samples", fast === undefined || (isCount(fast) && fast > 0), "a positive whole number"],
     ...COUNTS.map((key) => [key, isCount(facts[key]), "a whole number"]),
     ["precision", Object.hasOwn(ARRAYS, precision), Object.keys(ARRAYS).join(" or ")],
     ["onnx_sha256", typeof facts.onnx_sha256 === "string", "64 hexadecimal digits"],
@@ -111,7 +113,8 @@ export class StreamGraph {
    *   an instant, NaN a sample that is missing. Not to be changed before the promise is kept
    * @returns {Promise<object[]>} `time_s` (when it could be made, from the first sample), `onset_s`
    *   (when the slip it speaks of began), `score` (at least 0 is slip), `probability`, `statistic`
-   *   of the alarm, `valid` (every channel in use was whole), `alarm`, `on` (an alarm stands)
+   *   of the alarm, `valid` (every channel in use was whole), `alarm`, `on` (an alarm stands); with
+   *   an onset classifier `onset_score` and `raised_by`, "onset" or "status", null without alarm
    * @throws {Error} if samples are no volts or no whole rows; nothing is changed then
    */
   push(samples) {
@@ -180,6 +183,12 @@ export class StreamGraph {
       statistic: made.statistic.data[i],
       alarm: made.alarm.data[i] !== 0,
       on: made.on.data[i] !== 0,
+      ...(made.onset_score && onsetPart(made, i)),
     }));
   }
+}
+
+function onsetPart(made, i) {
+  const by = made.by_onset.data[i] ? "onset" : "status";
+  return { onset_score: made.onset_score.data[i], raised_by: made.alarm.data[i] ? by : null };
 }

@@ -19,7 +19,9 @@ export function decisionLine(decision, precision, isWhole) {
     probability: shown(probability),
     valid,
   };
-  return JSON.stringify(isWhole ? { ...line, statistic: shown(statistic), alarm, on } : line);
+  const { onset_score, raised_by } = decision; // undefined, and left out, without a classifier
+  const whole = isWhole && { statistic: shown(statistic), alarm, on, onset_score };
+  return JSON.stringify({ ...line, ...whole, raised_by });
 }
 
 /** The last line. */

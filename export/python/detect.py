@@ -12,7 +12,9 @@ import sys
 from arguments import Parser, chunk, number
 from command import run, say
 from files import load_recording
-from stream import KEYS, Stream
+from stream import Stream
+
+ALARM_KEYS = ("time_s", "onset_s", "score", "probability", "valid", "raised_by")
 
 
 def main(options):
@@ -20,14 +22,17 @@ def main(options):
     stream = Stream(options.model, options.threshold)
     recording = load_recording(options.recording, stream.facts, options.rate)
     num_decisions, num_alarms, not_valid_s = 0, 0, []
+    first_bin = max(stream.facts["first_samples"], stream.facts["frame_samples"])
+    first_bin_s = first_bin / stream.facts["sample_rate_hz"]  # nothing is known before
     for start in range(0, len(recording), options.chunk):
         decisions = stream.push(recording[start : start + options.chunk])
         alarms = [decision for decision in decisions if decision["alarm"]]
         num_decisions, num_alarms = num_decisions + len(decisions), num_alarms + len(alarms)
-        not_valid_s += [decision["time_s"] for decision in decisions if not decision["valid"]]
+        known = [decision for decision in decisions if decision["time_s"] >= first_bin_s]
+        not_valid_s += [decision["time_s"] for decision in known if not decision["valid"]]
         for decision in decisions if options.decisions else alarms:
-            line = {key: decision[key] for key in KEYS[: None if options.decisions else 5]}
-            say(json.dumps(line))
+            wanted = decision if options.decisions else ALARM_KEYS
+            say(json.dumps({key: decision[key] for key in decision if key in wanted}))
     seconds = len(recording) / stream.facts["sample_rate_hz"]
     sums = {"decisions": num_decisions, "alarms": num_alarms, "seconds": seconds}
     say(json.dumps(sums), flush=True)

@@ -14,7 +14,7 @@ COUNTS = {
     "bin": ("bin_samples", "context_before_samples", "context_after_samples"),
     "stream": ("hop_samples", "first_samples", "frame_samples", "tail_samples", "state_size"),
 }
-POSITIVE = ("bin_samples", "hop_samples")
+POSITIVE = ("bin_samples", "hop_samples", "onset_hop_samples")
 
 
 def load_model(path, graph):
@@ -71,7 +71,8 @@ def check_facts(sidecar, facts):
             "a positive number",
         ),
     ]
-    for key in COUNTS.get(graph, ()):
+    optional = [key for key in ("onset_hop_samples",) if key in facts]
+    for key in (*COUNTS.get(graph, ()), *optional):
         least = int(key in POSITIVE)
         wanted = "a positive whole number" if least else "a whole number"
         checks.append((key, is_count(facts.get(key), least), wanted))

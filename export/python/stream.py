@@ -4,6 +4,7 @@ import numpy as np
 from files import load_model
 
 KEYS = ("time_s", "onset_s", "score", "probability", "valid", "statistic", "alarm", "on")
+ONSET_KEYS = ("onset_score", "by_onset")  # of a model with an onset classifier
 
 
 class Stream:
@@ -11,11 +12,13 @@ class Stream:
 
     Args:
         path: of the model; its sidecar lies beside it.
-        threshold: at which the statistic raises an alarm, instead of the model's own.
+        threshold: at which the statistic, or the onset score of a model with an onset classifier,
+            raises an alarm, instead of the model's own.
     """
 
     def __init__(self, path, threshold=None):
         self.session, self.facts = load_model(path, "stream")
+        self.has_onset = "onset_hop_samples" in self.facts
         self.threshold = np.array([] if threshold is None else [threshold], np.float64)
         self.reset()
 
@@ -27,11 +30,20 @@ class Stream:
     def push(self, samples):
         """The decisions that volts ``[n, C]`` make possible, as dicts; NaN is a missing sample.
 
+        With an onset classifier an alarm's ``raised_by`` is ``"onset"``, its score, or
+        ``"status"``, the statistic of bins; of other decisions it is None.
+
         Memory grows with the decisions of a push, so push some 2000 samples at most.
         """
         feeds = {"samples": np.ascontiguousarray(samples, self.tail.dtype), "tail": self.tail}
         feeds |= {"state": self.state, "threshold": self.threshold}
-        names = ("next_tail", "next_state", *KEYS)
-        self.tail, self.state, *columns = self.session.run(names, feeds)
+        keys = KEYS + ONSET_KEYS if self.has_onset else KEYS
+        self.tail, self.state, *columns = self.session.run(
+            ("next_tail", "next_state", *keys), feeds
+        )
         rows = zip(*(column.tolist() for column in columns), strict=True)
-        return [dict(zip(KEYS, row, strict=True)) for row in rows]
+        decisions = [dict(zip(keys, row, strict=True)) for row in rows]
+        for decision in decisions if self.has_onset else ():
+            by = "onset" if decision.pop("by_onset") else "status"
+            decision["raised_by"] = by if decision["alarm"] else None
+        return decisions

@@ -4,8 +4,14 @@ const PUSHES = 512; // of which latencies are remembered
 
 /** Decisions of one recording, in typed arrays that are as long as it can make them. */
 export class History {
-  /** @param {number} capacity most decisions there can be */
-  constructor(capacity) {
+  /**
+   * @param {number} capacity most decisions there can be
+   * @param {object} facts of the sidecar
+   */
+  constructor(capacity, facts = {}) {
+    this.hasOnset = facts.onset_hop_samples !== undefined;
+    const first = Math.max(facts.first_samples, facts.frame_samples);
+    this.firstBinS = first / facts.sample_rate_hz; // nothing is known before
     const numbers = () => new Float64Array(capacity);
     this.columns = {
       time_s: numbers(),
@@ -13,8 +19,9 @@ export class History {
       score: numbers(),
       probability: numbers(),
       statistic: numbers(),
+      ...(this.hasOnset && { onset_score: numbers() }),
     };
-    this.flags = new Uint8Array(capacity); // 1 valid, 2 alarm, 4 on
+    this.flags = new Uint8Array(capacity); // 1 valid, 2 alarm, 4 on, 8 raised by the onset score
     this.clear();
   }
 
@@ -32,7 +39,8 @@ export class History {
       const i = this.count;
       for (const name in this.columns) this.columns[name][i] = decision[name];
       this.flags[i] = decision.valid + 2 * decision.alarm + 4 * decision.on;
-      if (!decision.valid) this.numInvalid += 1;
+      if (decision.raised_by === "onset") this.flags[i] += 8;
+      if (this.isDoubtful(i)) this.numInvalid += 1;
       if (decision.alarm) this.alarms.push(i);
       this.count += 1;
     }
@@ -51,8 +59,9 @@ export class History {
     return low - 1;
   }
 
-  isValid(i) {
-    return (this.flags[i] & 1) !== 0;
+  /** Whether it speaks of a bin that is not valid. */
+  isDoubtful(i) {
+    return (this.flags[i] & 1) === 0 && !(this.columns.time_s[i] < this.firstBinS);
   }
 
   isOn(i) {
@@ -61,9 +70,11 @@ export class History {
 
   /** A decision as `StreamGraph.push` gave it. */
   decision(i) {
-    const decision = { valid: this.isValid(i), alarm: (this.flags[i] & 2) !== 0, on: this.isOn(i) };
+    const has = (flag) => (this.flags[i] & flag) !== 0;
+    const decision = { valid: has(1), alarm: has(2), on: has(4) };
     for (const name in this.columns) decision[name] = this.columns[name][i];
-    return decision;
+    if (!this.hasOnset) return decision;
+    return { ...decision, raised_by: has(2) ? (has(8) ? "onset" : "status") : null };
   }
 }
 

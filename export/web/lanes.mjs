@@ -1,5 +1,5 @@
 // Where things stand in the picture: a lane per channel, gauges and films apart, then the status,
-// the probability and the statistic of the alarm.
+// the probability, the statistic of the alarm and, with an onset classifier, its score.
 
 const KINDS = { SG: "gauges", PVDF: "films" };
 const SAMPLED = 4000; // samples of a channel that its lane is scaled by
@@ -46,12 +46,13 @@ export function laneScales(volts, kinds) {
  * @param {object} facts of the sidecar
  * @param {number} height of the canvas
  * @returns {{groups: object[], centre: number[], status: object, probability: object,
- *   statistic: object, axis: number}} tops and heights; `centre` of each channel's lane
+ *   statistic: object, onset: ?object, axis: number}} tops and heights; `centre` of each channel's lane
  */
 export function panels(facts, height) {
   const kinds = [...new Set(facts.kinds)];
   const share = (kind) => (kind === "PVDF" ? FILM_SHARE : 1);
-  const below = HEIGHT.status + 2 * HEIGHT.trace + 3 * HEIGHT.gap + HEIGHT.axis;
+  const traces = facts.onset_hop_samples ? 3 : 2;
+  const below = HEIGHT.status + traces * HEIGHT.trace + (1 + traces) * HEIGHT.gap + HEIGHT.axis;
   const above = HEIGHT.marks + kinds.length * HEIGHT.title;
   const shares = facts.kinds.reduce((sum, kind) => sum + share(kind), 0);
   const unit = (height - below - above) / shares;
@@ -72,7 +73,8 @@ export function panels(facts, height) {
   const status = take(HEIGHT.status, HEIGHT.gap);
   const probability = take(HEIGHT.trace, HEIGHT.gap);
   const statistic = take(HEIGHT.trace, HEIGHT.gap);
-  return { groups, centre, status, probability, statistic, axis: top };
+  const onset = traces === 3 ? take(HEIGHT.trace, HEIGHT.gap) : null;
+  return { groups, centre, status, probability, statistic, onset, axis: top };
 }
 
 /** Channels that the detector uses: those its features are of. */
@@ -85,7 +87,14 @@ export function usedChannels(facts) {
 export function statisticRange(facts) {
   const ceiling = facts.rule?.ceiling ?? null;
   if (ceiling !== null) return [0, 1.05 * ceiling];
-  const threshold = facts.threshold ?? 0;
+  const threshold = facts.status_threshold ?? facts.threshold ?? 0;
   const reach = Math.max(5, Math.abs(threshold));
+  return [threshold - reach, threshold + reach];
+}
+
+/** Lowest and highest onset score shown. */
+export function onsetRange(facts) {
+  const threshold = facts.threshold ?? 0;
+  const reach = Math.max(2, Math.abs(threshold));
   return [threshold - reach, threshold + reach];
 }

@@ -41,13 +41,14 @@ function drawLanes(context, { facts, colours, panels, scales, size, used }) {
 }
 
 function drawTraces(context, scope, threshold) {
-  const { colours, panels, size, range, facts } = scope;
-  const { status, probability, statistic } = panels;
+  const { colours, panels, size, facts } = scope;
+  const { status, probability, statistic, onset } = panels;
   const label = (text, y, colour = colours.ink) =>
     write(context, FONT, colour, "right", text, GUTTER - 6, y);
   label("status", status.top + status.height / 2);
   label("P(slip)", probability.top + probability.height / 2);
   label(facts.rule?.name ?? "statistic", statistic.top + statistic.height / 2);
+  if (onset) label("onset", onset.top + onset.height / 2);
   for (const [text, share] of [
     ["1", 0],
     ["0", 1],
@@ -56,12 +57,17 @@ function drawTraces(context, scope, threshold) {
   }
   context.strokeStyle = colours.grid;
   context.lineWidth = 1;
-  for (const panel of [probability, statistic]) {
+  for (const panel of [probability, statistic, onset].filter(Boolean)) {
     for (const share of [0, 1]) line(context, panel.top + share * panel.height, size.width);
   }
-  const [low, high] = range;
+  const ofBins = onset ? (facts.status_threshold ?? Infinity) : threshold;
+  drawThreshold(context, scope, statistic, scope.range, ofBins);
+  if (onset) drawThreshold(context, scope, onset, scope.onsetRange, threshold);
+}
+
+function drawThreshold(context, { colours, size }, panel, [low, high], threshold) {
   const share = Math.min(1, Math.max(0, (threshold - low) / (high - low)));
-  const y = statistic.top + statistic.height * (1 - share);
+  const y = panel.top + panel.height * (1 - share);
   context.strokeStyle = colours.alarm;
   context.setLineDash([6, 4]);
   line(context, y, size.width);

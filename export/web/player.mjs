@@ -38,7 +38,9 @@ export class Player {
   /** Take another recording, from its start. */
   async load(recording) {
     this.recording = recording;
-    this.history = new History(Math.ceil(recording.rows / this.stream.facts.hop_samples) + 1);
+    const { facts } = this.stream;
+    const hop = facts.onset_hop_samples ?? facts.hop_samples;
+    this.history = new History(Math.ceil(recording.rows / hop) + 1, facts);
     await this.restart();
   }
 

@@ -10,7 +10,9 @@ function write(id, text) {
 
 /** Facts of the detector, once. */
 export function describe(facts, given) {
-  const perSecond = Math.round(facts.sample_rate_hz / facts.hop_samples);
+  const hop = facts.onset_hop_samples ?? facts.hop_samples;
+  const perSecond = Math.round(facts.sample_rate_hz / hop);
+  element("by").hidden = facts.onset_hop_samples === undefined;
   const kilobytes = Math.round(facts.onnx_bytes / 1000);
   const aheadMs = (1000 * facts.context_after_samples) / facts.sample_rate_hz;
   const parts = [
@@ -44,7 +46,7 @@ export function report(player, rate) {
   write("alarms", String(history.alarms.length));
   write("decisions", history.count.toLocaleString("en"));
   write("invalid", history.numInvalid.toLocaleString("en"));
-  box.classList.toggle("doubtful", last >= 0 && !history.isValid(last));
+  box.classList.toggle("doubtful", last >= 0 && history.isDoubtful(last));
   const rows = recording?.rows ?? 0;
   element("progress").value = rows ? player.position / rows : 0;
   const seconds = (samples) => (samples / rate).toFixed(1);
@@ -79,9 +81,11 @@ function listAlarms(history) {
     .slice(-LISTED)
     .reverse()
     .map((i) => {
-      const { time_s: alarmS, onset_s: onsetS, probability, valid } = history.decision(i);
+      const decision = history.decision(i);
+      const { time_s: alarmS, onset_s: onsetS, probability, valid } = decision;
       const row = document.createElement("tr");
       const texts = [`${alarmS.toFixed(3)} s`, `${onsetS.toFixed(3)} s`, probability.toFixed(2)];
+      if (decision.raised_by) texts.push(decision.raised_by);
       for (const text of texts) row.insertCell().textContent = text;
       if (!valid) row.title = "not valid: a channel in use is dead or broken";
       row.classList.toggle("doubtful", !valid);

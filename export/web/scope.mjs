@@ -1,6 +1,13 @@
 // The picture: columns of one pixel, each drawn once and kept in a ring as long as it is in view.
 
-import { GUTTER, laneScales, panels, statisticRange, usedChannels } from "./lanes.mjs";
+import {
+  GUTTER,
+  laneScales,
+  onsetRange,
+  panels,
+  statisticRange,
+  usedChannels,
+} from "./lanes.mjs";
 import { drawOverlay } from "./overlay.mjs";
 
 const VIEW_S = 4; // seconds from left to right
@@ -20,6 +27,7 @@ export class Scope {
     this.facts = facts;
     this.used = usedChannels(facts);
     this.range = statisticRange(facts);
+    this.onsetRange = onsetRange(facts);
     this.restyle();
   }
 
@@ -99,7 +107,7 @@ export class Scope {
     const { width, height } = this.#ring;
     const { ratio } = this.size;
     const { colours, samplesPerColumn } = this;
-    const { status, probability, statistic, groups } = this.panels;
+    const { status, probability, statistic, onset, groups } = this.panels;
     const x = column % width;
     const from = Math.max(0, Math.ceil(column * samplesPerColumn) - 1); // joins the one before
     const to = Math.min(this.recording.rows, Math.ceil((column + 1) * samplesPerColumn));
@@ -114,7 +122,7 @@ export class Scope {
     const lanes = { top: groups[0].top, height: bottom - groups[0].top };
     if (isOn) fill(colours.pale, lanes);
     if (now >= 0) fill(isOn ? colours.slip : colours.rest, status);
-    if (now >= 0 && !history.isValid(now)) for (const p of [lanes, status]) fill(this.#hatch, p);
+    if (now >= 0 && history.isDoubtful(now)) for (const p of [lanes, status]) fill(this.#hatch, p);
     for (const group of groups) {
       context.fillStyle =
         group.kind !== "PVDF" ? colours.gauge : isOn ? colours.slip : colours.rest;
@@ -125,6 +133,8 @@ export class Scope {
     context.fillStyle = colours.ink;
     this.#trace(context, x, probability, [0, 1], history.columns.probability, before, now);
     this.#trace(context, x, statistic, this.range, history.columns.statistic, before, now);
+    if (onset === null) return;
+    this.#trace(context, x, onset, this.onsetRange, history.columns.onset_score, before, now);
   }
 
   /** From the lowest to the highest sample of a channel in a column. */

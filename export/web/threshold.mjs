@@ -49,15 +49,16 @@ function byRate(facts, curve) {
 }
 
 function byStatistic(facts) {
-  const { rule } = facts;
-  const ceiling = rule?.ceiling ?? null; // with one, 0 bounds the statistic from below
+  const { rule, onset_hop_samples: hop } = facts;
+  const name = hop ? "onset score" : `${rule?.name ?? "alarm"} statistic`;
+  const ceiling = hop ? null : (rule?.ceiling ?? null); // with one, 0 bounds it from below
   const threshold = facts.threshold ?? ceiling ?? 0; // null is one that nothing reaches
   const reach = Math.max(5, Math.abs(threshold));
   const [low, high] = ceiling === null ? [threshold - reach, threshold + reach] : [0, ceiling];
   const toThreshold = (share) => low + share * (high - low);
   return {
     title: "Alarm threshold",
-    note: `of the ${rule?.name ?? "alarm"} statistic; this file has no curve of false alarms`,
+    note: `of the ${name}; this file has no curve of false alarms`,
     own: (threshold - low) / (high - low),
     toThreshold,
     text: (share) => rounded(toThreshold(share)),

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from tactslip_torch.commands.entry import entry_point, one_line
@@ -36,6 +37,7 @@ from tactslip_torch.onset.events import (
     pooled_metrics,
     recording_events,
 )
+from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.report.onset import (
     DecisionCounts,
@@ -155,7 +157,9 @@ def _detect_in(
             of = {column: values.numpy() for column, values in columns.items()}
             times, is_valid, is_on = of["available_s"], of["is_valid"], of["is_on"]
             counts.add(times, of["llr"], is_valid, is_on, [asdict(a) for a in decisions.alarms])
-            traces.add_decisions(times, of["probability"], is_on, is_valid, of["answer"] < 0)
+            score = np.where(of["onset_score"] > NOTHING_YET, of["onset_score"], math.nan)
+            doubtful = of["answer"] < 0
+            traces.add_decisions(times, of["probability"], is_on, is_valid, doubtful, score)
             if write:
                 write(zip(*(values.tolist() for values in of.values()), strict=True))
 
@@ -174,7 +178,15 @@ def _detect_in(
         alarms = [(alarm["alarm_s"], alarm["onset_s"]) for alarm in entry["alarms"]]
         title = onsets_title(entry, of_simulated=bool(detector.info.get("simulated")))
         path = context.folder / f"{name}_onsets.png"
-        onset_figure(traces, path, alarms=alarms, truth=entry["truth"], title=title)
+        onset = context.settings.onset
+        onset_figure(
+            traces,
+            path,
+            alarms=alarms,
+            truth=entry["truth"],
+            onset_threshold=None if onset is None else onset.threshold,
+            title=title,
+        )
     return entry, events
 
 
@@ -218,7 +230,10 @@ def _settings(config: DictConfig, detector: SlipDetector) -> AlarmSettings:
         return settings
     if type(config.threshold) not in (int, float) or not math.isfinite(config.threshold):
         raise ValueError(f"threshold must be a finite number, got {config.threshold!r}")
-    return replace(settings, threshold=float(config.threshold))
+    value = float(config.threshold)
+    if settings.onset is not None:  # bins keep theirs
+        return replace(settings, onset=replace(settings.onset, threshold=value))
+    return replace(settings, threshold=value)
 
 
 def _num_pieces(path: Path, context: _DetectionContext) -> int:

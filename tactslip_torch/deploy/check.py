@@ -30,6 +30,7 @@ from tactslip_torch.model.calibration import probability, widened_llr
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import ChannelMask, Prediction
 from tactslip_torch.onset.decisions import AlarmSettings, calibration_of
+from tactslip_torch.onset.rules import NOTHING_YET
 from tactslip_torch.onset.streaming import StreamingDetector
 from tactslip_torch.simulation.extremes import EXTREMES, RAIL_V, extreme_bins
 from tactslip_torch.simulation.scene import Scene
@@ -56,6 +57,7 @@ _QUIET_V = 2e-3  # twice the least range of a channel of a detector of simulated
 _DECISIONS = 12  # of the stream, at least
 _STATISTIC = {"float32": 1e-3, "float64": 1e-8}  # by which it may differ, as a part of its range
 _LATE_S = 1e-9  # by which times may differ
+_ONSET_SCORE = 1e-9  # by which onset scores may, which are float64 always
 
 
 def check_model(
@@ -294,7 +296,13 @@ _COLUMNS = {
     "onset_s": "onset_s",
 }
 """Outputs of the graph, and the fields of ``Decisions`` that they are."""
-_FLAGS, _TIMES = ("valid", "alarm", "on"), ("time_s", "onset_s")
+_OF_ONSETS = {"onset_score": "onset_score", "by_onset": "by_onset"}
+"""The same, with an onset classifier."""
+_FLAGS, _TIMES = ("valid", "alarm", "on", "by_onset"), ("time_s", "onset_s")
+
+
+def _columns(settings: AlarmSettings) -> dict[str, str]:
+    return _COLUMNS if settings.onset is None else _COLUMNS | _OF_ONSETS
 
 
 def check_stream(run: Run, detector: SlipDetector, precision: Precision) -> dict[str, Any]:
@@ -311,6 +319,8 @@ def check_stream(run: Run, detector: SlipDetector, precision: Precision) -> dict
         _FEWEST_BINS * max(timing.first, timing.frame),
     )
     num = max(slip.shape[1], max(timing.first, timing.frame) + _DECISIONS * timing.hop)
+    if settings.onset is not None:  # of which half is over before there is evidence
+        num = max(num, 2 * settings.onset.evidence.first_hop * settings.decision_samples)
     samples = _unit_of(detector) * slip.T[torch.arange(num) % slip.shape[1]]
     exact = copy.deepcopy(detector).double()
     usual = _decided(exact, samples, settings)
@@ -326,7 +336,12 @@ def check_stream(run: Run, detector: SlipDetector, precision: Precision) -> dict
         "anyhow": [0, *(int(cut) for cut in anyhow if cut < num)],
     }
     worst = max(compare(samples, settings, cut, f"cut {name}") for name, cut in cuts.items())
-    middling = replace(settings, threshold=_middle_threshold(usual["statistic"]))
+    if settings.onset is None:
+        middling = replace(settings, threshold=_middle_threshold(usual["statistic"]))
+    else:
+        known = usual["onset_score"][usual["onset_score"] > NOTHING_YET]
+        onset = replace(settings.onset, threshold=_middle_threshold(known) if len(known) else 0.0)
+        middling = replace(settings, onset=onset)
     compare(samples, middling, by_hop, "another threshold")
     broken = _broken(samples, detector.needed_index.tolist())
     mask = _masks(detector)["every other"]
@@ -370,13 +385,15 @@ class _StreamComparison(_Comparison):
         """
         expected = _decided(self.detector, samples, settings, () if mask is None else mask)
         got = self._watched(samples.numpy(), settings, cuts, mask, what)
-        for name in _FLAGS:
+        for name in expected.keys() & _FLAGS:
             _same_flags(got[name], expected[name], f"{what}: {name}")
-        off = {name: np.abs(got[name].astype(np.float64) - expected[name]) for name in _COLUMNS}
+        off = {name: np.abs(got[name].astype(np.float64) - expected[name]) for name in expected}
+        if settings.onset is not None:
+            _worst(off["onset_score"], _ONSET_SCORE, "", f"{what}: onset_score")
         for name in _TIMES:
             _worst(off[name], _LATE_S, "s", f"{what}: {name}")
         found = self.score_error(off["score"] / self.sd, degenerate, what)
-        tells = expected["statistic"] > -1e30  # before that a rule has seen too few decisions
+        tells = expected["statistic"] > NOTHING_YET  # before that a rule has seen too few decisions
         span = float(np.ptp(expected["statistic"][tells])) if tells.any() else 0.0
         error = off["statistic"][tells] / (span or 1.0)
         _worst(error, _STATISTIC[self.precision], "of its range", f"{what}: statistic")
@@ -395,23 +412,24 @@ class _StreamComparison(_Comparison):
         what: str,
     ) -> dict[str, NDArray[Any]]:
         """All columns, by a host that hands on tail and state and nothing else."""
-        timing, threshold = Timing.of(self.detector, settings), np.array([settings.threshold])
+        timing, columns = Timing.of(self.detector, settings), _columns(settings)
+        threshold = np.array([(settings.onset or settings).threshold])
         feeds = {"tail": samples[:0], "state": np.empty(0), "threshold": threshold}
         if mask is not None:
             feeds["masked_channels"] = mask.numpy()
         pieces = []
         for start, stop in pairwise([0, *cuts, len(samples)]):
             num = timing.decisions(stop) - timing.decisions(start)
-            wanted = dict.fromkeys(_COLUMNS, f"{self.precision}[{num}]")
-            wanted |= dict.fromkeys(_FLAGS, f"bool[{num}]")
-            wanted |= dict.fromkeys(_TIMES, f"float64[{num}]")
+            wanted = dict.fromkeys(columns, f"{self.precision}[{num}]")
+            wanted |= dict.fromkeys(columns.keys() & _FLAGS, f"bool[{num}]")
+            wanted |= dict.fromkeys(columns.keys() & {*_TIMES, "onset_score"}, f"float64[{num}]")
             wanted["next_tail"] = f"{self.precision}{[timing.tail, samples.shape[1]]}"
             wanted["next_state"] = f"float64{[timing.state_size]}"
             piece = feeds | {"samples": samples[start:stop]}
             got = self.outputs(piece, wanted, f"{what}: at sample {stop}")
             feeds["tail"], feeds["state"] = got.pop("next_tail"), got.pop("next_state")
             pieces.append(got)
-        return {name: np.concatenate([piece[name] for piece in pieces]) for name in _COLUMNS}
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in columns}
 
 
 def _decided(
@@ -423,7 +441,9 @@ def _decided(
         for dtype in (torch.float64, samples.dtype)
     )
     decisions = exact.push(samples)
-    columns = {name: getattr(decisions, field).numpy() for name, field in _COLUMNS.items()}
+    columns = {
+        name: getattr(decisions, field).numpy() for name, field in _columns(settings).items()
+    }
     # a channel is trusted by what its samples resolve in the precision they come in
     return columns | {"valid": in_its_own.push(samples).is_valid.numpy()}
 

@@ -126,10 +126,13 @@ def _metadata(detector: SlipDetector, kind: GraphKind, precision: Precision) -> 
             "tail_samples": timing.tail,
             "state_size": timing.state_size,
             "rule": settings.rule.to_dict(),
-            "threshold": settings.threshold,
+            "threshold": (settings.onset or settings).threshold,
             "target_false_alarms_per_hour": settings.target_per_hour,
             "threshold_curve": settings.metadata.get("threshold_curve", []),
         }
+        if settings.onset is not None:  # whose threshold the one above is
+            metadata["status_threshold"] = settings.threshold
+            metadata["onset_hop_samples"] = timing.onset_hop
     return metadata
 
 

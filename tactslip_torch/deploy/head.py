@@ -39,11 +39,11 @@ def scored(
     """
     head, gaussians = detector.head, detector.gaussians
     channels = detector.extractor.plan.channels
-    z = _scaled(_pooled(features, is_missing, detector), detector.scaler)
+    z = scaled(_pooled(features, is_missing, detector), detector.scaler)
     # a column that is pooled is of no channel; a product is quicker than to pick flags
     of_channel = np.equal.outer(np.array(channels), detector.channel_index.numpy())
     is_lost = is_missing.cast(F32) @ of_channel > 0.0  # [B, K]
-    score = _machine(is_lost.graph.where(is_lost, _float64(z, detector.imputation), z), head, dtype)
+    score = machine(is_lost.graph.where(is_lost, _float64(z, detector.imputation), z), head, dtype)
     if gaussians is None or not isinstance(head, QuadraticForm):
         return score, None
     return _expected_scores(score, z, is_lost, head, gaussians)
@@ -74,7 +74,7 @@ def _pooled(features: Value, is_missing: Value, detector: SlipDetector) -> Value
     return graph.where(known, made, _float64(made, layer.fill))
 
 
-def _scaled(features: Value, scaler: FeatureScaler) -> Value:
+def scaled(features: Value, scaler: FeatureScaler) -> Value:
     """Features in [-1, 1], ``[B, K]``, float64: ``FeatureScaler``.
 
     ONNX has no ``log1p``: the knee becomes ``Log(1 + x)``, off by some eps of the knee.
@@ -92,7 +92,7 @@ def _scaled(features: Value, scaler: FeatureScaler) -> Value:
     return (features * slope + _float64(features, offset)).clamp(-1.0, 1.0)
 
 
-def _machine(z: Value, head: Head, dtype: np.dtype[Any]) -> Value:
+def machine(z: Value, head: Head, dtype: np.dtype[Any]) -> Value:
     """The score of scaled features: ``[B, K] -> [B]``.
 
     A quadratic form is computed in the dtype of scores. The sum over training bins of a kernel that

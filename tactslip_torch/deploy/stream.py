@@ -3,28 +3,35 @@
 Samples become decisions, these a statistic (``onset.rules``), and that alarms. What one decision
 hands to the next, and no more, is walked by a ``Scan``, an iteration of which costs as much as
 several nodes do on all decisions together. While nothing speaks for slip, nothing is walked.
+With an onset classifier (``deploy.onset``) decisions are its hop apart.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tactslip_torch.deploy.bins import Precision, RawBin, dtype_of, masked_input, score_bins
+from tactslip_torch.deploy.bins import Precision, RawBin, Scored, dtype_of, masked_input, score_bins
+from tactslip_torch.deploy.onset import memory_size, memory_start, onset_scores
 from tactslip_torch.deploy.value import BOOL, END, F64, I64, Graph, Value
 from tactslip_torch.model.calibration import probability
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.onset.decisions import AlarmSettings
+from tactslip_torch.onset.evidence import OnsetClassifier
 from tactslip_torch.onset.rules import NEUTRAL, NOTHING_YET, Cusum, KOfN, Rule
 from tactslip_torch.signals.filtering import past_matrix
 
 LATCH_START = (0.0, 0.0, 2.0**52)
 """Armed, with no alarm before; the last number counts on exactly in float64."""
+
+
+_SAID_OF_BIN = ("score", "probability", "statistic", "valid", "onset_s")
+"""What is kept of the last bin for decisions with an onset classifier."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +40,12 @@ class Timing:
 
     Attributes:
         raw: the samples of a bin.
-        hop: distance of two decisions.
-        first: samples that must have come before the first decision, but for long frames.
-        frame: samples that must have come before any.
+        hop: distance of two decisions on bins.
+        first: samples that must have come before the first of these, but for long frames.
+        frame: samples that must have come before any of these.
         tail: samples that are kept.
         state_size: numbers that are kept.
+        onset_hop: distance of two decisions with an onset classifier.
     """
 
     raw: RawBin
@@ -46,6 +54,7 @@ class Timing:
     frame: int
     tail: int
     state_size: int
+    onset_hop: int | None = None
 
     @classmethod
     def of(cls, detector: SlipDetector, settings: AlarmSettings) -> Timing:
@@ -53,10 +62,18 @@ class Timing:
         raw = RawBin.of(detector)
         frame = max(detector.channel_filter.window_lengths[i] for i in raw.channels)
         size = 6 + len(rule_start(settings.rule))
-        return cls(raw, settings.hop_samples, raw.bin + raw.after, frame, raw.length - 1, size)
+        times = settings.hop_samples, raw.bin + raw.after, frame
+        if settings.onset is None:
+            return cls(raw, *times, raw.length - 1, size)
+        evidence = settings.onset.evidence
+        tail = max(raw.length, evidence.context + evidence.hop_samples) - 1
+        size += len(_SAID_OF_BIN) + memory_size(evidence)
+        return cls(raw, *times, tail, size, evidence.hop_samples)
 
     def decisions(self, num: int) -> int:
         """How many are made by the time that as many samples have come."""
+        if self.onset_hop is not None:
+            return num // self.onset_hop
         return 0 if num < max(self.first, self.frame) else (num - self.first) // self.hop + 1
 
 
@@ -76,6 +93,10 @@ def stream_graph(
     an alarm stands, decisions in a row that were low, decisions since the last alarm, and the
     memory of the rule.
 
+    With an onset classifier there are ``onset_score``, float64, and ``by_onset`` too, the threshold
+    is the classifier's, and behind the memory of the rule the state has what is said of the last
+    bin (``_SAID_OF_BIN``) and the memory of blocks (``deploy.onset``).
+
     Args:
         detector: that scores the bins.
         settings: hop, calibration, rule and threshold.
@@ -92,10 +113,19 @@ def stream_graph(
     threshold = graph.input("threshold", F64, ("t",))
     masked = masked_input(graph, detector)
 
-    nothing = graph.constant(np.zeros((timing.tail, num_channels)), dtype)
+    onset = settings.onset
+    before = 0.0 if onset is None else math.nan  # what no stream has is no evidence
+    nothing = graph.constant(np.full((timing.tail, num_channels), before), dtype)
     held = graph.concat(nothing, tail, samples, axis=0)
     start = graph.constant([0, 0, 0, *LATCH_START, *rule_start(settings.rule)], F64)
-    state = graph.concat(state, start, axis=0).slice(0, timing.state_size, 0)
+    if onset is not None:
+        says_nothing = graph.constant([0.0, settings.slip_share, NOTHING_YET, 0.0, math.inf], F64)
+        start, given = graph.concat(start, says_nothing, axis=0), state
+        small = timing.state_size - memory_size(onset.evidence)
+        state = given.slice(0, small, 0)
+    else:
+        small = timing.state_size
+    state = graph.concat(state, start, axis=0).slice(0, small, 0)
     seen = state.slice(0, 1, 0) + samples.length(0).cast(F64)
     decided = ((seen + float(timing.hop - timing.first)) / float(timing.hop)).floor().clamp(min=0.0)
     if timing.frame > timing.first:
@@ -103,30 +133,41 @@ def stream_graph(
     outputs: dict[str, np.dtype[Any]] = dict.fromkeys(("score", "probability", "statistic"), dtype)
     outputs |= dict.fromkeys(("valid", "alarm", "on"), BOOL)
     outputs |= dict.fromkeys(("time_s", "onset_s"), F64)
+    if onset is not None:
+        outputs |= {"onset_score": F64, "by_onset": BOOL}
+    rate_hz = detector.pool.sample_rate_hz
+    rearm, refractory = (
+        settings.decisions(seconds, rate_hz)
+        for seconds in (settings.rearm_s, settings.refractory_s)
+    )
 
-    def decide() -> list[Value]:
-        sizes = graph.axes(1, 1, 1, 3, timing.state_size - 6)
-        _, made, run, of_latch, of_rule = graph.ops("Split", state, sizes, dtypes=[F64] * 5, axis=0)
+    def level(own: float, of_dtype: np.dtype[Any]) -> Value:
+        """The threshold that is given, or the file's."""
+        known = graph.concat(threshold, graph.constant([own], F64), axis=0)
+        return known.slice(0, 1, 0).cast(of_dtype)
+
+    def bins(made: Value, of_rule: Value) -> tuple[Value, Scored, Value, Value, Value]:
+        """Number, scores, ratios and statistics of the next bins, and the memory of the rule."""
         places = _count_up((decided - made).cast(I64))
         number = places.cast(F64) + made
         windows = _windows(held, seen, made * float(timing.hop), places, detector, timing)
         scored = score_bins(windows.cast(dtype), detector, masked)
         llr = graph.where(scored.is_usable, scored.llr(settings.calibration), NEUTRAL)
-        statistic, of_rule = statistic_of(settings.rule, llr, of_rule)
-        own = graph.constant([settings.threshold], F64)
-        level = graph.concat(threshold, own, axis=0).slice(0, 1, 0).cast(dtype)
-        rate_hz = detector.pool.sample_rate_hz
-        rearm, refractory = (
-            settings.decisions(seconds, rate_hz)
-            for seconds in (settings.rearm_s, settings.refractory_s)
-        )
-        latch = latched(statistic, level, number, of_latch, rearm=rearm, refractory=refractory)
+        return number, scored, llr, *statistic_of(settings.rule, llr, of_rule)
+
+    def stated(ratio: Any) -> Any:
+        return probability(ratio, settings.slip_share)
+
+    def decide() -> list[Value]:
+        sizes = graph.axes(1, 1, 1, 3, timing.state_size - 6)
+        _, made, run, of_latch, of_rule = graph.ops("Split", state, sizes, dtypes=[F64] * 5, axis=0)
+        number, scored, llr, statistic, of_rule = bins(made, of_rule)
+        high = level(settings.threshold, dtype)
+        latch = latched(statistic, high, number, of_latch, rearm=rearm, refractory=refractory)
         run = _latest(llr <= 0.0, run, number + 1.0)
-        ratio: Any = llr
-        stated: Any = probability(ratio, settings.slip_share)
         return [
             scored.score,
-            stated,
+            stated(llr),
             statistic,
             scored.is_valid,
             latch.alarm,
@@ -139,7 +180,80 @@ def stream_graph(
         empty = [graph.constant([], kind) for kind in outputs.values()]
         return [*empty, graph.concat(seen, state.slice(1, END, 0), axis=0)]
 
-    *made, next_state = graph.if_(decided > state.slice(1, 2, 0), decide, wait)
+    def join(onset: OnsetClassifier) -> list[Value]:
+        """Decisions a hop of the classifier apart, from its scores and the last bin by then."""
+        num_said = len(_SAID_OF_BIN)
+        sizes = graph.axes(1, 1, 1, 3, small - 6 - num_said, num_said)
+        parts = graph.ops("Split", state, sizes, dtypes=[F64] * 6, axis=0)
+        before, made, run, of_latch, of_rule, said = parts
+        (memory,) = graph.if_(
+            given.length(0) > 0,
+            lambda: [given.slice(small, END, 0)],
+            lambda: [memory_start(graph, onset.evidence)],
+        )
+
+        def decide_bins() -> list[Value]:
+            number, scored, llr, statistic, after = bins(made, of_rule)
+            runs = _latest(llr <= 0.0, run, number + 1.0)
+            unwaiting = replace(timing, frame=0)
+            onset_s = _times_s(number, runs, settings, unwaiting, rate_hz)[1]
+            columns = scored.score, stated(llr), statistic, scored.is_valid, onset_s
+            made_rows = graph.concat(*(x.cast(F64).unsqueeze(1) for x in columns), axis=1)
+            rows = graph.concat(said.unsqueeze(0), made_rows, axis=0)
+            return [rows, decided, _last(runs), after]
+
+        rows, *of_bins = graph.if_(
+            decided > made, decide_bins, lambda: [said.unsqueeze(0), made, run, of_rule]
+        )
+        hop, of_bin = float(onset.evidence.hop_samples), float(timing.hop)
+        hops, first = (seen / hop).floor(), (before / hop).floor()
+
+        def next_state(of_latch: Value, memory: Value) -> Value:
+            kept = (seen, *of_bins[:2], of_latch, of_bins[2], _last(rows).squeeze(0), memory)
+            return graph.concat(*kept, axis=0)
+
+        def decide_hops() -> list[Value]:
+            places = _count_up((hops - first).cast(I64))
+            number = places.cast(F64) + first
+            origin = first * hop - seen - float(onset.evidence.context)  # counted from the end
+            x = held.slice(origin.cast(I64), END, 0)
+            onset_score, after = onset_scores(x, places, memory, onset, masked)
+            by_onset = onset_score >= level(onset.threshold, F64)
+            samples = (number + 1.0) * hop
+            last = ((samples - float(timing.first)) / of_bin).floor()
+            if timing.frame > timing.first:
+                last = graph.where(samples >= float(timing.frame), last, -1.0)
+            place = (last - made + 1.0).clamp(min=0.0).cast(I64)  # row 0 is what was known before
+            told = graph.op("Gather", rows, place, axis=0)
+            score, stated, statistic, valid, onset_s = (told[..., i] for i in range(num_said))
+            statistic, time_s = statistic.cast(dtype), samples / rate_hz
+            is_high = (by_onset | (statistic >= settings.threshold)).cast(F64)
+            one, times = graph.constant([1.0], F64), {"rearm": rearm, "refractory": refractory}
+            latch = latched(is_high, one, number, of_latch, **times)
+            return [
+                score.cast(dtype),
+                stated.cast(dtype),
+                statistic,
+                valid.cast(BOOL),
+                latch.alarm,
+                latch.on,
+                time_s,
+                graph.where(by_onset, time_s - onset.lead_s, onset_s).minimum(time_s),
+                onset_score,
+                by_onset,
+                next_state(latch.memory, after),
+            ]
+
+        def wait_for_hop() -> list[Value]:
+            empty = [graph.constant([], kind) for kind in outputs.values()]
+            return [*empty, next_state(of_latch, memory)]
+
+        return graph.if_(hops > first, decide_hops, wait_for_hop)
+
+    if onset is None:
+        *made, next_state = graph.if_(decided > state.slice(1, 2, 0), decide, wait)
+    else:
+        *made, next_state = join(onset)
     for name, value in zip(outputs, made, strict=True):
         graph.output(name, value, ("k",))
     graph.output("next_tail", held.slice(-timing.tail, END, 0), (timing.tail, num_channels))

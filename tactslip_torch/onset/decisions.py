@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.features.pool import FeaturePool
+from tactslip_torch.hand import HandLayout
 from tactslip_torch.model.abstention import ABSTAIN, Abstention
 from tactslip_torch.model.calibration import (
     Calibration,
@@ -28,7 +29,8 @@ from tactslip_torch.model.calibration import (
 )
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import Prediction
-from tactslip_torch.onset.rules import NEUTRAL, Latch, Rule, latch, rule_from_dict
+from tactslip_torch.onset.evidence import OnsetClassifier
+from tactslip_torch.onset.rules import NEUTRAL, NOTHING_YET, Latch, Rule, latch, rule_from_dict
 from tactslip_torch.signals.filtering import ChannelFilter
 
 KEY = "alarm"
@@ -52,6 +54,8 @@ class AlarmSettings:
         lead_s: from an onset to the first decision that speaks for slip, in the middle; the
             estimate of an onset goes back by it.
         metadata: on what the threshold was set, JSON-able: recordings, hours, achieved rate.
+        onset: classifier of fast evidence; with it an alarm comes from either, and decisions are
+            its hop apart.
 
     Raises:
         ValueError: if a time or the hop is negative, the share lies outside 0 to 1, or the
@@ -68,6 +72,7 @@ class AlarmSettings:
     refractory_s: float = 0.2
     lead_s: float = 0.0
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    onset: OnsetClassifier | None = None
 
     def __post_init__(self) -> None:
         if self.hop_samples < 1:
@@ -85,9 +90,14 @@ class AlarmSettings:
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
 
+    @property
+    def decision_samples(self) -> int:
+        """Distance of two decisions: that of the onset classifier, if there is one."""
+        return self.hop_samples if self.onset is None else self.onset.evidence.hop_samples
+
     def decisions(self, seconds: float, sample_rate_hz: float) -> int:
         """A length of time in decisions, rounded up."""
-        return -(-round(seconds * sample_rate_hz) // self.hop_samples)
+        return -(-round(seconds * sample_rate_hz) // self.decision_samples)
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain JSON types."""
@@ -95,11 +105,14 @@ class AlarmSettings:
         plain["calibration"] = self.calibration.to_dict()
         plain["rule"] = self.rule.to_dict()
         plain["metadata"] = dict(self.metadata)
+        plain["onset"] = self.onset and self.onset.to_dict()
         return plain
 
     @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> AlarmSettings:
-        """The settings that ``to_dict`` wrote.
+    def from_dict(
+        cls, plain: Mapping[str, Any], hand: HandLayout, sample_rate_hz: float
+    ) -> AlarmSettings:
+        """The settings that ``to_dict`` wrote, of a detector of this hand.
 
         Raises:
             ValueError: if one is missing, unknown or no such value.
@@ -108,6 +121,8 @@ class AlarmSettings:
             values = dict(plain)
             values["calibration"] = calibration_from_dict(values["calibration"])
             values["rule"] = rule_from_dict(values["rule"])
+            if (onset := values.get("onset")) is not None:
+                values["onset"] = OnsetClassifier.from_dict(onset, hand, sample_rate_hz)
             return cls(**values)
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"no alarm settings of this version: {error}") from error
@@ -124,7 +139,7 @@ class AlarmSettings:
                 "this detector has no alarm threshold; train with +exp=onset, which sets one, or "
                 "with onset=debounced, which is set for no rate"
             )
-        return cls.from_dict(detector.info[KEY])
+        return cls.from_dict(detector.info[KEY], detector.pool.hand, detector.pool.sample_rate_hz)
 
 
 def calibration_of(detector: SlipDetector) -> tuple[Calibration, float] | None:
@@ -219,6 +234,7 @@ class Alarm:
         probability: that the deciding bin is slip.
         statistic: of the rule.
         is_valid: whether every channel in use could be trusted.
+        raised_by: ``"onset"``, the classifier of fast evidence, or ``"status"``, that of bins.
     """
 
     alarm_s: float
@@ -227,10 +243,14 @@ class Alarm:
     probability: float
     statistic: float
     is_valid: bool
+    raised_by: str = "status"
 
 
 class Decisions(NamedTuple):
     """One entry per decision, in order; of several streams at once, one row each.
+
+    With an onset classifier there is one every hop of its own, and what is said of bins is that of
+    the last bin known by then: score 0 and no probability of its own before the first, not valid.
 
     Attributes:
         number: of the decision in its stream, from 0, ``[m]``, int64.
@@ -243,6 +263,8 @@ class Decisions(NamedTuple):
         is_valid: whether every channel in use could be trusted, ``[*, m]``.
         is_alarm: whether it raises an alarm, ``[*, m]``.
         is_on: whether an alarm stands after it: the contact's status, ``[*, m]``.
+        onset_score: of fast evidence, ``NOTHING_YET`` where there is none, ``[*, m]``, float64.
+        by_onset: whether fast evidence reaches its threshold, ``[*, m]``.
     """
 
     number: Tensor
@@ -255,6 +277,8 @@ class Decisions(NamedTuple):
     is_valid: Tensor
     is_alarm: Tensor
     is_on: Tensor
+    onset_score: Tensor
+    by_onset: Tensor
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
@@ -267,19 +291,30 @@ class Decisions(NamedTuple):
                 probability=float(self.probability[i]),
                 statistic=float(self.statistic[i]),
                 is_valid=bool(self.is_valid[i]),
+                raised_by="onset" if self.by_onset[i] else "status",
             )
             for i in self.is_alarm.nonzero().flatten().tolist()
         )
 
 
+_OF_BINS = ("onset_s", "score", "llr", "probability", "statistic", "is_valid")
+"""What decisions with an onset classifier say of the last bin; float64 holds all of it exactly."""
+
+
 class Decider:
     """Scores in, decisions out; its memory has a fixed size.
+
+    ``decide`` is told of bins alone. With an onset classifier ``join`` makes of these decisions and
+    of onset scores those of the alarm: it is raised by whichever reaches its threshold first, and
+    stands until both have been low for ``rearm_s``. So bins confirm what fast evidence raised, or
+    clear it.
 
     Args:
         settings: calibration, rule, threshold.
         sample_rate_hz: of the stream.
         bin_samples: length of a bin.
         look_ahead: samples behind its bin that a decision waits for.
+        frame_samples: that must have come before any decision on a bin.
 
     Example:
         >>> from tactslip_torch.model.calibration import Platt
@@ -292,11 +327,16 @@ class Decider:
     """
 
     def __init__(
-        self, settings: AlarmSettings, sample_rate_hz: float, bin_samples: int, look_ahead: int
+        self,
+        settings: AlarmSettings,
+        sample_rate_hz: float,
+        bin_samples: int,
+        look_ahead: int,
+        frame_samples: int = 0,
     ) -> None:
         self.settings = settings
         self._rate = sample_rate_hz
-        self._first = bin_samples + look_ahead
+        self._first, self._frame = bin_samples + look_ahead, frame_samples
         self._rearm = settings.decisions(settings.rearm_s, sample_rate_hz)
         self._refractory = settings.decisions(settings.refractory_s, sample_rate_hz)
         self.reset()
@@ -306,6 +346,10 @@ class Decider:
         self._number = 0  # Python's integers do not end
         # of the rule (of one stream plain numbers); of the latch, one a stream; where the run began
         self._state: tuple[Any, list[Latch], Array] | None = None
+        self._hop = 0  # of the next onset score
+        self._known: Array | None = None  # of bins, those that count from the next hop on
+        self._first_known = -1  # number of the first of them
+        self._latches: list[Latch] = []
 
     def decide(
         self,
@@ -348,16 +392,7 @@ class Decider:
         else:
             statistic, of_rule = settings.rule.scan(llr, of_rule)
             rows = statistic.flatten(0, -2).tolist()
-        times = {"rearm": self._rearm, "refractory": self._refractory}
-        made = [
-            latch(row, float(one(settings.threshold)), **times, state=state)
-            for row, state in zip(rows, latches, strict=True)
-        ]
-        is_alarm, is_on = (
-            torch.from_numpy(np.array([of_row[part] for of_row in made], bool).reshape(score.shape))
-            for part in (0, 1)
-        )
-        latches = [state for _, _, state in made]
+        is_alarm, is_on, latches = self._latched(rows, float(one(settings.threshold)), latches)
         number = np.arange(self._number, self._number + score.shape[-1])
         # where the unbroken run of positive ratios up to each decision began: behind one that is
         # not positive the next one would begin it
@@ -376,9 +411,79 @@ class Decider:
             probability(llr, settings.slip_share),
             statistic,
             is_valid,
-            is_alarm,
-            is_on,
+            is_alarm.reshape(score.shape),
+            is_on.reshape(score.shape),
+            torch.full(score.shape, NOTHING_YET, dtype=torch.float64),
+            torch.zeros(score.shape, dtype=torch.bool),
         )
+
+    def join(self, bins: Decisions, onset_score: Tensor) -> Decisions:
+        """The decisions of the alarm.
+
+        Args:
+            bins: what ``decide`` made next; those of one push may wait for later hops.
+            onset_score: of the hops that came next.
+
+        Shape:
+            - onset_score, output: ``[*, k]``; the streams ``*`` are always the same
+        """
+        onset, settings = self.settings.onset, self.settings
+        assert onset is not None
+        scores, known = onset_score.numpy(), self._known
+        if known is None:  # before all bins, number -1
+            says_nothing = (math.inf, 0.0, 0.0, settings.slip_share, NOTHING_YET, 0.0)
+            known = np.multiply.outer(says_nothing, np.ones((*scores.shape[:-1], 1)))
+            self._first_known, self._latches = -1, [Latch()] * int(np.prod(scores.shape[:-1]))
+        if bins.score.shape[-1]:
+            made = np.stack([getattr(bins, name).numpy() for name in _OF_BINS])
+            known = np.concatenate([known, made], -1)
+        number = self._hop + np.arange(scores.shape[-1])
+        samples = (number + 1) * onset.evidence.hop_samples
+        last = (samples - self._first) // settings.hop_samples
+        last[samples < max(self._frame, self._first)] = -1
+        at = last - self._first_known
+        began_s, score, llr, stated, statistic, is_valid = known.take(at, -1)
+        if len(at):
+            known, self._first_known = known[..., at[-1] :].copy(), int(last[-1])
+        self._known, self._hop = known, self._hop + len(number)
+        dtype = bins.score.numpy().dtype
+        score, llr, stated, statistic = (
+            torch.from_numpy(entry.astype(dtype)) for entry in (score, llr, stated, statistic)
+        )
+        by_onset = scores >= onset.threshold
+        is_high = by_onset | (statistic.numpy() >= dtype.type(settings.threshold))
+        rows = is_high.reshape(len(self._latches), len(number)).tolist()
+        is_alarm, is_on, self._latches = self._latched(rows, 1.0, self._latches)
+        available_s = samples / self._rate
+        onset_s = np.where(by_onset, available_s - onset.lead_s, began_s)
+        return Decisions(
+            torch.from_numpy(number),
+            torch.from_numpy(available_s),
+            torch.from_numpy(np.minimum(onset_s, available_s)),
+            score,
+            llr,
+            stated,
+            statistic,
+            torch.from_numpy(is_valid > 0),
+            is_alarm.reshape(scores.shape),
+            is_on.reshape(scores.shape),
+            onset_score,
+            torch.from_numpy(by_onset),
+        )
+
+    def _latched(
+        self, rows: list[list[float]], threshold: float, latches: list[Latch]
+    ) -> tuple[Tensor, Tensor, list[Latch]]:
+        """Alarms of every stream, whether one stands, and the latches after them."""
+        times = {"rearm": self._rearm, "refractory": self._refractory}
+        made = [
+            latch(row, threshold, **times, state=state)
+            for row, state in zip(rows, latches, strict=True)
+        ]
+        alarms, standing = (
+            torch.from_numpy(np.array([of_row[part] for of_row in made], bool)) for part in (0, 1)
+        )
+        return alarms, standing, [state for _, _, state in made]
 
     def _available_s(self, number: Array) -> Array:
         samples = number * self.settings.hop_samples + self._first

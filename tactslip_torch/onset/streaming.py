@@ -20,6 +20,7 @@ from torch import Tensor
 from tactslip_torch.model.detector import SlipDetector
 from tactslip_torch.model.missing_channels import ChannelMask, masked_names
 from tactslip_torch.onset.decisions import AlarmSettings, Decider, Decisions, is_usable
+from tactslip_torch.onset.evidence import OnsetStream
 from tactslip_torch.signals.filtering import past_of
 
 _LOG = logging.getLogger(__name__)
@@ -91,7 +92,7 @@ class StreamingDetector:
         self._before = detector.context_before
         self._whole = self._before + pool.bin_samples + detector.context_after
         self._first = pool.bin_samples + detector.look_ahead
-        parts = (pool.sample_rate_hz, pool.bin_samples, detector.look_ahead)
+        parts = (pool.sample_rate_hz, pool.bin_samples, detector.look_ahead, self._frame)
         self._decider = Decider(self.settings, *parts)
         self._start()
 
@@ -102,7 +103,10 @@ class StreamingDetector:
 
     @masked_channels.setter
     def masked_channels(self, masked_channels: ChannelMask) -> None:
-        self._masked_channels = masked_names(masked_channels, self.detector.pool.hand.names)
+        names = self.detector.pool.hand.names
+        self._masked_channels = masked_names(masked_channels, names)
+        is_masked = torch.tensor([name in self._masked_channels for name in names])
+        self._mask = is_masked if self._masked_channels else None
 
     @property
     def look_ahead_s(self) -> float:
@@ -117,12 +121,12 @@ class StreamingDetector:
     @property
     def hop_s(self) -> float:
         """Between two decisions."""
-        return self.settings.hop_samples / self._clock.sample_rate_hz
+        return self.settings.decision_samples / self._clock.sample_rate_hz
 
     @property
     def state_bytes(self) -> int:
         """Memory of the samples that are remembered."""
-        return int(self._held.nbytes)
+        return int(self._held.nbytes) + (self._onset.state_bytes if self._onset else 0)
 
     def push(
         self, samples: ArrayLike | Tensor, time_s: ArrayLike | Tensor | None = None
@@ -171,8 +175,9 @@ class StreamingDetector:
         if num_samples >= self._frame and last_start >= self._number * self.settings.hop_samples:
             ends = torch.from_numpy(self._held[:, -self._frame :]).flip(-1)
             future = past_of(ends, detector.channel_filter, detector.needed_index.tolist())
-            self._append(future.flip(-1)[:, : detector.context_after].numpy())
-            decisions = self._decide(last_start)
+            if self._onset is None:  # else every decision is there with its last sample
+                self._append(future.flip(-1)[:, : detector.context_after].numpy())
+                decisions = self._timed(self._decide(last_start))
         self._start()
         return decisions
 
@@ -186,8 +191,11 @@ class StreamingDetector:
         self._decider.reset()
         self._held = np.empty((len(self.detector.pool.hand), 0), _NUMPY[self._wide])
         self._start_of_held = 0  # its first sample's place in the stream
-        self._number = 0  # of the next decision
-        self._nothing = self._decide(-1)
+        self._number = 0  # of the next decision on a bin
+        self._onset = None if self.settings.onset is None else OnsetStream(self.settings.onset)
+        self._no_bins = self._nothing = self._decide(-1)
+        if self._onset is not None:
+            self._nothing = self._decider.join(self._no_bins, torch.empty(0, dtype=torch.float64))
 
     def _read(self, samples: ArrayLike | Tensor) -> Array:
         """Samples ``[n, C]`` as a copy ``[C, n]`` in the stream's dtype."""
@@ -232,9 +240,16 @@ class StreamingDetector:
         self._clock.take(x.shape[-1], places, times_s)
         self._append(x)
         num_samples, start = self._clock.num_samples, self._number * self.settings.hop_samples
-        if num_samples < max(start + self._first, self._frame):
+        bins = self._no_bins
+        if num_samples >= max(start + self._first, self._frame):
+            bins = self._decide(num_samples - self._first)
+        if self._onset is None:
+            return self._timed(bins)
+        with torch.no_grad():
+            score = self._onset.push(torch.from_numpy(x), self._mask)
+        if not len(score) and not len(bins.number):
             return self._nothing
-        return self._decide(num_samples - self._first)
+        return self._timed(self._decider.join(bins, score))
 
     def _append(self, x: Array) -> None:
         self._held = np.concatenate([self._held, x], -1, dtype=self._held.dtype)
@@ -254,7 +269,7 @@ class StreamingDetector:
         count = last_start // hop + 1 - self._number
         if count <= 0:
             none = torch.empty(0, dtype=self.dtype)
-            return self._timed(self._decider.decide(none, none.bool()))
+            return self._decider.decide(none, none.bool())
         with torch.no_grad():
             if self._number == 0 and self._start_of_held == 0:
                 first = torch.from_numpy(self._held)
@@ -277,14 +292,18 @@ class StreamingDetector:
             decisions = self._decider.decide(scores.score, scores.is_valid, tells, variance)
         self._number += count
         self._drop()
-        return self._timed(decisions)
+        return decisions
 
     def _timed(self, decisions: Decisions) -> Decisions:
         """The same by the times of the samples, and no earlier than the first frame."""
         if not self._clock.is_timed and self._frame <= self._first:
             return decisions
-        samples = decisions.number.numpy() * self.settings.hop_samples + self._first
-        available_s = torch.from_numpy(self._clock.end_s(samples.clip(min=self._frame)))
+        number, frame = decisions.number.numpy(), self._frame
+        if (onset := self.settings.onset) is None:
+            samples = (number * self.settings.hop_samples + self._first).clip(min=frame)
+        else:
+            samples = (number + 1) * onset.evidence.hop_samples
+        available_s = torch.from_numpy(self._clock.end_s(samples))
         onset_s = available_s - (decisions.available_s - decisions.onset_s)
         return decisions._replace(available_s=available_s, onset_s=onset_s)
 

@@ -42,6 +42,7 @@ Segments = Sequence[tuple[float, float]]
 REST, SLIP = BLUE, ORANGE
 COLUMNS = (
     *("file", "alarm_s", "onset_s", "end_s", "score", "probability", "statistic", "is_valid"),
+    "raised_by",
     *("outcome", "true_onset_s", "delay_s", "simulated"),
 )
 """Of ``onsets.csv``."""
@@ -130,7 +131,7 @@ class Traces:
         self._first, self._stop = (round(edge * sample_rate_hz) for edge in view)
         length, num_decisions = self._stop - self._first, round((view[1] - view[0]) / hop_s)
         self._samples = Envelope(len(channels), length, _NUM_SEGMENTS)
-        self._decisions = Envelope(4, num_decisions, _NUM_SEGMENTS)
+        self._decisions = Envelope(5, num_decisions, _NUM_SEGMENTS)
         self._num_samples = 0
         self._first_s: float | None = None
 
@@ -147,13 +148,15 @@ class Traces:
         is_slip: Array,
         is_valid: Array,
         abstains: Array,
+        onset_score: Array,
     ) -> None:
-        """Take the next decisions, each ``[m]``."""
+        """Take the next decisions, each ``[m]``; without onset score it is not finite."""
         since_s = self.view[0] - self._hop_s  # the one before the view tells the status there
         is_seen = (available_s > since_s) & (available_s <= self.view[1])
         if self._first_s is None and is_seen.any():
             self._first_s = float(available_s[is_seen][0])
-        columns = (probability, is_slip, 1 - is_valid, abstains)  # what is on anywhere stays seen
+        # what is on anywhere stays seen
+        columns = (probability, is_slip, 1 - is_valid, abstains, onset_score)
         self._decisions.add(np.stack(columns)[:, is_seen])
 
     def samples(self) -> tuple[NDArray[np.floating], Array]:
@@ -162,7 +165,10 @@ class Traces:
         return (self._first + numbers) / self._sample_rate_hz, values
 
     def decisions(self) -> tuple[NDArray[np.floating], Array]:
-        """Times in seconds, ``[M]``; probability, slip, not valid and abstaining, ``[4, M]``."""
+        """Times in seconds, ``[M]``, and ``[5, M]``.
+
+        Probability, slip, not valid, abstaining and the onset score, NaN where there is none.
+        """
         numbers, values = self._decisions.points()
         return (self._first_s or 0.0) + numbers * self._hop_s, values
 
@@ -309,6 +315,7 @@ def onsets_table(content: Mapping[str, Any]) -> str:
     for row in rows[:_MOST_ROWS]:
         cells: dict[str, object] = {"file": row["file"], "alarm s": _seconds(row["alarm_s"])}
         cells |= {"onset s": _seconds(row["onset_s"]), "P(slip)": _seconds(row["probability"], 2)}
+        cells |= {"by": row["raised_by"]}
         cells |= {"valid": "NO" if row["is_valid"] is False else row["is_valid"]}
         cells |= {
             "true onset s": _seconds(row["true_onset_s"]),
@@ -379,25 +386,30 @@ def onset_figure(
     *,
     alarms: Segments = (),
     truth: Mapping[str, Any] | None = None,
+    onset_threshold: float | None = None,
     title: str,
 ) -> None:
     """Write channels in lanes, the decided and the true status, and the probability of slip.
+
+    With an onset classifier its score too.
 
     Args:
         traces: what was gathered of the recording.
         path: the PNG to write, replaced as a whole if it exists.
         alarms: of each, when it was raised and when its slip is estimated to have begun.
         truth: of an entry of ``onsets.json``; ``None`` if it is not known.
+        onset_threshold: of the onset classifier; ``None``: there is none.
         title: of the figure; says what is simulated.
     """
     heights = [max(1.2, 0.42 * len(traces.channels)), 0.55, 1.3]
+    heights += [] if onset_threshold is None else [1.3]
     figure = new_figure(12.0, sum(heights) + 1.3, title)
-    panels = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": heights})
+    panels = figure.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights})
     first, last = traces.view
     onsets = truth["onsets"] if truth else []
     onsets_s = [onset["onset_s"] for onset in onsets]
     first_s = [s for onset in onsets if (s := onset.get("first_release_s")) is not None]
-    decided_s, (probability, *statuses) = traces.decisions()
+    decided_s, (probability, *statuses, onset_score) = traces.decisions()
     slips, invalid, doubtful = (_spans(decided_s, status, last) for status in statuses)
     for axes in panels:
         clean(axes, "y")
@@ -410,6 +422,10 @@ def onset_figure(
     panels[2].set(ylim=(-0.04, 1.04), yticks=[0, 0.5, 1])
     panels[2].set_ylabel("P(slip)", fontsize=8)
     _shade(panels[2], doubtful, "abstains", **_ABSTAINS)
+    if onset_threshold is not None:
+        panels[3].plot(decided_s, onset_score, color=INK, linewidth=0.8)
+        panels[3].axhline(onset_threshold, color=ALARM, linewidth=0.8, linestyle="--")
+        panels[3].set_ylabel("onset score", fontsize=8)
     panels[0].set_xlim(first, last)
     raised_s, estimates_s = ([alarm[which] for alarm in alarms] for which in (0, 1))
     for axes, times, name, style in (
@@ -420,7 +436,7 @@ def onset_figure(
         (panels[2], estimates_s, "estimate", _ESTIMATE),
     ):
         _mark(axes, times, name, **style)
-    panels[2].set_xlabel("time, s", fontsize=9, color=GREY)
+    panels[-1].set_xlabel("time, s", fontsize=9, color=GREY)
     handles: list[Any] = [
         Line2D([], [], color=REST, linewidth=2, label="decided: no slip"),
         Line2D([], [], color=SLIP, linewidth=2, label="decided: slip"),

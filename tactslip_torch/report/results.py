@@ -1080,20 +1080,54 @@ def _quiet_rates(metrics: _Metrics, role: str) -> dict[str, tuple[Mapping[str, f
 
 
 def target_line(metrics: _Metrics) -> str:
-    """The rate that was asked for, on what the threshold was set, and what that gave there."""
+    """The budget, and what calibration had of it."""
     alarm = metrics["alarm"]
-    settings, set_on = alarm["settings"], alarm["settings"]["metadata"]["calibrated"]["rate"]
+    metadata = alarm["settings"]["metadata"]
+    parts = []
+    for row in metadata["budget"]:
+        limit = f"{row['limit']:g} an hour"
+        amount = f"{row['amount']:.1f} h"
+        if row["is_share"]:
+            limit, amount = f"{100 * row['limit']:g} % of knocks", f"{row['amount']} knocks"
+        few = f"{row['alarms']} of {row['allowed']} allowed in {amount}"
+        parts.append(f"{words(row['scene'])} {limit} ({few})")
     return (
-        f"asked for: {settings['target_per_hour']:g} false alarms an hour of "
-        f"{settings['metadata']['slip_free']}; {words(alarm['rule'])}, which the "
-        f"detector's file has, was set on {set_on['hours']:.1f} h with {set_on['alarms']}"
+        f"budget of false alarms, at {100 * metadata['confidence']:g} % confidence: "
+        f"{', '.join(parts)}; {words(alarm['rule'])} is what the detector's file has"
     )
 
 
+def budget_rows(metrics: _Metrics) -> list[_Row]:
+    """False alarms of each scene and method beside the budget, on recordings that set nothing.
+
+    Args:
+        metrics: the content of ``metrics.json``, with ``alarm``.
+    """
+    found: dict[tuple[str, str], _Row] = {}
+    for row in metrics["alarm"]["budget"]:
+        if row["role"] not in _STREAMS or not row["amount"]:
+            continue
+        unit, factor = ("% of knocks", 100) if row["is_share"] else ("/h", 1)
+        amount = f"{row['amount']} knocks" if row["is_share"] else f"{row['amount']:.1f} h"
+        cells = found.setdefault(
+            (row["scene"], row["role"]),
+            {
+                "scene": words(row["scene"]),
+                "materials": {"test": "seen"}.get(row["role"], row["role"]),
+                "budget": f"{factor * row['limit']:g} {unit}",
+                "of": amount,
+            },
+        )
+        value, low, high = (factor * row[name] for name in ("rate", "low", "high"))
+        cells[words(row["method"])] = f"{value:.2f} [{low:.2f}, {high:.2f}]"
+    return list(found.values())
+
+
 def alarm_table(metrics: _Metrics) -> str:
-    """``target_line`` and ``rate_rows`` for the terminal."""
+    """``target_line``, ``rate_rows`` and ``budget_rows`` for the terminal."""
     rows = table(rate_rows(metrics), num_left=2, merged=1)
-    return marked(metrics["simulated"], target_line(metrics), rows)
+    budget = table(budget_rows(metrics), num_left=3)
+    return marked(metrics["simulated"], target_line(metrics), rows, budget)
 
 
 def scene_rows(metrics: _Metrics) -> list[_Row]:
@@ -1139,7 +1173,7 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
     """
     alarm = metrics["alarm"]
     scenes, target = alarm["scenes"], alarm["settings"]["target_per_hour"]
-    title = f"Asked for: {target:g} false alarms an hour (dashed)"
+    title = f"Without slip at most {target:g} false alarms an hour (dashed)"
     height = 2.2 + 0.5 * max(len(alarm["methods"]), len(scenes))
     figure = new_figure(12.0, height, title, simulated=metrics["simulated"])
     left, right = figure.subplots(1, 2)
@@ -1156,12 +1190,15 @@ def alarm_figure(metrics: _Metrics, path: str | Path) -> None:
         ]
         _draw_rates(right, of_scenes, aside, colour)
     left.set_title(f"Without slip: {' and '.join(hours)}", fontsize=10, loc="left")
-    trained = words(", ".join(scene for scene in scenes if scenes[scene]["trained"]))
-    what = f" ({trained}: trained on)" if trained else ""
-    right.set_title(f"Confounding scenes, by {words(alarm['rule'])}{what}", fontsize=10, loc="left")
+    left.axvline(target, color=INK, linewidth=1, linestyle="--", zorder=1)
+    what = f"Confounding scenes, by {words(alarm['rule'])} (bars: their budgets)"
+    right.set_title(what, fontsize=10, loc="left")
+    limits = {row["scene"]: row["limit"] for row in alarm["budget"] if not row["is_share"]}
+    for lane, scene in enumerate(scenes):
+        if scene in limits:
+            right.plot([limits[scene]] * 2, [lane - 0.35, lane + 0.35], color=INK, linewidth=1.6)
     for axes, names in ((left, methods), (right, scenes)):
         lanes(axes, list(map(words, names)))
-        axes.axvline(target, color=INK, linewidth=1, linestyle="--", zorder=1)
         axes.set_xscale("log")
         axes.set_xlim(left=0.8 * _LEAST_RATE)
         axes.set_xlabel("false alarms an hour, with interval (none: at the left edge)", fontsize=9)

@@ -1,8 +1,8 @@
 """The alarm of a fitted detector, set on recordings that it was not trained on.
 
-``CalibratedAlarm`` sets it for a false-alarm rate. Half of the cycles of the materials seen in
-training *calibrate*: score to log likelihood ratio, the threshold of every rule, how far an onset
-lies back. The other half and the held-out materials evaluate the result and set nothing.
+``CalibratedAlarm`` fits the onset classifier and sets its threshold and that of bins within a
+budget of false alarms. The recordings that learn, those that calibrate and those that test are
+apart; held-out materials set nothing.
 
 ``DebouncedAlarm`` is for sets with too little recorded without slip to count false alarms on: k of
 the last n decisions say slip, by the calibration of the held-out scores that training chose by.
@@ -15,15 +15,16 @@ import logging
 import math
 import statistics
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from itertools import groupby
+from itertools import groupby, product
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tactslip_torch.data.labels import whole_samples
@@ -58,16 +59,28 @@ from tactslip_torch.onset.events import (
     pooled_metrics,
     recording_events,
 )
-from tactslip_torch.onset.rules import Cusum, KOfN, Rule, rule_from_dict
+from tactslip_torch.onset.evidence import OnsetClassifier
+from tactslip_torch.onset.rules import NOTHING_YET, Cusum, KOfN, Rule, rule_from_dict
 from tactslip_torch.onset.streaming import StreamingDetector
-from tactslip_torch.onset.thresholds import alarm_counts, alarm_rate, choose_threshold
+from tactslip_torch.onset.thresholds import (
+    Budget,
+    Threshold,
+    alarm_rate,
+    choose_threshold,
+    false_alarms,
+    lowest_threshold,
+)
 from tactslip_torch.report.metrics import weights_at_share
 from tactslip_torch.runtime import bar, check_number, in_processes, one_thread
+from tactslip_torch.training.onset import OnsetTraining
 
 log = logging.getLogger(__name__)
 
 OURS = "detector"
 """The name of the detector among those that score; the others are baselines."""
+
+JOINT = "onset and status"
+"""The name of the alarm of fast evidence and bins together."""
 
 FIRST_TRANSITION = "first transition"
 """The name of the paper's rule."""
@@ -77,6 +90,8 @@ FITS: Mapping[str, Callable[[Tensor, Tensor], Calibration]] = {
     "isotonic": fit_isotonic,
 }
 """From scores to log likelihood ratios."""
+
+_SHARE = "_share"  # behind a scene: a budget of its knocks
 
 LEAST, MOST = 0.1, 1000.0
 """False alarms an hour that are of interest."""
@@ -88,6 +103,9 @@ _NUM_POINTS = 25  # of a threshold curve, at most
 _NUM_TRIED = 100
 _TOGETHER = 256  # streams decided at once
 _PUSHES = 200  # timed
+_FULL_S = 2.0  # of stream, until memories are full
+_OF_BINS = 0.5  # of what a budget allows, at most, that bins alone raise
+_SETTLE_S = 0.05  # behind what a decision rests on, as EventRules.settle_s
 
 
 # Streams, and what a detector decides in them ----------------------------------------------------
@@ -102,6 +120,7 @@ class Stream(NamedTuple):
         score: ``[N]``, float32.
         is_valid: whether every channel in use could be trusted, ``[N]``.
         is_usable: whether the score tells anything: some channel in use was there, ``[N]``.
+        onset_score: of every hop of the onset classifier, ``[k]``; of others than the detector [0].
     """
 
     recording: RecordingId
@@ -109,6 +128,7 @@ class Stream(NamedTuple):
     score: Tensor
     is_valid: Tensor
     is_usable: Tensor
+    onset_score: Tensor
 
 
 class Timing(NamedTuple):
@@ -136,7 +156,8 @@ def score_streams(
     source: RecordingSource,
     recordings: Sequence[RecordingId],
     scorers: Mapping[str, Scorer],
-    hop_samples: int,
+    hops: Mapping[str, int],
+    onset: OnsetClassifier | None = None,
     num_workers: int | None = None,
 ) -> dict[str, list[Stream]]:
     """The recordings, in order, as each detector scores them; made by workers.
@@ -145,29 +166,39 @@ def score_streams(
         source: of the recordings.
         recordings: which of them.
         scorers: detectors by name.
-        hop_samples: distance of two decisions.
+        hops: distance of two decisions of each, in samples.
+        onset: scores hops beside the detector ``OURS``.
         num_workers: processes; ``None`` for as many as there are processors, at most 8.
 
     Raises:
         ValueError: if a recording has other channels than a detector.
     """
-    scored = partial(_scored, source, scorers, hop_samples)
+    scored = partial(_scored, source, scorers, hops, onset)
     rows = list(in_processes(scored, recordings, "watch streams", "recording", num_workers))
-    return {name: [row[place] for row in rows] for place, name in enumerate(scorers)}
+    streams = dict[str, list[Stream]]()
+    for name in scorers:
+        arrays = [[torch.from_numpy(x) for x in row[name]] for row in rows]
+        named = zip(recordings, arrays, strict=True)
+        streams[name] = [Stream(one, source.timeline(one), *own) for one, own in named]
+    return streams
 
 
 def _scored(
     source: RecordingSource,
     scorers: Mapping[str, Scorer],
-    hop_samples: int,
+    hops: Mapping[str, int],
+    onset: OnsetClassifier | None,
     recording: RecordingId,
-) -> list[Stream]:
-    samples, times = source.load(recording).samples, source.timeline(recording)
-    streams = []
-    for scorer in scorers.values():
-        found = score_stream(scorer, samples, hop_samples)
+) -> dict[str, list[NDArray[Any]]]:
+    samples = source.load(recording).samples
+    streams = dict[str, list[NDArray[Any]]]()
+    for name, scorer in scorers.items():
+        found = score_stream(scorer, samples, hops[name])
         usable = is_usable(found.score, found.is_missing, scorer.needed_index)
-        streams.append(Stream(recording, times, found.score.float(), found.is_valid, usable))
+        is_ours = onset is not None and name == OURS
+        hopwise = onset.score_recording(samples) if is_ours and onset else torch.empty(0).double()
+        entries = (found.score.float(), found.is_valid, usable, hopwise)
+        streams[name] = [x.numpy() for x in entries]
     return streams
 
 
@@ -213,12 +244,14 @@ def decide(
                 torch.stack([stream.is_valid[::step] for stream in part]),
                 torch.stack([stream.is_usable[::step] for stream in part]),
             )
+            if settings.onset is not None:
+                made = decider.join(made, torch.stack([stream.onset_score for stream in part]))
             for row, stream in enumerate(part):
                 yield stream, Decisions(*(x[row] if x.ndim > 1 else x for x in made))
 
 
-def _length(stream: Stream) -> int:
-    return len(stream.score)
+def _length(stream: Stream) -> tuple[int, int]:
+    return len(stream.score), len(stream.onset_score)
 
 
 def watched(stream: Stream, decisions: Decisions) -> Watched:
@@ -254,6 +287,8 @@ def threshold_curve(
 ) -> list[list[float]]:
     """Thresholds and the false alarms of the detector an hour at each, by the rule in the settings.
 
+    With an onset classifier they are its thresholds, and that of bins stays.
+
     Rates fall as thresholds rise; from ``LEAST`` to ``MOST`` an hour, at most 25 points that are
     about equally far apart by the rate's logarithm. Fewer where the recordings show no more: none
     is below one alarm in all of them.
@@ -263,19 +298,28 @@ def threshold_curve(
         settings: calibration, rule, re-arming; their threshold does not count.
         timing: of the scores.
     """
-    statistics = [made.statistic for _, made in decide(quiet, settings, timing)]
-    hours = sum(map(len, statistics)) * timing.hop_s / 3600
-    falling = torch.cat(statistics).sort(descending=True).values
+    scores, raised = list[NDArray[Any]](), list[NDArray[np.bool_]]()
+    for _, made in decide(quiet, settings, timing):
+        status = made.statistic.numpy()
+        scores.append(status if settings.onset is None else made.onset_score.numpy())
+        is_raised = np.zeros(len(status), bool)
+        raised.append(is_raised if settings.onset is None else status >= settings.threshold)
+    rate_hz = timing.sample_rate_hz
+    hours = sum(map(len, scores)) * settings.decision_samples / rate_hz / 3600
+    falling = np.sort(np.concatenate(scores))[::-1]
+    falling = falling[falling > NOTHING_YET]
     ranks = np.unique(np.geomspace(1, len(falling), _NUM_TRIED).astype(int)) - 1
+    times = {
+        "rearm": settings.decisions(settings.rearm_s, rate_hz),
+        "refractory": settings.decisions(settings.refractory_s, rate_hz),
+    }
     points = list[list[float]]()
     for value in dict.fromkeys(falling[ranks].tolist()):
-        alarms = alarm_counts(
-            statistics,
-            value,
-            rearm=settings.decisions(settings.rearm_s, timing.sample_rate_hz),
-            refractory=settings.decisions(settings.refractory_s, timing.sample_rate_hz),
+        alarms = sum(
+            false_alarms((own >= value) | other, np.ones(len(own), bool), **times)
+            for own, other in zip(scores, raised, strict=True)
         )
-        rate = int(alarms.sum()) / hours
+        rate = alarms / hours
         if rate > MOST:
             break
         if rate >= LEAST and (not points or rate > points[-1][1]):
@@ -312,10 +356,11 @@ def _push_seconds(detector: SlipDetector, settings: AlarmSettings) -> float:
     """Median time of a push of one hop: what a decision costs a stream here, on one thread."""
     live = StreamingDetector(detector, settings)
     generator = torch.Generator().manual_seed(0)
-    hop = torch.randn(settings.hop_samples, len(detector.pool.hand), generator=generator)
+    hop_samples = settings.decision_samples
+    hop = torch.randn(hop_samples, len(detector.pool.hand), generator=generator)
     seconds = []
     with one_thread():
-        live.push(hop.repeat(-(-2 * detector.pool.bin_samples // settings.hop_samples), 1))  # full
+        live.push(hop.repeat(round(_FULL_S * detector.pool.sample_rate_hz) // hop_samples, 1))
         for _ in range(_PUSHES):
             started = time.perf_counter()
             live.push(hop)
@@ -343,21 +388,34 @@ def _lead_s(streams: Sequence[Stream], settings: AlarmSettings, timing: Timing) 
 
 @dataclass(frozen=True)
 class CalibratedAlarm:
-    """Sets the alarm of a fitted detector for a false-alarm rate.
+    """Sets the alarm of a fitted detector, of fast evidence and of bins, within a budget.
+
+    Of the recordings that the detector was not trained on, those of seen materials *learn* (the
+    onset classifier), *calibrate* (thresholds) and *test*; those of held-out materials test alone.
+
+    A classifier of bins raises an alarm where its rule reaches a threshold at which it uses at most
+    half of every budget; the onset classifier gets the lowest threshold at which both together keep
+    all of them. Baselines are thresholds on a score, at the onset classifier's hop and under the
+    same budgets.
 
     Args:
         streams: recordings, those trained on included or not; of the paper's scene, without
             slip, and of confounding scenes.
-        hop_ms: distance of two decisions.
-        false_alarms_per_hour: at most.
-        hours: of recordings without slip, at most, to set thresholds on, and as many to check
-            them on, for seen and for held-out materials.
-        slip_free: the scene without slip, on which false alarms are counted.
-        rules: of ``onset.rules``, by name.
-        rule: the one that the detector's file gets; those of baselines are like it.
+        classifier: how the onset classifier is fitted.
+        learn_scenes: what it is fitted on.
+        learn_cycles: recordings of each material and scene that it is fitted on.
+        budget: false alarms an hour of each scene; of ``SCENE_share``, alarms a knock.
+        confidence: with which budgets are to hold.
+        hours: to calibrate on, by scene; ``None``: half of the recordings.
+        check_hours: of each scene, at most, to check on, for seen and for held-out materials.
+        check_slip_free_hours: of the scene without slip.
+        found: share of slips below which a budget is said to cost too many.
+        hop_ms: distance of two bins.
+        slip_free: the scene without slip.
+        rule: what gathers evidence of bins; ``evidence: null`` is hop / bin.
         calibration: ``"platt"`` or ``"isotonic"``.
         slip_share: how much of a stream is slip, for probabilities.
-        rearm_s: how long the statistic must stay low before the next alarm.
+        rearm_s: how long both must stay low before the next alarm.
         refractory_s: shortest time between two alarms.
         level: of intervals.
 
@@ -367,85 +425,109 @@ class CalibratedAlarm:
     """
 
     streams: RecordingSource
+    classifier: OnsetTraining
+    learn_scenes: Sequence[str]
+    budget: Mapping[str, float]
+    hours: Mapping[str, float]
+    check_hours: float
+    check_slip_free_hours: float
     hop_ms: float
-    false_alarms_per_hour: float
-    hours: float
     slip_free: str
-    rules: Mapping[str, Mapping[str, Any]]
-    rule: str
+    rule: Mapping[str, Any]
+    learn_cycles: int = 4
+    confidence: float = 0.95
+    found: float = 0.95
     calibration: str = "platt"
     slip_share: float = 0.5
-    rearm_s: float = 0.1
+    rearm_s: float = 0.2
     refractory_s: float = 0.2
     level: float = 0.95
 
     def __post_init__(self) -> None:
         scenes = sorted({recording.scene for recording in self.streams.ids})
-        for name, known in (("rule", list(self.rules)), ("calibration", list(FITS))):
-            if (value := getattr(self, name)) not in known:
-                raise ValueError(f"onset.{name} must be one of {', '.join(known)}, got {value!r}")
-        if self.slip_free not in scenes:
-            raise ValueError(
-                f"onset.slip_free must be a scene of onset.streams, {', '.join(scenes)}, "
-                f"got {self.slip_free!r}"
-            )
-        _check_numbers(self, positive=("hop_ms", "false_alarms_per_hour", "hours"))
-        if not 0 < self.level < 1:
-            raise ValueError(f"onset.level must lie between 0 and 1, got {self.level}")
-        self.made_rules(self.hop_samples)  # bad numbers are refused now
+        if self.calibration not in FITS:
+            known = ", ".join(FITS)
+            raise ValueError(f"onset.calibration must be one of {known}, got {self.calibration!r}")
+        budgeted = [budget.scene for budget in self.budgets]
+        for name in (self.slip_free, *budgeted, *self.learn_scenes, *self.hours):
+            if name not in scenes:
+                raise ValueError(
+                    f"onset.streams has no scene {name!r}, it has {', '.join(scenes)}; take it out "
+                    "of onset.budget, onset.hours and onset.learn_scenes"
+                )
+        if self.slip_free not in self.budget:
+            raise ValueError(f"onset.budget must say what {self.slip_free} may have, an hour")
+        _check_numbers(self, positive=("hop_ms", "check_hours", "check_slip_free_hours"))
+        check_number("onset.learn_cycles", self.learn_cycles, whole=True)
+        for name in ("level", "found"):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(f"onset.{name} must lie between 0 and 1")
+        self.made_rule(self.hop_samples)  # bad numbers are refused now
 
     @property
     def hop_samples(self) -> int:
-        """Distance of two decisions."""
+        """Distance of two bins."""
         return whole_samples(self.hop_ms, self.streams.sample_rate_hz, "onset.hop_ms")
 
-    def made_rules(self, bin_samples: int) -> dict[str, Rule]:
-        """The rules; where they leave it open, evidence is hop / bin."""
+    @property
+    def budgets(self) -> list[Budget]:
+        """What each scene may have."""
+        return [
+            Budget(name.removesuffix(_SHARE), limit, name.endswith(_SHARE), self.confidence)
+            for name, limit in self.budget.items()
+        ]
+
+    def made_rule(self, bin_samples: int) -> Rule:
+        """The rule; where it leaves it open, evidence is hop / bin."""
         evidence = min(1.0, self.hop_samples / bin_samples)
-        return {
-            name: rule_from_dict(
-                {**given, "evidence": evidence} if given.get("evidence", 1) is None else given
-            )
-            for name, given in self.rules.items()
-        }
+        is_open = self.rule.get("evidence", 1) is None
+        return rule_from_dict({**self.rule, "evidence": evidence} if is_open else self.rule)
 
     def roles(self, detector: SlipDetector) -> dict[str, list[RecordingId]]:
-        """Which recordings calibrate, and which evaluate, of seen and of held-out materials.
-
-        Every second cycle of a seen material calibrates, of the paper's scene and the one without
-        slip; nothing that was trained on has a role.
+        """Which recordings learn, calibrate and test, of seen and of held-out materials.
 
         Raises:
             ValueError: if there is no recording to calibrate on.
         """
         trained = set(detector.info.get("train_recordings", {}).values())
         seen = set(detector.info.get("train_materials", ()))
-        needed = (PAPER_SCENE, self.slip_free)
-        roles: dict[str, list[RecordingId]] = {"calibrate": [], "test": [], "unseen": []}
-        hours = dict.fromkeys(roles, 0.0)
+        roles: dict[str, list[RecordingId]] = {
+            role: [] for role in ("learn", "calibrate", "test", "unseen")
+        }
+        hours: defaultdict[tuple[str, str], float] = defaultdict(float)
         places: Counter[tuple[str, str]] = Counter()
         fresh = [r for r in self.streams.ids if cache_key(self.streams.key(r)) not in trained]
         for recording in sorted(fresh, key=lambda r: (r.scene, r.cycle, r.material)):
-            of = (recording.material, recording.scene)
+            scene, of = recording.scene, (recording.material, recording.scene)
             role = "test" if recording.material in seen else "unseen"
-            if role == "test" and recording.scene in needed and places[of] % 2 == 0:
-                role = "calibrate"
-            places[of] += 1
-            if recording.scene == self.slip_free:
-                if hours[role] >= self.hours:
+            if role == "test":
+                places[of] += 1
+                if scene in self.learn_scenes and places[of] <= self.learn_cycles:
+                    roles["learn"].append(recording)
                     continue
-                hours[role] += self.streams.timeline(recording).duration_s / 3600
+                most = self.hours.get(scene, math.inf if scene == PAPER_SCENE else 0.0)
+                is_even = scene != PAPER_SCENE or places[of] % 2 == 0
+                if hours["calibrate", scene] < most and is_even:
+                    role = "calibrate"
+            most = self.check_slip_free_hours if scene == self.slip_free else self.check_hours
+            if role != "calibrate" and hours[role, scene] >= most:
+                continue
+            hours[role, scene] += self.streams.timeline(recording).duration_s / 3600
             roles[role].append(recording)
-        for role, found in hours.items():
-            if 0 < found < self.hours:
+        for scene, wanted in self.hours.items():
+            if (given := hours["calibrate", scene]) < wanted:
                 log.warning(
-                    "%s has %.2f h of %s, onset.hours=%g were asked for: give onset.streams more",
-                    role,
-                    found,
-                    self.slip_free,
-                    self.hours,
+                    "%.2f h of %s are left to calibrate on, onset.hours asks for %g: give "
+                    "onset.streams more",
+                    given,
+                    scene,
+                    wanted,
                 )
-        for scene in needed:
+        for budget in self.budgets:  # refused before hours are spent
+            own = [r for r in roles["calibrate"] if r.scene == budget.scene]
+            knocks = sum(len(self.streams.timeline(r).non_slip_s) for r in own)
+            budget.allowed(knocks if budget.is_share else hours["calibrate", budget.scene])
+        for scene in (PAPER_SCENE, self.slip_free):
             if not any(recording.scene == scene for recording in roles["calibrate"]):
                 raise ValueError(
                     f"no recording of scene {scene} that was not trained on is left to calibrate "
@@ -463,38 +545,46 @@ class CalibratedAlarm:
 
         Args:
             detector: fitted.
-            baselines: by name; they are calibrated and evaluated alike.
+            baselines: by name; each is a threshold on its score. One with ``hop_samples`` of its
+                own scores bins that far apart.
             num_workers: processes that score streams.
 
         Returns:
-            JSON-able: ``"rule"``, ``"settings"`` of it, ``"sample_rate_hz"``; ``"streams"``,
-            recordings, hours and slips of each role and scene; ``"methods"``; ``"reliability"`` of
-            each role; ``"events"`` of the protocol and of the scene without slip, by role and
-            method; ``"scenes"``, the same of every other scene by role, and whether it was
-            ``"trained"`` on.
+            JSON-able: ``"rule"``, the method that the detector's file has, ``"settings"`` of it,
+            ``"sample_rate_hz"``; ``"classifier"``, how the onset classifier was chosen;
+            ``"streams"``, recordings, hours and slips of each role and scene; ``"methods"``;
+            ``"budget"``, a row for each budget, method and role; ``"reliability"`` of each role;
+            ``"events"`` of the protocol and of the scene without slip, by role and method;
+            ``"scenes"``, the same of every other scene by role, and whether it was ``"trained"``
+            on.
 
         Raises:
-            ValueError: if there is nothing to calibrate on.
+            ValueError: if there is nothing to calibrate on, or too little to show a budget.
         """
         roles = self.roles(detector)
+        learn = roles.pop("learn")
+        onset, chosen = self.classifier(self.streams, learn, num_workers)
         recordings = [recording for own in roles.values() for recording in own]
         scorers: dict[str, Scorer] = {OURS: detector, **(baselines or {})}
-        scored = score_streams(self.streams, recordings, scorers, self.hop_samples, num_workers)
+        hop = onset.evidence.hop_samples
+        hops = {name: getattr(own, "hop_samples", hop) for name, own in scorers.items()}
+        hops[OURS] = self.hop_samples
+        scored = score_streams(self.streams, recordings, scorers, hops, onset, num_workers)
         rate, num_calibrate = self.streams.sample_rate_hz, len(roles["calibrate"])
         timings = {
-            name: Timing(rate, self.hop_samples, scorer.pool.bin_samples, scorer.look_ahead)
+            name: Timing(rate, hops[name], scorer.pool.bin_samples, scorer.look_ahead)
             for name, scorer in scorers.items()
         }
         calibrating = {name: own[:num_calibrate] for name, own in scored.items()}
-        methods = self.methods(calibrating, timings)
-        amounts = self._amounts(roles)
-        _, settings = methods[self.rule]
-        curve = threshold_curve(self._quiet(calibrating[OURS]), settings, timings[OURS])
+        methods = self.methods(calibrating, timings, onset)
+        amounts = self._amounts({"learn": learn, **roles})
+        _, settings = methods[JOINT]
+        quiet = [one for one in calibrating[OURS] if one.recording.scene == self.slip_free]
         metadata = {
             **settings.metadata,
             "simulated": self.streams.is_simulated,
             "streams": amounts["calibrate"],
-            "threshold_curve": curve,
+            "threshold_curve": threshold_curve(quiet, settings, timings[OURS]),
         }
         settings = replace(settings, metadata=metadata)
         detector.info[KEY] = settings.to_dict()
@@ -512,92 +602,138 @@ class CalibratedAlarm:
             own = [scored[scorer][index] for index in groups[scene, role]]
             found = self._events(own, made, timings[scorer], compute_s.get(scorer))
             events.setdefault(scene, {}).setdefault(role, {})[name] = found
+        paper = [one for one in calibrating[OURS] if one.recording.scene == PAPER_SCENE]
+        self._say_what_costs(self._events(paper, settings, timings[OURS], None), settings)
+        checked = events.pop("")
+        budget_rows = self._budget_rows(checked, events, methods, roles)
         told = {
             f"{role} stream": _reliability(
                 [scored[OURS][index] for index in groups["", role]], settings, timings[OURS]
             )
-            for role in events[""]
-        }
-        trained = {
-            name.split("/")[2]
-            for name in detector.info.get("train_recordings", {})
-            if name.count("/") > 1
+            for role in checked
         }
         return {
-            "rule": self.rule,
+            "rule": JOINT,
             "sample_rate_hz": rate,
             "settings": settings.to_dict(),
+            "classifier": chosen,
             "streams": amounts,
             "methods": {
                 name: {
                     "scorer": scorer,
                     "calibrated": made.metadata.get("calibrated"),
                     **made.to_dict(),
+                    "onset": made.onset is not None,
                 }
                 for name, (scorer, made) in methods.items()
             },
+            "budget": budget_rows,
             "reliability": {name: found for name, found in told.items() if found},
-            "events": {f"{role} stream": found for role, found in events.pop("").items()},
+            "events": {f"{role} stream": found for role, found in checked.items()},
             "scenes": {
-                scene: {"trained": scene in trained} | by_role for scene, by_role in events.items()
+                scene: {"trained": scene in self.learn_scenes} | by_role
+                for scene, by_role in events.items()
             },
         }
 
     def methods(
-        self, streams: Mapping[str, Sequence[Stream]], timings: Mapping[str, Timing]
+        self,
+        streams: Mapping[str, Sequence[Stream]],
+        timings: Mapping[str, Timing],
+        onset: OnsetClassifier,
     ) -> dict[str, tuple[str, AlarmSettings]]:
         """By name whose scores, and what makes alarms of them.
 
-        Every rule on our scores, the main one on those of baselines, and the paper's own.
+        ``JOINT``; the rule on bins alone, as published, at the rate that ``slip_free`` may have;
+        the paper's own rule, ``FIRST_TRANSITION``; and a threshold on the score of each baseline.
 
-        The paper's rule, ``FIRST_TRANSITION``, makes every change of the score to slip an alarm,
-        one decision a bin: there is no threshold but the score's own, and no memory beyond the bin
-        before. It is left out where the hop does not divide the bin.
+        The paper's rule makes every change of the score to slip an alarm, one decision a bin: there
+        is no threshold but the score's own, and no memory beyond the bin before. It is left out
+        where the hop does not divide the bin.
 
         Args:
             streams: that calibrate, by scorer, ``OURS`` included.
             timings: of every scorer.
+            onset: classifier, without threshold.
 
         Raises:
-            ValueError: if our scores cannot be calibrated; baselines whose cannot are left out.
+            ValueError: if our scores cannot be calibrated, or a budget not be shown.
         """
-        rules, methods = self.made_rules(timings[OURS].bin_samples), {}
-        for scorer, timing in timings.items():
-            try:
-                calibration = FITS[self.calibration](*labelled(streams[scorer], timing))
-            except ValueError as error:
-                if scorer == OURS:
-                    raise
-                log.warning("%s is left out: %s", scorer, error)
-                continue
-            for name, rule in rules.items() if scorer == OURS else [(scorer, rules[self.rule])]:
-                settings = self.calibrated(rule, calibration, streams[scorer], timing)
-                methods[name] = scorer, settings
-            if scorer == OURS and timing.bin_samples % timing.hop_samples == 0:
-                settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timing.bin_samples)
-                settings = replace(settings, threshold=_ABOVE_NEUTRAL, rearm_s=0, refractory_s=0)
-                methods[FIRST_TRANSITION] = scorer, settings
+        ours, timing = streams[OURS], timings[OURS]
+        calibration = FITS[self.calibration](*labelled(ours, timing))
+        rule = self.made_rule(timing.bin_samples)
+        methods = {JOINT: (OURS, self.joined(rule, calibration, onset, ours, timing))}
+        alone = self.calibrated(rule, calibration, ours, timing)
+        methods[rule.name] = OURS, alone
+        if timing.bin_samples % timing.hop_samples == 0:
+            settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timing.bin_samples)
+            settings = replace(settings, threshold=_ABOVE_NEUTRAL, rearm_s=0, refractory_s=0)
+            methods[FIRST_TRANSITION] = OURS, settings
+        for name in streams:
+            if name != OURS:
+                settings = self._settings(KOfN(1, 1), Platt(1.0, 0.0), timings[name].hop_samples)
+                scored = self._scored(streams[name], settings, timings[name])
+                settings = replace(settings, threshold=self._lowest(scored, settings, "statistic"))
+                methods[name] = name, self._told(settings, scored)
         return methods
+
+    def joined(
+        self,
+        rule: Rule,
+        calibration: Calibration,
+        onset: OnsetClassifier,
+        streams: Sequence[Stream],
+        timing: Timing,
+    ) -> AlarmSettings:
+        """Settings with both thresholds.
+
+        A ``Cusum`` without ceiling gets one above its threshold. A sum that is capped is sooner low
+        again, so what was one alarm can be two; the threshold is raised until budgets are kept.
+        """
+        settings = self._settings(rule, calibration, timing.hop_samples)
+        settings = replace(settings, onset=onset)
+        scored = self._scored(streams, settings, timing)
+        value = self._lowest(scored, settings, "statistic", of_allowed=_OF_BINS)
+        value = max(value, _ABOVE_NEUTRAL) / _STEP  # at 0 a sum would stand for ever
+        while True:
+            value *= _STEP
+            made = rule
+            if isinstance(rule, Cusum) and rule.ceiling == math.inf and value > 0:
+                made = replace(rule, ceiling=_CEILING * value)
+            settings = replace(settings, rule=made, threshold=value)
+            scored = self._scored(streams, settings, timing)
+            threshold = self._lowest(scored, settings, "onset_score")
+            settings = replace(settings, onset=replace(onset, threshold=threshold))
+            settings = self._told(settings, scored)
+            rows = settings.metadata["budget"]
+            if all(row["alarms"] <= row["allowed"] for row in rows):
+                break
+        lead_s = _lead_s(streams, replace(settings, onset=None), timing)
+        leads = [
+            alarm_s - onset_s
+            for stream, made in decide(streams, settings, timing)
+            for alarm_s in made.available_s[made.is_alarm & made.by_onset].tolist()
+            for first_s, onset_s in zip(
+                first_releases(stream.times.onsets_s, stream.times.released_s),
+                stream.times.onsets_s,
+                strict=True,
+            )
+            if first_s <= alarm_s <= onset_s + EventRules().found_within_s
+        ]
+        assert settings.onset is not None
+        joint = replace(settings.onset, lead_s=statistics.median(leads) if leads else 0.0)
+        return replace(settings, onset=joint, lead_s=lead_s)
 
     def calibrated(
         self, rule: Rule, calibration: Calibration, streams: Sequence[Stream], timing: Timing
     ) -> AlarmSettings:
-        """A rule with the threshold for the rate, and the lead of its onset estimates.
+        """A rule on bins alone, with the threshold for the rate that ``slip_free`` may have.
 
-        The ``Threshold`` is told in the settings' metadata, as ``"calibrated"``.
-
-        A ``Cusum`` without ceiling gets one above its threshold. A sum that is capped is sooner low
-        again, so what was one alarm can be two: they are counted again by the rule that goes into
-        the file, and the threshold is raised until the rate is kept.
-
-        Args:
-            rule: what makes statistics of ratios.
-            calibration: what makes ratios of scores.
-            streams: that calibrate, those of the scene without slip included.
-            timing: of the scores.
+        A ``Cusum`` without ceiling gets one, as ``joined`` gives it.
         """
         settings = self._settings(rule, calibration, timing.hop_samples)
-        quiet = self._quiet(streams)
+        quiet = [stream for stream in streams if stream.recording.scene == self.slip_free]
+        target = self.budget[self.slip_free]
         highest = math.inf  # of a statistic that is itself a ratio, what the calibration gives
         if isinstance(rule, KOfN) and isinstance(calibration, Isotonic):
             highest = max(calibration.llrs)
@@ -605,7 +741,7 @@ class CalibratedAlarm:
             [made.statistic for _, made in decide(quiet, settings, timing)],
             rule,
             timing.hop_s,
-            self.false_alarms_per_hour,
+            target,
             rearm=settings.decisions(self.rearm_s, timing.sample_rate_hz),
             refractory=settings.decisions(self.refractory_s, timing.sample_rate_hz),
             ceiling=highest,
@@ -613,7 +749,7 @@ class CalibratedAlarm:
         )
         settings = replace(settings, threshold=threshold.value)
         if isinstance(rule, Cusum) and rule.ceiling == math.inf and threshold.value > 0:
-            allowed = math.floor(self.false_alarms_per_hour * threshold.rate.hours)
+            allowed = math.floor(target * threshold.rate.hours)
             counts, value = [allowed + 1], threshold.value / _STEP
             while sum(counts) > allowed:
                 value *= _STEP
@@ -635,11 +771,149 @@ class CalibratedAlarm:
             calibration,
             rule,
             math.inf,
-            self.false_alarms_per_hour,
+            self.budget[self.slip_free],
             self.slip_share,
             self.rearm_s,
             self.refractory_s,
         )
+
+    def _scored(
+        self, streams: Sequence[Stream], settings: AlarmSettings, timing: Timing
+    ) -> dict[Budget, _Scores]:
+        """What thresholds are set on."""
+        settle_s = (timing.bin_samples + timing.look_ahead) / timing.sample_rate_hz + _SETTLE_S
+        found = dict[Budget, _Scores]()
+        for budget in self.budgets:
+            own = [stream for stream in streams if stream.recording.scene == budget.scene]
+            scores = found[budget] = _Scores()
+            for stream, made in decide(own, settings, timing):
+                time_s, quiet = made.available_s.numpy(), np.ones(len(made.available_s), bool)
+                firsts = first_releases(stream.times.onsets_s, stream.times.released_s)
+                for first_s, (_, end_s) in zip(firsts, stream.times.sliding_s, strict=True):
+                    before_s = first_s - EventRules().early_s
+                    quiet &= (time_s < before_s) | (time_s > end_s + settle_s)
+                scores.statistic.append(made.statistic.numpy())
+                scores.onset_score.append(made.onset_score.numpy())
+                scores.is_quiet.append(quiet)
+                scores.knocks += len(stream.times.non_slip_s)
+                scores.hours += int(quiet.sum()) * settings.decision_samples / self._rate_per_h
+        return found
+
+    def _lowest(
+        self,
+        scored: Mapping[Budget, _Scores],
+        settings: AlarmSettings,
+        name: str,
+        of_allowed: float = 1.0,
+    ) -> float:
+        """The lowest threshold of a score that keeps every budget, or so much of each."""
+        times = self._times(settings)
+        return max(
+            lowest_threshold(
+                getattr(scores, name),
+                scores.is_quiet,
+                int(of_allowed * budget.allowed(scores.amount(budget))),
+                is_raised=scores.raised(settings) if name == "onset_score" else None,
+                **times,
+            )
+            for budget, scores in scored.items()
+        )
+
+    def _told(self, settings: AlarmSettings, scored: Mapping[Budget, _Scores]) -> AlarmSettings:
+        """The settings, with what their thresholds gave on the recordings that they were set on."""
+        rows = list[dict[str, Any]]()
+        for budget, scores in scored.items():
+            alarms, amount = scores.alarms(settings, self._times(settings)), scores.amount(budget)
+            rows.append(
+                {
+                    "scene": budget.scene,
+                    "is_share": budget.is_share,
+                    "limit": budget.limit,
+                    "amount": amount,
+                    "allowed": budget.allowed(amount),
+                    "alarms": sum(alarms),
+                    "bound": budget.bound(sum(alarms), amount),
+                }
+            )
+            if budget.scene == self.slip_free and not budget.is_share:
+                hours = [len(own) * settings.decision_samples for own in scores.is_quiet]
+                rate = alarm_rate(alarms, [own / self._rate_per_h for own in hours], self.level)
+                onset = settings.onset
+                value = settings.threshold if onset is None else onset.threshold
+                reached = sum(alarms) <= rows[-1]["allowed"]
+                calibrated = asdict(Threshold(value, budget.limit, rate, reached))
+        metadata = {"slip_free": self.slip_free, "budget": rows, "calibrated": calibrated}
+        return replace(settings, metadata=metadata | {"confidence": self.confidence})
+
+    @property
+    def _rate_per_h(self) -> float:
+        return 3600 * self.streams.sample_rate_hz
+
+    def _times(self, settings: AlarmSettings) -> dict[str, int]:
+        rate = self.streams.sample_rate_hz
+        return {
+            "rearm": settings.decisions(self.rearm_s, rate),
+            "refractory": settings.decisions(self.refractory_s, rate),
+        }
+
+    def _say_what_costs(self, numbers: Mapping[str, Any], settings: AlarmSettings) -> None:
+        """Warn where budgets leave fewer slips found than wanted, and name what costs them."""
+        share = numbers["found"] and numbers["found"]["value"]
+        if share is None or share >= self.found:
+            return
+        full = [row for row in settings.metadata["budget"] if row["alarms"] == row["allowed"]]
+        log.warning(
+            "%.1f %% of the slips that calibrate are found, onset.found asks for %.1f: the budget "
+            "of %s leaves no more; allow it more alarms, or give it more hours to show its rate on",
+            100 * share,
+            100 * self.found,
+            ", ".join(row["scene"] for row in full) or "every scene",
+        )
+
+    def _budget_rows(
+        self,
+        usual: Mapping[str, Mapping[str, Any]],
+        scenes: Mapping[str, Mapping[str, Mapping[str, Any]]],
+        methods: Mapping[str, object],
+        roles: Mapping[str, Sequence[RecordingId]],
+    ) -> list[dict[str, Any]]:
+        """What each method had of each budget, on recordings of each role."""
+        rows = []
+        for role, budget, name in product(roles, self.budgets, methods):
+            if budget.scene == self.slip_free:
+                numbers = usual.get(role, {}).get(name, {}).get("per_scene", {}).get(budget.scene)
+            else:
+                numbers = scenes.get(budget.scene, {}).get(role, {}).get(name)
+            if not numbers:
+                continue
+            alarms, amount = numbers["num_false_alarms"], numbers["quiet_hours"]
+            if budget.is_share:
+                own = (one for one in roles[role] if one.scene == budget.scene)
+                amount = sum(len(self.streams.timeline(one).non_slip_s) for one in own)
+            if not amount:
+                continue
+            sides = ((1 - self.level) / 2, (1 + self.level) / 2)
+            low, high = (
+                replace(budget, confidence=side).bound(alarms - (side < 0.5), amount)
+                if alarms or side > 0.5
+                else 0.0
+                for side in sides
+            )
+            rows.append(
+                {
+                    "role": role,
+                    "scene": budget.scene,
+                    "is_share": budget.is_share,
+                    "limit": budget.limit,
+                    "method": name,
+                    "alarms": alarms,
+                    "amount": amount,
+                    "rate": alarms / amount,
+                    "low": low,
+                    "high": high,
+                }
+            )
+        return rows
 
     def _events(
         self,
@@ -671,8 +945,35 @@ class CalibratedAlarm:
                 row["slips"] += len(times.onsets_s)
         return amounts
 
-    def _quiet(self, streams: Sequence[Stream]) -> list[Stream]:
-        return [stream for stream in streams if stream.recording.scene == self.slip_free]
+
+@dataclass
+class _Scores:
+    """Of the recordings of a scene, each a row of decisions."""
+
+    statistic: list[NDArray[Any]] = field(default_factory=list)
+    onset_score: list[NDArray[Any]] = field(default_factory=list)
+    is_quiet: list[NDArray[np.bool_]] = field(default_factory=list)
+    hours: float = 0.0
+    knocks: int = 0
+
+    def amount(self, budget: Budget) -> float:
+        """What alarms are counted against."""
+        return self.knocks if budget.is_share else self.hours
+
+    def raised(self, settings: AlarmSettings) -> list[NDArray[np.bool_]]:
+        """Where bins alone would raise an alarm."""
+        return [own >= settings.threshold for own in self.statistic]
+
+    def alarms(self, settings: AlarmSettings, times: Mapping[str, int]) -> list[int]:
+        """False alarms of each recording."""
+        raised, onset = self.raised(settings), settings.onset
+        if onset is not None:
+            raised = [
+                of_bins | (own >= onset.threshold)
+                for of_bins, own in zip(raised, self.onset_score, strict=True)
+            ]
+        pairs = zip(raised, self.is_quiet, strict=True)
+        return [false_alarms(is_high, is_quiet, **times) for is_high, is_quiet in pairs]
 
 
 @dataclass(frozen=True)

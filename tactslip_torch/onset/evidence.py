@@ -1,0 +1,538 @@
+"""Fast evidence of a slip's beginning, every few milliseconds, and the classifier on it.
+
+When skin lets go, fast channels ring and the shear that slow channels carry falls. Both are told
+from taps, motors and mains by how they spread over channels and by what was there a moment before:
+
+- *fast channels*: power of four band filters over 10, 25 and 50 ms, as a log ratio to the channel's
+  own floor, the mean of the log power over the last second;
+- *slow channels*: steps between means of neighbouring stretches of 10 to 200 ms, and their sign: a
+  grip presses, a slip relieves;
+- each pooled over the channels of its kind (``features.pooling``).
+
+Three filters are differences of neighbouring means (Haar wavelets); the fourth first takes away the
+mean of the last periods of the mains, a comb that no harmonic passes. The classifier is the kernel
+machine of degree 2, as for bins; its score is averaged over three hops. All is causal, and of a
+block of samples nothing but its powers and means is kept. The first second of a stream has no
+floor, and so no evidence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tactslip_torch.hand import HandLayout
+from tactslip_torch.model.kernels import QuadraticForm
+from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.onset.rules import NOTHING_YET
+
+Array = NDArray[Any]
+
+WINDOWS_S = (0.01, 0.025, 0.05)
+FLOOR_S = 1.0
+WIDTHS_S = (0.0005, 0.002, 0.004)
+"""Of the means whose differences the first three band filters are: 1, 4 and 8 samples at 2 kHz."""
+COMB_WIDTH_S = 0.001
+STEPS_S = (
+    (0.010, 0.010, 0.010),
+    (0.025, 0.025, 0.025),
+    (0.025, 0.050, 0.050),
+    (0.050, 0.100, 0.100),
+    (0.050, 0.050, 0.200),
+    (0.100, 0.100, 0.400),
+)
+"""Length of the latest stretch, that of the one it is compared with, and how far back it ends."""
+_FEW_HOPS = 8  # that are scored one by one
+MEAN_HOPS = 3
+"""Over which the score is averaged: a knock is over sooner than a slip begins."""
+_LEAST_RISE = 1e-6  # of a floor over that of silence; below, a channel is stuck
+
+
+class Blocks(NamedTuple):
+    """What is kept of a stream: a column for each block of ``hop_samples``.
+
+    Attributes:
+        power: of each fast channel and filter, mean square and knee, ``[F, B, m]``.
+        log_power: half its log.
+        mean: of each slow channel, ``[S, m]``.
+    """
+
+    power: Tensor
+    log_power: Tensor
+    mean: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class OnsetEvidence:
+    """From samples to K columns a hop.
+
+    Args:
+        hand: the channels; at least one is fast.
+        sample_rate_hz: of the stream.
+        hop_samples: length of a block, and distance of decisions.
+        fast_knee: root mean square that counts as silence, of each filter, ``[B]``.
+        slow_knee: step that counts as none, of each of ``STEPS_S``, ``[D]``.
+        mains_hz: whose period the comb has.
+        comb_periods: over how many it takes the mean.
+
+    Raises:
+        ValueError: if the hand has no fast channel, a hop is longer than 5 ms, or a knee is not
+            positive and finite.
+    """
+
+    hand: HandLayout
+    sample_rate_hz: float
+    hop_samples: int
+    fast_knee: tuple[float, ...] = (1e-30,) * (len(WIDTHS_S) + 1)
+    slow_knee: tuple[float, ...] = (1e-30,) * len(STEPS_S)
+    mains_hz: float = 50.0
+    comb_periods: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.hand.fast:
+            raise ValueError(
+                "evidence of onsets needs fast channels, and this hand has none; "
+                "take onset=debounced"
+            )
+        if not 1 <= self.hop_samples <= 0.005 * self.sample_rate_hz:
+            raise ValueError(
+                f"a hop of {self.hop_samples} samples at {self.sample_rate_hz:g} Hz is no hop of "
+                "at most 5 ms"
+            )
+        knees = [*self.fast_knee, *self.slow_knee]
+        num_knees = len(WIDTHS_S) + 1 + len(STEPS_S)
+        if len(knees) != num_knees or not all(0 < knee < float("inf") for knee in knees):
+            raise ValueError(f"expected {num_knees} positive and finite knees, got {knees}")
+
+    def blocks_in(self, seconds: float) -> int:
+        """A length of time in blocks, rounded up."""
+        return max(1, -(-round(seconds * self.sample_rate_hz) // self.hop_samples))
+
+    @cached_property
+    def context(self) -> int:
+        """Samples before a block that its filters reach back to."""
+        return len(self._filters[0]) - 1
+
+    @cached_property
+    def windows(self) -> list[int]:
+        """``WINDOWS_S`` in blocks."""
+        return [self.blocks_in(seconds) for seconds in WINDOWS_S]
+
+    @cached_property
+    def memory(self) -> int:
+        """Blocks that the evidence of a hop rests on, its own included."""
+        return self.blocks_in(FLOOR_S) + self.windows[-1]
+
+    @property
+    def first_hop(self) -> int:
+        """Number of the first hop of a stream that has evidence."""
+        return -(-self.context // self.hop_samples) + self.memory - 1
+
+    @cached_property
+    def num_columns(self) -> int:
+        """``K``."""
+        num_rows = len(WINDOWS_S) * len(self.fast_knee)
+        num = num_rows * (3 if len(self.hand.fast) > 1 else 1)
+        num_slow = len(self.hand.slow)
+        return num + len(STEPS_S) * (min(num_slow, 2) + min(num_slow, 1))
+
+    @cached_property
+    def _filters(self) -> Array:
+        """Impulse responses, ``[B, context + 1]``; the first number meets the latest sample."""
+
+        def haar(seconds: float) -> Array:
+            width = max(1, round(seconds * self.sample_rate_hz))
+            return np.repeat([1.0, -1.0], width) / width
+
+        period = self.sample_rate_hz / self.mains_hz
+        comb = np.zeros(int(np.ceil(self.comb_periods * period)) + 1)
+        comb[0] = 1.0
+        for number in range(1, self.comb_periods + 1):
+            whole, part = divmod(number * period, 1)
+            comb[int(whole)] -= (1 - part) / self.comb_periods
+            if part:
+                comb[int(whole) + 1] -= part / self.comb_periods
+        rows = [*map(haar, WIDTHS_S), np.convolve(comb, haar(COMB_WIDTH_S))]
+        return np.stack([np.pad(row, (0, max(map(len, rows)) - len(row))) for row in rows])
+
+    @cached_property
+    def filter_matrix(self) -> Array:
+        """A block with its context to the outputs of all filters: ``[context + hop, B * hop]``."""
+        hop, length = self.hop_samples, self.context + 1
+        matrix = np.zeros((self.context + hop, len(self._filters), hop))
+        for place in range(hop):
+            matrix[place : place + length, :, place] = self._filters[:, ::-1].T
+        return matrix.reshape(len(matrix), -1)
+
+    @cached_property
+    def step_matrix(self) -> Tensor:
+        """Means of the last blocks to steps: ``[b, D]``."""
+        spans = [[self.blocks_in(seconds) for seconds in step] for step in STEPS_S]
+        matrix = np.zeros((max(back + length for _, length, back in spans), len(spans)))
+        for row, (latest, length, back) in zip(matrix.T, spans, strict=True):
+            row[len(row) - latest :] += 1 / latest
+            row[len(row) - back - length : len(row) - back] -= 1 / length
+        return torch.from_numpy(matrix)
+
+    @cached_property
+    def channels(self) -> tuple[Array, Array]:
+        """Fast and slow ones."""
+        return np.array(self.hand.fast, np.int64), np.array(self.hand.slow, np.int64)
+
+    @cached_property
+    def _power_of_silence(self) -> Array:
+        """Of each filter, ``[B]``."""
+        return np.square(self.fast_knee)
+
+    def blocks(self, samples: Tensor) -> Blocks:
+        """Of every whole block that has its context.
+
+        Args:
+            samples: raw, ``context`` of them before the first block; NaN makes its blocks NaN.
+
+        Shape:
+            - samples: ``[C, context + k * hop]``
+            - output: of k blocks
+        """
+        x = samples.double()
+        hop, context = self.hop_samples, self.context
+        frames = x[list(self.hand.fast)].unfold(-1, context + hop, hop)  # [F, k, context + hop]
+        heard = (frames - frames[..., :1]) @ torch.from_numpy(self.filter_matrix)
+        square = heard.unflatten(-1, (len(self.fast_knee), hop)).square().mean(-1)  # [F, k, B]
+        power = square.mT + torch.from_numpy(self._power_of_silence)[:, None]
+        mean = x[list(self.hand.slow), context:].unfold(-1, hop, hop).mean(-1)
+        return Blocks(power, 0.5 * power.log(), mean)
+
+    def block_arrays(self, samples: Array) -> list[Array]:
+        """``blocks`` in arrays: of one block quicker than small tensors."""
+        hop, context = self.hop_samples, self.context
+        fast, slow = (samples.take(channels, 0).astype(np.float64) for channels in self.channels)
+        frames = torch.from_numpy(fast).unfold(-1, context + hop, hop).numpy()
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is left out later
+            heard = (frames - frames[..., :1]) @ self.filter_matrix  # [F, k, B * hop]
+            square = (heard * heard).reshape(*heard.shape[:2], len(self.fast_knee), hop)
+            power = (square.sum(-1) / hop + self._power_of_silence).swapaxes(1, 2)
+            mean = slow[:, context:].reshape(len(slow), frames.shape[1], hop).sum(-1) / hop
+        return [power, 0.5 * np.log(power), mean]
+
+    def blocks_of_recording(self, samples: Tensor) -> Blocks:
+        """Of a whole recording ``[C, T]``: those that have their context."""
+        start = -(-self.context // self.hop_samples) * self.hop_samples - self.context
+        return self.blocks(samples[:, start:])
+
+    def columns(self, blocks: Blocks, masked: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The evidence of each hop, and whether any fast channel gave it some.
+
+        A channel that is masked, that had a NaN or an Inf in the last second, or that has been
+        silent for all of it, is left out of the pools.
+
+        Args:
+            blocks: of ``memory - 1`` hops before the first and of k more.
+            masked: channels that are not to be listened to.
+
+        Shape:
+            - masked: ``[C]``, bool
+            - output: ``[k, K]`` and ``[k]``, bool
+        """
+        power, log_power, mean = blocks
+        num, windows = power.shape[-1] - self.memory + 1, self.windows
+        level = torch.stack([_moving_mean(power, n)[..., -num:] for n in windows], -1)
+        floor = _moving_mean(log_power[..., : -windows[-1]], self.memory - windows[-1])
+        stretch = len(self.step_matrix)
+        latest = mean[:, mean.shape[-1] - num + 1 - stretch :].unfold(-1, stretch, 1)
+        steps = (latest - latest[..., :1]) @ self.step_matrix  # [S, k, D]
+        heard = torch.ones(len(self.hand), dtype=torch.bool) if masked is None else ~masked
+        return self.pooled(
+            level.permute(2, 3, 1, 0),
+            floor.permute(2, 1, 0),
+            steps.permute(1, 2, 0),
+            heard[list(self.hand.fast)],
+            heard[list(self.hand.slow)],
+        )
+
+    def pooled(
+        self, level: Tensor, floor: Tensor, steps: Tensor, fast: Tensor, slow: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Columns of what was measured; in operations that tensors and values of a graph share.
+
+        Args:
+            level: mean power in each window and of each filter.
+            floor: mean of half the log power over the last second.
+            steps: of the slow channels.
+            fast: fast channels that are listened to.
+            slow: slow ones.
+
+        Shape:
+            - level: ``[k, W, B, F]``; floor: ``[k, B, F]``; steps: ``[k, D, S]``
+            - fast: ``[F]``, slow: ``[S]``, bool
+            - output: ``[k, K]`` and ``[k]``, bool
+        """
+        silence = torch.tensor(self.fast_knee, dtype=torch.float64).log()[:, None]
+        loudness = level.log() * 0.5
+        rises = loudness - floor.unsqueeze(1)
+        is_finite = rises.sum(1).sum(1).isfinite()
+        in_use = ((floor - silence).amax(1) > _LEAST_RISE) & is_finite & fast  # [k, F]
+        rows = in_use.unsqueeze(1).unsqueeze(1)
+        num = rows.type_as(level).sum(-1).clamp(min=1.0)
+        columns = _over_channels(rises, rows, num)[: 3 if len(self.hand.fast) > 1 else 1]
+        columns = [torch.cat(columns, 1).flatten(-2)]
+        if num_slow := len(self.hand.slow):
+            knee = torch.tensor(self.slow_knee, dtype=torch.float64)[:, None]
+            size = (steps.abs() + knee).log()
+            told = size.sum(1).isfinite() & slow
+            rows = told.unsqueeze(1)
+            num = rows.type_as(size).sum(-1).clamp(min=1.0)
+            columns += _over_channels(size, rows, num)[: 2 if num_slow > 1 else 1]
+            way = steps.sign() * (size - knee.log())
+            columns += _over_channels(way, rows, num)[:1]
+        return torch.cat(columns, -1), in_use.any(-1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but the hand and the sample rate, which are the detector's."""
+        plain = {name: getattr(self, name) for name in ("hop_samples", "mains_hz", "comb_periods")}
+        return plain | {"fast_knee": list(self.fast_knee), "slow_knee": list(self.slow_knee)}
+
+
+@dataclass(frozen=True, eq=False)
+class OnsetClassifier:
+    """Whether a slip begins, by the evidence of each hop: at least the threshold says yes.
+
+    Args:
+        evidence: what is told of a hop.
+        scaler: of its columns.
+        head: the machine on scaled columns.
+        threshold: of its score.
+        lead_s: from an onset to the first hop that speaks for one, in the middle.
+    """
+
+    evidence: OnsetEvidence
+    scaler: FeatureScaler
+    head: QuadraticForm
+    threshold: float
+    lead_s: float = 0.0
+
+    def score(self, blocks: Blocks, masked: Tensor | None = None) -> Tensor:
+        """Of every hop alone, float64; NaN where no fast channel can be listened to.
+
+        Shape:
+            - blocks, masked: as ``OnsetEvidence.columns`` takes them
+            - output: ``[k]``
+        """
+        columns, is_usable = self.evidence.columns(blocks, masked)
+        return torch.where(is_usable, self.head(self.scaler(columns)), math.nan)
+
+    def score_recording(self, samples: Tensor) -> Tensor:
+        """Means over ``MEAN_HOPS`` of every whole hop; ``NOTHING_YET`` where one has no score.
+
+        So within the first second of a recording.
+
+        Shape:
+            - samples: ``[C, T]``
+            - output: ``[T // hop_samples]``, float64
+        """
+        evidence = self.evidence
+        num = samples.shape[-1] // evidence.hop_samples
+        score = torch.full((MEAN_HOPS - 1 + num,), math.nan, dtype=torch.float64)
+        if (silent := evidence.first_hop) < num:
+            with torch.no_grad():
+                made = self.score(evidence.blocks_of_recording(samples))
+                score[MEAN_HOPS - 1 + silent :] = made
+        return torch.from_numpy(_mean_of_hops(score.numpy()))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The classifier as plain JSON types, without hand and sample rate."""
+        return {
+            **self.evidence.to_dict(),
+            "minimum": self.scaler.minimum.tolist(),
+            "maximum": self.scaler.maximum.tolist(),
+            "quadratic": self.head.quadratic.tolist(),
+            "linear": self.head.linear.tolist(),
+            "constant": float(self.head.constant),
+            "threshold": self.threshold,
+            "lead_s": self.lead_s,
+        }
+
+    @classmethod
+    def from_dict(
+        cls, plain: Mapping[str, Any], hand: HandLayout, sample_rate_hz: float
+    ) -> OnsetClassifier:
+        """The classifier that ``to_dict`` wrote, of a detector's hand.
+
+        Raises:
+            KeyError, TypeError, ValueError: if a number is missing or no such number.
+        """
+
+        def tensor(name: str) -> Tensor:
+            return torch.tensor(plain[name], dtype=torch.float64)
+
+        evidence = OnsetEvidence(
+            hand,
+            sample_rate_hz,
+            int(plain["hop_samples"]),
+            tuple(map(float, plain["fast_knee"])),
+            tuple(map(float, plain["slow_knee"])),
+            float(plain["mains_hz"]),
+            int(plain["comb_periods"]),
+        )
+        num = len(plain["linear"])
+        quadratic = tensor("quadratic") if plain["quadratic"] else torch.zeros(0, 0).double()
+        head = QuadraticForm(quadratic, tensor("linear"), tensor("constant"))
+        scaler = FeatureScaler(tensor("minimum"), tensor("maximum"))
+        if len(scaler.minimum) != evidence.num_columns or num != evidence.num_columns:
+            raise ValueError(f"expected {evidence.num_columns} columns of evidence, got {num}")
+        return cls(evidence, scaler, head, float(plain["threshold"]), float(plain["lead_s"]))
+
+
+class OnsetStream:
+    """Onset scores of a stream as its samples come; its memory has a fixed size.
+
+    Args:
+        classifier: that scores.
+    """
+
+    def __init__(self, classifier: OnsetClassifier) -> None:
+        self._classifier = classifier
+        self._score = _HopScore(classifier)
+        self._hop = 0  # of the next score
+        self._skipped = 0  # samples before those that are held
+        self._held: Array | None = None
+        self._blocks: list[Array] = []
+        self._scores = np.full(MEAN_HOPS - 1, math.nan)
+
+    @property
+    def state_bytes(self) -> int:
+        """Memory of what is remembered."""
+        held = [] if self._held is None else [self._held]
+        return sum(int(x.nbytes) for x in held + self._blocks)
+
+    def push(self, samples: Tensor, masked: Tensor | None = None) -> Tensor:
+        """The scores of the hops that these samples complete.
+
+        Shape:
+            - samples: ``[C, n]``; masked: ``[C]``, bool
+            - output: ``[k]``, as ``OnsetClassifier.score_recording`` has them
+        """
+        evidence, x = self._classifier.evidence, samples.detach().numpy()
+        hop, context, memory = evidence.hop_samples, evidence.context, evidence.memory
+        held = x if self._held is None else np.concatenate([self._held, x], -1)
+        num = (self._skipped + held.shape[-1]) // hop
+        score = np.append(self._scores, np.full(num - self._hop, math.nan))
+        first = max(self._hop, -(-context // hop))  # block that has its context
+        if num > first:
+            start = first * hop - context - self._skipped
+            blocks = evidence.block_arrays(held[:, start : num * hop - self._skipped])
+            if self._blocks:
+                pairs = zip(self._blocks, blocks, strict=True)
+                blocks = [np.concatenate([old[..., 1 - memory :], new], -1) for old, new in pairs]
+            known = blocks[0].shape[-1] - memory + 1
+            if known > _FEW_HOPS:
+                with torch.no_grad():
+                    made = Blocks(*map(torch.from_numpy, blocks))
+                    score[-known:] = self._classifier.score(made, masked)
+            elif known > 0:
+                score[-known:] = self._score(blocks, known, masked)
+            if known > 1:
+                blocks = [x[..., -memory:].copy() for x in blocks]
+            self._blocks, first = blocks, num
+        self._hop, surplus = num, max(first * hop - context - self._skipped, 0)
+        self._held = held[:, surplus:].copy()
+        self._skipped += min(surplus, held.shape[-1])
+        self._scores = score[1 - MEAN_HOPS :]
+        return torch.from_numpy(_mean_of_hops(score))
+
+
+class _HopScore:
+    """``OnsetClassifier.score`` of a few hops, in plain arrays: quicker than small tensors.
+
+    Args:
+        classifier: that scores.
+    """
+
+    def __init__(self, classifier: OnsetClassifier) -> None:
+        evidence, scaler, head = classifier.evidence, classifier.scaler, classifier.head
+        windows, self._memory = evidence.windows, evidence.memory
+        self._of_windows = np.zeros((windows[-1], len(windows)))  # blocks to means
+        for number, length in enumerate(windows):
+            self._of_windows[-length:, number] = 1 / length
+        num_floor = evidence.memory - windows[-1]
+        self._of_floor = np.full(num_floor, 1 / num_floor)
+        self._of_steps, self._slow_knee = evidence.step_matrix.numpy(), np.array(evidence.slow_knee)
+        self._silence = np.log(evidence.fast_knee)
+        self._channels = evidence.channels
+        self._all = [np.ones(len(channels), bool) for channels in self._channels]
+        width = (scaler.maximum - scaler.minimum).numpy()
+        self._slope = np.divide(2.0, width, out=np.zeros_like(width), where=width > 0)
+        self._offset = np.where(width > 0, -1.0, 0.0) - self._slope * scaler.minimum.numpy()
+        self._quadratic = None if head.is_linear else head.quadratic.numpy()
+        self._linear, self._constant = head.linear.numpy(), float(head.constant)
+
+    def __call__(self, blocks: list[Array], num: int, masked: Tensor | None) -> list[float]:
+        """The last scores, of as many hops."""
+        heard = self._all if masked is None else [~masked.numpy()[c] for c in self._channels]
+        first = blocks[0].shape[-1] - self._memory - num + 1
+        with np.errstate(invalid="ignore"):
+            return [
+                self._of_hop(*(x[..., start : start + self._memory] for x in blocks), *heard)
+                for start in range(first, first + num)
+            ]
+
+    def _of_hop(
+        self, power: Array, log_power: Array, mean: Array, fast: Array, slow: Array
+    ) -> float:
+        """Of the blocks that it rests on, and the channels that are listened to."""
+        level = power[..., -len(self._of_windows) :] @ self._of_windows  # [F, B, W]
+        floor = log_power[..., : len(self._of_floor)] @ self._of_floor  # [F, B]
+        loudness = 0.5 * np.log(level).swapaxes(1, 2)
+        rises = (loudness - floor[:, None]).reshape(len(floor), -1)
+        in_use = ((floor - self._silence).max(1) > _LEAST_RISE) & fast & np.isfinite(rises.sum(1))
+        if not (num := np.count_nonzero(in_use)):
+            return math.nan
+        if num < len(in_use):
+            rises = rises[in_use]
+        columns = [rises.sum(0) / num]
+        if len(in_use) > 1:
+            columns += [rises.max(0), rises.min(0)]
+        if len(slow):
+            latest = mean[:, -len(self._of_steps) :]
+            steps = (latest - latest[:, :1]) @ self._of_steps
+            size = np.log(np.abs(steps) + self._slow_knee)
+            told = slow & np.isfinite(size.sum(1))  # size, way: [S, D]
+            way = np.sign(steps) * (size - np.log(self._slow_knee))
+            if not (num := np.count_nonzero(told)):
+                size = way = np.zeros((1, size.shape[1]))
+            elif num < len(told):
+                size, way = size[told], way[told]
+            columns.append(size.sum(0) / len(size))
+            if len(told) > 1:
+                columns.append(size.max(0))
+            columns.append(way.sum(0) / len(way))
+        z = np.concatenate(columns) * self._slope + self._offset
+        z = np.minimum(np.maximum(z, -1.0), 1.0)
+        pull = self._linear if self._quadratic is None else self._quadratic @ z + self._linear
+        return float(pull @ z) + self._constant
+
+
+def _over_channels(values: Tensor, in_use: Tensor, num: Tensor) -> list[Tensor]:
+    """Over the last axis, of the entries in use, mean, largest and smallest; 0 of none."""
+    mean = torch.where(in_use, values, 0.0).sum(-1) / num
+    known = torch.where(in_use, values, mean.unsqueeze(-1))
+    return [mean, known.amax(-1), known.amin(-1)]
+
+
+def _mean_of_hops(score: Array) -> Array:
+    """Means of each hop and those before it, ``NOTHING_YET`` for NaN: ``[2 + k] -> [k]``."""
+    mean = sum((score[i : len(score) + 1 - MEAN_HOPS + i] for i in range(MEAN_HOPS)), 0.0)
+    return np.where(np.isfinite(mean), mean / MEAN_HOPS, NOTHING_YET)
+
+
+def _moving_mean(x: Tensor, length: int) -> Tensor:
+    """Over the last axis, of every ``length`` neighbours."""
+    return x.unfold(-1, length, 1).mean(-1)
