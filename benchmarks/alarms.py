@@ -150,14 +150,15 @@ class Alarms(Benchmark[Sizes]):
 
     def _of_seed(self, seed: int, overrides: list[str], job: Job[Sizes]) -> dict[str, Any]:
         folder, is_first = job.folder / f"seed-{seed}", seed == job.sizes.seeds[0]
-        trained(f"detector, seed {seed}", [*overrides, "onset=none"], folder, job.folder / "cache")
+        training = [x for x in overrides if not x.startswith("onset.")] + ["onset=none"]
+        trained(f"detector, seed {seed}", training, folder, job.folder / "cache")
         detector = SlipDetector.load(folder / "detector.pt")
         parts = (detector.pool, detector.channel_filter)
         peers: dict[str, Scorer] = {LARGEST_DETAIL: BaselineDetector("largest_detail", *parts)}
         config: Any = OmegaConf.to_container(composed("train", overrides).onset, resolve=True)
         stage: CalibratedAlarm = instantiate(config, _convert_="all")
         if is_first and job.sizes.num_kernels:
-            peers[ROCKET] = _rocket(detector, [*overrides, "onset=none"], folder, stage, job.sizes)
+            peers[ROCKET] = _rocket(detector, training, folder, stage, job.sizes)
         say(f"alarm, seed {seed}")
         found = stage(detector, peers)
         detector.save(folder / "detector.pt")
