@@ -15,11 +15,12 @@ from hypothesis.extra.numpy import arrays
 from streams import detector_of, onset_of, signal
 
 from tactslip_torch.deploy.check import runner, session_of
-from tactslip_torch.deploy.onset import memory_size, onset_scores
 from tactslip_torch.deploy.stream import (
     LATCH_START,
     Timing,
     latched,
+    memory_size,
+    onset_scores,
     rule_start,
     statistic_of,
     stream_graph,

@@ -7,7 +7,7 @@ from taps, motors and mains by how they spread over channels and by what was the
   own floor, the mean of the log power over the last second;
 - *slow channels*: steps between means of neighbouring stretches of 10 to 200 ms, and their sign: a
   grip presses, a slip relieves;
-- each pooled over the channels of its kind (``features.pooling``).
+- each as mean, largest and smallest over the channels of its kind.
 
 Three filters are differences of neighbouring means (Haar wavelets); the fourth first takes away the
 mean of the last periods of the mains, a comb that no harmonic passes. The classifier is the kernel

@@ -12,7 +12,7 @@ a stream will use, and recordings are what the bootstrap draws.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -285,13 +285,26 @@ def lowest_threshold(
     other = np.zeros(0, np.int64)
     if is_raised is not None:
         other = np.flatnonzero(np.concatenate([x for own in is_raised for x in (own, none)]))
-    value, num, most = float(np.nextafter(ranked[0], np.inf)), 0, tried
-    while num < tried:
+
+    def keeps(threshold: float) -> bool:
+        above = np.union1d(places[flat[places] >= threshold], other)
+        return bool(quiet[_alarms(above, rearm, refractory)].sum() <= allowed)
+
+    return _lowest(ranked[:tried], float(np.nextafter(ranked[0], np.inf)), keeps)
+
+
+def _lowest(falling: NDArray[Any], above: float, keeps: Callable[[float], bool]) -> float:
+    """The last of falling values that keeps what is asked for, ``above`` if none does.
+
+    One by one among the highest 500, then in steps of a five hundredth, the last one by halves.
+    """
+    value, num, most = above, 0, len(falling)
+    while num < len(falling):
         step = min(num // _TRIED_ONE_BY_ONE, most)
-        below = ranked[min(num + step, tried - 1)]
-        above = np.union1d(places[flat[places] >= below], other)
-        if quiet[_alarms(above, rearm, refractory)].sum() <= allowed:
-            value, num = float(below), int(np.searchsorted(-ranked, -below, side="right"))
+        below = falling[min(num + step, len(falling) - 1)]
+        if keeps(below):
+            value = float(below)
+            num = len(falling) - int(np.searchsorted(falling[::-1], below))
         elif step == 0:
             break
         else:
@@ -349,20 +362,14 @@ def choose_threshold(
     apart = np.repeat(np.arange(len(sizes)), sizes) * (rearm + refractory + 2)
     places = np.arange(len(flat)) + apart  # so far apart that no latch remembers
     ranked = np.sort(flat)[::-1]
-    value, num = float(np.nextafter(ranked[0], np.inf, dtype=flat.dtype)), 0
+    value = float(np.nextafter(ranked[0], np.inf, dtype=flat.dtype))
     if 0 < value < (least := float(np.finfo(np.float32).tiny)):
         value = least  # denormal numbers have no digits to tell a threshold from its ceiling
-    most = len(flat)  # decisions to go down by at once
-    while num < len(flat):
-        step = min(num // _TRIED_ONE_BY_ONE, most)
-        below = ranked[min(num + step, len(flat) - 1)]
-        is_reached = flat >= below
-        if len(_alarms(places[is_reached], rearm, refractory)) <= allowed:
-            value, num = float(below), int(is_reached.sum())
-        elif step == 0:
-            break
-        else:
-            most = step // 2
+
+    def keeps(threshold: float) -> bool:
+        return len(_alarms(places[flat >= threshold], rearm, refractory)) <= allowed
+
+    value = _lowest(ranked, value, keeps)
     value = min(value, float(torch.tensor(min(rule.ceiling, ceiling), dtype=statistics[0].dtype)))
     counts = alarm_counts(statistics, value, rearm=rearm, refractory=refractory)
     rate = alarm_rate(counts, hours, level)

@@ -28,6 +28,7 @@ from tactslip_torch.model.fit import TrainingBins
 from tactslip_torch.model.kernels import Polynomial, QuadraticForm
 from tactslip_torch.model.leave_one_group_out import HeldOut
 from tactslip_torch.model.scaling import FeatureScaler
+from tactslip_torch.onset.events import first_releases
 from tactslip_torch.onset.evidence import OnsetClassifier, OnsetEvidence
 from tactslip_torch.runtime import in_processes
 
@@ -205,7 +206,7 @@ def kinds_of(
     Shape:
         - time_s, masks: ``[N]``
     """
-    firsts = [first for first, _ in times.released_s] or times.onsets_s
+    firsts = first_releases(times.onsets_s, times.released_s)
     onset, before, slide, unclear = (np.zeros(len(time_s), bool) for _ in range(4))
     for first, onset_s, (_, end) in zip(firsts, times.onsets_s, times.sliding_s, strict=True):
         since = time_s - onset_s
